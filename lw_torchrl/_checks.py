@@ -1,0 +1,54 @@
+"""Checks of arguments, shared by every room: the error names the argument, what was given and what is allowed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+from typing import Any
+
+
+def nearest(given: str, allowed: Iterable[str], *, n: int = 3) -> list[str]:
+    """The ``n`` allowed names closest in spelling to ``given``, best first."""
+    return get_close_matches(given, list(allowed), n=n, cutoff=0.4)
+
+
+def unknown_name(argument: str, given: object, allowed: Iterable[str]) -> ValueError:
+    """The error for a name outside a fixed set; the caller raises it.
+
+    Example:
+        >>> str(unknown_name("mix", "latent", ["latents", "actions"]))
+        "mix must be one of 'latents', 'actions', got 'latent'; did you mean 'latents'?"
+    """
+    names = list(allowed)
+    listed = ", ".join(repr(name) for name in names[:12]) + (", ..." if len(names) > 12 else "")
+    message = f"{argument} must be one of {listed}, got {given!r}"
+    if isinstance(given, str) and (close := nearest(given, names)):
+        message += "; did you mean " + " or ".join(repr(name) for name in close) + "?"
+    return ValueError(message)
+
+
+def check_choice(argument: str, given: Any, allowed: Iterable[str]) -> Any:
+    """Return ``given`` if it is one of ``allowed``, else raise :class:`ValueError` with the nearest name."""
+    names = list(allowed)
+    if given not in names:
+        raise unknown_name(argument, given, names)
+    return given
+
+
+def check_int(argument: str, given: Any, *, minimum: int | None = None) -> int:
+    """Return ``given`` as an int of at least ``minimum``; :class:`TypeError` for another type."""
+    if isinstance(given, bool) or not hasattr(given, "__index__"):
+        raise TypeError(f"{argument} must be an integer, got {given!r} ({type(given).__name__})")
+    value = int(given.__index__())
+    if minimum is not None and value < minimum:
+        raise ValueError(f"{argument} must be at least {minimum}, got {value}")
+    return value
+
+
+def check_scale(argument: str, given: Any) -> float:
+    """Return ``given`` as a finite float of at least 0."""
+    if isinstance(given, bool) or not isinstance(given, (int, float)):
+        raise TypeError(f"{argument} must be a number, got {given!r} ({type(given).__name__})")
+    if not 0.0 <= given < float("inf"):
+        raise ValueError(f"{argument} must be finite and at least 0, got {given!r}")
+    return float(given)

@@ -1,0 +1,189 @@
+"""A demonstration dataset on disk: what its folder holds, and the metadata that say how it was made.
+
+    root/data/            TorchRL's TED layout as a memory-mapped TensorDict, one row a step
+    root/metadata.json    written last: without it the dataset is not finished
+    root/.partial/        the episodes so far, while collecting
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from tensordict import TensorDict, TensorDictBase
+
+from lw_torchrl._files import write_json
+
+FORMAT = "lw_torchrl.demonstrations"
+FORMAT_VERSION = 1
+DATA, METADATA, PARTIAL = "data", "metadata.json", ".partial"
+_PACKAGES = ("lw_torchrl", "metaworld", "mujoco", "numpy", "tensordict", "torch", "torchrl")
+
+
+class DatasetError(ValueError):
+    """A folder that holds no finished dataset of this format."""
+
+
+@dataclass(frozen=True)
+class CollectConfig:
+    """How demonstrations are made; equal configurations give equal datasets.
+
+    Attributes:
+        tasks: the tasks' names, sorted.
+        episodes_per_task: kept episodes of each task.
+        seed: with task and episode, fixes the initial state, the goal and the noise.
+        noise_scale: standard deviations of the execution noise, one an episode in turn; (0.0,) for none.
+        gripper_noise_factor: what the gripper's noise is multiplied by; noise there makes grasps fail.
+        redraw_failures: keep successful episodes only, and draw another for each failure.
+        max_steps: steps of an episode.
+    """
+
+    tasks: tuple[str, ...]
+    episodes_per_task: int
+    seed: int
+    noise_scale: tuple[float, ...] = (0.0,)
+    gripper_noise_factor: float = 0.2
+    redraw_failures: bool = False
+    max_steps: int = 500
+
+    def to_json(self) -> dict[str, Any]:
+        return {key: list(v) if isinstance(v, tuple) else v for key, v in asdict(self).items()}
+
+
+@dataclass(frozen=True)
+class EpisodeInfo:
+    """One episode of a dataset.
+
+    Attributes:
+        task: the task's name.
+        episode: its index; ``episode_seed(task, seed, episode)`` is its seed.
+        start: its first row.
+        length: its number of rows.
+        success: whether it succeeded at some step.
+        first_success: the first successful step, from 1; None without success.
+    """
+
+    task: str
+    episode: int
+    start: int
+    length: int
+    success: bool
+    first_success: int | None
+
+
+@dataclass(frozen=True)
+class Demonstrations:
+    """A finished dataset, described; :class:`LanguageWorldExperienceReplay` reads its rows.
+
+    Attributes:
+        root: its folder.
+        config: how it was collected.
+        versions: of the packages that made it.
+        episodes: in the order of the rows.
+        attempts: task name to the episodes run, failures that were redrawn among them.
+    """
+
+    root: Path
+    config: CollectConfig
+    versions: dict[str, str]
+    episodes: tuple[EpisodeInfo, ...]
+    attempts: dict[str, int]
+
+    @property
+    def num_steps(self) -> int:
+        """The number of rows."""
+        return sum(episode.length for episode in self.episodes)
+
+    @property
+    def success_rate(self) -> dict[str, float]:
+        """Task name to the fraction of its kept episodes that succeeded."""
+        rates = {}
+        for task in self.config.tasks:
+            found = [episode.success for episode in self.episodes if episode.task == task]
+            rates[task] = sum(found) / len(found)
+        return rates
+
+
+def package_versions() -> dict[str, str]:
+    """The versions that results depend on."""
+    return {name: version(name) for name in _PACKAGES}
+
+
+def write_metadata(
+    root: Path, config: CollectConfig, episodes: Sequence[EpisodeInfo], attempts: dict[str, int]
+) -> None:
+    """Write the metadata, which makes the dataset a finished one."""
+    write_json(
+        root / METADATA,
+        {
+            "format": FORMAT,
+            "version": FORMAT_VERSION,
+            "config": config.to_json(),
+            "versions": package_versions(),
+            "attempts": attempts,
+            "episodes": {
+                key: [getattr(episode, key) for episode in episodes] for key in EpisodeInfo.__dataclass_fields__
+            },
+        },
+    )
+
+
+def read_metadata(root: str | os.PathLike[str]) -> Demonstrations:
+    """Describe the dataset in a folder.
+
+    Raises:
+        FileNotFoundError: there is no such folder.
+        DatasetError: (a ValueError) the dataset is half-written, damaged, or of another format or version.
+    """
+    folder = Path(root)
+    path = folder / METADATA
+    if not folder.is_dir():
+        raise FileNotFoundError(f"root: no dataset folder {str(folder)!r}; make one with collect_demonstrations")
+    if not path.is_file():
+        if (folder / PARTIAL).is_dir():
+            raise DatasetError(
+                f"root: the dataset in {str(folder)!r} is half-written; run the same collect_demonstrations again, "
+                "and it carries on"
+            )
+        raise DatasetError(f"root: {str(folder)!r} holds no {METADATA}, so it is no dataset of {FORMAT}")
+    try:
+        found = json.loads(path.read_text("utf-8"))
+        if found["format"] != FORMAT or found["version"] != FORMAT_VERSION:
+            raise DatasetError(
+                f"root: {str(path)!r} is of format {found['format']!r} version {found['version']!r}; this package "
+                f"reads {FORMAT!r} version {FORMAT_VERSION}. Collect it again."
+            )
+        config = {key: tuple(v) if isinstance(v, list) else v for key, v in found["config"].items()}
+        columns = found["episodes"]
+        rows = zip(*(columns[key] for key in EpisodeInfo.__dataclass_fields__), strict=True)
+        return Demonstrations(
+            folder,
+            CollectConfig(**config),
+            found["versions"],
+            tuple(EpisodeInfo(*row) for row in rows),
+            found["attempts"],
+        )
+    except DatasetError:
+        raise
+    except (KeyError, TypeError, ValueError) as error:
+        raise DatasetError(f"root: {str(path)!r} is damaged ({error!r}); collect the dataset again") from error
+
+
+def load_rows(demonstrations: Demonstrations) -> TensorDictBase:
+    """The rows of a dataset, memory-mapped and read without unpickling."""
+    folder = demonstrations.root / DATA
+    try:
+        rows = TensorDict.load_memmap(folder, allow_pickle=False)
+    except Exception as error:
+        raise DatasetError(f"root: the rows in {str(folder)!r} cannot be read ({error}); collect them again") from error
+    if rows.batch_size != (demonstrations.num_steps,):
+        raise DatasetError(
+            f"root: {str(folder)!r} has {tuple(rows.batch_size)} rows, the metadata say {demonstrations.num_steps}; "
+            "collect the dataset again"
+        )
+    return rows

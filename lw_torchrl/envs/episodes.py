@@ -1,0 +1,145 @@
+"""Running exactly the episodes one asks for, on however many rows there are: what collecting and evaluating share."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey
+from torchrl.envs import EnvBase, TransformedEnv, step_mdp
+
+from lw_torchrl.envs.language_world_env import LanguageWorldEnv
+from lw_torchrl.envs.seeding import action_noise
+
+BLOCK = 64
+
+
+class Episode(NamedTuple):
+    """One finished episode.
+
+    Attributes:
+        task: the task's name.
+        episode: its index.
+        steps: TensorDict of batch (T,) with the recorded keys.
+    """
+
+    task: str
+    episode: int
+    steps: TensorDictBase
+
+
+def in_blocks(policy: Callable[[TensorDictBase], TensorDictBase]) -> Callable[[TensorDictBase], TensorDictBase]:
+    """``policy``, run on blocks of exactly 64 rows, the last one padded.
+
+    A matrix product of another number of rows rounds differently, and contact amplifies the last bits. With blocks
+    of one size a row's action depends on that row alone, whatever the number of environments.
+    """
+
+    def run(tensordict: TensorDictBase) -> TensorDictBase:
+        n = tensordict.batch_size[0]
+        padding = -n % BLOCK
+        padded = torch.cat([tensordict, tensordict[:1].expand(padding)]) if padding else tensordict
+        outputs = torch.cat([policy(block.copy()) for block in padded.split(BLOCK)])
+        return tensordict.update(outputs[:n])
+
+    return run
+
+
+def _base(env: EnvBase) -> LanguageWorldEnv:
+    base = env.base_env if isinstance(env, TransformedEnv) else env
+    if not isinstance(base, LanguageWorldEnv):
+        raise TypeError(f"env must be a LanguageWorldEnv or a TransformedEnv of one, got {type(base).__name__}")
+    return base
+
+
+def run_episodes(
+    env: EnvBase,
+    policy: Callable[[TensorDictBase], TensorDictBase],
+    episodes: Mapping[str, Sequence[int]],
+    *,
+    keys: Sequence[NestedKey],
+    noise: Callable[[int], Sequence[float]] | None = None,
+    stop_at_success: bool = False,
+    clean_action: NestedKey | None = None,
+    on_progress: Callable[[int], object] | None = None,
+) -> Iterator[Episode]:
+    """Run each task's listed episodes once and yield them as they finish.
+
+    A row that finishes takes the next episode of its task; one without work costs nothing.
+
+    Args:
+        env: a LanguageWorldEnv, with transforms or without.
+        policy: called on all N rows, with a ``_step`` mask of those that count.
+        episodes: task name to episode indices.
+        keys: what to record of each step, ``("next", "success")`` say.
+        noise: episode index to the four standard deviations of the noise added to the action, from the same
+            (task, seed, episode) as the episode itself; None for none.
+        stop_at_success: end an episode after its first successful step.
+        clean_action: where to write the action before the noise.
+        on_progress: told after each step how many more of all the steps are done with; what an early stop saves
+            counts as done.
+
+    Yields:
+        Every episode, in the order in which they finish.
+    """
+    base = _base(env)
+    rows = len(base.row_tasks)
+    waiting = {task: deque(listed) for task, listed in episodes.items()}
+    if unknown := set(waiting) - set(base.tasks):
+        raise ValueError(f"episodes names {', '.join(sorted(unknown))}, which env does not have")
+    episode = torch.zeros(rows, dtype=torch.int64)
+    active = torch.zeros(rows, dtype=torch.bool)
+    steps = np.zeros(rows, dtype=np.int64)
+    noises = np.zeros((rows, base.max_steps, 4), dtype=np.float32)
+    buffers: TensorDictBase | None = None
+    state: TensorDictBase = env.full_done_spec.zero()
+    idle = torch.ones(rows, dtype=torch.bool)
+    while True:
+        starting = torch.zeros(rows, dtype=torch.bool)
+        for row in torch.nonzero(idle).flatten().tolist():
+            if queue := waiting.get(base.row_tasks[row]):
+                number = queue.popleft()
+                episode[row], starting[row], steps[row] = number, True, 0
+                if noise is not None:
+                    scale = np.asarray(noise(number), dtype=np.float32)
+                    drawn = action_noise(base.row_tasks[row], base.seed, number, base.max_steps)
+                    noises[row] = drawn * scale
+        active = (active & ~idle) | starting
+        if not active.any():
+            return
+        if starting.any():
+            request = TensorDict({"_reset": starting, "episode": episode.clone()}, [rows])
+            state = env.reset(state.update(request)).exclude("_reset")
+        state.set("_step", active)
+        state = policy(state)
+        action = state.get("action")
+        if clean_action is not None:
+            state.set(clean_action, action.clone())
+        if noise is not None:
+            drawn = torch.from_numpy(noises[np.arange(rows), np.minimum(steps, base.max_steps - 1)])
+            action = (action + drawn).clamp(-1.0, 1.0)
+        # Rows at rest keep a harmless action: theirs is computed from a state that may be stale.
+        state.set("action", torch.where(active.unsqueeze(-1), action, 0.0))
+        state.set("_step", active)
+        state = env.step(state)
+        recorded = state.select(*keys)
+        if buffers is None:
+            buffers = recorded.unsqueeze(1).expand(rows, base.max_steps).clone()
+        live = torch.nonzero(active).flatten()
+        buffers[live, torch.from_numpy(steps)[live]] = recorded[live]
+        steps[live.numpy()] += 1
+        following = state.get("next")
+        ended = following.get("done").squeeze(-1)
+        if stop_at_success:
+            ended = ended | following.get("success").squeeze(-1)
+        idle = ended & active
+        if on_progress is not None:
+            on_progress(int(active.sum()) + int((base.max_steps - steps)[idle.numpy()].sum()))
+        for row in torch.nonzero(idle).flatten().tolist():
+            yield Episode(base.row_tasks[row], int(episode[row]), buffers[row, : steps[row]].clone())
+        idle = idle | ~active
+        state = step_mdp(state, exclude_action=True, keep_other=True)

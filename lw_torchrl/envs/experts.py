@@ -1,0 +1,68 @@
+"""Meta-World's scripted experts as a TensorDictModule."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+
+from lw_torchrl.envs.engine import ACTION_SIZE
+from lw_torchrl.envs.metaworld_engine import import_metaworld
+from lw_torchrl.language.tasks import resolve_tasks, task_id
+
+
+class ExpertActor(TensorDictModuleBase):
+    """Meta-World's scripted policy of each row's task.
+
+    Reads ``observation`` (B, 39) float32 and ``task_id`` (B,) int64; writes ``action`` (B, 4) float32, clipped to
+    [-1, 1], since the scripts ask for far more. Rows that a ``_step`` mask (B,) leaves out get zeros.
+
+    Args:
+        tasks: the tasks it must know, as for :func:`resolve_tasks`.
+
+    Raises:
+        ValueError: an unknown task, or at call time a task_id outside ``tasks``.
+
+    Example:
+        >>> import lw_torchrl as lw
+        >>> env = lw.LanguageWorldEnv("reach", seed=0)
+        >>> bool(env.rollout(100, lw.ExpertActor("reach"))["next", "success"].any())
+        True
+        >>> env.close()
+
+    Source: ``metaworld.policies``.
+    """
+
+    in_keys = ["observation", "task_id"]
+    out_keys = ["action"]
+
+    def __init__(self, tasks: str | Iterable[str]) -> None:
+        super().__init__()
+        self.tasks = resolve_tasks(tasks)
+        policies = import_metaworld().policies.ENV_POLICY_MAP
+        self._policies = {task_id(task): policies[f"{task}-v3"]() for task in self.tasks}
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        observation = tensordict.get("observation")
+        if observation.shape[-1:] != (39,):
+            raise ValueError(f"observation must have 39 numbers, got shape {tuple(observation.shape)}")
+        states = observation.reshape(-1, 39).cpu().numpy().astype(np.float64)
+        task_ids = tensordict.get("task_id").reshape(-1).tolist()
+        mask = tensordict.get("_step", None)
+        wanted = [True] * len(task_ids) if mask is None else mask.reshape(-1).tolist()
+        action = np.zeros((len(task_ids), ACTION_SIZE), dtype=np.float32)
+        with warnings.catch_warnings():
+            # The scripts warn nearly every step that they ask for more than [-1, 1].
+            warnings.filterwarnings("ignore", message="Constant\\(s\\) may be too high")
+            for row, (state, task) in enumerate(zip(states, task_ids, strict=True)):
+                if not wanted[row]:
+                    continue
+                if task not in self._policies:
+                    raise ValueError(f"task_id {task} is none of this expert's tasks: {', '.join(self.tasks)}")
+                action[row] = self._policies[task].get_action(state)
+        clipped = torch.from_numpy(action.clip(-1.0, 1.0)).to(observation.device)
+        return tensordict.set("action", clipped.reshape(*observation.shape[:-1], ACTION_SIZE))

@@ -1,0 +1,240 @@
+"""LanguageWorldEnv: Meta-World's tasks as one natively batched TorchRL environment."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterable
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Bounded, Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from lw_torchrl._checks import check_choice, check_int
+from lw_torchrl.envs.engine import ACTION_SIZE, OBSERVATION_SIZE, Engine
+from lw_torchrl.envs.seeding import episode_seed
+from lw_torchrl.language.tasks import resolve_tasks, task_id
+
+ENGINES = ("metaworld",)
+
+
+def _make_engine(engine: str | Callable[..., Engine], rows: list[str], **options: Any) -> Engine:
+    if callable(engine):
+        return engine(rows, **options)
+    check_choice("engine", engine, ENGINES)
+    from lw_torchrl.envs.metaworld_engine import MetaWorldEngine
+
+    return MetaWorldEngine(rows, **options)
+
+
+class LanguageWorldEnv(EnvBase):
+    """N environments over any mixture of the 50 tasks, stepped together, by the MT50-rand protocol: a random
+    initial state and goal at every reset, the goal observed, 500 steps, ended by truncation alone.
+
+    Row i keeps the task ``tasks[i % n]`` for life. The m-th reset of the r-th of a task's R rows is that task's
+    episode m·R + r, unless the reset tensordict's ``episode`` names another. An episode starts as Meta-World's
+    own environment does after ``env.seed(episode_seed(task, seed, episode)); env.reset()``, whatever ran before
+    or beside it.
+
+    Keys (B = (N,)):
+        observation: (N, 39) float32, Meta-World's vector: metres, gripper opening in [0, 1], quaternions.
+        task_id: (N,) int64, rank of the task's name among the 50 sorted names.
+        episode: (N,) int64, index of the episode.
+        success: (N, 1) bool, Meta-World's success at this step.
+        fault: (N, 1) bool, the row was truncated because its action was NaN or its simulation became unstable.
+        action: (N, 4) float32 in [-1, 1], end-effector displacement xyz and gripper effort. Numbers out of range
+            are clipped as Meta-World does, in place, so that what was executed is what is recorded.
+        reward: (N, 1) float32; done, terminated, truncated: (N, 1) bool, terminated always false.
+
+    A ``_step`` mask leaves rows where they are; a ``_reset`` mask resets only its rows.
+
+    Args:
+        tasks: "MT10", "MT50", a task's name, or a list of names.
+        num_envs: N, at least the number of tasks; None for one environment each.
+        seed: any integer; :meth:`set_seed` starts again at episode 0.
+        engine: "metaworld" for Meta-World's own environments in a loop, or a callable
+            ``(row_tasks, *, reward, num_threads) -> Engine``.
+        num_threads: for engines that use threads; never changes a result.
+        reward: "sparse", the success as 0 and 1, or "dense", Meta-World's own.
+        max_steps: steps until truncation.
+        strict: raise on a NaN action or an unstable simulation, instead of truncating the row with a warning.
+
+    Raises:
+        ValueError: an unknown task or engine, or ``num_envs`` under the number of tasks.
+        ImportError: a rendering library named by MUJOCO_GL is absent.
+
+    Example:
+        >>> env = LanguageWorldEnv(["reach", "push"], num_envs=4, seed=0)
+        >>> rollout = env.rollout(3)
+        >>> rollout["observation"].shape, rollout["task_id"][:, 0].tolist()
+        (torch.Size([4, 3, 39]), [37, 41, 37, 41])
+        >>> env.close()
+
+    Source: paper section 'Task Formalism'; ``metaworld.sawyer_xyz_env.SawyerXYZEnv``.
+    """
+
+    def __init__(
+        self,
+        tasks: str | Iterable[str],
+        *,
+        num_envs: int | None = None,
+        seed: int = 0,
+        engine: Literal["metaworld"] | Callable[..., Engine] = "metaworld",
+        num_threads: int | None = None,
+        reward: Literal["sparse", "dense"] = "sparse",
+        max_steps: int = 500,
+        strict: bool = False,
+    ) -> None:
+        self.tasks = resolve_tasks(tasks)
+        n = len(self.tasks)
+        num_envs = n if num_envs is None else check_int("num_envs", num_envs, minimum=1)
+        if num_envs < n:
+            raise ValueError(f"num_envs must be at least the number of tasks, {n}, got {num_envs}")
+        check_choice("reward", reward, ("sparse", "dense"))
+        if num_threads is not None:
+            check_int("num_threads", num_threads, minimum=1)
+        self.max_steps = check_int("max_steps", max_steps, minimum=1)
+        self.strict = strict
+        self.row_tasks = tuple(self.tasks[i % n] for i in range(num_envs))
+        self._seed = check_int("seed", seed)
+        super().__init__(device=torch.device("cpu"), batch_size=(num_envs,))
+        self._make_specs(num_envs)
+        self._task_id = torch.tensor([task_id(task) for task in self.row_tasks])
+        self._rank = np.arange(num_envs) // n  # r, the row's rank among the rows of its task
+        self._copies = np.bincount(np.arange(num_envs) % n, minlength=n)[np.arange(num_envs) % n]  # R
+        self._resets = np.zeros(num_envs, dtype=np.int64)
+        self._episode = np.full(num_envs, -1, dtype=np.int64)
+        self._steps = np.zeros(num_envs, dtype=np.int64)
+        self._over = np.ones(num_envs, dtype=bool)
+        self._fault = np.zeros(num_envs, dtype=bool)
+        self._success = np.zeros(num_envs, dtype=bool)
+        self._observation = np.zeros((num_envs, OBSERVATION_SIZE), dtype=np.float32)
+        self._engine = _make_engine(engine, list(self.row_tasks), reward=reward, num_threads=num_threads)
+
+    def _make_specs(self, n: int) -> None:
+        flag = Categorical(2, shape=(n, 1), dtype=torch.bool)
+        self.observation_spec = Composite(
+            observation=Unbounded((n, OBSERVATION_SIZE)),
+            task_id=Categorical(50, shape=(n,), dtype=torch.int64),
+            episode=Unbounded((n,), dtype=torch.int64),
+            success=flag.clone(),
+            fault=flag.clone(),
+            shape=(n,),
+        )
+        self.action_spec = Bounded(-1.0, 1.0, (n, ACTION_SIZE))
+        self.reward_spec = Unbounded((n, 1))
+        self.done_spec = Composite(
+            done=flag.clone(), terminated=flag.clone(), truncated=flag.clone(), shape=(n,)
+        )
+
+    def _set_seed(self, seed: int | None) -> None:
+        if seed is not None:
+            self._seed = check_int("seed", seed)
+        self._resets[:] = 0
+
+    @property
+    def seed(self) -> int:
+        """The seed that, with task and episode, fixes every reset."""
+        return self._seed
+
+    def _state(self) -> TensorDict:
+        over = torch.from_numpy(self._over.copy()).unsqueeze(-1)
+        return TensorDict(
+            {
+                "observation": torch.from_numpy(self._observation.copy()),
+                "task_id": self._task_id.clone(),
+                "episode": torch.from_numpy(self._episode.copy()),
+                "success": torch.from_numpy(self._success.copy()).unsqueeze(-1),
+                "fault": torch.from_numpy(self._fault.copy()).unsqueeze(-1),
+                "done": over,
+                "terminated": torch.zeros_like(over),
+                "truncated": over.clone(),
+            },
+            batch_size=self.batch_size,
+        )
+
+    def _mask(self, tensordict: TensorDictBase | None, key: str) -> np.ndarray:
+        mask = None if tensordict is None else tensordict.get(key, None)
+        if mask is None:
+            return np.ones(self.batch_size[0], dtype=bool)
+        return mask.reshape(self.batch_size).cpu().numpy()
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDict:
+        rows = np.flatnonzero(self._mask(tensordict, "_reset"))
+        named = None if tensordict is None else tensordict.get("episode", None)
+        if named is None:
+            episodes = (self._resets * self._copies + self._rank)[rows]
+        else:
+            episodes = named.reshape(self.batch_size).cpu().numpy()[rows]
+            if (episodes < 0).any():
+                raise ValueError(f"episode must be at least 0, got {episodes.min()}")
+        seeds = [
+            episode_seed(self.row_tasks[row], self._seed, int(episode))
+            for row, episode in zip(rows, episodes, strict=True)
+        ]
+        self._observation[rows] = self._engine.reset(rows.tolist(), seeds)
+        self._resets[rows] += 1
+        self._episode[rows] = episodes
+        self._steps[rows] = 0
+        for flag in (self._over, self._fault, self._success):
+            flag[rows] = False
+        return self._state()
+
+    def _executed(self, tensordict: TensorDictBase) -> Tensor:
+        action = tensordict.get("action")
+        if action.shape != (*self.batch_size, ACTION_SIZE) or action.dtype != torch.float32:
+            raise ValueError(
+                f"action must be float32 of shape {(*self.batch_size, ACTION_SIZE)}, got {action.dtype} of shape "
+                f"{tuple(action.shape)}"
+            )
+        executed = action.detach().clamp(-1.0, 1.0)
+        if not torch.equal(executed, action):
+            # In place, since a transformed environment steps a copy of the caller's tensordict. A tensor that
+            # repeats its memory cannot be written to; then the caller's entry is replaced where it can be.
+            with torch.no_grad():
+                try:
+                    action.copy_(executed)
+                except RuntimeError:
+                    tensordict.set("action", executed)
+        return executed
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        action = self._executed(tensordict).cpu().numpy()
+        active = self._mask(tensordict, "_step")
+        if (active & self._over).any():
+            rows = np.flatnonzero(active & self._over)[:5].tolist()
+            raise RuntimeError(f"rows {rows} have ended or were never reset: reset them before the next step")
+        broken = active & np.isnan(action).any(-1)
+        if broken.any():
+            self._report(broken, "its action is NaN", "action must hold numbers")
+        stepped = active & ~broken
+        result = self._engine.step(action, stepped)
+        if (unstable := result.fault & stepped).any():
+            self._report(unstable, "its simulation became unstable", "the simulation must stay stable")
+        self._observation[stepped] = result.observation[stepped]
+        self._success[active] = result.success[active] & stepped[active]
+        self._steps[active] += 1
+        self._fault |= broken | unstable
+        self._over |= self._fault | (self._steps >= self.max_steps)
+        out = self._state()
+        reward = np.where(stepped, result.reward, 0.0).astype(np.float32)
+        return out.set("reward", torch.from_numpy(reward).unsqueeze(-1))
+
+    def _report(self, rows: np.ndarray, what: str, must: str) -> None:
+        row = int(np.flatnonzero(rows)[0])
+        message = (
+            f"row {row}: {what}, in task {self.row_tasks[row]!r}, seed {self._seed}, episode "
+            f"{self._episode[row]}, step {self._steps[row]}" + (f" ({rows.sum()} rows)" if rows.sum() > 1 else "")
+        )
+        if self.strict:
+            raise ValueError(f"{must}: {message}")
+        warnings.warn(f"{message}; the row is truncated and flagged, the others go on", stacklevel=3)
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Free the simulators."""
+        if not self.is_closed:
+            self._engine.close()
+        super().close(raise_if_closed=raise_if_closed)

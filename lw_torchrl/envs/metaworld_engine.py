@@ -1,0 +1,96 @@
+"""The plain engine: Meta-World's own environments, one per row, stepped in a loop."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lw_torchrl.envs.engine import OBSERVATION_SIZE, EngineStep
+
+RENDER_LIBRARIES = {
+    "egl": "libEGL (Debian: apt-get install libegl1)",
+    "osmesa": "OSMesa (Debian: apt-get install libosmesa6)",
+}
+
+
+def import_metaworld() -> Any:
+    """Import Meta-World, or say what its obscure AttributeError means: a rendering library that is absent."""
+    try:
+        import metaworld
+        import metaworld.policies
+    except AttributeError as error:
+        backend = os.environ.get("MUJOCO_GL", "").lower()
+        needs = RENDER_LIBRARIES.get(backend, "an OpenGL library")
+        raise ImportError(
+            f"MUJOCO_GL is {backend!r}, but {needs} is not installed. Install it, or unset MUJOCO_GL: "
+            "only camera images need it."
+        ) from error
+    return metaworld
+
+
+def make_metaworld_env(task: str, *, max_steps: int = 500) -> Any:
+    """Meta-World's own environment of ``task``, goal observable, a new initial state and goal at every reset.
+
+    Seed it with ``env.seed(seed)``; Meta-World ignores ``reset(seed=...)``.
+    """
+    import_metaworld()
+    from metaworld.env_dict import ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE
+
+    env = ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE[f"{task}-v3-goal-observable"](seed=0)
+    env._freeze_rand_vec = False
+    env.seeded_rand_vec = True
+    env.max_path_length = max_steps
+    return env
+
+
+class MetaWorldEngine:
+    """Meta-World's ``env.step`` in a loop: slow, and the oracle for every other engine.
+
+    Args:
+        tasks: the task of each row.
+        reward: "sparse" for the success as 0 and 1, "dense" for Meta-World's own reward.
+        num_threads: accepted for the interface; Meta-World's Python holds one thread.
+    """
+
+    def __init__(
+        self,
+        tasks: Sequence[str],
+        *,
+        reward: Literal["sparse", "dense"] = "sparse",
+        num_threads: int | None = None,
+    ) -> None:
+        self._dense = reward == "dense"
+        # The environment above counts the steps; Meta-World's own limit must not come first.
+        self._envs = [make_metaworld_env(task, max_steps=2**31 - 1) for task in tasks]
+        self._last = np.zeros((len(self._envs), OBSERVATION_SIZE))
+
+    def reset(self, rows: Sequence[int], seeds: Sequence[int]) -> NDArray[np.float64]:
+        for row, seed in zip(rows, seeds, strict=True):
+            env = self._envs[row]
+            env.seed(seed)
+            env._did_see_sim_exception = False
+            self._last[row] = env.reset()[0]
+        return self._last[list(rows)]
+
+    def step(self, action: NDArray[np.float32], active: NDArray[np.bool_]) -> EngineStep:
+        n = len(self._envs)
+        reward, success, fault = np.zeros(n), np.zeros(n, bool), np.zeros(n, bool)
+        for row in np.flatnonzero(active):
+            env = self._envs[row]
+            observation, dense, _, _, info = env.step(action[row])
+            if env._did_see_sim_exception or not np.isfinite(observation).all():
+                fault[row] = True
+                continue
+            self._last[row] = observation
+            success[row] = bool(info["success"])
+            reward[row] = dense if self._dense else success[row]
+        return EngineStep(self._last.copy(), reward, success, fault)
+
+    def close(self) -> None:
+        for env in self._envs:
+            env.close()
+        self._envs = []

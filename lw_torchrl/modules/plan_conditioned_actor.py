@@ -1,0 +1,131 @@
+"""PlanConditionedActor: the policy that a conditional plan makes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, dispatch
+from torch import Tensor
+
+from lw_torchrl._checks import check_choice
+from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
+from lw_torchrl.language.tasks import MT50, task_id
+from lw_torchrl.language.text import encode_texts
+from lw_torchrl.modules.decoder import ActionDecoder, text_to_latent
+from lw_torchrl.modules.observation_features import Features
+from lw_torchrl.modules.plan_attention import PlanAttention
+
+
+class PlanConditionedActor(TensorDictModuleBase):
+    """Plan Conditioned Behavioral Cloning's policy: each skill's text is encoded to a latent, the conditions' truth
+    gives attention over the steps, the mixed latent and the observation give the action.
+
+    Reads ``observation`` (B, 39) float32, ``task_id`` (B,) int64 and ``qaf`` (B, S) bool; writes ``action`` (B, 4)
+    float32 in (-1, 1), ``skill_weights`` (B, S) float32 and ``skill_latent`` (B, D) float32.
+
+    Args:
+        plans: a plan for each task it is to act in.
+        mix: "latents", decode the mixed latent, as in the paper; "actions", decode every step's latent and mix the
+            actions.
+        features: what the decoder sees of the observation: "raw", the 39 numbers; "differences", the pairwise
+            differences between hand, objects and goal; "both".
+        latent_size: D.
+        width, depth: hidden layers of the action decoder.
+        encoder_width, encoder_depth: hidden layers of the skill encoder.
+        text_encoder: texts to vectors (n, E) float32; None for the shipped sentence encoder.
+
+    Attributes:
+        plans: the plans.
+        skills: the K different skill texts, sorted.
+
+    Raises:
+        ValueError: a wrong option, with the allowed ones.
+        ImportError: a skill's text is not shipped, and the extra ``[text]`` is not installed.
+
+    Example:
+        >>> import lw_torchrl as lw
+        >>> from torchrl.envs import TransformedEnv
+        >>> plans = lw.load_plans("MT10")
+        >>> env = TransformedEnv(lw.LanguageWorldEnv("reach"), lw.QAFTransform(plans))
+        >>> lw.PlanConditionedActor(plans)(env.reset())["action"].shape
+        torch.Size([1, 4])
+        >>> env.close()
+
+    Source: paper section 'Plan Conditioning' and its figure of the architecture.
+    """
+
+    in_keys = ["observation", "task_id", "qaf"]
+    out_keys = ["action", "skill_weights", "skill_latent"]
+    skill_vectors: Tensor
+    skill_index: Tensor
+
+    def __init__(
+        self,
+        plans: Plans | Mapping[str, ConditionalPlan],
+        *,
+        mix: Literal["latents", "actions"] = "latents",
+        features: Features = "both",
+        latent_size: int = 64,
+        width: int = 256,
+        depth: int = 3,
+        encoder_width: int = 128,
+        encoder_depth: int = 1,
+        text_encoder: Callable[[Sequence[str]], Tensor] | None = None,
+    ) -> None:
+        super().__init__()
+        self.plans = as_plans(plans)
+        check_choice("mix", mix, ("latents", "actions"))
+        self.config: dict[str, Any] = {
+            "mix": mix,
+            "features": features,
+            "latent_size": latent_size,
+            "width": width,
+            "depth": depth,
+            "encoder_width": encoder_width,
+            "encoder_depth": encoder_depth,
+        }
+        self.text_encoder = text_encoder
+        self.skills = self.plans.skills
+        vectors = (encode_texts if text_encoder is None else text_encoder)(self.skills)
+        if vectors.ndim != 2 or len(vectors) != len(self.skills):
+            raise ValueError(f"text_encoder must give ({len(self.skills)}, E), got shape {tuple(vectors.shape)}")
+        index = torch.zeros(len(MT50), self.plans.num_steps, dtype=torch.int64)
+        for task, plan in self.plans.items():
+            index[task_id(task), : len(plan.steps)] = torch.tensor(
+                [self.skills.index(step.skill) for step in plan.steps]
+            )
+        # The tables come from the plans, not from training: they are not part of the state that is saved.
+        self.register_buffer("skill_vectors", vectors.to(torch.float32), persistent=False)
+        self.register_buffer("skill_index", index, persistent=False)
+        self.attention = PlanAttention(self.plans)
+        self.encoder = text_to_latent(vectors.shape[1], latent_size, encoder_width, encoder_depth)
+        self.decoder = ActionDecoder(latent_size, features, width, depth)
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        task = tensordict.get("task_id")
+        weights = self.attention.weights(tensordict.get("qaf"), task)
+        step_latents = self.encoder(self.skill_vectors)[self.skill_index[task]]  # (B, S, D)
+        latent = (weights.unsqueeze(-1) * step_latents).sum(-2)
+        seen = self.decoder.features(tensordict.get("observation"))
+        if self.config["mix"] == "latents":
+            action = self.decoder.decode(latent, seen)
+        else:
+            each = seen.unsqueeze(-2).expand(*step_latents.shape[:-1], -1)
+            action = (weights.unsqueeze(-1) * self.decoder.decode(step_latents, each)).sum(-2)
+        tensordict.set("action", action)
+        tensordict.set("skill_weights", weights)
+        return tensordict.set("skill_latent", latent)
+
+    def fit_normalization(self, observation: Tensor) -> None:
+        """Take the observation features' mean and standard deviation from (..., 39) float32, in place."""
+        self.decoder.features.fit(observation)
+
+    def with_plans(self, plans: Plans | Mapping[str, ConditionalPlan]) -> PlanConditionedActor:
+        """An actor that carries out other plans with the same weights: training either trains both."""
+        other = PlanConditionedActor(plans, text_encoder=self.text_encoder, **self.config)
+        other.encoder, other.decoder = self.encoder, self.decoder
+        return other.train(self.training)

@@ -1,0 +1,9 @@
+"""Recordings to look at: a torchrl Logger that writes rerun files, and the viewer that opens them.
+
+Importing this package loads no rerun; constructing a :class:`RerunLogger` does.
+"""
+
+from lw_torchrl.record.rerun_logger import RerunLogger
+from lw_torchrl.record.viewer import open_viewer
+
+__all__ = ["RerunLogger", "open_viewer"]

@@ -1,0 +1,79 @@
+"""Recording what a plan-conditioned policy does: one episode of each task, as a rerun file."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from itertools import groupby
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.envs import TransformedEnv
+
+from lw_torchrl.envs.episodes import in_blocks, run_episodes
+from lw_torchrl.envs.language_world_env import LanguageWorldEnv
+from lw_torchrl.envs.qaf_transform import QAFTransform
+from lw_torchrl.language.plans import ConditionalPlan
+from lw_torchrl.language.tasks import TASKS, resolve_tasks
+from lw_torchrl.modules import PlanConditionedActor
+from lw_torchrl.record.rerun_logger import RerunLogger
+
+_KEYS = ["observation", "task_id", "action", "qaf", "skill_weights", ("next", "success"), ("next", "reward")]
+
+
+def rollout_tasks(
+    actor: PlanConditionedActor,
+    tasks: str | Iterable[str],
+    *,
+    seed: int,
+    episode: int = 0,
+    noise_scale: float = 0.1,
+    max_steps: int = 500,
+) -> dict[str, TensorDictBase]:
+    """One episode of each task, the same as :func:`lw_torchrl.evaluate` runs it.
+
+    Returns:
+        Task to a TensorDict of batch (T,): observation (T, 39) and action (T, 4) float32, task_id (T,) int64, qaf
+        (T, S) bool, skill_weights (T, S) float32, next/success (T, 1) bool, next/reward (T, 1) float32.
+    """
+    names = resolve_tasks(tasks)
+    env = TransformedEnv(
+        LanguageWorldEnv(names, seed=seed, max_steps=max_steps, strict=True), QAFTransform(actor.plans)
+    )
+    try:
+        with torch.no_grad():
+            return {
+                found.task: found.steps
+                for found in run_episodes(
+                    env,
+                    in_blocks(actor.eval()),
+                    {task: [episode] for task in names},
+                    keys=_KEYS,
+                    noise=(lambda _: (noise_scale,) * 4) if noise_scale else None,
+                )
+            }
+    finally:
+        env.close()
+
+
+def write_recording(
+    path: str | os.PathLike[str], actor: PlanConditionedActor, rollouts: dict[str, TensorDictBase]
+) -> None:
+    """Write rollouts to a rerun file, each with its plan; the file is replaced whole."""
+    with RerunLogger(path) as logger:
+        for task, rollout in rollouts.items():
+            objects = TASKS[task].positions(rollout.get("observation"))
+            logger.log_episode(rollout, task=task, objects=objects, plan=actor.plans[task])
+
+
+def active_skills(rollout: TensorDictBase, plan: ConditionalPlan) -> list[tuple[str, int]]:
+    """The skills in the order in which they led, with how many steps each did, up to the first success.
+
+    A skill leads where it has the largest weight; steps in which no condition holds count as "no condition holds".
+    """
+    success = rollout.get(("next", "success")).flatten().nonzero().flatten()
+    end = int(success[0]) + 1 if len(success) else rollout.batch_size[0]
+    leading = rollout.get("skill_weights")[:end].argmax(-1).tolist()
+    answered = rollout.get("qaf")[:end].any(-1).tolist()
+    names = [plan.steps[i].skill if any_ else "no condition holds" for i, any_ in zip(leading, answered, strict=True)]
+    return [(name, len(list(group))) for name, group in groupby(names)]

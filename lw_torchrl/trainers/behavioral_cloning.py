@@ -1,0 +1,196 @@
+"""Behavioral cloning with TorchRL's BCLoss: AdamW, a cosine schedule, checkpoints that resume bit for bit."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict.nn import TensorDictModuleBase
+from torch.nn.utils import clip_grad_norm_
+from torchrl.checkpoint import Checkpoint
+from torchrl.data import TensorDictReplayBuffer
+from torchrl.objectives import BCLoss
+from torchrl.record.loggers import Logger
+from tqdm.auto import tqdm
+
+from lw_torchrl._checks import check_choice, check_int, check_scale
+from lw_torchrl.trainers.checkpoint import TrainingState, describe_actor, load_into, read_description
+
+LOSSES = ("l1", "l2", "smooth_l1")
+
+
+@dataclass(frozen=True)
+class BehavioralCloningConfig:
+    """How an actor is trained.
+
+    Attributes:
+        steps: minibatches.
+        batch_size: rows of a minibatch; the number of tasks must divide it.
+        learning_rate: at the start; a cosine brings it to 0 over ``steps``.
+        weight_decay: AdamW's.
+        loss_function: between the actor's and the demonstrated action: "l1", "l2" or "smooth_l1".
+        max_grad_norm: gradients are clipped to it.
+        seed: of the minibatches.
+        checkpoint_every: steps between checkpoints; the last step always makes one.
+    """
+
+    steps: int = 4000
+    batch_size: int = 500
+    learning_rate: float = 1e-3
+    weight_decay: float = 1e-4
+    loss_function: str = "l2"
+    max_grad_norm: float = 1.0
+    seed: int = 0
+    checkpoint_every: int = 500
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "batch_size", "checkpoint_every"):
+            check_int(name, getattr(self, name), minimum=1)
+        for name in ("learning_rate", "weight_decay", "max_grad_norm"):
+            check_scale(name, getattr(self, name))
+        check_int("seed", self.seed)
+        check_choice("loss_function", self.loss_function, LOSSES)
+
+
+class BehavioralCloningTrainer:
+    """Trains an actor to give the demonstrated actions.
+
+    Any TensorDictModule that writes ``action`` can be trained; one with ``fit_normalization`` first takes its
+    statistics from the demonstrations.
+
+    Args:
+        actor: it is trained in place.
+        replay: samples with what the actor reads and ``action`` (B, 4) float32. Its generator is set to the
+            configuration's seed.
+        config: how to train.
+        checkpoint: a file to write checkpoints to. If it is there already, training carries on from it.
+        logger: a TorchRL logger for the loss and the learning rate.
+        progress: show a progress bar.
+
+    Raises:
+        ValueError: the checkpoint is damaged, of another architecture, or of another configuration; or, in
+            :meth:`train`, the loss is no number.
+
+    Example:
+        >>> import lw_torchrl as lw, tempfile
+        >>> plans = lw.load_plans("MT10")
+        >>> with tempfile.TemporaryDirectory() as root:
+        ...     _ = lw.collect_demonstrations("reach", episodes_per_task=1, root=root + "/demos", max_steps=80)
+        ...     replay = lw.LanguageWorldExperienceReplay(root + "/demos", transform=lw.QAFTransform(plans))
+        ...     trainer = lw.BehavioralCloningTrainer(
+        ...         lw.PlanConditionedActor(plans), replay, lw.BehavioralCloningConfig(steps=5, batch_size=16)
+        ...     )
+        ...     trainer.train() < 1.0
+        True
+
+    Source: paper section 'Conditional Plan Experiments'; ``torchrl.objectives.BCLoss``.
+    """
+
+    def __init__(
+        self,
+        actor: TensorDictModuleBase,
+        replay: TensorDictReplayBuffer,
+        config: BehavioralCloningConfig | None = None,
+        *,
+        checkpoint: str | os.PathLike[str] | None = None,
+        logger: Logger | None = None,
+        progress: bool = True,
+    ) -> None:
+        self.actor, self.replay, self.logger, self.progress = actor, replay, logger, progress
+        self.config = config = config or BehavioralCloningConfig()
+        self.checkpoint = None if checkpoint is None else Path(checkpoint)
+        generator = torch.Generator().manual_seed(config.seed)
+        replay.set_rng(generator)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message=".*target_actor_network_params.*")
+            self.loss = BCLoss(actor, loss_function=config.loss_function)  # type: ignore[arg-type]
+        self.optimizer = torch.optim.AdamW(
+            self.loss.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
+        )
+        self.schedule = torch.optim.lr_scheduler.CosineAnnealingLR(self.optimizer, config.steps)
+        self.state = TrainingState(replay.sampler, generator)
+        if self.checkpoint is not None and self.checkpoint.exists():
+            self._resume(self.checkpoint)
+        elif hasattr(actor, "fit_normalization"):
+            actor.fit_normalization(replay.storage.get(slice(0, len(replay))).get("observation"))
+
+    def _describe(self) -> dict[str, Any]:
+        demonstrations = getattr(self.replay, "demonstrations", None)
+        data = None if demonstrations is None else demonstrations.config.to_json()
+        return {"actor": describe_actor(self.actor), "training": asdict(self.config), "data": data}
+
+    def _components(self) -> dict[str, Any]:
+        return {
+            "actor": self.actor,
+            "optimizer": self.optimizer,
+            "schedule": self.schedule,
+            "state": self.state,
+        }
+
+    def _resume(self, path: Path) -> None:
+        found, ours = read_description(path), self._describe()
+        for part in ours:
+            if found.get(part) != ours[part]:
+                before, now = found.get(part) or {}, ours[part] or {}
+                different = [key for key in {**before, **now} if before.get(key) != now.get(key)]
+                raise ValueError(
+                    f"checkpoint: {str(path)!r} is of another {'architecture' if part == 'actor' else 'configuration'}, "
+                    f"its {part} differs in {', '.join(different)}; choose another file, or delete it to start again"
+                )
+        load_into(path, **self._components())
+
+    def save(self) -> None:
+        """Write the checkpoint; an earlier one is replaced whole."""
+        if self.checkpoint is not None:
+            self.checkpoint.parent.mkdir(parents=True, exist_ok=True)
+            Checkpoint(format="archive", description=self._describe(), **self._components()).save(self.checkpoint)
+
+    def step(self) -> float:
+        """Train on one minibatch and return its loss."""
+        batch = self.replay.sample(self.config.batch_size)
+        loss = self.loss(batch)["loss_bc"]
+        if not loss.isfinite():
+            raise ValueError(
+                f"the loss is {loss.item()} at step {self.state.step}: the demonstrations hold NaN, or the learning "
+                f"rate {self.config.learning_rate} is too high"
+            )
+        self.optimizer.zero_grad()
+        loss.backward()
+        clip_grad_norm_(self.loss.parameters(), self.config.max_grad_norm)
+        self.optimizer.step()
+        self.schedule.step()
+        self.state.step += 1
+        return loss.item()
+
+    def train(self) -> float:
+        """Train to the last step, from wherever training stands.
+
+        Returns:
+            The mean loss over the last 100 steps made; NaN if there were none left to make.
+        """
+        losses: list[float] = []
+        self.actor.train()
+        every, total = self.config.checkpoint_every, self.config.steps
+        bar = tqdm(
+            total=total, initial=self.state.step, desc="training", unit="step", delay=1, disable=not self.progress
+        )
+        with bar:
+            while self.state.step < total:
+                losses.append(self.step())
+                step = self.state.step
+                bar.update()
+                if step % 100 == 0 or step == total:
+                    mean = sum(losses[-100:]) / len(losses[-100:])
+                    bar.set_postfix(loss=f"{mean:.4f}", refresh=False)
+                    if self.logger is not None:
+                        self.logger.log_scalar("train/loss", mean, step=step)
+                        self.logger.log_scalar("train/learning_rate", self.schedule.get_last_lr()[0], step=step)
+                if step % every == 0 or step == total:
+                    self.save()
+        self.actor.eval()
+        recent = losses[-100:]
+        return sum(recent) / len(recent) if recent else float("nan")

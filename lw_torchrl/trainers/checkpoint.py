@@ -1,0 +1,99 @@
+"""Checkpoints: one file, replaced whole, read without unpickling, that holds an actor and how its training stands."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torchrl.checkpoint import Checkpoint, CheckpointError
+
+from lw_torchrl._checks import check_choice
+from lw_torchrl.language.plans import Plans, format_plan, parse_plan
+from lw_torchrl.modules import DescriptorConditionedActor, PlanConditionedActor
+
+ACTORS = {"PlanConditionedActor": PlanConditionedActor, "DescriptorConditionedActor": DescriptorConditionedActor}
+Actor = PlanConditionedActor | DescriptorConditionedActor
+
+
+def describe_actor(actor: nn.Module) -> dict[str, Any]:
+    """What is needed to make the actor again, its weights aside, as JSON."""
+    if isinstance(actor, PlanConditionedActor):
+        plans = {task: format_plan(plan) for task, plan in actor.plans.items()}
+        return {"kind": "PlanConditionedActor", "options": actor.config, "plans": plans}
+    if isinstance(actor, DescriptorConditionedActor):
+        return {"kind": "DescriptorConditionedActor", "options": actor.config, "tasks": list(actor.tasks)}
+    return {"kind": type(actor).__name__}
+
+
+def _make_actor(found: dict[str, Any], text_encoder: Callable[[Sequence[str]], Tensor] | None) -> Actor:
+    check_choice("the checkpoint's actor", found["kind"], ACTORS)
+    if found["kind"] == "DescriptorConditionedActor":
+        return DescriptorConditionedActor(found["tasks"], text_encoder=text_encoder, **found["options"])
+    plans = Plans([parse_plan(text, task, f"plan of {task}") for task, text in found["plans"].items()])
+    return PlanConditionedActor(plans, text_encoder=text_encoder, **found["options"])
+
+
+def read_description(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """The description that a checkpoint was saved with.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is no checkpoint of ours, or damaged.
+    """
+    if not Path(path).exists():
+        raise FileNotFoundError(f"checkpoint: no file {str(path)!r}; `lw-torchrl train` writes one")
+    try:
+        return Checkpoint(description=None).load(path, components=["description"]).values["description"]
+    except (CheckpointError, OSError, ValueError, KeyError) as error:
+        raise ValueError(f"checkpoint: {str(path)!r} is damaged or none of ours ({error})") from error
+
+
+def load_actor(
+    path: str | os.PathLike[str], *, text_encoder: Callable[[Sequence[str]], Tensor] | None = None
+) -> Actor:
+    """Make the actor of a checkpoint, with its plans and weights, in eval mode.
+
+    Args:
+        path: the checkpoint.
+        text_encoder: the one that the actor was made with, if it was not the shipped one.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is damaged, or of another architecture than it says.
+    """
+    actor = _make_actor(read_description(path)["actor"], text_encoder)
+    load_into(path, actor=actor)
+    return actor.eval()
+
+
+def load_into(path: str | os.PathLike[str], **components: Any) -> None:
+    """Load named components of a checkpoint into live objects; :class:`ValueError` if they do not fit."""
+    try:
+        Checkpoint(**components).load(path, components=list(components))
+    except (CheckpointError, RuntimeError, KeyError) as error:
+        reason = str(error).split("\n")[0]
+        raise ValueError(f"checkpoint: {str(path)!r} does not fit, it is of another architecture ({reason})") from error
+
+
+class TrainingState:
+    """What a trainer must remember beside actor, optimizer and schedule, as tensors."""
+
+    def __init__(self, sampler: Any, generator: torch.Generator) -> None:
+        self.sampler, self.generator, self.step = sampler, generator, 0
+
+    def state_dict(self) -> dict[str, Any]:
+        return {
+            "step": torch.tensor(self.step),
+            "generator": self.generator.get_state(),
+            "sampler": dict(self.sampler.state_dict()),
+        }
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.step = int(state_dict["step"])
+        self.generator.set_state(state_dict["generator"].clone())
+        if state_dict.get("sampler"):
+            self.sampler.load_state_dict(state_dict["sampler"])

@@ -1,0 +1,202 @@
+"""The 50 tasks against the published package, and the ways to name them."""
+
+import language_world as oracle
+import numpy as np
+import pytest
+import torch
+
+from lw_torchrl.language.tasks import (
+    GRIPPER,
+    MT10,
+    MT50,
+    TASKS,
+    NamedObject,
+    Task,
+    check_task,
+    get_task,
+    resolve_tasks,
+    task_id,
+)
+
+
+def read(position, observation):
+    return np.array([float(observation[c]) if isinstance(c, int) else c for c in position])
+
+
+def test_the_names_are_the_published_ones_in_sorted_order():
+    assert len(TASKS) == 50
+    assert list(TASKS) == sorted(oracle.MT50_ENV_NAMES)
+    assert list(MT50) == list(TASKS)
+    assert list(MT10) == sorted(oracle.MT10_ENV_NAMES)
+    assert all(task.name == name for name, task in TASKS.items())
+
+
+def test_the_table_cannot_be_changed():
+    with pytest.raises(TypeError):
+        TASKS["reach"] = TASKS["push"]
+
+
+def test_the_task_id_is_the_rank_of_the_name():
+    assert [task_id(name) for name in sorted(oracle.MT50_ENV_NAMES)] == list(range(50))
+    # Without "-v3": with it "button-press-topdown-v3" would come before "button-press-v3".
+    assert task_id("button-press") < task_id("button-press-topdown")
+
+
+def test_descriptions_are_distinct_sentences_of_our_own():
+    descriptions = [task.description for task in TASKS.values()]
+    assert len(set(descriptions)) == 50
+    assert len({text.casefold().strip(".") for text in descriptions}) == 50
+    assert TASKS["door-lock"].description != TASKS["door-unlock"].description
+    published = {text.casefold() for text in oracle.TASK_DESCRIPTIONS.values()}
+    for text in descriptions:
+        assert text[0].isupper()
+        assert text.endswith(".")
+        assert ". " not in text, "one sentence"
+        assert text.casefold().strip(".") not in published
+
+
+@pytest.mark.parametrize("name", MT50)
+def test_objects_are_the_published_ones(name):
+    relations = [
+        query.split(" is near ") for query in oracle.enumerate_base_queries(name) if " is near " in query
+    ]
+    named = {side.removeprefix("the ") for sides in relations for side in sides}
+    assert set(TASKS[name].object_names) == named
+    assert TASKS[name].object_names[0] == GRIPPER
+    assert len(TASKS[name].objects) == len(named)
+
+
+@pytest.mark.parametrize("name", MT50)
+def test_positions_are_read_where_the_published_package_reads_them(name):
+    observation = np.random.default_rng(0).uniform(-1, 1, 39)
+    parsed = oracle.ParsedObs.from_obs(observation)
+    for named in TASKS[name].objects:
+        expected = oracle._get_object_location(name, f"the {named.name}", parsed)
+        np.testing.assert_array_equal(read(named.position, observation), expected, err_msg=named.name)
+
+
+@pytest.mark.parametrize("name", MT50)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_positions_of_a_whole_batch(name, dtype):
+    observation = torch.rand(2, 3, 39, generator=torch.Generator().manual_seed(0)).to(dtype)
+    positions = TASKS[name].positions(observation)
+    assert tuple(positions) == TASKS[name].object_names
+    for named in TASKS[name].objects:
+        at = positions[named.name]
+        assert at.shape == (2, 3, 3)
+        assert at.dtype == dtype
+        expected = torch.stack(
+            [torch.from_numpy(read(named.position, o)) for o in observation.reshape(6, 39)]
+        )
+        assert torch.equal(at.reshape(6, 3), expected.to(dtype))
+    assert TASKS[name].positions(observation[0, 0])[GRIPPER].tolist() == observation[0, 0, :3].tolist()
+
+
+def test_positions_that_are_not_plain_slices():
+    # The facts in words, so that a change on both sides of the test above is seen too.
+    assert TASKS["peg-insert-side"].object("hole").position == (-0.35, 37, 0.16)
+    assert TASKS["stick-pull"].object("thermos").position == (11, 12, 13)
+    assert TASKS["button-press-wall"].object("wall").position == (0.1, 0.6, 0.0)
+    assert TASKS["button-press-topdown-wall"].object("wall").position == (0.1, 0.7, 0.0)
+    assert all(
+        TASKS[f"{n}-wall"].object("wall").position == (0.1, 0.75, 0.06)
+        for n in ("reach", "push", "pick-place")
+    )
+    assert all(task.object(GRIPPER).position == (0, 1, 2) for task in TASKS.values())
+    # A whole number in the table is a fixed place, not an index.
+    assert all(isinstance(c, float) for c in TASKS["button-press-wall"].object("wall").position)
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ("MT10", MT10),
+        ("MT50", MT50),
+        ("pick-place", ("pick-place",)),
+        (["push", "door-open"], ("door-open", "push")),
+        (("reach",), ("reach",)),
+        ({"push": 1, "assembly": 2}, ("assembly", "push")),
+        ((name for name in ["window-open", "basketball"]), ("basketball", "window-open")),
+        (reversed(MT50), MT50),
+    ],
+)
+def test_resolve_tasks_takes_a_set_a_name_or_names(given, expected):
+    assert resolve_tasks(given) == expected
+
+
+@pytest.mark.parametrize(
+    ("given", "error", "says"),
+    [
+        ("pick-plaec", ValueError, ["'pick-plaec'", "did you mean", "'pick-place'"]),
+        ("pick-place-v3", ValueError, ["'pick-place'"]),
+        ("MT5", ValueError, ["'MT5'", "'MT50'"]),
+        ("mt10", ValueError, ["'MT10'"]),
+        ("", ValueError, ["''"]),
+        (["reach", "drawer-opne"], ValueError, ["'drawer-opne'", "'drawer-open'"]),
+        (["MT10"], ValueError, ["'MT10'"]),
+        (["push", "reach", "push"], ValueError, ["once", "push"]),
+        ([], ValueError, ["at least one task", "empty"]),
+        (3, TypeError, ["tasks", "3"]),
+        (None, TypeError, ["tasks", "None"]),
+        ([1, 2], TypeError, ["1", "int"]),
+        ([None], TypeError, ["None"]),
+        (b"reach", TypeError, ["int"]),
+    ],
+)
+def test_resolve_tasks_names_what_is_wrong(given, error, says):
+    with pytest.raises(error) as caught:
+        resolve_tasks(given)
+    assert all(word in str(caught.value) for word in says), str(caught.value)
+
+
+def test_a_repeated_name_is_named_alone():
+    with pytest.raises(ValueError, match="more than once") as caught:
+        resolve_tasks(["push", "reach", "push"])
+    assert "reach" not in str(caught.value)
+
+
+@pytest.mark.parametrize("function", [check_task, task_id, get_task])
+@pytest.mark.parametrize("name", ["reahc", "", "Reach", " reach", "reach-v3"])
+def test_an_unknown_task_is_a_value_error(function, name):
+    with pytest.raises(ValueError, match="task must be one of"):
+        function(name)
+
+
+@pytest.mark.parametrize("function", [check_task, task_id, get_task])
+@pytest.mark.parametrize("name", [0, None, b"reach", ["reach"]])
+def test_a_task_of_another_type_is_a_type_error(function, name):
+    with pytest.raises(TypeError):
+        function(name)
+
+
+def test_an_unknown_object_names_the_nearest():
+    with pytest.raises(ValueError, match="did you mean 'drawer handle'"):
+        TASKS["drawer-open"].object("drawer handel")
+
+
+def test_a_task_of_ones_own_is_returned_as_it_is():
+    mine = Task("stacking", "Stack them.", (NamedObject(GRIPPER, (0, 1, 2)), NamedObject("block", (4, 5, 6))))
+    assert get_task(mine) is mine
+    assert mine.object_names == (GRIPPER, "block")
+
+
+@pytest.mark.parametrize(
+    "name", ["", "Puck", "the puck", "puck and peg", "what is it", "not puck", "puck  peg", " puck"]
+)
+def test_an_object_name_that_queries_could_not_hold_is_refused(name):
+    with pytest.raises(ValueError, match="name"):
+        NamedObject(name, (4, 5, 6))
+
+
+@pytest.mark.parametrize("position", [(4, 5), (4, 5, 39), (-1, 0, 1), ()])
+def test_a_position_outside_the_observation_is_refused(position):
+    with pytest.raises(ValueError, match="puck"):
+        NamedObject("puck", position)
+
+
+@pytest.mark.parametrize(
+    "names", [[], ["puck"], ["puck", GRIPPER], [GRIPPER, "puck", "puck"], [GRIPPER, GRIPPER]]
+)
+def test_a_task_needs_the_gripper_first_and_different_names(names):
+    with pytest.raises(ValueError, match="objects of task 'mine'"):
+        Task("mine", "Mine.", tuple(NamedObject(name, (4, 5, 6)) for name in names))
