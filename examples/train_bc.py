@@ -1,7 +1,7 @@
 """Plan Conditioned Behavioral Cloning by hand: the library's parts with TorchRL's loss and replay buffer.
 
-    python examples/train_bc.py            # drawer-open and window-open, about two minutes
-    python examples/train_bc.py --steps 50 # only to see it run
+python examples/train_bc.py            # drawer-open and window-open, about two minutes
+python examples/train_bc.py --steps 50 # only to see it run
 """
 
 import argparse

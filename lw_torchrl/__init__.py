@@ -15,7 +15,12 @@ from lw_torchrl.language.queries import Clause, Query, QueryError, parse_query, 
 from lw_torchrl.language.query_program import QueryProgram
 from lw_torchrl.language.tasks import MT10, MT50, TASKS, NamedObject, Task, resolve_tasks, task_id
 from lw_torchrl.language.text import TextEncoder, encode_texts
-from lw_torchrl.modules import DescriptorConditionedActor, ObservationFeatures, PlanAttention, PlanConditionedActor
+from lw_torchrl.modules import (
+    DescriptorConditionedActor,
+    ObservationFeatures,
+    PlanAttention,
+    PlanConditionedActor,
+)
 from lw_torchrl.record import RerunLogger
 from lw_torchrl.trainers import BehavioralCloningConfig, BehavioralCloningTrainer, load_actor
 

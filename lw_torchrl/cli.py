@@ -5,11 +5,10 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import tyro
-
-Positional = tyro.conf.Positional
+from tyro.conf import Positional
 
 
 def demo(out: Path | None = None, quick: bool = False) -> None:
@@ -159,7 +158,9 @@ def evaluate(
     else:
         used = (read_description(checkpoint).get("data") or {}).get("seed")
         if used == seed:
-            raise ValueError(f"seed must differ from the demonstrations' seed, {used}; an evaluation wants fresh states")
+            raise ValueError(
+                f"seed must differ from the demonstrations' seed, {used}; an evaluation wants fresh states"
+            )
         actor = lw.load_actor(checkpoint)
         own = actor.tasks if isinstance(actor, lw.DescriptorConditionedActor) else tuple(actor.plans)
         chosen = chosen or own
@@ -208,7 +209,12 @@ def view(
 
 
 def query(
-    task: Positional[str], text: Positional[str | None] = None, /, step: int = 0, seed: int = 0, episode: int = 0
+    task: Positional[str],
+    text: Positional[str | None] = None,
+    /,
+    step: int = 0,
+    seed: int = 0,
+    episode: int = 0,
 ) -> None:
     """Answer a query on a state of a task: the state after so many steps of the scripted expert.
 
@@ -229,7 +235,11 @@ def query(
     from lw_torchrl.language.tasks import check_task
 
     name = check_task(task)
-    listed = [lw.parse_query(text, name)] if text is not None else [lw.parse_query(q, name) for q in lw.supported_queries(name)]
+    listed = (
+        [lw.parse_query(text, name)]
+        if text is not None
+        else [lw.parse_query(q, name) for q in lw.supported_queries(name)]
+    )
     if check_int("step", step, minimum=0) > 500:
         raise ValueError(f"step must be at most 500, got {step}")
     env = lw.LanguageWorldEnv(name, seed=seed)
@@ -248,7 +258,7 @@ def query(
             print(found)
 
 
-COMMANDS = {
+COMMANDS: dict[str, Any] = {
     "demo": demo,
     "collect": collect,
     "train": train,

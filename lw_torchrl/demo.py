@@ -38,9 +38,7 @@ class DemoConfig:
     evaluation_noise: float = 0.1
 
 
-QUICK = DemoConfig(
-    tasks=RECORDED, demonstrations_per_task=4, training_steps=800, batch_size=100, episodes_per_task=5
-)
+QUICK = DemoConfig(tasks=RECORDED, demonstrations_per_task=4, training_steps=800, batch_size=100, episodes_per_task=5)
 
 
 def _settle(out: Path, config: DemoConfig) -> None:
@@ -88,9 +86,7 @@ def run_demo(out: Path, config: DemoConfig) -> EvaluationResult:
     BehavioralCloningTrainer(
         actor,
         replay,
-        BehavioralCloningConfig(
-            steps=config.training_steps, batch_size=config.batch_size, seed=config.training_seed
-        ),
+        BehavioralCloningConfig(steps=config.training_steps, batch_size=config.batch_size, seed=config.training_seed),
         checkpoint=out / "checkpoint.zip",
     ).train()
     print(f"3/4  evaluating {config.episodes_per_task} episodes of each task on seeds no demonstration used")
@@ -108,9 +104,7 @@ def run_demo(out: Path, config: DemoConfig) -> EvaluationResult:
         result.save(results)
     plot_success(result, out / "success.png", title="Plan-conditioned behavioral cloning")
     print("4/4  recording a rollout")
-    rollouts = rollout_tasks(
-        actor, config.tasks, seed=config.evaluation_seed, noise_scale=config.evaluation_noise
-    )
+    rollouts = rollout_tasks(actor, config.tasks, seed=config.evaluation_seed, noise_scale=config.evaluation_noise)
     recorded = [task for task in RECORDED if task in rollouts] or list(rollouts)[:1]
     write_recording(out / "rollout.rrd", actor, {task: rollouts[task] for task in recorded})
     print(f"\n{result.table()}\n")

@@ -38,15 +38,12 @@ _KEYS = [
     "episode",
     "action",
     "expert_action",
-    *(
-        ("next", key)
-        for key in ("observation", "task_id", "reward", "success", "done", "terminated", "truncated")
-    ),
+    *(("next", key) for key in ("observation", "task_id", "reward", "success", "done", "terminated", "truncated")),
 ]
 _MAX_ATTEMPTS = 20  # episodes run for each one that is kept, before redrawing gives up
 
 
-def _name(key: str | tuple[str, ...]) -> str:
+def _name(key: str | Sequence[str]) -> str:
     return key if isinstance(key, str) else "/".join(key)
 
 
@@ -145,7 +142,12 @@ def _run(config: CollectConfig, shelf: _Shelf, num_envs: int | None, progress: b
     scales = [(s, s, s, s * config.gripper_noise_factor) for s in config.noise_scale]
     total = config.episodes_per_task * len(config.tasks)
     bar = tqdm(
-        total=total * config.max_steps, desc="collecting", unit="step", unit_scale=True, delay=1, disable=not progress
+        total=total * config.max_steps,
+        desc="collecting",
+        unit="step",
+        unit_scale=True,
+        delay=1,
+        disable=not progress,
     )
     with bar:
         while missing:

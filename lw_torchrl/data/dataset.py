@@ -1,8 +1,8 @@
 """A demonstration dataset on disk: what its folder holds, and the metadata that say how it was made.
 
-    root/data/            TorchRL's TED layout as a memory-mapped TensorDict, one row a step
-    root/metadata.json    written last: without it the dataset is not finished
-    root/.partial/        the episodes so far, while collecting
+root/data/            TorchRL's TED layout as a memory-mapped TensorDict, one row a step
+root/metadata.json    written last: without it the dataset is not finished
+root/.partial/        the episodes so far, while collecting
 """
 
 from __future__ import annotations
@@ -158,7 +158,7 @@ def read_metadata(root: str | os.PathLike[str]) -> Demonstrations:
                 f"root: {str(path)!r} is of format {found['format']!r} version {found['version']!r}; this package "
                 f"reads {FORMAT!r} version {FORMAT_VERSION}. Collect it again."
             )
-        config = {key: tuple(v) if isinstance(v, list) else v for key, v in found["config"].items()}
+        config: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in found["config"].items()}
         columns = found["episodes"]
         rows = zip(*(columns[key] for key in EpisodeInfo.__dataclass_fields__), strict=True)
         return Demonstrations(

@@ -32,7 +32,9 @@ class Episode(NamedTuple):
     steps: TensorDictBase
 
 
-def in_blocks(policy: Callable[[TensorDictBase], TensorDictBase]) -> Callable[[TensorDictBase], TensorDictBase]:
+def in_blocks(
+    policy: Callable[[TensorDictBase], TensorDictBase],
+) -> Callable[[TensorDictBase], TensorDictBase]:
     """``policy``, run on blocks of exactly 64 rows, the last one padded.
 
     A matrix product of another number of rows rounds differently, and contact amplifies the last bits. With blocks
@@ -120,8 +122,8 @@ def run_episodes(
         if clean_action is not None:
             state.set(clean_action, action.clone())
         if noise is not None:
-            drawn = torch.from_numpy(noises[np.arange(rows), np.minimum(steps, base.max_steps - 1)])
-            action = (action + drawn).clamp(-1.0, 1.0)
+            now = noises[np.arange(rows), np.minimum(steps, base.max_steps - 1)]
+            action = (action + torch.from_numpy(now)).clamp(-1.0, 1.0)
         # Rows at rest keep a harmless action: theirs is computed from a state that may be stale.
         state.set("action", torch.where(active.unsqueeze(-1), action, 0.0))
         state.set("_step", active)

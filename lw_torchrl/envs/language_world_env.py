@@ -126,9 +126,7 @@ class LanguageWorldEnv(EnvBase):
         )
         self.action_spec = Bounded(-1.0, 1.0, (n, ACTION_SIZE))
         self.reward_spec = Unbounded((n, 1))
-        self.done_spec = Composite(
-            done=flag.clone(), terminated=flag.clone(), truncated=flag.clone(), shape=(n,)
-        )
+        self.done_spec = Composite(done=flag.clone(), terminated=flag.clone(), truncated=flag.clone(), shape=(n,))
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:

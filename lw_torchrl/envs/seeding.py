@@ -12,7 +12,9 @@ from lw_torchrl.language.tasks import check_task
 
 
 def _hash(purpose: str, task: str, seed: int, episode: int) -> int:
-    text = f"lw_torchrl/{purpose}/{check_task(task)}/{check_int('seed', seed)}/{check_int('episode', episode, minimum=0)}"
+    text = (
+        f"lw_torchrl/{purpose}/{check_task(task)}/{check_int('seed', seed)}/{check_int('episode', episode, minimum=0)}"
+    )
     return int.from_bytes(blake2b(text.encode(), digest_size=8).digest(), "little") >> 1
 
 

@@ -13,7 +13,6 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm.auto import tqdm
 
 from lw_torchrl._checks import check_int, check_scale
-from lw_torchrl.envs.engine import Engine
 from lw_torchrl.envs.episodes import in_blocks, run_episodes
 from lw_torchrl.envs.experts import ExpertActor
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv

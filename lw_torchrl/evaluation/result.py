@@ -55,8 +55,7 @@ class EvaluationResult:
 
     def _by_task(self, value: Callable[[list[EpisodeResult]], float | None]) -> dict[str, float | None]:
         return {
-            task: value([episode for episode in self.episodes if episode.task == task])
-            for task in self.config["tasks"]
+            task: value([episode for episode in self.episodes if episode.task == task]) for task in self.config["tasks"]
         }
 
     @cached_property
@@ -117,7 +116,9 @@ class EvaluationResult:
                 raise ValueError(f"format {found['format']!r} version {found['version']!r}")
             return cls(found["config"], tuple(EpisodeResult(**episode) for episode in found["episodes"]))
         except FileNotFoundError:
-            raise FileNotFoundError(f"path: no result file {str(path)!r}; evaluate(...).save(path) writes one") from None
+            raise FileNotFoundError(
+                f"path: no result file {str(path)!r}; evaluate(...).save(path) writes one"
+            ) from None
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(
                 f"path: {str(path)!r} is no result of {FORMAT} version {FORMAT_VERSION} ({error})"

@@ -74,9 +74,9 @@ class ConditionalPlan:
         TypeError: a step is no PlanStep, or its skill no string.
 
     Example:
-        >>> plan = ConditionalPlan.from_pairs("reach", [("the gripper is open", "move the gripper to the reach target")])
+        >>> plan = ConditionalPlan.from_pairs("reach", [("gripper is open", "move the gripper to the target")])
         >>> plan.steps[0].skill
-        'move the gripper to the reach target'
+        'move the gripper to the target'
     """
 
     task: str
@@ -236,7 +236,7 @@ def parse_plan(text: str, task: str | None = None, source: str = "plan") -> Cond
             raise PlanError(f"{where}: expected 'def task_name(robot):' before {line!r}")
         elif match := _CHECK.fullmatch(line):
             if condition is not None:
-                raise PlanError(f"{where}: the condition above has no skill; expected robot.verb(\"details\")")
+                raise PlanError(f'{where}: the condition above has no skill; expected robot.verb("details")')
             try:
                 condition = check_query(_unquote(match, 1), found)
             except ValueError as error:
@@ -304,7 +304,8 @@ def load_plans(source: str | os.PathLike[str]) -> Plans:
         if not path.exists():
             raise FileNotFoundError(f"no plan file or folder {str(path)!r}; 'MT10' and 'MT50' name the shipped plans")
         # A name with a dot in front is what a killed save_plans leaves.
-        found = [path] if path.is_file() else sorted(p for p in path.glob("*.plan") if p.name[0] != ".")
+        listed = [path] if path.is_file() else sorted(p for p in path.glob("*.plan") if p.name[0] != ".")
+        found = list[Traversable](listed)
         if not found:
             raise FileNotFoundError(f"the folder {str(path)!r} holds no .plan files")
     plans = []

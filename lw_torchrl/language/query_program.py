@@ -36,9 +36,7 @@ class _Tables:
 
     def to(self, device: torch.device, dtype: torch.dtype) -> _Tables:
         moved = {f.name: getattr(self, f.name) for f in fields(self)}
-        return _Tables(
-            **{k: v.to(device, dtype if v.is_floating_point() else None) for k, v in moved.items()}
-        )
+        return _Tables(**{k: v.to(device, dtype if v.is_floating_point() else None) for k, v in moved.items()})
 
 
 def _clause_reads(clause: Clause, task: Task) -> tuple[tuple[Coordinate, ...], tuple[Coordinate, ...]]:
@@ -58,7 +56,10 @@ def _compile(queries: Mapping[Task, Sequence[Query]]) -> _Tables:
     row = torch.full((len(TASKS),), -1)
     first, second = torch.full((*shape, 3), _OBSERVATION), torch.full((*shape, 3), _OBSERVATION)
     negated = torch.zeros(shape, dtype=torch.bool)
-    axes, raised = torch.zeros(*shape, 2, 3, dtype=torch.float64), torch.zeros(*shape, 2, 3, dtype=torch.float64)
+    axes, raised = (
+        torch.zeros(*shape, 2, 3, dtype=torch.float64),
+        torch.zeros(*shape, 2, 3, dtype=torch.float64),
+    )
     length, below, flipped = (torch.zeros(*shape, 2, dtype=torch.bool) for _ in range(3))
     threshold = torch.zeros(*shape, 2, dtype=torch.float64)
 
@@ -75,7 +76,7 @@ def _compile(queries: Mapping[Task, Sequence[Query]]) -> _Tables:
             query = queries[task][s] if s < len(queries[task]) else None
             for k in range(width):
                 at = (t, s, k)
-                comparisons = (_NEVER if query is None else _ALWAYS,)
+                comparisons: tuple[Comparison, ...] = (_NEVER if query is None else _ALWAYS,)
                 if query is not None and k < len(query.clauses):
                     clause = query.clauses[k]
                     comparisons = PREDICATES[clause.predicate]

@@ -108,10 +108,7 @@ def _position(at: Any) -> tuple[Coordinate, Coordinate, Coordinate]:
         if stop - start == 3:
             return (start, start + 1, start + 2)
     if isinstance(at, list) and len(at) == 3:
-        found = [
-            int(match[1]) if isinstance(c, str) and (match := _INDEX.fullmatch(c)) else c
-            for c in at
-        ]
+        found = [int(match[1]) if isinstance(c, str) and (match := _INDEX.fullmatch(c)) else c for c in at]
         if all(isinstance(c, (int, float)) for c in found):
             x, y, z = (c if isinstance(o, str) else float(c) for c, o in zip(found, at, strict=True))
             return (x, y, z)

@@ -84,9 +84,7 @@ def log_lanes(stream: RecordingStream, root: str, episode: Episode) -> int:
     def send(lane: str, first: int, states: Sequence[str], styles: Mapping[str, tuple[str, Color]]) -> None:
         path = f"{root}/lanes{entity_path(lane)}"
         labels, colors = zip(*styles.values(), strict=True)
-        stream.log(
-            path, rr.StateConfiguration(values=list(styles), labels=labels, colors=colors), static=True
-        )
+        stream.log(path, rr.StateConfiguration(values=list(styles), labels=labels, colors=colors), static=True)
         changes = [i for i in range(len(states)) if i == 0 or states[i] != states[i - 1]]
         entries = [*(states[i] for i in changes), ""]
         times = time_columns(np.array([*changes, len(states)]) + first)
@@ -178,9 +176,7 @@ def _curves(origin: str, name: str, limits: tuple[float, float]) -> rrb.TimeSeri
     )
 
 
-def metric_views(
-    *, metrics: bool, histograms: Sequence[str], videos: Sequence[str], hparams: bool
-) -> list[Any]:
+def metric_views(*, metrics: bool, histograms: Sequence[str], videos: Sequence[str], hparams: bool) -> list[Any]:
     """The tabs of what is not an episode, those that have something to show."""
     import rerun.blueprint as rrb
 

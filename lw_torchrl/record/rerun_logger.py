@@ -209,9 +209,7 @@ class RerunLogger(Logger):
 
         values = np.asarray(torch.as_tensor(data).detach().cpu().to(torch.float64)).ravel()
         if not values.size or not np.isfinite(values).all():
-            raise ValueError(
-                f"data of histogram {name!r} must be finite and not empty, got {values.tolist()[:8]}"
-            )
+            raise ValueError(f"data of histogram {name!r} must be finite and not empty, got {values.tolist()[:8]}")
         counts, edges = np.histogram(values, bins=kwargs.get("bins", 30))
         path = entity_path("histograms", *_check_name(name).split("/"))
         index = [rr.TimeColumn(METRIC_TIMELINE, sequence=[self._count(path, kwargs.get("step"))])]
@@ -335,9 +333,7 @@ class RerunLogger(Logger):
         if not isinstance(task, str) or not task.strip():
             raise ValueError(f"task must be a task's name, got {task!r}")
         if name is None:
-            names: Iterator[str] = (
-                task if i == 1 else f"{task} {i}" for i in range(1, len(self._episodes) + 2)
-            )
+            names: Iterator[str] = (task if i == 1 else f"{task} {i}" for i in range(1, len(self._episodes) + 2))
             return next(free for free in names if free not in self._episodes)
         if not isinstance(name, str) or not name.strip():
             raise ValueError(f"name must be a non-empty string, got {name!r}")

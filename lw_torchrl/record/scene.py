@@ -91,17 +91,13 @@ class Episode:
         return len(self.observation)
 
     @classmethod
-    def from_rollout(
-        cls, rollout: TensorDictBase, objects: Mapping[str, Any], plan: PlanLike | None = None
-    ) -> Episode:
+    def from_rollout(cls, rollout: TensorDictBase, objects: Mapping[str, Any], plan: PlanLike | None = None) -> Episode:
         """Check a rollout; see :meth:`lw_torchrl.RerunLogger.log_episode` for the keys and the errors."""
         if not isinstance(rollout, TensorDictBase):
             raise TypeError(f"rollout must be a TensorDict, got {type(rollout).__name__}")
         if len(rollout.batch_size) != 1 or not rollout.batch_size[0]:
             hint = "; take one episode, rollout[i]" if len(rollout.batch_size) > 1 else ""
-            raise ValueError(
-                f"rollout must have batch size (T,) with T >= 1, got {tuple(rollout.batch_size)}{hint}"
-            )
+            raise ValueError(f"rollout must have batch size (T,) with T >= 1, got {tuple(rollout.batch_size)}{hint}")
         steps = tuple((str(step.condition), step.skill) for step in plan.steps) if plan is not None else ()
         length = rollout.batch_size[0]
         return cls(
@@ -121,9 +117,7 @@ def _array(value: Any, label: str, shape: tuple[int | None, ...]) -> NDArray[Any
     tensor = torch.as_tensor(value).detach().cpu()
     allowed = "×".join("S" if size is None else str(size) for size in shape)
     if tensor.ndim != len(shape) or any(s not in (None, n) for s, n in zip(shape, tensor.shape, strict=True)):
-        raise ValueError(
-            f"{label} must have shape {allowed}, got {'×'.join(map(str, tensor.shape)) or 'a scalar'}"
-        )
+        raise ValueError(f"{label} must have shape {allowed}, got {'×'.join(map(str, tensor.shape)) or 'a scalar'}")
     if tensor.dtype == torch.bool:
         return tensor.numpy()
     array = tensor.to(torch.float32).numpy()
@@ -147,9 +141,7 @@ def _of_steps(rollout: TensorDictBase, key: Any, length: int, steps: int) -> NDA
         return None
     array = _column(rollout, key, length, None)
     if array.shape[1] < max(steps, 1):
-        raise ValueError(
-            f"rollout[{key!r}] must have a column for each of {steps} plan steps, got {array.shape[1]}"
-        )
+        raise ValueError(f"rollout[{key!r}] must have a column for each of {steps} plan steps, got {array.shape[1]}")
     return array[:, :steps] if steps else array
 
 
@@ -223,19 +215,13 @@ def log_scene(stream: RecordingStream, root: str, episode: Episode) -> list[str]
     # Its name stands above the hand, where the objects that it handles are not.
     box("gripper/wrist", [(0.0, 0.0, WRIST_RISE)], [WRIST_HALF], STEEL, [GRIPPER])
     box("gripper/fingers", None, [FINGER_HALF] * 2, GOLD)
-    stream.send_columns(
-        f"{scene}/gripper", times, rr.Transform3D.columns(translation=episode.objects[GRIPPER])
-    )
+    stream.send_columns(f"{scene}/gripper", times, rr.Transform3D.columns(translation=episode.objects[GRIPPER]))
     fingers = rr.Boxes3D.columns(centers=_finger_centers(episode.observation[:, 3]))
     stream.send_columns(f"{scene}/gripper/fingers", times, fingers.partition([2] * len(episode)))
 
-    def point(
-        path: str, position: NDArray[np.float32], label: str | None, radius: float, color: Color
-    ) -> None:
+    def point(path: str, position: NDArray[np.float32], label: str | None, radius: float, color: Color) -> None:
         labels = None if label is None else [label]
-        style = rr.Points3D.from_fields(
-            radii=[radius], colors=[color], labels=labels, show_labels=label is not None
-        )
+        style = rr.Points3D.from_fields(radii=[radius], colors=[color], labels=labels, show_labels=label is not None)
         stream.log(f"{scene}/{path}", style, static=True)
         stream.send_columns(f"{scene}/{path}", times, rr.Points3D.columns(positions=position))
 

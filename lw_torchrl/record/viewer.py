@@ -92,9 +92,7 @@ def check_recording(path: str | os.PathLike[str]) -> Path:
     recording = Path(path)
     if not recording.is_file():
         what = "is a folder" if recording.is_dir() else "does not exist"
-        raise FileNotFoundError(
-            f"recording {str(recording)!r} {what}; expected a file that RerunLogger wrote"
-        )
+        raise FileNotFoundError(f"recording {str(recording)!r} {what}; expected a file that RerunLogger wrote")
     with recording.open("rb") as file:
         head = file.read(4)
     if head[:3] != RRD_MAGIC:
@@ -125,9 +123,7 @@ def _viewer(*arguments: str | Path) -> Iterator[tuple[subprocess.Popen[bytes], I
         command = [_binary(), *map(str, arguments), "--bind", LOCAL]
         # Its notes about software drawing would cover the picture.
         quiet = {"RUST_LOG": "error"} if "--headless" in command else {}
-        process = subprocess.Popen(
-            command, stdout=output, stderr=subprocess.STDOUT, env=quiet | dict(os.environ)
-        )
+        process = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT, env=quiet | dict(os.environ))
         try:
             yield process, output
         finally:
@@ -146,9 +142,7 @@ def _failure(output: IO[bytes]) -> RuntimeError:
         if re.search(pattern, text):
             return RuntimeError(f"rerun's viewer stopped: {reason}.")
     # Neither the stack nor the lines of routine.
-    telling = [
-        line for line in text.splitlines() if line.strip() and not re.match(r"\s+(\d+:|at )|.* INFO ", line)
-    ]
+    telling = [line for line in text.splitlines() if line.strip() and not re.match(r"\s+(\d+:|at )|.* INFO ", line)]
     return RuntimeError("rerun's viewer ended with an error:\n" + "\n".join(telling[-12:]))
 
 

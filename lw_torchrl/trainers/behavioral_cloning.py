@@ -107,7 +107,7 @@ class BehavioralCloningTrainer:
         replay.set_rng(generator)
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message=".*target_actor_network_params.*")
-            self.loss = BCLoss(actor, loss_function=config.loss_function)  # type: ignore[arg-type]
+            self.loss = BCLoss(actor, loss_function=config.loss_function)
         self.optimizer = torch.optim.AdamW(
             self.loss.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
         )
@@ -137,9 +137,10 @@ class BehavioralCloningTrainer:
             if found.get(part) != ours[part]:
                 before, now = found.get(part) or {}, ours[part] or {}
                 different = [key for key in {**before, **now} if before.get(key) != now.get(key)]
+                kind = "architecture" if part == "actor" else "configuration"
                 raise ValueError(
-                    f"checkpoint: {str(path)!r} is of another {'architecture' if part == 'actor' else 'configuration'}, "
-                    f"its {part} differs in {', '.join(different)}; choose another file, or delete it to start again"
+                    f"checkpoint: {str(path)!r} is of another {kind}, its {part} differs in "
+                    f"{', '.join(different)}; choose another file, or delete it to start again"
                 )
         load_into(path, **self._components())
 
@@ -176,7 +177,12 @@ class BehavioralCloningTrainer:
         self.actor.train()
         every, total = self.config.checkpoint_every, self.config.steps
         bar = tqdm(
-            total=total, initial=self.state.step, desc="training", unit="step", delay=1, disable=not self.progress
+            total=total,
+            initial=self.state.step,
+            desc="training",
+            unit="step",
+            delay=1,
+            disable=not self.progress,
         )
         with bar:
             while self.state.step < total:

@@ -15,7 +15,10 @@ from lw_torchrl._checks import check_choice
 from lw_torchrl.language.plans import Plans, format_plan, parse_plan
 from lw_torchrl.modules import DescriptorConditionedActor, PlanConditionedActor
 
-ACTORS = {"PlanConditionedActor": PlanConditionedActor, "DescriptorConditionedActor": DescriptorConditionedActor}
+ACTORS = {
+    "PlanConditionedActor": PlanConditionedActor,
+    "DescriptorConditionedActor": DescriptorConditionedActor,
+}
 Actor = PlanConditionedActor | DescriptorConditionedActor
 
 
@@ -52,9 +55,7 @@ def read_description(path: str | os.PathLike[str]) -> dict[str, Any]:
         raise ValueError(f"checkpoint: {str(path)!r} is damaged or none of ours ({error})") from error
 
 
-def load_actor(
-    path: str | os.PathLike[str], *, text_encoder: Callable[[Sequence[str]], Tensor] | None = None
-) -> Actor:
+def load_actor(path: str | os.PathLike[str], *, text_encoder: Callable[[Sequence[str]], Tensor] | None = None) -> Actor:
     """Make the actor of a checkpoint, with its plans and weights, in eval mode.
 
     Args:

@@ -191,9 +191,7 @@ def test_a_plan_for_another_task_is_refused():
         parse_plan(DRAWER, "push")
 
 
-@pytest.mark.parametrize(
-    "text", [None, 3, DRAWER.encode(), DRAWER.splitlines(), parse_query("gripper open", "push")]
-)
+@pytest.mark.parametrize("text", [None, 3, DRAWER.encode(), DRAWER.splitlines(), parse_query("gripper open", "push")])
 def test_a_text_of_another_type_is_a_type_error(text):
     with pytest.raises(TypeError, match="text must be a string"):
         parse_plan(text)
@@ -377,9 +375,7 @@ def test_a_plan_by_hand_is_checked(task, steps, error, says):
 
 
 def test_from_pairs_takes_any_spelling_and_refuses_the_rest():
-    assert plan("push", ("Is the gripper open?", "push puck")) == plan(
-        "push", ("gripper open", "push the puck")
-    )
+    assert plan("push", ("Is the gripper open?", "push puck")) == plan("push", ("gripper open", "push the puck"))
     with pytest.raises(PlanError, match="at least one step"):
         ConditionalPlan.from_pairs("push", [])
     with pytest.raises(QueryError, match="nearest query"):
@@ -543,17 +539,13 @@ def test_a_folder_without_plans_is_an_error(tmp_path):
 
 def test_a_file_named_after_another_task_is_an_error(tmp_path):
     (tmp_path / "reach.plan").write_text(HEAD)
-    with pytest.raises(
-        PlanError, match=r"reach\.plan, line 1: this is a plan for 'push', expected one for 'reach'"
-    ):
+    with pytest.raises(PlanError, match=r"reach\.plan, line 1: this is a plan for 'push', expected one for 'reach'"):
         load_plans(tmp_path)
 
 
 def test_one_bad_file_names_itself_and_its_line(tmp_path):
     save_plans(Plans([plan(), parse_plan(DRAWER)]), tmp_path)
-    (tmp_path / "reach.plan").write_text(
-        HEAD.replace("push(robot)", "reach(robot)").replace("is open", "is opne")
-    )
+    (tmp_path / "reach.plan").write_text(HEAD.replace("push(robot)", "reach(robot)").replace("is open", "is opne"))
     with pytest.raises(PlanError, match=r"^reach\.plan, line 2: .*at 'opne'"):
         load_plans(tmp_path)
 
@@ -570,9 +562,7 @@ def test_a_file_that_is_no_utf8_text_names_itself(tmp_path):
         load_plans(tmp_path)
 
 
-@pytest.mark.parametrize(
-    "encode", [lambda t: t.encode("utf-8-sig"), lambda t: t.replace("\n", "\r\n").encode()]
-)
+@pytest.mark.parametrize("encode", [lambda t: t.encode("utf-8-sig"), lambda t: t.replace("\n", "\r\n").encode()])
 def test_a_file_from_another_editor_loads(tmp_path, encode):
     (tmp_path / "push.plan").write_bytes(encode(HEAD))
     assert load_plans(tmp_path) == Plans([plan()])

@@ -64,14 +64,8 @@ def spelled(draw):
         parts.append(draw(st.sampled_from(negations + questions)))
         previous = clause.subject
     text = " and ".join(parts)
-    text = draw(
-        st.sampled_from([text, text.capitalize(), text.upper(), text.title(), text.replace("'", "’")])
-    )
-    text = (
-        draw(st.sampled_from(["", " ", "\n\t"]))
-        + text
-        + draw(st.sampled_from(["", "?", " ?", ".", "  ", "?\n"]))
-    )
+    text = draw(st.sampled_from([text, text.capitalize(), text.upper(), text.title(), text.replace("'", "’")]))
+    text = draw(st.sampled_from(["", " ", "\n\t"])) + text + draw(st.sampled_from(["", "?", " ?", ".", "  ", "?\n"]))
     return (
         task,
         query,
@@ -153,10 +147,7 @@ def test_around_is_listed_with_the_gripper_first_alone_but_answered_either_way()
     assert "the puck is around the robot's gripper" not in supported_queries("push")
     assert str(parse_query("puck around gripper", "push")) == "the puck is around the robot's gripper"
     assert "the target location is touching the table" not in supported_queries("push")
-    assert (
-        str(parse_query("target location touching the table", "push"))
-        == "the target location is touching the table"
-    )
+    assert str(parse_query("target location touching the table", "push")) == "the target location is touching the table"
     assert str(parse_query("the gripper isn't touching the table", "push")) == (
         "the robot's gripper is not touching the table"
     )
@@ -317,9 +308,7 @@ def test_an_error_points_at_the_word_and_names_the_nearest(text, task, at, expec
         assert f"nearest query is {near!r}" in message
 
 
-@pytest.mark.parametrize(
-    "function", [lambda task: parse_query("the gripper is open", task), supported_queries]
-)
+@pytest.mark.parametrize("function", [lambda task: parse_query("the gripper is open", task), supported_queries])
 def test_an_unknown_task_names_the_nearest(function):
     with pytest.raises(ValueError, match="did you mean 'pick-place'"):
         function("pick-plaec")

@@ -24,9 +24,7 @@ def random_states(task, seed=0, n=RANDOM):
     """Float32 states: objects within centimetres, the opening often near 0.75 and z near 0.02."""
     rng = np.random.default_rng([seed, task_id(task)])
     states = rng.uniform(-0.3, 0.9, (n, 39))
-    fixed = [
-        np.array(o.position) for o in TASKS[task].objects if all(isinstance(c, float) for c in o.position)
-    ]
+    fixed = [np.array(o.position) for o in TASKS[task].objects if all(isinstance(c, float) for c in o.position)]
     anchor = rng.uniform([-0.5, 0.4, 0.0], [0.5, 1.0, 0.4], (n, 3))
     if task == "peg-insert-side":
         fixed.append(np.array([-0.35, 0.6, 0.16]))
@@ -208,10 +206,7 @@ def all_tasks():
     ids = torch.randint(50, (600,), generator=torch.Generator().manual_seed(0))
     ids[:50] = torch.arange(50)
     states = torch.stack(
-        [
-            torch.from_numpy(random_states(MT50[i], seed=3, n=30))[row % 30]
-            for row, i in enumerate(ids.tolist())
-        ]
+        [torch.from_numpy(random_states(MT50[i], seed=3, n=30))[row % 30] for row, i in enumerate(ids.tolist())]
     )
     return queries, states, ids
 

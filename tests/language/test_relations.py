@@ -33,9 +33,7 @@ positions = st.tuples(*(st.floats(-1, 1),) * 3)
 
 
 def holds(relation, first, second, dtype=torch.float64):
-    return relation_holds(
-        relation, torch.tensor(first, dtype=dtype), torch.tensor(second, dtype=dtype)
-    ).item()
+    return relation_holds(relation, torch.tensor(first, dtype=dtype), torch.tensor(second, dtype=dtype)).item()
 
 
 def moved(position, displacement):
@@ -55,9 +53,7 @@ def test_a_relation_is_its_formula(relation, second, displacement):
     parts = FORMULAS[relation](*(a - b for a, b in zip(first, second, strict=True)))
     # Within rounding of a threshold either answer is right.
     assume(all(abs(value - threshold) > 1e-9 for value, _, threshold in parts))
-    expected = all(
-        value < threshold if sense == "<" else value > threshold for value, sense, threshold in parts
-    )
+    expected = all(value < threshold if sense == "<" else value > threshold for value, sense, threshold in parts)
     assert holds(relation, first, second) is expected
 
 

@@ -57,9 +57,7 @@ def test_descriptions_are_distinct_sentences_of_our_own():
 
 @pytest.mark.parametrize("name", MT50)
 def test_objects_are_the_published_ones(name):
-    relations = [
-        query.split(" is near ") for query in oracle.enumerate_base_queries(name) if " is near " in query
-    ]
+    relations = [query.split(" is near ") for query in oracle.enumerate_base_queries(name) if " is near " in query]
     named = {side.removeprefix("the ") for sides in relations for side in sides}
     assert set(TASKS[name].object_names) == named
     assert TASKS[name].object_names[0] == GRIPPER
@@ -85,9 +83,7 @@ def test_positions_of_a_whole_batch(name, dtype):
         at = positions[named.name]
         assert at.shape == (2, 3, 3)
         assert at.dtype == dtype
-        expected = torch.stack(
-            [torch.from_numpy(read(named.position, o)) for o in observation.reshape(6, 39)]
-        )
+        expected = torch.stack([torch.from_numpy(read(named.position, o)) for o in observation.reshape(6, 39)])
         assert torch.equal(at.reshape(6, 3), expected.to(dtype))
     assert TASKS[name].positions(observation[0, 0])[GRIPPER].tolist() == observation[0, 0, :3].tolist()
 
@@ -98,10 +94,7 @@ def test_positions_that_are_not_plain_slices():
     assert TASKS["stick-pull"].object("thermos").position == (11, 12, 13)
     assert TASKS["button-press-wall"].object("wall").position == (0.1, 0.6, 0.0)
     assert TASKS["button-press-topdown-wall"].object("wall").position == (0.1, 0.7, 0.0)
-    assert all(
-        TASKS[f"{n}-wall"].object("wall").position == (0.1, 0.75, 0.06)
-        for n in ("reach", "push", "pick-place")
-    )
+    assert all(TASKS[f"{n}-wall"].object("wall").position == (0.1, 0.75, 0.06) for n in ("reach", "push", "pick-place"))
     assert all(task.object(GRIPPER).position == (0, 1, 2) for task in TASKS.values())
     # A whole number in the table is a fixed place, not an index.
     assert all(isinstance(c, float) for c in TASKS["button-press-wall"].object("wall").position)
@@ -194,9 +187,7 @@ def test_a_position_outside_the_observation_is_refused(position):
         NamedObject("puck", position)
 
 
-@pytest.mark.parametrize(
-    "names", [[], ["puck"], ["puck", GRIPPER], [GRIPPER, "puck", "puck"], [GRIPPER, GRIPPER]]
-)
+@pytest.mark.parametrize("names", [[], ["puck"], ["puck", GRIPPER], [GRIPPER, "puck", "puck"], [GRIPPER, GRIPPER]])
 def test_a_task_needs_the_gripper_first_and_different_names(names):
     with pytest.raises(ValueError, match="objects of task 'mine'"):
         Task("mine", "Mine.", tuple(NamedObject(name, (4, 5, 6)) for name in names))

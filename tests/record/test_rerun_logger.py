@@ -56,9 +56,7 @@ def make_objects(rollout):
 def record(path, *rollouts, **kwargs):
     with RerunLogger(path) as logger:
         for rollout in rollouts:
-            logger.log_episode(
-                rollout, **{"task": "push", "objects": make_objects(rollout), "plan": PLAN} | kwargs
-            )
+            logger.log_episode(rollout, **{"task": "push", "objects": make_objects(rollout), "plan": PLAN} | kwargs)
     return Recording(path)
 
 
@@ -212,9 +210,7 @@ def test_several_episodes_and_their_names(tmp_path):
     assert names == ["push", "push 2", "best so far"]
     found = Recording(tmp_path / "a.rrd")
     for root, rollout in (("/push", first), ("/push\\ 2", second), ("/best\\ so\\ far", first)):
-        np.testing.assert_array_equal(
-            found.array(f"{root}/action", "Scalars:scalars"), rollout["action"].double()
-        )
+        np.testing.assert_array_equal(found.array(f"{root}/action", "Scalars:scalars"), rollout["action"].double())
 
 
 def test_the_layout_is_in_the_file(tmp_path):
@@ -473,9 +469,7 @@ def test_wrong_paths_are_named(tmp_path):
 
 
 def test_importing_loads_no_rerun():
-    code = (
-        "import sys, lw_torchrl.record; sys.exit('rerun' in sys.modules or 'rerun_bindings' in sys.modules)"
-    )
+    code = "import sys, lw_torchrl.record; sys.exit('rerun' in sys.modules or 'rerun_bindings' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
