@@ -33,6 +33,7 @@ def collect(
     episodes: int = 10,
     seed: int = 0,
     noise: tuple[float, ...] = (0.0,),
+    noise_hold: int = 10,
     redraw_failures: bool = False,
     num_envs: int | None = None,
 ) -> None:
@@ -46,6 +47,7 @@ def collect(
         episodes: kept for each task.
         seed: evaluate on another one.
         noise: standard deviations of the execution noise, gone through in turn, one an episode.
+        noise_hold: steps for which each draw of the noise is kept; longer leads further astray.
         redraw_failures: keep successful episodes only.
         num_envs: environments stepped together; the dataset does not depend on it.
     """
@@ -57,6 +59,7 @@ def collect(
         root=out,
         seed=seed,
         noise_scale=noise,
+        noise_hold=noise_hold,
         redraw_failures=redraw_failures,
         num_envs=num_envs,
     )

@@ -29,6 +29,7 @@ class DemoConfig:
     demonstrations_per_task: int = 10
     demonstration_seed: int = 0
     demonstration_noise: tuple[float, ...] = (0.0, 0.1, 0.2, 0.3, 0.4)
+    noise_hold: int = 10
     after_success: int = 20
     training_steps: int = 4000
     batch_size: int = 500
@@ -72,6 +73,7 @@ def run_demo(out: Path, config: DemoConfig) -> EvaluationResult:
         root=out / "demonstrations",
         seed=config.demonstration_seed,
         noise_scale=config.demonstration_noise,
+        noise_hold=config.noise_hold,
         redraw_failures=True,
     )
     print(f"2/4  training a plan-conditioned policy for {config.training_steps} steps")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import zipfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -40,6 +39,7 @@ _KEYS = [
     "expert_action",
     *(("next", key) for key in ("observation", "task_id", "reward", "success", "done", "terminated", "truncated")),
 ]
+_FAILED = b"FAILED"
 _MAX_ATTEMPTS = 20  # episodes run for each one that is kept, before redrawing gives up
 
 
@@ -48,7 +48,7 @@ def _name(key: str | Sequence[str]) -> str:
 
 
 class _Shelf:
-    """The episodes so far, one file each; an empty file stands for one that failed and was not kept."""
+    """The episodes so far, one file each; a file that says FAILED stands for one that was not kept."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -59,7 +59,7 @@ class _Shelf:
     def put(self, task: str, episode: int, steps: TensorDictBase | None) -> None:
         with replacing(self._path(task, episode)) as path:
             if steps is None:
-                path.touch()
+                path.write_bytes(_FAILED)
             else:
                 np.savez(path, **{_name(key): steps.get(key).numpy() for key in _KEYS})
 
@@ -67,7 +67,7 @@ class _Shelf:
         return self._path(task, episode).is_file()
 
     def kept(self, task: str, episode: int) -> bool:
-        return self._path(task, episode).stat().st_size > 0
+        return self._path(task, episode).stat().st_size != len(_FAILED)
 
     def get(self, task: str, episode: int) -> TensorDict:
         with np.load(self._path(task, episode), allow_pickle=False) as found:
@@ -79,7 +79,13 @@ class _Shelf:
 
     def drop_damaged(self) -> None:
         for path in self.folder.glob("*.npz"):
-            if path.stat().st_size and not zipfile.is_zipfile(path):
+            if path.read_bytes() == _FAILED:
+                continue
+            try:
+                with path.open("rb") as file, np.load(file, allow_pickle=False) as found:
+                    for key in _KEYS:
+                        found[_name(key)]  # read it: the checksum tells
+            except Exception:  # whatever is wrong with it, the episode can be run again
                 path.unlink()
 
 
@@ -87,7 +93,12 @@ def _open_shelf(root: Path, config: CollectConfig) -> _Shelf:
     folder = root / PARTIAL
     stated = folder / "config.json"
     if stated.is_file():
-        before = json.loads(stated.read_text("utf-8"))
+        try:
+            before = json.loads(stated.read_text("utf-8"))
+        except ValueError as error:
+            raise DatasetError(
+                f"root: {str(stated)!r} is damaged ({error}); delete {str(root)!r} to start again"
+            ) from error
         if before != config.to_json():
             raise DatasetError(
                 f"root: {str(root)!r} holds a half-made dataset of another configuration "
@@ -158,6 +169,7 @@ def _run(config: CollectConfig, shelf: _Shelf, num_envs: int | None, progress: b
                 wanted,
                 keys=_KEYS,
                 noise=(lambda n: scales[n % len(scales)]) if any(config.noise_scale) else None,
+                noise_hold=config.noise_hold,
                 clean_action="expert_action",
                 on_progress=bar.update,
             )
@@ -201,6 +213,7 @@ def collect_demonstrations(
     root: str | os.PathLike[str],
     seed: int = 0,
     noise_scale: float | Sequence[float] = 0.0,
+    noise_hold: int = 1,
     gripper_noise_factor: float = 0.2,
     redraw_failures: bool = False,
     max_steps: int = 500,
@@ -226,6 +239,8 @@ def collect_demonstrations(
         seed: evaluate on another one.
         noise_scale: standard deviation of the noise on the executed action; a sequence is gone through in turn, one
             an episode.
+        noise_hold: the steps for which each draw of the noise is kept; the longer, the further it leads the expert
+            astray, and the more a policy learns of the way back.
         gripper_noise_factor: multiplies the noise on the gripper.
         redraw_failures: keep only successful episodes.
         max_steps: steps of an episode.
@@ -254,6 +269,7 @@ def collect_demonstrations(
         episodes_per_task=check_int("episodes_per_task", episodes_per_task, minimum=1),
         seed=check_int("seed", seed),
         noise_scale=tuple(check_scale("noise_scale", scale) for scale in scales),
+        noise_hold=check_int("noise_hold", noise_hold, minimum=1),
         gripper_noise_factor=check_scale("gripper_noise_factor", gripper_noise_factor),
         redraw_failures=bool(redraw_failures),
         max_steps=check_int("max_steps", max_steps, minimum=1),

@@ -12,9 +12,11 @@ import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
+from math import prod
 from pathlib import Path
 from typing import Any
 
+import torch
 from tensordict import TensorDict, TensorDictBase
 
 from lw_torchrl._files import write_json
@@ -22,6 +24,18 @@ from lw_torchrl._files import write_json
 FORMAT = "lw_torchrl.demonstrations"
 FORMAT_VERSION = 1
 DATA, METADATA, PARTIAL = "data", "metadata.json", ".partial"
+COLUMNS: dict[tuple[str, ...], tuple[tuple[int, ...], torch.dtype]] = {
+    ("observation",): ((39,), torch.float32),
+    ("task_id",): ((), torch.int64),
+    ("episode",): ((), torch.int64),
+    ("action",): ((4,), torch.float32),
+    ("expert_action",): ((4,), torch.float32),
+    ("collector", "traj_ids"): ((), torch.int64),
+    ("next", "observation"): ((39,), torch.float32),
+    ("next", "task_id"): ((), torch.int64),
+    ("next", "reward"): ((1,), torch.float32),
+    **{("next", flag): ((1,), torch.bool) for flag in ("success", "done", "terminated", "truncated")},
+}
 _PACKAGES = ("lw_torchrl", "metaworld", "mujoco", "numpy", "tensordict", "torch", "torchrl")
 
 
@@ -38,6 +52,7 @@ class CollectConfig:
         episodes_per_task: kept episodes of each task.
         seed: with task and episode, fixes the initial state, the goal and the noise.
         noise_scale: standard deviations of the execution noise, one an episode in turn; (0.0,) for none.
+        noise_hold: the steps for which each draw of the noise is kept; the longer, the further it leads astray.
         gripper_noise_factor: what the gripper's noise is multiplied by; noise there makes grasps fail.
         redraw_failures: keep successful episodes only, and draw another for each failure.
         max_steps: steps of an episode.
@@ -47,6 +62,7 @@ class CollectConfig:
     episodes_per_task: int
     seed: int
     noise_scale: tuple[float, ...] = (0.0,)
+    noise_hold: int = 1
     gripper_noise_factor: float = 0.2
     redraw_failures: bool = False
     max_steps: int = 500
@@ -161,29 +177,46 @@ def read_metadata(root: str | os.PathLike[str]) -> Demonstrations:
         config: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in found["config"].items()}
         columns = found["episodes"]
         rows = zip(*(columns[key] for key in EpisodeInfo.__dataclass_fields__), strict=True)
-        return Demonstrations(
-            folder,
-            CollectConfig(**config),
-            found["versions"],
-            tuple(EpisodeInfo(*row) for row in rows),
-            found["attempts"],
-        )
+        episodes = tuple(EpisodeInfo(*row) for row in rows)
+        start = 0
+        for episode in episodes:
+            if episode.start != start:
+                raise ValueError(f"an episode starts at row {episode.start!r} instead of {start}")
+            start += episode.length
+        return Demonstrations(folder, CollectConfig(**config), found["versions"], episodes, found["attempts"])
     except DatasetError:
         raise
     except (KeyError, TypeError, ValueError) as error:
         raise DatasetError(f"root: {str(path)!r} is damaged ({error!r}); collect the dataset again") from error
 
 
+def _check_files(folder: Path, rows: int) -> None:
+    """Raise if a column's file is not what it should be. Mapping a file that is too short would lengthen it."""
+    for key, (tail, dtype) in COLUMNS.items():
+        parent = folder.joinpath(*key[:-1])
+        stated = json.loads((parent / "meta.json").read_text("utf-8"))[key[-1]]
+        if stated["shape"] != [rows, *tail] or stated["dtype"] != str(dtype):
+            raise ValueError(f"{'/'.join(key)} must be {dtype} of shape {[rows, *tail]}, its meta.json says {stated}")
+        size = (parent / f"{key[-1]}.memmap").stat().st_size
+        if size != rows * prod(tail) * dtype.itemsize:
+            raise ValueError(f"{'/'.join(key)}.memmap has {size} bytes, not {rows * prod(tail) * dtype.itemsize}")
+
+
 def load_rows(demonstrations: Demonstrations) -> TensorDictBase:
-    """The rows of a dataset, memory-mapped and read without unpickling."""
-    folder = demonstrations.root / DATA
+    """The rows of a dataset, memory-mapped and read without unpickling.
+
+    Raises:
+        DatasetError: (a ValueError) a column is missing, damaged, or not as long as the metadata say.
+    """
+    folder, expected = demonstrations.root / DATA, demonstrations.num_steps
     try:
-        rows = TensorDict.load_memmap(folder, allow_pickle=False)
+        (rows,) = json.loads((folder / "meta.json").read_text("utf-8"))["shape"]
+        if rows == expected:
+            _check_files(folder, rows)
+            return TensorDict.load_memmap(folder, allow_pickle=False)
     except Exception as error:
-        raise DatasetError(f"root: the rows in {str(folder)!r} cannot be read ({error}); collect them again") from error
-    if rows.batch_size != (demonstrations.num_steps,):
+        reason = f"{type(error).__name__}: {error}"
         raise DatasetError(
-            f"root: {str(folder)!r} has {tuple(rows.batch_size)} rows, the metadata say {demonstrations.num_steps}; "
-            "collect the dataset again"
-        )
-    return rows
+            f"root: the rows in {str(folder)!r} cannot be read ({reason}); collect them again"
+        ) from error
+    raise DatasetError(f"root: {str(folder)!r} has {rows} rows, the metadata say {expected}; collect the dataset again")

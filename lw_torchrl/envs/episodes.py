@@ -65,6 +65,7 @@ def run_episodes(
     *,
     keys: Sequence[NestedKey],
     noise: Callable[[int], Sequence[float]] | None = None,
+    noise_hold: int = 1,
     stop_at_success: bool = False,
     clean_action: NestedKey | None = None,
     on_progress: Callable[[int], object] | None = None,
@@ -80,6 +81,7 @@ def run_episodes(
         keys: what to record of each step, ``("next", "success")`` say.
         noise: episode index to the four standard deviations of the noise added to the action, from the same
             (task, seed, episode) as the episode itself; None for none.
+        noise_hold: the steps for which each draw of the noise is kept.
         stop_at_success: end an episode after its first successful step.
         clean_action: where to write the action before the noise.
         on_progress: told after each step how many more of all the steps are done with; what an early stop saves
@@ -108,7 +110,7 @@ def run_episodes(
                 episode[row], starting[row], steps[row] = number, True, 0
                 if noise is not None:
                     scale = np.asarray(noise(number), dtype=np.float32)
-                    drawn = action_noise(base.row_tasks[row], base.seed, number, base.max_steps)
+                    drawn = action_noise(base.row_tasks[row], base.seed, number, base.max_steps, noise_hold)
                     noises[row] = drawn * scale
         active = (active & ~idle) | starting
         if not active.any():

@@ -41,7 +41,9 @@ def episode_seed(task: str, seed: int, episode: int) -> int:
     return _hash("episode", task, seed, episode)
 
 
-def action_noise(task: str, seed: int, episode: int, steps: int) -> NDArray[np.float32]:
-    """Standard normal noise for the actions of one episode, (steps, 4) float32, the same wherever it is drawn."""
+def action_noise(task: str, seed: int, episode: int, steps: int, hold: int = 1) -> NDArray[np.float32]:
+    """Standard normal noise for the actions of one episode, (steps, 4) float32, the same wherever it is drawn; each
+    draw is kept for ``hold`` steps."""
     generator = np.random.Generator(np.random.Philox(_hash("noise", task, seed, episode)))
-    return generator.standard_normal((steps, 4), dtype=np.float32)
+    draws = generator.standard_normal((-(-steps // hold), 4), dtype=np.float32)
+    return draws.repeat(hold, axis=0)[:steps]

@@ -10,6 +10,13 @@ from lw_torchrl._checks import check_int
 from lw_torchrl.modules.observation_features import Features, ObservationFeatures
 
 
+def unit_scale(vectors: Tensor) -> Tensor:
+    """Texts' vectors (n, E), rescaled so that their numbers are of size 1; encoders give vectors of length 1, whose
+    numbers are so small that a fresh network hardly tells texts apart."""
+    vectors = vectors.to(torch.float32)
+    return vectors / vectors.square().mean(-1, keepdim=True).sqrt().clamp(min=1e-6)
+
+
 def text_to_latent(text_size: int, latent_size: int, width: int, depth: int) -> MLP:
     """An MLP from a text's vector to a skill latent, with ``depth`` hidden layers of ``width``."""
     check_int("latent_size", latent_size, minimum=1)
@@ -27,13 +34,13 @@ class ActionDecoder(nn.Module):
 
     Args:
         latent_size: D.
-        features: what it sees of the observation, see :class:`ObservationFeatures`.
+        features, feature_noise: what it sees of the observation, see :class:`ObservationFeatures`.
         width, depth: of the hidden layers.
     """
 
-    def __init__(self, latent_size: int, features: Features, width: int, depth: int) -> None:
+    def __init__(self, latent_size: int, features: Features, feature_noise: float, width: int, depth: int) -> None:
         super().__init__()
-        self.features = ObservationFeatures(features)
+        self.features = ObservationFeatures(features, feature_noise)
         self.network = MLP(
             in_features=latent_size + self.features.width,
             out_features=4,

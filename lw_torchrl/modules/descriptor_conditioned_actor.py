@@ -12,7 +12,7 @@ from torch import Tensor
 
 from lw_torchrl.language.tasks import MT50, TASKS, resolve_tasks, task_id
 from lw_torchrl.language.text import encode_texts
-from lw_torchrl.modules.decoder import ActionDecoder, text_to_latent
+from lw_torchrl.modules.decoder import ActionDecoder, text_to_latent, unit_scale
 from lw_torchrl.modules.observation_features import Features
 
 
@@ -23,7 +23,7 @@ class DescriptorConditionedActor(TensorDictModuleBase):
 
     Args:
         tasks: the tasks it is to act in, as for :func:`resolve_tasks`.
-        features, latent_size, width, depth, encoder_width, encoder_depth, text_encoder: as for
+        features, feature_noise, latent_size, width, depth, encoder_width, encoder_depth, text_encoder: as for
             :class:`PlanConditionedActor`, with the same networks.
 
     Raises:
@@ -49,6 +49,7 @@ class DescriptorConditionedActor(TensorDictModuleBase):
         tasks: str | Iterable[str],
         *,
         features: Features = "both",
+        feature_noise: float = 0.1,
         latent_size: int = 64,
         width: int = 256,
         depth: int = 3,
@@ -60,22 +61,23 @@ class DescriptorConditionedActor(TensorDictModuleBase):
         self.tasks = resolve_tasks(tasks)
         self.config: dict[str, Any] = {
             "features": features,
+            "feature_noise": feature_noise,
             "latent_size": latent_size,
             "width": width,
             "depth": depth,
             "encoder_width": encoder_width,
             "encoder_depth": encoder_depth,
         }
-        found = (text_encoder or encode_texts)([TASKS[task].description for task in self.tasks]).to(torch.float32)
+        found = (text_encoder or encode_texts)([TASKS[task].description for task in self.tasks])
         ids = torch.tensor([task_id(task) for task in self.tasks])
         vectors = torch.zeros(len(MT50), found.shape[1])
-        vectors[ids] = found
+        vectors[ids] = unit_scale(found)
         known = torch.zeros(len(MT50), dtype=torch.bool)
         known[ids] = True
         self.register_buffer("description_vectors", vectors, persistent=False)
         self.register_buffer("known", known, persistent=False)
         self.encoder = text_to_latent(found.shape[1], latent_size, encoder_width, encoder_depth)
-        self.decoder = ActionDecoder(latent_size, features, width, depth)
+        self.decoder = ActionDecoder(latent_size, features, feature_noise, width, depth)
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

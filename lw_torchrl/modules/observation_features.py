@@ -8,7 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from lw_torchrl._checks import check_choice
+from lw_torchrl._checks import check_choice, check_scale
 
 Features = Literal["raw", "differences", "both"]
 _HAND, _OBJECT_1, _OBJECT_2, _GOAL = slice(0, 3), slice(4, 7), slice(11, 14), slice(36, 39)
@@ -35,8 +35,11 @@ def differences(observation: Tensor) -> Tensor:
 class ObservationFeatures(nn.Module):
     """Observation to normalised features.
 
+    In training mode Gaussian noise is added to the normalised features, drawn from PyTorch's global generator.
+
     Args:
         kind: "raw", the 39 numbers; "differences", see :func:`differences`; "both", one after the other.
+        noise: standard deviation of the noise, in standard deviations of each feature.
 
     Attributes:
         width: F, the number of features.
@@ -46,8 +49,9 @@ class ObservationFeatures(nn.Module):
     mean: Tensor
     std: Tensor
 
-    def __init__(self, kind: Features = "both") -> None:
+    def __init__(self, kind: Features = "both", noise: float = 0.0) -> None:
         super().__init__()
+        self.noise = check_scale("feature_noise", noise)
         self.kind = check_choice("features", kind, _WIDTH)
         self.width = _WIDTH[kind]
         self.register_buffer("mean", torch.zeros(self.width))
@@ -82,4 +86,5 @@ class ObservationFeatures(nn.Module):
 
     def forward(self, observation: Tensor) -> Tensor:
         """(..., 39) float32 to (..., F) float32, within 10 standard deviations of the mean."""
-        return ((self._select(observation) - self.mean) / self.std).clamp(-10.0, 10.0)
+        found = ((self._select(observation) - self.mean) / self.std).clamp(-10.0, 10.0)
+        return found + self.noise * torch.randn_like(found) if self.training and self.noise else found

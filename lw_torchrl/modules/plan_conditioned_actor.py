@@ -14,7 +14,7 @@ from lw_torchrl._checks import check_choice
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.tasks import MT50, task_id
 from lw_torchrl.language.text import encode_texts
-from lw_torchrl.modules.decoder import ActionDecoder, text_to_latent
+from lw_torchrl.modules.decoder import ActionDecoder, text_to_latent, unit_scale
 from lw_torchrl.modules.observation_features import Features
 from lw_torchrl.modules.plan_attention import PlanAttention
 
@@ -32,6 +32,7 @@ class PlanConditionedActor(TensorDictModuleBase):
             actions.
         features: what the decoder sees of the observation: "raw", the 39 numbers; "differences", the pairwise
             differences between hand, objects and goal; "both".
+        feature_noise: standard deviation of the noise on the normalised features while training.
         latent_size: D.
         width, depth: hidden layers of the action decoder.
         encoder_width, encoder_depth: hidden layers of the skill encoder.
@@ -68,6 +69,7 @@ class PlanConditionedActor(TensorDictModuleBase):
         *,
         mix: Literal["latents", "actions"] = "latents",
         features: Features = "both",
+        feature_noise: float = 0.1,
         latent_size: int = 64,
         width: int = 256,
         depth: int = 3,
@@ -81,6 +83,7 @@ class PlanConditionedActor(TensorDictModuleBase):
         self.config: dict[str, Any] = {
             "mix": mix,
             "features": features,
+            "feature_noise": feature_noise,
             "latent_size": latent_size,
             "width": width,
             "depth": depth,
@@ -98,11 +101,11 @@ class PlanConditionedActor(TensorDictModuleBase):
                 [self.skills.index(step.skill) for step in plan.steps]
             )
         # The tables come from the plans, not from training: they are not part of the state that is saved.
-        self.register_buffer("skill_vectors", vectors.to(torch.float32), persistent=False)
+        self.register_buffer("skill_vectors", unit_scale(vectors), persistent=False)
         self.register_buffer("skill_index", index, persistent=False)
         self.attention = PlanAttention(self.plans)
         self.encoder = text_to_latent(vectors.shape[1], latent_size, encoder_width, encoder_depth)
-        self.decoder = ActionDecoder(latent_size, features, width, depth)
+        self.decoder = ActionDecoder(latent_size, features, feature_noise, width, depth)
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

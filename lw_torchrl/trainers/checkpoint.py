@@ -90,11 +90,13 @@ class TrainingState:
         return {
             "step": torch.tensor(self.step),
             "generator": self.generator.get_state(),
+            "torch_generator": torch.get_rng_state(),
             "sampler": dict(self.sampler.state_dict()),
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.step = int(state_dict["step"])
         self.generator.set_state(state_dict["generator"].clone())
+        torch.set_rng_state(state_dict["torch_generator"].clone())
         if state_dict.get("sampler"):
             self.sampler.load_state_dict(state_dict["sampler"])
