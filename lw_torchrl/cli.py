@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,6 +24,7 @@ def demo(out: Path | None = None, quick: bool = False) -> None:
     """
     from lw_torchrl.demo import QUICK, DemoConfig, run_demo
 
+    _calm_torch()
     run_demo(out or Path("runs/demo-quick" if quick else "runs/demo"), QUICK if quick else DemoConfig())
 
 
@@ -76,7 +78,7 @@ def train(
     plans: str = "MT10",
     policy: Literal["plan", "descriptor"] = "plan",
     mix: Literal["latents", "actions"] = "latents",
-    features: Literal["raw", "differences", "both"] = "both",
+    features: Literal["raw", "differences", "both"] = "differences",
     width: int = 256,
     depth: int = 3,
     steps: int = 4000,
@@ -108,6 +110,7 @@ def train(
 
     import lw_torchrl as lw
 
+    _calm_torch()
     options = {"features": features, "width": width, "depth": depth}
     config = lw.BehavioralCloningConfig(steps=steps, batch_size=batch_size, learning_rate=learning_rate, seed=seed)
     replay = lw.LanguageWorldExperienceReplay(data, sampler=lw.TaskBalancedSampler(), after_success=after_success)
@@ -153,6 +156,7 @@ def evaluate(
     from lw_torchrl.record.rollouts import rollout_tasks, write_recording
     from lw_torchrl.trainers.checkpoint import read_description
 
+    _calm_torch()
     chosen: str | tuple[str, ...] = tasks[0] if len(tasks) == 1 else tasks
     actor: lw.ExpertActor | lw.PlanConditionedActor | lw.DescriptorConditionedActor
     if str(checkpoint) == "expert":
@@ -269,6 +273,14 @@ COMMANDS: dict[str, Any] = {
     "view": view,
     "query": query,
 }
+
+
+def _calm_torch() -> None:
+    # Networks this small gain little from a second thread, and lose much where another process wants the core.
+    if "OMP_NUM_THREADS" not in os.environ:
+        import torch
+
+        torch.set_num_threads(1)
 
 
 def main(args: Sequence[str] | None = None) -> None:

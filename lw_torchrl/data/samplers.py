@@ -114,6 +114,12 @@ class TaskBalancedSampler(Sampler):
         self._cursor += torch.where(ending, 0, count)
         return index.flatten(), {}
 
+    def add(self, index: Any) -> None:
+        """Group the rows again at the next sample, since one was written, over an old one perhaps."""
+        self._length = 0
+
+    extend = add
+
     def state_dict(self) -> dict[str, Any]:
         """The shuffled order and how far each task's pass has come."""
         return {

@@ -9,59 +9,72 @@ import torch
 from torch import Tensor
 
 from lw_torchrl.language.queries import Clause, Query, check_query
-from lw_torchrl.language.relations import PREDICATES, Comparison
+from lw_torchrl.language.relations import MEASURES, PREDICATES, Comparison, measure
 from lw_torchrl.language.tasks import TASKS, Coordinate, Task, get_task, task_id
 
 _OBSERVATION = 39
 _OPENING = 3  # index of the gripper's opening in the observation
-_NEVER = Comparison("x", "<", -1.0)  # a length is never under -1: the padding of the tables
-_ALWAYS = Comparison("x", ">", -1.0)
+_ORIGIN = (0.0, 0.0, 0.0)
+_NEVER = Comparison("xyz", "<", -1.0)  # a length is never under -1: the padding of the tables
+_ALWAYS = Comparison("xyz", ">", -1.0)
 
 
 @dataclass
 class _Tables:
-    """Per task (T), query (S), clause (K) and comparison (2): where to read and what to compare."""
+    """Per task (T): the pairs of positions to subtract (P), and for each query (S), clause (K) and comparison (2)
+    which measure of which difference to compare with what. Every comparison is ``sign·measure < threshold``."""
 
     row: Tensor  # (50,) int64, the row of a task_id in the tables below, -1 for tasks without queries
     constants: Tensor  # (C,) float64, metres, read as if they followed the 39 numbers of the observation
-    first: Tensor  # (T, S*K*3) int64, index of each coordinate of the first position
-    second: Tensor  # (T, S*K*3) int64
-    negated: Tensor  # (T, S, K) bool
-    axes: Tensor  # (T, S, K, 2, 3) float64, 1 for the axes that count
-    raised: Tensor  # (T, S, K, 2, 3) float64, metres added to d
-    length: Tensor  # (T, S, K, 2) bool
-    below: Tensor  # (T, S, K, 2) bool, the sense is "<"
-    flipped: Tensor  # (T, S, K, 2) bool, the sense is "<=", the complement of ">"
-    threshold: Tensor  # (T, S, K, 2) float64, metres
+    first: Tensor  # (T, P*3) int64, index of each coordinate of the first position
+    second: Tensor  # (T, P*3) int64
+    measure: Tensor  # (T, S*K*2) int64, index into the P*M measures
+    sign: Tensor  # (T, S*K*2) float64
+    threshold: Tensor  # (T, S*K*2) float64, metres
+    flipped: Tensor  # (T, S*K*2) bool, take the complement
+    negated: Tensor  # (T, S, K) bool, take the clause's complement
 
     def to(self, device: torch.device, dtype: torch.dtype) -> _Tables:
         moved = {f.name: getattr(self, f.name) for f in fields(self)}
         return _Tables(**{k: v.to(device, dtype if v.is_floating_point() else None) for k, v in moved.items()})
 
 
-def _clause_reads(clause: Clause, task: Task) -> tuple[tuple[Coordinate, ...], tuple[Coordinate, ...]]:
-    origin = (0.0, 0.0, 0.0)
+_Position = tuple[Coordinate, Coordinate, Coordinate]
+
+
+def _clause_reads(clause: Clause, task: Task) -> tuple[_Position, _Position]:
     if clause.predicate in ("open", "closed"):
-        return (0.0, 0.0, _OPENING), origin
+        return (0.0, 0.0, _OPENING), _ORIGIN
     first = task.object(clause.subject).position
-    return first, origin if clause.object is None else task.object(clause.object).position
+    return first, _ORIGIN if clause.object is None else task.object(clause.object).position
+
+
+def _task_entries(
+    task: Task, queries: Sequence[Query], steps: int, width: int
+) -> tuple[list[tuple[_Position, _Position]], list[tuple[int, Comparison]], list[bool]]:
+    """The pairs of positions of one task, its comparisons with the pair of each, and which clauses are negated."""
+    pairs: list[tuple[_Position, _Position]] = []
+    entries: list[tuple[int, Comparison]] = []
+    negated: list[bool] = []
+    for s in range(steps):
+        clauses = queries[s].clauses if s < len(queries) else ()
+        for k in range(width):
+            pair = 0
+            comparisons: tuple[Comparison, ...] = (_ALWAYS if s < len(queries) else _NEVER,)
+            if k < len(clauses):
+                reads = _clause_reads(clauses[k], task)
+                if reads not in pairs:
+                    pairs.append(reads)
+                pair, comparisons = pairs.index(reads), PREDICATES[clauses[k].predicate]
+            entries += [(pair, part) for part in (*comparisons, _ALWAYS)[:2]]
+            negated.append(k < len(clauses) and clauses[k].negated)
+    return pairs, entries, negated
 
 
 def _compile(queries: Mapping[Task, Sequence[Query]]) -> _Tables:
-    tasks = list(queries)
-    steps = max(len(listed) for listed in queries.values())
+    steps = max(map(len, queries.values()))
     width = max(len(query.clauses) for listed in queries.values() for query in listed)
     constants = [0.0]
-    shape = (len(tasks), steps, width)
-    row = torch.full((len(TASKS),), -1)
-    first, second = torch.full((*shape, 3), _OBSERVATION), torch.full((*shape, 3), _OBSERVATION)
-    negated = torch.zeros(shape, dtype=torch.bool)
-    axes, raised = (
-        torch.zeros(*shape, 2, 3, dtype=torch.float64),
-        torch.zeros(*shape, 2, 3, dtype=torch.float64),
-    )
-    length, below, flipped = (torch.zeros(*shape, 2, dtype=torch.bool) for _ in range(3))
-    threshold = torch.zeros(*shape, 2, dtype=torch.float64)
 
     def index(coordinate: Coordinate) -> int:
         if isinstance(coordinate, int):
@@ -70,36 +83,33 @@ def _compile(queries: Mapping[Task, Sequence[Query]]) -> _Tables:
             constants.append(coordinate)
         return _OBSERVATION + constants.index(coordinate)
 
-    for t, task in enumerate(tasks):
+    found = [_task_entries(task, listed, steps, width) for task, listed in queries.items()]
+    most = max(len(pairs) for pairs, _, _ in found)
+    padded = [pairs + [(_ORIGIN, _ORIGIN)] * (most - len(pairs)) for pairs, _, _ in found]
+    row = torch.full((len(TASKS),), -1)
+    for t, task in enumerate(queries):
         row[task_id(task.name)] = t
-        for s in range(steps):
-            query = queries[task][s] if s < len(queries[task]) else None
-            for k in range(width):
-                at = (t, s, k)
-                comparisons: tuple[Comparison, ...] = (_NEVER if query is None else _ALWAYS,)
-                if query is not None and k < len(query.clauses):
-                    clause = query.clauses[k]
-                    comparisons = PREDICATES[clause.predicate]
-                    reads = _clause_reads(clause, task)
-                    first[at], second[at] = (torch.tensor([index(c) for c in read]) for read in reads)
-                    negated[at] = clause.negated
-                for c, part in enumerate((*comparisons, _ALWAYS)[:2]):
-                    axes[(*at, c)] = torch.tensor([float(axis in part.axes) for axis in "xyz"])
-                    raised[(*at, c, 2)] = part.raise_z
-                    length[(*at, c)], threshold[(*at, c)] = part.length, part.threshold
-                    below[(*at, c)], flipped[(*at, c)] = part.sense == "<", part.sense == "<="
+    signs = [[1.0 if part.sense == "<" else -1.0 for _, part in entries] for _, entries, _ in found]
+    sign = torch.tensor(signs, dtype=torch.float64)
+    limits = torch.tensor([[part.threshold for _, part in entries] for _, entries, _ in found], dtype=torch.float64)
+    first, second = (
+        torch.tensor([[index(c) for pair in pairs for c in pair[side]] for pairs in padded]) for side in (0, 1)
+    )
     return _Tables(
         row=row,
         constants=torch.tensor(constants, dtype=torch.float64),
-        first=first.flatten(1),
-        second=second.flatten(1),
-        negated=negated,
-        axes=axes,
-        raised=raised,
-        length=length,
-        below=below,
-        flipped=flipped,
-        threshold=threshold,
+        first=first,
+        second=second,
+        measure=torch.tensor(
+            [
+                [pair * len(MEASURES) + MEASURES.index(part.measured) for pair, part in entries]
+                for _, entries, _ in found
+            ]
+        ),
+        sign=sign,
+        threshold=sign * limits,
+        flipped=torch.tensor([[part.sense == "<=" for _, part in entries] for _, entries, _ in found]),
+        negated=torch.tensor([negated for _, _, negated in found]).unflatten(-1, (steps, width)),
     )
 
 
@@ -196,13 +206,9 @@ class QueryProgram:
         self._check(observation, task_id, tables)
         row = tables.row[task_id]
         numbers = torch.cat((observation, tables.constants.expand(*observation.shape[:-1], -1)), -1)
-        d = (numbers.gather(-1, tables.first[row]) - numbers.gather(-1, tables.second[row])).unflatten(
-            -1, (*tables.negated.shape[1:], 1, 3)
-        )
-        axes = tables.axes[row]
-        parts = (d + tables.raised[row]) * axes
-        value = torch.where(tables.length[row], torch.linalg.vector_norm(parts, dim=-1), parts.sum(-1))
-        threshold = tables.threshold[row]
-        below = tables.below[row]
-        holds = torch.where(below, value < threshold, (value > threshold) ^ tables.flipped[row]).all(-1)
-        return (holds ^ tables.negated[row]).all(-1)
+        d = numbers.gather(-1, tables.first[row]) - numbers.gather(-1, tables.second[row])
+        measures = measure(d.unflatten(-1, (-1, 3))).flatten(-2)
+        value = measures.gather(-1, tables.measure[row]) * tables.sign[row]
+        holds = (value < tables.threshold[row]) ^ tables.flipped[row]
+        clauses = holds.unflatten(-1, (*tables.negated.shape[1:], 2)).all(-1) ^ tables.negated[row]
+        return clauses.all(-1)

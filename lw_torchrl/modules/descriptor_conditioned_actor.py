@@ -12,7 +12,7 @@ from torch import Tensor
 
 from lw_torchrl.language.tasks import MT50, TASKS, resolve_tasks, task_id
 from lw_torchrl.language.text import encode_texts
-from lw_torchrl.modules.decoder import ActionDecoder, text_to_latent, unit_scale
+from lw_torchrl.modules.decoder import ActionDecoder, check_task_ids, text_to_latent, unit_scale
 from lw_torchrl.modules.observation_features import Features
 
 
@@ -48,7 +48,7 @@ class DescriptorConditionedActor(TensorDictModuleBase):
         self,
         tasks: str | Iterable[str],
         *,
-        features: Features = "both",
+        features: Features = "differences",
         feature_noise: float = 0.1,
         latent_size: int = 64,
         width: int = 256,
@@ -69,6 +69,8 @@ class DescriptorConditionedActor(TensorDictModuleBase):
             "encoder_depth": encoder_depth,
         }
         found = (text_encoder or encode_texts)([TASKS[task].description for task in self.tasks])
+        if found.ndim != 2 or len(found) != len(self.tasks):
+            raise ValueError(f"text_encoder must give ({len(self.tasks)}, E), got shape {tuple(found.shape)}")
         ids = torch.tensor([task_id(task) for task in self.tasks])
         vectors = torch.zeros(len(MT50), found.shape[1])
         vectors[ids] = unit_scale(found)
@@ -82,9 +84,7 @@ class DescriptorConditionedActor(TensorDictModuleBase):
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         task = tensordict.get("task_id")
-        if not torch.compiler.is_compiling() and not self.known[task].all():
-            wrong = sorted({MT50[i] for i in task[~self.known[task]].flatten().tolist()})
-            raise ValueError(f"task_id names tasks this actor was not made for: {', '.join(wrong)}")
+        check_task_ids(task, self.known, "tasks this actor was not made for")
         latent = self.encoder(self.description_vectors)[task]
         return tensordict.set("action", self.decoder(latent, tensordict.get("observation")))
 

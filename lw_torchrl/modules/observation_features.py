@@ -49,7 +49,7 @@ class ObservationFeatures(nn.Module):
     mean: Tensor
     std: Tensor
 
-    def __init__(self, kind: Features = "both", noise: float = 0.0) -> None:
+    def __init__(self, kind: Features = "differences", noise: float = 0.0) -> None:
         super().__init__()
         self.noise = check_scale("feature_noise", noise)
         self.kind = check_choice("features", kind, _WIDTH)
@@ -63,6 +63,8 @@ class ObservationFeatures(nn.Module):
                 f"observation must be float32 of shape (..., 39), got {observation.dtype} of shape "
                 f"{tuple(observation.shape)}"
             )
+        if not torch.compiler.is_compiling() and not observation.isfinite().all():
+            raise ValueError("observation must hold finite numbers, got NaN or infinity")
         if self.kind == "raw":
             return observation
         made = differences(observation)
@@ -77,8 +79,6 @@ class ObservationFeatures(nn.Module):
         Raises:
             ValueError: the observations hold NaN or infinity.
         """
-        if not observation.isfinite().all():
-            raise ValueError("observation must hold finite numbers, got NaN or infinity")
         found = self._select(observation.reshape(-1, 39))
         self.mean.copy_(found.mean(0))
         std = found.std(0, unbiased=False)

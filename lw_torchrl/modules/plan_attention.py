@@ -11,6 +11,7 @@ from torch import Tensor
 
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.tasks import MT50, task_id
+from lw_torchrl.modules.decoder import check_task_ids
 
 
 def step_mask(plans: Plans) -> Tensor:
@@ -61,12 +62,9 @@ class PlanAttention(TensorDictModuleBase):
                 f"qaf must have shape {(*task_id.shape, self.mask.shape[-1])}, one column for each step of the actor's "
                 f"plans, got {tuple(qaf.shape)}; give QAFTransform the same plans"
             )
-        mask = self.mask[task_id]
-        if not torch.compiler.is_compiling() and not mask[..., 0].all():
-            wrong = sorted({MT50[i] for i in task_id[~mask[..., 0]].flatten().tolist()})
-            raise ValueError(f"task_id names tasks without a plan here: {', '.join(wrong)}; {self.plans!r}")
+        check_task_ids(task_id, self.mask[:, 0], f"tasks without a plan in {self.plans!r}")
         logits = 10.0 * qaf.to(torch.float32) - 5.0
-        return logits.masked_fill(~mask, -torch.inf).softmax(-1)
+        return logits.masked_fill(~self.mask[task_id], -torch.inf).softmax(-1)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         return tensordict.set("skill_weights", self.weights(tensordict.get("qaf"), tensordict.get("task_id")))

@@ -68,7 +68,7 @@ class PlanConditionedActor(TensorDictModuleBase):
         plans: Plans | Mapping[str, ConditionalPlan],
         *,
         mix: Literal["latents", "actions"] = "latents",
-        features: Features = "both",
+        features: Features = "differences",
         feature_noise: float = 0.1,
         latent_size: int = 64,
         width: int = 256,
