@@ -56,13 +56,12 @@ def plot_success(result: EvaluationResult, path: str | os.PathLike[str], *, titl
         color="#4c78a8",
         error_kw={"ecolor": "#333333", "elinewidth": 1, "capsize": 2},
     )
-    axes.axvline(result.mean_success, color="#e45756", linestyle="--", label=f"mean {result.mean_success:.2f}")
+    axes.axvline(result.mean_success, color="#e45756", linestyle="--")
     axes.set_xlim(0, 1.02)
     axes.set_xlabel(
         f"episodes with success at any step (of {trials}; action noise {result.config['noise_scale']}; bars: 95 %)"
     )
-    axes.set_title(title)
-    axes.legend(loc="lower right")
+    axes.set_title(f"{title}\nmean over {len(tasks)} tasks: {result.mean_success:.2f}".strip())
     axes.spines[["top", "right"]].set_visible(False)
     with replacing(path) as temporary:
         figure.savefig(temporary, dpi=140)
