@@ -81,7 +81,7 @@ def train(
     features: Literal["raw", "differences", "both"] = "differences",
     width: int = 256,
     depth: int = 3,
-    steps: int = 4000,
+    steps: int = 8000,
     batch_size: int = 500,
     learning_rate: float = 1e-3,
     after_success: int | None = 20,

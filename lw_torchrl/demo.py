@@ -31,7 +31,7 @@ class DemoConfig:
     demonstration_noise: tuple[float, ...] = (0.0, 0.1, 0.2, 0.3, 0.4)
     noise_hold: int = 10
     after_success: int = 20
-    training_steps: int = 4000
+    training_steps: int = 8000
     batch_size: int = 500
     training_seed: int = 0
     episodes_per_task: int = 20

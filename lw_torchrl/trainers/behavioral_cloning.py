@@ -38,7 +38,7 @@ class BehavioralCloningConfig:
         checkpoint_every: steps between checkpoints; the last step always makes one.
     """
 
-    steps: int = 4000
+    steps: int = 8000
     batch_size: int = 500
     learning_rate: float = 1e-3
     weight_decay: float = 1e-4

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import zipfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -50,8 +51,11 @@ def read_description(path: str | os.PathLike[str]) -> dict[str, Any]:
     if not Path(path).exists():
         raise FileNotFoundError(f"checkpoint: no file {str(path)!r}; `lw-torchrl train` writes one")
     try:
-        return Checkpoint(description=None).load(path, components=["description"]).values["description"]
-    except (CheckpointError, OSError, ValueError, KeyError) as error:
+        found = Checkpoint(description=None).load(path, components=["description"]).values["description"]
+        if not isinstance(found, dict) or not isinstance(found.get("actor"), dict):
+            raise ValueError("it describes no actor")
+        return found
+    except (CheckpointError, zipfile.BadZipFile, OSError, ValueError, KeyError) as error:
         raise ValueError(f"checkpoint: {str(path)!r} is damaged or none of ours ({error})") from error
 
 
@@ -66,7 +70,11 @@ def load_actor(path: str | os.PathLike[str], *, text_encoder: Callable[[Sequence
         FileNotFoundError: there is no such file.
         ValueError: it is damaged, or of another architecture than it says.
     """
-    actor = _make_actor(read_description(path)["actor"], text_encoder)
+    described = read_description(path)["actor"]
+    try:
+        actor = _make_actor(described, text_encoder)
+    except (ValueError, TypeError, KeyError) as error:
+        raise ValueError(f"checkpoint: the actor of {str(path)!r} cannot be made ({error})") from error
     load_into(path, actor=actor)
     return actor.eval()
 
@@ -75,6 +83,8 @@ def load_into(path: str | os.PathLike[str], **components: Any) -> None:
     """Load named components of a checkpoint into live objects; :class:`ValueError` if they do not fit."""
     try:
         Checkpoint(**components).load(path, components=list(components))
+    except zipfile.BadZipFile as error:
+        raise ValueError(f"checkpoint: {str(path)!r} is damaged ({error})") from error
     except (CheckpointError, RuntimeError, KeyError) as error:
         reason = str(error).split("\n")[0]
         raise ValueError(f"checkpoint: {str(path)!r} does not fit, it is of another architecture ({reason})") from error
