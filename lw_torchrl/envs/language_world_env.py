@@ -10,24 +10,25 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Bounded, Categorical, Composite, Unbounded
-from torchrl.envs import EnvBase
 
 from lw_torchrl._checks import check_choice, check_int
 from lw_torchrl.envs.engine import ACTION_SIZE, OBSERVATION_SIZE, Engine
+from lw_torchrl.envs.metaworld_engine import MetaWorldEngine, naming_absent_renderer
 from lw_torchrl.envs.seeding import episode_seed
+from lw_torchrl.envs.vectorized_engine import VectorizedEngine
 from lw_torchrl.language.tasks import resolve_tasks, task_id
 
-ENGINES = ("metaworld",)
+with naming_absent_renderer():  # torchrl.envs imports MuJoCo
+    from torchrl.data import Bounded, Categorical, Composite, Unbounded
+    from torchrl.envs import EnvBase
+
+ENGINES: dict[str, Callable[..., Engine]] = {"vectorized": VectorizedEngine, "metaworld": MetaWorldEngine}
 
 
 def _make_engine(engine: str | Callable[..., Engine], rows: list[str], **options: Any) -> Engine:
     if callable(engine):
         return engine(rows, **options)
-    check_choice("engine", engine, ENGINES)
-    from lw_torchrl.envs.metaworld_engine import MetaWorldEngine
-
-    return MetaWorldEngine(rows, **options)
+    return ENGINES[check_choice("engine", engine, ENGINES)](rows, **options)
 
 
 class LanguageWorldEnv(EnvBase):
@@ -55,16 +56,17 @@ class LanguageWorldEnv(EnvBase):
         tasks: "MT10", "MT50", a task's name, or a list of names.
         num_envs: N, at least the number of tasks; None for one environment each.
         seed: any integer; :meth:`set_seed` starts again at episode 0.
-        engine: "metaworld" for Meta-World's own environments in a loop, or a callable
-            ``(row_tasks, *, reward, num_threads) -> Engine``.
-        num_threads: for engines that use threads; never changes a result.
+        engine: "vectorized", the fast one; "metaworld" for Meta-World's own environments in a loop, which gives the
+            same numbers; or a callable ``(row_tasks, *, reward, num_threads) -> Engine``.
+        num_threads: of the simulation, by default the cores this process may use; never changes a result.
         reward: "sparse", the success as 0 and 1, or "dense", Meta-World's own.
         max_steps: steps until truncation.
         strict: raise on a NaN action or an unstable simulation, instead of truncating the row with a warning.
 
     Raises:
         ValueError: an unknown task or engine, or ``num_envs`` under the number of tasks.
-        ImportError: a rendering library named by MUJOCO_GL is absent.
+        ImportError: a rendering library named by MUJOCO_GL is absent, or the vectorized engine does not know the
+            installed version of Meta-World or MuJoCo.
 
     Example:
         >>> env = LanguageWorldEnv(["reach", "push"], num_envs=4, seed=0)
@@ -82,7 +84,7 @@ class LanguageWorldEnv(EnvBase):
         *,
         num_envs: int | None = None,
         seed: int = 0,
-        engine: Literal["metaworld"] | Callable[..., Engine] = "metaworld",
+        engine: Literal["vectorized", "metaworld"] | Callable[..., Engine] = "vectorized",
         num_threads: int | None = None,
         reward: Literal["sparse", "dense"] = "sparse",
         max_steps: int = 500,
@@ -124,6 +126,8 @@ class LanguageWorldEnv(EnvBase):
             fault=flag.clone(),
             shape=(n,),
         )
+        # What a reset may read: a TransformedEnv hands down nothing of the reset tensordict that is not state.
+        self.state_spec = Composite(episode=Unbounded((n,), dtype=torch.int64), shape=(n,))
         self.action_spec = Bounded(-1.0, 1.0, (n, ACTION_SIZE))
         self.reward_spec = Unbounded((n, 1))
         self.done_spec = Composite(done=flag.clone(), terminated=flag.clone(), truncated=flag.clone(), shape=(n,))
@@ -166,6 +170,11 @@ class LanguageWorldEnv(EnvBase):
         if named is None:
             episodes = (self._resets * self._copies + self._rank)[rows]
         else:
+            if named.numel() != len(self.row_tasks) or named.dtype not in (torch.int64, torch.int32):
+                raise ValueError(
+                    f"episode must be int64 of shape {tuple(self.batch_size)}, got {named.dtype} of shape "
+                    f"{tuple(named.shape)}"
+                )
             episodes = named.reshape(self.batch_size).cpu().numpy()[rows]
             if (episodes < 0).any():
                 raise ValueError(f"episode must be at least 0, got {episodes.min()}")
@@ -182,19 +191,19 @@ class LanguageWorldEnv(EnvBase):
         return self._state()
 
     def _executed(self, tensordict: TensorDictBase) -> Tensor:
-        action = tensordict.get("action")
-        if action.shape != (*self.batch_size, ACTION_SIZE) or action.dtype != torch.float32:
-            raise ValueError(
-                f"action must be float32 of shape {(*self.batch_size, ACTION_SIZE)}, got {action.dtype} of shape "
-                f"{tuple(action.shape)}"
-            )
+        action = tensordict.get("action", None)
+        if action is None or action.shape != (*self.batch_size, ACTION_SIZE) or action.dtype != torch.float32:
+            given = "none" if action is None else f"{action.dtype} of shape {tuple(action.shape)}"
+            raise ValueError(f"action must be float32 of shape {(*self.batch_size, ACTION_SIZE)}, got {given}")
         executed = action.detach().clamp(-1.0, 1.0)
         if not torch.equal(executed, action):
-            # In place, since a transformed environment steps a copy of the caller's tensordict. A tensor that
-            # repeats its memory cannot be written to; then the caller's entry is replaced where it can be.
+            # In place, since a transformed environment steps a copy of the caller's tensordict; once where an
+            # expanded tensor repeats its memory. If it repeats it otherwise, it cannot be written to; then the
+            # caller's entry is replaced where it can be.
+            once = tuple(slice(0, 1) if stride == 0 else slice(None) for stride in action.stride())
             with torch.no_grad():
                 try:
-                    action.copy_(executed)
+                    action[once].copy_(executed[once])
                 except RuntimeError:
                     tensordict.set("action", executed)
         return executed

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, Literal
 
 import numpy as np
@@ -17,18 +18,26 @@ RENDER_LIBRARIES = {
 }
 
 
-def import_metaworld() -> Any:
-    """Import Meta-World, or say what its obscure AttributeError means: a rendering library that is absent."""
+@contextmanager
+def naming_absent_renderer() -> Iterator[None]:
+    """Say what the obscure AttributeError of importing MuJoCo means: the library that MUJOCO_GL asks for is absent."""
     try:
-        import metaworld
-        import metaworld.policies
+        yield
     except AttributeError as error:
         backend = os.environ.get("MUJOCO_GL", "").lower()
-        needs = RENDER_LIBRARIES.get(backend, "an OpenGL library")
+        if backend not in RENDER_LIBRARIES:
+            raise
         raise ImportError(
-            f"MUJOCO_GL is {backend!r}, but {needs} is not installed. Install it, or unset MUJOCO_GL: "
-            "only camera images need it."
+            f"MUJOCO_GL is {backend!r}, but {RENDER_LIBRARIES[backend]} is not installed. Install it, or unset "
+            "MUJOCO_GL: only camera images need it."
         ) from error
+
+
+def import_metaworld() -> Any:
+    """Import Meta-World; an absent rendering library is named."""
+    with naming_absent_renderer():
+        import metaworld
+        import metaworld.policies
     return metaworld
 
 

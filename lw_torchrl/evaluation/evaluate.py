@@ -13,6 +13,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm.auto import tqdm
 
 from lw_torchrl._checks import check_int, check_scale
+from lw_torchrl.envs.engine import ACTION_SIZE
 from lw_torchrl.envs.episodes import in_blocks, run_episodes
 from lw_torchrl.envs.experts import ExpertActor
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
@@ -53,6 +54,20 @@ def _result(task: str, episode: int, steps: TensorDictBase, stopped_early: bool,
     )
 
 
+def _checked(policy: Callable[[TensorDictBase], TensorDictBase]) -> Callable[[TensorDictBase], TensorDictBase]:
+    def run(tensordict: TensorDictBase) -> TensorDictBase:
+        tensordict = policy(tensordict)
+        action, shape = tensordict.get("action"), (*tensordict.batch_size, ACTION_SIZE)
+        if action.shape != shape or action.dtype != torch.float32:
+            raise ValueError(
+                f"the actor's action must be float32 of shape {shape}, got {action.dtype} of shape "
+                f"{tuple(action.shape)}"
+            )
+        return tensordict
+
+    return run
+
+
 def evaluate(
     actor: TensorDictModuleBase | Callable[[TensorDictBase], TensorDictBase],
     *,
@@ -66,7 +81,7 @@ def evaluate(
     record_actions: bool = False,
     reward: Literal["sparse", "dense"] = "sparse",
     max_steps: int = 500,
-    engine: Any = "metaworld",
+    engine: Any = "vectorized",
     num_threads: int | None = None,
     progress: bool = True,
 ) -> EvaluationResult:
@@ -112,8 +127,8 @@ def evaluate(
     check_int("episodes_per_task", episodes_per_task, minimum=1)
     check_scale("noise_scale", noise_scale)
     answered = actor_plans(actor, plans)
-    if num_envs is None:
-        num_envs = max(len(names), min(50, len(names) * episodes_per_task))
+    most = len(names) * episodes_per_task  # a row more would have nothing to do
+    num_envs = max(len(names), min(50, most)) if num_envs is None else min(check_int("num_envs", num_envs), most)
     if answered is not None:
         answered.require(names)
     base = LanguageWorldEnv(
@@ -145,7 +160,7 @@ def evaluate(
         with bar, torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
             for task, episode, steps in run_episodes(
                 env,
-                policy,
+                _checked(policy),
                 {task: range(episodes_per_task) for task in names},
                 keys=["action", ("next", "success"), ("next", "reward")],
                 noise=(lambda _: (noise_scale,) * 4) if noise_scale else None,

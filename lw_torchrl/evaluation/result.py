@@ -114,7 +114,10 @@ class EvaluationResult:
             found = json.loads(Path(path).read_text("utf-8"))
             if (found["format"], found["version"]) != (FORMAT, FORMAT_VERSION):
                 raise ValueError(f"format {found['format']!r} version {found['version']!r}")
-            return cls(found["config"], tuple(EpisodeResult(**episode) for episode in found["episodes"]))
+            result = cls(found["config"], tuple(EpisodeResult(**episode) for episode in found["episodes"]))
+            if set(result.config["tasks"]) != {episode.task for episode in result.episodes}:
+                raise ValueError("its tasks and its episodes do not agree")
+            return result
         except FileNotFoundError:
             raise FileNotFoundError(
                 f"path: no result file {str(path)!r}; evaluate(...).save(path) writes one"

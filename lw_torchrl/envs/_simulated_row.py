@@ -1,0 +1,97 @@
+"""One row of the vectorised engine: a MuJoCo state on a model that other rows use too."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from lw_torchrl.envs._models import SharedModel
+from lw_torchrl.envs._readings import StateWindow, reading_index
+from lw_torchrl.envs._simulation_table import TaskSources
+from lw_torchrl.envs._task_program import WARNED_ALREADY
+
+Array = NDArray[np.float64]
+
+UNSTABLE = slice(int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADQACC) + 1)
+"""MuJoCo's three warnings of an unstable simulation: bad positions, velocities or accelerations."""
+
+WARNING_KINDS = 3
+
+
+class SimulatedRow:
+    """A state, the places its last reset gave to bodies and sites, and Meta-World's program for its task.
+
+    Args:
+        sources: where the row's task finds its numbers.
+        shared: the model, which no other thread may use while this row simulates or resets.
+        builder: the task's program on that model, from which each episode takes a copy.
+    """
+
+    def __init__(self, sources: TaskSources, shared: SharedModel, builder: Any) -> None:
+        self.sources = sources
+        self.shared = shared
+        self.program: Any = None
+        self._builder = builder
+        self._model = shared.model
+        self._data = mujoco.MjData(shared.model)
+        self._body_pos = shared.compiled_body_pos.copy()
+        self._site_pos = shared.compiled_site_pos.copy()
+        self._substeps: int = builder.frame_skip
+        self._mocap: Array = self._data.mocap_pos[0]
+        self._control: Array = self._data.ctrl
+        window = StateWindow(self._model, self._data)
+        self._numbers = window.numbers
+        self._reading_index = reading_index(window, sources)
+        self._warnings: NDArray[np.int32] = self._data.warning.number[UNSTABLE]
+
+    def reset(self, seed: int) -> Array:
+        """Start an episode, a function of the seed alone; returns the first observation."""
+        self.shared.restore()
+        self.program = self._builder.on(self._data)
+        observation = self.program.start_episode(seed)
+        self._body_pos[...] = self.shared.body_pos
+        self._site_pos[...] = self.shared.site_pos
+        self.shared.holder = self
+        return observation
+
+    @property
+    def mocap(self) -> Array:
+        """(3,) the place that the hand is drawn to."""
+        return self._mocap
+
+    @property
+    def goal(self) -> Array:
+        """(3,) where the last reset put the goal."""
+        return self.program.present_goal()
+
+    def simulate(self, mocap: Array, control: Array, readings: Array, warnings: NDArray[np.int32]) -> None:
+        """One step of the environment: five of physics, and one more look without moving.
+
+        That look, ``mj_forward``, also leaves the accelerations from which the next step's solver starts, so
+        without it the numbers would drift apart from Meta-World's. ``readings`` (WIDTH,) and ``warnings`` (3,)
+        are filled at once, while the state is still in the processor's cache.
+        """
+        self._take_model()
+        self._mocap[...] = mocap
+        self._control[...] = control
+        mujoco.mj_step(self._model, self._data, self._substeps)
+        mujoco.mj_forward(self._model, self._data)
+        self._numbers.take(self._reading_index, out=readings, mode="clip")
+        warnings[...] = self._warnings
+
+    def dense_reward(self, action: NDArray[Any], observation: Array) -> float:
+        """Meta-World's reward of the present state."""
+        self._take_model()
+        return self.program.dense_reward(action, observation)
+
+    def _take_model(self) -> None:
+        if self.shared.holder is not self:
+            self.shared.load(self, self._body_pos, self._site_pos)
+
+
+def is_stable(observation: Array, warnings: NDArray[np.int32]) -> NDArray[np.bool_]:
+    """(rows,) whether the numbers are finite and MuJoCo gave none of its three warnings since the reset."""
+    return np.isfinite(observation).all(axis=1) & (warnings == WARNED_ALREADY).all(axis=1)

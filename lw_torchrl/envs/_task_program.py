@@ -1,0 +1,132 @@
+"""Meta-World's own reset and dense reward, run on a model and a state that this library owns."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import mujoco
+import numpy as np
+from gymnasium.utils import seeding
+from numpy.typing import NDArray
+
+from lw_torchrl._checks import check_choice
+from lw_torchrl.envs._models import SharedModel
+from lw_torchrl.envs.metaworld_engine import import_metaworld
+
+WARNED_ALREADY = 1000
+"""MuJoCo prints a warning, and writes MUJOCO_LOG.TXT, only when its count of that kind is zero. We start the
+counts here instead: nothing is written, and a count that is another number tells of a warning."""
+
+
+def silence_warnings(data: Any) -> None:
+    """Let MuJoCo count this state's warnings without printing them; a reset of the state undoes it."""
+    data.warning.number[:] = WARNED_ALREADY
+
+
+class TaskProgram:
+    """A Meta-World environment without a simulator of its own.
+
+    Mixed into one of Meta-World's classes by :func:`make_task_program`. It is built once for each model;
+    every episode of every row then runs on a light copy (:meth:`on`) that shares everything but the state.
+    """
+
+    model: Any
+    data: Any
+    frame_skip: int
+    hand_init_pos: NDArray[np.float64]
+    tcp_center: NDArray[np.float64]
+    _target_pos: NDArray[np.float64]
+    reset_model: Callable[[], NDArray[np.float64]]
+    compute_reward: Callable[..., tuple[Any, ...]]
+    get_body_com: Callable[[str], NDArray[np.float64]]
+
+    _moves_hand = True
+
+    def __init__(self, model: Any) -> None:
+        self.model = model
+        super().__init__()
+        # The goal is part of the observation; each reset draws a new initial state and goal from the seed.
+        self._partially_observable = False
+        self.__dict__.pop("sawyer_observation_space", None)
+        self._set_task_called = True
+        self._freeze_rand_vec = False
+        self.seeded_rand_vec = True
+        self.mujoco_renderer = None
+        self.data = None
+
+    def _initialize_simulation(self) -> tuple[Any, Any]:
+        return self.model, mujoco.MjData(self.model)
+
+    def on(self, data: Any) -> TaskProgram:
+        """A copy of this program, as it was when built, that works on ``data``."""
+        program = object.__new__(type(self))
+        program.__dict__.update(self.__dict__)
+        program.data = data
+        # Two attributes are windows into the state: in Meta-World they follow the fingers of its one state.
+        program.init_left_pad = program.get_body_com("leftpad")  # type: ignore[attr-defined]
+        program.init_right_pad = program.get_body_com("rightpad")  # type: ignore[attr-defined]
+        return program
+
+    def start_episode(self, seed: int) -> NDArray[np.float64]:
+        """Reset as Meta-World's ``env.seed(seed); env.reset()`` does; returns the first observation.
+
+        Meta-World places everything twice and simulates the hand's way to its start both times. Of the first
+        round only the random draws and the places it gives to bodies and sites survive, and neither depends
+        on the hand, so here the first round leaves the hand alone.
+        """
+        self.np_random, _ = seeding.np_random(seed)
+        mujoco.mj_resetData(self.model, self.data)
+        silence_warnings(self.data)
+        mujoco.mj_forward(self.model, self.data)
+        self._moves_hand = False
+        self.reset_model()
+
+        mujoco.mj_resetData(self.model, self.data)
+        silence_warnings(self.data)
+        self._moves_hand = True
+        observation = self.reset_model()
+        observation[18:36] = observation[:18]
+        return observation
+
+    def _reset_hand(self, steps: int = 50) -> None:
+        if self._moves_hand:
+            self.data.mocap_pos[:] = self.hand_init_pos
+            self.data.mocap_quat[:] = (1.0, 0.0, 1.0, 0.0)
+            self.data.ctrl[:] = (-1.0, 1.0)
+            mujoco.mj_step(self.model, self.data, nstep=steps * self.frame_skip)
+        self.init_tcp = self.tcp_center
+
+    def present_goal(self) -> NDArray[np.float64]:
+        """Where the goal is now."""
+        return self._target_pos
+
+    def dense_reward(self, action: NDArray[Any], observation: NDArray[np.float64]) -> float:
+        """Meta-World's reward of the present state; it may keep notes until the next call."""
+        return float(self.compute_reward(action, observation)[0])
+
+
+def _task_class(task: str) -> Any:
+    import_metaworld()
+    from metaworld.env_dict import ALL_V3_ENVIRONMENTS
+
+    check_choice("task", f"{task}-v3", ALL_V3_ENVIRONMENTS)
+    return ALL_V3_ENVIRONMENTS[f"{task}-v3"]
+
+
+@cache
+def _program_class(task: str) -> Any:
+    base = _task_class(task)
+    return type(f"{base.__name__}Program", (TaskProgram, base), {})
+
+
+def model_path(task: str) -> str:
+    """The XML file of a task; 36 files serve the 50 tasks."""
+    task_class = _task_class(task)
+    return object.__new__(task_class).model_name
+
+
+def make_task_program(task: str, shared: SharedModel) -> Any:
+    """Meta-World's program of ``task`` on a shared model."""
+    return _program_class(task)(shared.model)

@@ -1,0 +1,158 @@
+"""Meta-World's success of many rows at once.
+
+Nearly every task succeeds when a point comes close to the goal. What the other rules of
+data/simulation.toml mean is written at the method of each.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lw_torchrl.envs._readings import GRIPPER, JOINT, LEFT_TIP, OBJECT, POINT, RIGHT_TIP, SECOND
+from lw_torchrl.envs._simulation_table import TaskSources
+from lw_torchrl.envs._vectorized_observation import row_norm
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+Truth = NDArray[np.bool_]
+
+
+class Scene(NamedTuple):
+    """What a rule looks at, one entry a row.
+
+    Attributes:
+        near: whether the point is as close to the goal as the table asks.
+        readings: what was read from the states.
+        current: the first 18 numbers of the observations.
+        goal: (rows, 3) the goals.
+        point: (rows, 3) what is to come close to them.
+    """
+
+    near: Truth
+    readings: Array
+    current: Array
+    goal: Array
+    point: Array
+
+
+STICK_LIFT = 0.01  # metres above where the stick lay
+STICK_SIDEWAYS = 0.04  # metres between the stick's end and the handle
+STICK_UPWARD = 0.06
+
+
+class SuccessJudge:
+    """Judges a fixed set of rows.
+
+    Args:
+        sources: each row's task.
+        programs: gives a row's :class:`~lw_torchrl.envs._task_program.TaskProgram` of its present episode,
+            for the one rule that looks at contacts.
+    """
+
+    def __init__(self, sources: Sequence[TaskSources], programs: Callable[[int], Any]) -> None:
+        success = [row.success for row in sources]
+        self._programs = programs
+        self._offset = np.array([row.offset for row in success])
+        self._axes = np.array([row.axes for row in success])
+        self._within = np.array([row.within for row in success])
+        self._under = np.array([row.under for row in success])
+        self._above = np.array([row.above for row in success])
+        self._angle = np.array([row.angle for row in success])
+        points = [row.point for row in success]
+        self._seconds = np.flatnonzero([point == "second" for point in points])
+        self._grippers = np.flatnonzero([point == "gripper" for point in points])
+        self._places = np.flatnonzero([point not in ("object", "second", "gripper") for point in points])
+        self._at_height = np.flatnonzero([row.goal_height is not None for row in success])
+        self._goal_height = np.array([row.goal_height for row in success if row.goal_height is not None])
+        rules = [row.rule for row in success]
+        self._rules = [
+            (RULES[name], np.flatnonzero([rule == name for rule in rules]))
+            for name in sorted({rule for rule in rules if rule is not None})
+        ]
+
+    def __call__(self, readings: Array, current: Array, goal: Array) -> Truth:
+        """(rows,) whether each row stands in success.
+
+        Args:
+            readings: (rows, WIDTH) what was read from the states.
+            current: (rows, 18) the first numbers of the observations.
+            goal: (rows, 3) the goals.
+        """
+        point = current[:, OBJECT].copy()
+        if self._seconds.size:
+            point[self._seconds] = current[self._seconds, SECOND]
+        if self._grippers.size:
+            tips = readings[self._grippers]
+            point[self._grippers] = (tips[:, RIGHT_TIP] + tips[:, LEFT_TIP]) / 2.0
+        if self._places.size:
+            point[self._places] = readings[self._places, POINT]
+        if self._at_height.size:
+            goal = goal.copy()
+            goal[self._at_height, 2] = self._goal_height
+        distance = row_norm((point + self._offset - goal) * self._axes)
+        success = (distance <= self._within) & (distance < self._under)
+        scene = Scene(success, readings, current, goal, point)
+        for rule, rows in self._rules:
+            success[rows] = rule(self, rows, scene)
+        return success
+
+    def _point_below_goal(self, rows: Index, scene: Scene) -> Truth:
+        """The ring is over the peg and has sunk below its top."""
+        return scene.near[rows] & (scene.goal[rows, 2] - scene.point[rows, 2] > 0.0)
+
+    def _object_above_goal(self, rows: Index, scene: Scene) -> Truth:
+        """The object is higher than the goal, wherever it is."""
+        return scene.current[rows, OBJECT.stop - 1] > scene.goal[rows, 2]
+
+    def _joint_above(self, rows: Index, scene: Scene) -> Truth:
+        """The joint has moved further than ``above``."""
+        return scene.readings[rows, JOINT.start] > self._above[rows]
+
+    def _joint_near(self, rows: Index, scene: Scene) -> Truth:
+        """The joint is within ``within`` of ``angle``."""
+        return np.abs(scene.readings[rows, JOINT.start] - self._angle[rows]) <= self._within[rows]
+
+    def _stick_inserted(self, rows: Index, scene: Scene) -> Truth:
+        """The container is at the goal, and the stick's end is through its handle."""
+        held = scene.near[rows]
+        if held.any():
+            end, handle = scene.readings[rows, POINT], scene.current[rows, SECOND]
+            aside = np.abs(end - handle)
+            held &= end[:, 0] >= handle[:, 0]
+            held &= (aside[:, 1] <= STICK_SIDEWAYS) & (aside[:, 2] <= STICK_UPWARD)
+        return held
+
+    def _stick_held(self, rows: Index, scene: Scene) -> Truth:
+        """The container is at the goal, and the gripper holds the stick up."""
+        held = scene.near[rows]
+        for k in np.flatnonzero(held):
+            current, program = scene.current[rows[k]], self._programs(int(rows[k]))
+            lifted = current[OBJECT][2] - STICK_LIFT > program.stick_init_pos[2]
+            held[k] = current[GRIPPER] > 0.0 and lifted and both_pads_press(program, "objGeom")
+        return held
+
+
+RULES: dict[str, Callable[[SuccessJudge, Index, Scene], Truth]] = {
+    "point below goal": SuccessJudge._point_below_goal,
+    "object above goal": SuccessJudge._object_above_goal,
+    "joint above": SuccessJudge._joint_above,
+    "joint near": SuccessJudge._joint_near,
+    "stick inserted": SuccessJudge._stick_inserted,
+    "stick held": SuccessJudge._stick_held,
+}
+
+
+def both_pads_press(program: Any, geom: str) -> bool:
+    """Whether both pads of the gripper push against a geom, by the contact forces Meta-World looks at."""
+    model, data = program.model, program.data
+    pairs = data.contact.geom
+    touched = (pairs == model.geom(geom).id).any(axis=1)
+    for pad in ("leftpad_geom", "rightpad_geom"):
+        contacts = touched & (pairs == model.geom(pad).id).any(axis=1)
+        if not sum(data.efc_force[data.contact.efc_address[contacts]]) > 0:
+            return False
+    return True

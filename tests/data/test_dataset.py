@@ -1,0 +1,191 @@
+"""A dataset's folder: whatever is wrong with it is said, nothing on disk changes, no pickle is loaded."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from tensordict import NonTensorData, TensorDict
+
+from lw_torchrl.data import DatasetError, LanguageWorldExperienceReplay, collect_demonstrations
+from lw_torchrl.data.dataset import FORMAT, FORMAT_VERSION, load_rows, read_metadata
+
+
+def tree(root):
+    return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    root = tmp_path_factory.mktemp("made") / "demos"
+    return collect_demonstrations("reach", episodes_per_task=2, root=root, max_steps=5, progress=False)
+
+
+@pytest.fixture
+def root(made, tmp_path):
+    """A copy, to be damaged."""
+    return shutil.copytree(made.root, tmp_path / "demos")
+
+
+def refused(root, message):
+    """The error with which a dataset is refused; nothing on disk may change."""
+    before = tree(root)
+    with pytest.raises(DatasetError, match=message) as caught:
+        LanguageWorldExperienceReplay(root)
+    assert tree(root) == before
+    assert str(root) in str(caught.value)
+    return caught.value
+
+
+def edit(root, change):
+    path = root / "metadata.json"
+    found = json.loads(path.read_text())
+    change(found)
+    path.write_text(json.dumps(found))
+
+
+def test_the_description_reads_back(made, root):
+    found = read_metadata(root)
+    assert found.config == made.config
+    assert found.episodes == made.episodes
+    assert found.attempts == {"reach": 2}
+    assert load_rows(found).batch_size == (10,)
+
+
+def test_a_dataset_error_is_a_value_error():
+    assert issubclass(DatasetError, ValueError)
+
+
+def test_a_missing_folder_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"root: no dataset folder .*nowhere.*collect_demonstrations"):
+        LanguageWorldExperienceReplay(tmp_path / "nowhere")
+    assert not (tmp_path / "nowhere").exists()
+
+
+def test_a_file_in_place_of_the_folder_is_named(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(FileNotFoundError, match="root: no dataset folder"):
+        LanguageWorldExperienceReplay(tmp_path / "file")
+
+
+def test_a_half_written_dataset_says_how_to_finish_it(root):
+    (root / "metadata.json").unlink()
+    (root / ".partial").mkdir()
+    refused(root, "half-written; run the same collect_demonstrations again")
+
+
+def test_a_folder_of_something_else_is_no_dataset(root):
+    (root / "metadata.json").unlink()
+    refused(root, "holds no metadata.json")
+
+
+@pytest.mark.parametrize(("format", "number"), [(FORMAT, FORMAT_VERSION + 1), (FORMAT, 0), ("minari", FORMAT_VERSION)])
+def test_another_format_or_version_says_both(root, format, number):
+    edit(root, lambda found: found.update(format=format, version=number))
+    refused(root, f"format {format!r} version {number}.*reads {FORMAT!r} version {FORMAT_VERSION}")
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9, 0.999])
+def test_truncated_metadata_are_damaged(root, share):
+    path = root / "metadata.json"
+    content = path.read_bytes().rstrip()
+    path.write_bytes(content[: int(share * len(content))])
+    refused(root, "damaged")
+
+
+@pytest.mark.parametrize("text", ["[]", "null", "7", '"words"', "{}", "\x00\xff"])
+def test_metadata_of_another_kind_are_damaged(root, text):
+    (root / "metadata.json").write_text(text, encoding="latin-1")
+    refused(root, "damaged")
+
+
+DAMAGE = {
+    "no configuration": lambda found: found.pop("config"),
+    "no episodes": lambda found: found.pop("episodes"),
+    "no versions": lambda found: found.pop("versions"),
+    "unknown option": lambda found: found["config"].update(colour="red"),
+    "missing option": lambda found: found["config"].pop("seed"),
+    "columns of other lengths": lambda found: found["episodes"]["length"].pop(),
+    "missing column": lambda found: found["episodes"].pop("start"),
+    "a word for a number": lambda found: found["episodes"].update(length=["five", "five"]),
+    "nothing for a number": lambda found: found["episodes"].update(start=[None, 5]),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGE)
+def test_metadata_with_parts_missing_or_wrong_are_damaged(root, name):
+    edit(root, DAMAGE[name])
+    refused(root, "damaged")
+
+
+def test_rows_and_metadata_that_disagree_are_damaged(root):
+    edit(root, lambda found: found["episodes"].update(length=[5, 4]))
+    refused(root, "has 10 rows, the metadata say 9")
+
+
+@pytest.mark.parametrize("damage", ["no folder", "no meta", "meta half", "meta empty"])
+def test_rows_without_their_description_are_refused(root, damage):
+    meta = root / "data" / "meta.json"
+    if damage == "no folder":
+        shutil.rmtree(root / "data")
+    elif damage == "no meta":
+        meta.unlink()
+    else:
+        meta.write_bytes(meta.read_bytes()[: 40 if damage == "meta half" else 0])
+    refused(root, "rows .*cannot be read")
+
+
+@pytest.mark.parametrize("name", ["observation", "expert_action", "next/observation", "task_id"])
+@pytest.mark.parametrize("damage", ["missing", "truncated", "empty"])
+def test_a_damaged_column_is_refused(root, name, damage):
+    path = root / "data" / f"{name}.memmap"
+    if damage == "missing":
+        path.unlink()
+    else:
+        path.write_bytes(path.read_bytes()[:-8] if damage == "truncated" else b"")
+    refused(root, "cannot be read")
+
+
+@pytest.mark.parametrize("name", ["observation", "expert_action", "next"])
+def test_a_dataset_that_lacks_a_column_is_refused(root, name):
+    rows = TensorDict.load_memmap(root / "data").exclude(name).clone()
+    shutil.rmtree(root / "data")
+    rows.memmap(root / "data")
+    refused(root, name)
+
+
+class Evil:
+    """Makes a folder when it is unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return (os.mkdir, (self.path,))
+
+
+def test_a_pickle_among_the_rows_is_never_executed(root, tmp_path):
+    marker = tmp_path / "executed"
+    rows = TensorDict.load_memmap(root / "data").clone()
+    rows["note"] = NonTensorData(Evil(str(marker)), batch_size=rows.batch_size)
+    shutil.rmtree(root / "data")
+    rows.memmap(root / "data")
+    assert list((root / "data").rglob("*.pickle")), "the test wants a pickle"
+    refused(root, "cannot be read")
+    assert not marker.exists()
+    TensorDict.load_memmap(root / "data", allow_pickle=True)["note"]
+    assert marker.exists(), "the pickle would have been executed"
+
+
+def test_loading_and_sampling_leave_the_files_as_they_are(root):
+    before = tree(root)
+    replay = LanguageWorldExperienceReplay(root, batch_size=4)
+    batch = replay.sample()
+    batch["observation"].zero_()
+    batch["action"].fill_(torch.nan)
+    assert tree(root) == before
+    assert np.isfinite(replay[:]["action"].numpy()).all()

@@ -1,0 +1,219 @@
+"""TaskBalancedSampler: exact counts, no row twice in a pass, and batches that can be had again."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, RandomSampler, TensorDictReplayBuffer
+
+from lw_torchrl.data import TaskBalancedSampler
+
+sizes = st.lists(st.integers(1, 9), min_size=1, max_size=5)  # rows of each task
+counts = st.integers(1, 12)  # rows of a task in a batch
+seeds = st.integers(0, 2**31)
+
+
+def make_rows(sizes, first_task=3, shuffled=0):
+    tasks = torch.cat([torch.full((size,), first_task + 2 * i) for i, size in enumerate(sizes)])
+    order = torch.randperm(len(tasks), generator=torch.Generator().manual_seed(shuffled))
+    return TensorDict({"task_id": tasks[order], "row": torch.arange(len(tasks))}, [len(tasks)])
+
+
+def make_replay(rows, batch_size, seed=0, capacity=None, sampler=None):
+    replay = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(capacity or len(rows)),
+        sampler=sampler or TaskBalancedSampler(),
+        batch_size=batch_size,
+        generator=torch.Generator().manual_seed(seed),
+    )
+    if len(rows):
+        replay.extend(rows)
+    return replay
+
+
+def drawn(replay, number):
+    return [replay.sample()["row"].tolist() for _ in range(number)]
+
+
+@settings(max_examples=60, deadline=None)
+@given(sizes, counts, seeds)
+def test_every_batch_holds_equal_numbers_of_every_task(sizes, count, seed):
+    replay = make_replay(make_rows(sizes), count * len(sizes), seed)
+    for _ in range(5):
+        tasks, found = replay.sample()["task_id"].unique(return_counts=True)
+        assert tasks.tolist() == [3 + 2 * i for i in range(len(sizes))]
+        assert found.tolist() == [count] * len(sizes)
+
+
+@settings(max_examples=60, deadline=None)
+@given(sizes, counts, seeds)
+def test_within_a_task_every_row_comes_once_before_any_comes_again(sizes, count, seed):
+    rows = make_rows(sizes)
+    replay = make_replay(rows, count * len(sizes), seed)
+    batches = [replay.sample() for _ in range(8)]
+    for i in range(len(sizes)):
+        mine = torch.cat([batch["row"][batch["task_id"] == 3 + 2 * i] for batch in batches]).tolist()
+        everything = sorted(rows["row"][rows["task_id"] == 3 + 2 * i].tolist())
+        for start in range(0, len(mine) - sizes[i] + 1, sizes[i]):
+            assert sorted(mine[start : start + sizes[i]]) == everything
+        rest = mine[len(mine) // sizes[i] * sizes[i] :]
+        assert len(set(rest)) == len(rest)
+
+
+@settings(max_examples=30, deadline=None)
+@given(sizes, counts, seeds)
+def test_the_generator_fixes_the_batches(sizes, count, seed):
+    one, two = (make_replay(make_rows(sizes), count * len(sizes), seed) for _ in range(2))
+    torch.rand(3)  # the global generator plays no part
+    assert drawn(one, 4) == drawn(two, 4)
+
+
+def test_another_seed_gives_other_batches_and_a_pass_another_order():
+    rows = make_rows([40, 40])
+    assert drawn(make_replay(rows, 20, 0), 1) != drawn(make_replay(rows, 20, 1), 1)
+    passes = drawn(make_replay(rows, 80), 2)
+    assert passes[0] != passes[1]
+    assert sorted(passes[0]) == sorted(passes[1])
+
+
+@settings(max_examples=40, deadline=None)
+@given(sizes, counts, seeds, st.integers(0, 5))
+def test_a_state_saved_anywhere_gives_the_same_batches_again(sizes, count, seed, before):
+    rows = make_rows(sizes)
+    replay = make_replay(rows, count * len(sizes), seed)
+    drawn(replay, before)
+    state = replay.sampler.state_dict()
+    generator = torch.Generator()
+    generator.set_state(replay._rng.get_state())
+    expected = drawn(replay, 5)
+    other = make_replay(rows, count * len(sizes), seed + 1)
+    drawn(other, 1)
+    other.sampler.load_state_dict(state)
+    other.set_rng(generator)
+    assert drawn(other, 5) == expected
+
+
+def test_a_saved_state_does_not_change_with_the_sampler():
+    replay = make_replay(make_rows([7, 5]), 4)
+    drawn(replay, 1)
+    state = replay.sampler.state_dict()
+    before = {key: value.clone() for key, value in state.items()}
+    drawn(replay, 9)
+    assert all(torch.equal(state[key], before[key]) for key in before)
+
+
+@pytest.mark.parametrize("before", [0, 2])
+def test_the_state_goes_through_a_folder(tmp_path, before):
+    rows = make_rows([7, 5, 9])
+    replay = make_replay(rows, 12)
+    drawn(replay, before)
+    replay.sampler.dumps(tmp_path / "sampler")
+    assert not list(tmp_path.rglob("*.pickle"))
+    generator = torch.Generator()
+    generator.set_state(replay._rng.get_state())
+    expected = drawn(replay, 5)
+    other = make_replay(rows, 12, seed=9)
+    other.sampler.loads(tmp_path / "sampler")
+    other.set_rng(generator)
+    assert drawn(other, 5) == expected
+    other.sampler.load_state_dict(other.sampler.state_dict())
+
+
+def test_the_state_is_part_of_the_replay_buffers():
+    rows = make_rows([7, 5, 9])
+    replay = make_replay(rows, 12)
+    drawn(replay, 2)
+    state = replay.state_dict()
+    rng = replay._rng.get_state()
+    expected = drawn(replay, 4)
+    other = make_replay(rows, 12, seed=9)
+    other.load_state_dict(state)
+    other._rng.set_state(rng)
+    assert drawn(other, 4) == expected
+
+
+@pytest.mark.parametrize(
+    ("tasks", "batch_size", "nearest"),
+    [(3, 100, "99 and 102"), (3, 2, "3"), (10, 512, "510 and 520"), (7, 1, "7")],
+)
+def test_a_batch_that_the_tasks_do_not_divide_is_refused_with_the_nearest(tasks, batch_size, nearest):
+    replay = make_replay(make_rows([4] * tasks), batch_size)
+    with pytest.raises(ValueError, match=f"number of tasks, {tasks}, got {batch_size}; the nearest are {nearest}$"):
+        replay.sample()
+
+
+def test_after_a_refused_batch_size_sampling_goes_on():
+    replay = make_replay(make_rows([4, 4]), 4)
+    drawn(replay, 1)
+    with pytest.raises(ValueError, match="batch_size"):
+        replay.sampler.sample(replay.storage, 3)
+    tasks = replay.sample()["task_id"].bincount().tolist()
+    assert tasks == [0, 0, 0, 2, 0, 2]
+
+
+def test_an_empty_storage_is_refused():
+    replay = make_replay([], 4, capacity=10)
+    with pytest.raises((ValueError, RuntimeError), match="empty"):
+        replay.sample()
+    with pytest.raises(ValueError, match="storage must hold at least one row, got an empty one"):
+        TaskBalancedSampler().sample(LazyTensorStorage(10), 4)
+
+
+@settings(max_examples=40, deadline=None)
+@given(sizes, counts, seeds)
+def test_it_ran_out_whenever_a_batch_ends_a_pass_over_the_largest_task(sizes, count, seed):
+    replay = make_replay(make_rows(sizes), count * len(sizes), seed)
+    largest = max(sizes)
+    for batch in range(1, 9):
+        replay.sample()
+        ended = batch * count // largest > (batch - 1) * count // largest
+        assert replay.sampler.ran_out == ended
+
+
+def test_ran_out_can_be_set():
+    sampler = TaskBalancedSampler()
+    assert sampler.ran_out is False
+    sampler.ran_out = True
+    assert sampler.ran_out is True
+
+
+def test_a_buffer_that_grows_is_grouped_again():
+    replay = make_replay(make_rows([4, 4]), None, capacity=100)
+    replay.sample(4)
+    more = make_rows([6], first_task=20)
+    replay.extend(more.set("row", more["row"] + 8))
+    batch = replay.sample(6)
+    assert batch["task_id"].bincount(minlength=21)[[3, 5, 20]].tolist() == [2, 2, 2]
+    seen = {row for _ in range(10) for row in replay.sample(6)["row"].tolist()}
+    assert seen == set(range(14))
+
+
+def test_a_full_buffer_that_is_overwritten_is_grouped_again():
+    replay = make_replay(make_rows([4, 4]), 4, capacity=8)
+    drawn(replay, 1)
+    replay.extend(make_rows([2, 6], first_task=30))
+    for _ in range(4):
+        assert replay.sample()["task_id"].bincount(minlength=33)[[30, 32]].tolist() == [2, 2]
+
+
+def test_an_emptied_buffer_can_be_filled_again():
+    replay = make_replay(make_rows([4, 4]), 4, capacity=8)
+    drawn(replay, 1)
+    replay.empty()
+    replay.extend(make_rows([2, 6], first_task=30))
+    assert replay.sample()["task_id"].bincount(minlength=33)[[30, 32]].tolist() == [2, 2]
+
+
+def test_the_task_key_can_be_another():
+    rows = make_rows([4, 4]).rename_key_("task_id", "kind")
+    replay = make_replay(rows, 4, sampler=TaskBalancedSampler(task_key="kind"))
+    assert replay.sample()["kind"].bincount().tolist() == [0, 0, 0, 2, 0, 2]
+
+
+def test_the_counts_of_torchrls_random_sampler_are_not_exact():
+    """Why there is a sampler of our own."""
+    replay = make_replay(make_rows([50, 50]), 10, sampler=RandomSampler())
+    assert len({int((replay.sample()["task_id"] == 3).sum()) for _ in range(20)}) > 1

@@ -1,0 +1,354 @@
+"""evaluate: exactly the episodes asked for, the same whatever runs beside them, and true in Meta-World's own envs."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import pytest
+import torch
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.envs.utils import ExplorationType, exploration_type
+
+from lw_torchrl.data import LanguageWorldExperienceReplay, TaskBalancedSampler, collect_demonstrations
+from lw_torchrl.envs import ExpertActor, QAFTransform
+from lw_torchrl.envs.metaworld_engine import MetaWorldEngine, make_metaworld_env
+from lw_torchrl.envs.seeding import action_noise, episode_seed
+from lw_torchrl.evaluation import evaluate
+from lw_torchrl.language.plans import ConditionalPlan, Plans, load_plans
+from lw_torchrl.modules import DescriptorConditionedActor, PlanConditionedActor
+from lw_torchrl.trainers import BehavioralCloningConfig, BehavioralCloningTrainer
+
+PLANS = load_plans("MT10")
+SEED = 1000
+
+
+def run(actor, tasks, **changed):
+    options = dict(episodes_per_task=3, seed=SEED, max_steps=40, record_actions=True, progress=False)
+    return evaluate(actor, tasks=tasks, **{**options, **changed})
+
+
+def make_actor(seed=0, **options):
+    torch.manual_seed(seed)
+    return PlanConditionedActor(PLANS, **options)
+
+
+def by_episode(result):
+    return {(e.task, e.episode): e for e in result.episodes}
+
+
+def assert_same(found, expected):
+    """The same episodes with the very same actions."""
+    found, expected = by_episode(found), by_episode(expected)
+    assert found == expected
+    for key in expected:
+        assert torch.equal(found[key].actions, expected[key].actions), key
+
+
+# ---- which episodes
+
+
+@pytest.mark.parametrize("num_envs", [None, 2, 5, 20])
+def test_exactly_k_episodes_of_each_task(num_envs):
+    result = run(ExpertActor(["push", "reach"]), ["reach", "push"], num_envs=num_envs, max_steps=4)
+    assert [(e.task, e.episode) for e in result.episodes] == list(product(["push", "reach"], range(3)))
+    assert all(e.actions.shape == (4, 4) and e.actions.dtype == torch.float32 for e in result.episodes)
+    assert result.config["tasks"] == ["push", "reach"]
+    assert result.config["seed"] == SEED
+
+
+def test_actions_are_kept_only_if_asked():
+    result = run(ExpertActor("reach"), "reach", max_steps=3, record_actions=False)
+    assert [e.actions for e in result.episodes] == [None] * 3
+
+
+@pytest.fixture(scope="module")
+def alone():
+    """A policy's run with two rows only."""
+    return run(make_actor(), ["drawer-open", "push"], num_envs=2)
+
+
+@pytest.mark.parametrize("num_envs", [None, 3, 7])
+def test_the_number_of_environments_changes_no_bit(alone, num_envs):
+    assert_same(run(make_actor(), ["drawer-open", "push"], num_envs=num_envs), alone)
+
+
+def test_more_rows_than_a_block_change_no_bit(alone):
+    assert_same(run(make_actor(), ["drawer-open", "push"], num_envs=66, episodes_per_task=3), alone)
+
+
+def test_the_tasks_beside_change_no_bit(alone):
+    beside = by_episode(run(make_actor(), ["drawer-open", "push", "reach", "window-open"], num_envs=9))
+    for key, episode in by_episode(alone).items():
+        assert torch.equal(beside[key].actions, episode.actions)
+        assert beside[key] == episode
+
+
+def test_more_episodes_begin_with_the_same(alone):
+    more = by_episode(run(make_actor(), "push", episodes_per_task=5))
+    for key, episode in by_episode(alone).items():
+        if key[0] == "push":
+            assert torch.equal(more[key].actions, episode.actions)
+
+
+def test_another_engine_of_the_same_physics_changes_no_bit(alone):
+    assert_same(run(make_actor(), ["drawer-open", "push"], engine=MetaWorldEngine, num_threads=2), alone)
+
+
+def test_a_plain_function_and_the_baseline_are_run_the_same_way():
+    actor = DescriptorConditionedActor("MT10").eval()
+    one = run(actor, "reach", num_envs=1, max_steps=15)
+    assert_same(run(lambda state: actor(state), "reach", num_envs=3, max_steps=15), one)
+    assert_same(run(actor, "reach", num_envs=3, max_steps=15), one)
+
+
+def test_another_seed_gives_other_episodes(alone):
+    other = by_episode(run(make_actor(), "push", seed=SEED + 1, noise_scale=0.0, episodes_per_task=1))
+    mine = by_episode(run(make_actor(), "push", noise_scale=0.0, episodes_per_task=1))
+    assert not torch.equal(other["push", 0].actions, mine["push", 0].actions)
+
+
+# ---- what is executed
+
+
+def test_the_noise_is_the_episodes_own_and_clipped():
+    def still(state):
+        return state.set("action", torch.full((*state.batch_size, 4), 0.9))
+
+    result = run(still, "reach", noise_scale=0.2, num_envs=2)
+    for e in result.episodes:
+        noise = action_noise("reach", SEED, e.episode, 40) * np.float32(0.2)
+        assert torch.equal(e.actions, (0.9 + torch.from_numpy(noise)).clamp(-1, 1))
+    quiet = run(still, "reach", noise_scale=0.0)
+    assert all((e.actions == 0.9).all() for e in quiet.episodes)
+
+
+def test_actions_out_of_range_are_recorded_as_executed():
+    def strong(state):
+        return state.set("action", torch.tensor([3.0, -7.0, 0.5, 1.0]).expand(*state.batch_size, 4).clone())
+
+    result = run(strong, "reach", noise_scale=0.0, max_steps=5)
+    assert all(e.actions.tolist() == [[1.0, -1.0, 0.5, 1.0]] * 5 for e in result.episodes)
+
+
+def replay(env, task, episode, actions):
+    """Success at each step in Meta-World's own environment."""
+    env.seed(episode_seed(task, SEED, episode))
+    env.reset()
+    return [bool(env.step(action.numpy())[4]["success"]) for action in actions]
+
+
+def assert_true_in_metaworld(result):
+    envs = {task: make_metaworld_env(task) for task in result.config["tasks"]}
+    for e in result.episodes:
+        found = replay(envs[e.task], e.task, e.episode, e.actions)
+        assert any(found) == e.success, (e.task, e.episode)
+        assert (found.index(True) + 1 if any(found) else None) == e.first_success
+        if e.success_at_end is not None:
+            assert found[-1] == e.success_at_end
+            assert sum(found) == e.episode_return
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A policy that opens drawers, sometimes."""
+    root = tmp_path_factory.mktemp("demos") / "demos"
+    collect_demonstrations(
+        ["drawer-open", "reach"], episodes_per_task=4, root=root, max_steps=150, noise_scale=(0, 0.2), progress=False
+    )
+    transform = QAFTransform(PLANS)
+    replay = LanguageWorldExperienceReplay(root, sampler=TaskBalancedSampler(), transform=transform, after_success=20)
+    actor = make_actor()
+    config = BehavioralCloningConfig(steps=400, batch_size=100)
+    BehavioralCloningTrainer(actor, replay, config, progress=False).train()
+    return actor
+
+
+def test_a_trained_policys_actions_give_the_same_success_in_meta_worlds_own_environments(trained):
+    result = run(trained, ["drawer-open", "reach"], episodes_per_task=4, max_steps=150, num_envs=3)
+    assert result.mean_success > 0, "the test wants successes"
+    assert_true_in_metaworld(result)
+
+
+@pytest.mark.slow
+def test_on_every_mt10_task_the_recorded_actions_give_the_same_success():
+    result = run(ExpertActor("MT10"), "MT10", episodes_per_task=2, max_steps=500, num_envs=13)
+    assert [e.success for e in result.episodes].count(True) >= 15
+    assert {e.success_at_end for e in result.episodes} == {True, False}
+    assert_true_in_metaworld(result)
+
+
+def test_on_short_episodes_of_mt10_the_recorded_actions_give_the_same_success():
+    result = run(ExpertActor("MT10"), "MT10", episodes_per_task=1, max_steps=60)
+    assert {e.success for e in result.episodes} == {True, False}
+    assert_true_in_metaworld(result)
+
+
+@pytest.mark.parametrize("num_envs", [None, 3])
+def test_stopping_at_success_changes_nothing_of_the_any_step_success(trained, num_envs):
+    options = dict(episodes_per_task=4, max_steps=120)
+    whole = run(trained, ["drawer-open", "reach"], **options)
+    stopped = run(trained, ["drawer-open", "reach"], stop_at_success=True, num_envs=num_envs, **options)
+    assert stopped.success_once == whole.success_once
+    assert stopped.first_success == whole.first_success
+    for key, e in by_episode(stopped).items():
+        other = by_episode(whole)[key]
+        length = e.first_success or 120
+        assert (e.success, e.first_success) == (other.success, other.first_success)
+        assert torch.equal(e.actions, other.actions[:length])
+        assert (e.success_at_end, e.episode_return) == (None, None)
+    assert set(stopped.success_at_end.values()) == set(stopped.mean_return.values()) == {None}
+    assert any(e.success for e in whole.episodes)
+    assert_true_in_metaworld(stopped)
+
+
+def test_the_dense_reward_is_summed():
+    sparse = run(ExpertActor("reach"), "reach", max_steps=60)
+    dense = run(ExpertActor("reach"), "reach", max_steps=60, reward="dense")
+    for one, other in zip(sparse.episodes, dense.episodes, strict=True):
+        assert torch.equal(one.actions, other.actions)
+        assert other.episode_return > one.episode_return
+    env = make_metaworld_env("reach", max_steps=60)
+    env.seed(episode_seed("reach", SEED, 0))
+    env.reset()
+    total = sum(np.float32(env.step(action.numpy())[1]) for action in dense.episodes[0].actions)
+    assert dense.episodes[0].episode_return == pytest.approx(total, rel=1e-5)
+    env.close()
+
+
+# ---- how the actor is run
+
+
+class Watched(nn.Module):
+    def __init__(self, value=0.1):
+        super().__init__()
+        self.seen, self.value = [], value
+
+    def forward(self, observation):
+        self.seen.append((self.training, torch.is_grad_enabled(), exploration_type(), tuple(observation.shape)))
+        return torch.full((len(observation), 4), self.value)
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_the_actor_runs_in_eval_mode_and_its_mode_is_restored(training):
+    actor = TensorDictModule(Watched(), in_keys=["observation"], out_keys=["action"]).train(training)
+    run(actor, "reach", max_steps=3)
+    assert actor.training is training
+    assert actor.module.training is training
+    assert {seen[:3] for seen in actor.module.seen} == {(False, False, ExplorationType.DETERMINISTIC)}
+    assert len({seen[3] for seen in actor.module.seen}) == 1, "every forward pass has the same number of rows"
+
+
+def test_the_mode_is_restored_after_an_error_too():
+    actor = TensorDictModule(Watched(torch.nan), in_keys=["observation"], out_keys=["action"]).train()
+    with pytest.raises(ValueError, match=r"NaN.*'reach', seed 1000, episode 0, step 0"):
+        run(actor, "reach", noise_scale=0.0)
+    assert actor.training
+    with pytest.raises(ValueError, match="NaN"):
+        run(actor, "reach", noise_scale=0.1)
+
+
+def test_feature_noise_of_training_plays_no_part():
+    actor = make_actor(feature_noise=0.5).train()
+    assert_same(run(actor, "reach", max_steps=10), run(make_actor(feature_noise=0.0).eval(), "reach", max_steps=10))
+    assert actor.training
+
+
+def test_the_global_generator_plays_no_part():
+    torch.manual_seed(1)
+    one = run(make_actor(), "reach", max_steps=10)
+    torch.manual_seed(2)
+    state = torch.get_rng_state()
+    actor = make_actor()
+    torch.set_rng_state(state)
+    assert_same(run(actor, "reach", max_steps=10), one)
+
+
+# ---- plans
+
+
+def other_plan(task="reach"):
+    return ConditionalPlan.from_pairs(task, [("the gripper is open", "move the gripper to the reach target")])
+
+
+def test_plans_that_differ_from_the_actors_own_are_an_error():
+    with pytest.raises(ValueError, match=r"plans differ from the actor's own for reach; .*with_plans"):
+        run(make_actor(), "reach", plans={**PLANS, "reach": other_plan()})
+
+
+def test_the_actors_own_plans_may_be_given_again():
+    own = run(make_actor(), "reach", max_steps=8)
+    assert_same(run(make_actor(), "reach", max_steps=8, plans=PLANS), own)
+    assert_same(run(make_actor(), "reach", max_steps=8, plans={"reach": PLANS["reach"]}), own)
+
+
+def test_an_actor_with_other_plans_is_evaluated_on_them():
+    actor = make_actor(text_encoder=lambda texts: torch.eye(len(texts), 40))
+    other = actor.with_plans(Plans([other_plan()]))
+    found = run(other, "reach", max_steps=8, episodes_per_task=1)
+    assert not torch.equal(found.episodes[0].actions, run(actor, "reach", max_steps=8).episodes[0].actions)
+
+
+def test_plans_for_an_actor_that_has_none():
+    seen = []
+
+    def policy(state):
+        seen.append(state["qaf"].clone())
+        return state.set("action", torch.zeros(*state.batch_size, 4))
+
+    run(policy, "reach", plans=PLANS, max_steps=2)
+    assert seen[0].dtype == torch.bool
+    assert seen[0].shape[-1] == PLANS.num_steps
+
+
+def test_a_task_without_a_plan_is_named():
+    with pytest.raises(ValueError, match="plans lack sweep-into"):
+        run(make_actor(), ["reach", "sweep-into"])
+    with pytest.raises(ValueError, match="plans lack push"):
+        run(lambda state: state, "push", plans={"reach": PLANS["reach"]})
+
+
+# ---- bad input
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        (dict(tasks="raech"), "reach"),
+        (dict(episodes_per_task=0), "episodes_per_task must be at least 1, got 0"),
+        (dict(noise_scale=-1.0), "noise_scale must be finite and at least 0"),
+        (dict(noise_scale=float("nan")), "noise_scale"),
+        (dict(num_envs=0), "num_envs must be at least 1, got 0"),
+        (dict(tasks=["push", "reach"], num_envs=1), "num_envs must be at least the number of tasks, 2, got 1"),
+        (dict(max_steps=0), "max_steps must be at least 1"),
+        (dict(reward="sparce"), "reward must be one of .*did you mean 'sparse'"),
+        (dict(engine="mujoco"), "engine must be one of"),
+        (dict(num_threads=0), "num_threads must be at least 1"),
+    ],
+)
+def test_wrong_arguments_are_named(changed, message):
+    with pytest.raises(ValueError, match=message):
+        run(ExpertActor(["push", "reach"]), **{"tasks": "reach", **changed})
+
+
+@pytest.mark.parametrize("action", [torch.zeros(64, 3), torch.zeros(64, 4, dtype=torch.float64), torch.zeros(64, 1, 4)])
+def test_an_actor_that_gives_no_action_of_ours_is_refused(action):
+    with pytest.raises(ValueError, match=r"action must be float32 of shape \(1, 4\)"):
+        run(lambda state: state.set("action", action), "reach", num_envs=1)
+
+
+def test_an_actor_for_other_tasks_is_refused():
+    with pytest.raises(ValueError, match="task_id"):
+        run(ExpertActor("push"), "reach")
+    with pytest.raises(ValueError, match="not made for: reach"):
+        run(DescriptorConditionedActor("push"), "reach")
+
+
+def test_the_experts_succeed_and_the_untrained_do_not():
+    tasks = ["button-press-topdown", "reach"]
+    good = run(ExpertActor(tasks), tasks, max_steps=120, episodes_per_task=4)
+    bad = run(make_actor(), tasks, max_steps=120, episodes_per_task=4)
+    assert good.mean_success > bad.mean_success
+    assert good.success_once["reach"] == 1.0
+    assert all(0 < (e.first_success or 1) <= 120 for e in good.episodes)

@@ -1,0 +1,174 @@
+"""EvaluationResult: the statistics by hand, and a file that is whole or refused."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+
+from lw_torchrl.evaluation import EpisodeResult, EvaluationResult
+
+CONFIG = {
+    "tasks": ["push", "reach", "sweep"],
+    "episodes_per_task": 3,
+    "seed": 1,
+    "noise_scale": 0.1,
+    "stop_at_success": False,
+    "reward": "sparse",
+    "max_steps": 500,
+}
+
+
+def make_result():
+    episodes = [
+        EpisodeResult("push", 0, True, 10, False, 4.0, torch.zeros(500, 4)),
+        EpisodeResult("push", 1, True, 21, True, 480.0),
+        EpisodeResult("push", 2, False, None, False, 0.0),
+        EpisodeResult("reach", 0, True, 1, True, 500.0),
+        EpisodeResult("reach", 1, True, 2, True, 499.0),
+        EpisodeResult("reach", 2, True, 6, True, 495.0),
+        *(EpisodeResult("sweep", k, False, None, False, 0.0) for k in range(3)),
+    ]
+    return EvaluationResult(CONFIG, tuple(episodes))
+
+
+def stopped():
+    """An evaluation that stopped at success."""
+    episodes = [EpisodeResult("reach", 0, True, 9, None, None), EpisodeResult("reach", 1, False, None, None, None)]
+    config = {**CONFIG, "tasks": ["reach"], "episodes_per_task": 2, "stop_at_success": True}
+    return EvaluationResult(config, tuple(episodes))
+
+
+def test_the_statistics_by_hand():
+    result = make_result()
+    assert result.success_once == {"push": pytest.approx(2 / 3), "reach": 1.0, "sweep": 0.0}
+    assert result.success_at_end == {"push": pytest.approx(1 / 3), "reach": 1.0, "sweep": 0.0}
+    assert result.first_success == {"push": 15.5, "reach": 3.0, "sweep": None}
+    assert result.mean_return == {"push": pytest.approx(484 / 3), "reach": 498.0, "sweep": 0.0}
+    assert result.mean_success == pytest.approx(5 / 9)
+
+
+def test_what_a_stopped_episode_does_not_know_is_none():
+    result = stopped()
+    assert result.success_once == {"reach": 0.5}
+    assert result.first_success == {"reach": 9.0}
+    assert result.success_at_end == result.mean_return == {"reach": None}
+
+
+@pytest.mark.parametrize("make", [make_result, stopped])
+def test_it_reads_back(tmp_path, make):
+    result = make()
+    result.save(tmp_path / "runs" / "results.json")
+    found = EvaluationResult.load(tmp_path / "runs" / "results.json")
+    assert found == result
+    assert found.success_once == result.success_once
+    assert found.first_success == result.first_success
+    found.save(tmp_path / "again.json")
+    assert (tmp_path / "again.json").read_bytes() == (tmp_path / "runs" / "results.json").read_bytes()
+
+
+def test_the_file_can_be_read_by_anyone(tmp_path):
+    make_result().save(tmp_path / "results.json")
+    found = json.loads((tmp_path / "results.json").read_text())
+    assert found["config"] == CONFIG
+    assert found["success_once"]["reach"] == 1.0
+    assert found["first_success"]["sweep"] is None
+    assert found["mean_success_once"] == pytest.approx(5 / 9)
+    assert len(found["episodes"]) == 9
+    assert found["episodes"][0] == {
+        "task": "push",
+        "episode": 0,
+        "success": True,
+        "first_success": 10,
+        "success_at_end": False,
+        "episode_return": 4.0,
+    }
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"path: no result file .*nowhere.json"):
+        EvaluationResult.load(tmp_path / "nowhere.json")
+
+
+def change(**entries):
+    return lambda found: found.update(entries)
+
+
+DAMAGE = {
+    "another format": change(format="minari"),
+    "another version": change(version=2),
+    "no format": lambda found: found.pop("format"),
+    "no configuration": lambda found: found.pop("config"),
+    "no episodes": lambda found: found.pop("episodes"),
+    "an unknown entry": lambda found: found["episodes"][0].update(colour="red"),
+    "a missing entry": lambda found: found["episodes"][0].pop("success"),
+    "episodes of another kind": change(episodes=[1, 2]),
+    "a configuration without tasks": change(config={}),
+    "a configuration of another kind": change(config=[]),
+    "a task without episodes": lambda found: found["config"]["tasks"].append("drawer-open"),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGE)
+def test_a_wrong_file_is_refused_and_left_alone(tmp_path, name):
+    path = tmp_path / "results.json"
+    make_result().save(path)
+    found = json.loads(path.read_text())
+    DAMAGE[name](found)
+    path.write_text(json.dumps(found))
+    before = path.read_bytes()
+    with pytest.raises(ValueError, match=r"results.json' is no result of lw_torchrl.evaluation version 1"):
+        EvaluationResult.load(path)
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"[]", b"null", b"\xff\xfe\x00", b'"words"'])
+def test_what_is_no_result_is_refused(tmp_path, content):
+    path = tmp_path / "results.json"
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match="is no result of"):
+        EvaluationResult.load(path)
+    assert path.read_bytes() == content
+
+
+@pytest.mark.parametrize("share", [0.2, 0.7, 0.99])
+def test_a_truncated_file_is_refused(tmp_path, share):
+    path = tmp_path / "results.json"
+    make_result().save(path)
+    content = path.read_bytes().rstrip()
+    path.write_bytes(content[: int(share * len(content))])
+    with pytest.raises(ValueError, match="is no result of"):
+        EvaluationResult.load(path)
+
+
+def test_a_disk_that_fills_leaves_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / "results.json"
+    stopped().save(path)
+    before = path.read_bytes()
+
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.replace", full)
+    with pytest.raises(OSError, match="No space"):
+        make_result().save(path)
+    assert path.read_bytes() == before
+    assert [found.name for found in tmp_path.iterdir()] == ["results.json"]
+
+
+def test_numbers_that_are_none_are_not_written(tmp_path):
+    episode = EpisodeResult("reach", 0, True, 1, True, float("nan"))
+    result = EvaluationResult({**CONFIG, "tasks": ["reach"]}, (episode,))
+    with pytest.raises(ValueError, match="JSON"):
+        result.save(tmp_path / "results.json")
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_table_shows_every_task():
+    lines = make_result().table().splitlines()
+    assert len(lines) == 5
+    assert lines[1].split() == ["push", "0.67", "0.33", "16"]
+    assert lines[3].split() == ["sweep", "0.00", "0.00", "-"]
+    assert lines[4].split() == ["mean", "0.56", "0.44", "-"]
+    assert stopped().table().splitlines()[1].split() == ["reach", "0.50", "-", "9"]

@@ -1,0 +1,137 @@
+"""ObservationFeatures: the differences by hand, and a normalisation that is part of the module."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from lw_torchrl.modules import ObservationFeatures
+from lw_torchrl.modules.observation_features import differences
+
+
+def random_observation(*shape, seed=0):
+    return torch.rand(*shape, 39, generator=torch.Generator().manual_seed(seed))
+
+
+def test_the_differences_by_hand():
+    observation = random_observation()
+    hand, one, two, goal = (observation[i : i + 3] for i in (0, 4, 11, 36))
+    found = differences(observation)
+    plain = torch.cat([one - hand, two - hand, goal - hand, two - one, goal - one, goal - two])
+    torch.testing.assert_close(found[:18], plain)
+    torch.testing.assert_close(found[18:36], torch.tanh(plain / 0.02))
+    torch.testing.assert_close(found[36:54], torch.tanh(plain / 0.1))
+    assert torch.equal(found[54:], observation[2:4])
+
+
+def test_differences_to_an_object_that_is_not_there_are_zero():
+    observation = random_observation(2)
+    observation[0, 11:14] = 0
+    found = differences(observation)[:, :18].reshape(2, 6, 3)
+    assert found[0].abs().sum(-1).eq(0).tolist() == [False, True, False, True, False, True]
+    assert not found[1].abs().sum(-1).eq(0).any()
+
+
+def test_moving_everything_leaves_the_differences_as_they_are():
+    observation = random_observation()
+    moved = observation.clone()
+    for place in (0, 4, 11, 36):
+        moved[place : place + 3] += torch.tensor([0.3, -0.2, 0.0])
+    torch.testing.assert_close(differences(moved), differences(observation), atol=2e-4, rtol=0)
+
+
+@pytest.mark.parametrize(("kind", "width"), [("raw", 39), ("differences", 56), ("both", 95)])
+@pytest.mark.parametrize("shape", [(), (3,), (2, 3)])
+def test_every_kind_has_its_width_on_any_leading_shape(kind, width, shape):
+    features = ObservationFeatures(kind)
+    found = features(random_observation(*shape))
+    assert features.width == width
+    assert found.shape == (*shape, width)
+    assert found.dtype == torch.float32
+
+
+def test_both_is_one_after_the_other():
+    observation = random_observation(4)
+    both = ObservationFeatures("both")(observation)
+    assert torch.equal(both[:, :39], ObservationFeatures("raw")(observation))
+    assert torch.equal(both[:, 39:], ObservationFeatures("differences")(observation))
+
+
+@pytest.mark.parametrize("kind", ["raw", "differences", "both"])
+def test_what_it_was_fitted_to_has_mean_zero_and_deviation_one(kind):
+    features = ObservationFeatures(kind)
+    observation = random_observation(40, 25)
+    features.fit(observation)
+    found = features(observation).reshape(-1, features.width)
+    torch.testing.assert_close(found.mean(0), torch.zeros(features.width), atol=1e-4, rtol=0)
+    torch.testing.assert_close(found.std(0, unbiased=False), torch.ones(features.width), atol=1e-3, rtol=0)
+
+
+def test_a_constant_feature_is_centred_and_not_blown_up():
+    observation = random_observation(100)
+    observation[:, 20] = 7.0
+    features = ObservationFeatures("raw")
+    features.fit(observation)
+    other = observation[:1].clone()
+    other[0, 20] = 8.0
+    assert abs(features(observation)[:, 20].max()) < 1e-5
+    assert features(other)[0, 20] == pytest.approx(1.0, abs=1e-5)
+
+
+def test_far_away_is_clamped():
+    features = ObservationFeatures("raw")
+    features.fit(random_observation(100))
+    assert features(torch.full((1, 39), 1e6)).tolist() == [[10.0] * 39]
+
+
+def test_noise_in_training_mode_has_its_deviation_and_is_gone_in_eval_mode():
+    torch.manual_seed(0)
+    observation = random_observation(50, 50)
+    features = ObservationFeatures("raw", noise=0.3)
+    features.fit(observation)
+    plain = features.eval()(observation)
+    assert torch.equal(features(observation), plain)
+    added = features.train()(observation) - plain
+    assert added.mean().abs() < 0.01
+    assert added.std().item() == pytest.approx(0.3, rel=0.02)
+    assert torch.equal(ObservationFeatures("raw").train()(observation), observation)
+
+
+def test_the_normalisation_is_saved_with_the_module():
+    features, other = ObservationFeatures("both"), ObservationFeatures("both")
+    features.fit(random_observation(100))
+    other.load_state_dict(features.state_dict())
+    observation = random_observation(5, seed=1)
+    assert torch.equal(other(observation), features(observation))
+    assert not torch.equal(ObservationFeatures("both")(observation), features(observation))
+
+
+def test_another_kind_is_refused_with_the_nearest():
+    with pytest.raises(ValueError, match=r"features must be one of .*'raws'; did you mean 'raw'"):
+        ObservationFeatures("raws")
+
+
+@pytest.mark.parametrize(
+    ("observation", "said"),
+    [
+        (torch.zeros(2, 38), r"float32 of shape \(2, 38\)"),
+        (torch.zeros(()), r"shape \(\)"),
+        (torch.zeros(2, 39, dtype=torch.float64), "torch.float64"),
+        (torch.zeros(2, 39, dtype=torch.int64), "torch.int64"),
+    ],
+)
+def test_wrong_observations_are_refused(observation, said):
+    with pytest.raises(ValueError, match=rf"observation must be float32 of shape \(..., 39\), got .*{said}"):
+        ObservationFeatures()(observation)
+
+
+@pytest.mark.parametrize("wrong", [torch.nan, torch.inf, -torch.inf])
+@pytest.mark.parametrize("kind", ["raw", "differences", "both"])
+@pytest.mark.parametrize("call", ["forward", "fit"])
+def test_observations_that_are_no_numbers_are_refused(wrong, kind, call):
+    observation = random_observation(3)
+    observation[1, 4] = wrong
+    features = ObservationFeatures(kind)
+    with pytest.raises(ValueError, match="observation must hold finite numbers"):
+        getattr(features, call)(observation)
+    assert features.mean.isfinite().all()

@@ -1,0 +1,203 @@
+"""Checkpoints: load_actor makes the very same policy, and says what is wrong with a file."""
+
+from __future__ import annotations
+
+import shutil
+import zipfile
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+
+from lw_torchrl.data import TaskBalancedSampler
+from lw_torchrl.language.plans import ConditionalPlan, Plans, load_plans
+from lw_torchrl.language.tasks import MT10, task_id
+from lw_torchrl.modules import DescriptorConditionedActor, PlanConditionedActor
+from lw_torchrl.trainers import BehavioralCloningConfig, BehavioralCloningTrainer, load_actor
+from lw_torchrl.trainers.checkpoint import read_description
+
+SMALL = dict(latent_size=4, width=16, depth=1, encoder_width=8)
+PLANS = load_plans("MT10")
+
+
+def counted(texts):
+    return torch.tensor([[float(text.count(letter)) for letter in "aeiou"] for text in texts])
+
+
+def make_rows(rows=40, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    ids = torch.tensor([task_id(task) for task in ("push", "reach")]).repeat(rows // 2)
+    return TensorDict(
+        {
+            "observation": torch.rand(rows, 39, generator=generator),
+            "task_id": ids,
+            "qaf": torch.rand(rows, PLANS.num_steps, generator=generator) > 0.5,
+            "action": torch.rand(rows, 4, generator=generator) - 0.5,
+        },
+        [rows],
+    )
+
+
+def train(actor, path):
+    replay = TensorDictReplayBuffer(storage=LazyTensorStorage(40), sampler=TaskBalancedSampler())
+    replay.extend(make_rows())
+    config = BehavioralCloningConfig(steps=5, batch_size=8)
+    BehavioralCloningTrainer(actor, replay, config, checkpoint=path, progress=False).train()
+    return actor
+
+
+def own_plans():
+    pairs = [("the gripper is open", "move the gripper to the reach target"), ("the gripper is closed", 'say "well"')]
+    return Plans([ConditionalPlan.from_pairs("push", pairs[:1]), ConditionalPlan.from_pairs("reach", pairs)])
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory):
+    path = tmp_path_factory.mktemp("checkpoint") / "checkpoint.zip"
+    torch.manual_seed(0)
+    return path, train(PlanConditionedActor(PLANS, **SMALL), path)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        dict(mix="actions", features="raw"),
+        dict(mix="latents", features="both", feature_noise=0.5),
+        dict(latent_size=7, width=9, depth=2, encoder_width=5, encoder_depth=2),
+    ],
+)
+def test_load_actor_makes_the_same_policy(tmp_path, options):
+    torch.manual_seed(1)
+    actor = train(PlanConditionedActor(PLANS, **{**SMALL, **options}), tmp_path / "c.zip")
+    loaded = load_actor(tmp_path / "c.zip")
+    assert isinstance(loaded, PlanConditionedActor)
+    assert loaded.config == actor.config
+    assert loaded.plans == actor.plans
+    assert not loaded.training
+    state = make_rows(seed=1).exclude("action")
+    expected, found = actor.eval()(state.clone()), loaded(state.clone())
+    for key in actor.out_keys:
+        assert torch.equal(found[key], expected[key])
+
+
+def test_the_baseline_loads_too(tmp_path):
+    actor = train(DescriptorConditionedActor("MT10", **SMALL), tmp_path / "c.zip")
+    loaded = load_actor(tmp_path / "c.zip")
+    assert isinstance(loaded, DescriptorConditionedActor)
+    assert loaded.tasks == MT10
+    state = make_rows(seed=1).exclude("action")
+    assert torch.equal(loaded(state.clone())["action"], actor(state.clone())["action"])
+
+
+def test_plans_and_text_encoder_of_ones_own(tmp_path):
+    """The plans are in the file; the encoder is handed over again."""
+    actor = PlanConditionedActor(own_plans(), text_encoder=counted, **SMALL)
+    rows = make_rows()
+    replay = TensorDictReplayBuffer(storage=LazyTensorStorage(40), sampler=TaskBalancedSampler())
+    replay.extend(rows.set("qaf", rows["qaf"][:, :2]))
+    config = BehavioralCloningConfig(steps=5, batch_size=8)
+    BehavioralCloningTrainer(actor, replay, config, checkpoint=tmp_path / "c.zip", progress=False).train()
+    loaded = load_actor(tmp_path / "c.zip", text_encoder=counted)
+    assert loaded.plans == own_plans()
+    state = rows.exclude("action")
+    assert torch.equal(loaded(state.clone())["action"], actor(state.clone())["action"])
+
+
+def test_another_text_encoder_does_not_fit(saved):
+    path, _ = saved
+    with pytest.raises(ValueError, match=r"checkpoint: .* does not fit"):
+        load_actor(path, text_encoder=counted)
+
+
+def test_the_loaded_actor_outlives_the_file(saved, tmp_path):
+    path = tmp_path / "copy.zip"
+    shutil.copy(saved[0], path)
+    loaded = load_actor(path)
+    path.unlink()
+    state = make_rows(seed=1).exclude("action")
+    assert torch.equal(loaded(state.clone())["action"], saved[1](state.clone())["action"])
+    loaded(state)["action"].sum().backward()
+    torch.optim.SGD(loaded.parameters(), 0.1).step()
+
+
+def test_a_checkpoint_holds_no_pickle(saved):
+    with zipfile.ZipFile(saved[0]) as archive:
+        assert {name.rpartition(".")[2] for name in archive.namelist()} == {"json", "memmap"}
+
+
+def test_the_description_says_how_it_was_made(saved):
+    found = read_description(saved[0])
+    assert found["actor"]["kind"] == "PlanConditionedActor"
+    assert found["actor"]["options"] == saved[1].config
+    assert set(found["actor"]["plans"]) == set(MT10)
+    assert found["training"]["steps"] == 5
+    assert found["data"] is None
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"checkpoint: no file .*nowhere.zip"):
+        load_actor(tmp_path / "nowhere.zip")
+
+
+def refused(path, message):
+    content = path.read_bytes()
+    with pytest.raises(ValueError, match=message) as caught:
+        load_actor(path)
+    assert str(path) in str(caught.value)
+    assert path.read_bytes() == content
+
+
+@pytest.mark.parametrize("content", [b"", b"\x80\x04K\x01.", b"PK\x03\x04", b"words"])
+def test_a_foreign_file_is_refused(tmp_path, content):
+    path = tmp_path / "c.zip"
+    path.write_bytes(content)
+    refused(path, "damaged or none of ours")
+
+
+def test_a_torch_file_is_refused_and_not_unpickled(tmp_path):
+    class Evil:
+        def __reduce__(self):
+            return (shutil.copy, (str(tmp_path / "c.zip"), str(tmp_path / "executed")))
+
+    torch.save({"weights": Evil()}, tmp_path / "c.zip")
+    refused(tmp_path / "c.zip", "damaged or none of ours")
+    assert not (tmp_path / "executed").exists()
+
+
+def rewrite(source, target, change):
+    """Copy an archive, each file's bytes through ``change(name, bytes)``; None leaves the file out."""
+    with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w") as new:
+        for name in old.namelist():
+            content = change(name, old.read(name))
+            if content is not None:
+                new.writestr(name, content)
+
+
+DAMAGE = {
+    "no manifest": lambda name, content: None if name == "manifest.json" else content,
+    "no actor": lambda name, content: None if "actor" in name else content,
+    "half a description": lambda name, content: content[:50] if "description" in name else content,
+    "another description": lambda name, content: b"[1, 2]" if "description" in name else content,
+    "an actor of no kind": lambda name, content: content.replace(b"PlanConditionedActor", b"ElephantActor"),
+    "plans of no task": lambda name, content: content.replace(b"def reach(", b"def raech("),
+    "an unknown option": lambda name, content: content.replace(b'"depth"', b'"depht"'),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGE)
+def test_a_damaged_checkpoint_is_refused(saved, tmp_path, name):
+    path = tmp_path / "c.zip"
+    rewrite(saved[0], path, DAMAGE[name])
+    refused(path, "checkpoint: ")
+
+
+def test_flipped_bits_in_the_weights_are_found(saved, tmp_path):
+    content = bytearray(saved[0].read_bytes())
+    with zipfile.ZipFile(saved[0]) as archive:
+        info = max((i for i in archive.infolist() if "-actor/" in i.filename), key=lambda i: i.file_size)
+    middle = info.header_offset + len(info.filename) + 30 + info.file_size // 2
+    content[middle] ^= 0xFF
+    path = tmp_path / "c.zip"
+    path.write_bytes(bytes(content))
+    refused(path, "checkpoint: ")
