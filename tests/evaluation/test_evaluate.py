@@ -171,17 +171,10 @@ def test_a_trained_policys_actions_give_the_same_success_in_meta_worlds_own_envi
     assert_true_in_metaworld(result)
 
 
-@pytest.mark.slow
 def test_on_every_mt10_task_the_recorded_actions_give_the_same_success():
     result = run(ExpertActor("MT10"), "MT10", episodes_per_task=2, max_steps=500, num_envs=13)
     assert [e.success for e in result.episodes].count(True) >= 15
     assert {e.success_at_end for e in result.episodes} == {True, False}
-    assert_true_in_metaworld(result)
-
-
-def test_on_short_episodes_of_mt10_the_recorded_actions_give_the_same_success():
-    result = run(ExpertActor("MT10"), "MT10", episodes_per_task=1, max_steps=60)
-    assert {e.success for e in result.episodes} == {True, False}
     assert_true_in_metaworld(result)
 
 

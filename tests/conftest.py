@@ -1,0 +1,66 @@
+"""What several test files need: Meta-World's own environments as the oracle, plans for every task, one MT50 environment."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+import lw_torchrl as lw
+
+
+@pytest.fixture(scope="session")
+def metaworld_env() -> Callable[[str], Any]:
+    """A task's own Meta-World environment, fresh, made without any of our code."""
+
+    def make(task: str) -> Any:
+        from metaworld.env_dict import ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE
+
+        env = ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE[f"{task}-v3-goal-observable"](seed=12345)
+        env._freeze_rand_vec = False
+        env.seeded_rand_vec = True
+        return env
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def plans() -> dict[str, lw.ConditionalPlan]:
+    """A plan for each of the 50 tasks: the shipped one, or else one to seven supported queries."""
+    shipped = lw.load_plans("MT10")
+    found = {}
+    for number, task in enumerate(lw.MT50):
+        queries = lw.supported_queries(task)
+        steps = 1 + number % 7
+        found[task] = shipped.get(task) or lw.ConditionalPlan.from_pairs(
+            task, [(queries[(k * 37 + number) % len(queries)], f"move {k}") for k in range(steps)]
+        )
+    return found
+
+
+@pytest.fixture(scope="session")
+def mt50() -> Iterator[lw.LanguageWorldEnv]:
+    """All 50 tasks, a row each, on Meta-World's own environments. Whoever takes it calls ``set_seed`` first."""
+    env = lw.LanguageWorldEnv("MT50", seed=0, engine="metaworld", reward="dense")
+    yield env
+    env.close(raise_if_closed=False)
+
+
+@pytest.fixture(scope="session")
+def python() -> Callable[..., subprocess.CompletedProcess[str]]:
+    """Run a program text in an interpreter of its own."""
+
+    def run(program: str, **environment: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, "-c", program],
+            env={**os.environ, **environment},
+            capture_output=True,
+            text=True,
+            timeout=120,
+        )
+
+    return run
