@@ -10,7 +10,7 @@ READY := .venv/.ready
 demo: $(READY)
 	$(BIN)/lw-torchrl demo
 test: $(READY)
-	$(BIN)/pytest
+	OMP_NUM_THREADS=1 $(BIN)/pytest
 check: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .

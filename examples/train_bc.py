@@ -59,7 +59,7 @@ def main() -> None:
 
     env = TransformedEnv(lw.LanguageWorldEnv(TASKS, seed=1_000), lw.QAFTransform(plans))
     with torch.no_grad():
-        rollout = env.rollout(100, actor)
+        rollout = env.rollout(100, actor.eval())
     for row, task in enumerate(TASKS):
         led = rollout["skill_weights"][row].argmax(-1).unique_consecutive().tolist()
         print(f"{task}: " + " > ".join(plans[task].steps[step].skill for step in led))

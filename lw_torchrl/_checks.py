@@ -17,7 +17,7 @@ def unknown_name(argument: str, given: object, allowed: Iterable[str]) -> ValueE
 
     Example:
         >>> str(unknown_name("mix", "latent", ["latents", "actions"]))
-        "mix must be one of 'latents', 'actions', got 'latent'; did you mean 'latents'?"
+        "mix must be one of 'latents', 'actions', got 'latent'; did you mean 'latents' or 'actions'?"
     """
     names = list(allowed)
     listed = ", ".join(repr(name) for name in names[:12]) + (", ..." if len(names) > 12 else "")

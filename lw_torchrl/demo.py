@@ -47,7 +47,11 @@ def _settle(out: Path, config: DemoConfig) -> None:
     path = out / "config.json"
     stated = json.loads(json.dumps(asdict(config)))
     if path.is_file():
-        if json.loads(path.read_text("utf-8")) != stated:
+        try:
+            found = json.loads(path.read_text("utf-8"))
+        except ValueError as error:
+            raise ValueError(f"out: {str(path)!r} is damaged ({error}); choose another folder") from error
+        if found != stated:
             raise ValueError(f"out: {str(out)!r} holds a demo of another configuration; choose another folder")
         return
     write_json(path, stated)

@@ -1,4 +1,4 @@
-"""What several test files need: Meta-World's own environments as the oracle, plans for every task, one MT50 environment."""
+"""What several test files need: Meta-World's own environments as the oracle, a plan for every task, MT50."""
 
 from __future__ import annotations
 
@@ -42,10 +42,10 @@ def plans() -> dict[str, lw.ConditionalPlan]:
     return found
 
 
-@pytest.fixture(scope="session")
-def mt50() -> Iterator[lw.LanguageWorldEnv]:
-    """All 50 tasks, a row each, on Meta-World's own environments. Whoever takes it calls ``set_seed`` first."""
-    env = lw.LanguageWorldEnv("MT50", seed=0, engine="metaworld", reward="dense")
+@pytest.fixture(scope="session", params=["vectorized", "metaworld"])
+def mt50(request: pytest.FixtureRequest) -> Iterator[lw.LanguageWorldEnv]:
+    """All 50 tasks, a row each, on each engine. Whoever takes it calls ``set_seed`` first."""
+    env = lw.LanguageWorldEnv("MT50", seed=0, engine=request.param, reward="dense")
     yield env
     env.close(raise_if_closed=False)
 

@@ -15,12 +15,13 @@ from lw_torchrl._checks import check_choice, check_int
 from lw_torchrl.envs.engine import ACTION_SIZE, OBSERVATION_SIZE, Engine
 from lw_torchrl.envs.metaworld_engine import MetaWorldEngine, naming_absent_renderer
 from lw_torchrl.envs.seeding import episode_seed
-from lw_torchrl.envs.vectorized_engine import VectorizedEngine
 from lw_torchrl.language.tasks import resolve_tasks, task_id
 
-with naming_absent_renderer():  # torchrl.envs imports MuJoCo
+with naming_absent_renderer():  # these import MuJoCo
     from torchrl.data import Bounded, Categorical, Composite, Unbounded
     from torchrl.envs import EnvBase
+
+    from lw_torchrl.envs.vectorized_engine import VectorizedEngine
 
 ENGINES: dict[str, Callable[..., Engine]] = {"vectorized": VectorizedEngine, "metaworld": MetaWorldEngine}
 
@@ -72,7 +73,7 @@ class LanguageWorldEnv(EnvBase):
         >>> env = LanguageWorldEnv(["reach", "push"], num_envs=4, seed=0)
         >>> rollout = env.rollout(3)
         >>> rollout["observation"].shape, rollout["task_id"][:, 0].tolist()
-        (torch.Size([4, 3, 39]), [37, 41, 37, 41])
+        (torch.Size([4, 3, 39]), [37, 40, 37, 40])
         >>> env.close()
 
     Source: paper section 'Task Formalism'; ``metaworld.sawyer_xyz_env.SawyerXYZEnv``.
@@ -115,6 +116,7 @@ class LanguageWorldEnv(EnvBase):
         self._success = np.zeros(num_envs, dtype=bool)
         self._observation = np.zeros((num_envs, OBSERVATION_SIZE), dtype=np.float32)
         self._engine = _make_engine(engine, list(self.row_tasks), reward=reward, num_threads=num_threads)
+        self.is_closed = False  # EnvBase starts with True
 
     def _make_specs(self, n: int) -> None:
         flag = Categorical(2, shape=(n, 1), dtype=torch.bool)

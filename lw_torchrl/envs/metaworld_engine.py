@@ -76,6 +76,9 @@ class MetaWorldEngine:
         # The environment above counts the steps; Meta-World's own limit must not come first.
         self._envs = [make_metaworld_env(task, max_steps=2**31 - 1) for task in tasks]
         self._last = np.zeros((len(self._envs), OBSERVATION_SIZE))
+        import mujoco
+
+        self._unstable = slice(int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADQACC) + 1)
 
     def reset(self, rows: Sequence[int], seeds: Sequence[int]) -> NDArray[np.float64]:
         for row, seed in zip(rows, seeds, strict=True):
@@ -91,7 +94,9 @@ class MetaWorldEngine:
         for row in np.flatnonzero(active):
             env = self._envs[row]
             observation, dense, _, _, info = env.step(action[row])
-            if env._did_see_sim_exception or not np.isfinite(observation).all():
+            # MuJoCo quietly starts an unstable simulation over, and only counts a warning; a reset clears it.
+            warned = env.data.warning.number[self._unstable].any()
+            if warned or env._did_see_sim_exception or not np.isfinite(observation).all():
                 fault[row] = True
                 continue
             self._last[row] = observation

@@ -38,7 +38,8 @@ class PlanAttention(TensorDictModuleBase):
         >>> import torch, lw_torchrl as lw
         >>> from tensordict import TensorDict
         >>> plans = lw.load_plans("MT10")
-        >>> state = TensorDict(qaf=torch.zeros(1, plans.num_steps, dtype=torch.bool), task_id=torch.tensor([37]))
+        >>> reach = torch.tensor([lw.task_id("reach")])
+        >>> state = TensorDict(qaf=torch.zeros(1, plans.num_steps, dtype=torch.bool), task_id=reach)
         >>> weights = lw.PlanAttention(plans)(state)["skill_weights"]
         >>> len(plans["reach"].steps), int((weights > 0).sum())
         (3, 3)

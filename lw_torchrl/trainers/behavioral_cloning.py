@@ -34,7 +34,7 @@ class BehavioralCloningConfig:
         weight_decay: AdamW's.
         loss_function: between the actor's and the demonstrated action: "l1", "l2" or "smooth_l1".
         max_grad_norm: gradients are clipped to it.
-        seed: of the minibatches.
+        seed: of the minibatches, and of what the actor draws while training.
         checkpoint_every: steps between checkpoints; the last step always makes one.
     """
 
@@ -103,6 +103,8 @@ class BehavioralCloningTrainer:
         self.actor, self.replay, self.logger, self.progress = actor, replay, logger, progress
         self.config = config = config or BehavioralCloningConfig()
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
+        if replay._prefetch:
+            raise ValueError("replay must not prefetch: batches drawn ahead would be lost when training is resumed")
         generator = torch.Generator().manual_seed(config.seed)
         replay.set_rng(generator)
         with warnings.catch_warnings():
@@ -153,7 +155,10 @@ class BehavioralCloningTrainer:
     def step(self) -> float:
         """Train on one minibatch and return its loss."""
         batch = self.replay.sample(self.config.batch_size)
-        loss = self.loss(batch)["loss_bc"]
+        with torch.random.fork_rng(devices=[]):  # what the actor draws hangs on the configuration's seed alone
+            torch.set_rng_state(self.state.torch_generator)
+            loss = self.loss(batch)["loss_bc"]
+            self.state.torch_generator = torch.get_rng_state()
         if not loss.isfinite():
             raise ValueError(
                 f"the loss is {loss.item()} at step {self.state.step}: the demonstrations hold NaN, or the learning "

@@ -95,18 +95,19 @@ class TrainingState:
 
     def __init__(self, sampler: Any, generator: torch.Generator) -> None:
         self.sampler, self.generator, self.step = sampler, generator, 0
+        self.torch_generator = generator.get_state()  # of the random numbers that the actor draws while training
 
     def state_dict(self) -> dict[str, Any]:
         return {
             "step": torch.tensor(self.step),
             "generator": self.generator.get_state(),
-            "torch_generator": torch.get_rng_state(),
+            "torch_generator": self.torch_generator.clone(),
             "sampler": dict(self.sampler.state_dict()),
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.step = int(state_dict["step"])
         self.generator.set_state(state_dict["generator"].clone())
-        torch.set_rng_state(state_dict["torch_generator"].clone())
+        self.torch_generator = state_dict["torch_generator"].clone()
         if state_dict.get("sampler"):
             self.sampler.load_state_dict(state_dict["sampler"])

@@ -93,7 +93,7 @@ def test_a_row_does_not_depend_on_its_neighbours():
 
 
 def test_a_task_without_a_plan_is_named():
-    with pytest.raises(ValueError, match="without a plan.*: box-close, lever-pull"):
+    with pytest.raises(ValueError, match=r"without a plan.*: box-close, lever-pull"):
         weights(torch.zeros(3, 4), [task_id("lever-pull"), REACH, task_id("box-close")])
 
 

@@ -1,0 +1,104 @@
+"""What the documentation shows runs: every docstring's example, and every Python block of README and docs."""
+
+from __future__ import annotations
+
+import doctest
+import importlib
+import pkgutil
+import re
+import warnings
+from pathlib import Path
+
+import pytest
+
+import lw_torchrl
+
+ROOT = Path(__file__).parent.parent
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("**/*.md"))]
+BLOCK = re.compile(
+    r"(?P<skip><!--\s*no-run\s*-->\s*\n)?"
+    r"^(?P<indent> *)```(?P<kind>python|py|pycon)[^\n]*\n(?P<code>.*?)^(?P=indent)```",
+    re.MULTILINE | re.DOTALL,
+)
+MODULES = sorted(module.name for module in pkgutil.walk_packages(lw_torchrl.__path__, "lw_torchrl."))
+
+
+def blocks(page):
+    """(line, kind, code) of each block that is to run."""
+    text = page.read_text("utf-8")
+    for match in BLOCK.finditer(text):
+        if not match["skip"]:
+            lines = [line.removeprefix(match["indent"]) for line in match["code"].splitlines(keepends=True)]
+            yield text[: match.start("code")].count("\n"), match["kind"], "".join(lines)
+
+
+def examples(name):
+    module = importlib.import_module(name)
+    return [test for test in doctest.DocTestFinder(exclude_empty=True).find(module) if test.examples]
+
+
+@pytest.fixture(autouse=True)
+def _elsewhere(tmp_path, monkeypatch):
+    """Examples run in a folder of their own, and TorchRL's own warning is no fault of theirs."""
+    monkeypatch.chdir(tmp_path)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*target_actor_network_params.*")
+        yield
+
+
+@pytest.mark.parametrize("name", [name for name in MODULES if examples(name)])
+def test_the_examples_of_the_docstrings_run(name):
+    runner = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS)
+    report = []
+    for test in examples(name):
+        runner.run(test, out=report.append)
+    assert runner.summarize(verbose=False).failed == 0, "".join(report)
+
+
+def test_the_docstrings_have_examples():
+    assert sum(len(examples(name)) > 0 for name in MODULES) >= 10
+
+
+@pytest.mark.parametrize(
+    "name", [n for n in lw_torchrl.__all__ if n[0].isupper() and n not in ("MT10", "MT50", "TASKS")]
+)
+def test_every_public_class_says_what_it_is(name):
+    documented = getattr(lw_torchrl, name).__doc__
+    assert documented
+    assert not documented.startswith(f"{name}("), "that is a dataclass's own signature"
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if any(blocks(page))], ids=lambda page: page.name)
+def test_the_blocks_of_a_page_run_one_after_another(page):
+    namespace = {"__name__": "__main__"}
+    for line, kind, code in blocks(page):
+        if kind == "pycon":
+            test = doctest.DocTestParser().get_doctest(code, namespace, page.name, str(page), line)
+            runner, report = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS), []
+            runner.run(test, out=report.append, clear_globs=False)
+            assert runner.summarize(verbose=False).failed == 0, "".join(report)
+            namespace.update(test.globs)
+        else:
+            # Empty lines in front, so that a traceback names the page's own line.
+            exec(compile("\n" * line + code, str(page), "exec"), namespace)
+
+
+def test_the_readme_shows_python():
+    assert any(blocks(ROOT / "README.md"))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_a_pages_links_lead_somewhere(page):
+    text = re.sub(r"```.*?```", "", page.read_text("utf-8"), flags=re.DOTALL)
+    for target in re.findall(r"\]\(([^)#\s]+)", text):
+        if "://" not in target and not target.startswith("mailto:"):
+            assert (page.parent / target).exists(), target
+
+
+def test_blocks_are_found_numbered_and_skipped(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text(
+        "words\n```python\na = 1\n```\n<!-- no-run -->\n```python\nb = 2\n```\n- item\n\n  ```python\n  c = 3\n  ```\n"
+        "```sh\nd\n```\n"
+    )
+    assert list(blocks(page)) == [(2, "python", "a = 1\n"), (11, "python", "c = 3\n")]
