@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
-from lw_torchrl.envs.engine import ACTION_SIZE
+from lw_torchrl.envs.engine import ACTION_SIZE, OBSERVATION_SIZE
 from lw_torchrl.envs.metaworld_engine import import_metaworld
 from lw_torchrl.language.tasks import resolve_tasks, task_id
 
@@ -47,11 +47,18 @@ class ExpertActor(TensorDictModuleBase):
         self._policies = {task_id(task): policies[f"{task}-v3"]() for task in self.tasks}
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        observation = tensordict.get("observation")
-        if observation.shape[-1:] != (39,):
+        observation, given = tensordict.get("observation", None), tensordict.get("task_id", None)
+        if observation is None or given is None:
+            raise ValueError(f"observation and task_id are needed, got {', '.join(map(str, tensordict.keys()))}")
+        if observation.shape[-1:] != (OBSERVATION_SIZE,):
             raise ValueError(f"observation must have 39 numbers, got shape {tuple(observation.shape)}")
-        states = observation.reshape(-1, 39).cpu().numpy().astype(np.float64)
-        task_ids = tensordict.get("task_id").reshape(-1).tolist()
+        if given.shape != observation.shape[:-1]:
+            raise ValueError(
+                f"task_id must be of shape {tuple(observation.shape[:-1])}, one per observation, got "
+                f"{tuple(given.shape)}"
+            )
+        states = observation.reshape(-1, OBSERVATION_SIZE).cpu().numpy().astype(np.float64)
+        task_ids = given.reshape(-1).tolist()
         mask = tensordict.get("_step", None)
         wanted = [True] * len(task_ids) if mask is None else mask.reshape(-1).tolist()
         action = np.zeros((len(task_ids), ACTION_SIZE), dtype=np.float32)

@@ -166,7 +166,12 @@ class LanguageWorldEnv(EnvBase):
             return np.ones(self.batch_size[0], dtype=bool)
         return mask.reshape(self.batch_size).cpu().numpy()
 
+    def _check_open(self) -> None:
+        if self.is_closed:
+            raise RuntimeError("this environment is closed (a collector closes its own at its end): make a new one")
+
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDict:
+        self._check_open()
         rows = np.flatnonzero(self._mask(tensordict, "_reset"))
         named = None if tensordict is None else tensordict.get("episode", None)
         if named is None:
@@ -211,6 +216,7 @@ class LanguageWorldEnv(EnvBase):
         return executed
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        self._check_open()
         action = self._executed(tensordict).cpu().numpy()
         active = self._mask(tensordict, "_step")
         if (active & self._over).any():

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import torch
 from tensordict import TensorDictBase
 from torchrl.data import Binary, Composite, TensorSpec
-from torchrl.envs import Transform
+from torchrl.envs import EnvBase, Transform
 
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.query_program import QueryProgram
@@ -49,7 +49,10 @@ class QAFTransform(Transform):
         self.program = plan_program(self.plans)
 
     def _write(self, tensordict: TensorDictBase, task_ids: TensorDictBase) -> None:
-        tensordict.set("qaf", self.program(tensordict.get("observation"), task_ids.get("task_id")))
+        observation, task_id = tensordict.get("observation", None), task_ids.get("task_id", None)
+        if observation is None or task_id is None:
+            raise ValueError(f"observation and task_id are needed, got {', '.join(map(str, tensordict.keys()))}")
+        tensordict.set("qaf", self.program(observation, task_id))
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         self._write(next_tensordict, next_tensordict)
@@ -66,11 +69,17 @@ class QAFTransform(Transform):
             self._write(following, following if "task_id" in following.keys() else tensordict)
         return tensordict
 
+    def set_container(self, container: Transform | EnvBase) -> None:
+        """Join an environment, every task of which must have a plan."""
+        super().set_container(container)
+        try:
+            env = self.container
+        except ValueError:  # a Compose that is in no environment, or not yet
+            return
+        self.plans.require(getattr(env, "tasks", ()))
+
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        """Add ``qaf`` to the specs, and check that every task of the environment has a plan."""
-        tasks = getattr(self.parent, "tasks", None)
-        if tasks is not None:
-            self.plans.require(tasks)
+        """Add ``qaf`` to the specs."""
         assert isinstance(observation_spec, Composite)
         steps = self.program.num_queries
         observation_spec["qaf"] = Binary(

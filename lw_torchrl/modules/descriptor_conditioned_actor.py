@@ -49,7 +49,7 @@ class DescriptorConditionedActor(TensorDictModuleBase):
         tasks: str | Iterable[str],
         *,
         features: Features = "differences",
-        feature_noise: float = 0.1,
+        feature_noise: float = 0.05,
         latent_size: int = 64,
         width: int = 256,
         depth: int = 3,

@@ -69,7 +69,7 @@ class PlanConditionedActor(TensorDictModuleBase):
         *,
         mix: Literal["latents", "actions"] = "latents",
         features: Features = "differences",
-        feature_noise: float = 0.1,
+        feature_noise: float = 0.05,
         latent_size: int = 64,
         width: int = 256,
         depth: int = 3,

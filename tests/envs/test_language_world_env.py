@@ -447,6 +447,19 @@ def test_a_row_that_has_ended_must_be_reset(any_env):
     assert not torch.equal(after["observation"][2], state["observation"][2])
 
 
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_closed_environment_says_so(engine):
+    env = lw.LanguageWorldEnv("reach", engine=engine)
+    state = env.reset()
+    assert not env.is_closed
+    env.close()
+    assert env.is_closed
+    with pytest.raises(RuntimeError, match="this environment is closed"):
+        env.step(state.set("action", torch.zeros(1, 4)))
+    with pytest.raises(RuntimeError, match="this environment is closed"):
+        env.reset()
+
+
 def test_a_row_that_was_never_reset_must_be():
     env = lw.LanguageWorldEnv(["reach", "push"])
     with pytest.raises(RuntimeError, match=r"rows \[0, 1\] have ended or were never reset"):

@@ -1,0 +1,351 @@
+"""run_episodes runs exactly the episodes asked for, and gives the same on any number of rows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.envs import GymLikeEnv, TransformedEnv
+
+import lw_torchrl as lw
+from lw_torchrl.envs.episodes import Episode, in_blocks, run_episodes
+from lw_torchrl.envs.seeding import action_noise
+
+TASKS = ["push", "reach"]
+SEED, STEPS = 3, 8
+KEYS = ["observation", "task_id", "episode", "action", ("next", "observation"), ("next", "reward"), ("next", "done")]
+
+
+@cache
+def plain_env(num_envs: int, max_steps: int = STEPS) -> lw.LanguageWorldEnv:
+    return lw.LanguageWorldEnv(TASKS, num_envs=num_envs, seed=SEED, max_steps=max_steps, reward="dense")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def close() -> Iterator[None]:
+    yield
+    plain_env.cache_clear()
+    transformed_env.cache_clear()
+
+
+@cache
+def transformed_env(num_envs: int, max_steps: int = STEPS) -> TransformedEnv:
+    plans = lw.load_plans("MT10")
+    env = lw.LanguageWorldEnv(TASKS, num_envs=num_envs, seed=SEED, max_steps=max_steps, reward="dense")
+    return TransformedEnv(env, lw.QAFTransform(plans))
+
+
+def wavy(tensordict: TensorDictBase) -> TensorDictBase:
+    """A policy that treats every number alone, so that it cannot tell how many rows there are."""
+    return tensordict.set("action", (tensordict["observation"][..., :4] * 37).sin())
+
+
+@pytest.fixture(scope="module")
+def network() -> Callable[[TensorDictBase], TensorDictBase]:
+    """A small network, whose matrix products feel how many rows there are."""
+    torch.manual_seed(0)
+    layers = nn.Sequential(nn.Linear(39, 256), nn.ReLU(), nn.Linear(256, 256), nn.ReLU(), nn.Linear(256, 4), nn.Tanh())
+    return TensorDictModule(layers, in_keys=["observation"], out_keys=["action"])
+
+
+@cache
+def alone(task: str, episode: int) -> TensorDictBase:
+    """One episode under ``wavy``, stepped by hand in an environment of one row."""
+    env = lw.LanguageWorldEnv(task, seed=SEED, max_steps=STEPS, reward="dense")
+    state = env.reset(TensorDict({"episode": torch.tensor([episode])}, [1]))
+    steps = []
+    for _ in range(STEPS):
+        steps.append(env.step(wavy(state)).clone())
+        state = steps[-1]["next"].exclude("reward")
+    env.close()
+    return torch.cat(steps).select(*KEYS)
+
+
+def run(env, policy, episodes, **options) -> dict[tuple[str, int], TensorDictBase]:
+    """(task, episode) to the recorded steps; an episode that comes twice is an error."""
+    options.setdefault("keys", KEYS)
+    found: dict[tuple[str, int], TensorDictBase] = {}
+    with torch.no_grad():
+        for task, episode, steps in run_episodes(env, policy, episodes, **options):
+            assert (task, episode) not in found
+            found[task, episode] = steps
+    return found
+
+
+def asked(episodes: dict[str, list[int]]) -> set[tuple[str, int]]:
+    return {(task, episode) for task, listed in episodes.items() for episode in listed}
+
+
+def same(left: TensorDictBase, right: TensorDictBase) -> bool:
+    """Whether two recordings have the same keys and agree in every bit."""
+    keys = set(left.keys(True, True))
+    return keys == set(right.keys(True, True)) and all(torch.equal(left[key], right[key]) for key in keys)
+
+
+# --- exactly the episodes asked for --------------------------------------------------------------------------------
+
+LISTS = st.lists(st.integers(0, 12), unique=True, max_size=5)
+
+
+@given(
+    episodes=st.fixed_dictionaries({}, optional={task: LISTS for task in TASKS}),
+    num_envs=st.sampled_from([2, 3, 5]),
+    make=st.sampled_from([plain_env, transformed_env]),
+)
+@settings(max_examples=25, deadline=None)
+def test_each_listed_episode_comes_once_and_is_itself(episodes, num_envs, make):
+    """Whatever ran before on the same environment."""
+    found = run(make(num_envs), wavy, episodes)
+    assert found.keys() == asked(episodes)
+    for (task, episode), steps in found.items():
+        assert steps.batch_size == (STEPS,)
+        assert same(steps, alone(task, episode)), (task, episode)
+        assert steps["task_id"].unique().tolist() == [lw.task_id(task)]
+        assert steps["episode"].unique().tolist() == [episode]
+
+
+@pytest.mark.parametrize("make", [plain_env, transformed_env])
+def test_episodes_of_different_lengths_keep_their_names(make):
+    """Rows that end early take the next episode, not the one that the row's own count would give."""
+    env, ending = make(3), {("push", 7): 2, ("reach", 4): 5, ("reach", 1): 1}
+    names = {(lw.task_id(task), episode): length for (task, episode), length in ending.items()}
+    clock: dict[tuple[int, int], int] = {}
+
+    def policy(tensordict: TensorDictBase) -> TensorDictBase:
+        wavy(tensordict)
+        for row in torch.nonzero(tensordict["_step"]).flatten().tolist():
+            key = tensordict["task_id"][row].item(), tensordict["episode"][row].item()
+            clock[key] = clock.get(key, 0) + 1
+            if clock[key] == names.get(key):
+                tensordict["action"][row] = float("nan")
+        return tensordict
+
+    episodes = {"push": [7, 0, 9, 3], "reach": [4, 1, 11, 2, 6]}
+    keys = [*KEYS, ("next", "fault")]
+    with pytest.warns(UserWarning, match="its action is NaN"):
+        found = run(env, policy, episodes, keys=keys)
+    assert found.keys() == asked(episodes)
+    for key, steps in found.items():
+        length = ending.get(key, STEPS)
+        assert steps.batch_size == (length,)
+        assert steps["next", "fault"].any().item() == (key in ending)
+        expected = alone(*key)[:length]
+        assert torch.equal(steps["observation"], expected["observation"])
+
+
+def test_the_policy_is_told_which_rows_count():
+    seen = []
+
+    def policy(tensordict: TensorDictBase) -> TensorDictBase:
+        assert tensordict.batch_size == (5,)
+        seen.append(tensordict["_step"].clone())
+        wavy(tensordict)
+        tensordict["action"][~tensordict["_step"]] = float("nan")
+        return tensordict
+
+    found = run(plain_env(5), policy, {"push": [3], "reach": [0, 1, 2]})
+    assert found.keys() == {("push", 3), ("reach", 0), ("reach", 1), ("reach", 2)}
+    assert all(same(steps, alone(*key)) for key, steps in found.items())
+    assert len(seen) == 2 * STEPS, "three episodes on two rows"
+    assert [mask.sum().item() for mask in seen] == [3] * STEPS + [1] * STEPS
+
+
+def test_what_is_recorded_is_the_callers():
+    env = plain_env(2)
+    episodes = run_episodes(env, wavy, {"push": [0, 1], "reach": [0]}, keys=["observation", ("next", "success")])
+    with torch.no_grad():
+        first = next(episodes)
+        assert isinstance(first, Episode)
+        kept = first.steps.clone()
+        rest = list(episodes)
+    assert same(first.steps, kept)
+    assert set(kept.keys(True, True)) == {"observation", ("next", "success")}
+    assert {(found.task, found.episode) for found in [first, *rest]} == {("push", 0), ("push", 1), ("reach", 0)}
+
+
+def test_a_run_that_is_left_half_way_leaves_no_trace():
+    env = transformed_env(3)
+    with torch.no_grad():
+        episodes = run_episodes(env, wavy, {"push": [5, 6], "reach": [5, 6, 7]}, keys=KEYS)
+        next(episodes)
+        episodes.close()
+    found = run(env, wavy, {"push": [1], "reach": [2]})
+    assert all(same(steps, alone(*key)) for key, steps in found.items())
+
+
+def test_no_episodes_is_nothing_to_do():
+    assert run(plain_env(2), wavy, {}) == {}
+    assert run(plain_env(2), wavy, {"push": []}) == {}
+
+
+# --- on any number of rows -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("make", [plain_env, transformed_env])
+def test_the_number_of_rows_changes_nothing(network, make):
+    """With a network, in blocks, under noise, over many steps: bit for bit."""
+    episodes = {"push": [0, 4, 2], "reach": [6, 1, 3, 5]}
+    keys = [*KEYS, "clean", *(["qaf"] if make is transformed_env else [])]
+    options = {"noise": lambda number: (0.3, 0.2, 0.1, 0.05 * number), "clean_action": "clean", "keys": keys}
+    runs = [run(make(rows, 60), in_blocks(network), episodes, **options) for rows in (2, 5, 7)]
+    assert runs[0].keys() == asked(episodes)
+    for other in runs[1:]:
+        assert other.keys() == runs[0].keys()
+        assert all(same(runs[0][key], other[key]) for key in other)
+    again = run(make(5, 60), in_blocks(network), {"reach": [5]}, **options)
+    assert same(again["reach", 5], runs[0]["reach", 5]), "nor do the other episodes"
+
+
+def test_blocks_give_what_the_policy_gives(network):
+    torch.manual_seed(1)
+    states = TensorDict({"observation": torch.randn(200, 39), "row": torch.arange(200)}, [200])
+    whole = in_blocks(network)(states.clone())
+    assert set(whole.keys()) == {"observation", "row", "action"}
+    assert torch.allclose(whole["action"], network(states.clone())["action"], atol=1e-6)
+    for size in (1, 2, 63, 64, 65, 128, 130, 199):
+        part = in_blocks(network)(states[:size].clone())
+        assert part.batch_size == (size,)
+        assert torch.equal(part["action"], whole["action"][:size]), size
+        assert torch.equal(part["observation"], states["observation"][:size])
+        assert part["row"].tolist() == list(range(size))
+    order = torch.randperm(200, generator=torch.Generator().manual_seed(0))
+    assert torch.equal(in_blocks(network)(states[order].clone())["action"], whole["action"][order])
+
+
+def test_blocks_are_of_one_size():
+    sizes = []
+
+    def policy(tensordict: TensorDictBase) -> TensorDictBase:
+        sizes.append(tensordict.batch_size)
+        return wavy(tensordict)
+
+    for rows in (1, 64, 70, 129):
+        in_blocks(policy)(TensorDict({"observation": torch.zeros(rows, 39)}, [rows]))
+    assert sizes == [torch.Size([64])] * (1 + 1 + 2 + 3)
+
+
+def test_blocks_keep_what_else_the_policy_writes():
+    def policy(tensordict: TensorDictBase) -> TensorDictBase:
+        return (
+            wavy(tensordict).set("weights", tensordict["observation"][:, :3].softmax(-1)).set("row", -tensordict["row"])
+        )
+
+    states = TensorDict({"observation": torch.randn(70, 39), "row": torch.arange(70)}, [70])
+    out = in_blocks(policy)(states)
+    assert out is states
+    assert out["weights"].shape == (70, 3)
+    assert torch.equal(out["row"], -torch.arange(70))
+
+
+# --- noise ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("hold", [1, 3])
+def test_the_noise_is_the_episodes_own(hold):
+    episodes = {"push": [2, 7], "reach": [0]}
+
+    def scale(number: int) -> tuple[float, ...]:
+        return (0.1 * number, 0.5, 0.0, 2.0)
+
+    keys = [*KEYS, "clean"]
+    found = run(plain_env(3), wavy, episodes, noise=scale, noise_hold=hold, clean_action="clean", keys=keys)
+    clipped = 0
+    for (task, episode), steps in found.items():
+        noise = torch.from_numpy(action_noise(task, SEED, episode, STEPS, hold) * np.float32(scale(episode)))
+        expected = (wavy(steps.select("observation"))["action"] + noise).clamp(-1, 1)
+        assert torch.equal(steps["clean"], wavy(steps.select("observation"))["action"])
+        assert torch.equal(steps["action"], expected)
+        assert torch.equal(steps["action"][:, 2], steps["clean"][:, 2])
+        assert not torch.equal(steps["action"], steps["clean"])
+        clipped += (expected.abs() == 1).sum().item()
+    assert clipped > 0
+    quiet = run(plain_env(3), wavy, episodes, clean_action="clean", keys=keys)
+    assert all(torch.equal(steps["action"], steps["clean"]) for steps in quiet.values())
+    assert all(same(steps.exclude("clean"), alone(*key)) for key, steps in quiet.items())
+
+
+def test_noise_leaves_the_clean_action_unclipped():
+    """An actor that asks for too much: its own wish is what ``clean_action`` keeps."""
+
+    def policy(tensordict: TensorDictBase) -> TensorDictBase:
+        return tensordict.set("action", torch.full((2, 4), 1.5))
+
+    found = run(
+        plain_env(2), policy, {"reach": [0]}, noise=lambda _: (0.1,) * 4, clean_action="clean", keys=["clean", "action"]
+    )
+    steps = found["reach", 0]
+    assert (steps["clean"] == 1.5).all()
+    assert (steps["action"] <= 1).all()
+
+
+# --- stopping early ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("make", [plain_env, transformed_env])
+def test_stopping_at_success_gives_the_same_success(make):
+    length = 110
+    episodes = {"push": [3, 0, 8], "reach": [5, 2, 0, 7, 1]}
+    keys = ["observation", "action", ("next", "success")]
+    progress: dict[bool, list[int]] = {False: [], True: []}
+    runs = {
+        stop: run(
+            make(3, length),
+            lw.ExpertActor(TASKS),
+            episodes,
+            keys=keys,
+            noise=lambda _: (0.2,) * 4,
+            stop_at_success=stop,
+            on_progress=progress[stop].append,
+        )
+        for stop in (False, True)
+    }
+    assert runs[True].keys() == runs[False].keys() == asked(episodes)
+    lengths = []
+    for key, whole in runs[False].items():
+        assert whole.batch_size == (length,)
+        success = whole["next", "success"].flatten()
+        short = runs[True][key]
+        lengths.append(len(short))
+        assert short["next", "success"].any() == success.any()
+        if success.any():
+            assert len(short) == int(success.nonzero()[0]) + 1
+        assert same(short, whole[: len(short)])
+    assert len(set(lengths)) > 3, "episodes of different lengths"
+    assert min(lengths) < length
+    total = len(asked(episodes)) * length
+    assert sum(progress[True]) == sum(progress[False]) == total
+    assert len(progress[True]) < len(progress[False])
+
+
+# --- bad input -----------------------------------------------------------------------------------------------------
+
+
+def test_a_task_that_the_environment_lacks_is_named():
+    with pytest.raises(ValueError, match="episodes names drawer-open, sweep, which env does not have"):
+        run(plain_env(2), wavy, {"sweep": [0], "reach": [1], "drawer-open": []})
+
+
+def test_a_negative_episode_is_named():
+    with pytest.raises(ValueError, match="episode must be at least 0, got -1"):
+        run(plain_env(2), wavy, {"reach": [-1]})
+
+
+@pytest.mark.parametrize("env", [None, "reach", GymLikeEnv], ids=str)
+def test_another_environment_is_named(env):
+    with pytest.raises(TypeError, match="env must be a LanguageWorldEnv or a TransformedEnv of one, got"):
+        run(env, wavy, {"reach": [0]})
+
+
+def test_a_nan_raises_where_the_environment_is_strict():
+    env = lw.LanguageWorldEnv("reach", strict=True)
+    with pytest.raises(ValueError, match="action must hold numbers: row 0"):
+        run(env, lambda td: td.set("action", torch.full((1, 4), float("nan"))), {"reach": [0]})
+    env.close()

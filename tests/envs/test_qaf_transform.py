@@ -1,0 +1,274 @@
+"""QAFTransform writes what QueryProgram answers, in an environment and on a replay buffer."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, LazyTensorStorage, SamplerWithoutReplacement, TensorDictReplayBuffer
+from torchrl.envs import Compose, InitTracker, StepCounter, TransformedEnv
+
+import lw_torchrl as lw
+
+# Conditions that an expert makes true and false; plans of 2, 3, 1 and 5 steps.
+PAIRS = {
+    "button-press-topdown": [
+        ("the gripper is not above the button", "move the gripper above the button"),
+        ("the gripper is above the button", "press the button"),
+    ],
+    "drawer-open": [
+        ("the gripper is not vertically aligned with the drawer handle", "move over the drawer handle"),
+        ("the gripper is near the drawer handle and the gripper is open", "pull the drawer handle"),
+        ("the gripper is closed", "open the gripper"),
+    ],
+    "push": [("the gripper is not near the puck", "move to the puck")],
+    "reach": [
+        ("the gripper is not near the reach target", "move the gripper to the reach target"),
+        ("the gripper is near the reach target", "hold still"),
+        ("the gripper is left of the reach target", "move to the right"),
+        ("the gripper is above the reach target", "move down"),
+        ("the gripper is not above the reach target", "move up"),
+    ],
+}
+TASKS = sorted(PAIRS)
+ROWS, STEPS, WIDTH = 6, 60, 5
+
+
+@pytest.fixture(scope="module")
+def few_plans() -> lw.Plans:
+    return lw.Plans([lw.ConditionalPlan.from_pairs(task, pairs) for task, pairs in PAIRS.items()])
+
+
+@pytest.fixture(scope="module")
+def env(few_plans) -> Iterator[TransformedEnv]:
+    env = TransformedEnv(lw.LanguageWorldEnv(TASKS, num_envs=ROWS, seed=0, max_steps=STEPS), lw.QAFTransform(few_plans))
+    yield env
+    env.close()
+
+
+@pytest.fixture(scope="module")
+def rollout(env) -> TensorDictBase:
+    """An episode of the experts and the beginning of the next."""
+    env.set_seed(0)
+    return env.rollout(STEPS + 5, lw.ExpertActor(TASKS), break_when_any_done=False)
+
+
+def answers(observation: Tensor, task_id: Tensor) -> Tensor:
+    """Each condition of each row by a program of its own, for one state at a time."""
+    states, tasks = observation.reshape(-1, 39), task_id.reshape(-1)
+    found = torch.zeros(len(states), WIDTH, dtype=torch.bool)
+    for task in TASKS:
+        rows = torch.nonzero(tasks == lw.task_id(task)).flatten()
+        for step, (condition, _) in enumerate(PAIRS[task]):
+            program = lw.QueryProgram({task: [condition]})
+            for row in rows.tolist():
+                found[row, step] = program(states[row : row + 1], tasks[row : row + 1]).item()
+    return found.reshape(*task_id.shape, WIDTH)
+
+
+def test_it_is_the_programs_answer_at_every_step(rollout):
+    expected = answers(rollout["observation"], rollout["task_id"])
+    assert torch.equal(rollout["qaf"], expected)
+    assert torch.equal(rollout["next", "qaf"], answers(rollout["next", "observation"], rollout["next", "task_id"]))
+    for task, pairs in PAIRS.items():
+        rows = rollout["qaf"][rollout["task_id"][:, 0] == lw.task_id(task)].flatten(0, 1)
+        assert not rows[:, len(pairs) :].any(), "padding is false"
+        if task != "reach":
+            assert rows[:, 0].any(), task
+            assert not rows[:, 0].all(), task
+    ended = rollout["next", "done"].squeeze(-1)
+    assert ended.sum() == ROWS
+    assert not torch.equal(rollout["qaf"][:, STEPS], rollout["next", "qaf"][:, STEPS - 1]), "a reset answers afresh"
+
+
+def test_one_call_answers_like_the_program(rollout, few_plans):
+    program = lw.QueryProgram({task: [step.condition for step in plan.steps] for task, plan in few_plans.items()})
+    assert torch.equal(rollout["qaf"], program(rollout["observation"], rollout["task_id"]))
+
+
+def test_the_specs_know_it(env):
+    spec = env.observation_spec["qaf"]
+    assert isinstance(spec, Binary)
+    assert spec.shape == (ROWS, WIDTH)
+    assert spec.dtype == torch.bool
+    assert env.fake_tensordict()["next", "qaf"].shape == (ROWS, WIDTH)
+
+
+def test_masked_rows_keep_their_answers(env):
+    env.set_seed(0)
+    state = env.reset()
+    mask = torch.arange(ROWS) % 2 == 0
+    expert = lw.ExpertActor(TASKS)
+    for _ in range(50):
+        state = env.step(expert(state).set("_step", mask))["next"]
+    fresh = env.reset(state.clone().set("_reset", mask))
+    env.set_seed(0)
+    first = env.reset()
+    assert torch.equal(state["qaf"][~mask], first["qaf"][~mask])
+    assert not torch.equal(state["qaf"][mask], first["qaf"][mask])
+    assert torch.equal(fresh["qaf"][~mask], state["qaf"][~mask])
+    assert torch.equal(fresh["qaf"], answers(fresh["observation"], fresh["task_id"]))
+
+
+def test_other_transforms_go_beside_it(few_plans):
+    env = TransformedEnv(
+        lw.LanguageWorldEnv(["push", "reach"], seed=0, max_steps=4),
+        Compose(StepCounter(), lw.QAFTransform(few_plans), InitTracker()),
+    )
+    rollout = env.rollout(6, break_when_any_done=False)
+    assert torch.equal(rollout["qaf"], answers(rollout["observation"], rollout["task_id"]))
+    assert rollout["step_count"][0].flatten().tolist() == [0, 1, 2, 3, 0, 1]
+    env.close()
+    later = TransformedEnv(lw.LanguageWorldEnv("reach", seed=0))
+    later.append_transform(lw.QAFTransform(few_plans))
+    assert later.reset()["qaf"].shape == (1, WIDTH)
+    later.close()
+
+
+# --- on a replay buffer --------------------------------------------------------------------------------------------
+
+
+def buffer(data: TensorDictBase, plans: lw.Plans) -> TensorDictReplayBuffer:
+    """Whose samples hold every row once, in some order."""
+    replay = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(len(data)),
+        sampler=SamplerWithoutReplacement(),
+        transform=lw.QAFTransform(plans),
+        batch_size=len(data),
+    )
+    replay.extend(data)
+    return replay
+
+
+STORED = ("observation", "task_id", "action", ("next", "observation"), ("next", "task_id"), ("next", "reward"))
+
+
+@pytest.mark.parametrize("next_task_id", [True, False])
+def test_on_a_replay_buffer(rollout, few_plans, next_task_id):
+    data = rollout.select(*STORED).flatten(0, 1)
+    if not next_task_id:
+        data = data.exclude(("next", "task_id"))
+    sample = buffer(data, few_plans).sample()
+    assert torch.equal(sample["qaf"], answers(sample["observation"], sample["task_id"]))
+    assert torch.equal(sample["next", "qaf"], answers(sample["next", "observation"], sample["task_id"]))
+    assert not torch.equal(sample["qaf"], sample["next", "qaf"])
+    assert (("next", "task_id") in sample.keys(True)) == next_task_id
+
+
+@pytest.mark.parametrize("keys", [STORED[:3], (*STORED[:3], ("next", "reward"))], ids=["no next", "next reward"])
+def test_without_a_next_observation_there_is_no_next_qaf(rollout, few_plans, keys):
+    sample = buffer(rollout.select(*keys).flatten(0, 1), few_plans).sample()
+    assert torch.equal(sample["qaf"], answers(sample["observation"], sample["task_id"]))
+    assert ("next", "qaf") not in sample.keys(True)
+
+
+def test_any_leading_shape(rollout, few_plans):
+    transform = lw.QAFTransform(few_plans)
+    data = rollout.select(*STORED)
+    whole = transform(data.clone())
+    assert whole["qaf"].shape == (ROWS, STEPS + 5, WIDTH)
+    assert torch.equal(whole["qaf"], rollout["qaf"])
+    assert torch.equal(whole["next", "qaf"], rollout["next", "qaf"])
+    one = transform(data[2, 7].clone())
+    assert one["qaf"].shape == (WIDTH,)
+    assert torch.equal(one["qaf"], rollout["qaf"][2, 7])
+    assert torch.equal(one["next", "qaf"], rollout["next", "qaf"][2, 7])
+
+
+# --- bad input -----------------------------------------------------------------------------------------------------
+
+
+def test_a_task_without_a_plan_is_named_at_once(few_plans):
+    env = lw.LanguageWorldEnv(["reach", "sweep", "soccer"])
+    with pytest.raises(lw.PlanError, match=r"plans lack soccer, sweep; they cover button-press-topdown, .*reach"):
+        TransformedEnv(env, lw.QAFTransform(few_plans))
+    with pytest.raises(lw.PlanError, match="plans lack soccer, sweep"):
+        TransformedEnv(env, Compose(StepCounter(), Compose(lw.QAFTransform(few_plans))))
+    transformed = TransformedEnv(env, StepCounter())
+    with pytest.raises(lw.PlanError, match="plans lack soccer, sweep"):
+        transformed.append_transform(lw.QAFTransform(few_plans))
+    env.close()
+
+
+def test_more_plans_than_tasks_are_welcome(few_plans):
+    env = TransformedEnv(lw.LanguageWorldEnv("push"), lw.QAFTransform(few_plans))
+    assert env.reset()["qaf"].shape == (1, WIDTH)
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("plans", "error", "message"),
+    [
+        ({}, lw.PlanError, "at least one plan"),
+        (None, TypeError, "plans must map task names to ConditionalPlan, got NoneType"),
+        ("MT10", TypeError, "plans must map task names to ConditionalPlan, got str"),
+        ({"reach": "move to the goal"}, TypeError, "plans must hold ConditionalPlan"),
+    ],
+    ids=str,
+)
+def test_wrong_plans_are_named(plans, error, message):
+    with pytest.raises(error, match=message):
+        lw.QAFTransform(plans)
+
+
+def test_a_plan_under_another_name_is_named(few_plans):
+    with pytest.raises(lw.PlanError, match="plans\\['push'\\] is a plan for another task, 'reach'"):
+        lw.QAFTransform({"push": few_plans["reach"]})
+
+
+def wrong_states() -> dict[str, tuple[dict[str, Tensor], str]]:
+    observation, reach = torch.zeros(3, 39), torch.full((3,), lw.task_id("reach"))
+    nan, infinite, unknown = observation.clone(), observation.clone(), reach.clone()
+    nan[1, 4], infinite[2, 0], unknown[1] = float("nan"), float("inf"), lw.task_id("soccer")
+    outside = reach.clone()
+    outside[0] = 50
+    return {
+        "narrow": ({"observation": torch.zeros(3, 36), "task_id": reach}, r"observation must be .*39\), got .*\(3, 36"),
+        "wide": ({"observation": torch.zeros(3, 40), "task_id": reach}, r"observation must be .*39\), got .*\(3, 40"),
+        "integers": (
+            {"observation": observation.long(), "task_id": reach},
+            "observation must be float.* got torch.int",
+        ),
+        "NaN": ({"observation": nan, "task_id": reach}, "observation must hold finite numbers, got NaN"),
+        "infinite": ({"observation": infinite, "task_id": reach}, "observation must hold finite numbers"),
+        "no plan": ({"observation": observation, "task_id": unknown}, r"task_id holds .*\(soccer\)"),
+        "too large": ({"observation": observation, "task_id": outside}, "task_id holds 50"),
+        "negative": ({"observation": observation, "task_id": reach - 100}, "task_id holds -"),
+        "float id": (
+            {"observation": observation, "task_id": reach.float()},
+            "task_id must be int64.* got torch.float32",
+        ),
+        "extra axis": ({"observation": observation, "task_id": reach[:, None]}, r"task_id must be .*\(3,\).*\(3, 1\)"),
+    }
+
+
+@pytest.mark.parametrize("case", wrong_states())
+@pytest.mark.parametrize("place", ["now", "next"])
+def test_a_wrong_state_is_named(few_plans, case, place):
+    state, message = wrong_states()[case]
+    good = {"observation": torch.zeros(3, 39), "task_id": torch.full((3,), lw.task_id("reach"))}
+    data = {**state} if place == "now" else {**good, "next": state}
+    with pytest.raises(ValueError, match=message):
+        lw.QAFTransform(few_plans)(TensorDict(data, [3]))
+
+
+@pytest.mark.parametrize("key", ["observation", "task_id"])
+def test_a_missing_entry_is_named(few_plans, key):
+    data = TensorDict({"observation": torch.zeros(3, 39), "task_id": torch.full((3,), lw.task_id("reach"))}, [3])
+    with pytest.raises((KeyError, ValueError), match=key):
+        lw.QAFTransform(few_plans)(data.exclude(key))
+
+
+def test_an_instance_has_one_environment(few_plans):
+    transform = lw.QAFTransform(few_plans)
+    first, second = lw.LanguageWorldEnv("reach"), lw.LanguageWorldEnv("push")
+    taken = TransformedEnv(first, transform)
+    with pytest.raises(AttributeError, match=r"parent of transform .*QAFTransform.* already set"):
+        TransformedEnv(second, transform)
+    copied = TransformedEnv(second, transform.clone())
+    assert copied.reset()["qaf"].shape == taken.reset()["qaf"].shape == (1, WIDTH)
+    first.close()
+    second.close()
