@@ -1,6 +1,7 @@
 # make demo    train, evaluate and record a plan-conditioned policy on MT10
 # make test    the whole test suite, warnings as errors
 # make check   ruff and mypy
+# make bench   what everything costs, against rivals (docs/performance.md)
 # make setup   the environment alone (.venv)
 PYTHON ?= python3
 BIN := .venv/bin
@@ -16,6 +17,8 @@ check: $(READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 setup: $(READY)
+bench: $(READY)
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks
 
 # pip, not uv: constraints.txt pins torch, and pip is what honours the wheel an environment provides.
 $(READY): pyproject.toml constraints.txt

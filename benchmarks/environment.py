@@ -1,0 +1,276 @@
+"""LanguageWorldEnv: what TorchRL's layer adds, resets, construction, and other ways to run Meta-World."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import warnings
+from collections.abc import Callable, Sequence
+from statistics import median
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torchrl.envs import Compose, EnvBase, StepCounter, TransformedEnv
+
+import lw_torchrl as lw
+from benchmarks.language import plans_for_all
+from benchmarks.report import Row, Settings, Skipped, bars, compare, part_of, take_turns, timed, under
+from lw_torchrl.envs.engine import OBSERVATION_SIZE, Engine, EngineStep
+from lw_torchrl.envs.metaworld_engine import make_metaworld_env
+from lw_torchrl.envs.vectorized_engine import VectorizedEngine, available_cores
+
+_SMALL = ("reach", "push", "door-open")
+
+
+class _IdleEngine:
+    """Simulates nothing: what is left of a step is TorchRL's layer."""
+
+    def __init__(self, tasks: Sequence[str], **_: Any) -> None:
+        n = len(tasks)
+        self._seen = np.zeros((n, OBSERVATION_SIZE))
+        self._zero, self._no = np.zeros(n), np.zeros(n, dtype=bool)
+
+    def reset(self, rows: Sequence[int], seeds: Sequence[int]) -> np.ndarray:
+        return self._seen[list(rows)]
+
+    def step(self, action: np.ndarray, active: np.ndarray) -> EngineStep:
+        return EngineStep(self._seen.copy(), self._zero.copy(), self._no.copy(), self._no.copy())
+
+    def close(self) -> None:
+        pass
+
+
+class _Clock:
+    """Makes engines, and counts the seconds spent in their steps."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+
+    def __call__(self, tasks: Sequence[str], **options: Any) -> Engine:
+        engine = VectorizedEngine(tasks, **options)
+        step = engine.step
+
+        def counted(action: np.ndarray, active: np.ndarray) -> EngineStep:
+            start = perf_counter()
+            result = step(action, active)
+            self.seconds += perf_counter() - start
+            return result
+
+        engine.step = counted  # type: ignore[method-assign]
+        return engine
+
+
+def _tasks(n: int) -> tuple[str, ...]:
+    """The first n of the 50 tasks, spread over the list, so that small batches are of typical tasks too."""
+    return tuple(lw.MT50[i * len(lw.MT50) // n] for i in range(n)) if n < len(lw.MT50) else lw.MT50
+
+
+def _stepper(env: EnvBase, state: TensorDictBase, steps: int) -> Callable[[], None]:
+    generator = torch.Generator().manual_seed(0)
+    actions = torch.rand((steps, *state.batch_size, 4), generator=generator) * 2 - 1
+
+    def run() -> None:
+        now = state
+        for action in actions:
+            now.set("action", action.clone())
+            now = env.step_and_maybe_reset(now)[1]
+
+    return run
+
+
+def overhead(settings: Settings) -> list[Row]:
+    """What is not the engine in a step with QAFTransform and StepCounter: measured around the engine, and, as a
+    check, as a whole step of an engine that does nothing."""
+    rows = []
+    for n in (2, 4) if settings.quick else (1, 10, 50, 200):
+        rounds, steps = settings.pick(15, 3), settings.pick(max(5, 600 // n), 5)
+        clock = _Clock()
+        runs, envs = {}, []
+        for name, engine in (("whole", clock), ("idle", _IdleEngine)):
+            base = lw.LanguageWorldEnv(_tasks(n), num_envs=n, engine=engine, num_threads=1, max_steps=10**6)
+            envs.append(TransformedEnv(base, Compose(lw.QAFTransform(plans_for_all()), StepCounter())))
+            runs[name] = _stepper(envs[-1], envs[-1].reset(), steps)
+        whole, idle, layer = [], [], []
+        for _ in bars(range(rounds), f"overhead, N = {n}"):
+            clock.seconds = 0.0
+            whole.append(timed(runs["whole"]))
+            layer.append(whole[-1] - clock.seconds)
+            idle.append(timed(runs["idle"]))
+        for env in envs:
+            env.close()
+        rows.append(
+            part_of(
+                f"TorchRL's layer of a step, N = {n}, 1 thread",
+                layer,
+                "the whole step",
+                whole,
+                unit="µs",
+                scale=1e6 / steps,
+                at_most=0.05 if n == 50 else None,
+                note=f"{1e6 * median(idle) / steps:.0f} µs with an engine that does nothing",
+            )
+        )
+    return rows
+
+
+def reset(settings: Settings) -> list[Row]:
+    """A reset of every row, against Meta-World's own ``env.seed(s); env.reset()``."""
+    tasks = _SMALL if settings.quick else lw.MT50
+    env = lw.LanguageWorldEnv(tasks, num_threads=1)
+    originals = [make_metaworld_env(task) for task in tasks]
+    seeds = iter(range(10**6))
+
+    def theirs() -> None:
+        seed = next(seeds)
+        for original in originals:
+            original.seed(seed)
+            original.reset()
+
+    found = take_turns({"ours": env.reset, "theirs": theirs}, settings.pick(15, 2))
+    env.close()
+    return [
+        compare(
+            f"reset, {len(tasks)} tasks, 1 thread",
+            found["ours"],
+            "Meta-World's env.reset",
+            found["theirs"],
+            unit="ms",
+            scale=1e3 / len(tasks),
+        )
+    ]
+
+
+_CONSTRUCT = """
+import json, resource, sys, time
+import lw_torchrl as lw
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+start = time.perf_counter()
+env = lw.LanguageWorldEnv(sys.argv[1].split(","), num_envs=int(sys.argv[2]))
+built = time.perf_counter() - start
+env.reset()
+after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+unit = 1 if sys.platform == "darwin" else 1024
+print(json.dumps({"built": built, "reset": time.perf_counter() - start - built,
+                  "memory": after * unit / 1e9, "imports": before * unit / 1e9}))
+"""
+
+
+def construction(settings: Settings) -> list[Row]:
+    """MT50 with 1000 environments, each time in a fresh process: no model is compiled yet."""
+    n = settings.pick(1000, 6)
+    tasks = _SMALL if settings.quick else lw.MT50
+    found = []
+    for _ in bars(range(settings.pick(3, 1)), "construction"):
+        command = [sys.executable, "-W", "ignore", "-c", _CONSTRUCT, ",".join(tasks), str(n)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise RuntimeError(done.stderr.strip().splitlines()[-1])
+        found.append(json.loads(done.stdout.splitlines()[-1]))
+    middle = {key: median(one[key] for one in found) for key in found[0]}
+    what = f"MT50, {n} environments" if not settings.quick else f"{len(tasks)} tasks, {n} environments"
+    return [
+        under(f"{what}: built", middle["built"], "s", 12, "compiles every model; the imports are not counted"),
+        under(f"{what}: first reset", middle["reset"], "s"),
+        under(f"{what}: peak memory", middle["memory"], "GB", 3, f"imports alone {middle['imports']:.2f} GB"),
+    ]
+
+
+def gym_wrapper(settings: Settings) -> list[Row]:
+    """TorchRL's GymWrapper over Meta-World, one environment after another, as a SerialEnv would step them.
+
+    It is stepped with zero actions and no info reader: seeding, partial resets and success are not to be had from it.
+    """
+    from torchrl.envs import GymWrapper
+
+    tasks = _SMALL if settings.quick else lw.MT50
+    steps = settings.pick(10, 3)
+    wrapped = []
+    for task in tasks:
+        env = make_metaworld_env(task, max_steps=10**6)
+        env.seed(0)
+        wrapped.append(GymWrapper(env))
+    states = [env.reset() for env in wrapped]
+    action = torch.zeros(4)
+
+    def theirs() -> None:
+        for number, env in enumerate(wrapped):
+            for _ in range(steps):
+                states[number].set("action", action)
+                states[number] = env.step_mdp(env.step(states[number]))
+
+    ours = lw.LanguageWorldEnv(tasks, num_threads=1, max_steps=10**6, reward="dense")
+    state = ours.reset()
+
+    def run() -> None:
+        now = state
+        for _ in range(steps):
+            now.set("action", torch.zeros(len(tasks), 4))
+            now = ours.step_mdp(ours.step(now))
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # what the wrapper and Gymnasium say of Meta-World's specs
+        found = take_turns({"ours": run, "theirs": theirs}, settings.pick(15, 2))
+    ours.close()
+    return [
+        compare(
+            f"LanguageWorldEnv step, N = {len(tasks)}, 1 thread, dense reward",
+            found["ours"],
+            "GymWrapper over Meta-World",
+            found["theirs"],
+            unit="µs",
+            scale=1e6 / len(tasks) / steps,
+        )
+    ]
+
+
+def envpool(settings: Settings) -> list[Row]:
+    """EnvPool's own C++ Meta-World, a pool of 10 for each of 10 tasks, random actions, dense reward."""
+    try:
+        import envpool as rival
+    except ImportError as error:
+        raise Skipped(f"EnvPool is not installed ({error}): pip install -e '.[bench]'") from error
+
+    tasks, n, steps = (_SMALL if settings.quick else lw.MT10), 10, settings.pick(20, 3)
+    count = min(2, available_cores())
+    generator = np.random.default_rng(0)
+    found: dict[str, list[float]] = {"ours": [], "theirs": []}
+    pools = []
+    for task in tasks:
+        name = "".join(word.capitalize() for word in task.split("-"))
+        pools.append(rival.make_gymnasium(f"MetaWorld/{name}-v3", num_envs=n, num_threads=count, seed=0))
+        pools[-1].reset()
+    envs = [lw.LanguageWorldEnv(task, num_envs=n, num_threads=count, reward="dense") for task in tasks]
+    states = [env.reset() for env in envs]
+    for _ in bars(range(settings.pick(15, 2)), "EnvPool"):
+        actions = generator.uniform(-1, 1, (steps, n, 4)).astype(np.float32)
+
+        def ours(actions: np.ndarray = actions) -> None:
+            for number, env in enumerate(envs):
+                for action in actions:
+                    states[number].set("action", torch.from_numpy(action))
+                    states[number] = env.step_mdp(env.step(states[number]))
+
+        def theirs(actions: np.ndarray = actions) -> None:
+            for pool in pools:
+                for action in actions:
+                    pool.step(action)
+
+        found["theirs"].append(timed(theirs))
+        found["ours"].append(timed(ours))
+    for env in envs:
+        env.close()
+    return [
+        compare(
+            f"LanguageWorldEnv step, one task × {n}, {count} threads, dense reward",
+            found["ours"],
+            f"EnvPool {rival.__version__}",
+            found["theirs"],
+            unit="µs",
+            scale=1e6 / len(tasks) / steps / n,
+            note="EnvPool's numbers need not be Meta-World's",
+        )
+    ]

@@ -1,0 +1,208 @@
+"""The engine against the physics alone, Meta-World's own step, and its own second thread."""
+
+from __future__ import annotations
+
+import warnings
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from copy import copy
+from functools import partial
+from time import perf_counter
+from typing import Any
+
+import mujoco
+import numpy as np
+from metaworld.policies import ENV_POLICY_MAP
+
+import lw_torchrl as lw
+from benchmarks.report import Row, Settings, Skipped, bars, compare, timed
+from lw_torchrl.envs.metaworld_engine import make_metaworld_env
+from lw_torchrl.envs.vectorized_engine import VectorizedEngine, available_cores
+
+CHUNK = 25  # steps that one contender makes before it is the next one's turn
+SUBSTEPS = 5
+MOCAP_QUATERNION = (1.0, 0.0, 1.0, 0.0)  # Meta-World puts it there at every step
+
+
+class _Physics:
+    """Copies of the states of Meta-World's environments, on the same models, moved by MuJoCo alone."""
+
+    def __init__(self, envs: list[Any], *, look: bool) -> None:
+        self._look = look
+        self.pairs = [(env.model, copy(env.data)) for env in envs]
+
+    def play(self, mocap: np.ndarray, control: np.ndarray) -> float:
+        """Seconds of physics along mocap (T, N, 3) and control (T, N, 2); what sets the controls is not counted."""
+        seconds = 0.0
+        for positions, controls in zip(mocap, control, strict=True):
+            for (_, data), position, values in zip(self.pairs, positions, controls, strict=True):
+                data.mocap_pos[0] = position
+                data.mocap_quat[0] = MOCAP_QUATERNION
+                data.ctrl[:] = values
+            start = perf_counter()
+            if self._look:
+                for model, data in self.pairs:
+                    mujoco.mj_step(model, data, SUBSTEPS)
+                    mujoco.mj_forward(model, data)
+            else:
+                for model, data in self.pairs:
+                    mujoco.mj_step(model, data, SUBSTEPS)
+            seconds += perf_counter() - start
+        return seconds
+
+
+def steps(settings: Settings) -> list[Row]:
+    """All 50 tasks, expert actions, one thread, in turns of 25 steps; all must come to the same states."""
+    tasks = lw.MT50[:3] if settings.quick else lw.MT50
+    n, seeds = len(tasks), list(range(len(tasks)))
+    experts = [ENV_POLICY_MAP[f"{task}-v3"]() for task in tasks]
+    originals = [make_metaworld_env(task) for task in tasks]
+    observations = []
+    for env, seed in zip(originals, seeds, strict=True):
+        env.seed(seed)
+        observations.append(env.reset()[0])
+    floor, bare = (_Physics(originals, look=look) for look in (True, False))
+    engines = {reward: VectorizedEngine(tasks, num_threads=1, reward=reward) for reward in ("sparse", "dense")}
+    for engine in engines.values():
+        engine.reset(range(n), seeds)
+    active = np.ones(n, dtype=bool)
+    found: dict[str, list[float]] = {name: [] for name in ("metaworld", "floor", "bare", "sparse", "dense")}
+    for number in bars(range(settings.pick(500, 50) // CHUNK), "steps"):
+        actions = np.empty((CHUNK, n, 4), dtype=np.float32)
+        mocap, control = np.empty((CHUNK, n, 3)), np.empty((CHUNK, n, 2))
+        seconds = 0.0
+        for step in range(CHUNK):
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", message="Constant\\(s\\) may be too high")
+                wanted = [expert.get_action(seen) for expert, seen in zip(experts, observations, strict=True)]
+            actions[step] = np.clip(np.stack(wanted), -1, 1)
+            start = perf_counter()
+            observations = [env.step(action)[0] for env, action in zip(originals, actions[step], strict=True)]
+            seconds += perf_counter() - start
+            for row, env in enumerate(originals):
+                mocap[step, row], control[step, row] = env.data.mocap_pos[0], env.data.ctrl
+        found["metaworld"].append(seconds)
+
+        def play_engine(reward: str, actions: np.ndarray = actions, expected: list = observations) -> None:
+            engine = engines[reward]
+            start = perf_counter()
+            for action in actions:
+                result = engine.step(action, active)
+            found[reward].append(perf_counter() - start)
+            if not np.array_equal(result.observation, np.stack(expected)):
+                raise RuntimeError(f"the {reward} engine and Meta-World disagree")
+
+        def play_physics(name: str, mocap: np.ndarray = mocap, control: np.ndarray = control) -> None:
+            found[name].append({"floor": floor, "bare": bare}[name].play(mocap, control))
+
+        turns: list[Callable[[], None]] = [
+            lambda: play_engine("sparse"),
+            lambda: play_physics("floor"),
+            lambda: play_engine("dense"),
+            lambda: play_physics("bare"),
+        ]
+        for turn in turns if number % 2 else reversed(turns):
+            turn()
+        twins = zip(originals, floor.pairs, strict=True)
+        if not all(np.array_equal(env.data.qpos, data.qpos) for env, (_, data) in twins):
+            raise RuntimeError("the exact floor and Meta-World disagree")
+    for engine in engines.values():
+        engine.close()
+
+    def row(ours: str, rival: str, theirs: str, at_least: float | None = None, note: str = "") -> Row:
+        name = "environment step, " + ours + " reward"
+        return compare(
+            name, found[ours], rival, found[theirs], unit="µs", scale=1e6 / CHUNK / n, at_least=at_least, note=note
+        )
+
+    return [
+        row("sparse", "mj_step ×5 alone", "bare", note="without mj_forward the states drift from Meta-World's"),
+        row("sparse", "mj_step ×5, mj_forward", "floor", 0.90, note="the least that gives Meta-World's numbers"),
+        row("sparse", "Meta-World's env.step", "metaworld", 2.0),
+        row("dense", "Meta-World's env.step", "metaworld", 1.5),
+    ]
+
+
+def threads(settings: Settings) -> list[Row]:
+    """Two threads against one, and the same for a loop of nothing but physics: what the machine can give."""
+    if available_cores() < 2:
+        raise Skipped("this process may use one core only")
+    rows = []
+    for copies in (1,) if settings.quick else (1, 4):
+        rows += _threads(lw.MT50[:4] if settings.quick else lw.MT50 * copies, settings)
+    return rows
+
+
+def _threads(tasks: tuple[str, ...], settings: Settings) -> list[Row]:
+    n = len(tasks)
+    engines = [VectorizedEngine(tasks, num_threads=count) for count in (1, 2)]
+    for engine in engines:
+        engine.reset(range(n), list(range(n)))
+    active = np.ones(n, dtype=bool)
+    generator = np.random.default_rng(0)
+    block = 10 if n <= 50 else 5
+    # A piece of the bare loop's work is the rows of one task, which share a model; a thread takes piece after piece.
+    pieces = []
+    for task in dict.fromkeys(tasks):
+        env = make_metaworld_env(task)
+        env.seed(0)
+        env.reset()
+        pieces.append([(env.model, copy(env.data)) for _ in range(tasks.count(task))])
+
+    def work_through(waiting: deque[list[tuple[Any, Any]]]) -> None:
+        while True:
+            try:
+                piece = waiting.popleft()
+            except IndexError:
+                return
+            for model, data in piece:
+                mujoco.mj_step(model, data, SUBSTEPS)
+                mujoco.mj_forward(model, data)
+
+    def alone() -> None:
+        for _ in range(block):
+            work_through(deque(pieces))
+
+    def in_two() -> None:
+        for _ in range(block):
+            waiting = deque(pieces)
+            other = pool.submit(work_through, waiting)
+            work_through(waiting)
+            other.result()
+
+    def step(engine: VectorizedEngine) -> None:
+        for action in actions:
+            engine.step(action, active)
+
+    found: dict[str, list[float]] = {name: [] for name in ("one", "two", "bare one", "bare two")}
+    with ThreadPoolExecutor(1) as pool:
+        for number in bars(range(settings.pick(20, 3)), f"threads, N = {n}"):
+            actions = generator.uniform(-1, 1, (block, n, 4)).astype(np.float32)
+            one, two = partial(step, engines[0]), partial(step, engines[1])
+            turns = {"one": one, "two": two, "bare one": alone, "bare two": in_two}
+            for name in turns if number % 2 else reversed(turns):
+                found[name].append(timed(turns[name]))
+    for engine in engines:
+        engine.close()
+    scale = 1e6 / block / n
+    return [
+        compare(
+            f"engine step, N = {n}, 2 threads",
+            found["two"],
+            "1 thread",
+            found["one"],
+            unit="µs",
+            scale=scale,
+            at_least=1.6,
+        ),
+        compare(
+            f"bare physics, N = {n}, 2 threads",
+            found["bare two"],
+            "1 thread",
+            found["bare one"],
+            unit="µs",
+            scale=scale,
+            note="what this machine gains from a second thread",
+        ),
+    ]

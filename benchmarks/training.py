@@ -1,0 +1,73 @@
+"""A step of behavioral cloning, eager and compiled."""
+
+from __future__ import annotations
+
+import warnings
+from time import perf_counter
+
+import torch
+from tensordict import TensorDict
+from torchrl.objectives import BCLoss
+
+import lw_torchrl as lw
+from benchmarks.language import plans_for_all
+from benchmarks.report import Row, Settings, compare, take_turns, under
+
+BATCH = 500
+
+
+def _batch() -> TensorDict:
+    generator = torch.Generator().manual_seed(0)
+    observation = torch.randn((BATCH, 39), generator=generator)
+    task_id = torch.arange(BATCH) % len(lw.MT50)
+    action = torch.rand((BATCH, 4), generator=generator) * 2 - 1
+    batch = TensorDict({"observation": observation, "task_id": task_id, "action": action}, [BATCH])
+    return lw.QAFTransform(plans_for_all())(batch)
+
+
+class _Learner:
+    """An actor, its loss and its optimizer, as BehavioralCloningTrainer has them."""
+
+    def __init__(self, batch: TensorDict, *, compiled: bool) -> None:
+        torch.manual_seed(0)
+        actor = lw.PlanConditionedActor(plans_for_all())
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message=".*target_actor_network_params.*")
+            self._module = BCLoss(actor, loss_function="l2")
+        self._loss = torch.compile(self._module) if compiled else self._module
+        self._optimizer = torch.optim.AdamW(self._module.parameters(), lr=1e-3)
+        self._batch = batch
+
+    def __call__(self) -> None:
+        loss = self._loss(self._batch)["loss_bc"]
+        self._optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self._module.parameters(), 1.0)
+        self._optimizer.step()
+
+
+def train_step(settings: Settings) -> list[Row]:
+    """PlanConditionedActor with BCLoss on batches of 500 of all 50 tasks."""
+    batch = _batch()
+    eager = _Learner(batch, compiled=False)
+    name = f"training step, batch {BATCH}"
+    if not settings.compiled or settings.quick:
+        found = take_turns({"eager": eager}, settings.pick(50, 2), warm_up=3)
+        middle = sorted(found["eager"])[len(found["eager"]) // 2]
+        return [under(f"{name}, eager", 1e3 * middle, "ms", note="--compile measures torch.compile too")]
+    compiled = _Learner(batch, compiled=True)
+    start = perf_counter()
+    compiled()
+    waited = perf_counter() - start
+    found = take_turns({"compiled": compiled, "eager": eager}, 50, warm_up=5)
+    return [
+        compare(
+            f"{name}, torch.compile",
+            found["compiled"],
+            "eager",
+            found["eager"],
+            unit="ms",
+            scale=1e3,
+            note=f"after {waited:.0f} s of compiling",
+        )
+    ]

@@ -1,0 +1,84 @@
+"""python -m benchmarks runs, writes what docs/performance.md says, and survives a benchmark that fails."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+sys.path.insert(0, str(ROOT))
+from benchmarks import __main__ as cli  # noqa: E402
+from benchmarks.report import Row, Skipped, compare, part_of, under  # noqa: E402
+
+FIELDS = {"name", "ours", "unit", "rival", "theirs", "ratio", "spread", "target", "met", "note"}
+
+
+def test_a_quick_run_writes_a_table_and_json(tmp_path):
+    command = [sys.executable, "-m", "benchmarks", "samplers", "queries", "overhead", "--quick", "--out", str(tmp_path)]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / "results.json").read_text("utf-8"))
+    assert report["format_version"] == 1
+    assert report["quick"] is True
+    assert report["machine"]["cores"] >= 1
+    assert list(report["benchmarks"]) == ["samplers", "queries", "overhead"]
+    for result in report["benchmarks"].values():
+        assert result["status"] == "done", result["message"]
+        assert result["rows"]
+        for row in result["rows"]:
+            assert set(row) == FIELDS
+            assert row["ours"] > 0
+            assert row["met"] is None  # a quick run judges nothing
+            assert row["ratio"] > 0
+            assert row["spread"][0] <= row["ratio"] <= row["spread"][1]
+    table = (tmp_path / "table.md").read_text("utf-8")
+    assert "ReplayBufferEnsemble" in table
+    assert "ReplayBufferEnsemble" in done.stdout
+    again = subprocess.run(
+        [sys.executable, "-m", "benchmarks", "--markdown", "--out", str(tmp_path)],
+        cwd=ROOT, env=environment, capture_output=True, text=True, timeout=120,
+    )  # fmt: skip
+    assert again.stdout == table
+
+
+def test_a_benchmark_that_fails_is_reported_and_the_others_go_on(tmp_path, monkeypatch):
+    def fail(settings):
+        raise RuntimeError("no luck")
+
+    def skip(settings):
+        raise Skipped("no such thing here")
+
+    rows = [under("a wait", 2.0, "s", 60)]
+    monkeypatch.setattr(cli, "BENCHMARKS", {"bad": fail, "absent": skip, "good": lambda settings: rows})
+    assert cli.main(["--out", str(tmp_path)]) == 1
+    results = json.loads((tmp_path / "results.json").read_text("utf-8"))["benchmarks"]
+    assert [result["status"] for result in results.values()] == ["failed", "skipped", "done"]
+    assert results["bad"]["message"] == "RuntimeError: no luck"
+    assert results["good"]["rows"][0]["met"] is True
+
+
+def test_an_unknown_name_is_refused(tmp_path, capsys):
+    assert cli.main(["stepz", "--out", str(tmp_path)]) == 2
+    assert "no benchmark stepz; there are steps" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("limit", "met"), [(1.9, True), (2.1, False), (None, None)])
+def test_a_ratio_is_the_median_of_the_rounds(limit, met):
+    row = compare("x", [1.0, 2.0, 1.0], "y", [2.0, 4.0, 9.0], unit="ms", scale=1e3, at_least=limit)
+    assert (row.ours, row.theirs, row.ratio, row.met) == (1000.0, 4000.0, 2.0, met)
+
+
+def test_a_share_is_of_the_whole():
+    row = part_of("x", [1.0], "y", [4.0], unit="s", scale=1.0, at_most=0.3)
+    assert row == Row("x", 1.0, "s", "y", 4.0, 0.25, (0.25, 0.25), "share ≤ 0.3", True)
+
+
+def test_every_benchmark_is_explained():
+    page = (ROOT / "docs" / "performance.md").read_text("utf-8")
+    assert [name for name in cli.BENCHMARKS if f"`{name}`" not in page] == []
