@@ -161,17 +161,16 @@ print(json.dumps({"built": built, "reset": time.perf_counter() - start - built,
 
 def construction(settings: Settings) -> list[Row]:
     """MT50 with 1000 environments, each time in a fresh process: no model is compiled yet."""
-    n = settings.pick(1000, 6)
-    tasks = _SMALL if settings.quick else lw.MT50
+    tasks, n = (_SMALL, 6) if settings.quick else (lw.MT50, 1000)
     found = []
     for _ in bars(range(settings.pick(3, 1)), "construction"):
         command = [sys.executable, "-W", "ignore", "-c", _CONSTRUCT, ",".join(tasks), str(n)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
-            raise RuntimeError(done.stderr.strip().splitlines()[-1])
+            raise RuntimeError((done.stderr.strip().splitlines() or [f"exit status {done.returncode}"])[-1])
         found.append(json.loads(done.stdout.splitlines()[-1]))
     middle = {key: median(one[key] for one in found) for key in found[0]}
-    what = f"MT50, {n} environments" if not settings.quick else f"{len(tasks)} tasks, {n} environments"
+    what = f"{len(tasks)} tasks, {n} environments"
     return [
         under(f"{what}: built", middle["built"], "s", 12, "compiles every model; the imports are not counted"),
         under(f"{what}: first reset", middle["reset"], "s"),

@@ -41,7 +41,7 @@ def queries(settings: Settings) -> list[Row]:
     except ImportError as error:
         raise Skipped(f"language-world is not installed ({error}): pip install -e '.[dev]'") from error
     shipped = lw.load_plans("MT10")
-    eight = {}
+    eight: dict[str | lw.Task, list[str | lw.Query]] = {}
     for task in lw.MT50:
         listed = lw.supported_queries(task)
         eight[task] = [listed[k * len(listed) // 8] for k in range(8)]

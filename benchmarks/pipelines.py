@@ -32,7 +32,7 @@ def evaluation(settings: Settings) -> list[Row]:
     full = timed(lambda: lw.evaluate(actor, **options))
     found: list[lw.EvaluationResult] = []
     stopped = timed(lambda: found.append(lw.evaluate(lw.ExpertActor(tasks), stop_at_success=True, **options)))
-    rate = sum(found[0].success_once.values()) / len(tasks)
+    rate = sum(episode.success for episode in found[0].episodes) / len(found[0].episodes)
     return [
         under(_name("evaluation of a PlanConditionedActor,", tasks, episodes, steps), full, "s", 60, "untrained"),
         under(

@@ -110,17 +110,17 @@ def steps(settings: Settings) -> list[Row]:
     for engine in engines.values():
         engine.close()
 
-    def row(ours: str, rival: str, theirs: str, at_least: float | None = None, note: str = "") -> Row:
+    def line(ours: str, rival: str, theirs: str, at_least: float | None = None, note: str = "") -> Row:
         name = "environment step, " + ours + " reward"
         return compare(
             name, found[ours], rival, found[theirs], unit="µs", scale=1e6 / CHUNK / n, at_least=at_least, note=note
         )
 
     return [
-        row("sparse", "mj_step ×5 alone", "bare", note="without mj_forward the states drift from Meta-World's"),
-        row("sparse", "mj_step ×5, mj_forward", "floor", 0.90, note="the least that gives Meta-World's numbers"),
-        row("sparse", "Meta-World's env.step", "metaworld", 2.0),
-        row("dense", "Meta-World's env.step", "metaworld", 1.5),
+        line("sparse", "mj_step ×5 alone", "bare", note="without mj_forward the states drift from Meta-World's"),
+        line("sparse", "mj_step ×5, mj_forward", "floor", 0.90, note="the least that gives Meta-World's numbers"),
+        line("sparse", "Meta-World's env.step", "metaworld", 2.0),
+        line("dense", "Meta-World's env.step", "metaworld", 1.5),
     ]
 
 
@@ -180,7 +180,7 @@ def _threads(tasks: tuple[str, ...], settings: Settings) -> list[Row]:
         for number in bars(range(settings.pick(20, 3)), f"threads, N = {n}"):
             actions = generator.uniform(-1, 1, (block, n, 4)).astype(np.float32)
             one, two = partial(step, engines[0]), partial(step, engines[1])
-            turns = {"one": one, "two": two, "bare one": alone, "bare two": in_two}
+            turns: dict[str, Callable[[], None]] = {"one": one, "two": two, "bare one": alone, "bare two": in_two}
             for name in turns if number % 2 else reversed(turns):
                 found[name].append(timed(turns[name]))
     for engine in engines:
