@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Iterable
 from typing import Any, Literal
@@ -144,7 +145,7 @@ class LanguageWorldEnv(EnvBase):
         """The seed that, with task and episode, fixes every reset."""
         return self._seed
 
-    def _state(self) -> TensorDict:
+    def _state(self, **more: Tensor) -> TensorDict:
         over = torch.from_numpy(self._over.copy()).unsqueeze(-1)
         return TensorDict(
             {
@@ -156,8 +157,10 @@ class LanguageWorldEnv(EnvBase):
                 "done": over,
                 "terminated": torch.zeros_like(over),
                 "truncated": over.clone(),
+                **more,
             },
             batch_size=self.batch_size,
+            device=self.device,
         )
 
     def _mask(self, tensordict: TensorDictBase | None, key: str) -> np.ndarray:
@@ -222,23 +225,24 @@ class LanguageWorldEnv(EnvBase):
         if (active & self._over).any():
             rows = np.flatnonzero(active & self._over)[:5].tolist()
             raise RuntimeError(f"rows {rows} have ended or were never reset: reset them before the next step")
-        broken = active & np.isnan(action).any(-1)
-        if broken.any():
+        stepped = active
+        if math.isnan(action.sum()):  # of numbers in [-1, 1], so one of them is NaN
+            broken = active & np.isnan(action).any(-1)
             self._report(broken, "its action is NaN", "action must hold numbers")
-        stepped = active & ~broken
+            stepped = active & ~broken
         result = self._engine.step(action, stepped)
-        if (unstable := result.fault & stepped).any():
-            self._report(unstable, "its simulation became unstable", "the simulation must stay stable")
-        self._observation[stepped] = result.observation[stepped]
-        self._success[active] = result.success[active] & stepped[active]
-        self._steps[active] += 1
-        self._fault |= broken | unstable
-        self._over |= self._fault | (self._steps >= self.max_steps)
-        out = self._state()
-        reward = np.where(stepped, result.reward, 0.0).astype(np.float32)
-        return out.set("reward", torch.from_numpy(reward).unsqueeze(-1))
+        if result.fault.any():
+            self._report(result.fault, "its simulation became unstable", "the simulation must stay stable")
+        np.copyto(self._observation, result.observation, casting="same_kind")
+        np.copyto(self._success, result.success, where=active)
+        self._steps += active
+        self._over |= self._fault
+        self._over |= self._steps >= self.max_steps
+        return self._state(reward=torch.from_numpy(result.reward.astype(np.float32)).unsqueeze(-1))
 
     def _report(self, rows: np.ndarray, what: str, must: str) -> None:
+        if not rows.any():
+            return
         row = int(np.flatnonzero(rows)[0])
         message = (
             f"row {row}: {what}, in task {self.row_tasks[row]!r}, seed {self._seed}, episode "
@@ -246,6 +250,7 @@ class LanguageWorldEnv(EnvBase):
         )
         if self.strict:
             raise ValueError(f"{must}: {message}")
+        self._fault |= rows
         warnings.warn(f"{message}; the row is truncated and flagged, the others go on", stacklevel=3)
 
     def close(self, *, raise_if_closed: bool = True) -> None:

@@ -2,115 +2,102 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from lw_torchrl.language.queries import Clause, Query, check_query
-from lw_torchrl.language.relations import MEASURES, PREDICATES, Comparison, measure
+from lw_torchrl.language.relations import PREDICATES, Comparison
 from lw_torchrl.language.tasks import TASKS, Coordinate, Task, get_task, task_id
 
 _OBSERVATION = 39
 _OPENING = 3  # index of the gripper's opening in the observation
 _ORIGIN = (0.0, 0.0, 0.0)
-_NEVER = Comparison("xyz", "<", -1.0)  # a length is never under -1: the padding of the tables
-_ALWAYS = Comparison("xyz", ">", -1.0)
+_ALWAYS = Comparison("xyz", "<", 1.0)  # of the origin and itself: the padding of the tables
+_NEVER = Comparison("xyz", "<", -1.0)
+_KEPT_ROWS = 4096  # of the last batch, the most to keep the tables of
+
+_Position = tuple[Coordinate, Coordinate, Coordinate]
+_Atom = tuple[_Position, _Position, Comparison]
 
 
 @dataclass
 class _Tables:
-    """Per task (T): the pairs of positions to subtract (P), and for each query (S), clause (K) and comparison (2)
-    which measure of which difference to compare with what. Every comparison is ``sign·measure < threshold``."""
+    """A task's atoms (A), each a comparison of the difference of two positions, and which two atoms make up each
+    clause (K) of each query (S). The first dimension is of tasks (T) where compiled, of rows where selected."""
 
-    row: Tensor  # (50,) int64, the row of a task_id in the tables below, -1 for tasks without queries
-    constants: Tensor  # (C,) float64, metres, read as if they followed the 39 numbers of the observation
-    first: Tensor  # (T, P*3) int64, index of each coordinate of the first position
-    second: Tensor  # (T, P*3) int64
-    measure: Tensor  # (T, S*K*2) int64, index into the P*M measures
-    sign: Tensor  # (T, S*K*2) float64
-    threshold: Tensor  # (T, S*K*2) float64, metres
-    flipped: Tensor  # (T, S*K*2) bool, take the complement
-    negated: Tensor  # (T, S, K) bool, take the clause's complement
+    first: Tensor  # (T, 3*A) int64, index of each coordinate of the first position; of 0 for an axis left out
+    second: Tensor  # (T, 3*A) int64
+    raised: Tensor  # (T, 3, A) float64, metres, added to the difference
+    length: Tensor  # (T, A) bool, the difference's length is compared, otherwise its one coordinate
+    threshold: Tensor  # (T, A) float64, metres; the atom holds below it
+    flipped: Tensor  # (T, A) bool, take the atom's complement
+    atoms: Tensor  # (T, 2*K*S) int64
+    negated: Tensor  # (T, K, S) bool, take the clause's complement
 
-    def to(self, device: torch.device, dtype: torch.dtype) -> _Tables:
-        moved = {f.name: getattr(self, f.name) for f in fields(self)}
-        return _Tables(**{k: v.to(device, dtype if v.is_floating_point() else None) for k, v in moved.items()})
+    def apply(self, function: Callable[[Tensor], Tensor]) -> _Tables:
+        return _Tables(**{field.name: function(getattr(self, field.name)) for field in fields(self)})
 
 
-_Position = tuple[Coordinate, Coordinate, Coordinate]
-
-
-def _clause_reads(clause: Clause, task: Task) -> tuple[_Position, _Position]:
+def _clause_atoms(clause: Clause, task: Task) -> list[_Atom]:
+    first: _Position
     if clause.predicate in ("open", "closed"):
-        return (0.0, 0.0, _OPENING), _ORIGIN
-    first = task.object(clause.subject).position
-    return first, _ORIGIN if clause.object is None else task.object(clause.object).position
+        first, second = (0.0, 0.0, _OPENING), _ORIGIN
+    else:
+        first = task.object(clause.subject).position
+        second = _ORIGIN if clause.object is None else task.object(clause.object).position
+    return [(first, second, part) for part in PREDICATES[clause.predicate]]
 
 
-def _task_entries(
-    task: Task, queries: Sequence[Query], steps: int, width: int
-) -> tuple[list[tuple[_Position, _Position]], list[tuple[int, Comparison]], list[bool]]:
-    """The pairs of positions of one task, its comparisons with the pair of each, and which clauses are negated."""
-    pairs: list[tuple[_Position, _Position]] = []
-    entries: list[tuple[int, Comparison]] = []
-    negated: list[bool] = []
-    for s in range(steps):
-        clauses = queries[s].clauses if s < len(queries) else ()
-        for k in range(width):
-            pair = 0
-            comparisons: tuple[Comparison, ...] = (_ALWAYS if s < len(queries) else _NEVER,)
-            if k < len(clauses):
-                reads = _clause_reads(clauses[k], task)
-                if reads not in pairs:
-                    pairs.append(reads)
-                pair, comparisons = pairs.index(reads), PREDICATES[clauses[k].predicate]
-            entries += [(pair, part) for part in (*comparisons, _ALWAYS)[:2]]
-            negated.append(k < len(clauses) and clauses[k].negated)
-    return pairs, entries, negated
+def _task_atoms(task: Task, queries: Sequence[Query], steps: int, width: int) -> tuple[list[_Atom], list, list]:
+    """The atoms of one task, each once; the two of each clause (steps, width, 2); what is negated (steps, width)."""
+    clauses = [[(_clause_atoms(clause, task), clause.negated) for clause in query.clauses] for query in queries]
+    clauses += [[([(_ORIGIN, _ORIGIN, _NEVER)], False)]] * (steps - len(queries))
+    always = (_ORIGIN, _ORIGIN, _ALWAYS)
+    padded = [[*listed, *[([], False)] * (width - len(listed))] for listed in clauses]
+    atoms = list(dict.fromkeys([always, *(atom for listed in padded for found, _ in listed for atom in found)]))
+    places = [[[atoms.index(atom) for atom in (*found, always, always)[:2]] for found, _ in row] for row in padded]
+    return atoms, places, [[negated for _, negated in row] for row in padded]
 
 
-def _compile(queries: Mapping[Task, Sequence[Query]]) -> _Tables:
+def _compile(queries: Mapping[Task, Sequence[Query]]) -> tuple[_Tables, Tensor]:
+    """The tables, and the constants (C,) float64 that are read as if they followed the observation."""
     steps = max(map(len, queries.values()))
     width = max(len(query.clauses) for listed in queries.values() for query in listed)
+    found = [_task_atoms(task, listed, steps, width) for task, listed in queries.items()]
+    most = max(len(atoms) for atoms, _, _ in found)
+    listed = [atoms + [(_ORIGIN, _ORIGIN, _ALWAYS)] * (most - len(atoms)) for atoms, _, _ in found]
     constants = [0.0]
 
-    def index(coordinate: Coordinate) -> int:
-        if isinstance(coordinate, int):
-            return coordinate
-        if coordinate not in constants:
-            constants.append(coordinate)
-        return _OBSERVATION + constants.index(coordinate)
+    def index(atom: _Atom, side: int) -> list[int]:
+        *positions, part = atom
+        places = []
+        for axis, coordinate in zip("xyz", positions[side if part.sense == "<" else 1 - side], strict=True):
+            coordinate = coordinate if axis in part.axes else 0.0
+            if isinstance(coordinate, float) and coordinate not in constants:
+                constants.append(coordinate)
+            places.append(coordinate if isinstance(coordinate, int) else _OBSERVATION + constants.index(coordinate))
+        return places
 
-    found = [_task_entries(task, listed, steps, width) for task, listed in queries.items()]
-    most = max(len(pairs) for pairs, _, _ in found)
-    padded = [pairs + [(_ORIGIN, _ORIGIN)] * (most - len(pairs)) for pairs, _, _ in found]
-    row = torch.full((len(TASKS),), -1)
-    for t, task in enumerate(queries):
-        row[task_id(task.name)] = t
-    signs = [[1.0 if part.sense == "<" else -1.0 for _, part in entries] for _, entries, _ in found]
-    sign = torch.tensor(signs, dtype=torch.float64)
-    limits = torch.tensor([[part.threshold for _, part in entries] for _, entries, _ in found], dtype=torch.float64)
-    first, second = (
-        torch.tensor([[index(c) for pair in pairs for c in pair[side]] for pairs in padded]) for side in (0, 1)
+    def table(value: Callable[[_Atom], Any], dtype: torch.dtype = torch.int64) -> Tensor:
+        values = torch.tensor([[value(atom) for atom in atoms] for atoms in listed], dtype=dtype)
+        return values.movedim(1, -1).contiguous()
+
+    tables = _Tables(
+        first=table(lambda atom: index(atom, 0)).flatten(1),
+        second=table(lambda atom: index(atom, 1)).flatten(1),
+        raised=table(lambda atom: (0.0, 0.0, atom[2].raise_z), torch.float64),
+        length=table(lambda atom: atom[2].length, torch.bool),
+        threshold=table(lambda atom: atom[2].threshold * (1 if atom[2].sense == "<" else -1), torch.float64),
+        flipped=table(lambda atom: atom[2].sense == "<=", torch.bool),
+        atoms=torch.tensor([places for _, places, _ in found]).permute(0, 3, 2, 1).flatten(1),
+        negated=torch.tensor([negated for _, _, negated in found]).transpose(1, 2).contiguous(),
     )
-    return _Tables(
-        row=row,
-        constants=torch.tensor(constants, dtype=torch.float64),
-        first=first,
-        second=second,
-        measure=torch.tensor(
-            [
-                [pair * len(MEASURES) + MEASURES.index(part.measured) for pair, part in entries]
-                for _, entries, _ in found
-            ]
-        ),
-        sign=sign,
-        threshold=sign * limits,
-        flipped=torch.tensor([[part.sense == "<=" for _, part in entries] for _, entries, _ in found]),
-        negated=torch.tensor([negated for _, _, negated in found]).unflatten(-1, (steps, width)),
-    )
+    return tables, torch.tensor(constants, dtype=torch.float64)
 
 
 class QueryProgram:
@@ -155,36 +142,46 @@ class QueryProgram:
         self.queries = dict(sorted(((task.name, found) for task, found in compiled.items())))
         self.tasks = tuple(self.queries)
         self.num_queries = max(map(len, compiled.values()))
-        self._source = _compile(compiled)
-        self._moved: dict[tuple[torch.device, torch.dtype], _Tables] = {}
+        self._compiled, self._constants = _compile(compiled)
+        self._column = torch.full((len(TASKS),), -1)  # of a task_id in the tables, -1 for tasks without queries
+        self._column[[task_id(task.name) for task in compiled]] = torch.arange(len(compiled))
+        self._moved: dict[tuple[torch.device, torch.dtype], tuple[_Tables, Tensor, Tensor]] = {}
+        self._last: tuple[Tensor, _Tables, Tensor] | None = None
 
     def __repr__(self) -> str:
         return f"QueryProgram({len(self.tasks)} tasks, num_queries={self.num_queries})"
 
-    def _tables(self, observation: Tensor) -> _Tables:
-        key = (observation.device, observation.dtype)
-        if key not in self._moved:
-            self._moved[key] = self._source.to(*key)
-        return self._moved[key]
+    def _selected(self, observation: Tensor, task_id: Tensor) -> tuple[_Tables, Tensor]:
+        """The tables and constants for each row of a batch; kept for the next call, since the rows of an environment
+        keep their tasks."""
+        last = self._last
+        compiling = torch.compiler.is_compiling()
+        if last is not None and not compiling:
+            ids, tables, constants = last
+            same = ids.device == task_id.device and constants.dtype == observation.dtype
+            if same and torch.equal(ids, task_id):
+                return tables, constants
+        device, dtype = observation.device, observation.dtype
+        if (device, dtype) not in self._moved:
+            self._moved[device, dtype] = (
+                self._compiled.apply(lambda table: table.to(device, dtype if table.is_floating_point() else None)),
+                self._constants.to(device, dtype),
+                self._column.to(device),
+            )
+        compiled, constants, column = self._moved[device, dtype]
+        if not compiling:
+            self._check_tasks(task_id, column)
+        chosen = column[task_id]
+        tables = compiled.apply(lambda table: table.index_select(0, chosen))
+        constants = constants.expand(len(chosen), -1)
+        if not compiling and len(chosen) <= _KEPT_ROWS:
+            self._last = (task_id.clone(), tables, constants)
+        return tables, constants
 
-    def _check(self, observation: Tensor, task_id: Tensor, tables: _Tables) -> None:
-        if observation.shape[-1:] != (_OBSERVATION,) or not observation.is_floating_point():
-            raise ValueError(
-                f"observation must be float of shape (..., {_OBSERVATION}), got {observation.dtype} of shape "
-                f"{tuple(observation.shape)}"
-            )
-        if task_id.shape != observation.shape[:-1] or task_id.dtype not in (torch.int64, torch.int32):
-            raise ValueError(
-                f"task_id must be int64 of shape {tuple(observation.shape[:-1])}, one per observation, got "
-                f"{task_id.dtype} of shape {tuple(task_id.shape)}"
-            )
-        if torch.compiler.is_compiling():
-            return
-        if not observation.isfinite().all():
-            raise ValueError("observation must hold finite numbers, got NaN or infinity")
-        inside = (task_id >= 0) & (task_id < len(TASKS))
-        if not inside.all() or (tables.row[task_id] < 0).any():
-            known = inside & (tables.row[task_id.clamp(0, len(TASKS) - 1)] >= 0)
+    def _check_tasks(self, task_id: Tensor, column: Tensor) -> None:
+        known = (task_id >= 0) & (task_id < len(TASKS))
+        known &= column[task_id.clamp(0, len(TASKS) - 1)] >= 0
+        if not known.all():
             wrong = sorted(set(task_id[~known].tolist()))[:5]
             names = [f"{i} ({list(TASKS)[i]})" if 0 <= i < len(TASKS) else str(i) for i in wrong]
             raise ValueError(f"task_id holds {', '.join(names)}, for which there are no queries; {self!r}")
@@ -202,13 +199,30 @@ class QueryProgram:
         Raises:
             ValueError: wrong shape or dtype, NaN or infinity in the observation, or a task without queries.
         """
-        tables = self._tables(observation)
-        self._check(observation, task_id, tables)
-        row = tables.row[task_id]
-        numbers = torch.cat((observation, tables.constants.expand(*observation.shape[:-1], -1)), -1)
-        d = numbers.gather(-1, tables.first[row]) - numbers.gather(-1, tables.second[row])
-        measures = measure(d.unflatten(-1, (-1, 3))).flatten(-2)
-        value = measures.gather(-1, tables.measure[row]) * tables.sign[row]
-        holds = (value < tables.threshold[row]) ^ tables.flipped[row]
-        clauses = holds.unflatten(-1, (*tables.negated.shape[1:], 2)).all(-1) ^ tables.negated[row]
-        return clauses.all(-1)
+        _check_batch(observation, task_id)
+        batch = task_id.shape
+        tables, constants = self._selected(observation, task_id.reshape(-1))
+        numbers = torch.cat((observation.reshape(-1, _OBSERVATION), constants), 1)
+        d = (numbers.gather(1, tables.first) - numbers.gather(1, tables.second)).unflatten(1, (3, -1))
+        length = (d + tables.raised).square_().sum(1).sqrt_()
+        value = torch.where(tables.length, length, d.sum(1))
+        holds = (value < tables.threshold) ^ tables.flipped
+        one, other = holds.gather(1, tables.atoms).unflatten(1, (2, *tables.negated.shape[1:])).unbind(1)
+        return ((one & other) ^ tables.negated).all(1).unflatten(0, batch)
+
+
+def _check_batch(observation: Tensor, task_id: Tensor) -> None:
+    if observation.shape[-1:] != (_OBSERVATION,) or not observation.is_floating_point():
+        raise ValueError(
+            f"observation must be float of shape (..., {_OBSERVATION}), got {observation.dtype} of shape "
+            f"{tuple(observation.shape)}"
+        )
+    if task_id.shape != observation.shape[:-1] or task_id.dtype not in (torch.int64, torch.int32):
+        raise ValueError(
+            f"task_id must be int64 of shape {tuple(observation.shape[:-1])}, one per observation, got "
+            f"{task_id.dtype} of shape {tuple(task_id.shape)}"
+        )
+    if torch.compiler.is_compiling() or math.isfinite(observation.sum()):  # the sum is fast; it may overflow
+        return
+    if not observation.isfinite().all():
+        raise ValueError("observation must hold finite numbers, got NaN or infinity")

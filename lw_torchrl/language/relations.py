@@ -35,39 +35,13 @@ class Comparison:
     length: bool = True
     raise_z: float = 0.0
 
-    @property
-    def measured(self) -> tuple[str, bool, float]:
-        """What is compared, one of :data:`MEASURES`."""
-        return (self.axes, self.length, self.raise_z)
-
-    def holds(self, measures: Tensor) -> Tensor:
-        """Whether the comparison holds, from what :func:`measure` gave: (..., M) metres to (...) bool."""
-        value = measures[..., MEASURES.index(self.measured)]
+    def holds(self, d: Tensor) -> Tensor:
+        """Whether the comparison holds of d: (..., 3) metres to (...) bool."""
+        counted = [d[..., "xyz".index(axis)] + (self.raise_z if axis == "z" else 0.0) for axis in self.axes]
+        value = torch.stack([x.square() for x in counted]).sum(0).sqrt() if self.length else counted[0]
         if self.sense == "<":
             return value < self.threshold
         return value > self.threshold if self.sense == ">" else value <= self.threshold
-
-
-_RAISE = 0.02  # metres; "around" means the point so far below the first object
-MEASURES = (
-    ("x", False, 0.0),
-    ("y", False, 0.0),
-    ("z", False, 0.0),
-    ("xyz", True, 0.0),
-    ("xyz", True, _RAISE),
-    ("xy", True, 0.0),
-    ("xz", True, 0.0),
-    ("yz", True, 0.0),
-)
-"""All that relations ask of a difference d: axes, whether the length over them is meant, metres added to dz."""
-
-
-def measure(d: Tensor) -> Tensor:
-    """Every measure of :data:`MEASURES` at once: (..., 3) metres to (..., M) metres."""
-    xx, yy, zz = d.square().unbind(-1)
-    raised = (d[..., 2] + _RAISE).square()
-    squared = torch.stack((xx + yy + zz, xx + yy + raised, xx + yy, xx + zz, yy + zz), -1)
-    return torch.cat((d, squared.sqrt()), -1)
 
 
 def _within(axes: str, radius: float, raise_z: float = 0.0) -> Comparison:
@@ -85,7 +59,7 @@ def _less(axis: str, threshold: float) -> Comparison:
 RELATIONS = MappingProxyType(
     {
         "near": (_within("xyz", 0.04),),
-        "around": (_within("xyz", 0.03, raise_z=_RAISE),),
+        "around": (_within("xyz", 0.03, raise_z=0.02),),
         "left of": (_more("x", 0.04),),
         "right of": (_less("x", -0.04),),
         "behind": (_more("y", 0.04), _within("xz", 0.04)),
@@ -133,5 +107,4 @@ def relation_holds(relation: str, first: Tensor, second: Tensor) -> Tensor:
         tensor(True)
     """
     check_choice("relation", relation, RELATIONS)
-    measures = measure(first - second)
-    return torch.stack([part.holds(measures) for part in RELATIONS[relation]]).all(0)
+    return torch.stack([part.holds(first - second) for part in RELATIONS[relation]]).all(0)
