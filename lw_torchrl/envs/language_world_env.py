@@ -231,14 +231,15 @@ class LanguageWorldEnv(EnvBase):
             self._report(broken, "its action is NaN", "action must hold numbers")
             stepped = active & ~broken
         result = self._engine.step(action, stepped)
-        if result.fault.any():
-            self._report(result.fault, "its simulation became unstable", "the simulation must stay stable")
-        np.copyto(self._observation, result.observation, casting="same_kind")
-        np.copyto(self._success, result.success, where=active)
+        if (unstable := result.fault & stepped).any():
+            self._report(unstable, "its simulation became unstable", "the simulation must stay stable")
+        np.copyto(self._observation, result.observation, casting="same_kind", where=stepped[:, None])
+        np.copyto(self._success, result.success & stepped, where=active)
         self._steps += active
         self._over |= self._fault
         self._over |= self._steps >= self.max_steps
-        return self._state(reward=torch.from_numpy(result.reward.astype(np.float32)).unsqueeze(-1))
+        reward = np.where(stepped, result.reward, 0.0).astype(np.float32)
+        return self._state(reward=torch.from_numpy(reward).unsqueeze(-1))
 
     def _report(self, rows: np.ndarray, what: str, must: str) -> None:
         if not rows.any():
