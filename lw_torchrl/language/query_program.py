@@ -208,7 +208,7 @@ class QueryProgram:
         value = torch.where(tables.length, length, d.sum(1))
         holds = (value < tables.threshold) ^ tables.flipped
         one, other = holds.gather(1, tables.atoms).unflatten(1, (2, *tables.negated.shape[1:])).unbind(1)
-        return ((one & other) ^ tables.negated).all(1).unflatten(0, batch)
+        return ((one & other) ^ tables.negated).all(1).reshape(*batch, -1)
 
 
 def _check_batch(observation: Tensor, task_id: Tensor) -> None:
