@@ -22,6 +22,8 @@ from lw_torchrl.evaluation.result import EpisodeResult, EvaluationResult
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.tasks import resolve_tasks
 
+_ROWS = 256  # more hardly make a step of all of them cheaper per row, and cost memory
+
 
 def actor_plans(actor: Any, plans: Plans | Mapping[str, ConditionalPlan] | None) -> Plans | None:
     """The plans to answer queries for: those given, or the actor's own; different ones are an error."""
@@ -99,7 +101,7 @@ def evaluate(
         episodes_per_task: k.
         seed: one that no demonstration was collected with.
         noise_scale: standard deviation of the action noise.
-        num_envs: environments stepped together, at least the number of tasks.
+        num_envs: environments stepped together, at least the number of tasks; by default about 256.
         stop_at_success: end an episode at its first success; any-step success is the same, success at the end and
             return are None.
         record_actions: keep each episode's executed actions, (T, 4) float32.
@@ -128,7 +130,9 @@ def evaluate(
     check_scale("noise_scale", noise_scale)
     answered = actor_plans(actor, plans)
     most = len(names) * episodes_per_task  # a row more would have nothing to do
-    num_envs = max(len(names), min(50, most)) if num_envs is None else min(check_int("num_envs", num_envs), most)
+    if num_envs is None:
+        num_envs = len(names) * max(1, min(episodes_per_task, _ROWS // len(names)))
+    num_envs = min(check_int("num_envs", num_envs), most)
     if answered is not None:
         answered.require(names)
     base = LanguageWorldEnv(
