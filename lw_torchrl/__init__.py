@@ -13,6 +13,8 @@ from lw_torchrl.evaluation import EpisodeResult, EvaluationResult, evaluate, plo
 from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans, PlanStep, load_plans, save_plans
 from lw_torchrl.language.queries import Clause, Query, QueryError, parse_query, supported_queries
 from lw_torchrl.language.query_program import QueryProgram
+from lw_torchrl.language.skill_program import SkillProgram
+from lw_torchrl.language.skills import ScriptedSkill, SkillError, load_skills, nearest_skill
 from lw_torchrl.language.tasks import MT10, MT50, TASKS, NamedObject, Task, resolve_tasks, task_id
 from lw_torchrl.language.text import TextEncoder, encode_texts
 from lw_torchrl.modules import (
@@ -20,6 +22,7 @@ from lw_torchrl.modules import (
     ObservationFeatures,
     PlanAttention,
     PlanConditionedActor,
+    ScriptedSkillActor,
 )
 from lw_torchrl.record import RerunLogger
 from lw_torchrl.trainers import BehavioralCloningConfig, BehavioralCloningTrainer, load_actor
@@ -57,6 +60,10 @@ __all__ = [
     "QueryError",
     "QueryProgram",
     "RerunLogger",
+    "ScriptedSkill",
+    "ScriptedSkillActor",
+    "SkillError",
+    "SkillProgram",
     "Task",
     "TaskBalancedSampler",
     "TextEncoder",
@@ -66,6 +73,8 @@ __all__ = [
     "evaluate",
     "load_actor",
     "load_plans",
+    "load_skills",
+    "nearest_skill",
     "parse_query",
     "plot_success",
     "resolve_tasks",

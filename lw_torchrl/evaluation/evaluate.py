@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm.auto import tqdm
 
 from lw_torchrl._checks import check_int, check_scale
 from lw_torchrl.envs.engine import ACTION_SIZE
-from lw_torchrl.envs.episodes import in_blocks, run_episodes
+from lw_torchrl.envs.episodes import Episode, in_blocks, run_episodes
 from lw_torchrl.envs.experts import ExpertActor
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.envs.qaf_transform import QAFTransform
@@ -86,6 +87,8 @@ def evaluate(
     engine: Any = "vectorized",
     num_threads: int | None = None,
     progress: bool = True,
+    also_record: Sequence[NestedKey] = (),
+    on_episode: Callable[[Episode], object] | None = None,
 ) -> EvaluationResult:
     """Run episodes 0 to k - 1 of each task and report how they went.
 
@@ -109,6 +112,9 @@ def evaluate(
         max_steps: steps of an episode.
         engine, num_threads: as for :class:`LanguageWorldEnv`.
         progress: show a progress bar when it takes longer than a second.
+        also_record: more keys for ``on_episode`` to see: "qaf", "skill_weights".
+        on_episode: called with each finished episode, (task, index, steps): steps has batch (T,) and the keys
+            ``action``, ``("next", "success")``, ``("next", "reward")`` and those of ``also_record``.
 
     Returns:
         The result; ``.success_once`` maps each task to its success rate.
@@ -162,16 +168,18 @@ def evaluate(
     )
     try:
         with bar, torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-            for task, episode, steps in run_episodes(
+            for finished in run_episodes(
                 env,
                 _checked(policy),
                 {task: range(episodes_per_task) for task in names},
-                keys=["action", ("next", "success"), ("next", "reward")],
+                keys=["action", ("next", "success"), ("next", "reward"), *also_record],
                 noise=(lambda _: (noise_scale,) * 4) if noise_scale else None,
                 stop_at_success=stop_at_success,
                 on_progress=bar.update,
             ):
-                found.append(_result(task, episode, steps, stop_at_success, record_actions))
+                found.append(_result(*finished, stop_at_success, record_actions))
+                if on_episode is not None:
+                    on_episode(finished)
     finally:
         env.close()
         if isinstance(actor, torch.nn.Module):

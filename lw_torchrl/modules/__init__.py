@@ -4,5 +4,12 @@ from lw_torchrl.modules.descriptor_conditioned_actor import DescriptorConditione
 from lw_torchrl.modules.observation_features import ObservationFeatures
 from lw_torchrl.modules.plan_attention import PlanAttention
 from lw_torchrl.modules.plan_conditioned_actor import PlanConditionedActor
+from lw_torchrl.modules.scripted_skill_actor import ScriptedSkillActor
 
-__all__ = ["DescriptorConditionedActor", "ObservationFeatures", "PlanAttention", "PlanConditionedActor"]
+__all__ = [
+    "DescriptorConditionedActor",
+    "ObservationFeatures",
+    "PlanAttention",
+    "PlanConditionedActor",
+    "ScriptedSkillActor",
+]

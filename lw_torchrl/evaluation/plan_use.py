@@ -1,0 +1,136 @@
+"""How plans fare: which steps hold in which states, which were chosen, and where a policy got stuck."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field
+from statistics import median
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lw_torchrl.envs.episodes import Episode
+from lw_torchrl.envs.experts import ExpertActor
+from lw_torchrl.evaluation.evaluate import evaluate
+from lw_torchrl.evaluation.result import EvaluationResult
+from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
+from lw_torchrl.language.tasks import resolve_tasks
+
+_AFTER = 20  # steps after the first success that still count, as in training data
+_STUCK = 50  # the last steps of a failed episode, in which it got nowhere
+
+
+@dataclass
+class TaskUse:
+    """How one task's plan was used, over all its episodes.
+
+    Attributes:
+        states: how many states were seen, to 20 steps after the first success.
+        true: per step of the plan, the share of states in which its condition held.
+        chosen: per step, the share of states in which it had the greatest weight; empty if no policy chose.
+        covered: the share of the states before the first success in which some condition held.
+        num_true: the median number of conditions that held, before the first success.
+        stuck: per step, in how many failed episodes it was the one chosen (or true) most in the last 50 steps.
+        failed: how many episodes failed.
+    """
+
+    states: int = 0
+    true: list[float] = field(default_factory=list)
+    chosen: list[float] = field(default_factory=list)
+    covered: float = 0.0
+    num_true: float = 0.0
+    stuck: list[int] = field(default_factory=list)
+    failed: int = 0
+
+    def to_json(self) -> dict[str, Any]:
+        """As plain numbers and lists."""
+        return asdict(self)
+
+
+class PlanUse:
+    """Collects how plans are used from finished episodes: pass it to :func:`evaluate` as ``on_episode``."""
+
+    def __init__(self, plans: Plans | Mapping[str, ConditionalPlan]) -> None:
+        self.plans = as_plans(plans)
+        self._seen: dict[str, list[tuple[Tensor, Tensor | None, int, bool]]] = {}
+
+    def __call__(self, episode: Episode) -> None:
+        hits = episode.steps.get(("next", "success")).flatten().nonzero().flatten()
+        before = int(hits[0]) + 1 if len(hits) else len(episode.steps)
+        steps = len(self.plans[episode.task].steps)
+        qaf = episode.steps.get("qaf")[: before + _AFTER, :steps]
+        weights = episode.steps.get("skill_weights", None)
+        chosen = None if weights is None else weights[: before + _AFTER, :steps].argmax(-1)
+        self._seen.setdefault(episode.task, []).append((qaf, chosen, before, len(hits) > 0))
+
+    def tasks(self) -> dict[str, TaskUse]:
+        """What was seen of each task."""
+        return {task: _summed(seen) for task, seen in sorted(self._seen.items())}
+
+
+def _summed(seen: list[tuple[Tensor, Tensor | None, int, bool]]) -> TaskUse:
+    qaf = torch.cat([q for q, _, _, _ in seen])
+    steps = qaf.shape[1]
+    before = torch.cat([q[:length] for q, _, length, _ in seen])
+    stuck = [0] * steps
+    for q, chosen, _, success in seen:
+        if not success:
+            end = q[-_STUCK:].sum(0) if chosen is None else torch.bincount(chosen[-_STUCK:], minlength=steps)
+            stuck[int(end.argmax())] += 1
+    shares: list[float] = []
+    if all(c is not None for _, c, _, _ in seen):
+        counts = torch.bincount(torch.cat([c for _, c, _, _ in seen if c is not None]), minlength=steps)
+        shares = (counts / len(qaf)).tolist()
+    return TaskUse(
+        states=len(qaf),
+        true=qaf.float().mean(0).tolist(),
+        chosen=shares,
+        covered=float(before.any(-1).float().mean()),
+        num_true=float(median(before.sum(-1).tolist())),
+        stuck=stuck,
+        failed=sum(not success for _, _, _, success in seen),
+    )
+
+
+def expert_use(
+    plans: Plans | Mapping[str, ConditionalPlan],
+    tasks: str | Iterable[str] | None = None,
+    *,
+    episodes_per_task: int = 10,
+    seed: int = 0,
+    progress: bool = True,
+) -> tuple[EvaluationResult, dict[str, TaskUse]]:
+    """Which conditions of the plans hold in the states that Meta-World's experts visit.
+
+    Args:
+        plans: the plans.
+        tasks: some of their tasks; None for all.
+        episodes_per_task: episodes of each, without action noise.
+        seed: of the episodes.
+        progress: show a progress bar.
+
+    Returns:
+        How the experts fared, and task name to :class:`TaskUse`.
+
+    Example:
+        >>> import lw_torchrl as lw
+        >>> _, use = expert_use(lw.load_plans("MT10"), "reach", episodes_per_task=1)
+        >>> use["reach"].covered
+        1.0
+    """
+    answered = as_plans(plans)
+    names = resolve_tasks(list(answered) if tasks is None else tasks)
+    use = PlanUse(answered)
+    result = evaluate(
+        ExpertActor(names),
+        tasks=names,
+        plans=answered,
+        episodes_per_task=episodes_per_task,
+        seed=seed,
+        noise_scale=0.0,
+        also_record=["qaf"],
+        on_episode=use,
+        progress=progress,
+    )
+    return result, use.tasks()

@@ -1,0 +1,114 @@
+"""SkillProgram: the scripted skills of many tasks as index tensors, run for a mixed batch in one call."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from lw_torchrl._checks import unknown_name
+from lw_torchrl.language.skills import ScriptedSkill, load_skills
+from lw_torchrl.language.tasks import TASKS, Task, get_task, task_id
+
+_OBSERVATION = 39
+
+
+class SkillProgram:
+    """Lists of scripted skills compiled once; every skill of every row acts in one call.
+
+    Args:
+        skills: task name (or :class:`Task`) to its skills, each a :class:`ScriptedSkill` or the text of one.
+        table: where texts are looked up; None for the shipped skills.
+
+    Attributes:
+        num_skills: S, the length of the longest list.
+
+    Raises:
+        SkillError: (a ValueError) a skill speaks of objects that its task lacks.
+        ValueError: an unknown task or text (with the nearest).
+
+    Example:
+        >>> import torch
+        >>> from lw_torchrl.language.tasks import task_id
+        >>> program = SkillProgram({"push": ["place the gripper above the puck"]})
+        >>> program(torch.zeros(1, 39), torch.tensor([task_id("push")])).shape
+        torch.Size([1, 1, 4])
+
+    Source: paper section 'Scripted Skills'.
+    """
+
+    def __init__(
+        self,
+        skills: Mapping[str | Task, Sequence[str | ScriptedSkill]],
+        table: Mapping[str, ScriptedSkill] | None = None,
+    ) -> None:
+        known = load_skills() if table is None else table
+        found = {
+            get_task(task): [_look_up(skill, known).for_task(task) for skill in listed]
+            for task, listed in skills.items()
+        }
+        self.num_skills = max(map(len, found.values()))
+        self._column = torch.full((len(TASKS),), -1)
+        constants = [0.0]
+        index = torch.full((len(found), 2, self.num_skills, 3), _OBSERVATION)
+        numbers = torch.zeros(len(found), 3, self.num_skills, 3, dtype=torch.float64)  # offset, gain, effort
+        for t, (task, listed) in enumerate(found.items()):
+            self._column[task_id(task.name)] = t
+            for s, skill in enumerate(listed):
+                for side, name in enumerate((skill.target, skill.moved)):
+                    index[t, side, s] = torch.tensor(_places(task, name, constants))
+                numbers[t, 0, s] = torch.tensor(skill.offset, dtype=torch.float64)
+                numbers[t, 1, s] = torch.tensor(skill.gain, dtype=torch.float64)
+                numbers[t, 2, s] = skill.gripper
+        self._index, self._numbers = index.flatten(1), numbers
+        self._constants = torch.tensor(constants, dtype=torch.float64)
+
+    def __call__(self, observation: Tensor, task_id: Tensor) -> Tensor:
+        """The action of each skill.
+
+        Args:
+            observation: (..., 39) float, Meta-World's vector, metres.
+            task_id: (...) int64.
+
+        Returns:
+            (..., S, 4) of the observation's dtype: displacement xyz and gripper effort, each in [-1, 1]; zeros
+            beyond the task's last skill.
+
+        Raises:
+            ValueError: a wrong shape, or a task without skills.
+        """
+        if observation.shape[-1:] != (_OBSERVATION,) or task_id.shape != observation.shape[:-1]:
+            raise ValueError(
+                f"observation must be of shape (..., {_OBSERVATION}) and task_id of (...), got "
+                f"{tuple(observation.shape)} and {tuple(task_id.shape)}"
+            )
+        batch, device = task_id.shape, observation.device
+        task_ids = task_id.reshape(-1)
+        row = self._column.to(device)[task_ids]
+        if (row < 0).any():
+            raise ValueError(f"task_id {int(task_ids[row < 0][0])} has no skills")
+        constants = self._constants.to(observation).expand(len(row), -1)
+        state = torch.cat((observation.reshape(-1, _OBSERVATION), constants), 1)
+        target, moved = state.gather(1, self._index.to(device)[row]).unflatten(1, (2, self.num_skills, 3)).unbind(1)
+        offset, gain, effort = self._numbers.to(observation)[row].unbind(1)
+        shift = ((target + offset - moved) * gain).clamp(-1.0, 1.0)
+        return torch.cat((shift, effort[..., :1]), -1).reshape(*batch, self.num_skills, 4)
+
+
+def _look_up(skill: str | ScriptedSkill, table: Mapping[str, ScriptedSkill]) -> ScriptedSkill:
+    if isinstance(skill, ScriptedSkill):
+        return skill
+    if skill not in table:
+        raise unknown_name("skill", skill, table)
+    return table[skill]
+
+
+def _places(task: Task, name: str, constants: list[float]) -> list[int]:
+    """The index of each coordinate in the observation followed by the constants."""
+    places = []
+    for coordinate in task.object(name).position:
+        if isinstance(coordinate, float) and coordinate not in constants:
+            constants.append(coordinate)
+        places.append(coordinate if isinstance(coordinate, int) else _OBSERVATION + constants.index(coordinate))
+    return places

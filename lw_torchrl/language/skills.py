@@ -1,0 +1,186 @@
+"""Scripted skills: stateless linear controllers with a name in plain English. The table itself is data/skills.toml."""
+
+from __future__ import annotations
+
+import math
+import os
+import tomllib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from rapidfuzz import fuzz, process
+
+from lw_torchrl._checks import nearest
+from lw_torchrl.language.tasks import GRIPPER, Task, check_task, get_task
+
+Triple = tuple[float, float, float]
+
+
+class SkillError(ValueError):
+    """A skill that cannot be read, or that a task cannot use."""
+
+
+@dataclass(frozen=True)
+class ScriptedSkill:
+    """A linear controller: action xyz = clip(gain · (target + offset - moved), -1, 1), with a constant effort of the
+    gripper.
+
+    Attributes:
+        text: what it does, in plain English: "place the gripper above the puck".
+        target: the object or point to go to; the robot's gripper makes the offset relative to the hand.
+        moved: what is to arrive there: the robot's gripper, or an object that it holds or pushes.
+        offset: added to the target, metres. x points to the left as the robot sees it, y away from it, z up.
+        gain: per axis, action per metre; 0 leaves an axis alone.
+        gripper: effort in [-1, 1]; -1 opens, 1 closes.
+        variants: task name to what differs there, any of the above but the text.
+
+    Raises:
+        SkillError: (a ValueError) a number is not finite, a negative gain, an effort outside [-1, 1], or a variant
+            for an unknown task.
+
+    Example:
+        >>> skill = ScriptedSkill("place the gripper above the puck", "puck", offset=(0.0, 0.0, 0.1), gripper=-1.0)
+        >>> skill.for_task("push").target
+        'puck'
+
+    Source: paper section 'Scripted Skills'.
+    """
+
+    text: str
+    target: str
+    moved: str = GRIPPER
+    offset: Triple = (0.0, 0.0, 0.0)
+    gain: Triple = (10.0, 10.0, 10.0)
+    gripper: float = 0.0
+    variants: Mapping[str, ScriptedSkill] = field(default_factory=dict, hash=False, repr=False)
+
+    def __post_init__(self) -> None:
+        for name in ("offset", "gain"):
+            numbers = getattr(self, name)
+            if len(numbers) != 3 or not all(isinstance(x, (int, float)) and math.isfinite(x) for x in numbers):
+                raise SkillError(f"{name} of skill {self.text!r} must be three numbers, got {numbers!r}")
+        if min(self.gain) < 0:
+            raise SkillError(f"gain of skill {self.text!r} must not be negative, got {self.gain!r}")
+        if not isinstance(self.gripper, (int, float)) or not -1 <= self.gripper <= 1:
+            raise SkillError(f"gripper of skill {self.text!r} must lie in [-1, 1], got {self.gripper!r}")
+
+    def for_task(self, task: str | Task) -> ScriptedSkill:
+        """The skill as this task has it; :class:`SkillError` if it speaks of objects that the task lacks."""
+        found = get_task(task)
+        skill = self.variants.get(found.name, self)
+        for name in (skill.target, skill.moved):
+            if name not in found.object_names:
+                close = nearest(name, found.object_names, n=1)
+                raise SkillError(
+                    f"skill {self.text!r} needs {name!r}, which task {found.name!r} lacks; it has "
+                    f"{', '.join(found.object_names)}" + (f"; did you mean {close[0]!r}?" if close else "")
+                )
+        return skill
+
+    def suits(self, task: str | Task) -> bool:
+        """Whether the task has the objects that the skill speaks of."""
+        found = get_task(task)
+        skill = self.variants.get(found.name, self)
+        return {skill.target, skill.moved} <= set(found.object_names)
+
+
+_KEYS = tuple(f.name for f in fields(ScriptedSkill) if f.name not in ("text", "variants"))
+
+
+def _skill(text: str, row: Any, source: str) -> ScriptedSkill:
+    if not isinstance(row, Mapping):
+        raise SkillError(f"{source}: skill {text!r} must be a table, got {row!r}")
+    given = dict(row)
+    listed = given.pop("for", {})
+    variants = {}
+    for task, change in listed.items():
+        check_task(task)
+        variants[task] = _skill(text, {**given, **change}, f"{source}, for {task}")
+    for key in given:
+        if key not in _KEYS:
+            close = nearest(key, _KEYS, n=1)
+            raise SkillError(
+                f"{source}: skill {text!r} may have {', '.join(_KEYS)} and for, got {key!r}"
+                + (f"; did you mean {close[0]!r}?" if close else "")
+            )
+    if "target" not in given:
+        raise SkillError(f"{source}: skill {text!r} must name a target")
+    gain = given.get("gain", 10.0)
+    given["gain"] = (gain,) * 3 if isinstance(gain, (int, float)) else tuple(gain)
+    given["offset"] = tuple(given.get("offset", (0.0, 0.0, 0.0)))
+    try:
+        return ScriptedSkill(text, **given, variants=MappingProxyType(variants))
+    except (SkillError, TypeError) as error:
+        raise SkillError(f"{source}: {error}") from error
+
+
+@cache
+def _shipped() -> Mapping[str, ScriptedSkill]:
+    text = (files("lw_torchrl.language") / "data" / "skills.toml").read_text("utf-8")
+    return MappingProxyType(_read(text, "skills.toml"))
+
+
+def _read(text: str, source: str) -> dict[str, ScriptedSkill]:
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise SkillError(f"{source}: {error}") from error
+    return {name: _skill(name, row, source) for name, row in sorted(table.items())}
+
+
+def load_skills(path: str | os.PathLike[str] | None = None) -> Mapping[str, ScriptedSkill]:
+    """The scripted skills by their text.
+
+    Args:
+        path: a file like data/skills.toml, whose skills join ours or replace those with the same text; None for
+            ours alone.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        SkillError: (a ValueError) it is no TOML, or a skill in it is malformed.
+
+    Example:
+        >>> load_skills()["place the gripper above the puck"].target
+        'puck'
+    """
+    if path is None:
+        return _shipped()
+    file = Path(path)
+    return MappingProxyType({**_shipped(), **_read(file.read_text("utf-8"), str(file))})
+
+
+def nearest_skill(
+    text: str, task: str | Task | None = None, skills: Mapping[str, ScriptedSkill] | Iterable[str] | None = None
+) -> tuple[ScriptedSkill, float]:
+    """The scripted skill whose text is closest in spelling, and how close it is, in [0, 1].
+
+    Args:
+        text: what to do, in any words.
+        task: consider only skills whose objects this task has.
+        skills: to choose from; None for the shipped ones.
+
+    Raises:
+        TypeError: ``text`` is no string.
+        SkillError: (a ValueError) no skill suits the task.
+
+    Example:
+        >>> nearest_skill("put gripper above puck", task="push")[0].text
+        'place the gripper above the puck'
+
+    Source: paper section 'Conditional Plan Generation', which takes the nearest description.
+    """
+    if not isinstance(text, str):
+        raise TypeError(f"text must be a string, got {type(text).__name__}")
+    table = _shipped() if skills is None else skills
+    if not isinstance(table, Mapping):
+        table = {name: _shipped()[name] for name in table}
+    allowed = [name for name, skill in table.items() if task is None or skill.suits(task)]
+    found = process.extractOne(" ".join(text.lower().replace("_", " ").split()), allowed, scorer=fuzz.ratio)
+    if found is None:
+        raise SkillError(f"no scripted skill suits task {task!r}")
+    return table[found[0]], found[1] / 100
