@@ -11,6 +11,8 @@ from typing import Any, Literal
 import tyro
 from tyro.conf import Positional
 
+from lw_torchrl import cli_language
+
 
 def demo(out: Path | None = None, quick: bool = False) -> None:
     """Train a plan-conditioned policy on MT10 and show it: demonstrations, training, evaluation, a recording.
@@ -272,6 +274,12 @@ COMMANDS: dict[str, Any] = {
     "evaluate": evaluate,
     "view": view,
     "query": query,
+    "scripted": cli_language.scripted,
+    "tasks": cli_language.tasks,
+    "queries": cli_language.queries,
+    "skills": cli_language.skills,
+    "plans": cli_language.plans,
+    "check": cli_language.check,
 }
 
 

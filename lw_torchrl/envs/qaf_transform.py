@@ -15,7 +15,7 @@ from lw_torchrl.language.query_program import QueryProgram
 
 def plan_program(plans: Plans) -> QueryProgram:
     """The conditions of ``plans`` as one :class:`QueryProgram`, a column for each step."""
-    return QueryProgram({task: [step.condition for step in plan.steps] for task, plan in plans.items()})
+    return QueryProgram({plan.definition: [step.condition for step in plan.steps] for plan in plans.values()})
 
 
 class QAFTransform(Transform):

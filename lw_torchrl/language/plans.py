@@ -21,11 +21,12 @@ from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
 from types import MappingProxyType
+from typing import Literal
 
-from lw_torchrl._checks import nearest
+from lw_torchrl._checks import check_choice, nearest
 from lw_torchrl._files import write_text
 from lw_torchrl.language.queries import Query, check_query
-from lw_torchrl.language.tasks import MT10, TASKS, check_task, get_task
+from lw_torchrl.language.tasks import MT10, TASKS, Task, check_task, get_task
 
 _TEXT = r'"((?:[^"\\]|\\.)*)"|\'((?:[^\'\\]|\\.)*)\''
 _DEF = re.compile(r"def\s+([A-Za-z]\w*)\s*\(\s*robot\s*\)\s*:")
@@ -67,6 +68,7 @@ class ConditionalPlan:
         task: the task's name.
         steps: at least one :class:`PlanStep`, in canonical spelling, so that the plan's text reads back as
             the same plan: conditions as ``str(query)`` gives them, skills with "the" before the task's nouns.
+        definition: the :class:`Task` whose objects the conditions name; None for ours of that name.
 
     Raises:
         PlanError: (a ValueError) the plan has no steps, a skill does not begin with a plain word, or a
@@ -81,16 +83,21 @@ class ConditionalPlan:
 
     task: str
     steps: tuple[PlanStep, ...]
+    definition: Task = field(default=None, compare=False, repr=False)  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         check_task(self.task)
+        definition = TASKS[self.task] if self.definition is None else self.definition
+        if definition.name != self.task:
+            raise PlanError(f"definition of plan {self.task!r} is of another task, {definition.name!r}")
+        object.__setattr__(self, "definition", definition)
         steps = []
         for number, step in enumerate(self.steps, 1):
             where = f"step {number} of plan {self.task!r}"
             if not isinstance(step, PlanStep) or not isinstance(step.skill, str):
                 raise TypeError(f"{where} must be a PlanStep with a skill in words, got {step!r}")
             try:
-                condition, skill = check_query(step.condition, self.task), _skill_text(step.skill, self.task)
+                condition, skill = check_query(step.condition, definition), _skill_text(step.skill, definition)
             except ValueError as error:
                 raise PlanError(f"{where}: {error}") from error
             steps.append(replace(step, condition=condition, skill=skill))
@@ -99,9 +106,11 @@ class ConditionalPlan:
         object.__setattr__(self, "steps", tuple(steps))
 
     @classmethod
-    def from_pairs(cls, task: str, pairs: Iterable[tuple[str | Query, str]]) -> ConditionalPlan:
+    def from_pairs(cls, task: str | Task, pairs: Iterable[tuple[str | Query, str]]) -> ConditionalPlan:
         """A plan from (condition, skill) pairs, the conditions in any accepted spelling."""
-        return cls(task, tuple(PlanStep(check_query(query, task), skill) for query, skill in pairs))
+        definition = get_task(task)
+        steps = tuple(PlanStep(check_query(query, definition), skill) for query, skill in pairs)
+        return cls(definition.name, steps, definition)
 
     def __str__(self) -> str:
         return format_plan(self)
@@ -172,17 +181,17 @@ def _unquote(match: re.Match[str], group: int) -> str:
     return re.sub(r"\\(.)", r"\1", match[group] or match[group + 1] or "").strip()
 
 
-def _with_articles(details: str, task: str) -> str:
+def _with_articles(details: str, task: Task) -> str:
     def article(match: re.Match[str]) -> str:
         before = details[: match.start()].removesuffix(" ").rpartition(" ")[2]
         return f"the {match[0]}" if not before or before in _BEFORE_NOUN else match[0]
 
-    nouns = sorted({*get_task(task).object_names, "gripper"}, key=len, reverse=True)
+    nouns = sorted({*task.object_names, "gripper"}, key=len, reverse=True)
     pattern = "|".join(re.escape(noun) for noun in nouns)
     return re.sub(rf"(?<![\w'-])(?:{pattern})(?![\w'-])", article, details)
 
 
-def _skill_text(skill: str, task: str) -> str:
+def _skill_text(skill: str, task: Task) -> str:
     """The skill in plain English: articles go before the nouns that lack one, as in the paper.
 
     A noun lacks one at the beginning and after a word like "above"; after any other word ("the coffee mug") it
@@ -196,13 +205,16 @@ def _skill_text(skill: str, task: str) -> str:
     return f"{verb} {_with_articles(details, task)}".strip()
 
 
-def parse_plan(text: str, task: str | None = None, source: str = "plan") -> ConditionalPlan:
+def parse_plan(
+    text: str, task: str | None = None, source: str = "plan", tasks: Mapping[str, Task] = TASKS
+) -> ConditionalPlan:
     """Read one plan in the chain_py format.
 
     Args:
         text: the plan.
         task: the task it must be for; None takes the one its ``def`` line names.
         source: what to call the text in errors, a file's name.
+        tasks: whose objects the conditions name, by task name, as from :func:`load_tasks`.
 
     Raises:
         PlanError: (a ValueError) with the line: a line of another form, a condition outside the query language,
@@ -227,8 +239,8 @@ def parse_plan(text: str, task: str | None = None, source: str = "plan") -> Cond
             if found is not None:
                 raise PlanError(f"{where}: a second plan begins; a plan file holds one")
             found = match[1].replace("_", "-")
-            if found not in TASKS:
-                near = nearest(found, TASKS)
+            if found not in tasks:
+                near = nearest(found, tasks)
                 raise PlanError(f"{where}: {found!r} is no task" + (f"; did you mean {near[0]!r}?" if near else ""))
             if task is not None and found != task:
                 raise PlanError(f"{where}: this is a plan for {found!r}, expected one for {task!r}")
@@ -238,7 +250,7 @@ def parse_plan(text: str, task: str | None = None, source: str = "plan") -> Cond
             if condition is not None:
                 raise PlanError(f'{where}: the condition above has no skill; expected robot.verb("details")')
             try:
-                condition = check_query(_unquote(match, 1), found)
+                condition = check_query(_unquote(match, 1), tasks[found])
             except ValueError as error:
                 raise PlanError(f"{where}: {error}") from error
         elif match := _SKILL.fullmatch(line):
@@ -254,7 +266,7 @@ def parse_plan(text: str, task: str | None = None, source: str = "plan") -> Cond
         raise PlanError(f"{source}: no plan found; a plan begins with 'def task_name(robot):'")
     if condition is not None:
         raise PlanError(f"{source}: the last condition has no skill")
-    return ConditionalPlan(found, tuple(steps))
+    return ConditionalPlan(found, tuple(steps), tasks[found])
 
 
 def format_plan(plan: ConditionalPlan) -> str:
@@ -263,7 +275,7 @@ def format_plan(plan: ConditionalPlan) -> str:
     def quote(text: str) -> str:
         return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
 
-    lines = [f"# {plan.task}: {TASKS[plan.task].description}", f"def {plan.task.replace('-', '_')}(robot):"]
+    lines = [f"# {plan.task}: {plan.definition.description}", f"def {plan.task.replace('-', '_')}(robot):"]
     for step in plan.steps:
         if reason := " ".join(step.reason.split()).lstrip("# "):
             lines.append(f"    # {reason}")
@@ -272,12 +284,20 @@ def format_plan(plan: ConditionalPlan) -> str:
     return "\n".join(lines) + "\n"
 
 
-def load_plans(source: str | os.PathLike[str]) -> Plans:
+def load_plans(
+    source: str | os.PathLike[str],
+    *,
+    skills: Literal["own", "MT10"] = "own",
+    tasks: Mapping[str, Task] = TASKS,
+) -> Plans:
     """Load plans.
 
     Args:
         source: "MT10" or "MT50" for the shipped plans of a set; otherwise the path of a .plan file, or of a
             folder of them.
+        skills: of the shipped plans, "own" for the set whose every step has a scripted skill; "MT10" for the set
+            that words every step as the plans of MT10 do, for policies that have only seen MT10.
+        tasks: whose objects the conditions name, by task name, as from :func:`load_tasks`.
 
     Returns:
         The plans, by task name.
@@ -285,20 +305,23 @@ def load_plans(source: str | os.PathLike[str]) -> Plans:
     Raises:
         FileNotFoundError: there is no such file or folder, or the folder holds no plans.
         PlanError: (a ValueError) a file holds no valid plan, or one for another task than its name says.
+        ValueError: another value for ``skills``, or "MT10" with plans of your own.
 
     Example:
         >>> load_plans("MT10")["reach"].task
         'reach'
     """
+    check_choice("skills", skills, ("own", "MT10"))
     found: list[Traversable]
     if source in ("MT10", "MT50"):
-        shipped = files("lw_torchrl.language") / "data" / "plans"
-        found = [shipped / f"{task}.plan" for task in (MT10 if source == "MT10" else TASKS)]
-        if absent := [path.name for path in found if not path.is_file()]:
-            raise FileNotFoundError(
-                f"no plans are shipped for {len(absent)} tasks of {source} yet, {absent[0]} among them; "
-                "load_plans('MT10') works, and so does a folder of your own"
-            )
+        data = files("lw_torchrl.language") / "data"
+        other = "plans_mt10_skills" if skills == "MT10" else "plans"
+        found = [
+            data / ("plans" if task in MT10 else other) / f"{task}.plan"
+            for task in (MT10 if source == "MT10" else TASKS)
+        ]
+    elif skills != "own":
+        raise ValueError(f"skills={skills!r} is for the shipped plans, 'MT10' and 'MT50', got source {str(source)!r}")
     else:
         path = Path(source)
         if not path.exists():
@@ -314,7 +337,7 @@ def load_plans(source: str | os.PathLike[str]) -> Plans:
             text = file.read_text("utf-8-sig")
         except UnicodeDecodeError as error:
             raise PlanError(f"{file.name}: a plan is a text file in UTF-8: {error}") from error
-        plans.append(parse_plan(text, file.name.removesuffix(".plan"), file.name))
+        plans.append(parse_plan(text, file.name.removesuffix(".plan"), file.name, tasks))
     return Plans(plans)
 
 

@@ -59,7 +59,7 @@ class ScriptedSkillActor(TensorDictModuleBase):
         self.select = check_choice("select", select, ("first", "random", "mix"))
         self._skills = skills
         self.program = SkillProgram(
-            {task: [step.skill for step in plan.steps] for task, plan in self.plans.items()}, skills
+            {plan.definition: [step.skill for step in plan.steps] for plan in self.plans.values()}, skills
         )
         last = torch.zeros(len(MT50), dtype=torch.int64)
         for task, plan in self.plans.items():
