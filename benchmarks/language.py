@@ -1,4 +1,4 @@
-"""Query answering against the language_world package."""
+"""Query answering and scripted skills against the language_world package."""
 
 from __future__ import annotations
 
@@ -18,20 +18,8 @@ ASKED = 64  # states that the rival is asked about in one round; it works state 
 
 @cache
 def plans_for_all() -> lw.Plans:
-    """A plan for each of the 50 tasks: the shipped one, or else seven supported queries with a skill that is known."""
-    try:
-        return lw.load_plans("MT50")
-    except FileNotFoundError:
-        shipped = lw.load_plans("MT10")
-    plans = []
-    for task in lw.MT50:
-        if task in shipped:
-            plans.append(shipped[task])
-            continue
-        queries = lw.supported_queries(task)
-        pairs = [(queries[k * len(queries) // 7], shipped.skills[k]) for k in range(7)]
-        plans.append(lw.ConditionalPlan.from_pairs(task, pairs))
-    return lw.Plans(plans)
+    """The shipped plan of each of the 50 tasks."""
+    return lw.load_plans("MT50")
 
 
 def queries(settings: Settings) -> list[Row]:
@@ -40,16 +28,44 @@ def queries(settings: Settings) -> list[Row]:
         import language_world as rival
     except ImportError as error:
         raise Skipped(f"language-world is not installed ({error}): pip install -e '.[dev]'") from error
-    shipped = lw.load_plans("MT10")
-    eight: dict[str | lw.Task, list[str | lw.Query]] = {}
-    for task in lw.MT50:
-        listed = lw.supported_queries(task)
-        eight[task] = [listed[k * len(listed) // 8] for k in range(8)]
     programs = {
-        f"the {len(shipped)} shipped MT10 plans": plan_program(shipped),
-        "8 queries of each MT50 task": lw.QueryProgram(eight),
+        f"the plans of {len(plans)} tasks": plan_program(plans) for plans in (lw.load_plans("MT10"), plans_for_all())
     }
     return [_against(rival.eval_queries, name, program, settings) for name, program in programs.items()]
+
+
+def skills(settings: Settings) -> list[Row]:
+    """Every step of every row's plan acts, against as many calls of one skill on one state."""
+    try:
+        import language_world as rival
+    except ImportError as error:
+        raise Skipped(f"language-world is not installed ({error}): pip install -e '.[dev]'") from error
+    actor = lw.ScriptedSkillActor(lw.load_plans("MT50"))
+    tasks = [lw.MT50[i % 50] for i in range(BATCH)]
+    task_id = torch.tensor([lw.task_id(task) for task in tasks])
+    states = np.random.default_rng(0).uniform(-0.3, 0.9, (BATCH, 39)).astype(np.float32)
+    observation = torch.from_numpy(states)
+    acted = sum(len(actor.plans[task].steps) for task in tasks)
+    names = rival.SCRIPTED_SKILL_NAMES
+
+    def theirs() -> None:
+        for i in range(ASKED):
+            rival.run_scripted_skill(names[i % len(names)], states[i])
+
+    found = take_turns(
+        {"ours": lambda: actor.program(observation, task_id), "theirs": theirs}, settings.pick(30, 3)
+    )
+    return [
+        compare(
+            f"action of a scripted skill, plans of 50 tasks, batch {BATCH}",
+            [seconds / acted for seconds in found["ours"]],
+            "language_world.run_scripted_skill",
+            [seconds / ASKED for seconds in found["theirs"]],
+            unit="µs",
+            scale=1e6,
+            at_least=300,
+        )
+    ]
 
 
 def _against(eval_queries: Callable[..., np.ndarray], name: str, program: lw.QueryProgram, settings: Settings) -> Row:
@@ -77,4 +93,5 @@ def _against(eval_queries: Callable[..., np.ndarray], name: str, program: lw.Que
         [seconds / ASKED for seconds in found["theirs"]],
         unit="µs",
         scale=1e6,
+        at_least=1000,
     )

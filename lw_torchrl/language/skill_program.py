@@ -44,6 +44,13 @@ class SkillProgram:
         table: Mapping[str, ScriptedSkill] | None = None,
     ) -> None:
         known = load_skills() if table is None else table
+        if not skills:
+            raise ValueError("skills must name at least one task, got an empty mapping")
+        for name, listed in skills.items():
+            if isinstance(listed, (str, ScriptedSkill)) or not listed:
+                raise ValueError(
+                    f"skills[{get_task(name).name!r}] must be a list of at least one skill, got {listed!r}"
+                )
         found = {
             get_task(task): [_look_up(skill, known).for_task(task) for skill in listed]
             for task, listed in skills.items()
@@ -85,9 +92,9 @@ class SkillProgram:
             )
         batch, device = task_id.shape, observation.device
         task_ids = task_id.reshape(-1)
-        row = self._column.to(device)[task_ids]
-        if (row < 0).any():
-            raise ValueError(f"task_id {int(task_ids[row < 0][0])} has no skills")
+        row = self._column.to(device)[task_ids.clamp(0, len(TASKS) - 1)]
+        if not (known := (row >= 0) & (task_ids >= 0) & (task_ids < len(TASKS))).all():
+            raise ValueError(f"task_id {int(task_ids[~known][0])} has no skills")
         constants = self._constants.to(observation).expand(len(row), -1)
         state = torch.cat((observation.reshape(-1, _OBSERVATION), constants), 1)
         target, moved = state.gather(1, self._index.to(device)[row]).unflatten(1, (2, self.num_skills, 3)).unbind(1)

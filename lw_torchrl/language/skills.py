@@ -60,9 +60,18 @@ class ScriptedSkill:
     variants: Mapping[str, ScriptedSkill] = field(default_factory=dict, hash=False, repr=False)
 
     def __post_init__(self) -> None:
+        for name in ("target", "moved"):
+            if not isinstance(getattr(self, name), str):
+                raise SkillError(
+                    f"{name} of skill {self.text!r} must be the name of an object, got {getattr(self, name)!r}"
+                )
         for name in ("offset", "gain"):
             numbers = getattr(self, name)
-            if len(numbers) != 3 or not all(isinstance(x, (int, float)) and math.isfinite(x) for x in numbers):
+            if (
+                not isinstance(numbers, (list, tuple))
+                or len(numbers) != 3
+                or not all(isinstance(x, (int, float)) and math.isfinite(x) for x in numbers)
+            ):
                 raise SkillError(f"{name} of skill {self.text!r} must be three numbers, got {numbers!r}")
         if min(self.gain) < 0:
             raise SkillError(f"gain of skill {self.text!r} must not be negative, got {self.gain!r}")
@@ -97,9 +106,14 @@ def _skill(text: str, row: Any, source: str) -> ScriptedSkill:
         raise SkillError(f"{source}: skill {text!r} must be a table, got {row!r}")
     given = dict(row)
     listed = given.pop("for", {})
+    if not isinstance(listed, Mapping) or not all(isinstance(change, Mapping) for change in listed.values()):
+        raise SkillError(f"{source}: for of skill {text!r} must map task names to tables, got {listed!r}")
     variants = {}
     for task, change in listed.items():
-        check_task(task)
+        try:
+            check_task(task)
+        except ValueError as error:
+            raise SkillError(f"{source}: skill {text!r}: {error}") from error
         variants[task] = _skill(text, {**given, **change}, f"{source}, for {task}")
     for key in given:
         if key not in _KEYS:
@@ -111,11 +125,13 @@ def _skill(text: str, row: Any, source: str) -> ScriptedSkill:
     if "target" not in given:
         raise SkillError(f"{source}: skill {text!r} must name a target")
     gain = given.get("gain", 10.0)
-    given["gain"] = (gain,) * 3 if isinstance(gain, (int, float)) else tuple(gain)
-    given["offset"] = tuple(given.get("offset", (0.0, 0.0, 0.0)))
+    given["gain"] = (gain,) * 3 if isinstance(gain, (int, float)) else gain
+    for key in ("gain", "offset"):
+        if isinstance(given.get(key), list):
+            given[key] = tuple(given[key])
     try:
         return ScriptedSkill(text, **given, variants=MappingProxyType(variants))
-    except (SkillError, TypeError) as error:
+    except SkillError as error:
         raise SkillError(f"{source}: {error}") from error
 
 

@@ -94,7 +94,8 @@ def encode_texts(texts: Sequence[str]) -> Tensor:
 
 def shipped_texts() -> list[str]:
     """The task descriptions and the skills of the shipped plans, sorted."""
-    return sorted({task.description for task in TASKS.values()} | set(load_plans("MT10").skills))
+    skills = {*load_plans("MT50").skills, *load_plans("MT50", skills="MT10").skills}
+    return sorted({task.description for task in TASKS.values()} | skills)
 
 
 def write_table(path: Path, texts: Iterable[str]) -> None:

@@ -1,98 +1,79 @@
-"""The shipped MT10 plans: their form, and whether their conditions describe what an expert goes through."""
+"""The shipped plans: their form, and whether their conditions describe what an expert goes through."""
 
 from importlib.resources import files
 
-import numpy as np
 import pytest
-import torch
 
-from lw_torchrl.envs.metaworld_engine import import_metaworld, make_metaworld_env
-from lw_torchrl.language.plans import format_plan, load_plans, parse_plan
-from lw_torchrl.language.query_program import QueryProgram
-from lw_torchrl.language.tasks import MT10, task_id
+import lw_torchrl as lw
+from lw_torchrl.evaluation.plan_use import expert_use
+from lw_torchrl.language import text
+from lw_torchrl.language.plans import format_plan, parse_plan
 
-EPISODES = 6  # for each task, half of them with execution noise
-NOISE = 0.1
-AFTER_SUCCESS = 20  # steps after the first success that still count as the task's states
-LIMIT = 300  # steps after which an expert has failed
+EPISODES = 6
 
 
-def plan_text(task):
-    return (files("lw_torchrl.language") / "data" / "plans" / f"{task}.plan").read_text("utf-8")
+def plan_text(task, folder="plans"):
+    return (files("lw_torchrl.language") / "data" / folder / f"{task}.plan").read_text("utf-8")
 
 
-def expert_episodes(task):
-    """Expert episodes: observations (T, 39) float32, and the first success, T where there is none."""
-    policies = import_metaworld().policies
-    env = make_metaworld_env(task)
-    episodes = []
-    for seed in range(EPISODES):
-        rng = np.random.default_rng(seed)
-        policy = policies.ENV_POLICY_MAP[f"{task}-v3"]()
-        env.seed(seed)
-        observation, _ = env.reset()
-        seen, first = [], None
-        while len(seen) < LIMIT and (first is None or len(seen) <= first + AFTER_SUCCESS):
-            seen.append(observation.astype(np.float32))
-            # A copy, because the expert of door-open writes into what it is given.
-            action = np.clip(policy.get_action(observation.copy()), -1, 1)
-            if seed % 2:
-                action = np.clip(action + NOISE * rng.standard_normal(4), -1, 1)
-            observation, _, _, _, info = env.step(action)
-            if first is None and info["success"]:
-                first = len(seen) - 1
-        episodes.append((torch.from_numpy(np.stack(seen)), len(seen) if first is None else first))
-    env.close()
-    return episodes
+@pytest.fixture(scope="module")
+def use():
+    """How the 50 plans fare in the states that the experts visit, with a table."""
+    result, found = expert_use(lw.load_plans("MT50"), episodes_per_task=EPISODES, seed=0, progress=False)
+    print(f"\n{EPISODES} expert episodes a task: covered before success, conditions true (median), each step's share")
+    for task, seen in found.items():
+        shares = " ".join(f"{100 * share:3.0f}" for share in seen.true)
+        print(f"{task:28} {seen.covered:6.3f} {seen.num_true:3.0f}   {shares}")
+    assert result.mean_success > 0.95
+    return found
 
 
-def percent(share):
-    return f"{100 * float(share):5.1f} %"
+@pytest.mark.parametrize("task", lw.MT50)
+def test_a_condition_is_true_wherever_an_expert_goes(use, task):
+    assert use[task].covered >= 0.9
+    assert use[task].num_true <= 2
 
 
-@pytest.mark.parametrize("task", MT10)
+@pytest.mark.parametrize("task", lw.MT50)
+def test_every_step_is_needed_and_none_is_always_on(use, task):
+    assert min(use[task].true) >= 0.01, use[task].true
+    assert max(use[task].true) <= 0.95, use[task].true
+
+
+@pytest.mark.parametrize("task", lw.MT50)
 def test_file_is_canonical(task):
-    text = plan_text(task)
-    assert format_plan(parse_plan(text, task)) == text
+    assert format_plan(parse_plan(plan_text(task), task)) == plan_text(task)
 
 
-@pytest.mark.parametrize("task", MT10)
-def test_has_three_to_six_reasoned_steps(task):
-    steps = load_plans("MT10")[task].steps
-    assert 3 <= len(steps) <= 6
+@pytest.mark.parametrize("task", lw.MT50)
+def test_has_a_few_reasoned_steps_with_scripted_skills(task):
+    steps = lw.load_plans("MT50")[task].steps
+    assert 2 <= len(steps) <= 8
     assert all(step.reason for step in steps)
     assert len({step.condition for step in steps}) == len(steps)
+    for step in steps:
+        assert lw.load_skills()[step.skill].for_task(task)
 
 
-def test_skills_are_shared_between_tasks():
-    skills = load_plans("MT10").skills
+def test_skills_of_mt10_are_shared_between_tasks():
+    skills = lw.load_plans("MT10").skills
     verbs = {skill.split()[0] for skill in skills}
     assert verbs == {"place", "center", "lower", "close", "move", "hold", "push", "pull"}
 
 
-@pytest.mark.filterwarnings(r"ignore:Constant\(s\) may be too high")
-@pytest.mark.parametrize("task", MT10)
-def test_conditions_cover_what_an_expert_passes_through(task):
-    plan = load_plans("MT10")[task]
-    program = QueryProgram({task: [step.condition for step in plan.steps]})
-    before, around = [], []
-    for observations, first in expert_episodes(task):
-        true = program(observations, torch.full((len(observations),), task_id(task)))
-        before.append(true[: first + 1])
-        around.append(true)
-    before, active = torch.cat(before), torch.cat(around).float().mean(0)
+def test_the_second_set_speaks_of_nothing_that_mt10_has_not():
+    plans = lw.load_plans("MT50", skills="MT10")
+    assert tuple(plans) == lw.MT50
+    assert set(plans.skills) == set(lw.load_plans("MT10").skills)
+    for task in lw.MT50:
+        assert all(step.reason for step in plans[task].steps)
+        if task in lw.MT10:
+            assert plans[task] == lw.load_plans("MT10")[task]
+        else:
+            assert format_plan(plans[task]) == plan_text(task, "plans_mt10_skills")
 
-    covered = before.any(1).float().mean()
-    median = before.sum(1).float().median()
-    table = [
-        f"{task}, {EPISODES} expert episodes: {percent(covered)} covered, {median:.0f} true (median)",
-        f"   before | to {AFTER_SUCCESS} steps after success | skill: condition",
-    ]
-    for step, earlier, share in zip(plan.steps, before.float().mean(0), active, strict=True):
-        table.append(f"  {percent(earlier)} | {percent(share):>25} | {step.skill}: {step.condition}")
-    report = "\n".join(table)
 
-    assert covered >= 0.9, report
-    assert median <= 2, report
-    assert active.min() >= 0.01, report
-    assert active.max() <= 0.95, report
+def test_every_text_comes_with_its_embedding(monkeypatch):
+    monkeypatch.setattr(text, "sentence_encoder", lambda texts: pytest.fail(f"not shipped: {texts}"))
+    texts = {skill for kind in ("own", "MT10") for skill in lw.load_plans("MT50", skills=kind).skills}
+    text.encode_texts([*sorted(texts), *(task.description for task in lw.TASKS.values())])

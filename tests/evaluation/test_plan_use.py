@@ -1,0 +1,54 @@
+"""PlanUse: the shares it reports, from episodes made up by hand."""
+
+import torch
+from tensordict import TensorDict
+
+import lw_torchrl as lw
+from lw_torchrl.envs.episodes import Episode
+from lw_torchrl.evaluation.plan_use import PlanUse
+
+PLANS = {"reach": lw.load_plans("MT10")["reach"]}  # three steps
+
+
+def episode(number, steps, success_at=None, weights=True):
+    """An episode whose step t has only condition ``steps[t]`` true, none for -1, and takes that step's skill."""
+    chosen = torch.tensor(steps)
+    qaf = torch.nn.functional.one_hot(chosen.clamp(min=0), 4).bool() & (chosen >= 0)[:, None]
+    success = torch.zeros(len(steps), 1, dtype=torch.bool)
+    if success_at is not None:
+        success[success_at] = True
+    found = TensorDict({"qaf": qaf, "next": TensorDict({"success": success}, [len(steps)])}, [len(steps)])
+    if weights:
+        found["skill_weights"] = torch.nn.functional.one_hot(chosen.clamp(min=0), 4).float()
+    return Episode("reach", number, found)
+
+
+def test_shares_of_states_to_twenty_steps_after_the_first_success():
+    use = PlanUse(PLANS)
+    use(episode(0, [0] * 10 + [1] * 5 + [2] * 100, success_at=14))
+    found = use.tasks()["reach"]
+    assert found.states == 35
+    assert found.true == [10 / 35, 5 / 35, 20 / 35] or torch.allclose(
+        torch.tensor(found.true), torch.tensor([10, 5, 20]) / 35
+    )
+    assert found.chosen == found.true
+    assert (found.covered, found.num_true, found.failed, found.stuck) == (1.0, 1.0, 0, [0, 0, 0])
+
+
+def test_uncovered_states_and_where_failures_end():
+    use = PlanUse(PLANS)
+    use(episode(0, [0] * 30 + [1] * 60 + [-1] * 10))
+    use(episode(1, [2] * 200))
+    found = use.tasks()["reach"]
+    assert found.failed == 2
+    assert found.stuck == [0, 1, 1]
+    assert found.covered == 290 / 300 or abs(found.covered - 290 / 300) < 1e-6
+
+
+def test_without_a_policy_that_chooses():
+    use = PlanUse(PLANS)
+    use(episode(0, [0, 1, 1], weights=False))
+    found = use.tasks()["reach"]
+    assert found.chosen == []
+    assert found.stuck == [0, 1, 0]
+    assert found.to_json()["states"] == 3

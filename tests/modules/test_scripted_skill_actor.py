@@ -1,0 +1,106 @@
+"""ScriptedSkillActor: which step it takes, and that plans of MT10 are carried out."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+import lw_torchrl as lw
+from lw_torchrl.language.skills import SkillError
+
+PLANS = lw.load_plans("MT10")
+PUSH = lw.task_id("push")
+
+
+def acting(select, qaf, **options):
+    """The actor's weights and actions in as many random states of push as there are rows of ``qaf``."""
+    n = len(qaf)
+    torch.manual_seed(0)
+    state = TensorDict(
+        {"observation": torch.rand(n, 39), "task_id": torch.full((n,), PUSH), "qaf": torch.tensor(qaf)}, [n]
+    )
+    actor = lw.ScriptedSkillActor({"push": PLANS["push"]}, select, **options)
+    out = actor(state)
+    return out["skill_weights"], out["action"], actor.program(state["observation"], state["task_id"])
+
+
+TRUE = [[True, False, False, False], [False, True, True, False], [False, False, False, False], [True, True, True, True]]
+
+
+def test_first_takes_the_first_true_step_and_the_last_where_none_is():
+    weights, action, each = acting("first", TRUE)
+    assert weights.argmax(-1).tolist() == [0, 1, 3, 0]
+    assert weights.sum(-1).tolist() == [1.0] * 4
+    assert torch.equal(action, each[torch.arange(4), weights.argmax(-1)])
+
+
+def test_mix_takes_equal_parts_of_the_true_steps():
+    weights, action, each = acting("mix", TRUE)
+    assert weights[1].tolist() == [0.0, 0.5, 0.5, 0.0]
+    assert weights[2].tolist() == [0.0, 0.0, 0.0, 1.0]
+    assert torch.allclose(action[1], (each[1, 1] + each[1, 2]) / 2)
+
+
+def test_random_takes_any_true_step_equally_often_and_hangs_on_its_seed():
+    qaf = [[False, True, True, True]] * 3000
+    weights, _, _ = acting("random", qaf, seed=3)
+    counts = weights.sum(0).tolist()
+    assert counts[0] == 0
+    assert all(900 < count < 1100 for count in counts[1:])
+    assert torch.equal(weights, acting("random", qaf, seed=3)[0])
+    assert not torch.equal(weights, acting("random", qaf, seed=4)[0])
+
+
+def test_padding_gets_no_weight():
+    plans = lw.load_plans("MT10")
+    env_steps = plans.num_steps
+    state = TensorDict(
+        {
+            "observation": torch.rand(10, 39),
+            "task_id": torch.tensor([lw.task_id(task) for task in lw.MT10]),
+            "qaf": torch.zeros(10, env_steps, dtype=torch.bool),
+        },
+        [10],
+    )
+    weights = lw.ScriptedSkillActor(plans)(state)["skill_weights"]
+    assert weights.argmax(-1).tolist() == [len(plans[task].steps) - 1 for task in lw.MT10]
+
+
+def test_it_carries_out_the_plans_of_mt10():
+    result = lw.evaluate(
+        lw.ScriptedSkillActor(PLANS),
+        tasks="MT10",
+        episodes_per_task=5,
+        seed=31,
+        noise_scale=0.0,
+        stop_at_success=True,
+        progress=False,
+    )
+    assert result.mean_success >= 0.98, result.table()
+
+
+def test_other_plans_and_ones_own_skills(tmp_path):
+    path = tmp_path / "skills.toml"
+    path.write_text('["stay put"]\ntarget = "robot\'s gripper"\n')
+    plan = lw.ConditionalPlan.from_pairs("reach", [("the gripper is open", "stay put")])
+    actor = lw.ScriptedSkillActor({"reach": plan}, skills=lw.load_skills(path))
+    state = TensorDict(
+        {
+            "observation": torch.rand(1, 39),
+            "task_id": torch.tensor([lw.task_id("reach")]),
+            "qaf": torch.ones(1, 1).bool(),
+        },
+        [1],
+    )
+    assert not actor(state)["action"].any()
+    assert actor.with_plans({"reach": plan}).plans == actor.plans
+
+
+def test_what_it_refuses():
+    with pytest.raises(ValueError, match="select must be one of 'first', 'random', 'mix', got 'frist'; did you mean"):
+        lw.ScriptedSkillActor(PLANS, "frist")
+    plan = lw.ConditionalPlan.from_pairs("reach", [("the gripper is open", "place the gripper above the puck")])
+    with pytest.raises(SkillError, match="task 'reach' lacks"):
+        lw.ScriptedSkillActor({"reach": plan})
+    plan = lw.ConditionalPlan.from_pairs("push", [("the gripper is open", "put the gripper above the puck")])
+    with pytest.raises(ValueError, match="did you mean 'place the gripper above the puck'"):
+        lw.ScriptedSkillActor({"push": plan})
