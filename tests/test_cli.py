@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import os
 import re
@@ -12,33 +13,27 @@ import time
 from importlib.metadata import entry_points
 
 import pytest
+from commands import fails, run
 
 import lw_torchrl as lw
 from lw_torchrl import cli
 from lw_torchrl.cli import main
 from lw_torchrl.demo import QUICK
 
-COMMANDS = ("demo", "collect", "train", "evaluate", "view", "query")
-
-
-def run(capsys, *args):
-    """What a command prints."""
-    main([str(arg) for arg in args])
-    printed = capsys.readouterr()
-    assert "Traceback" not in printed.err
-    return printed.out
-
-
-def fails(capsys, *args):
-    """The one line with which a command fails."""
-    with pytest.raises(SystemExit) as caught:
-        main([str(arg) for arg in args])
-    assert caught.value.code == 2
-    printed = capsys.readouterr()
-    assert printed.out == ""
-    assert printed.err.startswith("lw-torchrl: error: ")
-    assert printed.err.count("\n") == 1, printed.err
-    return printed.err
+COMMANDS = (
+    "demo",
+    "collect",
+    "train",
+    "evaluate",
+    "view",
+    "query",
+    "scripted",
+    "tasks",
+    "queries",
+    "skills",
+    "plans",
+    "check",
+)
 
 
 # ---- help
@@ -66,15 +61,8 @@ def test_every_command_explains_itself(capsys, command):
     printed = " ".join(re.sub(r"[^ -~]", " ", capsys.readouterr().out).split())
     first = cli.COMMANDS[command].__doc__.strip().splitlines()[0]
     assert " ".join(first.split()[:5]) in printed
-    options = set(cli.COMMANDS[command].__annotations__) - {
-        "return",
-        "tasks",
-        "data",
-        "checkpoint",
-        "recording",
-        "task",
-        "text",
-    }
+    parameters = inspect.signature(cli.COMMANDS[command]).parameters.values()
+    options = [p.name for p in parameters if p.kind is p.POSITIONAL_OR_KEYWORD]
     assert all(f"--{name.replace('_', '-')}" in printed for name in options)
 
 
