@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor, nn
 from torchrl.modules import MLP
@@ -50,16 +52,19 @@ class ActionDecoder(nn.Module):
     Args:
         latent_size: D.
         features, feature_noise: what it sees of the observation, see :class:`ObservationFeatures`.
-        width, depth: of the hidden layers.
+        width, depth: of the hidden layers; a tuple of widths says both.
     """
 
-    def __init__(self, latent_size: int, features: Features, feature_noise: float, width: int, depth: int) -> None:
+    def __init__(
+        self, latent_size: int, features: Features, feature_noise: float, width: int | Sequence[int], depth: int
+    ) -> None:
         super().__init__()
         self.features = ObservationFeatures(features, feature_noise)
+        widths = [width] * check_int("depth", depth, minimum=0) if isinstance(width, int) else list(width)
         self.network = MLP(
             in_features=latent_size + self.features.width,
             out_features=4,
-            num_cells=[check_int("width", width, minimum=1)] * check_int("depth", depth, minimum=0),
+            num_cells=[check_int("width", cells, minimum=1) for cells in widths],
             activation_class=nn.ReLU,
         )
 

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor
 
+from lw_torchrl._checks import check_choice
 from lw_torchrl.language.tasks import MT50, TASKS, resolve_tasks, task_id
 from lw_torchrl.language.text import encode_texts
 from lw_torchrl.modules.decoder import ActionDecoder, check_task_ids, text_to_latent, unit_scale
 from lw_torchrl.modules.observation_features import Features
+
+
+def _one_hot(texts: Sequence[str]) -> Tensor:
+    return torch.eye(len(texts))
 
 
 class DescriptorConditionedActor(TensorDictModuleBase):
@@ -23,6 +28,7 @@ class DescriptorConditionedActor(TensorDictModuleBase):
 
     Args:
         tasks: the tasks it is to act in, as for :func:`resolve_tasks`.
+        condition: "description", the text's vector; "one-hot", one number for each task, which knows no words.
         features, feature_noise, latent_size, width, depth, encoder_width, encoder_depth, text_encoder: as for
             :class:`PlanConditionedActor`, with the same networks.
 
@@ -48,10 +54,11 @@ class DescriptorConditionedActor(TensorDictModuleBase):
         self,
         tasks: str | Iterable[str],
         *,
+        condition: Literal["description", "one-hot"] = "description",
         features: Features = "differences",
         feature_noise: float = 0.05,
         latent_size: int = 64,
-        width: int = 256,
+        width: int | tuple[int, ...] = 256,
         depth: int = 3,
         encoder_width: int = 128,
         encoder_depth: int = 1,
@@ -60,6 +67,7 @@ class DescriptorConditionedActor(TensorDictModuleBase):
         super().__init__()
         self.tasks = resolve_tasks(tasks)
         self.config: dict[str, Any] = {
+            "condition": check_choice("condition", condition, ("description", "one-hot")),
             "features": features,
             "feature_noise": feature_noise,
             "latent_size": latent_size,
@@ -68,7 +76,8 @@ class DescriptorConditionedActor(TensorDictModuleBase):
             "encoder_width": encoder_width,
             "encoder_depth": encoder_depth,
         }
-        found = (text_encoder or encode_texts)([TASKS[task].description for task in self.tasks])
+        encode = text_encoder or (encode_texts if condition == "description" else _one_hot)
+        found = encode([TASKS[task].description for task in self.tasks])
         if found.ndim != 2 or len(found) != len(self.tasks):
             raise ValueError(f"text_encoder must give ({len(self.tasks)}, E), got shape {tuple(found.shape)}")
         ids = torch.tensor([task_id(task) for task in self.tasks])
@@ -83,10 +92,18 @@ class DescriptorConditionedActor(TensorDictModuleBase):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return tensordict.set("action", self.act(*self.prepare(tensordict))[0])
+
+    def prepare(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """What no trained parameter touches: task_id (B,) int64, and the observation's features (B, F)."""
         task = tensordict.get("task_id")
         check_task_ids(task, self.known, "tasks this actor was not made for")
+        return task, self.decoder.features(tensordict.get("observation"))
+
+    def act(self, task: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
+        """From what :meth:`prepare` gives: action (B, 4), and the task's latent (B, D)."""
         latent = self.encoder(self.description_vectors)[task]
-        return tensordict.set("action", self.decoder(latent, tensordict.get("observation")))
+        return self.decoder.decode(latent, seen), latent
 
     def fit_normalization(self, observation: Tensor) -> None:
         """Take the observation features' mean and standard deviation from (..., 39) float32, in place."""

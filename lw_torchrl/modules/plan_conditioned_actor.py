@@ -34,7 +34,7 @@ class PlanConditionedActor(TensorDictModuleBase):
             differences between hand, objects and goal; "both".
         feature_noise: standard deviation of the noise on the normalised features while training.
         latent_size: D.
-        width, depth: hidden layers of the action decoder.
+        width, depth: hidden layers of the action decoder; a tuple of widths says both.
         encoder_width, encoder_depth: hidden layers of the skill encoder.
         text_encoder: texts to vectors (n, E) float32; None for the shipped sentence encoder.
 
@@ -71,7 +71,7 @@ class PlanConditionedActor(TensorDictModuleBase):
         features: Features = "differences",
         feature_noise: float = 0.05,
         latent_size: int = 64,
-        width: int = 256,
+        width: int | tuple[int, ...] = 256,
         depth: int = 3,
         encoder_width: int = 128,
         encoder_depth: int = 1,
@@ -109,19 +109,29 @@ class PlanConditionedActor(TensorDictModuleBase):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        task = tensordict.get("task_id")
-        weights = self.attention.weights(tensordict.get("qaf"), task)
-        step_latents = self.encoder(self.skill_vectors)[self.skill_index[task]]  # (B, S, D)
-        latent = (weights.unsqueeze(-1) * step_latents).sum(-2)
-        seen = self.decoder.features(tensordict.get("observation"))
-        if self.config["mix"] == "latents":
-            action = self.decoder.decode(latent, seen)
-        else:
-            each = seen.unsqueeze(-2).expand(*step_latents.shape[:-1], -1)
-            action = (weights.unsqueeze(-1) * self.decoder.decode(step_latents, each)).sum(-2)
+        action, latent, weights = self.act(*self.prepare(tensordict))
         tensordict.set("action", action)
         tensordict.set("skill_weights", weights)
         return tensordict.set("skill_latent", latent)
+
+    def prepare(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
+        """What no trained parameter touches: attention (B, S), the index of each step's skill (B, S) int64, and the
+        observation's features (B, F)."""
+        task = tensordict.get("task_id")
+        weights = self.attention.weights(tensordict.get("qaf"), task)
+        return weights, self.skill_index[task], self.decoder.features(tensordict.get("observation"))
+
+    def act(self, weights: Tensor, index: Tensor, seen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """From what :meth:`prepare` gives: action (B, 4), skill latent (B, D), and the weights again."""
+        latents = self.encoder(self.skill_vectors)  # (K, D)
+        # A product with (B, K) is faster than picking (B, S, D) latents, forwards and backwards.
+        over_skills = weights.new_zeros((*weights.shape[:-1], len(self.skills))).scatter_add(-1, index, weights)
+        latent = over_skills @ latents
+        if self.config["mix"] == "latents":
+            return self.decoder.decode(latent, seen), latent, weights
+        steps = latents[index]
+        each = seen.unsqueeze(-2).expand(*steps.shape[:-1], -1)
+        return (weights.unsqueeze(-1) * self.decoder.decode(steps, each)).sum(-2), latent, weights
 
     def fit_normalization(self, observation: Tensor) -> None:
         """Take the observation features' mean and standard deviation from (..., 39) float32, in place."""
