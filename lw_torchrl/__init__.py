@@ -25,7 +25,7 @@ from lw_torchrl.modules import (
     ScriptedSkillActor,
 )
 from lw_torchrl.record import RerunLogger
-from lw_torchrl.trainers import BehavioralCloningConfig, BehavioralCloningTrainer, load_actor
+from lw_torchrl.trainers import BehavioralCloningConfig, BehavioralCloningTrainer, StackedBehavioralCloning, load_actor
 
 __version__ = "0.1.0"
 
@@ -64,6 +64,7 @@ __all__ = [
     "ScriptedSkillActor",
     "SkillError",
     "SkillProgram",
+    "StackedBehavioralCloning",
     "Task",
     "TaskBalancedSampler",
     "TextEncoder",

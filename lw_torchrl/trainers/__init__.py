@@ -1,6 +1,7 @@
-"""Training: behavioral cloning, and the checkpoints that it leaves."""
+"""Training: behavioral cloning of one actor or of many at once, and the checkpoints that it leaves."""
 
 from lw_torchrl.trainers.behavioral_cloning import BehavioralCloningConfig, BehavioralCloningTrainer
 from lw_torchrl.trainers.checkpoint import load_actor
+from lw_torchrl.trainers.stacked import StackedBehavioralCloning
 
-__all__ = ["BehavioralCloningConfig", "BehavioralCloningTrainer", "load_actor"]
+__all__ = ["BehavioralCloningConfig", "BehavioralCloningTrainer", "StackedBehavioralCloning", "load_actor"]

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 import warnings
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 from torch.nn.utils import clip_grad_norm_
 from torchrl.checkpoint import Checkpoint
 from torchrl.data import TensorDictReplayBuffer
@@ -30,8 +32,12 @@ class BehavioralCloningConfig:
     Attributes:
         steps: minibatches.
         batch_size: rows of a minibatch; the number of tasks must divide it.
-        learning_rate: at the start; a cosine brings it to 0 over ``steps``.
-        weight_decay: AdamW's.
+        learning_rate: at the start.
+        optimizer: "adamw" or "sgd".
+        weight_decay: the optimizer's.
+        momentum: of "sgd".
+        schedule: of the learning rate, "cosine" to 0 or "constant".
+        normalize: first take the statistics of the observation's features from the demonstrations.
         loss_function: between the actor's and the demonstrated action: "l1", "l2" or "smooth_l1".
         max_grad_norm: gradients are clipped to it.
         seed: of the minibatches, and of what the actor draws while training.
@@ -41,7 +47,11 @@ class BehavioralCloningConfig:
     steps: int = 8000
     batch_size: int = 500
     learning_rate: float = 1e-3
+    optimizer: str = "adamw"
     weight_decay: float = 1e-4
+    momentum: float = 0.9
+    schedule: str = "cosine"
+    normalize: bool = True
     loss_function: str = "l2"
     max_grad_norm: float = 1.0
     seed: int = 0
@@ -50,10 +60,28 @@ class BehavioralCloningConfig:
     def __post_init__(self) -> None:
         for name in ("steps", "batch_size", "checkpoint_every"):
             check_int(name, getattr(self, name), minimum=1)
-        for name in ("learning_rate", "weight_decay", "max_grad_norm"):
+        for name in ("learning_rate", "weight_decay", "momentum", "max_grad_norm"):
             check_scale(name, getattr(self, name))
         check_int("seed", self.seed)
         check_choice("loss_function", self.loss_function, LOSSES)
+        check_choice("optimizer", self.optimizer, ("adamw", "sgd"))
+        check_choice("schedule", self.schedule, ("cosine", "constant"))
+
+
+def make_optimizer(
+    parameters: Iterable[Tensor], config: BehavioralCloningConfig
+) -> tuple[torch.optim.Optimizer, torch.optim.lr_scheduler.LRScheduler]:
+    """The optimizer of a configuration, and its schedule."""
+    optimizer: torch.optim.Optimizer
+    if config.optimizer == "adamw":
+        optimizer = torch.optim.AdamW(parameters, lr=config.learning_rate, weight_decay=config.weight_decay)
+    else:
+        optimizer = torch.optim.SGD(
+            parameters, lr=config.learning_rate, momentum=config.momentum, weight_decay=config.weight_decay
+        )
+    if config.schedule == "cosine":
+        return optimizer, torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, config.steps)
+    return optimizer, torch.optim.lr_scheduler.LambdaLR(optimizer, lambda _: 1.0)
 
 
 class BehavioralCloningTrainer:
@@ -110,14 +138,11 @@ class BehavioralCloningTrainer:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message=".*target_actor_network_params.*")
             self.loss = BCLoss(actor, loss_function=config.loss_function)
-        self.optimizer = torch.optim.AdamW(
-            self.loss.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
-        )
-        self.schedule = torch.optim.lr_scheduler.CosineAnnealingLR(self.optimizer, config.steps)
+        self.optimizer, self.schedule = make_optimizer(self.loss.parameters(), config)
         self.state = TrainingState(replay.sampler, generator)
         if self.checkpoint is not None and self.checkpoint.exists():
             self._resume(self.checkpoint)
-        elif hasattr(actor, "fit_normalization"):
+        elif config.normalize and hasattr(actor, "fit_normalization"):
             actor.fit_normalization(replay.storage.get(slice(0, len(replay))).get("observation"))
 
     def _describe(self) -> dict[str, Any]:

@@ -1,0 +1,146 @@
+"""StackedBehavioralCloning: many actors of one architecture trained at once, their parameters stacked."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.func import functional_call, stack_module_state, vmap
+from torchrl.data import TensorDictReplayBuffer
+from torchrl.objectives.utils import distance_loss
+from tqdm.auto import tqdm
+
+from lw_torchrl.modules import DescriptorConditionedActor, PlanConditionedActor
+from lw_torchrl.trainers.behavioral_cloning import BehavioralCloningConfig, make_optimizer
+
+
+class _Act(nn.Module):
+    """``functional_call`` calls a module's forward: this one's is the actor's ``act``."""
+
+    def __init__(self, actor: Any) -> None:
+        super().__init__()
+        self.actor = actor
+
+    def forward(self, *prepared: Tensor) -> Tensor:
+        return self.actor.act(*prepared)[0]
+
+
+class StackedBehavioralCloning:
+    """Trains M actors, each on batches of its own, as :class:`BehavioralCloningTrainer` trains one.
+
+    Every product is done for all M at once. Each actor draws its batches and its feature noise from the seed that
+    it would have alone, so its losses are those it would have alone, up to rounding.
+
+    Args:
+        actors: M actors of one architecture, with ``prepare`` and ``act``; they are trained in place.
+        replays: M buffers; the i-th actor's batches come from the i-th.
+        config: how to train each; the i-th has the seed ``config.seed + i``.
+        progress: show a progress bar.
+
+    Raises:
+        ValueError: not as many buffers as actors, or actors of different shapes; in :meth:`train`, a loss that is
+            no number.
+
+    Example:
+        >>> import lw_torchrl as lw, tempfile
+        >>> plans = lw.load_plans("MT10")
+        >>> with tempfile.TemporaryDirectory() as root:
+        ...     _ = lw.collect_demonstrations("reach", episodes_per_task=1, root=root + "/demos", max_steps=80)
+        ...     load = lambda: lw.LanguageWorldExperienceReplay(root + "/demos", transform=lw.QAFTransform(plans))
+        ...     trainer = lw.StackedBehavioralCloning(
+        ...         [lw.PlanConditionedActor(plans), lw.PlanConditionedActor(plans)],
+        ...         [load(), load()],
+        ...         lw.BehavioralCloningConfig(steps=5, batch_size=16),
+        ...     )
+        ...     trainer.train().shape
+        torch.Size([2])
+
+    Source: paper section 'Conditional Plan Experiments', which trains 50 one-shot models; ``torch.func``.
+    """
+
+    def __init__(
+        self,
+        actors: Sequence[PlanConditionedActor | DescriptorConditionedActor],
+        replays: Sequence[TensorDictReplayBuffer],
+        config: BehavioralCloningConfig | None = None,
+        *,
+        progress: bool = True,
+    ) -> None:
+        self.config = config = config or BehavioralCloningConfig()
+        if not actors or len(replays) != len(actors):
+            raise ValueError(f"replays must be as many as actors, at least one, got {len(replays)} and {len(actors)}")
+        self.actors, self.replays, self.progress = list(actors), list(replays), progress
+        self._noise = []
+        for number, (actor, replay) in enumerate(zip(actors, replays, strict=True)):
+            generator = torch.Generator().manual_seed(config.seed + number)
+            replay.set_rng(generator)
+            self._noise.append(torch.Generator().manual_seed(config.seed + number).get_state())
+            if config.normalize:
+                actor.fit_normalization(replay.storage.get(slice(0, len(replay))).get("observation"))
+            actor.train()
+        modules: list[nn.Module] = [_Act(actor) for actor in actors]
+        try:
+            parameters, buffers = stack_module_state(modules)
+        except RuntimeError as error:
+            raise ValueError(f"actors must be of one architecture ({error})") from error
+        self._parameters = {name: nn.Parameter(value.detach()) for name, value in parameters.items()}
+        shared = modules[0]
+        self._act = vmap(lambda p, b, prepared: functional_call(shared, (p, b), prepared))
+        self._buffers = buffers
+        self.optimizer, self.schedule = make_optimizer(list(self._parameters.values()), config)
+        self.steps = 0
+
+    def step(self) -> Tensor:
+        """Train every actor on one minibatch and return their losses, (M,) float32."""
+        prepared, targets = [], []
+        for number, (actor, replay) in enumerate(zip(self.actors, self.replays, strict=True)):
+            batch = replay.sample(self.config.batch_size)
+            with torch.random.fork_rng(devices=[]):
+                torch.set_rng_state(self._noise[number])
+                prepared.append(actor.prepare(batch))
+                self._noise[number] = torch.get_rng_state()
+            targets.append(batch.get("action"))
+        inputs = tuple(torch.stack(column) for column in zip(*prepared, strict=True))
+        actions = self._act(self._parameters, self._buffers, inputs)
+        losses = distance_loss(actions, torch.stack(targets), self.config.loss_function).flatten(1).mean(1)
+        if not losses.isfinite().all():
+            first = int((~losses.isfinite()).nonzero()[0])
+            raise ValueError(f"the loss of actor {first} is {losses[first].item()} at step {self.steps}")
+        self.optimizer.zero_grad()
+        losses.sum().backward()
+        self._clip()
+        self.optimizer.step()
+        self.schedule.step()
+        self.steps += 1
+        return losses.detach()
+
+    def _clip(self) -> None:
+        gradients = [p.grad for p in self._parameters.values() if p.grad is not None]
+        norms = torch.stack([g.flatten(1).square().sum(1) for g in gradients]).sum(0).sqrt()
+        factor = (self.config.max_grad_norm / (norms + 1e-6)).clamp(max=1.0)  # as clip_grad_norm_ does
+        for gradient in gradients:
+            gradient.mul_(factor.reshape(-1, *[1] * (gradient.ndim - 1)))
+
+    def train(self) -> Tensor:
+        """Train to the last step and give the actors their weights.
+
+        Returns:
+            (M,) float32, each actor's mean loss over the last 100 steps.
+        """
+        recent: list[Tensor] = []
+        steps = range(self.steps, self.config.steps)
+        for _ in tqdm(steps, desc=f"training {len(self.actors)} models", delay=1, disable=not self.progress):
+            recent = [*recent[-99:], self.step()]
+        self.write_back()
+        return torch.stack(recent).mean(0)
+
+    @torch.no_grad()
+    def write_back(self) -> None:
+        """Copy the stacked parameters into the actors, and put them in eval mode."""
+        for number, actor in enumerate(self.actors):
+            own = dict(actor.named_parameters())
+            for name, value in self._parameters.items():
+                own[name.removeprefix("actor.")].copy_(value[number])
+            actor.eval()

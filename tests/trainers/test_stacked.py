@@ -1,0 +1,73 @@
+"""Many actors trained at once: each fares as it would alone."""
+
+import pytest
+import torch
+
+import lw_torchrl as lw
+
+TASKS = ("push", "reach", "window-open")
+PLANS = lw.load_plans("MT10")
+CONFIG = lw.BehavioralCloningConfig(steps=100, batch_size=30, seed=5)
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory):
+    root = tmp_path_factory.mktemp("stacked") / "demos"
+    lw.collect_demonstrations(TASKS, episodes_per_task=2, root=root, max_steps=100, progress=False)
+    return root
+
+
+def replay(demos):
+    return lw.LanguageWorldExperienceReplay(
+        demos, sampler=lw.TaskBalancedSampler(), transform=lw.QAFTransform(PLANS), after_success=20
+    )
+
+
+def make(kind, seed):
+    torch.manual_seed(seed)
+    if kind == "plan":
+        return lw.PlanConditionedActor(PLANS, width=32)
+    if kind == "mixed actions":
+        return lw.PlanConditionedActor(PLANS, width=32, mix="actions")
+    return lw.DescriptorConditionedActor(TASKS, width=32, condition=kind)
+
+
+@pytest.mark.parametrize("kind", ["plan", "mixed actions", "description", "one-hot"])
+def test_every_loss_is_the_one_it_has_alone(demos, kind):
+    together = lw.StackedBehavioralCloning(
+        [make(kind, seed) for seed in range(3)], [replay(demos) for _ in range(3)], CONFIG, progress=False
+    )
+    losses = torch.stack([together.step() for _ in range(CONFIG.steps)])
+    assert losses[-10:].mean() < losses[:10].mean() / 2
+    for number in range(3):
+        config = lw.BehavioralCloningConfig(**{**vars(CONFIG), "seed": CONFIG.seed + number})
+        alone = lw.BehavioralCloningTrainer(make(kind, number), replay(demos), config, progress=False)
+        own = torch.tensor([alone.step() for _ in range(CONFIG.steps)])
+        assert (losses[:, number] - own).abs().max() < 1e-5
+
+
+def test_the_actors_get_their_weights(demos):
+    actors = [make("plan", seed) for seed in range(2)]
+    config = lw.BehavioralCloningConfig(steps=3, batch_size=30)
+    trainer = lw.StackedBehavioralCloning(actors, [replay(demos) for _ in range(2)], config, progress=False)
+    before = [actor.decoder.network[0].weight.clone() for actor in actors]
+    assert trainer.train().shape == (2,)
+    for number, actor in enumerate(actors):
+        assert not actor.training
+        assert not torch.equal(actor.decoder.network[0].weight, before[number])
+        stacked = trainer._parameters["actor.decoder.network.0.weight"][number]
+        assert torch.equal(actor.decoder.network[0].weight, stacked)
+    assert actors[0].decoder.features.mean.any()
+
+
+def test_what_it_refuses(demos):
+    with pytest.raises(ValueError, match="replays must be as many as actors, at least one, got 1 and 2"):
+        lw.StackedBehavioralCloning([make("plan", 0), make("plan", 1)], [replay(demos)])
+    odd = lw.PlanConditionedActor(PLANS, width=16)
+    with pytest.raises(ValueError, match="actors must be of one architecture"):
+        lw.StackedBehavioralCloning([make("plan", 0), odd], [replay(demos), replay(demos)])
+    broken = make("plan", 0)
+    torch.nn.init.constant_(broken.decoder.network[0].weight, float("nan"))
+    trainer = lw.StackedBehavioralCloning([make("plan", 0), broken], [replay(demos), replay(demos)], CONFIG)
+    with pytest.raises(ValueError, match="the loss of actor 1 is nan at step 0"):
+        trainer.step()
