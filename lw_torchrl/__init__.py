@@ -13,9 +13,20 @@ from lw_torchrl.evaluation import EpisodeResult, EvaluationResult, evaluate, plo
 from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans, PlanStep, load_plans, save_plans
 from lw_torchrl.language.queries import Clause, Query, QueryError, parse_query, supported_queries
 from lw_torchrl.language.query_program import QueryProgram
+from lw_torchrl.language.query_search import QueryMatch, nearest_query
 from lw_torchrl.language.skill_program import SkillProgram
 from lw_torchrl.language.skills import ScriptedSkill, SkillError, load_skills, nearest_skill
-from lw_torchrl.language.tasks import MT10, MT50, TASKS, NamedObject, Task, resolve_tasks, task_id
+from lw_torchrl.language.tasks import (
+    MT10,
+    MT50,
+    TASKS,
+    NamedObject,
+    Task,
+    TaskError,
+    load_tasks,
+    resolve_tasks,
+    task_id,
+)
 from lw_torchrl.language.text import TextEncoder, encode_texts
 from lw_torchrl.modules import (
     DescriptorConditionedActor,
@@ -58,6 +69,7 @@ __all__ = [
     "QAFTransform",
     "Query",
     "QueryError",
+    "QueryMatch",
     "QueryProgram",
     "RerunLogger",
     "ScriptedSkill",
@@ -67,6 +79,7 @@ __all__ = [
     "StackedBehavioralCloning",
     "Task",
     "TaskBalancedSampler",
+    "TaskError",
     "TextEncoder",
     "collect_demonstrations",
     "encode_texts",
@@ -75,6 +88,8 @@ __all__ = [
     "load_actor",
     "load_plans",
     "load_skills",
+    "load_tasks",
+    "nearest_query",
     "nearest_skill",
     "parse_query",
     "plot_success",

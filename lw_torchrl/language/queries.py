@@ -76,17 +76,21 @@ def _supported(task: Task) -> tuple[str, ...]:
                 for negated in (False, True):
                     queries.append(Clause(first, relation, second, negated))
     for thing in task.objects:
-        if thing.position in ((4, 5, 6), (11, 12, 13)):
+        if not thing.ours and thing.position in ((4, 5, 6), (11, 12, 13)):
             queries += [Clause(thing.name, TOUCHING), Clause(thing.name, TOUCHING, negated=True)]
     queries += [Clause(GRIPPER, "open"), Clause(GRIPPER, "closed")]
     return tuple(map(str, queries))
 
 
-def supported_queries(task: str | Task) -> tuple[str, ...]:
-    """The published base queries of a task, in canonical spelling.
+def supported_queries(task: str | Task, published_only: bool = False) -> tuple[str, ...]:
+    """The base queries of a task, in canonical spelling.
 
     :func:`parse_query` answers more: any relation between two different objects, "touching the table" for any
     object, the negations of open and closed, and conjunctions of all these.
+
+    Args:
+        task: a task or its name.
+        published_only: leave out the points that we named; what remains is the published enumeration.
 
     Raises:
         ValueError: the task is unknown.
@@ -95,7 +99,8 @@ def supported_queries(task: str | Task) -> tuple[str, ...]:
         >>> len(supported_queries("reach")), supported_queries("reach")[0]
         (52, "the robot's gripper is near the reach target")
     """
-    return _supported(get_task(task))
+    found = get_task(task)
+    return _supported(found.published if published_only else found)
 
 
 class _ClauseParser:

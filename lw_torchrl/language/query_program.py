@@ -19,10 +19,12 @@ _OPENING = 3  # index of the gripper's opening in the observation
 _ORIGIN = (0.0, 0.0, 0.0)
 _ALWAYS = Comparison("xyz", "<", 1.0)  # of the origin and itself: the padding of the tables
 _NEVER = Comparison("xyz", "<", -1.0)
+_LEAST = 1e-6  # metres, and logits
 _KEPT_ROWS = 4096  # of the last batch, the most to keep the tables of
 
 _Position = tuple[Coordinate, Coordinate, Coordinate]
-_Atom = tuple[_Position, _Position, Comparison]
+_Atom = tuple[_Position, _Position, tuple[float, float, float], Comparison]
+_NO_SHIFT = (0.0, 0.0, 0.0)
 
 
 @dataclass
@@ -32,10 +34,11 @@ class _Tables:
 
     first: Tensor  # (T, 3*A) int64, index of each coordinate of the first position; of 0 for an axis left out
     second: Tensor  # (T, 3*A) int64
-    raised: Tensor  # (T, 3, A) float64, metres, added to the difference
+    shift: Tensor  # (T, 3, A) float64, metres, added to the difference
     length: Tensor  # (T, A) bool, the difference's length is compared, otherwise its one coordinate
     threshold: Tensor  # (T, A) float64, metres; the atom holds below it
     flipped: Tensor  # (T, A) bool, take the atom's complement
+    temperature: Tensor  # (T, A) float64, metres to one logit
     atoms: Tensor  # (T, 2*K*S) int64
     negated: Tensor  # (T, K, S) bool, take the clause's complement
 
@@ -44,20 +47,25 @@ class _Tables:
 
 
 def _clause_atoms(clause: Clause, task: Task) -> list[_Atom]:
-    first: _Position
-    if clause.predicate in ("open", "closed"):
-        first, second = (0.0, 0.0, _OPENING), _ORIGIN
-    else:
-        first = task.object(clause.subject).position
-        second = _ORIGIN if clause.object is None else task.object(clause.object).position
-    return [(first, second, part) for part in PREDICATES[clause.predicate]]
+    first: _Position = (0.0, 0.0, _OPENING)
+    second: _Position = _ORIGIN
+    shift = _NO_SHIFT
+    if clause.predicate not in ("open", "closed"):
+        subject = task.object(clause.subject)
+        first, shift = subject.position, subject.offset
+        if clause.object is not None:
+            other = task.object(clause.object)
+            second = other.position
+            x, y, z = (a - b for a, b in zip(shift, other.offset, strict=True))
+            shift = (x, y, z)
+    return [(first, second, shift, part) for part in PREDICATES[clause.predicate]]
 
 
 def _task_atoms(task: Task, queries: Sequence[Query], steps: int, width: int) -> tuple[list[_Atom], list, list]:
     """The atoms of one task, each once; the two of each clause (steps, width, 2); what is negated (steps, width)."""
     clauses = [[(_clause_atoms(clause, task), clause.negated) for clause in query.clauses] for query in queries]
-    clauses += [[([(_ORIGIN, _ORIGIN, _NEVER)], False)]] * (steps - len(queries))
-    always = (_ORIGIN, _ORIGIN, _ALWAYS)
+    clauses += [[([(_ORIGIN, _ORIGIN, _NO_SHIFT, _NEVER)], False)]] * (steps - len(queries))
+    always = (_ORIGIN, _ORIGIN, _NO_SHIFT, _ALWAYS)
     padded = [[*listed, *[([], False)] * (width - len(listed))] for listed in clauses]
     atoms = list(dict.fromkeys([always, *(atom for listed in padded for found, _ in listed for atom in found)]))
     places = [[[atoms.index(atom) for atom in (*found, always, always)[:2]] for found, _ in row] for row in padded]
@@ -70,18 +78,24 @@ def _compile(queries: Mapping[Task, Sequence[Query]]) -> tuple[_Tables, Tensor]:
     width = max(len(query.clauses) for listed in queries.values() for query in listed)
     found = [_task_atoms(task, listed, steps, width) for task, listed in queries.items()]
     most = max(len(atoms) for atoms, _, _ in found)
-    listed = [atoms + [(_ORIGIN, _ORIGIN, _ALWAYS)] * (most - len(atoms)) for atoms, _, _ in found]
+    listed = [atoms + [(_ORIGIN, _ORIGIN, _NO_SHIFT, _ALWAYS)] * (most - len(atoms)) for atoms, _, _ in found]
     constants = [0.0]
 
     def index(atom: _Atom, side: int) -> list[int]:
-        *positions, part = atom
+        first, second, _, part = atom
         places = []
-        for axis, coordinate in zip("xyz", positions[side if part.sense == "<" else 1 - side], strict=True):
+        for axis, coordinate in zip("xyz", (first, second)[side if part.sense == "<" else 1 - side], strict=True):
             coordinate = coordinate if axis in part.axes else 0.0
             if isinstance(coordinate, float) and coordinate not in constants:
                 constants.append(coordinate)
             places.append(coordinate if isinstance(coordinate, int) else _OBSERVATION + constants.index(coordinate))
         return places
+
+    def shift(atom: _Atom) -> list[float]:
+        *_, found, part = atom
+        sign = 1.0 if part.sense == "<" else -1.0
+        moved = (found[0], found[1], found[2] + part.raise_z)
+        return [sign * metres if axis in part.axes else 0.0 for axis, metres in zip("xyz", moved, strict=True)]
 
     def table(value: Callable[[_Atom], Any], dtype: torch.dtype = torch.int64) -> Tensor:
         values = torch.tensor([[value(atom) for atom in atoms] for atoms in listed], dtype=dtype)
@@ -90,10 +104,11 @@ def _compile(queries: Mapping[Task, Sequence[Query]]) -> tuple[_Tables, Tensor]:
     tables = _Tables(
         first=table(lambda atom: index(atom, 0)).flatten(1),
         second=table(lambda atom: index(atom, 1)).flatten(1),
-        raised=table(lambda atom: (0.0, 0.0, atom[2].raise_z), torch.float64),
-        length=table(lambda atom: atom[2].length, torch.bool),
-        threshold=table(lambda atom: atom[2].threshold * (1 if atom[2].sense == "<" else -1), torch.float64),
-        flipped=table(lambda atom: atom[2].sense == "<=", torch.bool),
+        shift=table(shift, torch.float64),
+        length=table(lambda atom: atom[3].length, torch.bool),
+        threshold=table(lambda atom: atom[3].threshold * (1 if atom[3].sense == "<" else -1), torch.float64),
+        flipped=table(lambda atom: atom[3].sense == "<=", torch.bool),
+        temperature=table(lambda atom: atom[3].temperature, torch.float64),
         atoms=torch.tensor([places for _, places, _ in found]).permute(0, 3, 2, 1).flatten(1),
         negated=torch.tensor([negated for _, _, negated in found]).transpose(1, 2).contiguous(),
     )
@@ -200,15 +215,67 @@ class QueryProgram:
             ValueError: wrong shape or dtype, NaN or infinity in the observation, or a task without queries.
         """
         _check_batch(observation, task_id)
-        batch = task_id.shape
         tables, constants = self._selected(observation, task_id.reshape(-1))
-        numbers = torch.cat((observation.reshape(-1, _OBSERVATION), constants), 1)
-        d = (numbers.gather(1, tables.first) - numbers.gather(1, tables.second)).unflatten(1, (3, -1))
-        length = (d + tables.raised).square_().sum(1).sqrt_()
-        value = torch.where(tables.length, length, d.sum(1))
-        holds = (value < tables.threshold) ^ tables.flipped
-        one, other = holds.gather(1, tables.atoms).unflatten(1, (2, *tables.negated.shape[1:])).unbind(1)
-        return ((one & other) ^ tables.negated).all(1).reshape(*batch, -1)
+        holds = (_values(observation, tables, constants) < tables.threshold) ^ tables.flipped
+        one, other = self._clauses(holds, tables)
+        return ((one & other) ^ tables.negated).all(1).reshape(*task_id.shape, self.num_queries)
+
+    def logits(self, observation: Tensor, task_id: Tensor, *, temperature: float = 1.0) -> Tensor:
+        """Soft truth: how far each query is from changing its truth, differentiable in the observation.
+
+        A comparison's margin is the distance to its threshold, divided by its temperature (see
+        :class:`~lw_torchrl.language.relations.Comparison`); a conjunction has the least margin of its parts, a
+        negation the opposite one. The sign is the hard truth: positive where the query holds, negative where it does
+        not, never zero.
+
+        Args:
+            observation: (..., 39) float, Meta-World's vector, metres.
+            task_id: (...) int64.
+            temperature: multiplies every comparison's own.
+
+        Returns:
+            (..., S) float32 logits on the observation's device; padding is -100 / temperature.
+
+        Raises:
+            ValueError: as for the hard truth; or the temperature is not above 0.
+
+        Example:
+            >>> import torch, lw_torchrl as lw
+            >>> program = QueryProgram({"reach": ["the gripper is near the reach target"]})
+            >>> state = torch.zeros(1, 39, requires_grad=True)
+            >>> logit = program.logits(state, torch.tensor([lw.task_id("reach")]))
+            >>> logit.item() > 0, torch.autograd.grad(logit.sum(), state)[0].isfinite().all().item()
+            (True, True)
+        """
+        if not isinstance(temperature, (int, float)) or not 0 < temperature < math.inf:
+            raise ValueError(f"temperature must be a number above 0, got {temperature!r}")
+        _check_batch(observation, task_id)
+        tables, constants = self._selected(observation, task_id.reshape(-1))
+        value = _values(observation, tables, constants, floor=_LEAST)
+        margin = (tables.threshold - value) / (temperature * tables.temperature)
+        one, other = self._clauses(torch.where(tables.flipped, -margin, margin), tables)
+        clause = torch.minimum(one, other)
+        soft = (
+            torch.where(tables.negated, -clause, clause)
+            .amin(1)
+            .to(torch.float32)
+            .reshape(*task_id.shape, self.num_queries)
+        )
+        holds = self(observation.detach(), task_id)
+        # On its threshold a query is what the hard truth says.
+        return torch.where(holds, soft.clamp(min=_LEAST), soft.clamp(max=-_LEAST))
+
+    def _clauses(self, atoms: Tensor, tables: _Tables) -> tuple[Tensor, ...]:
+        """(B, A) of the atoms to two of (B, K, S), the atoms of each clause."""
+        return atoms.gather(1, tables.atoms).unflatten(1, (2, *tables.negated.shape[1:])).unbind(1)
+
+
+def _values(observation: Tensor, tables: _Tables, constants: Tensor, floor: float = 0.0) -> Tensor:
+    """What each atom compares, (B, A) metres. The length of nothing has no gradient: ``floor`` keeps away from it."""
+    numbers = torch.cat((observation.reshape(-1, _OBSERVATION), constants), 1)
+    d = (numbers.gather(1, tables.first) - numbers.gather(1, tables.second)).unflatten(1, (3, -1)) + tables.shift
+    squared = d.square().sum(1)
+    return torch.where(tables.length, (squared.clamp(min=floor**2) if floor else squared).sqrt(), d.sum(1))
 
 
 def _check_batch(observation: Tensor, task_id: Tensor) -> None:

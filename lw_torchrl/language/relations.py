@@ -27,6 +27,7 @@ class Comparison:
         threshold: in metres.
         length: the Euclidean length over the axes; otherwise the signed coordinate of the one axis.
         raise_z: added to dz first, in metres.
+        temperature: of the soft truth, metres (or shares of the gripper's opening) to one logit.
     """
 
     axes: str
@@ -34,6 +35,7 @@ class Comparison:
     threshold: float
     length: bool = True
     raise_z: float = 0.0
+    temperature: float = 0.01
 
     def holds(self, d: Tensor) -> Tensor:
         """Whether the comparison holds of d: (..., 3) metres to (...) bool."""
@@ -79,8 +81,8 @@ TOUCHING = "touching the table"
 UNARY = MappingProxyType(
     {
         TOUCHING: (Comparison("z", "<=", 0.02, length=False),),
-        "open": (_more("z", 0.75),),
-        "closed": (Comparison("z", "<=", 0.75, length=False),),
+        "open": (Comparison("z", ">", 0.75, length=False, temperature=0.05),),
+        "closed": (Comparison("z", "<=", 0.75, length=False, temperature=0.05),),
     }
 )
 """The predicates of one object; "open" and "closed" are the gripper's."""

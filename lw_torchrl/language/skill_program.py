@@ -9,7 +9,7 @@ from torch import Tensor
 
 from lw_torchrl._checks import unknown_name
 from lw_torchrl.language.skills import ScriptedSkill, load_skills
-from lw_torchrl.language.tasks import TASKS, Task, get_task, task_id
+from lw_torchrl.language.tasks import TASKS, NamedObject, Task, get_task, task_id
 
 _OBSERVATION = 39
 
@@ -63,9 +63,11 @@ class SkillProgram:
         for t, (task, listed) in enumerate(found.items()):
             self._column[task_id(task.name)] = t
             for s, skill in enumerate(listed):
-                for side, name in enumerate((skill.target, skill.moved)):
-                    index[t, side, s] = torch.tensor(_places(task, name, constants))
-                numbers[t, 0, s] = torch.tensor(skill.offset, dtype=torch.float64)
+                target, moved = task.object(skill.target), task.object(skill.moved)
+                index[t, 0, s] = torch.tensor(_places(target, constants))
+                index[t, 1, s] = torch.tensor(_places(moved, constants))
+                offsets = torch.tensor([skill.offset, target.offset, moved.offset], dtype=torch.float64)
+                numbers[t, 0, s] = offsets[0] + offsets[1] - offsets[2]
                 numbers[t, 1, s] = torch.tensor(skill.gain, dtype=torch.float64)
                 numbers[t, 2, s] = skill.gripper
         self._index, self._numbers = index.flatten(1), numbers
@@ -111,10 +113,10 @@ def _look_up(skill: str | ScriptedSkill, table: Mapping[str, ScriptedSkill]) -> 
     return table[skill]
 
 
-def _places(task: Task, name: str, constants: list[float]) -> list[int]:
+def _places(named: NamedObject, constants: list[float]) -> list[int]:
     """The index of each coordinate in the observation followed by the constants."""
     places = []
-    for coordinate in task.object(name).position:
+    for coordinate in named.position:
         if isinstance(coordinate, float) and coordinate not in constants:
             constants.append(coordinate)
         places.append(coordinate if isinstance(coordinate, int) else _OBSERVATION + constants.index(coordinate))

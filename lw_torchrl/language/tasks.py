@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
+import os
 import re
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.resources import files
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -32,6 +35,8 @@ class NamedObject:
         name: "drawer handle", in lower case and without an article.
         position: where x, y and z are found: an int is an index into the 39 numbers of the observation,
             a float is a fixed place in metres.
+        offset: added to it, metres; a point beside an object has one.
+        ours: a point that we named, and the published object list has not.
 
     Raises:
         ValueError: the name is not plain lower-case words, or a coordinate lies outside the observation.
@@ -39,6 +44,8 @@ class NamedObject:
 
     name: str
     position: tuple[Coordinate, Coordinate, Coordinate]
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    ours: bool = False
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[a-z][a-z0-9'-]*( [a-z0-9][a-z0-9'-]*)*", self.name):
@@ -50,6 +57,8 @@ class NamedObject:
         for coordinate in self.position:
             if isinstance(coordinate, int) and not 0 <= coordinate < 39:
                 raise ValueError(f"position of {self.name!r}: obs[{coordinate}] is outside the 39 numbers")
+        if len(self.offset) != 3 or not all(isinstance(x, (int, float)) and math.isfinite(x) for x in self.offset):
+            raise ValueError(f"offset of {self.name!r} must be three numbers in metres, got {self.offset!r}")
 
 
 @dataclass(frozen=True)
@@ -59,7 +68,7 @@ class Task:
     Attributes:
         name: "drawer-open", Meta-World's name without its version.
         description: one sentence that says what is to be done.
-        objects: the named objects, the robot's gripper first.
+        objects: the named objects, the robot's gripper first; then the points that we named.
 
     Raises:
         ValueError: two objects have the same name, or the first is not the gripper.
@@ -81,6 +90,11 @@ class Task:
         """The names of the objects, in the table's order."""
         return tuple(named.name for named in self.objects)
 
+    @cached_property
+    def published(self) -> Task:
+        """The task without the points that we named."""
+        return Task(self.name, self.description, tuple(named for named in self.objects if not named.ours))
+
     def object(self, name: str) -> NamedObject:
         """The object called ``name``; :class:`ValueError` names the nearest if there is none."""
         for named in self.objects:
@@ -93,8 +107,8 @@ class Task:
         return {
             named.name: torch.stack(
                 [
-                    observation[..., c] if isinstance(c, int) else torch.full_like(observation[..., 0], c)
-                    for c in named.position
+                    (observation[..., c] if isinstance(c, int) else torch.full_like(observation[..., 0], c)) + shift
+                    for c, shift in zip(named.position, named.offset, strict=True)
                 ],
                 -1,
             )
@@ -115,17 +129,44 @@ def _position(at: Any) -> tuple[Coordinate, Coordinate, Coordinate]:
     raise ValueError(f"position must be like 'obs[4:7]' or [0.1, 'obs[37]', 0.0], got {at!r}")
 
 
+class TaskError(ValueError):
+    """A file of tasks that cannot be read."""
+
+
+_KEYS = ("description", "objects", "points", "mt10")
+
+
+def _point(name: str, at: Any, objects: Mapping[str, NamedObject]) -> NamedObject:
+    if not isinstance(at, Mapping):
+        return NamedObject(name, _position(at), ours=True)
+    if set(at) != {"object", "offset"}:
+        raise ValueError(f"point {name!r} must have object and offset, got {', '.join(map(str, at)) or 'neither'}")
+    if at["object"] not in objects:
+        raise unknown_name(f"object of point {name!r}", at["object"], objects)
+    if not isinstance(at["offset"], list) or len(at["offset"]) != 3:
+        raise ValueError(f"offset of {name!r} must be three numbers in metres, got {at['offset']!r}")
+    x, y, z = at["offset"]
+    return NamedObject(name, objects[at["object"]].position, (x, y, z), ours=True)
+
+
+def _task(name: str, row: Any) -> Task:
+    if not isinstance(row, Mapping):
+        raise ValueError(f"must be a table, got {row!r}")
+    for key in row:
+        if key not in _KEYS:
+            raise unknown_name("key", key, _KEYS)
+    if not isinstance(row.get("description"), str):
+        raise ValueError("description must be a sentence")
+    objects = {GRIPPER: NamedObject(GRIPPER, (0, 1, 2))}
+    for named, at in row.get("objects", {}).items():
+        objects[named] = NamedObject(named, _position(at))
+    points = [_point(named, at, objects) for named, at in row.get("points", {}).items()]
+    return Task(name, row["description"], (*objects.values(), *points))
+
+
 def _load() -> tuple[Mapping[str, Task], tuple[str, ...]]:
     table = tomllib.loads((files("lw_torchrl.language") / "data" / "tasks.toml").read_text("utf-8"))
-    gripper = NamedObject(GRIPPER, (0, 1, 2))
-    tasks = {
-        name: Task(
-            name,
-            row["description"],
-            (gripper, *(NamedObject(o, _position(at)) for o, at in row.get("objects", {}).items())),
-        )
-        for name, row in sorted(table.items())
-    }
+    tasks = {name: _task(name, row) for name, row in sorted(table.items())}
     return MappingProxyType(tasks), tuple(sorted(name for name, row in table.items() if row.get("mt10")))
 
 
@@ -191,3 +232,39 @@ def resolve_tasks(tasks: str | Iterable[str]) -> tuple[str, ...]:
 def get_task(task: str | Task) -> Task:
     """The :class:`Task` of a name; a Task is returned as it is."""
     return task if isinstance(task, Task) else TASKS[check_task(task)]
+
+
+def load_tasks(path: str | os.PathLike[str]) -> Mapping[str, Task]:
+    """All 50 tasks, some of them as a file of one's own has them: other objects, points or words.
+
+    Args:
+        path: a file in the format of data/tasks.toml. The simulator knows 50 tasks, so the names are theirs.
+
+    Returns:
+        Task name to :class:`Task`; pass one wherever a task is asked for, or all of them to
+        :func:`~lw_torchrl.load_plans`.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        TaskError: (a ValueError) it is no TOML, names an unknown task, or a task in it is malformed.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.NamedTemporaryFile("w", suffix=".toml") as file:
+        ...     _ = file.write('[push]\ndescription = "Push the disc."\nobjects.disc = "obs[4:7]"')
+        ...     file.flush()
+        ...     load_tasks(file.name)["push"].object_names
+        ("robot's gripper", 'disc')
+    """
+    file = Path(path)
+    try:
+        table = tomllib.loads(file.read_text("utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise TaskError(f"{file}: {error}") from error
+    found = dict(TASKS)
+    for name, row in table.items():
+        try:
+            found[check_task(name)] = _task(name, row)
+        except (ValueError, TypeError, AttributeError) as error:
+            raise TaskError(f"{file}, task {name!r}: {error}") from error
+    return MappingProxyType(found)
