@@ -17,9 +17,10 @@ from lw_torchrl.language.tasks import TASKS, Coordinate, Task, get_task, task_id
 _OBSERVATION = 39
 _OPENING = 3  # index of the gripper's opening in the observation
 _ORIGIN = (0.0, 0.0, 0.0)
-_ALWAYS = Comparison("xyz", "<", 1.0)  # of the origin and itself: the padding of the tables
-_NEVER = Comparison("xyz", "<", -1.0)
-_LEAST = 1e-6  # metres, and logits
+# Of the origin and itself, the padding of the tables: far from changing its truth at any temperature.
+_ALWAYS = Comparison("xyz", "<", 1e4, temperature=1e-6)
+_NEVER = Comparison("xyz", "<", -1e4, temperature=1e-6)
+_LEAST, _MOST = 1e-6, 1e4  # of the size of a logit, and of metres where a length has a gradient
 _KEPT_ROWS = 4096  # of the last batch, the most to keep the tables of
 
 _Position = tuple[Coordinate, Coordinate, Coordinate]
@@ -226,18 +227,18 @@ class QueryProgram:
         A comparison's margin is the distance to its threshold, divided by its temperature (see
         :class:`~lw_torchrl.language.relations.Comparison`); a conjunction has the least margin of its parts, a
         negation the opposite one. The sign is the hard truth: positive where the query holds, negative where it does
-        not, never zero.
+        not, never zero. The gradient is that of the comparison that decides; it is finite everywhere.
 
         Args:
             observation: (..., 39) float, Meta-World's vector, metres.
             task_id: (...) int64.
-            temperature: multiplies every comparison's own.
+            temperature: multiplies every comparison's own, between 1e-6 and 1e6.
 
         Returns:
-            (..., S) float32 logits on the observation's device; padding is -100 / temperature.
+            (..., S) float32 logits on the observation's device, of size 1e-6 to 1e4; padding is -1e4.
 
         Raises:
-            ValueError: as for the hard truth; or the temperature is not above 0.
+            ValueError: as for the hard truth; or the temperature is out of range.
 
         Example:
             >>> import torch, lw_torchrl as lw
@@ -247,23 +248,19 @@ class QueryProgram:
             >>> logit.item() > 0, torch.autograd.grad(logit.sum(), state)[0].isfinite().all().item()
             (True, True)
         """
-        if not isinstance(temperature, (int, float)) or not 0 < temperature < math.inf:
-            raise ValueError(f"temperature must be a number above 0, got {temperature!r}")
-        _check_batch(observation, task_id)
-        tables, constants = self._selected(observation, task_id.reshape(-1))
-        value = _values(observation, tables, constants, floor=_LEAST)
-        margin = (tables.threshold - value) / (temperature * tables.temperature)
+        if not isinstance(temperature, (int, float)) or not 1e-6 <= temperature <= 1e6:
+            raise ValueError(f"temperature must be a number between 1e-6 and 1e6, got {temperature!r}")
+        holds = self(observation.detach(), task_id)
+        near = observation if observation.dtype in (torch.float32, torch.float64) else observation.float()
+        near = near.clamp(-_MOST, _MOST)  # squares of larger numbers overflow
+        tables, constants = self._selected(near, task_id.reshape(-1))
+        margin = (tables.threshold - _values(near, tables, constants, floor=_LEAST)) / tables.temperature / temperature
         one, other = self._clauses(torch.where(tables.flipped, -margin, margin), tables)
         clause = torch.minimum(one, other)
-        soft = (
-            torch.where(tables.negated, -clause, clause)
-            .amin(1)
-            .to(torch.float32)
-            .reshape(*task_id.shape, self.num_queries)
-        )
-        holds = self(observation.detach(), task_id)
-        # On its threshold a query is what the hard truth says.
-        return torch.where(holds, soft.clamp(min=_LEAST), soft.clamp(max=-_LEAST))
+        soft = torch.where(tables.negated, -clause, clause).amin(1).float().reshape(holds.shape)
+        size = torch.where(holds, soft, -soft).detach().clamp(_LEAST, _MOST)
+        # On a threshold, the side that the hard truth takes; the gradient is that of soft everywhere.
+        return soft - soft.detach() + torch.where(holds, size, -size)
 
     def _clauses(self, atoms: Tensor, tables: _Tables) -> tuple[Tensor, ...]:
         """(B, A) of the atoms to two of (B, K, S), the atoms of each clause."""
@@ -289,7 +286,7 @@ def _check_batch(observation: Tensor, task_id: Tensor) -> None:
             f"task_id must be int64 of shape {tuple(observation.shape[:-1])}, one per observation, got "
             f"{task_id.dtype} of shape {tuple(task_id.shape)}"
         )
-    if torch.compiler.is_compiling() or math.isfinite(observation.sum()):  # the sum is fast; it may overflow
+    if torch.compiler.is_compiling() or math.isfinite(observation.sum().item()):  # the sum is fast; it may overflow
         return
     if not observation.isfinite().all():
         raise ValueError("observation must hold finite numbers, got NaN or infinity")
