@@ -103,21 +103,26 @@ def supported_queries(task: str | Task, published_only: bool = False) -> tuple[s
     return _supported(found.published if published_only else found)
 
 
+def _cut(text: str, most: int = 80) -> str:
+    return text if len(text) <= most else f"{text[: most - 25]} ... {text[-20:]}"
+
+
 class _ClauseParser:
     """Reads one clause from left to right; every failure says at which word."""
 
     def __init__(self, words: Sequence[str], task: Task, text: str) -> None:
         self.words, self.task, self.text, self.at = words, task, text, 0
+        self.inferred = ""  # of a clause that leaves its subject out, what it says by that
         self.names = {name: name for name in task.object_names}
         self.names.update({alias: name for alias, name in _ALIASES.items() if alias not in self.names})
 
     def error(self, expected: str) -> QueryError:
-        found = repr(self.words[self.at]) if self.at < len(self.words) else "its end"
-        said = " ".join(self.words)
-        close = process.extractOne(said, supported_queries(self.task), scorer=fuzz.ratio)
+        found = f"{_cut(self.words[self.at], 40)!r} (word {self.at + 1})" if self.at < len(self.words) else "its end"
+        said = " ".join(self.words[max(0, self.at - 8) : self.at + 8])
+        close = process.extractOne((self.inferred + said)[:300], supported_queries(self.task), scorer=fuzz.ratio)
         return QueryError(
-            f"query {self.text!r} of task {self.task.name!r}: at {found} in {said!r}, expected {expected}. "
-            f"The nearest query is {close[0]!r}; supported_queries({self.task.name!r}) lists all."
+            f"query {_cut(self.text)!r} of task {self.task.name!r}: at {found} in {_cut(said, 60)!r}, "
+            f"expected {expected}. The nearest query is {close[0]!r}; supported_queries({self.task.name!r}) lists all."
         )
 
     def take(self, phrase: str) -> bool:
@@ -156,6 +161,7 @@ class _ClauseParser:
             if previous is None or (self.words[self.at : self.at + 1] and self.words[self.at] in ARTICLES):
                 raise self.name_error(self.names_allowed())
             subject = previous
+            self.inferred = f"the {subject} is "
         if not negated:
             negated = self.take("isn't") or (self.take("is") and self.take("not")) or self.take("not")
         predicate = next((name for name in _LONGEST_FIRST if self.take(name)), None)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Literal, NamedTuple
 
@@ -10,26 +11,29 @@ from rapidfuzz import fuzz, process
 from torch import Tensor
 
 from lw_torchrl._checks import check_choice
-from lw_torchrl.language.queries import Query, QueryError, parse_query, supported_queries
+from lw_torchrl.language.queries import Clause, Query, QueryError, parse_query, supported_queries
 from lw_torchrl.language.tasks import Task, get_task
 
-_ALSO = tuple(f"the robot's gripper is not {state}" for state in ("open", "closed"))
+_NEGATIONS = frozenset(("not", "no", "never", "without", "cannot"))
+# What says nothing about which query is meant: articles, the gripper's owner, the verb of a question.
+_EMPTY = frozenset(("the", "a", "an", "is", "are", "be", "does", "do", "did", "has", "have", "robot's", "robot"))
 
 
 class QueryPart(NamedTuple):
-    """One clause of a text, the base query it was taken for, and how alike they are, in [0, 1]."""
+    """One clause of a text, the query it was taken for, and how alike they are, in [0, 1]."""
 
     text: str
     query: str
     score: float
 
 
-class QueryMatch(NamedTuple):
+@dataclass(frozen=True)
+class QueryMatch:
     """The nearest query to a text.
 
     Attributes:
         query: the query.
-        score: the mean of its parts' scores; 1 for a text that is a query itself.
+        score: the mean of its parts' scores, in [0, 1]; 1 for a text that is a query itself.
         parts: what each clause of the text was taken for.
     """
 
@@ -38,57 +42,67 @@ class QueryMatch(NamedTuple):
     parts: tuple[QueryPart, ...]
 
 
-def _plain(text: str) -> str:
-    """Without what the query language may leave out: articles, the gripper's owner, "is", the question mark."""
-    words = re.sub(r"isn't", "is not", re.sub(r"[?.!,]", " ", text.replace("’", "'").casefold())).split()
-    return " ".join(word for word in words if word not in ("the", "a", "an", "is", "are", "robot's", "robot"))
+def _affirmed(text: str) -> tuple[list[str], bool]:
+    """The words of a text but its negations, and whether it is a negation."""
+    plain = re.sub(r"(\w)n't\b", r"\1 not", text.replace("’", "'").casefold())
+    words = re.sub(r"[^\w\s'-]", " ", plain).split()
+    kept = [word for word in words if word not in _NEGATIONS]
+    return kept, (len(words) - len(kept)) % 2 == 1
+
+
+def _told(words: list[str]) -> str:
+    return " ".join(word for word in words if word not in _EMPTY)
 
 
 @lru_cache(maxsize=256)
-def _choices(task: Task, published_only: bool) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    listed = (*supported_queries(task, published_only), *_ALSO)
-    return listed, tuple(_plain(query) for query in listed)
+def _choices(task: Task) -> tuple[tuple[Clause, ...], tuple[str, ...]]:
+    """The clauses that base queries affirm, and what each says; a negation is compared without its "not"."""
+    clauses = [clause for text in supported_queries(task) for clause in parse_query(text, task).clauses]
+    affirmed = tuple(clause for clause in clauses if not clause.negated)
+    return affirmed, tuple(_told(str(clause).split()) for clause in affirmed)
 
 
-@lru_cache(maxsize=64)
-def _vectors(task: Task, published_only: bool) -> Tensor:
+@lru_cache(maxsize=256)
+def _vectors(task: Task) -> Tensor:
     from lw_torchrl.language.text import sentence_encoder
 
-    return sentence_encoder(_choices(task, published_only)[0])
+    return sentence_encoder(tuple(map(str, _choices(task)[0])))
 
 
-def _nearest(part: str, task: Task, by: str, published_only: bool) -> QueryPart:
-    listed, plain = _choices(task, published_only)
+def _nearest(part: str, task: Task, by: str) -> QueryPart:
     try:
-        own = str(parse_query(part, task))
-        if not published_only or parse_query(own, task.published):
-            return QueryPart(part, own, 1.0)
+        return QueryPart(part, str(parse_query(part, task)), 1.0)
     except QueryError:
         pass
+    words, negated = _affirmed(part)
+    clauses, told = _choices(task)
     if by == "edit":
-        _, score, at = process.extractOne(_plain(part), plain, scorer=fuzz.ratio)
-        return QueryPart(part, listed[at], score / 100)
-    from lw_torchrl.language.text import sentence_encoder
+        _, similarity, at = process.extractOne(_told(words), told, scorer=fuzz.ratio)
+        score = similarity / 100
+    else:
+        from lw_torchrl.language.text import sentence_encoder
 
-    alike = _vectors(task, published_only) @ sentence_encoder([part])[0]
-    return QueryPart(part, listed[int(alike.argmax())], float(alike.max().clamp(0.0, 1.0)))
+        # A surrogate alone is no text that an encoder could read.
+        alike = _vectors(task) @ sentence_encoder([" ".join(words).encode("utf-8", "replace").decode()])[0]
+        at, score = int(alike.argmax()), float(alike.max().clamp(0.0, 1.0))
+    return QueryPart(part, str(replace(clauses[at], negated=negated)), score)
 
 
 def nearest_query(
     text: str,
     task: str | Task,
     by: Literal["edit", "embedding"] = "edit",
-    *,
     published_only: bool = False,
 ) -> QueryMatch:
     """The query of a task that is nearest to a text.
 
-    A text that is a query is found as it is. Otherwise each of its parts between "and" is taken for the nearest
-    base query; one that leaves its subject out takes that of the part before.
+    A text that is a query is found as it is. Otherwise each of its parts between "and" or "but" is taken for the
+    nearest base query; one that leaves its subject out takes that of the part before. A part with "not", "doesn't" or
+    "never" is taken for the negation of the base query nearest to the rest of it, so truth is never turned round.
 
     Args:
         text: any words.
-        task: the task whose objects the query may name.
+        task: a task or its name, whose objects the query may name.
         by: "edit", closest in spelling; "embedding", closest in meaning, by the sentence encoder.
         published_only: leave out the points that we named.
 
@@ -98,29 +112,36 @@ def nearest_query(
         ImportError: by="embedding" without the extra ``[text]``.
 
     Example:
-        >>> match = nearest_query("the gripper touches the puck", "push")
+        >>> match = nearest_query("the gripper isn't touching the puck", "push")
         >>> str(match.query), match.score > 0.5
-        ("the robot's gripper is near the puck", True)
+        ("the robot's gripper is not around the puck", True)
+        >>> str(nearest_query("gripper open and over the target locaton", "push").query)
+        "the robot's gripper is open and the robot's gripper is above the target location"
 
-    Source: paper section 'Conditional Plan Generation', which maps conditions to the nearest query.
+    Source: paper section 'Query Answering Function', which maps other queries to the nearest supported one by a
+    sentence embedding or by string edit distance.
     """
     if not isinstance(text, str):
         raise TypeError(f"text must be a string, got {text!r} ({type(text).__name__})")
     check_choice("by", by, ("edit", "embedding"))
-    owner = get_task(task)
+    owner = get_task(task).published if published_only else get_task(task)
     try:
-        query = parse_query(text, owner.published if published_only else owner)
+        query = parse_query(text, owner)
         return QueryMatch(query, 1.0, tuple(QueryPart(str(clause), str(clause), 1.0) for clause in query.clauses))
     except QueryError:
         pass
+    said = [" ".join(part.split()) for part in re.split(r"\b(?:and|but)\b", text, flags=re.IGNORECASE)]
+    known: dict[tuple[str, str], QueryPart] = {}  # a text may say the same again and again
     parts: list[QueryPart] = []
-    for said in re.split(r"\band\b", text, flags=re.IGNORECASE):
-        part = " ".join(said.split())
-        alone = _nearest(part, owner, by, published_only)
-        if parts and alone.score < 1.0:
-            subject = parse_query(parts[-1].query, owner).clauses[0].subject
-            joined = _nearest(f"the {subject} {part}", owner, by, published_only)
-            alone = joined if joined.score > alone.score else alone
-        parts.append(alone)
-    query = parse_query(" and ".join(part.query for part in parts), owner)
+    subject = ""
+    for part in [part for part in said if _told(_affirmed(part)[0])] or [" ".join(text.split())]:
+        if (part, subject) not in known:
+            found = _nearest(part, owner, by)
+            if subject and found.score < 1.0:
+                joined = _nearest(f"the {subject} {part}", owner, by)
+                found = joined._replace(text=part) if joined.score > found.score else found
+            known[part, subject] = found
+        parts.append(known[part, subject])
+        subject = parse_query(parts[-1].query, owner).clauses[0].subject
+    query = Query(tuple(clause for part in parts for clause in parse_query(part.query, owner).clauses))
     return QueryMatch(query, sum(part.score for part in parts) / len(parts), tuple(parts))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import re
 import tomllib
@@ -25,6 +24,10 @@ Coordinate = int | float
 
 _SLICE = re.compile(r"obs\[(\d+):(\d+)\]")
 _INDEX = re.compile(r"obs\[(\d+)\]")
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e9
 
 
 @dataclass(frozen=True)
@@ -55,9 +58,11 @@ class NamedObject:
         if len(self.position) != 3:
             raise ValueError(f"position of {self.name!r} must have 3 coordinates, got {self.position!r}")
         for coordinate in self.position:
+            if not _is_number(coordinate):
+                raise ValueError(f"position of {self.name!r} must hold ints and finite floats, got {self.position!r}")
             if isinstance(coordinate, int) and not 0 <= coordinate < 39:
-                raise ValueError(f"position of {self.name!r}: obs[{coordinate}] is outside the 39 numbers")
-        if len(self.offset) != 3 or not all(isinstance(x, (int, float)) and math.isfinite(x) for x in self.offset):
+                raise ValueError(f"position of {self.name!r}: obs[{coordinate}] is outside the 39 numbers, 0 to 38")
+        if len(self.offset) != 3 or not all(map(_is_number, self.offset)):
             raise ValueError(f"offset of {self.name!r} must be three numbers in metres, got {self.offset!r}")
 
 
@@ -116,17 +121,17 @@ class Task:
         }
 
 
-def _position(at: Any) -> tuple[Coordinate, Coordinate, Coordinate]:
+def _position(name: str, at: Any) -> tuple[Coordinate, Coordinate, Coordinate]:
     if isinstance(at, str) and (match := _SLICE.fullmatch(at)):
         start, stop = map(int, match.groups())
         if stop - start == 3:
             return (start, start + 1, start + 2)
     if isinstance(at, list) and len(at) == 3:
         found = [int(match[1]) if isinstance(c, str) and (match := _INDEX.fullmatch(c)) else c for c in at]
-        if all(isinstance(c, (int, float)) for c in found):
+        if all(map(_is_number, found)):
             x, y, z = (c if isinstance(o, str) else float(c) for c, o in zip(found, at, strict=True))
             return (x, y, z)
-    raise ValueError(f"position must be like 'obs[4:7]' or [0.1, 'obs[37]', 0.0], got {at!r}")
+    raise ValueError(f"position of {name!r} must be like 'obs[4:7]' or [0.1, 'obs[37]', 0.0], got {at!r}")
 
 
 class TaskError(ValueError):
@@ -138,15 +143,25 @@ _KEYS = ("description", "objects", "points", "mt10")
 
 def _point(name: str, at: Any, objects: Mapping[str, NamedObject]) -> NamedObject:
     if not isinstance(at, Mapping):
-        return NamedObject(name, _position(at), ours=True)
+        return NamedObject(name, _position(name, at), ours=True)
+    for key in at:
+        if key not in ("object", "offset"):
+            raise unknown_name(f"key of point {name!r}", key, ("object", "offset"))
     if set(at) != {"object", "offset"}:
-        raise ValueError(f"point {name!r} must have object and offset, got {', '.join(map(str, at)) or 'neither'}")
+        raise ValueError(f"point {name!r} must have object and offset, got {', '.join(at) or 'neither'}")
     if at["object"] not in objects:
         raise unknown_name(f"object of point {name!r}", at["object"], objects)
-    if not isinstance(at["offset"], list) or len(at["offset"]) != 3:
-        raise ValueError(f"offset of {name!r} must be three numbers in metres, got {at['offset']!r}")
-    x, y, z = at["offset"]
-    return NamedObject(name, objects[at["object"]].position, (x, y, z), ours=True)
+    offset = at["offset"]
+    if not isinstance(offset, list) or len(offset) != 3 or not all(map(_is_number, offset)):
+        raise ValueError(f"offset of {name!r} must be three numbers in metres, got {offset!r}")
+    return NamedObject(name, objects[at["object"]].position, (offset[0], offset[1], offset[2]), ours=True)
+
+
+def _table(key: str, row: Mapping[str, Any]) -> Mapping[str, Any]:
+    found = row.get(key, {})
+    if not isinstance(found, Mapping):
+        raise ValueError(f"{key} must be a table of names and positions, got {found!r}")
+    return found
 
 
 def _task(name: str, row: Any) -> Task:
@@ -155,13 +170,16 @@ def _task(name: str, row: Any) -> Task:
     for key in row:
         if key not in _KEYS:
             raise unknown_name("key", key, _KEYS)
-    if not isinstance(row.get("description"), str):
-        raise ValueError("description must be a sentence")
+    description = row.get("description")
+    if not isinstance(description, str) or not description.strip():
+        raise ValueError(f"description must be a sentence, got {description!r}")
     objects = {GRIPPER: NamedObject(GRIPPER, (0, 1, 2))}
-    for named, at in row.get("objects", {}).items():
-        objects[named] = NamedObject(named, _position(at))
-    points = [_point(named, at, objects) for named, at in row.get("points", {}).items()]
-    return Task(name, row["description"], (*objects.values(), *points))
+    for named, at in _table("objects", row).items():
+        if named in objects:
+            raise ValueError(f"objects may not name {named!r}, which every task has")
+        objects[named] = NamedObject(named, _position(named, at))
+    points = [_point(named, at, objects) for named, at in _table("points", row).items()]
+    return Task(name, description, (*objects.values(), *points))
 
 
 def _load() -> tuple[Mapping[str, Task], tuple[str, ...]]:
@@ -249,22 +267,25 @@ def load_tasks(path: str | os.PathLike[str]) -> Mapping[str, Task]:
         TaskError: (a ValueError) it is no TOML, names an unknown task, or a task in it is malformed.
 
     Example:
-        >>> import tempfile
-        >>> with tempfile.NamedTemporaryFile("w", suffix=".toml") as file:
-        ...     _ = file.write('[push]\ndescription = "Push the disc."\nobjects.disc = "obs[4:7]"')
-        ...     file.flush()
-        ...     load_tasks(file.name)["push"].object_names
+        >>> import os, tempfile
+        >>> folder = tempfile.TemporaryDirectory()
+        >>> path = os.path.join(folder.name, "mine.toml")
+        >>> lines = ["[push]", "description = 'Push the disc.'", "objects.disc = 'obs[4:7]'"]
+        >>> with open(path, "w") as file:
+        ...     print(*lines, sep=os.linesep, file=file)
+        >>> load_tasks(path)["push"].object_names
         ("robot's gripper", 'disc')
+        >>> folder.cleanup()
     """
     file = Path(path)
     try:
-        table = tomllib.loads(file.read_text("utf-8"))
+        table = tomllib.loads(file.read_text("utf-8-sig"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise TaskError(f"{file}: {error}") from error
     found = dict(TASKS)
     for name, row in table.items():
         try:
             found[check_task(name)] = _task(name, row)
-        except (ValueError, TypeError, AttributeError) as error:
+        except ValueError as error:
             raise TaskError(f"{file}, task {name!r}: {error}") from error
     return MappingProxyType(found)

@@ -59,16 +59,19 @@ def test_descriptions_are_distinct_sentences_of_our_own():
 def test_objects_are_the_published_ones(name):
     relations = [query.split(" is near ") for query in oracle.enumerate_base_queries(name) if " is near " in query]
     named = {side.removeprefix("the ") for sides in relations for side in sides}
-    assert set(TASKS[name].object_names) == named
-    assert TASKS[name].object_names[0] == GRIPPER
-    assert len(TASKS[name].objects) == len(named)
+    published = TASKS[name].published
+    assert set(published.object_names) == named
+    assert published.object_names[0] == GRIPPER
+    assert len(published.objects) == len(named)
+    assert all(thing.offset == (0.0, 0.0, 0.0) for thing in published.objects)
+    assert TASKS[name].objects[: len(named)] == published.objects, "points of ours come after"
 
 
 @pytest.mark.parametrize("name", MT50)
 def test_positions_are_read_where_the_published_package_reads_them(name):
     observation = np.random.default_rng(0).uniform(-1, 1, 39)
     parsed = oracle.ParsedObs.from_obs(observation)
-    for named in TASKS[name].objects:
+    for named in TASKS[name].published.objects:
         expected = oracle._get_object_location(name, f"the {named.name}", parsed)
         np.testing.assert_array_equal(read(named.position, observation), expected, err_msg=named.name)
 
@@ -84,7 +87,7 @@ def test_positions_of_a_whole_batch(name, dtype):
         assert at.shape == (2, 3, 3)
         assert at.dtype == dtype
         expected = torch.stack([torch.from_numpy(read(named.position, o)) for o in observation.reshape(6, 39)])
-        assert torch.equal(at.reshape(6, 3), expected.to(dtype))
+        assert torch.equal(at.reshape(6, 3), expected.to(dtype) + torch.tensor(named.offset, dtype=dtype))
     assert TASKS[name].positions(observation[0, 0])[GRIPPER].tolist() == observation[0, 0, :3].tolist()
 
 
