@@ -1,9 +1,12 @@
 """Language-World and Plan Conditioned Behavioral Cloning as TorchRL components."""
 
 from lw_torchrl.data import (
+    CoLearningSampler,
     CollectConfig,
     DatasetError,
     Demonstrations,
+    JoinedDemonstrations,
+    JoinedStorage,
     LanguageWorldExperienceReplay,
     TaskBalancedSampler,
     collect_demonstrations,
@@ -47,6 +50,7 @@ __all__ = [
     "BehavioralCloningConfig",
     "BehavioralCloningTrainer",
     "Clause",
+    "CoLearningSampler",
     "CollectConfig",
     "ConditionalPlan",
     "DatasetError",
@@ -57,6 +61,8 @@ __all__ = [
     "EpisodeResult",
     "EvaluationResult",
     "ExpertActor",
+    "JoinedDemonstrations",
+    "JoinedStorage",
     "LanguageWorldEnv",
     "LanguageWorldExperienceReplay",
     "NamedObject",

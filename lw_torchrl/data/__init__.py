@@ -1,14 +1,20 @@
 """Demonstrations: collecting them, reading them as a replay buffer, sampling them in exact proportions."""
 
+from lw_torchrl.data.co_learning import CoLearningSampler
 from lw_torchrl.data.collect import collect_demonstrations
 from lw_torchrl.data.dataset import CollectConfig, DatasetError, Demonstrations
 from lw_torchrl.data.replay import LanguageWorldExperienceReplay
 from lw_torchrl.data.samplers import TaskBalancedSampler
+from lw_torchrl.data.selection import JoinedDemonstrations
+from lw_torchrl.data.storage import JoinedStorage
 
 __all__ = [
+    "CoLearningSampler",
     "CollectConfig",
     "DatasetError",
     "Demonstrations",
+    "JoinedDemonstrations",
+    "JoinedStorage",
     "LanguageWorldExperienceReplay",
     "TaskBalancedSampler",
     "collect_demonstrations",

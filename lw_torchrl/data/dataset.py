@@ -118,11 +118,10 @@ class Demonstrations:
     @property
     def success_rate(self) -> dict[str, float]:
         """Task name to the fraction of its kept episodes that succeeded."""
-        rates = {}
-        for task in self.config.tasks:
-            found = [episode.success for episode in self.episodes if episode.task == task]
-            rates[task] = sum(found) / len(found)
-        return rates
+        found: dict[str, list[bool]] = {}
+        for episode in self.episodes:
+            found.setdefault(episode.task, []).append(episode.success)
+        return {task: sum(found[task]) / len(found[task]) for task in self.config.tasks if task in found}
 
 
 def package_versions() -> dict[str, str]:

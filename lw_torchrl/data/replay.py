@@ -3,45 +3,52 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-import torch
 from tensordict import TensorDictBase
+from torch import Tensor
 from torchrl.data import ImmutableDatasetWriter, TensorStorage
 from torchrl.data.datasets.common import BaseDatasetExperienceReplay
 from torchrl.data.replay_buffers.samplers import Sampler
+from torchrl.data.replay_buffers.storages import Storage
 from torchrl.envs import Transform
 
 from lw_torchrl._checks import check_choice, check_int
-from lw_torchrl.data.dataset import DATA, Demonstrations, load_rows, read_metadata
+from lw_torchrl.data.dataset import DATA, Demonstrations, read_metadata
+from lw_torchrl.data.selection import EpisodeChoice, JoinedDemonstrations, choose_episodes, read_part
+from lw_torchrl.data.storage import JoinedStorage
 
 
-def _until_success(rows: TensorDictBase, demonstrations: Demonstrations, after: int) -> TensorDictBase:
-    """The rows up to ``after`` steps past each episode's first success; the last one kept is truncated."""
-    keep = torch.ones(rows.batch_size[0], dtype=torch.bool)
-    last = torch.zeros_like(keep)
-    for episode in demonstrations.episodes:
-        length = episode.length
-        if episode.first_success is not None:
-            length = min(length, episode.first_success + after)
-        keep[episode.start + length : episode.start + episode.length] = False
-        last[episode.start + length - 1] = True
-    kept = rows[keep].clone()  # in memory: indexing a memory map reads it
-    for key in ("done", "truncated"):
-        flag = kept.get(("next", key))
-        kept.set(("next", key), flag | last[keep].reshape(flag.shape))
-    return kept
+def _as_it_is(batch: TensorDictBase) -> TensorDictBase:
+    return batch
+
+
+def _choices(episodes: Any, roots: int, joined: bool) -> list[EpisodeChoice]:
+    """The choice of episodes for each folder."""
+    if not roots:
+        raise ValueError("root must hold at least one folder, got an empty list")
+    if not joined or episodes is None:
+        return [episodes] * roots
+    if isinstance(episodes, (str, Mapping)) or not isinstance(episodes, Sequence):
+        raise TypeError(f"episodes must be a list of choices, one for each of the {roots} folders, got {episodes!r}")
+    if len(episodes) != roots:
+        raise ValueError(f"episodes must be as many as the folders in root, {roots}, got {len(episodes)}")
+    return list(episodes)
 
 
 class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
-    """The rows of a dataset that :func:`collect_demonstrations` made.
+    """The rows of datasets that :func:`collect_demonstrations` made; several are joined, and none is copied.
 
     Samples hold observation (B, 39) float32, action (B, 4) float32, task_id and episode (B,) int64, and what
-    ``label`` leaves; a :class:`QAFTransform` adds ``qaf``.
+    ``label`` leaves; a :class:`QAFTransform` adds ``qaf``. collector/traj_ids (B,) int64 tells episodes apart, those
+    of different datasets too.
 
     Args:
-        root: the dataset's folder.
+        root: the dataset's folder, or a list of folders: the rows of the first come first.
+        episodes: which episodes to show. None: all; a number: the first so many of each task; a mapping: for each task
+            to show, the first so many, or a list of indices of episodes. Of a list of folders, a list of such choices.
         batch_size: rows of a sample.
         sampler: a TorchRL sampler, :class:`TaskBalancedSampler` say; None for uniform.
         transform: applied to each sample.
@@ -51,9 +58,12 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         **kwargs: for :class:`torchrl.data.TensorDictReplayBuffer`: generator, prefetch, pin_memory, ...
 
     Attributes:
-        demonstrations: the dataset's description.
+        demonstrations: the dataset's description; a :class:`JoinedDemonstrations` where folders are joined or
+            episodes chosen.
+        roots: the folders.
 
     Raises:
+        ValueError: a wrong argument; a task or an episode that the dataset does not hold.
         FileNotFoundError: there is no such folder.
         DatasetError: (a ValueError) the dataset is half-written, damaged, or of another format or version.
 
@@ -70,8 +80,9 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
 
     def __init__(
         self,
-        root: str | os.PathLike[str],
+        root: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
         *,
+        episodes: EpisodeChoice | Sequence[EpisodeChoice] = None,
         batch_size: int | None = None,
         sampler: Sampler | None = None,
         transform: Transform | None = None,
@@ -82,16 +93,36 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         check_choice("label", label, ("expert", "executed"))
         if batch_size is not None:
             check_int("batch_size", batch_size, minimum=1)
-        self.demonstrations = read_metadata(root)
-        self.root = root
-        rows = load_rows(self.demonstrations)
         if after_success is not None:
-            rows = _until_success(rows, self.demonstrations, check_int("after_success", after_success, minimum=0))
-        if label == "expert":
-            rows = rows.exclude("next", "action").rename_key_("expert_action", "action")
+            check_int("after_success", after_success, minimum=0)
+        joined = not isinstance(root, (str, os.PathLike))
+        self.roots = tuple(map(Path, root)) if joined else (Path(root),)  # type: ignore[arg-type]
+        choices = _choices(episodes, len(self.roots), joined)
+        shown: list[Demonstrations] = []
+        parts: list[TensorDictBase] = []
+        kept: list[Tensor | None] = []
+        trajectories = 0
+        for number, (folder, choice) in enumerate(zip(self.roots, choices, strict=True)):
+            whole = read_metadata(folder)
+            shown.append(choose_episodes(whole, choice, f"episodes[{number}]" if joined else "episodes"))
+            rows, keep = read_part(
+                whole, shown[-1], label=label, after_success=after_success, first_trajectory=trajectories
+            )
+            parts.append(rows)
+            kept.append(keep)
+            trajectories += len(whole.episodes)
+        storage: Storage
+        if joined or episodes is not None:
+            self.demonstrations: Demonstrations | JoinedDemonstrations = JoinedDemonstrations(tuple(shown))
+            storage = JoinedStorage(parts, kept)
+            kwargs.setdefault("collate_fn", _as_it_is)
+        else:
+            self.demonstrations = shown[0]
+            storage = TensorStorage(parts[0] if kept[0] is None else parts[0][kept[0]])  # the second is in memory
+        self.root = self.roots[0]
         self.label = label
         super().__init__(
-            storage=TensorStorage(rows),
+            storage=storage,
             sampler=sampler,
             writer=ImmutableDatasetWriter(),
             batch_size=batch_size,
@@ -101,17 +132,23 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
 
     @property
     def tasks(self) -> tuple[str, ...]:
-        """The names of the dataset's tasks, sorted."""
-        return self.demonstrations.config.tasks
+        """The names of the tasks that are shown, sorted."""
+        return tuple(sorted({episode.task for episode in self.demonstrations.episodes}))
 
     @property
     def data_path_root(self) -> Path:
-        """The dataset's folder."""
-        return Path(self.root)
+        """The dataset's folder.
+
+        Raises:
+            ValueError: there are several; see ``roots``.
+        """
+        if len(self.roots) > 1:
+            raise ValueError(f"this buffer joins {len(self.roots)} datasets, so it has no one folder; see its roots")
+        return self.roots[0]
 
     @property
     def data_path(self) -> Path:
-        """The folder of the rows."""
+        """The folder of the rows; as for ``data_path_root``."""
         return self.data_path_root / DATA
 
     def _is_downloaded(self) -> bool:

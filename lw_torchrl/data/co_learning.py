@@ -1,0 +1,169 @@
+"""CoLearningSampler: one target task's demonstration beside the base tasks, in an exact ratio."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from fractions import Fraction
+from math import gcd, isclose
+from typing import Any
+
+import torch
+from tensordict import NestedKey
+from torch import Tensor
+from torchrl.data.replay_buffers.storages import Storage
+
+from lw_torchrl._checks import unknown_name
+from lw_torchrl.data.samplers import GroupSampler, column, nearest_sizes
+from lw_torchrl.data.storage import JoinedStorage
+from lw_torchrl.language.tasks import MT50, TASKS, task_id
+
+
+def _check_target(target: Any) -> str | Tensor:
+    if isinstance(target, str):
+        if target not in TASKS:
+            raise unknown_name("target", target, TASKS)
+        return target
+    wanted = "target must be a task's name or one bool for each episode"
+    try:
+        mask = torch.as_tensor(target)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise TypeError(f"{wanted}, got {target!r}") from error
+    if mask.dtype != torch.bool or mask.dim() != 1:
+        raise TypeError(f"{wanted}, got {mask.dtype} of shape {tuple(mask.shape)}")
+    if mask.all() or not mask.any():
+        raise ValueError(f"target must have true and false episodes, all {len(mask)} are {bool(mask.any())}")
+    return mask.clone()
+
+
+def _check_fraction(fraction: Any) -> Fraction:
+    if isinstance(fraction, bool) or not isinstance(fraction, (float, Fraction)):
+        raise TypeError(f"target_fraction must be a float or a Fraction, got {fraction!r} ({type(fraction).__name__})")
+    if not 0 < fraction < 1:
+        raise ValueError(f"target_fraction must lie between 0 and 1, both excluded, got {fraction}")
+    exact = Fraction(fraction).limit_denominator(10_000)
+    if not isclose(exact, fraction, rel_tol=1e-9):
+        raise ValueError(
+            f"target_fraction must be a ratio of whole numbers up to 10000, got {fraction}; the nearest is {exact}"
+        )
+    return exact
+
+
+class CoLearningSampler(GroupSampler):
+    """Half of every minibatch from the target's demonstration, half in equal numbers from the base tasks; exactly.
+
+    Target and base tasks are gone through without replacement, each in passes of its own: every row of the target
+    comes once before any comes again, and so does every row of each base task. An epoch, at whose end ``ran_out`` is
+    true, is the pass that takes the most batches: of the largest base task, as a rule. It draws from the replay
+    buffer's generator; its state, restored in the middle of an epoch, goes on with the same batches.
+
+    Where the target is itself a base task, its base demonstrations are left out. A batch holds the target's rows, then
+    those of the base tasks in the order of their ids; each row has, beside the storage's own columns:
+        is_target: (B,) bool.
+
+    Args:
+        target: a task's name, or the episodes that are the target's demonstrations: one bool for each episode, in the
+            order of ``replay.demonstrations.episodes``. A name stands for all demonstrations of the task; in a storage
+            that joins datasets, for those of the last dataset that has any.
+        target_fraction: the target's share of a minibatch, between 0 and 1, such as 0.5, 1/3 or Fraction(2, 7).
+        task_key: the entry of the storage that tells the task.
+        episode_key: the entry of the storage that tells the episode, for a mask; episodes are numbered in its order.
+
+    Raises:
+        ValueError: an unknown task, with the nearest; a fraction that is none; a mask without an episode, or without
+            any other. At sampling: a batch size that cannot be exact, with the nearest that can; no row of the target
+            or of a base task; a mask of another number of episodes.
+        TypeError: a target that is neither name nor mask.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+        >>> sampler = CoLearningSampler("coffee-push")
+        >>> replay = TensorDictReplayBuffer(storage=LazyTensorStorage(12), sampler=sampler, batch_size=8)
+        >>> task = torch.tensor([3] * 5 + [7] * 5 + [task_id("coffee-push")] * 2)
+        >>> _ = replay.extend(TensorDict({"task_id": task}, [12]))
+        >>> batch = replay.sample()
+        >>> batch["is_target"].sum().item(), batch["task_id"].unique(return_counts=True)[1].tolist()
+        (4, [2, 2, 4])
+
+    Source: paper section 'Cross-Task Co-Learning via 1:1 Data Mixing'.
+    """
+
+    def __init__(
+        self,
+        target: str | Sequence[bool] | Tensor,
+        *,
+        target_fraction: float | Fraction = 0.5,
+        task_key: NestedKey = "task_id",
+        episode_key: NestedKey = ("collector", "traj_ids"),
+    ) -> None:
+        self.target = _check_target(target)
+        self.target_fraction = _check_fraction(target_fraction)
+        self.task_key = task_key
+        self.episode_key = episode_key
+        super().__init__()
+
+    def _targets(self, storage: Storage, task: Tensor) -> Tensor:
+        """Whether each row is the target's: (R,) bool."""
+        if isinstance(self.target, str):
+            mine = task == task_id(self.target)
+            if not mine.any():
+                there = ", ".join(MT50[i] if 0 <= i < len(MT50) else str(i) for i in task.unique().tolist())
+                raise ValueError(f"target: the storage has no row of {self.target!r}; its tasks are {there}")
+            if isinstance(storage, JoinedStorage):
+                part = storage.part()
+                mine &= part == part[mine].max()
+            return mine
+        episode = torch.unique(column(storage, self.episode_key).reshape(-1), return_inverse=True)[1]
+        if (episodes := int(episode.max()) + 1) != len(self.target):
+            raise ValueError(f"target must have one bool for each of the {episodes} episodes, got {len(self.target)}")
+        return self.target.to(episode.device)[episode]
+
+    def _label(self, storage: Storage) -> Tensor:
+        task = column(storage, self.task_key).reshape(-1)
+        mine = self._targets(storage, task)
+        base = ~torch.isin(task, task[mine].unique())
+        if not base.any():
+            raise ValueError("target: the storage has no row of any other task, so there are no base tasks")
+        label = torch.where(mine, 0, -1)
+        label[base] = 1 + torch.unique(task[base], return_inverse=True)[1]
+        return label
+
+    def _shares(self, batch_size: int) -> Tensor:
+        base = len(self._size) - 1
+        part, whole = self.target_fraction.numerator, self.target_fraction.denominator
+        unit = whole * base // gcd(base, whole - part)
+        if batch_size < 1 or batch_size % unit:
+            raise ValueError(
+                f"batch_size must be a multiple of {unit}, so that {self.target_fraction} of it is the target's and "
+                f"{base} base tasks share the rest equally, got {batch_size}; the nearest are "
+                + nearest_sizes(batch_size, unit)
+            )
+        mine = batch_size // whole * part
+        return torch.tensor([mine] + [(batch_size - mine) // base] * base)
+
+    def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[str, Any]]:
+        """Draw ``batch_size`` indices, the target's first, and tell which are the target's."""
+        index, info = super().sample(storage, batch_size)
+        info["is_target"] = self._layout(batch_size)[1] == 0
+        return index, info
+
+    def _identity(self) -> dict[str, Tensor]:
+        target = torch.tensor(task_id(self.target)) if isinstance(self.target, str) else self.target.clone()
+        fraction = torch.tensor([self.target_fraction.numerator, self.target_fraction.denominator])
+        return {"target": target, "target_fraction": fraction}
+
+    def state_dict(self) -> dict[str, Any]:
+        """The shuffled order, how far each pass has come, and of which target and ratio that is."""
+        return super().state_dict() | self._identity()
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore what :meth:`state_dict` gave.
+
+        Raises:
+            ValueError: it is the state of another target or ratio.
+        """
+        for name, ours in self._identity().items():
+            if (given := state_dict.get(name)) is None or not torch.equal(given.cpu(), ours.cpu()):
+                raise ValueError(f"state_dict must be of the same {name}, {getattr(self, name)}, got one of another")
+        super().load_state_dict(state_dict)

@@ -1,0 +1,160 @@
+"""Which episodes of which datasets a replay buffer shows, and which of their rows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from lw_torchrl._checks import check_int, unknown_name
+from lw_torchrl.data.dataset import CollectConfig, Demonstrations, EpisodeInfo, load_rows
+
+TRAJECTORY = ("collector", "traj_ids")
+EpisodeChoice = int | Mapping[str, int | Sequence[int]] | None
+"""All episodes; the first so many of each task; or, for each task to take, the first so many or these."""
+
+
+def _first(argument: str, task: str, there: list[int], number: int) -> list[int]:
+    if check_int(argument, number, minimum=1) > len(there):
+        raise ValueError(f"{argument}: the dataset has {len(there)} episodes of {task!r}, got {number}")
+    return there[:number]
+
+
+def choose_episodes(found: Demonstrations, chosen: EpisodeChoice, argument: str = "episodes") -> Demonstrations:
+    """A dataset's description with the chosen episodes alone, in the dataset's order.
+
+    Raises:
+        ValueError: a task or an episode that the dataset does not hold, an episode twice, none at all.
+        TypeError: something that chooses no episodes.
+    """
+    if chosen is None:
+        return found
+    there: dict[str, list[int]] = {}
+    for episode in found.episodes:
+        there.setdefault(episode.task, []).append(episode.episode)
+    wanted: dict[str, int | Sequence[int]]
+    if isinstance(chosen, Mapping):
+        wanted = dict(chosen)
+    elif hasattr(chosen, "__index__"):
+        wanted = dict.fromkeys(there, chosen)
+    else:
+        raise TypeError(f"{argument} must be None, a number, or a mapping of task names, got {chosen!r}")
+    if not wanted:
+        raise ValueError(f"{argument} must name at least one task, got an empty mapping")
+    keep: set[tuple[str, int]] = set()
+    for task, some in wanted.items():
+        if task not in there:
+            raise unknown_name(f"{argument}: task", task, there)
+        place = f"{argument}[{task!r}]"
+        if hasattr(some, "__index__"):
+            numbers = _first(place, task, there[task], some)  # type: ignore[arg-type]
+        elif isinstance(some, Sequence) and not isinstance(some, str):
+            numbers = [check_int(place, number) for number in some]
+        else:
+            raise TypeError(f"{place} must be a number or a list of episodes, got {some!r}")
+        if odd := sorted(set(numbers) - set(there[task])):
+            raise ValueError(f"{place}: the dataset holds the episodes {_listed(there[task])}, got {_listed(odd)}")
+        if not numbers or len(set(numbers)) != len(numbers):
+            raise ValueError(f"{place} must name at least one episode, each once, got {list(numbers)}")
+        keep |= {(task, number) for number in numbers}
+    return replace(found, episodes=tuple(e for e in found.episodes if (e.task, e.episode) in keep))
+
+
+def _listed(numbers: list[int]) -> str:
+    return ", ".join(map(str, numbers[:20])) + (", ..." if len(numbers) > 20 else "")
+
+
+def _kept(episodes: Sequence[EpisodeInfo], after: int | None) -> tuple[Tensor, Tensor]:
+    """The rows up to ``after`` steps past each episode's first success, and the last of them of each episode."""
+    starts = torch.tensor([episode.start for episode in episodes])
+    lengths = torch.tensor(
+        [
+            e.length if after is None or e.first_success is None else min(e.length, e.first_success + after)
+            for e in episodes
+        ]
+    )
+    before = lengths.cumsum(0) - lengths
+    rows = torch.repeat_interleave(starts - before, lengths) + torch.arange(int(lengths.sum()))
+    return rows, starts + lengths - 1
+
+
+def read_part(
+    whole: Demonstrations,
+    chosen: Demonstrations,
+    *,
+    label: Literal["expert", "executed"],
+    after_success: int | None,
+    first_trajectory: int = 0,
+) -> tuple[TensorDictBase, Tensor | None]:
+    """All rows of a dataset, memory-mapped, and which of them to show: (n,) int64, None for all.
+
+    What differs from the files is held in memory, one number a row: the ends of episodes that are cut short, and
+    ``first_trajectory`` added to the trajectories' ids.
+    """
+    rows = load_rows(whole)
+    if label == "expert":
+        rows = rows.exclude("next", "action").rename_key_("expert_action", "action")
+    else:
+        rows = rows.clone(recurse=False)
+    if first_trajectory:
+        rows.set(TRAJECTORY, rows.get(TRAJECTORY) + first_trajectory)
+    if chosen.episodes == whole.episodes and after_success is None:
+        return rows, None
+    kept, last = _kept(chosen.episodes, after_success)
+    if label == "executed" and after_success is not None:
+        for key in ("done", "truncated"):
+            flag = rows.get(("next", key)).clone()
+            flag[last] = True
+            rows.set(("next", key), flag)
+    return rows, kept
+
+
+@dataclass(frozen=True)
+class JoinedConfig:
+    """How the parts of joined demonstrations were collected, and which episodes were chosen.
+
+    Attributes:
+        parts: the configuration of each dataset.
+        episodes: for each dataset, task name to the indices of the chosen episodes.
+    """
+
+    parts: tuple[CollectConfig, ...]
+    episodes: tuple[dict[str, list[int]], ...]
+
+    def to_json(self) -> dict[str, Any]:
+        return {"parts": [part.to_json() for part in self.parts], "episodes": list(self.episodes)}
+
+
+@dataclass(frozen=True)
+class JoinedDemonstrations:
+    """Chosen episodes of one or more datasets, as :class:`LanguageWorldExperienceReplay` joins them.
+
+    Attributes:
+        parts: each dataset's description, of the chosen episodes alone.
+    """
+
+    parts: tuple[Demonstrations, ...]
+
+    @property
+    def episodes(self) -> tuple[EpisodeInfo, ...]:
+        """The episodes in the order of the rows; ``start`` and ``length`` are those in their own dataset."""
+        return tuple(episode for part in self.parts for episode in part.episodes)
+
+    @property
+    def num_steps(self) -> int:
+        """The number of rows of these episodes, before any are dropped."""
+        return sum(part.num_steps for part in self.parts)
+
+    @property
+    def config(self) -> JoinedConfig:
+        """How the parts were collected, and which episodes were chosen."""
+        chosen: list[dict[str, list[int]]] = []
+        for part in self.parts:
+            chosen.append({})
+            for episode in part.episodes:
+                chosen[-1].setdefault(episode.task, []).append(episode.episode)
+        return JoinedConfig(tuple(part.config for part in self.parts), tuple(chosen))

@@ -1,0 +1,194 @@
+"""JoinedStorage: chosen rows of one or more datasets as one read-only storage; no column is copied."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NoReturn
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data.replay_buffers.storages import Storage
+
+from lw_torchrl._files import write_json
+
+_MAX_RUNS = 4  # runs of one part in a batch, for each part, up to which they are read one after another
+
+
+def _name(key: NestedKey) -> str:
+    return key if isinstance(key, str) else "/".join(key)
+
+
+def _columns(parts: Sequence[TensorDictBase]) -> dict[NestedKey, list[Tensor]]:
+    """The leaves of each column; all parts must have the same ones."""
+    columns: dict[NestedKey, list[Tensor]] = {}
+    for number, part in enumerate(parts):
+        if part.batch_dims != 1:
+            raise ValueError(f"parts[{number}] must have one batch dimension, got {tuple(part.batch_size)}")
+        found = {key: part.get(key) for key in part.keys(True, True)}
+        if number and (odd := sorted(map(_name, found.keys() ^ columns.keys()))):
+            raise ValueError(f"parts[{number}] must have the columns of parts[0], they differ in {', '.join(odd)}")
+        for key, leaf in found.items():
+            if not isinstance(leaf, Tensor):
+                raise TypeError(f"parts[{number}]: column {_name(key)} must be a tensor, got {type(leaf).__name__}")
+            leaf = leaf.as_subclass(Tensor)  # the same memory; indexing a memory map's own class is slow
+            before = columns.setdefault(key, [leaf])[0]
+            if (leaf.shape[1:], leaf.dtype) != (before.shape[1:], before.dtype):
+                raise ValueError(
+                    f"parts[{number}]: column {_name(key)} must be {before.dtype} of shape {tuple(before.shape[1:])} "
+                    f"a row as in parts[0], got {leaf.dtype} of shape {tuple(leaf.shape[1:])}"
+                )
+            if number:
+                columns[key].append(leaf)
+    return columns
+
+
+class JoinedStorage(Storage):
+    """Rows of several tensordicts, memory-mapped ones say, behind one index; reading a batch copies that batch alone.
+
+    The rows come in the order of the parts, and within a part in the order of ``rows``. Nothing can be written, and
+    its state is its length: whoever restores a buffer opens the same data again. A replay buffer over it wants
+    ``collate_fn=lambda batch: batch``; :class:`LanguageWorldExperienceReplay` sees to that.
+
+    Args:
+        parts: P tensordicts of one batch dimension and the same columns (names, dtypes, shapes of a row).
+        rows: for each part the rows to take, (n,) int64, or None for all; None for all of all.
+
+    Raises:
+        ValueError: no parts, columns that differ, not as many ``rows`` as parts.
+        IndexError: a row outside its part.
+        TypeError: a column is no tensor.
+        RuntimeError: at an attempt to write.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> base, target = (TensorDict({"x": torch.arange(n)}, [n]) for n in (4, 100))
+        >>> storage = JoinedStorage([base, target], rows=[None, torch.tensor([70, 71])])
+        >>> storage[:]["x"].tolist(), storage[[5, 0]]["x"].tolist()
+        ([0, 1, 2, 3, 70, 71], [71, 0])
+
+    Source: ``torchrl.data.StorageEnsemble``, which joins storages for samplers that name the storage with each index.
+    """
+
+    def __init__(self, parts: Sequence[TensorDictBase], rows: Sequence[Tensor | None] | None = None) -> None:
+        if not parts:
+            raise ValueError("parts must hold at least one tensordict, got none")
+        chosen = [None] * len(parts) if rows is None else list(rows)
+        if len(chosen) != len(parts):
+            raise ValueError(f"rows must be one for each of the {len(parts)} parts, got {len(chosen)}")
+        self._columns = _columns(parts)
+        self._ends = torch.tensor([len(part) for part in parts]).cumsum(0)  # of the parts, all rows counted
+        starts = [0, *self._ends.tolist()]
+        taken = []
+        for number, (start, end) in enumerate(pairwise(starts)):
+            one = chosen[number]
+            if one is None:
+                taken.append(torch.arange(start, end))
+                continue
+            if len(one) and not 0 <= int(one.min()) <= int(one.max()) < end - start:
+                raise IndexError(
+                    f"rows[{number}] must be in [0, {end - start}), got {int(one.min())}..{int(one.max())}"
+                )
+            taken.append(one.to(torch.int64) + start)
+        self._rows = torch.cat(taken)
+        self.num_parts = len(parts)
+        self._batch_device = parts[0].device
+        super().__init__(max_size=len(self._rows))
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def part(self) -> Tensor:
+        """The number of the part that each row is from: (R,) int64, from 0."""
+        return torch.bucketize(self._rows, self._ends, right=True)
+
+    def column(self, key: NestedKey) -> Tensor:
+        """One column of all rows: (R, ...).
+
+        Raises:
+            KeyError: there is no such column.
+        """
+        if key not in self._columns:
+            raise KeyError(f"no column {_name(key)}; there are {', '.join(map(_name, self._columns))}")
+        return self._gather(self._rows, [key])[key]
+
+    def _gather(self, rows: Tensor, keys: Sequence[NestedKey]) -> dict[NestedKey, Tensor]:
+        """The columns of rows counted over all parts, a fresh tensor each."""
+        if self.num_parts == 1:
+            return {key: self._columns[key][0].index_select(0, rows) for key in keys}
+        part = torch.bucketize(rows, self._ends, right=True)
+        back = None
+        cuts = (part[1:] != part[:-1]).nonzero().flatten().tolist()
+        if len(cuts) >= _MAX_RUNS * self.num_parts:  # too scattered to read run by run: part by part, then back
+            part, order = part.sort(stable=True)
+            back = torch.empty_like(order)
+            back[order] = torch.arange(len(order))
+            rows = rows[order]
+            cuts = (part[1:] != part[:-1]).nonzero().flatten().tolist()
+        bounds = [0, *(cut + 1 for cut in cuts), len(rows)]
+        firsts = [0, *self._ends.tolist()]
+        runs = []
+        for start, stop in pairwise(bounds):
+            number = int(part[start]) if stop > start else 0
+            runs.append((number, rows[start:stop] - firsts[number]))
+        found = {}
+        for key in keys:
+            leaves = self._columns[key]
+            read = [leaves[number].index_select(0, local) for number, local in runs]
+            joined = read[0] if len(read) == 1 else torch.cat(read)
+            found[key] = joined if back is None else joined.index_select(0, back)
+        return found
+
+    def get(self, index: Any) -> TensorDict:
+        """The rows at an int, a slice, a list, a mask or a tensor of indices of any shape, as fresh tensors."""
+        rows = self._rows[index]
+        found = self._gather(rows.reshape(-1), list(self._columns))
+        nested: dict[str, Any] = {}
+        for key, leaf in found.items():
+            *path, last = (key,) if isinstance(key, str) else key
+            node = nested
+            for name in path:
+                node = node.setdefault(name, {})
+            node[last] = leaf if rows.dim() == 1 else leaf.reshape(rows.shape + leaf.shape[1:])
+        return TensorDict(nested, rows.shape, device=self._batch_device)
+
+    def contains(self, item: Any) -> Any:
+        """Whether an index, or each of a tensor of indices, names a row."""
+        if isinstance(item, Tensor):
+            return (item >= -len(self)) & (item < len(self))
+        return -len(self) <= item < len(self)
+
+    def _read_only(self) -> NoReturn:
+        raise RuntimeError("this storage is read-only: it shows datasets as they are on disk")
+
+    def set(self, cursor: Any, data: Any, *, set_cursor: bool = True) -> NoReturn:
+        """Raise: nothing can be written."""
+        self._read_only()
+
+    def _empty(self) -> NoReturn:
+        self._read_only()
+
+    def state_dict(self) -> dict[str, Any]:
+        """The number of rows; the rows themselves stay in their datasets."""
+        return {"length": len(self)}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Check that a state is of as many rows."""
+        if state_dict.get("length") != len(self):
+            raise ValueError(f"state_dict must be of {len(self)} rows, got one of {state_dict.get('length')}")
+
+    def dumps(self, path: Any) -> None:
+        """Write the number of rows."""
+        write_json(Path(path) / "joined.json", self.state_dict())
+
+    def loads(self, path: Any) -> None:
+        """Check that what :meth:`dumps` wrote is of as many rows."""
+        self.load_state_dict(json.loads((Path(path) / "joined.json").read_text("utf-8")))
+
+    def __repr__(self) -> str:
+        columns = ", ".join(map(_name, self._columns))
+        return f"{type(self).__name__}({len(self)} rows of {self.num_parts} parts, columns {columns})"
