@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase, is_leaf_nontensor
 from torch import Tensor
 from torchrl.data.replay_buffers.storages import Storage
 
@@ -28,7 +28,7 @@ def _columns(parts: Sequence[TensorDictBase]) -> dict[NestedKey, list[Tensor]]:
     for number, part in enumerate(parts):
         if part.batch_dims != 1:
             raise ValueError(f"parts[{number}] must have one batch dimension, got {tuple(part.batch_size)}")
-        found = {key: part.get(key) for key in part.keys(True, True)}
+        found = {key: part.get(key) for key in part.keys(True, True, is_leaf=is_leaf_nontensor)}
         if number and (odd := sorted(map(_name, found.keys() ^ columns.keys()))):
             raise ValueError(f"parts[{number}] must have the columns of parts[0], they differ in {', '.join(odd)}")
         for key, leaf in found.items():
@@ -145,7 +145,7 @@ class JoinedStorage(Storage):
 
     def get(self, index: Any) -> TensorDict:
         """The rows at an int, a slice, a list, a mask or a tensor of indices of any shape, as fresh tensors."""
-        rows = self._rows[index]
+        rows = self._rows[index].contiguous()  # a slice with a step is not
         found = self._gather(rows.reshape(-1), list(self._columns))
         nested: dict[str, Any] = {}
         for key, leaf in found.items():

@@ -1,0 +1,307 @@
+"""CoLearningSampler: exact counts in any ratio, passes without repetition, states that go on as they were."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from math import lcm
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, ReplayBufferEnsemble, TensorDictReplayBuffer, TensorStorage
+
+from lw_torchrl.data import CoLearningSampler, JoinedStorage
+from lw_torchrl.language.tasks import MT50, task_id
+
+TARGET = "coffee-push"
+OTHERS = [i for i in range(50) if i != task_id(TARGET)]
+base_sizes = st.lists(st.integers(1, 9), min_size=1, max_size=6)  # rows of each base task
+target_size = st.integers(1, 9)
+fractions = st.integers(2, 9).flatmap(lambda q: st.integers(1, q - 1).map(lambda p: Fraction(p, q)))
+multiples = st.integers(1, 3)  # of the smallest batch that is exact
+seeds = st.integers(0, 2**31)
+
+
+def smallest(base, fraction):
+    """The least batch size whose shares are whole numbers, counted up."""
+    size = 1
+    while (size * fraction).denominator > 1 or (size * (1 - fraction) / base).denominator > 1:
+        size += 1
+    return size
+
+
+def make_rows(base, target, shuffled=0):
+    tasks = torch.cat([torch.full((n,), OTHERS[4 * i]) for i, n in enumerate(base)])
+    tasks = torch.cat([tasks, torch.full((target,), task_id(TARGET))])
+    order = torch.randperm(len(tasks), generator=torch.Generator().manual_seed(shuffled))
+    return TensorDict({"task_id": tasks[order], "row": torch.arange(len(tasks))}, [len(tasks)])
+
+
+def with_episodes(*episodes):
+    """Rows of (task_id, length) episodes."""
+    task = torch.cat([torch.full((length,), task) for task, length in episodes])
+    ids = torch.cat([torch.full((length,), 10 + 3 * number) for number, (_, length) in enumerate(episodes)])
+    rows = TensorDict({"task_id": task, "row": torch.arange(len(task))}, [len(task)])
+    return rows.set(("collector", "traj_ids"), ids)
+
+
+def make_replay(rows, batch_size, sampler=None, seed=0):
+    return TensorDictReplayBuffer(
+        storage=rows if isinstance(rows, JoinedStorage) else TensorStorage(rows),
+        sampler=sampler or CoLearningSampler(TARGET),
+        batch_size=batch_size,
+        generator=torch.Generator().manual_seed(seed),
+        collate_fn=lambda batch: batch,
+    )
+
+
+def drawn(replay, number):
+    return [replay.sample()["row"].tolist() for _ in range(number)]
+
+
+@settings(max_examples=100, deadline=None)
+@given(base_sizes, target_size, fractions, multiples, seeds)
+def test_every_batch_has_exactly_the_fraction_of_the_target_and_equal_numbers_of_the_rest(
+    base, target, fraction, multiple, seed
+):
+    size = multiple * smallest(len(base), fraction)
+    sampler = CoLearningSampler(TARGET, target_fraction=float(fraction) if seed % 2 else fraction)
+    replay = make_replay(make_rows(base, target), size, sampler, seed)
+    for _ in range(4):
+        batch = replay.sample()
+        assert batch["is_target"].dtype == torch.bool
+        assert batch["is_target"].shape == batch["task_id"].shape == (size,)
+        assert int(batch["is_target"].sum()) == size * fraction
+        assert torch.equal(batch["is_target"], batch["task_id"] == task_id(TARGET))
+        tasks, found = batch["task_id"][~batch["is_target"]].unique(return_counts=True)
+        assert tasks.tolist() == [OTHERS[4 * i] for i in range(len(base))]
+        assert found.tolist() == [size * (1 - fraction) / len(base)] * len(base)
+
+
+@settings(max_examples=60, deadline=None)
+@given(base_sizes, target_size, fractions, seeds)
+def test_target_and_each_base_task_come_once_before_any_row_comes_again(base, target, fraction, seed):
+    rows = make_rows(base, target)
+    sampler = CoLearningSampler(TARGET, target_fraction=fraction)
+    replay = make_replay(rows, smallest(len(base), fraction), sampler, seed)
+    batches = [replay.sample() for _ in range(10)]
+    for task in rows["task_id"].unique():
+        everything = sorted(rows["row"][rows["task_id"] == task].tolist())
+        mine = torch.cat([batch["row"][batch["task_id"] == task] for batch in batches]).tolist()
+        for start in range(0, len(mine), len(everything)):
+            piece = mine[start : start + len(everything)]
+            assert len(set(piece)) == len(piece)
+            assert sorted(piece) == everything or start + len(everything) > len(mine)
+
+
+@settings(max_examples=60, deadline=None)
+@given(base_sizes, target_size, fractions, st.integers(1, 300))
+def test_a_batch_that_cannot_be_exact_is_refused_with_the_nearest_that_can(base, target, fraction, size):
+    unit = smallest(len(base), fraction)
+    sampler = CoLearningSampler(TARGET, target_fraction=fraction)
+    replay = make_replay(make_rows(base, target), None, sampler)
+    if size % unit == 0:
+        assert len(replay.sample(size)) == size
+        return
+    near = [n for n in (size // unit * unit, size // unit * unit + unit) if n]
+    with pytest.raises(ValueError, match=f"batch_size must be a multiple of {unit}, .* got {size};") as caught:
+        replay.sample(size)
+    assert str(caught.value).endswith("the nearest are " + " and ".join(map(str, near)))
+    assert len(replay.sample(near[-1])) == near[-1]
+
+
+def test_the_papers_batch_with_ten_base_tasks_and_with_nine():
+    assert len(make_replay(make_rows([5] * 10, 5), 200).sample()) == 200
+    replay = make_replay(make_rows([5] * 9, 5), 200)
+    with pytest.raises(ValueError, match=r"so that 1/2 of it is the target's and 9 base tasks share .* 198 and 216"):
+        replay.sample()
+
+
+@settings(max_examples=50, deadline=None)
+@given(base_sizes, target_size, seeds, st.integers(0, 6))
+def test_a_state_saved_anywhere_in_an_epoch_gives_the_same_batches_again(base, target, seed, before):
+    rows, size = make_rows(base, target), lcm(2, 2 * len(base))
+    replay = make_replay(rows, size, seed=seed)
+    drawn(replay, before)
+    state = replay.state_dict()
+    expected = [(batch["row"].tolist(), replay.sampler.ran_out) for batch in (replay.sample() for _ in range(6))]
+    other = make_replay(rows, size, seed=seed + 1)
+    drawn(other, 3)
+    other.load_state_dict(state)
+    assert [(batch["row"].tolist(), other.sampler.ran_out) for batch in (other.sample() for _ in range(6))] == expected
+
+
+@pytest.mark.parametrize("target", [TARGET, [False, True, False]])
+def test_the_state_goes_through_a_folder(tmp_path, target):
+    rows = with_episodes((1, 5), (task_id(TARGET), 4), (2, 6))
+    replay = make_replay(rows, 8, CoLearningSampler(target))
+    drawn(replay, 2)
+    replay.sampler.dumps(tmp_path / "sampler")
+    assert not list(tmp_path.rglob("*.pickle"))
+    rng = replay._rng.get_state()
+    expected = drawn(replay, 5)
+    other = make_replay(rows, 8, CoLearningSampler(target), seed=9)
+    other.sampler.loads(tmp_path / "sampler")
+    other._rng.set_state(rng)
+    assert drawn(other, 5) == expected
+
+
+@pytest.mark.parametrize(
+    ("other", "name"),
+    [
+        (CoLearningSampler("reach"), "target, reach"),
+        (CoLearningSampler([True, False]), "target, tensor"),
+        (CoLearningSampler(TARGET, target_fraction=0.25), "target_fraction, 1/4"),
+    ],
+)
+def test_the_state_of_another_target_or_ratio_is_refused(other, name):
+    replay = make_replay(make_rows([3, 3], 3), 4)
+    drawn(replay, 1)
+    with pytest.raises(ValueError, match=f"state_dict must be of the same {name}"):
+        other.load_state_dict(replay.sampler.state_dict())
+
+
+def test_the_buffers_generator_alone_fixes_the_batches():
+    rows = make_rows([40, 40], 40)
+    one, two = make_replay(rows, 20, seed=5), make_replay(rows, 20, seed=5)
+    first = drawn(one, 5)
+    torch.rand(3)
+    assert drawn(two, 5) == first
+    assert drawn(make_replay(rows, 20, seed=6), 5) != first
+
+
+@settings(max_examples=40, deadline=None)
+@given(base_sizes, target_size, fractions, seeds)
+def test_it_ran_out_whenever_the_pass_that_takes_most_batches_ends(base, target, fraction, seed):
+    size = smallest(len(base), fraction)
+    replay = make_replay(make_rows(base, target), size, CoLearningSampler(TARGET, target_fraction=fraction), seed)
+    shares = [int(size * fraction)] + [int(size * (1 - fraction)) // len(base)] * len(base)
+    passes = [Fraction(rows, share) for rows, share in zip([target, *base], shares, strict=True)]
+    longest = max(passes)
+    for batch in range(1, 12):
+        replay.sample()
+        assert replay.sampler.ran_out == (batch // longest > (batch - 1) // longest)
+
+
+def test_a_masked_target_leaves_out_its_tasks_other_demonstrations():
+    """Rows 0..4 are a base task, 5..8 and 9..11 demonstrations of the target, 12..17 another base task."""
+    rows = with_episodes((1, 5), (task_id(TARGET), 4), (task_id(TARGET), 3), (2, 6))
+    masks = [False, False, True, False], torch.tensor([False, False, True, False]), np.array([0, 0, 1, 0], dtype=bool)
+    for mask in masks:
+        replay = make_replay(rows, 12, CoLearningSampler(mask))
+        batches = [replay.sample() for _ in range(9)]
+        mine = torch.cat([batch["row"][batch["is_target"]] for batch in batches])
+        rest = torch.cat([batch["row"][~batch["is_target"]] for batch in batches])
+        assert mine.unique().tolist() == [9, 10, 11]
+        assert rest.unique().tolist() == [*range(5), *range(12, 18)]
+    replay = make_replay(rows, 12, CoLearningSampler(TARGET))
+    mine = torch.cat([batch["row"][batch["is_target"]] for batch in (replay.sample() for _ in range(9))])
+    assert mine.unique().tolist() == [*range(5, 12)], "a name stands for all its demonstrations"
+
+
+def test_a_mask_may_take_several_tasks():
+    rows = with_episodes((1, 4), (2, 4), (3, 4), (1, 4))
+    replay = make_replay(rows, 8, CoLearningSampler([True, True, False, False]))
+    batches = [replay.sample() for _ in range(6)]
+    assert torch.cat([b["row"][b["is_target"]] for b in batches]).unique().tolist() == [*range(8)]
+    assert torch.cat([b["row"][~b["is_target"]] for b in batches]).unique().tolist() == [*range(8, 12)]
+
+
+def test_of_joined_datasets_a_named_target_is_the_last_ones():
+    base = with_episodes((1, 4), (task_id(TARGET), 4), (2, 4))
+    target = with_episodes((task_id(TARGET), 3)).apply(lambda column: column + 0)
+    target["row"] += 100
+    replay = make_replay(JoinedStorage([base, target]), 8)
+    batches = [replay.sample() for _ in range(8)]
+    assert torch.cat([b["row"][b["is_target"]] for b in batches]).unique().tolist() == [100, 101, 102]
+    assert torch.cat([b["row"][~b["is_target"]] for b in batches]).unique().tolist() == [0, 1, 2, 3, 8, 9, 10, 11]
+    only_base = JoinedStorage([target, with_episodes((1, 4))])
+    assert int(make_replay(only_base, 8).sample()["is_target"].sum()) == 4
+
+
+def test_what_comes_back_is_the_callers():
+    replay = make_replay(make_rows([4, 4], 4), 8)
+    replay.sample()["is_target"].fill_(True)
+    assert int(replay.sample()["is_target"].sum()) == 4
+
+
+def test_a_refused_batch_changes_nothing():
+    one, two = make_replay(make_rows([4, 4], 4), 8), make_replay(make_rows([4, 4], 4), 8)
+    drawn(one, 1), drawn(two, 1)
+    with pytest.raises(ValueError, match="batch_size"):
+        one.sampler.sample(one.storage, 6)
+    assert drawn(one, 5) == drawn(two, 5)
+
+
+def test_a_buffer_that_grows_is_grouped_again():
+    replay = TensorDictReplayBuffer(storage=LazyTensorStorage(50), sampler=CoLearningSampler(TARGET), batch_size=12)
+    replay.extend(make_rows([4, 4], 4))
+    assert replay.sample()["task_id"].unique(return_counts=True)[1].tolist() == [3, 3, 6]
+    replay.extend(make_rows([4, 4, 4], 4))
+    assert sorted(replay.sample()["task_id"].unique(return_counts=True)[1].tolist()) == [2, 2, 2, 6]
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        (dict(target="coffee-pusj"), ValueError, "target must be one of .* got 'coffee-pusj'; did you mean 'coffee-pu"),
+        (dict(target=7), TypeError, "target must be a task's name or one bool for each episode, got torch.int64"),
+        (dict(target=[0, 1]), TypeError, "one bool for each episode, got torch.int64"),
+        (dict(target=[[True, False]]), TypeError, r"got torch.bool of shape \(1, 2\)"),
+        (dict(target=[(TARGET, 0)]), TypeError, "target must be a task's name or one bool"),
+        (dict(target=None), TypeError, "target must be a task's name or one bool"),
+        (dict(target=[False, False]), ValueError, "true and false episodes, all 2 are False"),
+        (dict(target=[True]), ValueError, "true and false episodes, all 1 are True"),
+        (dict(target=TARGET, target_fraction=1.0), ValueError, "between 0 and 1, both excluded, got 1.0"),
+        (dict(target=TARGET, target_fraction=0.0), ValueError, "between 0 and 1"),
+        (dict(target=TARGET, target_fraction=float("nan")), ValueError, "between 0 and 1"),
+        (
+            dict(target=TARGET, target_fraction=0.123456789),
+            ValueError,
+            "whole numbers up to 10000, .* nearest is 10/81",
+        ),
+        (dict(target=TARGET, target_fraction="half"), TypeError, "target_fraction must be a float or a Fraction"),
+        (dict(target=TARGET, target_fraction=1), TypeError, "target_fraction must be a float or a Fraction, got 1"),
+    ],
+)
+def test_wrong_options_are_named(options, error, message):
+    with pytest.raises(error, match=message):
+        CoLearningSampler(**options)
+
+
+@pytest.mark.parametrize(
+    ("rows", "target", "message"),
+    [
+        (with_episodes((1, 3), (2, 3)), TARGET, f"no row of '{TARGET}'; its tasks are {MT50[1]}, {MT50[2]}"),
+        (with_episodes((task_id(TARGET), 3)), TARGET, "no row of any other task, so there are no base tasks"),
+        (with_episodes((1, 3), (1, 3)), [True, False], "no row of any other task, so there are no base tasks"),
+        (with_episodes((1, 3), (2, 3)), [True, False, False], "one bool for each of the 2 episodes, got 3"),
+    ],
+)
+def test_a_storage_that_does_not_fit_is_refused(rows, target, message):
+    with pytest.raises(ValueError, match=message):
+        make_replay(rows, 8, CoLearningSampler(target)).sample()
+
+
+def test_an_empty_storage_and_a_missing_column_are_refused():
+    with pytest.raises(ValueError, match="storage must hold at least one row"):
+        CoLearningSampler(TARGET).sample(LazyTensorStorage(10), 4)
+    with pytest.raises(KeyError, match="no column 'kind'"):
+        make_replay(make_rows([4], 4), 8, CoLearningSampler(TARGET, task_key="kind")).sample()
+    with pytest.raises(KeyError, match="no column"):
+        make_replay(make_rows([4], 4), 8, CoLearningSampler([True, False])).sample()
+
+
+def test_torchrls_ensemble_cannot_keep_the_ratio():
+    """Why there is a sampler of our own."""
+    rows = make_rows([50] * 4, 50)
+    members = [
+        TensorDictReplayBuffer(storage=TensorStorage(rows[rows["task_id"] == t])) for t in rows["task_id"].unique()
+    ]
+    p = torch.tensor([0.5 if t == task_id(TARGET) else 0.125 for t in rows["task_id"].unique()])
+    ensemble = ReplayBufferEnsemble(*members, p=p, batch_size=40, num_buffer_sampled=8)
+    found = {int((ensemble.sample()["task_id"] == task_id(TARGET)).sum()) for _ in range(20)}
+    assert found != {20}

@@ -1,0 +1,281 @@
+"""The replay buffer over several datasets and chosen episodes: which rows, which label, and nothing copied."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+from torchrl.data import SliceSampler
+
+from lw_torchrl.data import (
+    CoLearningSampler,
+    JoinedDemonstrations,
+    JoinedStorage,
+    LanguageWorldExperienceReplay,
+    collect_demonstrations,
+    selection,
+)
+from lw_torchrl.data.dataset import load_rows
+from lw_torchrl.envs import QAFTransform
+from lw_torchrl.language.plans import load_plans
+from lw_torchrl.language.tasks import task_id
+from lw_torchrl.modules import PlanConditionedActor
+from lw_torchrl.trainers import BehavioralCloningConfig, BehavioralCloningTrainer
+
+STEPS = 50
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory):
+    """Two demonstrations each of button-press-topdown, push and reach."""
+    return collect_demonstrations(
+        ["reach", "push", "button-press-topdown"],
+        episodes_per_task=2,
+        root=tmp_path_factory.mktemp("made") / "base",
+        max_steps=STEPS,
+        noise_scale=(0, 0.3),
+        progress=False,
+    )
+
+
+@pytest.fixture(scope="module")
+def target(tmp_path_factory):
+    """Four of reach, on another seed."""
+    root = tmp_path_factory.mktemp("made") / "target"
+    made = collect_demonstrations(
+        "reach", episodes_per_task=4, root=root, max_steps=STEPS, seed=1, noise_scale=(0, 0.2), progress=False
+    )
+    assert {e.success for e in made.episodes} == {True, False}, "the tests want successes and failures"
+    return made
+
+
+def expected_rows(part, episodes, after=None):
+    """The rows of a dataset's episodes, by a loop over steps."""
+    rows, kept, ends = load_rows(part), [], []
+    for number, episode in enumerate(part.episodes):
+        if (episode.task, episode.episode) not in episodes:
+            continue
+        success = rows["next", "success"][episode.start : episode.start + episode.length].flatten().tolist()
+        for t in range(episode.length):
+            if after is None or not any(success) or t <= success.index(True) + after:
+                kept.append(episode.start + t)
+                ends.append(False)
+        ends[-1] = True
+        assert (rows["collector", "traj_ids"][kept[-1]]) == number
+    return rows[torch.tensor(kept)], torch.tensor(ends)[:, None]
+
+
+def everything(part):
+    return [(e.task, e.episode) for e in part.episodes]
+
+
+@pytest.mark.parametrize("label", ["expert", "executed"])
+@pytest.mark.parametrize("after", [None, 0, 5, 20])
+def test_labels_and_dropped_steps_are_those_of_each_dataset(base, target, label, after):
+    replay = LanguageWorldExperienceReplay(
+        [base.root, target.root], episodes=[None, {"reach": [1, 3]}], label=label, after_success=after
+    )
+    first, first_ends = expected_rows(base, everything(base), after)
+    second, second_ends = expected_rows(target, [("reach", 1), ("reach", 3)], after)
+    second.set(("collector", "traj_ids"), second["collector", "traj_ids"] + 6)
+    expected = torch.cat([first, second])
+    if label == "expert":
+        expected = expected.exclude("next", "action").rename_key_("expert_action", "action")
+    else:
+        ends = torch.cat([first_ends, second_ends])
+        expected["next", "done"] = expected["next", "truncated"] = ends
+    found = replay[:]
+    assert len(replay) == len(expected)
+    assert set(found.keys(True, True)) == set(expected.keys(True, True))
+    assert (found == expected).all()
+    assert found.device == LanguageWorldExperienceReplay(base.root)[:].device
+
+
+@pytest.mark.parametrize(
+    ("choice", "wanted"),
+    [
+        (1, [("button-press-topdown", 0), ("push", 0), ("reach", 0)]),
+        ({"reach": 1}, [("reach", 0)]),
+        ({"reach": [1], "push": 2}, [("push", 0), ("push", 1), ("reach", 1)]),
+        ({"reach": (1, 0)}, [("reach", 0), ("reach", 1)]),
+    ],
+)
+def test_episodes_are_chosen_from_one_dataset(base, choice, wanted):
+    replay = LanguageWorldExperienceReplay(base.root, episodes=choice, label="executed")
+    assert [(e.task, e.episode) for e in replay.demonstrations.episodes] == wanted
+    assert (replay[:] == expected_rows(base, wanted)[0]).all()
+    assert replay.tasks == tuple(sorted({task for task, _ in wanted}))
+    assert replay.demonstrations.num_steps == len(replay) == STEPS * len(wanted)
+    assert replay.data_path_root == base.root
+    (part,) = replay.demonstrations.parts
+    assert part.success_rate.keys() == set(replay.tasks)
+
+
+def test_one_demonstration_beside_the_base_tasks(base, target):
+    """The paper's one-shot minibatch, where the target is a base task."""
+    replay = LanguageWorldExperienceReplay(
+        [base.root, target.root],
+        episodes=[None, {"reach": [1]}],
+        batch_size=40,
+        sampler=CoLearningSampler("reach"),
+        transform=QAFTransform(load_plans("MT10")),
+        after_success=20,
+    )
+    demonstration, _ = expected_rows(target, [("reach", 1)], 20)
+    seen = []
+    for _ in range(20):
+        batch = replay.sample()
+        assert batch["task_id"].unique(return_counts=True)[1].tolist() == [10, 10, 20]
+        assert torch.equal(batch["is_target"], batch["task_id"] == task_id("reach"))
+        assert batch["qaf"].shape[0] == 40
+        seen.append(batch[batch["is_target"]])
+    seen = torch.cat(seen)
+    assert seen["episode"].unique().tolist() == [1]
+    assert seen["collector", "traj_ids"].unique().tolist() == [6 + 1]
+    assert torch.equal(seen["observation"].unique(dim=0), demonstration["observation"].unique(dim=0))
+
+
+def test_a_mask_chooses_the_demonstration_too(base, target):
+    shown = (*base.episodes, *target.episodes)
+    mask = [episode is target.episodes[2] for episode in shown]
+    replay = LanguageWorldExperienceReplay([base.root, target.root], batch_size=8, sampler=CoLearningSampler(mask))
+    assert replay.demonstrations.episodes == shown
+    batch = replay.sample()
+    assert batch["collector", "traj_ids"][batch["is_target"]].unique().tolist() == [6 + 2]
+    assert not (batch["task_id"][~batch["is_target"]] == task_id("reach")).any()
+
+
+@pytest.mark.parametrize("label", ["expert", "executed"])
+def test_no_column_of_numbers_is_copied(base, target, label, monkeypatch):
+    loaded = []
+    monkeypatch.setattr(selection, "load_rows", lambda part: loaded.append(load_rows(part)) or loaded[-1])
+    replay = LanguageWorldExperienceReplay([base.root, target.root], label=label, after_success=0)
+    assert isinstance(replay.storage, JoinedStorage)
+    own = {("collector", "traj_ids"), ("next", "done"), ("next", "truncated")}  # one number a row, changed
+    for key, leaves in replay.storage._columns.items():
+        if key not in own:
+            source = "expert_action" if (key, label) == ("action", "expert") else key
+            assert [leaf.data_ptr() for leaf in leaves] == [rows[source].data_ptr() for rows in loaded]
+
+
+def test_joining_leaves_the_datasets_alone(base, target):
+    before = {p: p.read_bytes() for one in (base, target) for p in one.root.rglob("*") if p.is_file()}
+    replay = LanguageWorldExperienceReplay([base.root, target.root], label="executed", after_success=0, batch_size=8)
+    replay.sample().zero_()
+    with pytest.raises(RuntimeError):
+        replay.empty()
+    assert before == {path: path.read_bytes() for path in before}
+
+
+def test_the_same_dataset_can_be_base_and_target(base):
+    replay = LanguageWorldExperienceReplay(
+        [base.root, base.root], episodes=[None, {"push": 1}], batch_size=8, sampler=CoLearningSampler("push")
+    )
+    batch = replay.sample()
+    assert batch["collector", "traj_ids"][batch["is_target"]].unique().tolist() == [6 + 2]
+
+
+def test_a_buffer_goes_on_after_its_state_is_restored(base, target, tmp_path):
+    def make(seed):
+        return LanguageWorldExperienceReplay(
+            [base.root, target.root],
+            batch_size=16,
+            sampler=CoLearningSampler("reach"),
+            generator=torch.Generator().manual_seed(seed),
+        )
+
+    replay, other = make(0), make(1)
+    for _ in range(9):
+        replay.sample()
+    state = replay.state_dict()
+    torch.save(state, tmp_path / "state")
+    assert (tmp_path / "state").stat().st_size < 100_000, "the rows are not in the state"
+    expected = torch.stack([replay.sample() for _ in range(20)])
+    other.load_state_dict(state)
+    assert (torch.stack([other.sample() for _ in range(20)]) == expected).all()
+
+
+def test_slices_of_torchrls_own_sampler_stay_within_an_episode(base, target):
+    sampler = SliceSampler(slice_len=10, traj_key=("collector", "traj_ids"), cache_values=True)
+    replay = LanguageWorldExperienceReplay(
+        [base.root, target.root], batch_size=40, sampler=sampler, label="executed", after_success=20
+    )
+    slices = replay.sample().reshape(4, 10)
+    assert torch.equal(slices["observation"][:, 1:], slices["next", "observation"][:, :-1])
+
+
+def test_a_policy_trains_on_joined_data_and_a_checkpoint_knows_the_episodes(base, target, tmp_path):
+    plans = load_plans("MT10")
+
+    def trainer(number):
+        replay = LanguageWorldExperienceReplay(
+            [base.root, target.root],
+            episodes=[None, {"reach": [number]}],
+            sampler=CoLearningSampler("reach"),
+            transform=QAFTransform(plans),
+        )
+        config = BehavioralCloningConfig(steps=3, batch_size=8)
+        actor = PlanConditionedActor(plans)
+        return BehavioralCloningTrainer(actor, replay, config, checkpoint=tmp_path / "one.zip", progress=False)
+
+    assert trainer(1).train() < 2
+    assert trainer(1).state.step == 3
+    with pytest.raises(ValueError, match="its data differs in episodes"):
+        trainer(2)
+
+
+def test_it_describes_its_parts(base, target):
+    replay = LanguageWorldExperienceReplay([base.root, str(target.root)], episodes=[1, {"reach": [2, 0]}])
+    found = replay.demonstrations
+    assert isinstance(found, JoinedDemonstrations)
+    assert [part.root for part in found.parts] == list(replay.roots) == [base.root, target.root]
+    assert found.config.episodes == ({"button-press-topdown": [0], "push": [0], "reach": [0]}, {"reach": [0, 2]})
+    assert json.loads(json.dumps(found.config.to_json()))["parts"][0] == base.config.to_json()
+    for path in ("data_path_root", "data_path"):
+        with pytest.raises(ValueError, match="joins 2 datasets, so it has no one folder; see its roots"):
+            getattr(replay, path)
+
+
+@pytest.mark.parametrize(
+    ("choice", "error", "message"),
+    [
+        ({"pusj": 1}, ValueError, "episodes: task must be one of .* got 'pusj'; did you mean 'push'"),
+        (3, ValueError, r"episodes\['button-press-topdown'\]: the dataset has 2 episodes of .* got 3"),
+        ({"push": 3}, ValueError, r"episodes\['push'\]: the dataset has 2 episodes of 'push', got 3"),
+        ({"push": 0}, ValueError, r"episodes\['push'\] must be at least 1, got 0"),
+        ({"push": [0, 7]}, ValueError, r"episodes\['push'\]: the dataset holds the episodes 0, 1, got 7"),
+        ({"push": [0, 0]}, ValueError, r"episodes\['push'\] must name at least one episode, each once, got \[0, 0\]"),
+        ({"push": []}, ValueError, r"episodes\['push'\] must name at least one episode"),
+        ({"push": "0"}, TypeError, r"episodes\['push'\] must be a number or a list of episodes, got '0'"),
+        ({"push": [0.5]}, TypeError, r"episodes\['push'\] must be an integer, got 0.5"),
+        ({}, ValueError, "episodes must name at least one task, got an empty mapping"),
+        (True, TypeError, "episodes.* must be an integer, got True"),
+        ("push", TypeError, "episodes must be None, a number, or a mapping of task names, got 'push'"),
+        ([None], TypeError, "episodes must be None, a number, or a mapping"),
+    ],
+)
+def test_wrong_choices_are_named(base, choice, error, message):
+    with pytest.raises(error, match=message):
+        LanguageWorldExperienceReplay(base.root, episodes=choice)
+
+
+@pytest.mark.parametrize(
+    ("episodes", "error", "message"),
+    [
+        ([None], ValueError, "episodes must be as many as the folders in root, 2, got 1"),
+        ({"push": 1}, TypeError, "episodes must be a list of choices, one for each of the 2 folders"),
+        (1, TypeError, "episodes must be a list of choices, one for each of the 2 folders, got 1"),
+        ([None, {"push": 1}], ValueError, r"episodes\[1\]: task must be one of 'reach', got 'push'"),
+    ],
+)
+def test_choices_for_several_folders_are_a_list(base, target, episodes, error, message):
+    with pytest.raises(error, match=message):
+        LanguageWorldExperienceReplay([base.root, target.root], episodes=episodes)
+
+
+def test_a_list_of_folders_is_not_empty_and_each_is_there(base, tmp_path):
+    with pytest.raises(ValueError, match="root must hold at least one folder"):
+        LanguageWorldExperienceReplay([])
+    with pytest.raises(FileNotFoundError, match=r"no dataset folder .*nowhere"):
+        LanguageWorldExperienceReplay([base.root, tmp_path / "nowhere"])
