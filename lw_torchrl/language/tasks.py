@@ -149,7 +149,7 @@ def _point(name: str, at: Any, objects: Mapping[str, NamedObject]) -> NamedObjec
             raise unknown_name(f"key of point {name!r}", key, ("object", "offset"))
     if set(at) != {"object", "offset"}:
         raise ValueError(f"point {name!r} must have object and offset, got {', '.join(at) or 'neither'}")
-    if at["object"] not in objects:
+    if at["object"] not in list(objects):
         raise unknown_name(f"object of point {name!r}", at["object"], objects)
     offset = at["offset"]
     if not isinstance(offset, list) or len(offset) != 3 or not all(map(_is_number, offset)):

@@ -5,6 +5,9 @@ import numpy as np
 import pytest
 import torch
 
+from lw_torchrl.language.queries import parse_query, supported_queries
+from lw_torchrl.language.query_program import QueryProgram
+from lw_torchrl.language.query_search import nearest_query
 from lw_torchrl.language.tasks import (
     GRIPPER,
     MT10,
@@ -12,8 +15,10 @@ from lw_torchrl.language.tasks import (
     TASKS,
     NamedObject,
     Task,
+    TaskError,
     check_task,
     get_task,
+    load_tasks,
     resolve_tasks,
     task_id,
 )
@@ -194,3 +199,115 @@ def test_a_position_outside_the_observation_is_refused(position):
 def test_a_task_needs_the_gripper_first_and_different_names(names):
     with pytest.raises(ValueError, match="objects of task 'mine'"):
         Task("mine", "Mine.", tuple(NamedObject(name, (4, 5, 6)) for name in names))
+
+
+PUSH = '[push]\ndescription = "Push the disc."\nobjects.disc = "obs[4:7]"\n'
+
+
+def load(tmp_path, text):
+    path = tmp_path / "mine.toml"
+    path.write_text(text, "utf-8")
+    return load_tasks(path)
+
+
+def test_tasks_of_ones_own_replace_ours_of_the_same_name(tmp_path):
+    mine = load(
+        tmp_path,
+        PUSH
+        + """
+objects.goal = [0.1, "obs[37]", 0]
+points."disc edge" = {object = "disc", offset = [0.03, 0, 0]}
+points.corner = [0.4, 0.9, 0.0]
+points.shadow = ["obs[4]", "obs[5]", 0.0]
+points."gripper tip" = {object = "robot's gripper", offset = [0.0, 0.0, -0.04]}
+""",
+    )
+    assert list(mine) == list(TASKS)
+    assert all(mine[name] is TASKS[name] for name in MT50 if name != "push")
+    push = mine["push"]
+    assert push.description == "Push the disc."
+    assert push.object_names == (GRIPPER, "disc", "goal", "disc edge", "corner", "shadow", "gripper tip")
+    assert push.published.object_names == (GRIPPER, "disc", "goal")
+    assert push.object("goal") == NamedObject("goal", (0.1, 37, 0.0))
+    assert push.object("disc edge") == NamedObject("disc edge", (4, 5, 6), (0.03, 0, 0), ours=True)
+    assert push.object("corner") == NamedObject("corner", (0.4, 0.9, 0.0), ours=True)
+    assert push.object("shadow") == NamedObject("shadow", (4, 5, 0.0), ours=True)
+    assert push.object("gripper tip").position == (0, 1, 2)
+    with pytest.raises(TypeError):
+        mine["push"] = push
+    assert TASKS["push"].object_names != push.object_names
+
+
+def test_a_task_of_ones_own_is_taken_wherever_a_task_is_asked_for(tmp_path):
+    push = load(tmp_path, PUSH)["push"]
+    assert str(parse_query("gripper above the disc", push)) == "the robot's gripper is above the disc"
+    assert "the disc is touching the table" in supported_queries(push)
+    assert str(nearest_query("gripper abov the disk", push).query) == "the robot's gripper is above the disc"
+    program = QueryProgram({push: ["gripper near disc", "disc touching the table"]})
+    state, ids = torch.zeros(39), torch.tensor(task_id("push"))
+    assert program(state, ids).tolist() == [True, True]
+    assert (program.logits(state, ids) > 0).tolist() == [True, True]
+
+
+def test_our_own_table_is_such_a_file():
+    from importlib.resources import files
+
+    assert load_tasks(files("lw_torchrl.language") / "data" / "tasks.toml") == TASKS
+
+
+def test_a_byte_order_mark_is_no_part_of_the_first_key(tmp_path):
+    (tmp_path / "mine.toml").write_bytes(b"\xef\xbb\xbf" + PUSH.encode())
+    assert load_tasks(tmp_path / "mine.toml")["push"].object_names == (GRIPPER, "disc")
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("[push", ["']'", "end of document"]),
+        (PUSH.replace("[push]", "[psuh]"), ["'psuh'", "did you mean 'push'"]),
+        (PUSH.replace("[push]", '["push-v3"]'), ["'push-v3'", "'push'"]),
+        ("push = 3", ["'push'", "table", "3"]),
+        (PUSH + 'object.puck = "obs[4:7]"', ["'push'", "'object'", "did you mean 'objects'"]),
+        (PUSH + 'point.puck = "obs[4:7]"', ["'push'", "'point'", "'points'"]),
+        (PUSH.replace("description", "desciption"), ["'desciption'", "'description'"]),
+        ('[push]\nobjects.disc = "obs[4:7]"', ["'push'", "description must be a sentence"]),
+        (PUSH.replace("Push the disc.", ""), ["'push'", "description must be a sentence"]),
+        ("[push]\ndescription = 3", ["'push'", "description must be a sentence", "3"]),
+        (PUSH.replace("obs[4:7]", "obs[4:8]"), ["'push'", "'disc'", "'obs[4:8]'", "'obs[4:7]'"]),
+        (PUSH.replace("obs[4:7]", "obs[37:40]"), ["'push'", "'disc'", "obs[39]", "0 to 38"]),
+        (PUSH.replace("obs[4:7]", "state[4:7]"), ["'push'", "'disc'", "'obs[4:7]'"]),
+        (PUSH.replace('"obs[4:7]"', "[0.1, 0.2]"), ["'push'", "'disc'", "[0.1, 0.2]"]),
+        (PUSH.replace('"obs[4:7]"', "[0.1, nan, 0.2]"), ["'push'", "'disc'", "nan"]),
+        (PUSH.replace('"obs[4:7]"', "[0.1, true, 0.2]"), ["'push'", "'disc'", "True"]),
+        (PUSH.replace('"obs[4:7]"', f"[0.1, {10**400}, 0.2]"), ["'push'", "'disc'"]),
+        (PUSH.replace('"obs[4:7]"', "7"), ["'push'", "'disc'", "7"]),
+        (PUSH.replace(".disc", '."The Disc"'), ["'push'", "'The Disc'", "lower-case"]),
+        (PUSH.replace(".disc", '."robot\'s gripper"'), ["'push'", "robot's gripper", "every task has"]),
+        ('[push]\ndescription = "Push."\nobjects = ["disc"]', ["'push'", "objects must be a table", "disc"]),
+        (PUSH + "points = 3", ["'push'", "points must be a table", "3"]),
+        (PUSH + "points.edge = {object = 'disk', offset = [0, 0, 0]}", ["'edge'", "'disk'", "did you mean 'disc'"]),
+        (PUSH + "points.edge = {object = 'disc'}", ["'edge'", "object and offset"]),
+        (PUSH + "points.edge = {objekt = 'disc', offset = [0, 0, 0]}", ["'edge'", "'objekt'", "did you mean 'object'"]),
+        (PUSH + "points.edge = {object = 'disc', offset = [0, 0]}", ["'edge'", "three numbers", "[0, 0]"]),
+        (PUSH + "points.edge = {object = 'disc', offset = ['a', 0, 0]}", ["'edge'", "three numbers", "'a'"]),
+        (PUSH + "points.edge = {object = 'disc', offset = 0.1}", ["'edge'", "three numbers", "0.1"]),
+        (PUSH + "points.edge = {object = ['disc'], offset = [0, 0, 0]}", ["'edge'", "['disc']"]),
+        (PUSH + "points.edge = 'obs[4]'", ["'edge'", "'obs[4:7]'"]),
+        (PUSH + "points.disc = [0, 0, 0]", ["'push'", "different names", "'disc'"]),
+        (PUSH + "points.disc = ", ["Invalid value"]),
+    ],
+)
+def test_a_file_of_tasks_says_what_is_wrong_and_where(tmp_path, text, says):
+    with pytest.raises(TaskError) as caught:
+        load(tmp_path, text)
+    message = str(caught.value)
+    assert isinstance(caught.value, ValueError)
+    assert all(word in message for word in ["mine.toml", *says]), message
+
+
+def test_a_missing_or_unreadable_file_of_tasks(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        load_tasks(tmp_path / "none.toml")
+    (tmp_path / "latin.toml").write_bytes(b"# caf\xe9")
+    with pytest.raises(TaskError, match=r"latin\.toml"):
+        load_tasks(tmp_path / "latin.toml")

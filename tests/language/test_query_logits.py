@@ -1,0 +1,220 @@
+"""QueryProgram.logits: the sign is the hard truth everywhere, and gradients are finite and reach what decides."""
+
+import functools
+import math
+import random
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from states import random_states, real_states
+
+from lw_torchrl.language.queries import supported_queries
+from lw_torchrl.language.query_program import QueryProgram
+from lw_torchrl.language.relations import PREDICATES
+from lw_torchrl.language.tasks import MT50, TASKS, task_id
+
+
+@functools.cache
+def everything():
+    """Every base query of all 50 tasks, negations not listed, and conjunctions of them."""
+    queries = {}
+    for task in MT50:
+        rng, base = random.Random(task), list(supported_queries(task))
+        joined = [" and ".join(rng.sample(base, rng.choice([2, 3, 4]))) for _ in range(40)]
+        queries[task] = [*base, "gripper is not open", "gripper isn't closed", *joined]
+    return QueryProgram(queries)
+
+
+def on_thresholds(states):
+    """The states with their numbers on a grid of half centimetres, which puts many differences on a threshold."""
+    return (np.round(states * 200) / 200).astype(states.dtype)
+
+
+def same_sign(program, observation, ids):
+    """How many pairs were compared; all of them must agree."""
+    soft, hard = program.logits(observation, ids), program(observation, ids)
+    assert soft.shape == hard.shape
+    assert soft.dtype == torch.float32
+    assert soft.isfinite().all()
+    assert (soft != 0).all()
+    assert torch.equal(soft > 0, hard)
+    return sum(len(program.queries[MT50[i]]) for i in ids.reshape(-1).tolist())
+
+
+def test_soft_and_hard_truth_agree_on_a_million_pairs_of_state_and_query():
+    compared = 0
+    for seed in (11, 12):
+        states = [random_states(task, seed=seed, n=40) for task in MT50]
+        ids = torch.arange(50).repeat_interleave(40)
+        for found in (np.concatenate(states), on_thresholds(np.concatenate(states))):
+            for dtype in (torch.float32, torch.float64):
+                compared += same_sign(everything(), torch.from_numpy(found).to(dtype), ids)
+    assert compared > 1_000_000
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", MT50)
+def test_soft_and_hard_truth_agree_on_real_states(task):
+    states = torch.from_numpy(real_states(task))
+    assert same_sign(everything(), states, torch.full((len(states),), task_id(task))) > 5_000
+
+
+@pytest.mark.parametrize("task", ["reach", "peg-insert-side", "drawer-open"])
+def test_soft_and_hard_truth_agree_on_an_experts_states(task):
+    states = torch.from_numpy(real_states(task))
+    same_sign(everything(), states, torch.full((len(states),), task_id(task)))
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision(dtype):
+    states = torch.cat([torch.from_numpy(random_states(task, n=5)) for task in MT50]).to(dtype).requires_grad_()
+    ids = torch.arange(50).repeat_interleave(5)
+    same_sign(everything(), states.detach(), ids)
+    (gradient,) = torch.autograd.grad(everything().logits(states, ids).sum(), states)
+    assert gradient.isfinite().all()
+
+
+numbers = st.floats(-0.25, 0.25, width=32) | st.sampled_from([0.0, 0.02, 0.03, 0.04, -0.04, 0.06, 0.12, 0.23, 0.75])
+large = st.floats(allow_nan=False, allow_infinity=False, width=32)
+
+
+@settings(max_examples=100, deadline=None)
+@example([0.0] * 39, 3)
+@example([3.4e38] * 20 + [-3.4e38] * 19, 12)
+@given(st.lists(numbers | large, min_size=39, max_size=39), st.integers(0, 49))
+def test_logits_and_gradients_are_finite_for_any_finite_state(state, task):
+    observation = torch.tensor(state, requires_grad=True)
+    logits = everything().logits(observation, torch.tensor(task))
+    assert logits.isfinite().all()
+    assert torch.equal(logits > 0, everything()(observation.detach(), torch.tensor(task)))
+    (gradient,) = torch.autograd.grad(logits.sum(), observation)
+    assert gradient.isfinite().all()
+
+
+def ask(query, task="push", temperature=1.0, **at):
+    state = torch.zeros(39)
+    for name, value in at.items():
+        start = {"hand": 0, "opening": 3, "puck": 4, "goal": 36}[name]
+        value = torch.as_tensor(value).reshape(-1)
+        state[start : start + len(value)] = value
+    state.requires_grad_()
+    logit = QueryProgram({task: [query]}).logits(state, torch.tensor(task_id(task)), temperature=temperature)
+    (gradient,) = torch.autograd.grad(logit.sum(), state)
+    return logit.item(), gradient
+
+
+@pytest.mark.parametrize(
+    ("query", "at", "expected"),
+    [
+        ("gripper near puck", {"hand": [0.0, 0.0, 0.03]}, 1.0),  # a centimetre inside
+        ("gripper near puck", {"hand": [0.0, 0.06, 0.0]}, -2.0),
+        ("gripper not near puck", {"hand": [0.0, 0.06, 0.0]}, 2.0),
+        ("gripper around puck", {"hand": [0.01, 0.0, -0.02]}, 2.0),
+        ("gripper left of puck", {"hand": [0.34, 5.0, 5.0]}, 30.0),
+        ("gripper left of puck", {"hand": [2.04, 0.0, 0.0]}, 200.0),
+        ("gripper mostly below puck", {"hand": [0.0, 0.0, -5.0]}, 523.0),
+        ("puck touching the table", {"puck": [9.0, 9.0, 0.05]}, -3.0),
+        ("puck is not touching the table", {"puck": [9.0, 9.0, 0.05]}, 3.0),
+        ("gripper open", {"opening": 0.85}, 2.0),
+        ("gripper closed", {"opening": 0.85}, -2.0),
+        ("gripper above puck", {"hand": [0.0, 0.01, 0.005]}, 0.5),  # the least of its two parts
+        ("gripper above puck", {"hand": [0.0, 0.01, 0.5]}, 1.0),
+        ("gripper not above puck", {"hand": [0.0, 0.01, 0.5]}, -1.0),
+        ("gripper open and not above puck", {"hand": [0.0, 0.01, 0.5], "opening": 1.0}, -1.0),
+        ("gripper open and above puck", {"hand": [0.0, 0.01, 0.5], "opening": 0.0}, -15.0),
+    ],
+)
+def test_a_logit_is_the_distance_to_the_threshold_over_the_temperature(query, at, expected):
+    logit, gradient = ask(query, **at)
+    assert logit == pytest.approx(expected, rel=1e-4)
+    assert gradient.abs().sum() > 0
+    half, _ = ask(query, temperature=2.0, **at)
+    assert half == pytest.approx(expected / 2, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("query", "at", "reached"),
+    [
+        ("gripper near puck", {"hand": [0.03, 0.0, 0.0]}, [0, 4]),
+        ("gripper near puck", {"hand": [0.04, 0.0, 0.0]}, [0, 4]),  # on the threshold
+        ("gripper above puck", {"hand": [0.0, 0.01, 0.0]}, [2, 6]),  # on the threshold
+        ("gripper above puck", {"hand": [0.0, 0.03, 0.5]}, [1, 5]),
+        ("gripper not above puck", {"hand": [0.0, 0.03, 0.5]}, [1, 5]),
+        ("puck touching the table", {"puck": [0.3, 0.3, 0.02]}, [6]),  # on the threshold
+        ("gripper open", {"opening": 0.75}, [3]),  # on the threshold
+        ("gripper left of puck", {"hand": [3.0, 0.0, 0.0]}, [0, 4]),
+        ("gripper open and left of puck", {"hand": [3.0, 0.0, 0.0], "opening": 0.8}, [3]),
+    ],
+)
+def test_the_gradient_is_that_of_the_comparison_that_decides(query, at, reached):
+    _, gradient = ask(query, **at)
+    assert gradient.nonzero().flatten().tolist() == reached
+    assert gradient.abs().max() == pytest.approx(20.0 if reached == [3] else 100.0, rel=1e-4)
+
+
+@pytest.mark.parametrize(("query", "expected"), [("gripper open", -1e-6), ("gripper closed", 1e-6)])
+def test_on_the_threshold_a_logit_is_tiny_and_on_the_side_of_the_hard_truth(query, expected):
+    assert ask(query, opening=0.75)[0] == pytest.approx(expected)
+
+
+def test_padding_is_far_below_at_any_temperature():
+    program = QueryProgram({"push": ["gripper open"], "reach": ["gripper open", "gripper closed"]})
+    for temperature in (1e-6, 1e-3, 1.0, 1e3, 1e6):
+        logits = program.logits(torch.zeros(39), torch.tensor(task_id("push")), temperature=temperature)
+        assert logits[1].item() == -1e4
+
+
+def test_following_the_gradient_makes_a_query_true():
+    query = "the gripper is above the puck and the puck is near the target location and the gripper is open"
+    program, ids = QueryProgram({"push": [query]}), torch.full((64,), task_id("push"))
+    state = torch.from_numpy(random_states("push", n=64)).requires_grad_()
+    for _ in range(4000):
+        logits = program.logits(state, ids)
+        (gradient,) = torch.autograd.grad(logits.clamp(max=0.2).sum(), state)
+        state = (state + 2e-5 * gradient).detach().requires_grad_()
+    assert program(state.detach(), ids).float().mean() > 0.95
+
+
+@pytest.mark.parametrize("shape", [(), (3,), (2, 5), (0,), (2, 0)])
+def test_any_leading_shape(shape):
+    n = math.prod(shape)
+    states = torch.from_numpy(random_states("push", n=10))[:n].reshape(*shape, 39)
+    ids = torch.full(shape, task_id("push"))
+    logits = everything().logits(states, ids)
+    assert logits.shape == (*shape, everything().num_queries)
+    assert torch.equal(logits > 0, everything()(states, ids))
+
+
+@pytest.mark.parametrize("temperature", [0, -1.0, math.nan, math.inf, 1e-9, "warm", None])
+def test_a_wrong_temperature_is_named(temperature):
+    with pytest.raises(ValueError, match="temperature"):
+        QueryProgram({"push": ["gripper open"]}).logits(
+            torch.zeros(39), torch.tensor(task_id("push")), temperature=temperature
+        )
+
+
+def test_a_wrong_state_is_refused_as_by_the_hard_truth():
+    program = QueryProgram({"push": ["gripper open"]})
+    for states, ids, says in (
+        (torch.zeros(38), torch.tensor(task_id("push")), "39"),
+        (torch.full((39,), math.nan), torch.tensor(task_id("push")), "NaN"),
+        (torch.zeros(39), torch.tensor(task_id("reach")), "reach"),
+    ):
+        with pytest.raises(ValueError, match=says):
+            program.logits(states, ids)
+
+
+def test_asking_for_logits_leaves_the_hard_truth_alone():
+    program, ids = everything(), torch.arange(50)
+    states = torch.stack([torch.from_numpy(random_states(task, n=1)[0]) for task in TASKS])
+    before = program(states, ids)
+    program.logits(states.double(), ids)
+    assert torch.equal(program(states, ids), before)
+    assert not program(states.clone().requires_grad_(), ids).requires_grad
+
+
+def test_every_comparison_has_a_temperature():
+    assert all(0 < part.temperature < 1 for parts in PREDICATES.values() for part in parts)

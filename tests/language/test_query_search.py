@@ -1,0 +1,201 @@
+"""nearest_query: any text becomes a query of the task, and one that is a query stays as it is."""
+
+import dataclasses
+import statistics
+import time
+
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from lw_torchrl.language import query_search
+from lw_torchrl.language.queries import QueryError, parse_query, supported_queries
+from lw_torchrl.language.query_search import QueryMatch, nearest_query
+from lw_torchrl.language.tasks import GRIPPER, MT50, NamedObject, Task
+
+tasks = st.sampled_from(MT50)
+WORDS = sorted({
+    word for task in ("drawer-open", "stick-pull", "door-lock") for text in supported_queries(task)
+    for word in text.split()
+} | {"a", "and", "but", "isn't", "doesn't", "never", "hand", "?", ",", "does", "over", "puck", "’", "AND"})  # fmt: skip
+any_text = st.text(st.characters()) | st.lists(st.sampled_from(WORDS), max_size=25).map(" ".join)
+
+
+@example("", "push")
+@example("and", "push")
+@example("and and and", "push")
+@example("not", "push")
+@example("?!", "push")
+@example("\ud800", "push")
+@example("\x00 and \x00", "push")
+@example("x" * 100_000, "stick-pull")
+@example("İs the gripper open", "reach")
+@settings(max_examples=400, deadline=None)
+@given(any_text, tasks)
+def test_any_text_has_a_nearest_query(text, task):
+    match = nearest_query(text, task)
+    assert 0.0 <= match.score <= 1.0
+    assert parse_query(str(match.query), task) == match.query
+    assert match.parts
+    clauses = [clause for part in match.parts for clause in parse_query(part.query, task).clauses]
+    assert tuple(clauses) == match.query.clauses
+    assert all(0.0 <= part.score <= 1.0 for part in match.parts)
+    assert match.score == pytest.approx(statistics.mean(part.score for part in match.parts))
+    try:
+        assert match.query == parse_query(text, task)
+        assert match.score == 1.0
+    except QueryError:
+        pass
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.data(), tasks)
+def test_a_text_that_is_a_query_is_found_as_it_is(data, task):
+    picked = data.draw(st.lists(st.sampled_from(supported_queries(task)), min_size=1, max_size=3))
+    match = nearest_query(" and ".join(picked), task)
+    assert str(match.query) == " and ".join(picked)
+    assert match.score == 1.0
+    assert [part.query for part in match.parts] == picked
+
+
+def test_a_query_that_is_answered_and_not_listed_keeps_its_meaning():
+    match = nearest_query("puck around gripper", "push")
+    assert (str(match.query), match.score) == ("the puck is around the robot's gripper", 1.0)
+    assert str(nearest_query("Isn't the gripper open?", "push").query) == "the robot's gripper is not open"
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.data(), tasks)
+def test_one_wrong_letter_is_forgiven(data, task):
+    meant = data.draw(st.sampled_from([text for text in supported_queries(task) if " above " in text]))
+    text = meant.replace("above", data.draw(st.sampled_from(["abov", "abbove", "aboove", "abve"])))
+    match = nearest_query(text, task)
+    assert str(match.query) == meant
+    assert 0.8 < match.score < 1.0
+
+
+@pytest.mark.parametrize(
+    ("text", "task", "expected"),
+    [
+        ("the gripper is open and around the drawer", "drawer-open",
+         "the robot's gripper is open and the robot's gripper is around the drawer handle"),
+        ("the gripper is closed and around the drawer", "drawer-open",
+         "the robot's gripper is closed and the robot's gripper is around the drawer handle"),
+        ("Gripper open and over the target locaton", "push",
+         "the robot's gripper is open and the robot's gripper is above the target location"),
+        ("Is the puck at the target location?", "push", "the puck is near the target location"),
+        ("the gripper's open but not abov the puck", "push",
+         "the robot's gripper is open and the robot's gripper is not above the puck"),
+        ("the puck is near the gripper and above the target", "push",
+         "the puck is near the robot's gripper and the puck is above the target location"),
+    ],
+)  # fmt: skip
+def test_what_people_write(text, task, expected):
+    match = nearest_query(text, task)
+    assert str(match.query) == expected
+    assert 0.5 < match.score < 1.0
+
+
+@pytest.mark.parametrize("by", ["edit", "embedding"])
+@pytest.mark.parametrize(
+    ("text", "negated"),
+    [
+        ("the gripper is hovering above the puck", False),
+        ("the gripper is not hovering above the puck", True),
+        ("the gripper isn't hovering above the puck", True),
+        ("the gripper isn’t hovering above the puck", True),
+        ("the gripper doesn't hover above the puck", True),
+        ("Is the gripper never hovering above the puck?", True),
+        ("no, the gripper is not not hovering above the puck", True),
+    ],
+)
+def test_a_negation_stays_one(text, negated, by):
+    query = nearest_query(text, "push", by=by).query
+    assert [(clause.predicate, clause.negated) for clause in query.clauses] == [("above", negated)]
+
+
+def test_parts_say_what_was_taken_for_what():
+    match = nearest_query("the gripper is open and  not abov the puck", "push")
+    assert [part.text for part in match.parts] == ["the gripper is open", "not abov the puck"]
+    assert match.parts[0].query == "the robot's gripper is open"
+    assert match.parts[0].score == 1.0
+    assert match.parts[1].query == "the robot's gripper is not above the puck"
+    assert 0.5 < match.parts[1].score < 1.0
+    assert isinstance(match, QueryMatch)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        match.score = 1.0
+
+
+def test_by_embedding_finds_the_meaning_and_encodes_a_tasks_list_once(monkeypatch):
+    from lw_torchrl.language import text
+
+    sizes = []
+    encode = text.sentence_encoder
+    monkeypatch.setattr(text, "sentence_encoder", lambda texts: sizes.append(len(texts)) or encode(texts))
+    query_search._vectors.cache_clear()
+    match = nearest_query("Has the gripper arrived at the reach target?", "reach", by="embedding")
+    assert str(match.query) == "the robot's gripper is near the reach target"
+    assert 0.3 < match.score < 1.0
+    for said in ("the goal was reached", "", "\ud800", "and", "the gripper is open and where it should be"):
+        again = nearest_query(said, "reach", by="embedding")
+        assert parse_query(str(again.query), "reach") == again.query
+        assert 0.0 <= again.score <= 1.0
+    assert sum(size > 1 for size in sizes) == 1
+
+
+def test_a_query_needs_no_text_model(monkeypatch):
+    from lw_torchrl.language import text
+
+    monkeypatch.setattr(text, "sentence_encoder", lambda texts: pytest.fail("encoded"))
+    assert nearest_query("gripper open", "push", by="embedding").score == 1.0
+
+
+def with_point():
+    puck, point = NamedObject("puck", (4, 5, 6)), NamedObject("puck edge", (4, 5, 6), (0.03, 0.0, 0.0), ours=True)
+    return Task("push", "Push it.", (NamedObject(GRIPPER, (0, 1, 2)), puck, point))
+
+
+def test_points_of_ours_are_found_unless_published_only():
+    match = nearest_query("gripper near the puck edge", with_point())
+    assert (str(match.query), match.score) == ("the robot's gripper is near the puck edge", 1.0)
+    match = nearest_query("gripper near the puck edge", with_point(), published_only=True)
+    assert str(match.query) == "the robot's gripper is near the puck"
+    assert match.score < 1.0
+    match = nearest_query("gripper open and by the puck edge", with_point(), "edit", True)
+    assert "edge" not in str(match.query)
+
+
+@pytest.mark.parametrize("text", [None, 3, b"gripper open", ["gripper open"]])
+def test_another_type_is_a_type_error(text):
+    with pytest.raises(TypeError, match="text must be a string"):
+        nearest_query(text, "push")
+
+
+def test_a_wrong_way_or_task_names_the_nearest():
+    with pytest.raises(ValueError, match="did you mean 'edit'"):
+        nearest_query("gripper open", "push", by="edits")
+    with pytest.raises(ValueError, match="'push'"):
+        nearest_query("gripper open", "psuh")
+    with pytest.raises(TypeError):
+        nearest_query("gripper open", 3)
+
+
+def test_a_tasks_whole_list_is_searched_within_two_milliseconds():
+    longest = max(MT50, key=lambda task: len(supported_queries(task)))
+    text = "the gripper touches the puck"
+    nearest_query(text, longest)
+    times = []
+    for _ in range(20):
+        started = time.perf_counter()
+        nearest_query(text, longest)
+        times.append(time.perf_counter() - started)
+    assert min(times) < 2e-3
+
+
+@pytest.mark.parametrize(
+    "text", ["x" * 200_000, "and " * 50_000, "the gripper is open and " * 8_000 + "the moon", "not " * 50_000]
+)
+def test_a_very_long_text_is_answered_soon(text):
+    started = time.perf_counter()
+    nearest_query(text, "stick-pull")
+    assert time.perf_counter() - started < 5.0
