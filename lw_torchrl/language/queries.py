@@ -64,8 +64,9 @@ class QueryError(ValueError):
 
 
 @lru_cache(maxsize=256)
-def _supported(task: Task) -> tuple[str, ...]:
-    queries = []
+def base_clauses(task: Task) -> tuple[Clause, ...]:
+    """The clauses that :func:`supported_queries` lists as texts."""
+    clauses = []
     for first in task.object_names:
         for second in task.object_names:
             if first == second:
@@ -74,12 +75,17 @@ def _supported(task: Task) -> tuple[str, ...]:
                 if relation == "around" and first != GRIPPER:
                     continue
                 for negated in (False, True):
-                    queries.append(Clause(first, relation, second, negated))
+                    clauses.append(Clause(first, relation, second, negated))
     for thing in task.objects:
         if not thing.ours and thing.position in ((4, 5, 6), (11, 12, 13)):
-            queries += [Clause(thing.name, TOUCHING), Clause(thing.name, TOUCHING, negated=True)]
-    queries += [Clause(GRIPPER, "open"), Clause(GRIPPER, "closed")]
-    return tuple(map(str, queries))
+            clauses += [Clause(thing.name, TOUCHING), Clause(thing.name, TOUCHING, negated=True)]
+    clauses += [Clause(GRIPPER, "open"), Clause(GRIPPER, "closed")]
+    return tuple(clauses)
+
+
+@lru_cache(maxsize=256)
+def _supported(task: Task) -> tuple[str, ...]:
+    return tuple(map(str, base_clauses(task)))
 
 
 def supported_queries(task: str | Task, published_only: bool = False) -> tuple[str, ...]:

@@ -11,7 +11,7 @@ from rapidfuzz import fuzz, process
 from torch import Tensor
 
 from lw_torchrl._checks import check_choice
-from lw_torchrl.language.queries import Clause, Query, QueryError, parse_query, supported_queries
+from lw_torchrl.language.queries import Clause, Query, QueryError, base_clauses, parse_query
 from lw_torchrl.language.tasks import Task, get_task
 
 _NEGATIONS = frozenset(("not", "no", "never", "without", "cannot"))
@@ -57,8 +57,7 @@ def _told(words: list[str]) -> str:
 @lru_cache(maxsize=256)
 def _choices(task: Task) -> tuple[tuple[Clause, ...], tuple[str, ...]]:
     """The clauses that base queries affirm, and what each says; a negation is compared without its "not"."""
-    clauses = [clause for text in supported_queries(task) for clause in parse_query(text, task).clauses]
-    affirmed = tuple(clause for clause in clauses if not clause.negated)
+    affirmed = tuple(clause for clause in base_clauses(task) if not clause.negated)
     return affirmed, tuple(_told(str(clause).split()) for clause in affirmed)
 
 
