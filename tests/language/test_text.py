@@ -14,7 +14,7 @@ from lw_torchrl.language.tasks import TASKS
 
 NEW = "juggle three drawers while whistling"
 DESCRIPTIONS = [task.description for task in TASKS.values()]
-SKILLS = list(load_plans("MT10").skills)
+SKILLS = sorted({*load_plans("MT50").skills, *load_plans("MT50", skills="MT10").skills})
 
 
 @pytest.fixture
