@@ -52,9 +52,7 @@ def skills(settings: Settings) -> list[Row]:
         for i in range(ASKED):
             rival.run_scripted_skill(names[i % len(names)], states[i])
 
-    found = take_turns(
-        {"ours": lambda: actor.program(observation, task_id), "theirs": theirs}, settings.pick(30, 3)
-    )
+    found = take_turns({"ours": lambda: actor.program(observation, task_id), "theirs": theirs}, settings.pick(30, 3))
     return [
         compare(
             f"action of a scripted skill, plans of 50 tasks, batch {BATCH}",
