@@ -58,10 +58,11 @@ def plot_success(result: EvaluationResult, path: str | os.PathLike[str], *, titl
     )
     axes.axvline(result.mean_success, color="#e45756", linestyle="--")
     axes.set_xlim(0, 1.02)
+    axes.margins(y=0.5 / len(tasks))
     axes.set_xlabel(
         f"episodes with success at any step (of {trials}; action noise {result.config['noise_scale']}; bars: 95 %)"
     )
-    axes.set_title(f"{title}\nmean over {len(tasks)} tasks: {result.mean_success:.2f}".strip())
+    axes.set_title(f"{title}\nmean over {len(tasks)} tasks: {result.mean_success:.3f}".strip())
     axes.spines[["top", "right"]].set_visible(False)
     with replacing(path) as temporary:
         figure.savefig(temporary, dpi=140)

@@ -74,7 +74,7 @@ def test_the_bars_are_the_rates_best_on_top(tmp_path):
     axes = plot_success(RESULT, tmp_path / "success.png").axes[0]
     assert [bar.get_width() for bar in axes.patches] == [0.0, 0.25, 1.0]
     assert [label.get_text() for label in axes.get_yticklabels()] == ["sweep", "push", "reach"]
-    assert f"{RESULT.mean_success:.2f}" in axes.get_title()
+    assert f"{RESULT.mean_success:.3f}" in axes.get_title()
     assert "4" in axes.get_xlabel()
 
 
