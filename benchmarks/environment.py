@@ -145,17 +145,22 @@ def reset(settings: Settings) -> list[Row]:
 
 
 _CONSTRUCT = """
-import json, resource, sys, time
+import json, re, resource, sys, time
 import lw_torchrl as lw
-before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+def peak():
+    # A fork inherits its parent's ru_maxrss, so that of a process started from here says nothing.
+    try:
+        return int(re.search(r"VmHWM:\\s+(\\d+)", open("/proc/self/status").read())[1]) * 1024 / 1e9
+    except OSError:
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e9
+
+before = peak()
 start = time.perf_counter()
 env = lw.LanguageWorldEnv(sys.argv[1].split(","), num_envs=int(sys.argv[2]))
 built = time.perf_counter() - start
 env.reset()
-after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-unit = 1 if sys.platform == "darwin" else 1024
-print(json.dumps({"built": built, "reset": time.perf_counter() - start - built,
-                  "memory": after * unit / 1e9, "imports": before * unit / 1e9}))
+print(json.dumps({"built": built, "reset": time.perf_counter() - start - built, "memory": peak(), "imports": before}))
 """
 
 

@@ -12,6 +12,7 @@ from lw_torchrl.language.skills import ScriptedSkill, load_skills
 from lw_torchrl.language.tasks import TASKS, NamedObject, Task, get_task, task_id
 
 _OBSERVATION = 39
+_KEPT_ROWS = 4096  # of the last batch, the most to keep the tables of
 
 
 class SkillProgram:
@@ -59,7 +60,8 @@ class SkillProgram:
         self._column = torch.full((len(TASKS),), -1)
         constants = [0.0]
         index = torch.full((len(found), 2, self.num_skills, 3), _OBSERVATION)
-        numbers = torch.zeros(len(found), 3, self.num_skills, 3, dtype=torch.float64)  # offset, gain, effort
+        numbers = torch.zeros(len(found), 2, self.num_skills, 3, dtype=torch.float64)  # gain, gain times offset
+        effort = torch.zeros(len(found), self.num_skills, 4, dtype=torch.float64)
         for t, (task, listed) in enumerate(found.items()):
             self._column[task_id(task.name)] = t
             for s, skill in enumerate(listed):
@@ -67,11 +69,27 @@ class SkillProgram:
                 index[t, 0, s] = torch.tensor(_places(target, constants))
                 index[t, 1, s] = torch.tensor(_places(moved, constants))
                 offsets = torch.tensor([skill.offset, target.offset, moved.offset], dtype=torch.float64)
-                numbers[t, 0, s] = offsets[0] + offsets[1] - offsets[2]
-                numbers[t, 1, s] = torch.tensor(skill.gain, dtype=torch.float64)
-                numbers[t, 2, s] = skill.gripper
-        self._index, self._numbers = index.flatten(1), numbers
+                numbers[t, 0, s] = torch.tensor(skill.gain, dtype=torch.float64)
+                numbers[t, 1, s] = numbers[t, 0, s] * (offsets[0] + offsets[1] - offsets[2])
+                effort[t, s, 3] = skill.gripper
+        self._tables = (*index.flatten(2).unbind(1), *numbers.flatten(2).unbind(1), effort)
         self._constants = torch.tensor(constants, dtype=torch.float64)
+        self._last: tuple[Tensor, torch.dtype, tuple[Tensor, ...]] | None = None
+
+    def _selected(self, task_ids: Tensor, observation: Tensor) -> tuple[Tensor, ...]:
+        """The tables' rows for a batch, kept for the next: the rows of an environment keep their tasks."""
+        if self._last is not None:
+            ids, dtype, tables = self._last
+            if dtype == observation.dtype and ids.device == observation.device and torch.equal(ids, task_ids):
+                return tables
+        row = self._column.to(task_ids.device)[task_ids.clamp(0, len(TASKS) - 1)]
+        if not (known := (row >= 0) & (task_ids >= 0) & (task_ids < len(TASKS))).all():
+            raise ValueError(f"task_id {int(task_ids[~known][0])} has no skills")
+        moved = [table.to(observation if table.is_floating_point() else observation.device) for table in self._tables]
+        tables = (*(table[row] for table in moved), self._constants.to(observation).expand(len(row), -1))
+        if len(row) <= _KEPT_ROWS:
+            self._last = (task_ids.clone(), observation.dtype, tables)
+        return tables
 
     def __call__(self, observation: Tensor, task_id: Tensor) -> Tensor:
         """The action of each skill.
@@ -92,17 +110,12 @@ class SkillProgram:
                 f"observation must be of shape (..., {_OBSERVATION}) and task_id of (...), got "
                 f"{tuple(observation.shape)} and {tuple(task_id.shape)}"
             )
-        batch, device = task_id.shape, observation.device
-        task_ids = task_id.reshape(-1)
-        row = self._column.to(device)[task_ids.clamp(0, len(TASKS) - 1)]
-        if not (known := (row >= 0) & (task_ids >= 0) & (task_ids < len(TASKS))).all():
-            raise ValueError(f"task_id {int(task_ids[~known][0])} has no skills")
-        constants = self._constants.to(observation).expand(len(row), -1)
+        target, moved, gain, offset, effort, constants = self._selected(task_id.reshape(-1), observation)
         state = torch.cat((observation.reshape(-1, _OBSERVATION), constants), 1)
-        target, moved = state.gather(1, self._index.to(device)[row]).unflatten(1, (2, self.num_skills, 3)).unbind(1)
-        offset, gain, effort = self._numbers.to(observation)[row].unbind(1)
-        shift = ((target + offset - moved) * gain).clamp(-1.0, 1.0)
-        return torch.cat((shift, effort[..., :1]), -1).reshape(*batch, self.num_skills, 4)
+        shift = torch.addcmul(offset, gain, state.gather(1, target) - state.gather(1, moved)).clamp_(-1.0, 1.0)
+        action = effort.clone()
+        action[..., :3] = shift.unflatten(1, (-1, 3))
+        return action.reshape(*task_id.shape, self.num_skills, 4)
 
 
 def _look_up(skill: str | ScriptedSkill, table: Mapping[str, ScriptedSkill]) -> ScriptedSkill:
