@@ -1,7 +1,36 @@
-"""Evaluation: exactly k episodes of each task, their results and figures."""
+"""Evaluation: exactly k episodes of each task, their results, statistics over seeds, and figures."""
 
 from lw_torchrl.evaluation.evaluate import evaluate
-from lw_torchrl.evaluation.figures import plot_success
+from lw_torchrl.evaluation.figures import plot_sorted_tasks, plot_success
+from lw_torchrl.evaluation.published import published, published_curves, published_plans
 from lw_torchrl.evaluation.result import EpisodeResult, EvaluationResult
+from lw_torchrl.evaluation.statistics import (
+    Estimate,
+    count_solved,
+    interquartile_mean,
+    mean_difference,
+    mean_rate,
+    probability_of_improvement,
+)
+from lw_torchrl.evaluation.summary import Summary, TaskSummary, summarize, summarize_rates
 
-__all__ = ["EpisodeResult", "EvaluationResult", "evaluate", "plot_success"]
+__all__ = [
+    "EpisodeResult",
+    "Estimate",
+    "EvaluationResult",
+    "Summary",
+    "TaskSummary",
+    "count_solved",
+    "evaluate",
+    "interquartile_mean",
+    "mean_difference",
+    "mean_rate",
+    "plot_sorted_tasks",
+    "plot_success",
+    "probability_of_improvement",
+    "published",
+    "published_curves",
+    "published_plans",
+    "summarize",
+    "summarize_rates",
+]

@@ -4,12 +4,19 @@ from __future__ import annotations
 
 import math
 import os
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Literal
 
+import numpy as np
+
+from lw_torchrl._checks import check_choice
 from lw_torchrl._files import replacing
 from lw_torchrl.evaluation.result import EvaluationResult
+from lw_torchrl.evaluation.statistics import Array, check_rates
+from lw_torchrl.evaluation.summary import Summary
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 _Z = 1.96  # of a 95 % interval
@@ -67,3 +74,127 @@ def plot_success(result: EvaluationResult, path: str | os.PathLike[str], *, titl
     with replacing(path) as temporary:
         figure.savefig(temporary, dpi=140)
     return figure
+
+
+Rates = Mapping[str, float | Sequence[float]]
+_COLORS = ("#4c78a8", "#f58518", "#54a24b", "#b279a2", "#9d755d", "#e45756")
+_DASHES = ((0, (5, 2)), (0, (1, 1.5)), (0, (5, 1, 1, 1)), (0, (3, 3)))
+
+
+def plot_sorted_tasks(
+    curves: Mapping[str, Rates | Summary],
+    path: str | os.PathLike[str],
+    *,
+    published: Mapping[str, Mapping[str, float]] | None = None,
+    order: Literal["shared", "own"] = "shared",
+    title: str = "",
+) -> Figure:
+    """Draw the paper's figure: tasks sorted by success rate on x, success on y, a line per method.
+
+    A line is the mean over seeds, its band spans the least and the greatest seed, and a thin line across marks the
+    mean over tasks, which the legend gives too. Published curves are dashed.
+
+    Args:
+        curves: a method's name to its :class:`Summary`, or to (task to its rates, one per seed), in [0, 1]. All have
+            the same tasks.
+        path: an image file, .png, .svg or .pdf; it is replaced whole.
+        published: label to (task to rate), of the same tasks at least; :func:`published_curves` gives them.
+        order: "shared" sorts the tasks by the first method, so that each place on x is one named task; "own" sorts
+            every curve for itself, as the paper does: x is then a rank.
+        title: above the figure.
+
+    Returns:
+        The figure.
+
+    Raises:
+        ValueError: no curves, methods with different tasks, or rates outside [0, 1].
+
+    Example:
+        >>> figure = plot_sorted_tasks({"PCBC": {"push": [0.5, 0.7], "reach": [1.0, 0.9]}}, "few-shot.png")
+        >>> [label.get_text() for label in figure.axes[0].get_xticklabels()]
+        ['push', 'reach']
+
+    Source: paper, figures of section 'Conditional Plan Experiments'.
+    """
+    from matplotlib.figure import Figure
+
+    check_choice("order", order, ("shared", "own"))
+    if not curves:
+        raise ValueError("curves must hold at least one method, got none")
+    named = {method: _as_rates(f"curves[{method!r}]", given) for method, given in curves.items()}
+    first = next(iter(named))
+    for method, rates in named.items():
+        if different := sorted(set(named[first]) ^ set(rates)):
+            raise ValueError(f"curves must be of the same tasks; {first!r} and {method!r} do not share {different}")
+    means = {task: float(rates.mean()) for task, rates in named[first].items()}
+    tasks = sorted(means, key=lambda task: (means[task], task))
+    dashed = {label: _as_rates(f"published[{label!r}]", rates) for label, rates in (published or {}).items()}
+    for label, rates in dashed.items():
+        if missing := [task for task in tasks if task not in rates]:
+            raise ValueError(f"published[{label!r}] lacks the tasks {missing}")
+
+    figure = Figure(figsize=(max(7.0, 3.5 + 0.21 * len(tasks)), 6.4), layout="constrained")
+    axes = figure.subplots()
+    for k, (method, rates) in enumerate(named.items()):
+        _draw_method(axes, method, np.stack([rates[task] for task in tasks]), _COLORS[k % len(_COLORS)], order)
+    for k, (label, rates) in enumerate(dashed.items()):
+        _draw_published(axes, label, np.array([rates[task].mean() for task in tasks]), k, order)
+    shown = [*tasks] if order == "shared" else [str(rank) for rank in range(1, len(tasks) + 1)]
+    axes.set_xticks(range(len(tasks)), shown, rotation=90 if order == "shared" else 0, fontsize=8)
+    axes.set_xlabel(f"tasks, sorted by {first}" if order == "shared" else "tasks, each curve sorted for itself")
+    axes.set_ylabel("episodes with success at any step")
+    axes.set_xlim(-0.5, len(tasks) - 0.5)
+    axes.set_ylim(-0.02, 1.02)
+    axes.grid(axis="y", color="#dddddd", linewidth=0.6)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.set_title(title)
+    _add_legend(figure, axes, len(named))
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=140)
+    return figure
+
+
+def _add_legend(figure: Figure, axes: Axes, methods: int) -> None:
+    """Below the axes: the methods, and the published curves in a column beside, or under them in a narrow figure."""
+    from matplotlib.lines import Line2D
+
+    lines, _ = axes.get_legend_handles_labels()
+    wide = methods < len(lines) and figure.get_figwidth() > 10
+    columns = [lines[:methods], lines[methods:]] if wide else [lines]
+    longest = max(len(column) for column in columns)
+    blank = Line2D([], [], linestyle="none", label=" ")
+    handles = [handle for column in columns for handle in (*column, *[blank] * (longest - len(column)))]
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(columns), frameon=False, fontsize=9)
+
+
+def _draw_method(axes: Axes, method: str, rates: Array, color: str, order: str) -> None:
+    """A line, a band and the mean of rates (tasks, seeds)."""
+    if order == "own":
+        rates = rates[np.argsort(rates.mean(1), kind="stable")]
+    mean, x, seeds = rates.mean(1), range(len(rates)), rates.shape[1]
+    spread = "1 seed" if seeds == 1 else f"{seeds} seeds, min–max shaded"
+    axes.fill_between(x, rates.min(1), rates.max(1), color=color, alpha=0.16, linewidth=0)
+    axes.plot(
+        x, mean, color=color, linewidth=2, marker=".", zorder=3, label=f"{method}: mean {mean.mean():.2f} ({spread})"
+    )
+    axes.axhline(float(mean.mean()), color=color, linewidth=1.2, alpha=0.8)
+
+
+def _draw_published(axes: Axes, label: str, rates: Array, k: int, order: str) -> None:
+    rates = np.sort(rates) if order == "own" else rates
+    color = ("#666666", "#aaaaaa")[k % 2]
+    style = _DASHES[k // 2 % len(_DASHES)]
+    axes.plot(rates, color=color, linewidth=1, linestyle=style, zorder=1.5, label=f"{label}: mean {rates.mean():.2f}")
+    axes.axhline(float(rates.mean()), color=color, linewidth=0.9, linestyle=style, zorder=1.5)
+
+
+def _as_rates(argument: str, given: Rates | Summary | Mapping[str, float]) -> dict[str, Array]:
+    """Task to its rates over seeds, (n,) float64."""
+    if isinstance(given, Summary):
+        return dict(zip(given.tasks, given.array.T, strict=True))
+    columns = {task: np.atleast_1d(np.asarray(rates, dtype=np.float64)) for task, rates in given.items()}
+    if len({len(rates) for rates in columns.values()}) > 1:
+        raise ValueError(f"{argument} must hold a rate per seed for each task, got different numbers of them")
+    check_rates(argument, list(columns.values()))
+    return columns

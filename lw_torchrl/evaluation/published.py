@@ -1,0 +1,99 @@
+"""The paper's own numbers, per task: what our curves are drawn beside."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from functools import cache
+from importlib.resources import files
+from typing import Any, Literal
+
+from lw_torchrl._checks import check_choice
+
+#: What each choice of ``which`` is called in tables and legends; the best of ten is never the headline.
+WHICH = {"last": "published, last", "best": "published, best of the last 10 evaluations"}
+
+
+@cache
+def _table() -> dict[str, Any]:
+    return json.loads((files("lw_torchrl.evaluation") / "data/published.json").read_text(encoding="utf-8"))
+
+
+def published(setting: str, method: str = "PCBC", which: Literal["last", "best"] = "last") -> dict[str, float]:
+    """The published success rate of each of the 50 tasks, a mean over 4 seeds of 20 episodes each.
+
+    The rates of single seeds were not published. The published "last" and "best" of DC one-shot are the same numbers.
+
+    Args:
+        setting: "zero-shot", "few-shot" or "one-shot".
+        method: "PCBC" or "DC" (descriptor conditioning).
+        which: "last", the last evaluation of each run, to compare with; or "best", per task and seed the best of the
+            last ten evaluations, which the paper's figures show.
+
+    Returns:
+        Task to success rate, in [0, 1], sorted by name.
+
+    Raises:
+        ValueError: an argument that is none of these.
+
+    Example:
+        >>> rates = published("few-shot")
+        >>> len(rates), round(sum(rates.values()) / 50, 3), rates["coffee-pull"]
+        (50, 0.393, 0.4875)
+
+    Source: the authors' published result files; paper section 'Conditional Plan Experiments'.
+    """
+    rates = _table()["rates"]
+    methods = rates[check_choice("setting", setting, rates)]
+    choices = methods[check_choice("method", method, methods)]
+    return dict(zip(_table()["tasks"], choices[check_choice("which", which, choices)], strict=True))
+
+
+def published_curves(setting: str, methods: str | Iterable[str] = ("PCBC",)) -> dict[str, dict[str, float]]:
+    """Both published curves of each method, by the label that a figure or a table gives them.
+
+    Args:
+        setting: "zero-shot", "few-shot" or "one-shot".
+        methods: "PCBC", "DC" or several of them; a method that the paper has no rates of raises.
+
+    Returns:
+        Label to (task to success rate): for :func:`plot_sorted_tasks` and :meth:`Summary.table`.
+
+    Raises:
+        ValueError: an argument that is none of these.
+
+    Example:
+        >>> list(published_curves("zero-shot"))
+        ['PCBC published, best of the last 10 evaluations', 'PCBC published, last']
+    """
+    names = [methods] if isinstance(methods, str) else list(methods)
+    return {
+        f"{method} {label}": published(setting, method, which)  # type: ignore[arg-type]
+        for method in names
+        for which, label in reversed(WHICH.items())
+    }
+
+
+def published_plans(model: str = "PaLM 2") -> dict[str, tuple[float, ...]]:
+    """The published success rate of each of a model's 5 generated plans per task, run with scripted skills.
+
+    The plans are in the format "chain_py", each model's best.
+
+    Args:
+        model: "PaLM 2", "GPT-3.5" or "GPT-3".
+
+    Returns:
+        Task to the rates of its 5 plans, in [0, 1], sorted by name.
+
+    Raises:
+        ValueError: another model.
+
+    Example:
+        >>> published_plans()["window-open"]
+        (1.0, 1.0, 1.0, 1.0, 0.98)
+
+    Source: the authors' published result files; paper section 'LLM Experiments'.
+    """
+    models = _table()["scripted"]
+    columns = zip(*models[check_choice("model", model, models)], strict=True)
+    return dict(zip(_table()["tasks"], columns, strict=True))

@@ -1,0 +1,202 @@
+"""summarize: the results of several training seeds as the headline numbers and a row per task."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from lw_torchrl.evaluation.result import EvaluationResult
+from lw_torchrl.evaluation.statistics import (
+    Array,
+    Estimate,
+    check_rates,
+    count_solved,
+    interquartile_mean,
+    mean_rate,
+)
+
+_SETTINGS = ("episodes_per_task", "noise_scale", "max_steps")  # what rates must share to be averaged
+
+
+@dataclass(frozen=True)
+class TaskSummary:
+    """One task over the seeds: the mean, the least and the greatest success rate."""
+
+    mean: float
+    min: float
+    max: float
+
+
+@dataclass(frozen=True)
+class Summary:
+    """The success rates of one method over seeds and tasks, from :func:`summarize` or :func:`summarize_rates`.
+
+    Attributes:
+        tasks: their names, T of them.
+        seeds: the training seeds' names, n of them.
+        rates: n rows of T success rates at any step.
+        mean: over seeds and tasks, with its 95 % interval.
+        iqm: the interquartile mean, likewise.
+        solved: how many tasks' mean over seeds is at least ``threshold``.
+        threshold: 0.8.
+    """
+
+    tasks: tuple[str, ...]
+    seeds: tuple[str, ...]
+    rates: tuple[tuple[float, ...], ...]
+    mean: Estimate
+    iqm: Estimate
+    solved: int
+    threshold: float
+
+    @property
+    def array(self) -> Array:
+        """The rates as a fresh float64 array (n, T), for the functions of :mod:`lw_torchrl.evaluation.statistics`."""
+        return np.array(self.rates)
+
+    @cached_property
+    def per_task(self) -> dict[str, TaskSummary]:
+        """Task to its mean, minimum and maximum over the seeds."""
+        rates = self.array
+        columns = zip(rates.mean(0).tolist(), rates.min(0).tolist(), rates.max(0).tolist(), strict=True)
+        return {task: TaskSummary(*column) for task, column in zip(self.tasks, columns, strict=True)}
+
+    @property
+    def by_seed(self) -> dict[str, float]:
+        """Seed to its mean over the tasks."""
+        return dict(zip(self.seeds, self.array.mean(1).tolist(), strict=True))
+
+    def to_json(self) -> dict[str, Any]:
+        """As plain numbers, lists and mappings."""
+        return {
+            "seeds": list(self.seeds),
+            "mean": self.mean.to_json(),
+            "iqm": self.iqm.to_json(),
+            "solved": self.solved,
+            "threshold": self.threshold,
+            "by_seed": self.by_seed,
+            "tasks": {
+                task: {"mean": found.mean, "min": found.min, "max": found.max, "rates": rates}
+                for (task, found), rates in zip(self.per_task.items(), self.array.T.tolist(), strict=True)
+            },
+        }
+
+    def table(self, beside: Mapping[str, Mapping[str, float]] | None = None) -> str:
+        """The headline, then a row per task, as text in columns.
+
+        Args:
+            beside: more columns, name to (task to rate), such as :func:`published_curves` gives; "-" where a task is
+                missing. Their names stand in full below the table.
+        """
+        columns = list((beside or {}).items())
+        head = "".join(f" {f'({k + 1})':>6}" for k in range(len(columns)))
+        count = f"{len(self.seeds)} seed" + "s" * (len(self.seeds) > 1)
+        solved = f"{self.solved} of {len(self.tasks)} tasks >= {self.threshold:g}"
+        lines = [
+            f"mean {self.mean}, IQM {self.iqm}; {solved}; {count}",
+            f"{'task':28} {'mean':>6} {'min':>6} {'max':>6}{head}",
+        ]
+        for task, found in self.per_task.items():
+            cells = "".join(f" {rates[task]:6.2f}" if task in rates else f" {'-':>6}" for _, rates in columns)
+            lines.append(f"{task:28} {found.mean:6.2f} {found.min:6.2f} {found.max:6.2f}{cells}")
+        seeds = self.by_seed.values()
+        cells = ""
+        for _, rates in columns:
+            shared = [rates[task] for task in self.tasks if task in rates]
+            cells += f" {sum(shared) / len(shared):6.2f}" if len(shared) == len(self.tasks) else f" {'-':>6}"
+        lines.append(f"{'mean':28} {self.mean.value:6.2f} {min(seeds):6.2f} {max(seeds):6.2f}{cells}")
+        return "\n".join([*lines, *(f"({k + 1}) {name}" for k, (name, _) in enumerate(columns))])
+
+
+def summarize_rates(
+    rates: Mapping[str, Sequence[float]],
+    *,
+    seeds: Sequence[object] | None = None,
+    threshold: float = 0.8,
+    **options: Any,
+) -> Summary:
+    """Summarize success rates, for those that come from elsewhere than one evaluation per seed.
+
+    Args:
+        rates: task to its n success rates, one per training seed, in [0, 1].
+        seeds: the seeds' names; by default 0 to n - 1.
+        threshold: a task counts as solved from here.
+        options: of the bootstrap, as for :func:`mean_rate`.
+
+    Raises:
+        ValueError: no tasks, tasks with different numbers of seeds, or another wrong argument.
+
+    Example:
+        >>> summary = summarize_rates({"push": [0.5, 0.7], "reach": [1.0, 0.9]})
+        >>> print(summary.mean, summary.solved)
+        0.775 [0.700, 0.850] 1
+        >>> summary.per_task["push"].min
+        0.5
+    """
+    counts = {task: len(found) for task, found in rates.items()}
+    if not counts or min(counts.values()) == 0:
+        raise ValueError(f"rates must hold at least one task, each with at least one rate, got {dict(rates)!r}")
+    if len(set(counts.values())) > 1:
+        raise ValueError(f"rates must hold a rate per seed for each task, got different numbers: {counts}")
+    array = check_rates("rates", list(rates.values())).T
+    names = tuple(str(seed) for seed in (range(len(array)) if seeds is None else seeds))
+    if len(names) != len(array) or len(set(names)) != len(names):
+        raise ValueError(f"seeds must be {len(array)} different names, got {names}")
+    return Summary(
+        tasks=tuple(rates),
+        seeds=names,
+        rates=tuple(tuple(row) for row in array.tolist()),
+        mean=mean_rate(array, **options),
+        iqm=interquartile_mean(array, **options),
+        solved=count_solved(array, threshold),
+        threshold=threshold,
+    )
+
+
+def summarize(results: Mapping[Any, EvaluationResult] | Sequence[EvaluationResult], **options: Any) -> Summary:
+    """Summarize the any-step success of several training seeds, one evaluation of the same tasks each.
+
+    Args:
+        results: training seed to result, or the results in order.
+        options: ``threshold`` (0.8), and those of the bootstrap, as for :func:`mean_rate`.
+
+    Raises:
+        ValueError: no results, other tasks in one than in another, or evaluations that cannot be averaged because
+            their episodes_per_task, noise_scale or max_steps differ.
+
+    Example:
+        >>> import lw_torchrl as lw
+        >>> episodes = tuple(lw.EpisodeResult("reach", k, k > 0, 9, None, None) for k in range(2))
+        >>> result = lw.EvaluationResult({"tasks": ["reach"], "episodes_per_task": 2}, episodes)
+        >>> lw.summarize({7: result}).by_seed
+        {'7': 0.5}
+    """
+    named = dict(results) if isinstance(results, Mapping) else dict(enumerate(results))
+    if not named:
+        raise ValueError("results must hold at least one result, got none")
+    first_seed, first = next(iter(named.items()))
+    tasks = tuple(first.success_once)
+    for seed, result in named.items():
+        if different := set(tasks) ^ set(result.success_once):
+            raise ValueError(
+                f"results must be of the same tasks; seeds {first_seed!r} and {seed!r} do not share "
+                + ", ".join(sorted(different))
+            )
+        for key in _SETTINGS:
+            if first.config.get(key) != result.config.get(key):
+                raise ValueError(
+                    f"results must share {key}, got {first.config.get(key)!r} for seed {first_seed!r} and "
+                    f"{result.config.get(key)!r} for seed {seed!r}"
+                )
+    rates = {task: [_rate(result, task) for result in named.values()] for task in tasks}
+    return summarize_rates(rates, seeds=list(named), **options)
+
+
+def _rate(result: EvaluationResult, task: str) -> float:
+    rate = result.success_once[task]
+    assert rate is not None  # any-step success is known of every episode
+    return rate
