@@ -11,7 +11,7 @@ from typing import Any, Literal
 import tyro
 from tyro.conf import Positional
 
-from lw_torchrl import cli_language
+from lw_torchrl import cli_experiments, cli_language
 
 
 def demo(out: Path | None = None, quick: bool = False) -> None:
@@ -280,6 +280,7 @@ COMMANDS: dict[str, Any] = {
     "skills": cli_language.skills,
     "plans": cli_language.plans,
     "check": cli_language.check,
+    "reproduce": cli_experiments.reproduce,
 }
 
 

@@ -33,6 +33,7 @@ COMMANDS = (
     "skills",
     "plans",
     "check",
+    "reproduce",
 )
 
 
