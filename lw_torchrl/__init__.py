@@ -1,5 +1,7 @@
 """Language-World and Plan Conditioned Behavioral Cloning as TorchRL components."""
 
+# First, since where TorchRL loads MuJoCo it names a rendering library that is absent.
+import lw_torchrl.envs  # noqa: F401
 from lw_torchrl.data import (
     CoLearningSampler,
     CollectConfig,
