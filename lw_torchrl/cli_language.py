@@ -161,13 +161,13 @@ def check(
     for path in paths:
         faults, steps, notes = _check_plan(path.read_text("utf-8-sig"), task, path.name, table, known)
         wrong += len(faults)
-        print(
-            "\n".join(
-                [*faults, *notes, f"{path.name}: " + (f"{len(faults)} faults" if faults else f"{steps} steps, valid")]
-            )
-        )
+        print("\n".join([*faults, *notes, f"{path.name}: " + (_count(faults) if faults else f"{steps} steps, valid")]))
     if wrong:
-        raise ValueError(f"{wrong} faults in {len(paths)} file" + ("s" if len(paths) > 1 else ""))
+        raise ValueError(f"{wrong} fault{'s' * (wrong > 1)} in {len(paths)} file{'s' * (len(paths) > 1)}")
+
+
+def _count(faults: list[str]) -> str:
+    return f"{len(faults)} fault" + "s" * (len(faults) > 1)
 
 
 def _check_table(file: Path) -> str:
@@ -204,20 +204,19 @@ def _check_plan(
         try:
             plan = parse_plan("\n".join(lines), task, source, tasks)
         except lw.PlanError as error:
-            faults.append(str(error))
             at = re.match(rf"{re.escape(source)}, line (\d+)", str(error))
-            if at is None or lines[int(at[1]) - 1].lstrip().startswith("def"):
-                return faults, 0, []
-            # Leave the line out and go on with the next fault; a condition takes its skill with it.
+            if at is None:  # of the plan as a whole, or what is left of it
+                return faults or [str(error)], 0, []
+            faults.append(str(error))
             number = int(at[1]) - 1
-            with_skill = "check(" in lines[number].replace(" ", "")
-            lines[number] = ""
-            if with_skill:
+            if lines[number].lstrip().startswith("def"):
+                return faults, 0, []
+            # Leave the line out and go on to the next fault; a condition takes its skill with it.
+            if lines[number].lstrip().startswith("if"):
                 following = next((k for k in range(number + 1, len(lines)) if lines[k].strip()), None)
                 if following is not None:
                     lines[following] = ""
-            if not any("check" in line for line in lines):
-                return faults, 0, []
+            lines[number] = ""
             continue
         break
     notes = []

@@ -73,6 +73,20 @@ def test_every_fault_of_a_plan_is_named(capsys, tmp_path):
     assert "faults in 1 file" in printed.err
 
 
+def test_faults_without_a_sound_step_left(capsys, tmp_path):
+    path = tmp_path / "push.plan"
+    path.write_text(PLAN.replace("puck", "pluck").replace("if check", "if chek", 1))
+    with pytest.raises(SystemExit):
+        run(capsys, "check", path)
+    printed = capsys.readouterr()
+    assert [line.split(":")[0] for line in printed.out.splitlines()] == [
+        "push.plan, line 4",
+        "push.plan, line 6",
+        "push.plan",
+    ]
+    assert "2 faults in 1 file" in printed.err
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
