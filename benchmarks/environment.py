@@ -17,7 +17,6 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import Compose, EnvBase, StepCounter, TransformedEnv
 
 import lw_torchrl as lw
-from benchmarks.language import plans_for_all
 from benchmarks.report import Row, Settings, Skipped, bars, compare, part_of, take_turns, timed, under
 from lw_torchrl.envs.engine import Engine, EngineStep
 from lw_torchrl.envs.metaworld_engine import make_metaworld_env
@@ -82,7 +81,7 @@ def overhead(settings: Settings) -> list[Row]:
     for n in (2, 4) if settings.quick else (1, 10, 50, 200):
         rounds, steps = settings.pick(15, 3), settings.pick(max(5, 600 // n), 5)
         layers = {
-            "whole": (lw.LanguageWorldEnv, [lw.QAFTransform(plans_for_all()), StepCounter()]),
+            "whole": (lw.LanguageWorldEnv, [lw.QAFTransform(lw.load_plans("MT50")), StepCounter()]),
             "machinery": (_OnlySimulates, [StepCounter()]),
         }
         clock, runs, envs = _Clock(), {}, []

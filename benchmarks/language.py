@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache
+from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 import lw_torchrl as lw
 from benchmarks.report import Row, Settings, Skipped, compare, take_turns
@@ -16,18 +17,24 @@ BATCH = 4096
 ASKED = 64  # states that the rival is asked about in one round; it works state by state
 
 
-@cache
-def plans_for_all() -> lw.Plans:
-    """The shipped plan of each of the 50 tasks."""
-    return lw.load_plans("MT50")
+def _rival() -> Any:
+    try:
+        import language_world
+    except ImportError as error:
+        raise Skipped(f"language-world is not installed ({error}): pip install -e '.[dev]'") from error
+    return language_world
+
+
+def _states(tasks: Sequence[str]) -> tuple[list[str], np.ndarray, Tensor]:
+    """The task of each of 4096 states, the states (B, 39) float32, and the ids of the tasks (B,) int64."""
+    mixed = [tasks[i % len(tasks)] for i in range(BATCH)]
+    states = np.random.default_rng(0).uniform(-0.3, 0.9, (BATCH, 39)).astype(np.float32)
+    return mixed, states, torch.tensor([lw.task_id(task) for task in mixed])
 
 
 def queries(settings: Settings) -> list[Row]:
     """A batch of 4096 states of mixed tasks; the rival is asked about 64 of them, and gives the same answers."""
-    try:
-        import language_world as rival
-    except ImportError as error:
-        raise Skipped(f"language-world is not installed ({error}): pip install -e '.[dev]'") from error
+    rival = _rival()
     mt10, mt50 = lw.load_plans("MT10"), lw.load_plans("MT50")
     asked = {task: lw.supported_queries(task, published_only=True)[: len(plan.steps)] for task, plan in mt50.items()}
     return [
@@ -38,14 +45,9 @@ def queries(settings: Settings) -> list[Row]:
 
 def skills(settings: Settings) -> list[Row]:
     """Every step of every row's plan acts, against as many calls of one skill on one state."""
-    try:
-        import language_world as rival
-    except ImportError as error:
-        raise Skipped(f"language-world is not installed ({error}): pip install -e '.[dev]'") from error
+    rival = _rival()
     actor = lw.ScriptedSkillActor(lw.load_plans("MT50"))
-    tasks = [lw.MT50[i % 50] for i in range(BATCH)]
-    task_id = torch.tensor([lw.task_id(task) for task in tasks])
-    states = np.random.default_rng(0).uniform(-0.3, 0.9, (BATCH, 39)).astype(np.float32)
+    tasks, states, task_id = _states(lw.MT50)
     observation = torch.from_numpy(states)
     acted = sum(len(actor.plans[task].steps) for task in tasks)
     names = rival.SCRIPTED_SKILL_NAMES
@@ -80,9 +82,7 @@ def _against(
     same = texts is None
     if texts is None:
         texts = {task: [str(query) for query in listed] for task, listed in program.queries.items()}
-    tasks = [program.tasks[i % len(program.tasks)] for i in range(BATCH)]
-    task_id = torch.tensor([lw.task_id(task) for task in tasks])
-    states = np.random.default_rng(0).uniform(-0.3, 0.9, (BATCH, 39)).astype(np.float32)
+    tasks, states, task_id = _states(program.tasks)
     observation = torch.from_numpy(states)
     asked = [i * BATCH // ASKED + i % 50 for i in range(ASKED)]
     answers = program(observation, task_id)

@@ -9,7 +9,6 @@ from typing import Any
 import torch
 
 import lw_torchrl as lw
-from benchmarks.language import plans_for_all
 from benchmarks.report import Row, Settings, timed, under
 from lw_torchrl.envs.vectorized_engine import available_cores
 
@@ -28,7 +27,7 @@ def evaluation(settings: Settings) -> list[Row]:
     tasks, episodes, steps = _size(settings, 20)
     options: dict[str, Any] = {"tasks": tasks, "episodes_per_task": episodes, "seed": 1_000, "max_steps": steps}
     torch.manual_seed(0)
-    actor = lw.PlanConditionedActor(plans_for_all())
+    actor = lw.PlanConditionedActor(lw.load_plans("MT50"))
     full = timed(lambda: lw.evaluate(actor, **options))
     found: list[lw.EvaluationResult] = []
     stopped = timed(lambda: found.append(lw.evaluate(lw.ExpertActor(tasks), stop_at_success=True, **options)))

@@ -10,7 +10,6 @@ from tensordict import TensorDict
 from torchrl.objectives import BCLoss
 
 import lw_torchrl as lw
-from benchmarks.language import plans_for_all
 from benchmarks.report import Row, Settings, compare, take_turns, under
 
 BATCH = 500
@@ -22,7 +21,7 @@ def _batch() -> TensorDict:
     task_id = torch.arange(BATCH) % len(lw.MT50)
     action = torch.rand((BATCH, 4), generator=generator) * 2 - 1
     batch = TensorDict({"observation": observation, "task_id": task_id, "action": action}, [BATCH])
-    return lw.QAFTransform(plans_for_all())(batch)
+    return lw.QAFTransform(lw.load_plans("MT50"))(batch)
 
 
 class _Learner:
@@ -30,7 +29,7 @@ class _Learner:
 
     def __init__(self, batch: TensorDict, *, compiled: bool) -> None:
         torch.manual_seed(0)
-        actor = lw.PlanConditionedActor(plans_for_all())
+        actor = lw.PlanConditionedActor(lw.load_plans("MT50"))
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message=".*target_actor_network_params.*")
             self._module = BCLoss(actor, loss_function="l2")

@@ -42,6 +42,7 @@ def reproduce(
         unit: run this one alone, such as few-shot/strong/pcbc/seed0.
         out: where everything goes.
     """
+    from lw_torchrl._checks import check_choice
     from lw_torchrl.cli import _calm_torch
     from lw_torchrl.language.plans import load_plans
     from lw_torchrl.trainers.experiments import PRESETS, SETTINGS, Unit, run_unit
@@ -58,11 +59,7 @@ def reproduce(
         units += [Unit(SETTINGS["few-shot"], "scripted", seed, PRESETS[preset], episodes) for seed in seeds]
     if unit is not None:
         named = {str(one.folder): one for one in units}
-        if unit not in named:
-            from lw_torchrl._checks import unknown_name
-
-            raise unknown_name("unit", unit, named)
-        units = [named[unit]]
+        units = [named[check_choice("unit", unit, named)]]
 
     def plans_of(one: Unit) -> Plans:
         if plans is not None:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from lw_torchrl._checks import unknown_name
 from lw_torchrl.language.skills import ScriptedSkill, load_skills
-from lw_torchrl.language.tasks import TASKS, NamedObject, Task, get_task, task_id
+from lw_torchrl.language.tasks import TASKS, Task, get_task, place, task_id
 
 _OBSERVATION = 39
 _KEPT_ROWS = 4096  # of the last batch, the most to keep the tables of
@@ -66,8 +66,8 @@ class SkillProgram:
             self._column[task_id(task.name)] = t
             for s, skill in enumerate(listed):
                 target, moved = task.object(skill.target), task.object(skill.moved)
-                index[t, 0, s] = torch.tensor(_places(target, constants))
-                index[t, 1, s] = torch.tensor(_places(moved, constants))
+                index[t, 0, s] = torch.tensor([place(c, constants) for c in target.position])
+                index[t, 1, s] = torch.tensor([place(c, constants) for c in moved.position])
                 offsets = torch.tensor([skill.offset, target.offset, moved.offset], dtype=torch.float64)
                 numbers[t, 0, s] = torch.tensor(skill.gain, dtype=torch.float64)
                 numbers[t, 1, s] = numbers[t, 0, s] * (offsets[0] + offsets[1] - offsets[2])
@@ -124,13 +124,3 @@ def _look_up(skill: str | ScriptedSkill, table: Mapping[str, ScriptedSkill]) -> 
     if skill not in table:
         raise unknown_name("skill", skill, table)
     return table[skill]
-
-
-def _places(named: NamedObject, constants: list[float]) -> list[int]:
-    """The index of each coordinate in the observation followed by the constants."""
-    places = []
-    for coordinate in named.position:
-        if isinstance(coordinate, float) and coordinate not in constants:
-            constants.append(coordinate)
-        places.append(coordinate if isinstance(coordinate, int) else _OBSERVATION + constants.index(coordinate))
-    return places
