@@ -34,7 +34,8 @@ from lw_torchrl.evaluation import (
     summarize,
     summarize_rates,
 )
-from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans, PlanStep, load_plans, save_plans
+from lw_torchrl.language.plan_files import load_plans, save_plans
+from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans, PlanStep
 from lw_torchrl.language.queries import Clause, Query, QueryError, parse_query, supported_queries
 from lw_torchrl.language.query_program import QueryProgram
 from lw_torchrl.language.query_search import QueryMatch, nearest_query

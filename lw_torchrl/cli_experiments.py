@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -10,99 +12,173 @@ from tyro.conf import Positional
 
 if TYPE_CHECKING:
     from lw_torchrl.language.plans import Plans
-    from lw_torchrl.trainers.experiments import Unit
+    from lw_torchrl.trainers.experiments import Dataset, Unit
+
+Experiment = Literal["zero-shot", "few-shot", "one-shot", "scripted", "all"]
+Method = Literal["pcbc", "dc", "one-hot", "scripted"]
 
 
 def reproduce(
-    experiment: Positional[Literal["zero-shot", "few-shot", "scripted", "all"]],
+    experiment: Positional[Experiment],
     /,
     seeds: tuple[int, ...] = (0, 1, 2),
-    methods: tuple[Literal["pcbc", "dc", "one-hot"], ...] = ("pcbc", "dc", "one-hot"),
+    methods: tuple[Method, ...] | None = None,
     preset: Literal["strong", "paper"] = "strong",
+    passes: int | None = None,
     plans: Path | None = None,
     episodes: int = 20,
+    launcher: Literal["local", "ray"] = "local",
+    jobs: int = 1,
     unit: str | None = None,
+    list: bool = False,
     out: Path = Path("runs/reproduce"),
 ) -> None:
     """Run the paper's experiments and compare them with the published results. Stopped and started again it carries on.
 
-    A unit is one policy of one seed: its demonstrations, its training, its evaluation. Each can be run by a command
-    of its own, with --unit, by any scheduler; the summary is written when the command is run without it.
+    A unit is a dataset, or the policy of one method and seed with its evaluation (in one-shot, a policy for each of the
+    50 tasks). Each can be run by a command of its own, with --unit, by any scheduler; datasets first. The summary is
+    written when the command is run without it.
 
     Example: lw-torchrl reproduce few-shot --seeds 0 1 2 --methods pcbc dc
 
     Args:
-        experiment: zero-shot, 100 demonstrations of each MT10 task; few-shot, 10 of each MT50 task; scripted, plans
-            with scripted skills; or all of them.
+        experiment: zero-shot, 100 demonstrations of each MT10 task; few-shot, 10 of each MT50 task; one-shot, 100 of
+            each MT10 task and 1 of the target; scripted, plans with scripted skills; or all of them.
         seeds: of the demonstrations, the initial weights and the minibatches.
-        methods: conditioned on plans, on the task's description, on the task's number.
+        methods: conditioned on plans, on the task's description, on the task's number; plans with scripted skills. By
+            default all; with --plans, those that are trained.
         preset: ours, or the published recipe, which takes hours.
-        plans: a folder of plans for all 50 tasks instead of ours.
+        passes: over the rows, fewer than the 500 of the preset paper.
+        plans: a folder of plans for all 50 tasks, or a .json file of pairs, instead of ours.
         episodes: evaluated for each task, on seeds that no training used, action noise 0.1.
+        launcher: local, on this machine; ray, on a Ray cluster, or on all cores of this machine.
+        jobs: units run at a time by the launcher local.
         unit: run this one alone, such as few-shot/strong/pcbc/seed0.
-        out: where everything goes.
+        list: print the names of the units and do nothing.
+        out: where everything goes; on a cluster, a folder that all its machines share.
     """
-    from lw_torchrl._checks import check_choice
+    from lw_torchrl._checks import check_choice, check_int
     from lw_torchrl.cli import _calm_torch
-    from lw_torchrl.language.plans import load_plans
-    from lw_torchrl.trainers.experiments import PRESETS, SETTINGS, Unit, run_unit
+    from lw_torchrl.trainers.experiments import METHODS, Unit, run_unit
+    from lw_torchrl.trainers.recipes import PRESETS, SETTINGS
 
-    _calm_torch()
-    chosen = [name for name in SETTINGS if experiment in (name, "all")]
+    check_int("jobs", jobs, minimum=1)
+    recipes = PRESETS[preset]
+    if passes is not None:
+        check_int("passes", passes, minimum=1)
+        if preset != "paper":
+            raise ValueError("passes is for the preset paper; ours counts minibatches")
+        recipes = {name: replace(recipe, passes=passes) for name, recipe in recipes.items()}
+    if methods is None:
+        methods = METHODS if plans is None else METHODS[:-1]  # type: ignore[assignment]
+    if experiment == "scripted":
+        methods = ("scripted",)
+    assert methods is not None
+    plans_name = "" if plans is None else plans.stem
     units = [
-        Unit(SETTINGS[name], method, seed, PRESETS[preset], episodes)
-        for name in chosen
+        Unit(SETTINGS[name], method, seed, recipes[name], episodes, plans_name)
+        for name in (["few-shot"] if experiment == "scripted" else SETTINGS)
+        if experiment in (name, "scripted", "all")
         for method in methods
         for seed in seeds
     ]
-    if experiment in ("scripted", "all"):
-        units += [Unit(SETTINGS["few-shot"], "scripted", seed, PRESETS[preset], episodes) for seed in seeds]
-    if unit is not None:
-        named = {str(one.folder): one for one in units}
-        units = [named[check_choice("unit", unit, named)]]
+    datasets = {str(dataset.folder): dataset for one in units for dataset in one.datasets}
+    named = {str(one.folder): one for one in units}
+    if list:
+        print("\n".join([*datasets, *named]))
+        return
+    load = _Plans(plans)
+    _calm_torch()
+    if unit in datasets:
+        datasets[unit].collect(out, progress=True)
+    elif unit is not None:
+        result = run_unit(one := named[check_choice("unit", unit, [*datasets, *named])], load(one), out)
+        print(f"{one.folder}: mean success {result.mean_success:.3f}, {result.config['seconds']:.0f} s")
+    else:
+        if launcher == "local" and jobs == 1:
+            _report(len(named), _here(named, load, out))
+        else:
+            given = [experiment, "--preset", preset, "--episodes", str(episodes), "--out", str(out)]
+            given += ["--seeds", *map(str, seeds), "--methods", *methods]
+            given += [] if passes is None else ["--passes", str(passes)]
+            given += [] if plans is None else ["--plans", str(plans)]
+            for stage in (datasets, named):
+                _report(len(stage), _there(stage, given, launcher, jobs))
+        _summarize(units, load, out)
 
-    def plans_of(one: Unit) -> Plans:
-        if plans is not None:
-            return load_plans(plans)
-        return load_plans("MT50", skills="MT10" if one.setting.name == "zero-shot" else "own")
 
+class _Plans:
+    """The plans that a unit uses, each set read once."""
+
+    def __init__(self, source: Path | None) -> None:
+        self.source = source
+        self.known: dict[str, Plans] = {}
+
+    def __call__(self, unit: Unit) -> Plans:
+        from lw_torchrl.language.plan_files import load_plans
+
+        zero_shot = unit.setting.name == "zero-shot" and unit.method != "scripted"
+        skills: Literal["MT10", "own"] = "MT10" if zero_shot else "own"
+        if skills not in self.known:
+            self.known[skills] = load_plans("MT50", skills=skills) if self.source is None else load_plans(self.source)
+        return self.known[skills]
+
+
+def _here(named: dict[str, Unit], load: Callable[[Unit], Plans], out: Path) -> Iterator[str]:
+    from lw_torchrl.trainers.experiments import run_unit
+
+    for name, one in named.items():
+        result = run_unit(one, load(one), out)
+        yield f"{name}: mean success {result.mean_success:.3f}, {result.config['seconds']:.0f} s"
+
+
+def _there(
+    named: dict[str, Dataset] | dict[str, Unit], given: list[str], launcher: Literal["local", "ray"], jobs: int
+) -> Iterator[str]:
+    from lw_torchrl.launchers import run_commands
+
+    names = [*named]
+    for index, printed in run_commands([["reproduce", *given, "--unit", name] for name in names], launcher, jobs):
+        yield printed.strip() or names[index]
+
+
+def _report(total: int, lines: Iterator[str]) -> None:
+    """Print what each unit says as it ends, and how long the others will take."""
     started = time.perf_counter()
-    for number, one in enumerate(units, 1):
-        before = time.perf_counter()
-        result = run_unit(one, plans_of(one), out)
-        spent = time.perf_counter() - before
-        left = (time.perf_counter() - started) / number * (len(units) - number)
-        print(
-            f"[{number}/{len(units)}] {one.folder}: mean success {result.mean_success:.3f}, {spent:.0f} s; "
-            f"about {left / 60:.0f} min left"
-        )
-    if unit is None:
-        _summarize(units, out)
+    for number, line in enumerate(lines, 1):
+        left = (time.perf_counter() - started) / number * (total - number)
+        print(f"[{number}/{total}] {line}; about {left / 60:.0f} min left", flush=True)
 
 
-def _summarize(units: list[Unit], out: Path) -> None:
-    """A summary, a table and a figure for each setting, from the results on disk."""
-    from lw_torchrl._files import write_json
-    from lw_torchrl.evaluation import (
-        EvaluationResult,
-        Summary,
-        plot_sorted_tasks,
-        published_curves,
-        summarize,
-    )
+def _summarize(units: list[Unit], load: Callable[[Unit], Plans], out: Path) -> None:
+    """A summary, tables and a figure for each setting, from the results on disk."""
+    from lw_torchrl._files import write_json, write_text
+    from lw_torchrl.evaluation import Comparison, EvaluationResult, plot_sorted_tasks, published_curves, summarize
+    from lw_torchrl.trainers.experiments import load_result
 
-    found: dict[str, dict[str, dict[int, EvaluationResult]]] = {}
+    found: dict[Path, dict[str, dict[int, EvaluationResult]]] = {}
+    settings = {}
     for one in units:
-        result = EvaluationResult.load(out / one.folder / "results.json")
-        found.setdefault(one.setting.name, {}).setdefault(one.method, {})[one.seed] = result
-    for setting, methods in found.items():
-        summaries: dict[str, Summary] = {
-            method: summarize(results, whole_seeds=True) for method, results in methods.items()
-        }
-        curves = published_curves(setting)
-        folder = out / setting / units[0].preset.name
-        for method, summary in summaries.items():
-            print(f"\n{setting}, {method}: {summary.table(curves)}")
-        write_json(folder / "summary.json", {method: summary.to_json() for method, summary in summaries.items()})
-        plot_sorted_tasks(summaries, folder / "tasks.png", published=curves, title=f"{setting}, last checkpoint")
-        print(f"\nwritten to {folder}")
+        alone = all(other.method == "scripted" for other in units)
+        group = one.folder.parent if alone else one.group
+        result = load_result(one, load(one), out)
+        assert result is not None
+        found.setdefault(group, {}).setdefault(one.method, {})[one.seed] = result
+        settings[group] = None if alone else one.setting
+    for group, methods in found.items():
+        setting = settings[group]
+        # One policy for all tasks can be good or bad at all of them alike; a policy for each task cannot.
+        options = {"whole_seeds": setting is not None and setting.targets is None}
+        published = {} if setting is None else published_curves(setting.name, ("PCBC", "DC"))
+        comparison = Comparison(
+            {method: summarize(results, **options) for method, results in methods.items()}, published, **options
+        )
+        folder = out / group
+        print(f"\n{group}\n{comparison.headline()}")
+        write_json(folder / "summary.json", comparison.to_json())
+        write_text(folder / "summary.md", f"{comparison.headline()}\n\n{comparison.per_task()}\n")
+        curves = {} if setting is None else published_curves(setting.name)
+        plot_sorted_tasks(
+            comparison.summaries, folder / "tasks.png", published=curves, title=f"{group}, last checkpoint"
+        )
+        print(f"\nsummary.md, summary.json and tasks.png are in {folder}")

@@ -1,65 +1,154 @@
-"""``lw-torchrl reproduce``: units one by one, then a summary, a table and a figure beside the published curves."""
+"""``lw-torchrl reproduce``: units one by one, then a summary, tables and a figure beside the published curves."""
 
 import json
+import os
+import subprocess
+import sys
+import time
 from dataclasses import replace
+from functools import partial
 from types import MappingProxyType
 
+import numpy as np
 import pytest
 from commands import fails, run
 
 import lw_torchrl as lw
-from lw_torchrl.trainers import experiments
-from lw_torchrl.trainers.experiments import PRESETS, DataSetting
+from lw_torchrl.trainers import experiments, recipes
+from lw_torchrl.trainers.recipes import PRESETS, DataSetting
+
+TINY = """
+from dataclasses import replace
+from functools import partial
+import lw_torchrl as lw
+from lw_torchrl.trainers import experiments, recipes
+from lw_torchrl.trainers.recipes import PRESETS, DataSetting, Execution
+
+training = lw.BehavioralCloningConfig(steps=100, batch_size=180, checkpoint_every=10)
+options = {"target": Execution("clean", (0.0,)), "actor": {"width": 16, "depth": 1}, "training": training}
+recipes.SETTINGS = {
+    "few-shot": DataSetting("few-shot", "MT10", 2), "one-shot": DataSetting("one-shot", "MT10", 1, targets="MT10")
+}
+recipes.PRESETS = {"strong": {name: replace(PRESETS["strong"][name], **options) for name in recipes.SETTINGS}}
+experiments.evaluate = partial(lw.evaluate, max_steps=60)
+experiments.collect_demonstrations = partial(lw.collect_demonstrations, max_steps=100)
+"""
 
 
 @pytest.fixture
 def tiny(monkeypatch):
     """Experiments of one demonstration and twenty steps."""
     small = replace(
-        PRESETS["strong"],
+        PRESETS["strong"]["few-shot"],
         actor={"width": 16, "depth": 1},
         training=lw.BehavioralCloningConfig(steps=20, batch_size=20),
     )
-    monkeypatch.setattr(experiments, "PRESETS", MappingProxyType({**PRESETS, "strong": small}))
-    monkeypatch.setattr(experiments, "SETTINGS", MappingProxyType({"few-shot": DataSetting("few-shot", "reach", 1)}))
+    presets = {"strong": {"few-shot": small}, "paper": {"few-shot": replace(small, passes=500)}}
+    monkeypatch.setattr(recipes, "PRESETS", MappingProxyType(presets))
+    monkeypatch.setattr(experiments, "evaluate", partial(lw.evaluate, max_steps=60))
+    monkeypatch.setattr(recipes, "SETTINGS", MappingProxyType({"few-shot": DataSetting("few-shot", "reach", 1)}))
+
+
+def arguments(out, *more, methods=("pcbc", "dc"), seeds=(0, 1)):
+    return ("reproduce", "few-shot", "--seeds", *seeds, "--methods", *methods, "--episodes", 1, "--out", out, *more)
 
 
 def test_units_and_their_summary(capsys, tmp_path, tiny):
-    arguments = (
-        "reproduce",
-        "few-shot",
-        "--seeds",
-        0,
-        1,
-        "--methods",
-        "pcbc",
-        "dc",
-        "--episodes",
-        1,
-        "--out",
-        tmp_path,
-    )
-    out = run(capsys, *arguments, "--unit", "few-shot/strong/dc/seed1")
-    assert "[1/1] few-shot/strong/dc/seed1: mean success 0." in out
-    assert not (tmp_path / "few-shot" / "strong" / "pcbc").exists()
-    first = (tmp_path / "few-shot" / "strong" / "dc" / "seed1" / "results.json").read_text()
+    listed = run(capsys, *arguments(tmp_path, "--list")).split()
+    datasets = [f"demonstrations/reachx1-astray-seed{seed}" for seed in (0, 1)]
+    assert listed == [
+        *datasets,
+        *(f"few-shot/strong/{method}/seed{seed}" for method in ("pcbc", "dc") for seed in (0, 1)),
+    ]
+    assert not any(tmp_path.iterdir())
 
-    out = run(capsys, *arguments)
+    run(capsys, *arguments(tmp_path, "--unit", listed[1]))
+    assert (tmp_path / listed[1] / "metadata.json").is_file()
+    assert not (tmp_path / listed[0]).exists()
+    out = run(capsys, *arguments(tmp_path, "--unit", listed[-1]))
+    assert "few-shot/strong/dc/seed1: mean success 0." in out
+    assert not (tmp_path / "few-shot" / "strong" / "pcbc").exists()
+    first = (tmp_path / listed[-1] / "results.json").read_text()
+
+    out = run(capsys, *arguments(tmp_path))
     assert "[4/4] few-shot/strong/dc/seed1" in out
     assert "about 0 min left" in out
-    assert "few-shot, pcbc: mean 0." in out
-    assert "2 seeds" in out
-    assert "PCBC published, last" in out
+    assert "| PCBC published, last" in out
+    assert "pcbc - dc: " in out
+    assert "probability of improvement 0." in out
     folder = tmp_path / "few-shot" / "strong"
     summary = json.loads((folder / "summary.json").read_text())
-    assert list(summary) == ["pcbc", "dc"]
-    assert list(summary["dc"]["tasks"]) == list(lw.MT50)
+    assert list(summary["methods"]) == ["pcbc", "dc"]
+    assert list(summary["methods"]["dc"]["tasks"]) == list(lw.MT50)
+    assert summary["pairs"][0]["methods"] == ["pcbc", "dc"]
+    assert summary["published_means"]["PCBC published, last"] == pytest.approx(0.393, abs=1e-3)
+    assert (folder / "summary.md").read_text().count("\n| ") == 4 + 2 + 52 + 2 - 1
     assert (folder / "tasks.png").read_bytes().startswith(b"\x89PNG")
     assert (folder / "dc" / "seed1" / "results.json").read_text() == first
 
 
-def test_an_unknown_unit_is_named(capsys, tmp_path, tiny):
-    message = fails(
-        capsys, "reproduce", "few-shot", "--seeds", 0, "--unit", "few-shot/strong/pbc/seed0", "--out", tmp_path
+def test_plans_of_ones_own(capsys, tmp_path, tiny):
+    pairs = {task: [["the gripper is open", "move the gripper to the target"]] for task in lw.MT50}
+    (tmp_path / "mine.json").write_text(json.dumps(pairs))
+    own = ("--plans", tmp_path / "mine.json")
+    out = run(capsys, "reproduce", "few-shot", "--seeds", 0, "--list", "--out", tmp_path, *own).split()
+    assert out[1:] == [f"few-shot/strong-mine/{method}/seed0" for method in ("pcbc", "dc", "one-hot")]
+    run(capsys, *arguments(tmp_path / "out", "--unit", out[1], *own, methods=["pcbc"], seeds=[0]))
+    actor = lw.load_actor(tmp_path / "out" / out[1] / "checkpoint.zip")
+    assert actor.skills == ("move the gripper to the target",)
+
+
+def test_what_it_refuses(capsys, tmp_path, tiny):
+    message = fails(capsys, *arguments(tmp_path, "--unit", "few-shot/strong/pbc/seed0"))
+    assert "unit must be one of" in message
+    assert "did you mean 'few-shot/strong/pcbc/seed0'" in message
+    assert "passes is for the preset paper" in fails(capsys, *arguments(tmp_path, "--passes", 3))
+    assert "passes must be at least 1" in fails(capsys, *arguments(tmp_path, "--preset", "paper", "--passes", 0))
+    assert "jobs must be at least 1" in fails(capsys, *arguments(tmp_path, "--jobs", 0))
+
+
+def start(program, out, *more):
+    """``lw-torchrl reproduce`` on tiny experiments in a process of its own."""
+    said = [str(one) for one in ("--methods", "pcbc", "--seeds", 0, "--episodes", 1, "--out", out, *more)]
+    code = f"{TINY}\nfrom lw_torchrl.cli import main\nmain(['reproduce', {program!r}, *{said!r}])"
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    return subprocess.Popen(
+        [sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
-    assert message is None or "did you mean" in message
+
+
+def finish(process):
+    with process:
+        error = process.communicate()[1]
+    assert process.returncode == 0, error[-2000:]
+
+
+def results(folder):
+    """Every results file but for the times."""
+    found = {}
+    for path in folder.rglob("results.json"):
+        result = json.loads(path.read_text())
+        del result["config"]["seconds"]
+        found[path.relative_to(folder).as_posix()] = result
+    return found, json.loads(next(folder.rglob("summary.json")).read_text())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("setting", ["few-shot", "one-shot"])
+def test_killed_at_five_random_moments_it_ends_the_same(tmp_path, setting):
+    started = time.perf_counter()
+    finish(start(setting, tmp_path, "--list"))
+    idle = time.perf_counter() - started  # to import everything
+    finish(start(setting, tmp_path / "whole"))
+    work = time.perf_counter() - started - 2 * idle
+    killed = 0
+    for moment in np.random.default_rng(5).uniform(0.0, 0.4, 5):
+        with start(setting, tmp_path / "killed") as process:
+            try:
+                process.communicate(timeout=idle + moment * work)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                killed += 1
+    assert killed >= 3
+    finish(start(setting, tmp_path / "killed"))
+    assert results(tmp_path / "killed") == results(tmp_path / "whole")

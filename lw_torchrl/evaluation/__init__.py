@@ -1,5 +1,6 @@
 """Evaluation: exactly k episodes of each task, their results, statistics over seeds, and figures."""
 
+from lw_torchrl.evaluation.comparison import Comparison, Pair
 from lw_torchrl.evaluation.evaluate import evaluate
 from lw_torchrl.evaluation.figures import plot_sorted_tasks, plot_success
 from lw_torchrl.evaluation.published import published, published_curves, published_plans
@@ -15,9 +16,11 @@ from lw_torchrl.evaluation.statistics import (
 from lw_torchrl.evaluation.summary import Summary, TaskSummary, summarize, summarize_rates
 
 __all__ = [
+    "Comparison",
     "EpisodeResult",
     "Estimate",
     "EvaluationResult",
+    "Pair",
     "Summary",
     "TaskSummary",
     "count_solved",

@@ -1,4 +1,4 @@
-"""Conditional plans: (condition, skill) pairs in English, kept as text files in the chain_py format.
+"""Conditional plans: (condition, skill) pairs in English, written as text in the chain_py format.
 
     # drawer-open: Take hold of the drawer handle and pull the drawer open.
     def drawer_open(robot):
@@ -12,21 +12,15 @@ Source: paper section 'Conditional Plan Generation' and its figure of a chain_py
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from importlib.resources import files
-from importlib.resources.abc import Traversable
-from pathlib import Path
 from types import MappingProxyType
-from typing import Literal
 
-from lw_torchrl._checks import check_choice, nearest
-from lw_torchrl._files import write_text
+from lw_torchrl._checks import nearest
 from lw_torchrl.language.queries import Query, check_query
-from lw_torchrl.language.tasks import MT10, TASKS, Task, check_task, get_task
+from lw_torchrl.language.tasks import TASKS, Task, check_task, get_task
 
 _TEXT = r'"((?:[^"\\]|\\.)*)"|\'((?:[^\'\\]|\\.)*)\''
 _DEF = re.compile(r"def\s+([A-Za-z]\w*)\s*\(\s*robot\s*\)\s*:")
@@ -282,72 +276,3 @@ def format_plan(plan: ConditionalPlan) -> str:
         verb, _, details = step.skill.partition(" ")
         lines += [f"    if check({quote(str(step.condition))}):", f"        robot.{verb}({quote(details)})"]
     return "\n".join(lines) + "\n"
-
-
-def load_plans(
-    source: str | os.PathLike[str],
-    *,
-    skills: Literal["own", "MT10"] = "own",
-    tasks: Mapping[str, Task] = TASKS,
-) -> Plans:
-    """Load plans.
-
-    Args:
-        source: "MT10" or "MT50" for the shipped plans of a set; otherwise the path of a .plan file, or of a
-            folder of them.
-        skills: of the shipped plans, "own" for the set whose every step has a scripted skill; "MT10" for the set
-            that words every step as the plans of MT10 do, for policies that have only seen MT10.
-        tasks: whose objects the conditions name, by task name, as from :func:`load_tasks`.
-
-    Returns:
-        The plans, by task name.
-
-    Raises:
-        FileNotFoundError: there is no such file or folder, or the folder holds no plans.
-        PlanError: (a ValueError) a file holds no valid plan, or one for another task than its name says.
-        ValueError: another value for ``skills``, or "MT10" with plans of your own.
-
-    Example:
-        >>> load_plans("MT10")["reach"].task
-        'reach'
-    """
-    check_choice("skills", skills, ("own", "MT10"))
-    found: list[Traversable]
-    if source in ("MT10", "MT50"):
-        data = files("lw_torchrl.language") / "data"
-        other = "plans_mt10_skills" if skills == "MT10" else "plans"
-        found = [
-            data / ("plans" if task in MT10 else other) / f"{task}.plan"
-            for task in (MT10 if source == "MT10" else TASKS)
-        ]
-    elif skills != "own":
-        raise ValueError(f"skills={skills!r} is for the shipped plans, 'MT10' and 'MT50', got source {str(source)!r}")
-    else:
-        path = Path(source)
-        if not path.exists():
-            raise FileNotFoundError(f"no plan file or folder {str(path)!r}; 'MT10' and 'MT50' name the shipped plans")
-        # A name with a dot in front is what a killed save_plans leaves.
-        listed = [path] if path.is_file() else sorted(p for p in path.glob("*.plan") if p.name[0] != ".")
-        found = list[Traversable](listed)
-        if not found:
-            raise FileNotFoundError(f"the folder {str(path)!r} holds no .plan files")
-    plans = []
-    for file in found:
-        try:
-            text = file.read_text("utf-8-sig")
-        except UnicodeDecodeError as error:
-            raise PlanError(f"{file.name}: a plan is a text file in UTF-8: {error}") from error
-        plans.append(parse_plan(text, file.name.removesuffix(".plan"), file.name, tasks))
-    return Plans(plans)
-
-
-def save_plans(plans: Plans | Mapping[str, ConditionalPlan], folder: str | os.PathLike[str]) -> list[Path]:
-    """Write each plan to ``folder``/<task>.plan; a file is replaced whole or not at all."""
-    checked = as_plans(plans)
-    root = Path(folder)
-    root.mkdir(parents=True, exist_ok=True)
-    written = []
-    for task, plan in checked.items():
-        written.append(root / f"{task}.plan")
-        write_text(written[-1], format_plan(plan))
-    return written

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from lw_torchrl._files import replacing
-from lw_torchrl.language.plans import load_plans
+from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.tasks import TASKS
 
 TEXT_DIMENSION = 384

@@ -20,7 +20,7 @@ from torchrl.record.loggers import Logger
 from tqdm.auto import tqdm
 
 from lw_torchrl._checks import check_choice, check_int, check_scale
-from lw_torchrl.trainers.checkpoint import TrainingState, describe_actor, load_into, read_description
+from lw_torchrl.trainers.checkpoint import TrainingState, check_description, describe_actor, describe_data, load_into
 
 LOSSES = ("l1", "l2", "smooth_l1")
 
@@ -141,13 +141,13 @@ class BehavioralCloningTrainer:
         self.optimizer, self.schedule = make_optimizer(self.loss.parameters(), config)
         self.state = TrainingState(replay.sampler, generator)
         if self.checkpoint is not None and self.checkpoint.exists():
-            self._resume(self.checkpoint)
+            check_description(self.checkpoint, self._describe())
+            load_into(self.checkpoint, **self._components())
         elif config.normalize and hasattr(actor, "fit_normalization"):
             actor.fit_normalization(replay.storage.get(slice(0, len(replay))).get("observation"))
 
     def _describe(self) -> dict[str, Any]:
-        demonstrations = getattr(self.replay, "demonstrations", None)
-        data = None if demonstrations is None else demonstrations.config.to_json()
+        data = describe_data(self.replay)
         return {"actor": describe_actor(self.actor), "training": asdict(self.config), "data": data}
 
     def _components(self) -> dict[str, Any]:
@@ -157,19 +157,6 @@ class BehavioralCloningTrainer:
             "schedule": self.schedule,
             "state": self.state,
         }
-
-    def _resume(self, path: Path) -> None:
-        found, ours = read_description(path), self._describe()
-        for part in ours:
-            if found.get(part) != ours[part]:
-                before, now = found.get(part) or {}, ours[part] or {}
-                different = [key for key in {**before, **now} if before.get(key) != now.get(key)]
-                kind = "architecture" if part == "actor" else "configuration"
-                raise ValueError(
-                    f"checkpoint: {str(path)!r} is of another {kind}, its {part} differs in "
-                    f"{', '.join(different)}; choose another file, or delete it to start again"
-                )
-        load_into(path, **self._components())
 
     def save(self) -> None:
         """Write the checkpoint; an earlier one is replaced whole."""

@@ -33,6 +33,12 @@ def describe_actor(actor: nn.Module) -> dict[str, Any]:
     return {"kind": type(actor).__name__}
 
 
+def describe_data(replay: Any) -> dict[str, Any] | None:
+    """What demonstrations a replay buffer shows, as JSON; None for a buffer that is none of ours."""
+    demonstrations = getattr(replay, "demonstrations", None)
+    return None if demonstrations is None else demonstrations.config.to_json()
+
+
 def _make_actor(found: dict[str, Any], text_encoder: Callable[[Sequence[str]], Tensor] | None) -> Actor:
     check_choice("the checkpoint's actor", found["kind"], ACTORS)
     if found["kind"] == "DescriptorConditionedActor":
@@ -57,6 +63,26 @@ def read_description(path: str | os.PathLike[str]) -> dict[str, Any]:
         return found
     except (CheckpointError, zipfile.BadZipFile, OSError, ValueError, KeyError) as error:
         raise ValueError(f"checkpoint: {str(path)!r} is damaged or none of ours ({error})") from error
+
+
+def save_actor(actor: Actor, path: str | os.PathLike[str]) -> None:
+    """Write an actor alone, for :func:`load_actor`; an earlier file is replaced whole."""
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    Checkpoint(format="archive", description={"actor": describe_actor(actor)}, actor=actor).save(path)
+
+
+def check_description(path: Path, ours: dict[str, Any]) -> None:
+    """Raise :class:`ValueError` unless the checkpoint was saved with the description ``ours``."""
+    found = read_description(path)
+    for part in ours:
+        if found.get(part) != ours[part]:
+            before, now = found.get(part) or {}, ours[part] or {}
+            different = [key for key in {**before, **now} if before.get(key) != now.get(key)]
+            kind = "architecture" if part == "actor" else "configuration"
+            raise ValueError(
+                f"checkpoint: {str(path)!r} is of another {kind}, its {part} differs in "
+                f"{', '.join(different)}; choose another file, or delete it to start again"
+            )
 
 
 def load_actor(path: str | os.PathLike[str], *, text_encoder: Callable[[Sequence[str]], Tensor] | None = None) -> Actor:

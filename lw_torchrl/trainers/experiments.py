@@ -1,128 +1,86 @@
-"""The paper's experiments: what data a setting has, how a preset trains, and the units of work that they make."""
+"""The paper's experiments as units of work: datasets, and policies trained on them and evaluated."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from hashlib import sha256
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import torch
+from filelock import FileLock
+from tqdm.auto import tqdm
 
 from lw_torchrl._checks import check_choice
-from lw_torchrl.data import LanguageWorldExperienceReplay, TaskBalancedSampler, collect_demonstrations
+from lw_torchrl.data import CoLearningSampler, LanguageWorldExperienceReplay, TaskBalancedSampler
+from lw_torchrl.data.collect import collect_demonstrations
 from lw_torchrl.envs import QAFTransform
 from lw_torchrl.evaluation import EvaluationResult, evaluate
-from lw_torchrl.language.plans import Plans
+from lw_torchrl.language.plans import Plans, format_plan
 from lw_torchrl.language.tasks import MT50, resolve_tasks
 from lw_torchrl.modules import DescriptorConditionedActor, PlanConditionedActor, ScriptedSkillActor
-from lw_torchrl.trainers.behavioral_cloning import BehavioralCloningConfig, BehavioralCloningTrainer
+from lw_torchrl.trainers.behavioral_cloning import BehavioralCloningTrainer
+from lw_torchrl.trainers.checkpoint import load_actor, save_actor
+from lw_torchrl.trainers.recipes import DataSetting, Execution, Preset
+from lw_torchrl.trainers.stacked import StackedBehavioralCloning
 
 METHODS = ("pcbc", "dc", "one-hot", "scripted")
 EVALUATION_SEED = 10_000
 """Training seeds count from 0; the evaluation of training seed k has seed 10000 + k."""
+RESULTS = "results.json"
 
 
 @dataclass(frozen=True)
-class DataSetting:
-    """What demonstrations an experiment may see.
+class Dataset:
+    """Demonstrations that units share: a unit of work itself.
 
     Attributes:
-        name: "zero-shot", "few-shot".
-        base: the tasks demonstrated, "MT10" or "MT50".
+        tasks: "MT10" or another argument of :func:`resolve_tasks`.
         episodes: demonstrations of each.
+        execution: how the experts are executed.
+        seed: of the initial states and the noise.
     """
 
-    name: str
-    base: str
+    tasks: str
     episodes: int
+    execution: Execution
+    seed: int
 
+    @property
+    def folder(self) -> Path:
+        """Where it goes, below the experiments' folder."""
+        return Path("demonstrations") / f"{self.tasks}x{self.episodes}-{self.execution.name}-seed{self.seed}"
 
-SETTINGS: Mapping[str, DataSetting] = MappingProxyType(
-    {setting.name: setting for setting in (DataSetting("zero-shot", "MT10", 100), DataSetting("few-shot", "MT50", 10))}
-)
-"""Source: paper, the table of data configurations."""
-
-
-@dataclass(frozen=True)
-class Preset:
-    """How demonstrations are made and policies trained, the same for every method, task and setting.
-
-    Attributes:
-        name: "strong", ours; "paper", the published recipe.
-        noise_scale: execution noise of the demonstrations, gone through in turn.
-        noise_hold: steps for which each draw is kept.
-        redraw_failures: keep successful demonstrations only.
-        after_success: drop what comes so many steps after the first success; None keeps all.
-        passes: train for so many passes over the rows instead of ``training.steps`` minibatches.
-        actor: options of the actors.
-        training: of the optimizer.
-    """
-
-    name: str
-    noise_scale: tuple[float, ...]
-    noise_hold: int
-    redraw_failures: bool
-    after_success: int | None
-    passes: int | None
-    actor: Mapping[str, Any] = field(hash=False)
-    training: BehavioralCloningConfig
-
-
-PRESETS: Mapping[str, Preset] = MappingProxyType(
-    {
-        "strong": Preset(
-            "strong",
-            noise_scale=(0.0, 0.1, 0.2, 0.3, 0.4),
-            noise_hold=10,
-            redraw_failures=True,
-            after_success=20,
-            passes=None,
-            actor=MappingProxyType({"features": "differences", "width": 512}),
-            training=BehavioralCloningConfig(steps=12_000, batch_size=500),
-        ),
-        "paper": Preset(
-            "paper",
-            noise_scale=(0.0,),
-            noise_hold=1,
-            redraw_failures=False,
-            after_success=None,
-            passes=500,
-            actor=MappingProxyType(
-                {
-                    "features": "raw",
-                    "feature_noise": 0.0,
-                    "encoder_width": 64,
-                    "encoder_depth": 3,
-                    "width": (128, 128, 128, 64, 32),
-                }
-            ),
-            training=BehavioralCloningConfig(
-                batch_size=200,
-                learning_rate=1e-5,
-                optimizer="sgd",
-                momentum=0.995,
-                weight_decay=0.0,
-                schedule="constant",
-                normalize=False,
-                max_grad_norm=1e9,
-            ),
-        ),
-    }
-)
+    def collect(self, out: Path, progress: bool) -> None:
+        """Collect it, or what is left; of several processes one does, and the others wait."""
+        root = out / self.folder
+        root.parent.mkdir(parents=True, exist_ok=True)
+        with FileLock(root.with_name(f".{root.name}.lock")):
+            collect_demonstrations(
+                self.tasks,
+                episodes_per_task=self.episodes,
+                root=root,
+                seed=self.seed,
+                noise_scale=self.execution.noise_scale,
+                noise_hold=self.execution.noise_hold,
+                redraw_failures=self.execution.redraw_failures,
+                progress=progress,
+            )
 
 
 @dataclass(frozen=True)
 class Unit:
-    """One policy, or plans with scripts, of one training seed: what a scheduler runs.
+    """One policy, or one for each target, or plans with scripts, of one training seed: what a scheduler runs.
 
     Attributes:
-        setting: one of :data:`SETTINGS`.
+        setting: what data it sees; scripts see none, and are the same in every setting.
         method: one of :data:`METHODS`.
         seed: of demonstrations, initial weights and minibatches.
         preset: how to train.
         episodes: evaluated for each task.
+        plans_name: part of the folder's name, for other plans than ours.
     """
 
     setting: DataSetting
@@ -130,55 +88,160 @@ class Unit:
     seed: int
     preset: Preset
     episodes: int = 20
+    plans_name: str = ""
 
     def __post_init__(self) -> None:
         check_choice("method", self.method, METHODS)
 
     @property
-    def folder(self) -> Path:
-        """Where its files go, below the experiment's folder."""
-        return Path(self.setting.name) / self.preset.name / self.method / f"seed{self.seed}"
+    def group(self) -> Path:
+        """The folder of the setting, the preset and the plans: what methods are compared in."""
+        return Path(self.setting.name) / "-".join(filter(None, (self.preset.name, self.plans_name)))
 
     @property
-    def data(self) -> Path:
-        """The folder of its demonstrations, which the methods share."""
-        return Path("demonstrations") / f"{self.setting.name}-{self.preset.name}-seed{self.seed}"
+    def folder(self) -> Path:
+        """Where its files go, below the experiments' folder."""
+        if self.method == "scripted":
+            return Path("-".join(filter(None, ("scripted", self.plans_name)))) / f"seed{self.seed}"
+        return self.group / self.method / f"seed{self.seed}"
+
+    @property
+    def datasets(self) -> tuple[Dataset, ...]:
+        """What it is trained on: the base tasks' demonstrations, and the targets'."""
+        if self.method == "scripted":
+            return ()
+        base = Dataset(self.setting.base, self.setting.episodes, self.preset.base, self.seed)
+        if self.setting.targets is None:
+            return (base,)
+        assert self.preset.target is not None
+        return base, Dataset(self.setting.targets, 1, self.preset.target, self.seed)
+
+    def describe(self, plans: Plans) -> dict[str, Any]:
+        """Everything that its result hangs on, as JSON."""
+        text = "".join(map(format_plan, plans.values()))
+        described: dict[str, Any] = {
+            "setting": self.setting.name,
+            "method": self.method,
+            "seed": self.seed,
+            "preset": self.preset.name,
+            "plans": sha256(text.encode()).hexdigest()[:16] if self.method in ("pcbc", "scripted") else None,
+            "datasets": [asdict(dataset) for dataset in self.datasets],
+        }
+        if self.method != "scripted":
+            options = {"actor": dict(self.preset.actor), "training": asdict(self.preset.training)}
+            described |= options | {"after_success": self.preset.after_success, "passes": self.preset.passes}
+        return _plain(described)
 
 
-def _train(unit: Unit, plans: Plans, out: Path, progress: bool) -> PlanConditionedActor | DescriptorConditionedActor:
-    """Collect, then train or carry on, from whatever is there."""
-    setting, preset = unit.setting, unit.preset
-    collect_demonstrations(
-        setting.base,
-        episodes_per_task=setting.episodes,
-        root=out / unit.data,
-        seed=unit.seed,
-        noise_scale=preset.noise_scale,
-        noise_hold=preset.noise_hold,
-        redraw_failures=preset.redraw_failures,
-        progress=progress,
-    )
-    replay = LanguageWorldExperienceReplay(
-        out / unit.data,
-        sampler=TaskBalancedSampler(),
-        transform=QAFTransform(plans) if unit.method == "pcbc" else None,
-        after_success=preset.after_success,
-    )
-    config = replace(preset.training, seed=unit.seed)
-    if preset.passes is not None:
-        config = replace(
-            config, steps=max(1, preset.passes * len(replay) // config.batch_size), checkpoint_every=10_000
-        )
-    torch.manual_seed(unit.seed)
-    actor: PlanConditionedActor | DescriptorConditionedActor
+def _plain(value: Any) -> Any:
+    """As JSON gives it back: lists for tuples."""
+    if isinstance(value, dict):
+        return {key: _plain(one) for key, one in value.items()}
+    return [_plain(one) for one in value] if isinstance(value, (list, tuple)) else value
+
+
+Trained = PlanConditionedActor | DescriptorConditionedActor
+
+
+def _make_actor(unit: Unit, plans: Plans, seed: int) -> Trained:
+    torch.manual_seed(seed)
+    options: dict[str, Any] = dict(unit.preset.actor)
     if unit.method == "pcbc":
-        actor = PlanConditionedActor(plans, **preset.actor)
-    else:
-        condition = "description" if unit.method == "dc" else "one-hot"
-        actor = DescriptorConditionedActor(MT50, condition=condition, **preset.actor)  # type: ignore[arg-type]
+        return PlanConditionedActor(plans, **options)
+    return DescriptorConditionedActor(MT50, condition="description" if unit.method == "dc" else "one-hot", **options)
+
+
+def _transform(unit: Unit, plans: Plans) -> QAFTransform | None:
+    return QAFTransform(plans) if unit.method == "pcbc" else None
+
+
+def _train_one(unit: Unit, plans: Plans, out: Path, progress: bool) -> Trained:
+    """One policy for all tasks; training carries on from its checkpoint."""
+    replay = LanguageWorldExperienceReplay(
+        out / unit.datasets[0].folder,
+        sampler=TaskBalancedSampler(),
+        transform=_transform(unit, plans),
+        after_success=unit.preset.after_success,
+    )
+    config = replace(unit.preset.training, seed=unit.seed)
+    if unit.preset.passes is not None:
+        config = replace(config, steps=max(1, unit.preset.passes * len(replay) // config.batch_size))
+    actor = _make_actor(unit, plans, unit.seed)
     checkpoint = out / unit.folder / "checkpoint.zip"
     BehavioralCloningTrainer(actor, replay, config, checkpoint=checkpoint, progress=progress).train()
     return actor
+
+
+def _train_each(unit: Unit, plans: Plans, out: Path, progress: bool) -> dict[str, Trained]:
+    """A policy for each target, all trained together; ``models/<target>.zip`` holds each, once they are done."""
+    targets = resolve_tasks(unit.setting.targets or ())
+    models = {target: out / unit.folder / "models" / f"{target}.zip" for target in targets}
+    if all(path.is_file() for path in models.values()):
+        return {target: load_actor(path) for target, path in models.items()}
+    roots = [out / dataset.folder for dataset in unit.datasets]
+    replays = [
+        LanguageWorldExperienceReplay(
+            roots,
+            episodes=[None, {target: 1}],
+            sampler=CoLearningSampler(target),
+            transform=_transform(unit, plans),
+            after_success=unit.preset.after_success,
+        )
+        for target in targets
+    ]
+    config = replace(unit.preset.training, seed=1_000 * unit.seed)  # the i-th model has the i-th seed from here
+    if unit.preset.passes is not None:  # over the base tasks, which have half of each minibatch
+        base = LanguageWorldExperienceReplay(roots[0], after_success=unit.preset.after_success)
+        config = replace(config, steps=max(1, 2 * unit.preset.passes * len(base) // config.batch_size))
+    actors = [_make_actor(unit, plans, config.seed + number) for number in range(len(targets))]
+    checkpoint = out / unit.folder / "checkpoint.zip"
+    StackedBehavioralCloning(actors, replays, config, checkpoint=checkpoint, progress=progress).train()
+    for actor, path in zip(actors, models.values(), strict=True):
+        save_actor(actor, path)
+    checkpoint.unlink()
+    return dict(zip(targets, actors, strict=True))
+
+
+def _evaluate(unit: Unit, plans: Plans, out: Path, tasks: tuple[str, ...], progress: bool) -> EvaluationResult:
+    options: dict[str, Any] = {
+        "episodes_per_task": unit.episodes,
+        "seed": EVALUATION_SEED + unit.seed,
+        "noise_scale": 0.1,
+        "stop_at_success": True,
+    }
+    if unit.method == "scripted":
+        return evaluate(ScriptedSkillActor(plans), tasks=tasks, progress=progress, **options)
+    if unit.setting.targets is None:
+        return evaluate(_train_one(unit, plans, out, progress), tasks=tasks, progress=progress, **options)
+    actors = _train_each(unit, plans, out, progress)
+    each = [
+        evaluate(actors[task], tasks=task, progress=False, **options)
+        for task in tqdm(sorted({*tasks} & {*actors}), desc="evaluating", unit="model", delay=1, disable=not progress)
+    ]
+    shown = [task for one in each for task in one.config["tasks"]]
+    return EvaluationResult(each[0].config | {"tasks": shown}, tuple(e for one in each for e in one.episodes))
+
+
+def load_result(unit: Unit, plans: Plans, out: Path) -> EvaluationResult | None:
+    """The result of a unit, if it is there.
+
+    Raises:
+        ValueError: it is of another configuration.
+    """
+    path = out / unit.folder / RESULTS
+    if not path.is_file():
+        return None
+    result = EvaluationResult.load(path)
+    found, ours = result.config.get("unit") or {}, unit.describe(plans)
+    different = [key for key in ours if found.get(key) != ours[key]]
+    if result.config.get("episodes_per_task") != unit.episodes:
+        different.append("episodes")
+    if different:
+        raise ValueError(
+            f"out: {str(path)!r} is of another configuration, it differs in {', '.join(different)}; choose another "
+            "folder, or delete it to do the unit again"
+        )
+    return result
 
 
 def run_unit(
@@ -194,30 +257,26 @@ def run_unit(
     Args:
         unit: what to do.
         plans: a plan for each of the 50 tasks.
-        out: the experiment's folder.
+        out: the experiments' folder.
         tasks: to evaluate.
         progress: show progress bars.
 
     Returns:
-        The evaluation of the last checkpoint, action noise 0.1.
+        The evaluation of the last checkpoint, action noise 0.1; ``config["unit"]`` says what was done, and
+        ``config["seconds"]`` how long this call took.
 
     Raises:
         ValueError: ``out`` holds the same unit of another configuration.
 
     Source: paper section 'Conditional Plan Experiments'.
     """
-    path = out / unit.folder / "results.json"
-    if path.is_file():
-        return EvaluationResult.load(path)
-    actor: Any = ScriptedSkillActor(plans) if unit.method == "scripted" else _train(unit, plans, out, progress)
-    result = evaluate(
-        actor,
-        tasks=resolve_tasks(tasks),
-        episodes_per_task=unit.episodes,
-        seed=EVALUATION_SEED + unit.seed,
-        noise_scale=0.1,
-        stop_at_success=True,
-        progress=progress,
-    )
-    result.save(path)
+    if (done := load_result(unit, plans, out)) is not None:
+        return done
+    started = time.perf_counter()
+    for dataset in unit.datasets:
+        dataset.collect(out, progress)
+    result = _evaluate(unit, plans, out, resolve_tasks(tasks), progress)
+    spent = {"unit": unit.describe(plans), "seconds": round(time.perf_counter() - started, 1)}
+    result = replace(result, config=result.config | spent)
+    result.save(out / unit.folder / RESULTS)
     return result

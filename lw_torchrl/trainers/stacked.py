@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.func import functional_call, stack_module_state, vmap
+from torchrl.checkpoint import Checkpoint
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.objectives.utils import distance_loss
 from tqdm.auto import tqdm
 
 from lw_torchrl.modules import DescriptorConditionedActor, PlanConditionedActor
 from lw_torchrl.trainers.behavioral_cloning import BehavioralCloningConfig, make_optimizer
+from lw_torchrl.trainers.checkpoint import TrainingState, check_description, describe_actor, describe_data, load_into
 
 
 class _Act(nn.Module):
@@ -27,6 +32,35 @@ class _Act(nn.Module):
         return self.actor.act(*prepared)[0]
 
 
+class _Parameters:
+    """Tensors by name as a checkpoint's component."""
+
+    def __init__(self, tensors: Mapping[str, Tensor]) -> None:
+        self.tensors = tensors
+
+    def state_dict(self) -> dict[str, Any]:
+        return {name: tensor.detach().clone() for name, tensor in self.tensors.items()}
+
+    @torch.no_grad()
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        for name, tensor in self.tensors.items():
+            tensor.copy_(state_dict[name])
+
+
+class _States:
+    """Training states by number as a checkpoint's component."""
+
+    def __init__(self, states: Sequence[TrainingState]) -> None:
+        self.states = states
+
+    def state_dict(self) -> dict[str, Any]:
+        return {str(number): state.state_dict() for number, state in enumerate(self.states)}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        for number, state in enumerate(self.states):
+            state.load_state_dict(state_dict[str(number)])
+
+
 class StackedBehavioralCloning:
     """Trains M actors, each on batches of its own, as :class:`BehavioralCloningTrainer` trains one.
 
@@ -37,11 +71,12 @@ class StackedBehavioralCloning:
         actors: M actors of one architecture, with ``prepare`` and ``act``; they are trained in place.
         replays: M buffers; the i-th actor's batches come from the i-th.
         config: how to train each; the i-th has the seed ``config.seed + i``.
+        checkpoint: a file to write checkpoints to. If it is there already, training carries on from it.
         progress: show a progress bar.
 
     Raises:
-        ValueError: not as many buffers as actors, or actors of different shapes; in :meth:`train`, a loss that is
-            no number.
+        ValueError: not as many buffers as actors, or actors of different shapes; a checkpoint that is damaged, or of
+            other actors or another configuration; in :meth:`train`, a loss that is no number.
 
     Example:
         >>> import lw_torchrl as lw, tempfile
@@ -66,17 +101,19 @@ class StackedBehavioralCloning:
         replays: Sequence[TensorDictReplayBuffer],
         config: BehavioralCloningConfig | None = None,
         *,
+        checkpoint: str | os.PathLike[str] | None = None,
         progress: bool = True,
     ) -> None:
         self.config = config = config or BehavioralCloningConfig()
         if not actors or len(replays) != len(actors):
             raise ValueError(f"replays must be as many as actors, at least one, got {len(replays)} and {len(actors)}")
         self.actors, self.replays, self.progress = list(actors), list(replays), progress
-        self._noise = []
+        self.checkpoint = None if checkpoint is None else Path(checkpoint)
+        self.states = []
         for number, (actor, replay) in enumerate(zip(actors, replays, strict=True)):
             generator = torch.Generator().manual_seed(config.seed + number)
             replay.set_rng(generator)
-            self._noise.append(torch.Generator().manual_seed(config.seed + number).get_state())
+            self.states.append(TrainingState(replay.sampler, generator))
             if config.normalize:
                 actor.fit_normalization(replay.storage.get(slice(0, len(replay))).get("observation"))
             actor.train()
@@ -90,17 +127,46 @@ class StackedBehavioralCloning:
         self._act = vmap(lambda p, b, prepared: functional_call(shared, (p, b), prepared))
         self._buffers = buffers
         self.optimizer, self.schedule = make_optimizer(list(self._parameters.values()), config)
-        self.steps = 0
+        if self.checkpoint is not None and self.checkpoint.exists():
+            check_description(self.checkpoint, self._describe())
+            load_into(self.checkpoint, **self._components())
+
+    def _describe(self) -> dict[str, Any]:
+        data = {str(number): describe_data(replay) for number, replay in enumerate(self.replays)}
+        return {
+            "actor": describe_actor(self.actors[0]) | {"number": len(self.actors)},
+            "training": asdict(self.config),
+            "data": data,
+        }
+
+    def _components(self) -> dict[str, Any]:
+        return {
+            "parameters": _Parameters(self._parameters),
+            "optimizer": self.optimizer,
+            "schedule": self.schedule,
+            "states": _States(self.states),
+        }
+
+    def save(self) -> None:
+        """Write the checkpoint; an earlier one is replaced whole."""
+        if self.checkpoint is not None:
+            self.checkpoint.parent.mkdir(parents=True, exist_ok=True)
+            Checkpoint(format="archive", description=self._describe(), **self._components()).save(self.checkpoint)
+
+    @property
+    def steps(self) -> int:
+        """How many minibatches each actor has been trained on."""
+        return self.states[0].step
 
     def step(self) -> Tensor:
         """Train every actor on one minibatch and return their losses, (M,) float32."""
         prepared, targets = [], []
-        for number, (actor, replay) in enumerate(zip(self.actors, self.replays, strict=True)):
+        for actor, replay, state in zip(self.actors, self.replays, self.states, strict=True):
             batch = replay.sample(self.config.batch_size)
             with torch.random.fork_rng(devices=[]):
-                torch.set_rng_state(self._noise[number])
+                torch.set_rng_state(state.torch_generator)
                 prepared.append(actor.prepare(batch))
-                self._noise[number] = torch.get_rng_state()
+                state.torch_generator = torch.get_rng_state()
             targets.append(batch.get("action"))
         inputs = tuple(torch.stack(column) for column in zip(*prepared, strict=True))
         actions = self._act(self._parameters, self._buffers, inputs)
@@ -113,7 +179,8 @@ class StackedBehavioralCloning:
         self._clip()
         self.optimizer.step()
         self.schedule.step()
-        self.steps += 1
+        for state in self.states:
+            state.step += 1
         return losses.detach()
 
     def _clip(self) -> None:
@@ -127,12 +194,23 @@ class StackedBehavioralCloning:
         """Train to the last step and give the actors their weights.
 
         Returns:
-            (M,) float32, each actor's mean loss over the last 100 steps.
+            (M,) float32, each actor's mean loss over the last 100 steps made; NaN if there were none left to make.
         """
-        recent: list[Tensor] = []
-        steps = range(self.steps, self.config.steps)
-        for _ in tqdm(steps, desc=f"training {len(self.actors)} models", delay=1, disable=not self.progress):
-            recent = [*recent[-99:], self.step()]
+        recent = [torch.full((len(self.actors),), torch.nan)] * (self.steps == self.config.steps)
+        bar = tqdm(
+            total=self.config.steps,
+            initial=self.steps,
+            desc=f"training {len(self.actors)} models",
+            unit="step",
+            delay=1,
+            disable=not self.progress,
+        )
+        with bar:
+            while self.steps < self.config.steps:
+                recent = [*recent[-99:], self.step()]
+                bar.update()
+                if self.steps % self.config.checkpoint_every == 0 or self.steps == self.config.steps:
+                    self.save()
         self.write_back()
         return torch.stack(recent).mean(0)
 

@@ -16,7 +16,8 @@ from lw_torchrl.envs import ExpertActor, QAFTransform
 from lw_torchrl.envs.metaworld_engine import MetaWorldEngine, make_metaworld_env
 from lw_torchrl.envs.seeding import action_noise, episode_seed
 from lw_torchrl.evaluation import evaluate
-from lw_torchrl.language.plans import ConditionalPlan, Plans, load_plans
+from lw_torchrl.language.plan_files import load_plans
+from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.modules import DescriptorConditionedActor, PlanConditionedActor
 from lw_torchrl.trainers import BehavioralCloningConfig, BehavioralCloningTrainer
 

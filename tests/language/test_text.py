@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from lw_torchrl.language import text
-from lw_torchrl.language.plans import load_plans
+from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.tasks import TASKS
 
 NEW = "juggle three drawers while whistling"

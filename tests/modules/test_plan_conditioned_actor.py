@@ -9,7 +9,8 @@ import torch
 from tensordict import TensorDict
 from torchrl.objectives import BCLoss
 
-from lw_torchrl.language.plans import ConditionalPlan, Plans, load_plans
+from lw_torchrl.language.plan_files import load_plans
+from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.language.tasks import MT10, task_id
 from lw_torchrl.language.text import encode_texts
 from lw_torchrl.modules import PlanConditionedActor

@@ -18,7 +18,7 @@ from torchrl.record.loggers import Logger
 
 from lw_torchrl.data import LanguageWorldExperienceReplay, TaskBalancedSampler, collect_demonstrations
 from lw_torchrl.envs import QAFTransform
-from lw_torchrl.language.plans import load_plans
+from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.modules import DescriptorConditionedActor, PlanConditionedActor
 from lw_torchrl.trainers import BehavioralCloningConfig, BehavioralCloningTrainer
 

@@ -11,7 +11,8 @@ from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from lw_torchrl.data import TaskBalancedSampler
-from lw_torchrl.language.plans import ConditionalPlan, Plans, load_plans
+from lw_torchrl.language.plan_files import load_plans
+from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.language.tasks import MT10, task_id
 from lw_torchrl.modules import DescriptorConditionedActor, PlanConditionedActor
 from lw_torchrl.trainers import BehavioralCloningConfig, BehavioralCloningTrainer, load_actor

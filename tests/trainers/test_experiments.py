@@ -7,82 +7,163 @@ import pytest
 
 import lw_torchrl as lw
 from lw_torchrl.trainers import experiments
-from lw_torchrl.trainers.experiments import METHODS, PRESETS, SETTINGS, DataSetting, Unit, run_unit
+from lw_torchrl.trainers.experiments import METHODS, Unit, load_result, run_unit
+from lw_torchrl.trainers.recipes import PRESETS, SETTINGS, DataSetting, Execution
 
 PLANS = lw.load_plans("MT50")
 TINY = DataSetting("tiny", "reach", 2)
+TINY_ONE_SHOT = DataSetting("tiny-one-shot", "reach", 2, targets="push")
+ASTRAY = PRESETS["strong"]["few-shot"].base
 PRESET = replace(
-    PRESETS["strong"],
+    PRESETS["strong"]["few-shot"],
+    target=Execution("target", (0.0,)),
     actor={"features": "differences", "width": 32, "depth": 1},
     training=lw.BehavioralCloningConfig(steps=60, batch_size=20, checkpoint_every=20),
 )
 
 
-def unit(method="pcbc", seed=3):
-    return Unit(TINY, method, seed, PRESET, episodes=2)
+def unit(method="pcbc", seed=3, setting=TINY):
+    return Unit(setting, method, seed, PRESET, episodes=2)
+
+
+def task_of(one):
+    return one.setting.targets or "reach"
+
+
+def run(one, out, preset=None):
+    one = one if preset is None else replace(one, preset=preset)
+    return run_unit(one, PLANS, out, tasks=task_of(one), progress=False)
 
 
 def rates(path):
     found = json.loads((path / "results.json").read_text())
+    assert found["config"].pop("seconds") > 0
     return found["episodes"], found["config"]
+
+
+UNITS = [
+    *(unit(method) for method in METHODS),
+    *(unit(method, setting=TINY_ONE_SHOT) for method in METHODS[:-1]),
+]
+by_name = pytest.mark.parametrize("one", UNITS, ids=lambda one: f"{one.setting.name} {one.method}")
 
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory):
     out = tmp_path_factory.mktemp("undisturbed")
-    for method in METHODS:
-        run_unit(unit(method), PLANS, out, tasks="reach", progress=False)
+    for one in UNITS:
+        run(one, out)
     return out
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_a_unit_leaves_its_result_and_is_not_done_twice(undisturbed, method, monkeypatch):
-    one = unit(method)
-    assert one.folder.as_posix() == f"tiny/strong/{method}/seed3"
+@by_name
+def test_a_unit_leaves_its_result_and_is_not_done_twice(undisturbed, one, monkeypatch):
     episodes, config = rates(undisturbed / one.folder)
-    assert len(episodes) == 2
-    assert (config["seed"], config["noise_scale"]) == (10_003, 0.1)
+    assert [episode["task"] for episode in episodes] == [task_of(one)] * 2
+    assert (config["seed"], config["noise_scale"], config["tasks"]) == (10_003, 0.1, [task_of(one)])
     monkeypatch.setattr(experiments, "evaluate", lambda *_, **__: pytest.fail("evaluated again"))
-    again = run_unit(one, PLANS, undisturbed, tasks="reach", progress=False)
-    assert len(again.episodes) == 2
+    assert len(run(one, undisturbed).episodes) == 2
 
 
-def test_stopped_in_training_and_resumed_it_ends_the_same(undisturbed, tmp_path, monkeypatch):
-    step = lw.BehavioralCloningTrainer.step
+def test_folders(undisturbed):
+    assert unit().folder.as_posix() == "tiny/strong/pcbc/seed3"
+    assert unit("scripted").folder.as_posix() == "scripted/seed3"
+    assert unit("scripted", setting=TINY_ONE_SHOT).folder == unit("scripted").folder
+    named = replace(unit(), plans_name="palm")
+    assert named.folder.as_posix() == "tiny/strong-palm/pcbc/seed3"
+    found = {path.name for path in (undisturbed / "demonstrations").iterdir() if path.name[0] != "."}
+    assert found == {"reachx2-astray-seed3", "pushx1-target-seed3"}
+    assert unit(seed=4).datasets != unit().datasets
+
+
+@by_name
+def test_the_result_says_what_was_done(undisturbed, one):
+    said = rates(undisturbed / one.folder)[1]["unit"]
+    assert (said["method"], said["seed"]) == (one.method, 3)
+    assert (said["plans"] is None) == (one.method in ("dc", "one-hot"))
+    if one.method == "scripted":
+        assert said["datasets"] == []
+    else:
+        assert said["actor"]["width"] == 32
+        assert said["training"]["steps"] == 60
+        assert said["datasets"][0]["execution"]["noise_scale"] == [0.0, 0.1, 0.2, 0.3, 0.4]
+        assert len(said["datasets"]) == (2 if one.setting.targets else 1)
+        assert said["after_success"] == 20
+
+
+def test_a_result_of_another_configuration_is_refused(undisturbed):
+    longer = replace(PRESET, training=replace(PRESET.training, steps=61))
+    with pytest.raises(ValueError, match="is of another configuration, it differs in training; choose another folder"):
+        run(unit("dc"), undisturbed, longer)
+    with pytest.raises(ValueError, match="differs in plans"):
+        load_result(unit(), lw.load_plans("MT50", skills="MT10"), undisturbed)
+    with pytest.raises(ValueError, match="differs in episodes"):
+        load_result(replace(unit(), episodes=3), PLANS, undisturbed)
+
+
+@pytest.mark.parametrize(
+    ("setting", "trainer"), [(TINY, lw.BehavioralCloningTrainer), (TINY_ONE_SHOT, lw.StackedBehavioralCloning)]
+)
+def test_stopped_in_training_and_resumed_it_ends_the_same(undisturbed, tmp_path, monkeypatch, setting, trainer):
+    one, step, count = unit(setting=setting), trainer.step, [0]
 
     def stops(self):
-        if self.state.step == 45:
+        count[0] += 1
+        if count[0] == 46:
             raise KeyboardInterrupt
         return step(self)
 
-    monkeypatch.setattr(lw.BehavioralCloningTrainer, "step", stops)
+    monkeypatch.setattr(trainer, "step", stops)
     with pytest.raises(KeyboardInterrupt):
-        run_unit(unit(), PLANS, tmp_path, tasks="reach", progress=False)
-    monkeypatch.setattr(lw.BehavioralCloningTrainer, "step", step)
-    run_unit(unit(), PLANS, tmp_path, tasks="reach", progress=False)
-    assert rates(tmp_path / unit().folder) == rates(undisturbed / unit().folder)
+        run(one, tmp_path)
+    run(one, tmp_path)
+    assert count[0] == 46 + 20  # from the checkpoint at step 40
+    assert rates(tmp_path / one.folder) == rates(undisturbed / one.folder)
 
 
-def test_methods_share_demonstrations_and_seeds_do_not(undisturbed):
-    assert [path.name for path in (undisturbed / "demonstrations").iterdir()] == ["tiny-strong-seed3"]
-    assert unit(seed=4).data != unit().data
+def test_the_policies_of_one_shot_are_kept_one_by_one(undisturbed):
+    folder = undisturbed / unit(setting=TINY_ONE_SHOT).folder
+    assert sorted(path.name for path in folder.iterdir()) == ["models", "results.json"]
+    actor = lw.load_actor(folder / "models" / "push.zip")
+    result = lw.evaluate(actor, tasks="push", episodes_per_task=2, seed=10_003, stop_at_success=True, progress=False)
+    assert result.success_once == lw.EvaluationResult.load(folder / "results.json").success_once
 
 
 def test_settings_are_the_papers():
     assert (SETTINGS["zero-shot"].base, SETTINGS["zero-shot"].episodes) == ("MT10", 100)
     assert (SETTINGS["few-shot"].base, SETTINGS["few-shot"].episodes) == ("MT50", 10)
-    paper = PRESETS["paper"]
+    one_shot = SETTINGS["one-shot"]
+    assert (one_shot.base, one_shot.episodes, one_shot.targets) == ("MT10", 100, "MT50")
+    paper = PRESETS["paper"]["few-shot"]
     assert (paper.training.optimizer, paper.training.learning_rate, paper.training.momentum) == ("sgd", 1e-5, 0.995)
     assert paper.actor["width"] == (128, 128, 128, 64, 32)
     assert (paper.actor["encoder_width"], paper.actor["encoder_depth"]) == (64, 3)
-    assert paper.passes == 500
+    assert (paper.passes, paper.base.noise_scale) == (500, (0.0,))
+    assert PRESETS["paper"]["one-shot"].base.noise_scale == (0.1, 0.2, 0.3, 0.4)
+    for preset in PRESETS.values():
+        assert preset.keys() == SETTINGS.keys()
+        assert preset["one-shot"].training.batch_size % 180 == 0
     with pytest.raises(ValueError, match=r"method must be one of 'pcbc', .*did you mean 'pcbc'"):
         Unit(TINY, "pbc", 0, PRESET)
 
 
-def test_passes_count_rows(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("setting", "trainer", "share"),
+    [(TINY, "BehavioralCloningTrainer", 20), (TINY_ONE_SHOT, "StackedBehavioralCloning", 10)],
+)
+def test_passes_count_rows(undisturbed, tmp_path, monkeypatch, setting, trainer, share):
+    (tmp_path / "demonstrations").symlink_to(undisturbed / "demonstrations")
     steps = []
-    monkeypatch.setattr(lw.BehavioralCloningTrainer, "train", lambda self: steps.append(self.config.steps))
-    run_unit(replace(unit(), preset=replace(PRESET, passes=2)), PLANS, tmp_path, tasks="reach", progress=False)
-    rows = len(lw.LanguageWorldExperienceReplay(tmp_path / unit().data, after_success=20))
-    assert steps == [2 * rows // 20]
+
+    def stop(*_, **__):
+        raise KeyboardInterrupt
+
+    def see(*arguments, **_):
+        steps.append(arguments[2].steps)
+        stop()
+
+    monkeypatch.setattr(experiments, trainer, see)
+    with pytest.raises(KeyboardInterrupt):
+        run(unit(setting=setting), tmp_path, replace(PRESET, passes=2))
+    rows = len(lw.LanguageWorldExperienceReplay(tmp_path / unit().datasets[0].folder, after_success=20))
+    assert steps == [2 * rows // share]

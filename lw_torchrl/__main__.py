@@ -1,0 +1,5 @@
+"""``python -m lw_torchrl``: the command line."""
+
+from lw_torchrl.cli import main
+
+main()

@@ -1,0 +1,120 @@
+"""Plans on disk: folders of .plan files, and JSON files of pairs as language models wrote them."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from importlib.resources import files
+from importlib.resources.abc import Traversable
+from pathlib import Path
+from typing import Any, Literal
+
+from lw_torchrl._checks import check_choice, nearest
+from lw_torchrl._files import write_text
+from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans, PlanStep, as_plans, format_plan, parse_plan
+from lw_torchrl.language.query_search import nearest_query
+from lw_torchrl.language.tasks import MT10, TASKS, Task
+
+
+def load_plans(
+    source: str | os.PathLike[str],
+    *,
+    skills: Literal["own", "MT10"] = "own",
+    tasks: Mapping[str, Task] = TASKS,
+) -> Plans:
+    """Load plans.
+
+    A .json file maps task names to lists of (condition, skill) pairs, by itself or below the key "plans", as language
+    models wrote them: a condition outside the query language is taken for the nearest query, as
+    :func:`nearest_query` finds it, and the step's ``reason`` tells what it was.
+
+    Args:
+        source: "MT10" or "MT50" for the shipped plans of a set; otherwise the path of a .plan or .json file, or of a
+            folder of .plan files.
+        skills: of the shipped plans, "own" for the set whose every step has a scripted skill; "MT10" for the set
+            that words every step as the plans of MT10 do, for policies that have only seen MT10.
+        tasks: whose objects the conditions name, by task name, as from :func:`load_tasks`.
+
+    Returns:
+        The plans, by task name.
+
+    Raises:
+        FileNotFoundError: there is no such file or folder, or the folder holds no plans.
+        PlanError: (a ValueError) a file holds no valid plan, or one for another task than its name says.
+        ValueError: another value for ``skills``, or "MT10" with plans of your own.
+
+    Example:
+        >>> load_plans("MT10")["reach"].task
+        'reach'
+    """
+    check_choice("skills", skills, ("own", "MT10"))
+    if source in ("MT10", "MT50"):
+        data = files("lw_torchrl.language") / "data"
+        other = "plans_mt10_skills" if skills == "MT10" else "plans"
+        names = MT10 if source == "MT10" else tuple(TASKS)
+        return _read_all([data / ("plans" if task in MT10 else other) / f"{task}.plan" for task in names], tasks)
+    if skills != "own":
+        raise ValueError(f"skills={skills!r} is for the shipped plans, 'MT10' and 'MT50', got source {str(source)!r}")
+    path = Path(source)
+    if not path.exists():
+        raise FileNotFoundError(f"no plan file or folder {str(path)!r}; 'MT10' and 'MT50' name the shipped plans")
+    if path.suffix == ".json":
+        return _read_pairs(path, tasks)
+    # A name with a dot in front is what a killed save_plans leaves.
+    listed = [path] if path.is_file() else sorted(p for p in path.glob("*.plan") if p.name[0] != ".")
+    if not listed:
+        raise FileNotFoundError(f"the folder {str(path)!r} holds no .plan files")
+    return _read_all(list[Traversable](listed), tasks)
+
+
+def _text(file: Traversable) -> str:
+    try:
+        return file.read_text("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise PlanError(f"{file.name}: a plan is a text file in UTF-8: {error}") from error
+
+
+def _read_all(found: list[Traversable], tasks: Mapping[str, Task]) -> Plans:
+    return Plans([parse_plan(_text(file), file.name.removesuffix(".plan"), file.name, tasks) for file in found])
+
+
+def _read_pairs(path: Path, tasks: Mapping[str, Task]) -> Plans:
+    try:
+        found = json.loads(_text(path))
+    except (ValueError, RecursionError) as error:
+        raise PlanError(f"{path.name}: not JSON: {error}") from error
+    if isinstance(found, dict):
+        found = found.get("plans", found)
+    if not isinstance(found, dict):
+        raise PlanError(f"{path.name}: expected task names with lists of (condition, skill) pairs, got {found!r:.80}")
+    plans = []
+    for name, pairs in found.items():
+        if name not in tasks:
+            near = nearest(name, tasks)
+            raise PlanError(f"{path.name}: {name!r} is no task" + (f"; did you mean {near[0]!r}?" if near else ""))
+        if not isinstance(pairs, list):
+            raise PlanError(f"{path.name}, {name}: expected a list of (condition, skill) pairs, got {pairs!r:.80}")
+        steps = [_step(pair, tasks[name], f"{path.name}, {name}, step {n}") for n, pair in enumerate(pairs, 1)]
+        plans.append(ConditionalPlan(name, tuple(steps), tasks[name]))
+    return Plans(plans)
+
+
+def _step(pair: Any, task: Task, where: str) -> PlanStep:
+    if not (isinstance(pair, list) and len(pair) == 2 and all(isinstance(text, str) for text in pair)):
+        raise PlanError(f"{where}: expected a condition and a skill, two strings, got {pair!r:.80}")
+    condition, skill = pair
+    match = nearest_query(condition, task)
+    return PlanStep(match.query, skill, "" if match.score == 1.0 else f"nearest to: {condition}")
+
+
+def save_plans(plans: Plans | Mapping[str, ConditionalPlan], folder: str | os.PathLike[str]) -> list[Path]:
+    """Write each plan to ``folder``/<task>.plan; a file is replaced whole or not at all."""
+    checked = as_plans(plans)
+    root = Path(folder)
+    root.mkdir(parents=True, exist_ok=True)
+    written = []
+    for task, plan in checked.items():
+        written.append(root / f"{task}.plan")
+        write_text(written[-1], format_plan(plan))
+    return written

@@ -1,0 +1,141 @@
+"""What data an experiment may see, and how a preset makes and uses it: named, frozen configurations."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import Any
+
+from lw_torchrl.trainers.behavioral_cloning import BehavioralCloningConfig
+
+
+@dataclass(frozen=True)
+class DataSetting:
+    """What demonstrations an experiment may see.
+
+    Attributes:
+        name: "zero-shot", "few-shot" or "one-shot".
+        base: the tasks demonstrated, "MT10" or "MT50".
+        episodes: demonstrations of each.
+        targets: tasks that get a policy of their own from one demonstration beside the base tasks; None for one
+            policy of all base tasks.
+    """
+
+    name: str
+    base: str
+    episodes: int
+    targets: str | None = None
+
+
+SETTINGS: Mapping[str, DataSetting] = MappingProxyType(
+    {
+        setting.name: setting
+        for setting in (
+            DataSetting("zero-shot", "MT10", 100),
+            DataSetting("few-shot", "MT50", 10),
+            DataSetting("one-shot", "MT10", 100, targets="MT50"),
+        )
+    }
+)
+"""Source: paper, the table of data configurations."""
+
+
+@dataclass(frozen=True)
+class Execution:
+    """How experts are executed for demonstrations: options of :func:`collect_demonstrations`.
+
+    Attributes:
+        name: part of the datasets' names.
+        noise_scale: of the noise on the executed action, gone through in turn, an episode each.
+        noise_hold: steps for which each draw is kept.
+        redraw_failures: keep successful demonstrations only.
+    """
+
+    name: str
+    noise_scale: tuple[float, ...]
+    noise_hold: int = 1
+    redraw_failures: bool = False
+
+
+CLEAN = Execution("clean", (0.0,))
+NOISY = Execution("noisy", (0.1, 0.2, 0.3, 0.4))
+LED_ASTRAY = Execution("astray", (0.0, 0.1, 0.2, 0.3, 0.4), noise_hold=10, redraw_failures=True)
+TARGET = Execution("target", (0.4,), noise_hold=10, redraw_failures=True)
+
+
+@dataclass(frozen=True)
+class Preset:
+    """How demonstrations are made and policies trained in a setting, the same for every method and task.
+
+    Attributes:
+        name: "strong", ours; "paper", the published recipe.
+        base: how the base tasks are demonstrated.
+        target: how a target task is demonstrated, once, where the setting has targets.
+        after_success: drop what comes so many steps after the first success; None keeps all.
+        passes: train for so many passes over the rows instead of ``training.steps`` minibatches.
+        actor: options of the actors.
+        training: of the optimizer.
+    """
+
+    name: str
+    base: Execution
+    target: Execution | None
+    after_success: int | None
+    passes: int | None
+    actor: Mapping[str, Any] = field(hash=False)
+    training: BehavioralCloningConfig
+
+
+_STRONG = Preset(
+    "strong",
+    base=LED_ASTRAY,
+    target=None,
+    after_success=20,
+    passes=None,
+    actor=MappingProxyType({"features": "differences", "width": 512}),
+    training=BehavioralCloningConfig(steps=12_000, batch_size=500),
+)
+_STRONG_ONE_SHOT = replace(
+    _STRONG,
+    target=TARGET,
+    actor=MappingProxyType({"features": "differences", "width": 256}),
+    # Half of a minibatch is shared by ten base tasks, or by nine where the target is one of them: 180 suits both.
+    training=BehavioralCloningConfig(steps=2_000, batch_size=180),
+)
+_PAPER = Preset(
+    "paper",
+    base=CLEAN,
+    target=None,
+    after_success=None,
+    passes=500,
+    actor=MappingProxyType(
+        {
+            "features": "raw",
+            "feature_noise": 0.0,
+            "encoder_width": 64,
+            "encoder_depth": 3,
+            "width": (128, 128, 128, 64, 32),
+        }
+    ),
+    training=BehavioralCloningConfig(
+        batch_size=200,
+        learning_rate=1e-5,
+        optimizer="sgd",
+        momentum=0.995,
+        weight_decay=0.0,
+        schedule="constant",
+        normalize=False,
+        max_grad_norm=1e9,
+        checkpoint_every=10_000,
+    ),
+)
+_PAPER_ONE_SHOT = replace(_PAPER, base=NOISY, target=CLEAN, training=replace(_PAPER.training, batch_size=180))
+
+PRESETS: Mapping[str, Mapping[str, Preset]] = MappingProxyType(
+    {
+        "strong": {"zero-shot": _STRONG, "few-shot": _STRONG, "one-shot": _STRONG_ONE_SHOT},
+        "paper": {"zero-shot": _PAPER, "few-shot": _PAPER, "one-shot": _PAPER_ONE_SHOT},
+    }
+)
+"""Preset's name, then setting's name, to :class:`Preset`. Source of "paper": section 'Conditional Plan Experiments'."""
