@@ -129,6 +129,14 @@ class CoLearningSampler(GroupSampler):
         label[base] = 1 + torch.unique(task[base], return_inverse=True)[1]
         return label
 
+    def row_weights(self, storage: Storage) -> Tensor:
+        """How often each row comes in a minibatch, as a share of all: (R,) float32, 0 for a row that is left out."""
+        label = self._label(storage)
+        sizes = label[label >= 0].bincount()
+        share = torch.full((len(sizes),), (1 - float(self.target_fraction)) / (len(sizes) - 1))
+        share[0] = float(self.target_fraction)
+        return torch.where(label >= 0, (share / sizes)[label.clamp(min=0)], 0.0)
+
     def _shares(self, batch_size: int) -> Tensor:
         base = len(self._size) - 1
         part, whole = self.target_fraction.numerator, self.target_fraction.denominator

@@ -105,6 +105,7 @@ class DescriptorConditionedActor(TensorDictModuleBase):
         latent = self.encoder(self.description_vectors)[task]
         return self.decoder.decode(latent, seen), latent
 
-    def fit_normalization(self, observation: Tensor) -> None:
-        """Take the observation features' mean and standard deviation from (..., 39) float32, in place."""
-        self.decoder.features.fit(observation)
+    def fit_normalization(self, observation: Tensor, weights: Tensor | None = None) -> None:
+        """Take the features' mean and standard deviation, in place, from observations (R, 39) float32; ``weights`` (R,)
+        float32, with the sum 1, tell how much each counts."""
+        self.decoder.features.fit(observation, weights)

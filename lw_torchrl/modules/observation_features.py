@@ -71,17 +71,25 @@ class ObservationFeatures(nn.Module):
         return made if self.kind == "differences" else torch.cat((observation, made), -1)
 
     @torch.no_grad()
-    def fit(self, observation: Tensor) -> None:
-        """Take mean and standard deviation from observations, (..., 39) float32, in place.
+    def fit(self, observation: Tensor, weights: Tensor | None = None) -> None:
+        """Take mean and standard deviation from observations, in place.
 
         A feature that hardly varies is centred and left at its scale.
+
+        Args:
+            observation: (..., 39) float32, R in all.
+            weights: how much each counts, (R,) float32, with the sum 1; None for all alike.
 
         Raises:
             ValueError: the observations hold NaN or infinity.
         """
         found = self._select(observation.reshape(-1, 39))
-        self.mean.copy_(found.mean(0))
-        std = found.std(0, unbiased=False)
+        if weights is None:
+            mean, std = found.mean(0), found.std(0, unbiased=False)
+        else:
+            mean = weights @ found
+            std = (weights @ (found - mean).square()).sqrt()
+        self.mean.copy_(mean)
         self.std.copy_(torch.where(std > 1e-4, std, 1.0))
 
     def forward(self, observation: Tensor) -> Tensor:

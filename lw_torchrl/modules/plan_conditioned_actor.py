@@ -133,9 +133,10 @@ class PlanConditionedActor(TensorDictModuleBase):
         each = seen.unsqueeze(-2).expand(*steps.shape[:-1], -1)
         return (weights.unsqueeze(-1) * self.decoder.decode(steps, each)).sum(-2), latent, weights
 
-    def fit_normalization(self, observation: Tensor) -> None:
-        """Take the observation features' mean and standard deviation from (..., 39) float32, in place."""
-        self.decoder.features.fit(observation)
+    def fit_normalization(self, observation: Tensor, weights: Tensor | None = None) -> None:
+        """Take the features' mean and standard deviation, in place, from observations (R, 39) float32; ``weights`` (R,)
+        float32, with the sum 1, tell how much each counts."""
+        self.decoder.features.fit(observation, weights)
 
     def with_plans(self, plans: Plans | Mapping[str, ConditionalPlan]) -> PlanConditionedActor:
         """An actor that carries out other plans with the same weights: training either trains both."""

@@ -84,6 +84,16 @@ def make_optimizer(
     return optimizer, torch.optim.lr_scheduler.LambdaLR(optimizer, lambda _: 1.0)
 
 
+def fit_normalization(actor: Any, replay: TensorDictReplayBuffer) -> None:
+    """Give the actor the statistics of the buffer's rows, each as often as :class:`CoLearningSampler` draws it.
+
+    Without the weights a target's few rows would not count, and its features lie far outside the base tasks' range.
+    """
+    weigh = getattr(replay.sampler, "row_weights", None)
+    weights = None if weigh is None else weigh(replay.storage)
+    actor.fit_normalization(replay.storage.get(slice(0, len(replay))).get("observation"), weights)
+
+
 class BehavioralCloningTrainer:
     """Trains an actor to give the demonstrated actions.
 
@@ -144,7 +154,7 @@ class BehavioralCloningTrainer:
             check_description(self.checkpoint, self._describe())
             load_into(self.checkpoint, **self._components())
         elif config.normalize and hasattr(actor, "fit_normalization"):
-            actor.fit_normalization(replay.storage.get(slice(0, len(replay))).get("observation"))
+            fit_normalization(actor, replay)
 
     def _describe(self) -> dict[str, Any]:
         data = describe_data(self.replay)

@@ -17,7 +17,7 @@ from torchrl.objectives.utils import distance_loss
 from tqdm.auto import tqdm
 
 from lw_torchrl.modules import DescriptorConditionedActor, PlanConditionedActor
-from lw_torchrl.trainers.behavioral_cloning import BehavioralCloningConfig, make_optimizer
+from lw_torchrl.trainers.behavioral_cloning import BehavioralCloningConfig, fit_normalization, make_optimizer
 from lw_torchrl.trainers.checkpoint import TrainingState, check_description, describe_actor, describe_data, load_into
 
 
@@ -115,7 +115,7 @@ class StackedBehavioralCloning:
             replay.set_rng(generator)
             self.states.append(TrainingState(replay.sampler, generator))
             if config.normalize:
-                actor.fit_normalization(replay.storage.get(slice(0, len(replay))).get("observation"))
+                fit_normalization(actor, replay)
             actor.train()
         modules: list[nn.Module] = [_Act(actor) for actor in actors]
         try:

@@ -305,3 +305,27 @@ def test_torchrls_ensemble_cannot_keep_the_ratio():
     ensemble = ReplayBufferEnsemble(*members, p=p, batch_size=40, num_buffer_sampled=8)
     found = {int((ensemble.sample()["task_id"] == task_id(TARGET)).sum()) for _ in range(20)}
     assert found != {20}
+
+
+@settings(max_examples=50, deadline=None)
+@given(base_sizes, target_size, fractions, seeds)
+def test_row_weights_are_how_often_rows_come(base, target, fraction, seed):
+    rows = make_rows(base, target, shuffled=seed)
+    size = smallest(len(base), fraction)
+    replay = make_replay(rows, size, CoLearningSampler(TARGET, target_fraction=fraction), seed)
+    batches = lcm(*base, target)  # after which every row has come equally often within its group
+    found = torch.zeros(len(rows))
+    for _ in range(min(batches, 20)):
+        found.index_add_(0, replay.sample()["row"], torch.ones(size))
+    weights = replay.sampler.row_weights(replay.storage)
+    assert weights.sum().item() == pytest.approx(1.0)
+    if batches <= 20:
+        torch.testing.assert_close(weights, found / found.sum())
+
+
+def test_a_row_that_is_left_out_has_no_weight():
+    rows = with_episodes((3, 4), (task_id(TARGET), 2), (7, 4), (task_id(TARGET), 2))
+    sampler = CoLearningSampler([False, False, False, True])
+    replay = make_replay(rows, 4, sampler)
+    weights = sampler.row_weights(replay.storage)
+    assert weights.tolist() == pytest.approx([0.0625] * 4 + [0.0] * 2 + [0.0625] * 4 + [0.25] * 2)

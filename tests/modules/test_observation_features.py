@@ -135,3 +135,13 @@ def test_observations_that_are_no_numbers_are_refused(wrong, kind, call):
     with pytest.raises(ValueError, match="observation must hold finite numbers"):
         getattr(features, call)(observation)
     assert features.mean.isfinite().all()
+
+
+def test_weights_count_as_copies_of_rows():
+    observation = random_observation(6)
+    copies = torch.tensor([1, 2, 1, 3, 1, 0])
+    weighted, copied = ObservationFeatures("both"), ObservationFeatures("both")
+    weighted.fit(observation, copies / copies.sum())
+    copied.fit(observation.repeat_interleave(copies, 0))
+    torch.testing.assert_close(weighted.mean, copied.mean)
+    torch.testing.assert_close(weighted.std, copied.std)
