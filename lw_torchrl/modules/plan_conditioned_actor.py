@@ -10,13 +10,16 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor
 
-from lw_torchrl._checks import check_choice
+from lw_torchrl._checks import check_choice, check_scale
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.tasks import MT50, task_id
 from lw_torchrl.language.text import encode_texts
 from lw_torchrl.modules.decoder import ActionDecoder, text_to_latent, unit_scale
+from lw_torchrl.modules.mentions import mentioned, swap_unmentioned
 from lw_torchrl.modules.observation_features import Features
 from lw_torchrl.modules.plan_attention import PlanAttention
+
+_IN_FORCE = 0.01  # a step whose condition does not hold beside one that does has a weight of 1e-4
 
 
 class PlanConditionedActor(TensorDictModuleBase):
@@ -33,6 +36,8 @@ class PlanConditionedActor(TensorDictModuleBase):
         features: what the decoder sees of the observation: "raw", the 39 numbers; "differences", the pairwise
             differences between hand, objects and goal; "both".
         feature_noise: standard deviation of the noise on the normalised features while training.
+        swap_unmentioned: the probability with which, in training, an object or the goal is put where it is in another
+            row, where no step in force mentions it.
         latent_size: D.
         width, depth: hidden layers of the action decoder; a tuple of widths says both.
         encoder_width, encoder_depth: hidden layers of the skill encoder.
@@ -62,6 +67,7 @@ class PlanConditionedActor(TensorDictModuleBase):
     out_keys = ["action", "skill_weights", "skill_latent"]
     skill_vectors: Tensor
     skill_index: Tensor
+    mentioned: Tensor
 
     def __init__(
         self,
@@ -70,6 +76,7 @@ class PlanConditionedActor(TensorDictModuleBase):
         mix: Literal["latents", "actions"] = "latents",
         features: Features = "differences",
         feature_noise: float = 0.05,
+        swap_unmentioned: float = 0.0,
         latent_size: int = 64,
         width: int | tuple[int, ...] = 256,
         depth: int = 3,
@@ -80,10 +87,13 @@ class PlanConditionedActor(TensorDictModuleBase):
         super().__init__()
         self.plans = as_plans(plans)
         check_choice("mix", mix, ("latents", "actions"))
+        if check_scale("swap_unmentioned", swap_unmentioned) > 1.0:
+            raise ValueError(f"swap_unmentioned must be a probability, at most 1, got {swap_unmentioned}")
         self.config: dict[str, Any] = {
             "mix": mix,
             "features": features,
             "feature_noise": feature_noise,
+            "swap_unmentioned": swap_unmentioned,
             "latent_size": latent_size,
             "width": width,
             "depth": depth,
@@ -103,6 +113,7 @@ class PlanConditionedActor(TensorDictModuleBase):
         # The tables come from the plans, not from training: they are not part of the state that is saved.
         self.register_buffer("skill_vectors", unit_scale(vectors), persistent=False)
         self.register_buffer("skill_index", index, persistent=False)
+        self.register_buffer("mentioned", mentioned(self.plans), persistent=False)
         self.attention = PlanAttention(self.plans)
         self.encoder = text_to_latent(vectors.shape[1], latent_size, encoder_width, encoder_depth)
         self.decoder = ActionDecoder(latent_size, features, feature_noise, width, depth)
@@ -117,9 +128,12 @@ class PlanConditionedActor(TensorDictModuleBase):
     def prepare(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
         """What no trained parameter touches: attention (B, S), the index of each step's skill (B, S) int64, and the
         observation's features (B, F)."""
-        task = tensordict.get("task_id")
+        task, observation = tensordict.get("task_id"), tensordict.get("observation")
         weights = self.attention.weights(tensordict.get("qaf"), task)
-        return weights, self.skill_index[task], self.decoder.features(tensordict.get("observation"))
+        if self.training and self.config["swap_unmentioned"]:
+            kept = ((weights > _IN_FORCE).unsqueeze(-1) & self.mentioned[task]).any(-2)
+            observation = swap_unmentioned(observation, kept, self.config["swap_unmentioned"])
+        return weights, self.skill_index[task], self.decoder.features(observation)
 
     def act(self, weights: Tensor, index: Tensor, seen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """From what :meth:`prepare` gives: action (B, 4), skill latent (B, D), and the weights again."""

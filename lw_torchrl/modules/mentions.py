@@ -1,0 +1,62 @@
+"""What a plan's steps mention, and training observations in which the rest is somewhere else."""
+
+from __future__ import annotations
+
+import re
+
+import torch
+from torch import Tensor
+
+from lw_torchrl.language.plans import Plans, PlanStep
+from lw_torchrl.language.tasks import MT50, Task, task_id
+
+# The numbers of each thing that an observation tells of, now and a step before: two objects, with their quaternions,
+# and the goal, which has no past.
+_PLACES = ((*range(4, 11), *range(22, 29)), (*range(11, 18), *range(29, 36)), (36, 37, 38))
+
+
+def _names(step: PlanStep, task: Task) -> set[str]:
+    names = {name for clause in step.condition.clauses for name in (clause.subject, clause.object) if name}
+    text = step.skill
+    for name in sorted(task.object_names, key=len, reverse=True):  # "drawer handle" is no "drawer"
+        text, found = re.subn(rf"(?<![\w-]){re.escape(name)}(?![\w-])", " ", text)
+        if found:
+            names.add(name)
+    return names
+
+
+def mentioned(plans: Plans) -> Tensor:
+    """(50, S, 3) bool: whether a step's condition or skill mentions the first object, the second, the goal, or a point
+    beside it."""
+    table = torch.zeros(len(MT50), plans.num_steps, len(_PLACES), dtype=torch.bool)
+    for task, plan in plans.items():
+        for number, step in enumerate(plan.steps):
+            for name in _names(step, plan.definition):
+                for thing, place in enumerate(_PLACES):
+                    if set(place).intersection(plan.definition.object(name).position):
+                        table[task_id(task), number, thing] = True
+    return table
+
+
+def swap_unmentioned(observation: Tensor, kept: Tensor, probability: float) -> Tensor:
+    """Put what no step in force mentions where it is in another row of the batch.
+
+    So a policy cannot lean on it: in one demonstration everything stands in one constellation, and the hand's way to
+    the goal can as well be told from an object that has nothing to do with it. Drawn from PyTorch's global generator.
+
+    Args:
+        observation: (..., 39) float32.
+        kept: (..., 3) bool, whether the first object, the second and the goal are mentioned.
+        probability: of each swap.
+
+    Returns:
+        (..., 39) float32, a copy.
+    """
+    rows, kept = observation.reshape(-1, observation.shape[-1]), kept.reshape(-1, len(_PLACES))
+    swapped, number, device = rows.clone(), len(rows), observation.device
+    for thing, place in enumerate(_PLACES):
+        away = ~kept[:, thing] & (torch.rand(number, device=device) < probability)
+        other = torch.randint(number, (number,), device=device)
+        columns = torch.tensor(place, device=device)
+        swapped[:, columns] = torch.where(away.unsqueeze(-1), rows[other][:, columns], rows[:, columns])
+    return swapped.reshape(observation.shape)
