@@ -47,22 +47,29 @@ def text_to_latent(text_size: int, latent_size: int, width: int, depth: int) -> 
 
 
 class ActionDecoder(nn.Module):
-    """Latent (..., D) and observation (..., 39), both float32, to an action (..., 4) float32 in (-1, 1).
+    """Makes an observation's features, and with a latent (..., D) float32 an action (..., 4) float32 in (-1, 1).
 
     Args:
         latent_size: D.
         features, feature_noise: what it sees of the observation, see :class:`ObservationFeatures`.
         width, depth: of the hidden layers; a tuple of widths says both.
+        more: the number of features that the actor adds to them.
     """
 
     def __init__(
-        self, latent_size: int, features: Features, feature_noise: float, width: int | Sequence[int], depth: int
+        self,
+        latent_size: int,
+        features: Features,
+        feature_noise: float,
+        width: int | Sequence[int],
+        depth: int,
+        more: int = 0,
     ) -> None:
         super().__init__()
         self.features = ObservationFeatures(features, feature_noise)
         widths = [width] * check_int("depth", depth, minimum=0) if isinstance(width, int) else list(width)
         self.network = MLP(
-            in_features=latent_size + self.features.width,
+            in_features=latent_size + self.features.width + more,
             out_features=4,
             num_cells=[check_int("width", cells, minimum=1) for cells in widths],
             activation_class=nn.ReLU,
@@ -71,6 +78,3 @@ class ActionDecoder(nn.Module):
     def decode(self, latent: Tensor, features: Tensor) -> Tensor:
         """From features already made, (..., F)."""
         return torch.tanh(self.network(torch.cat((latent, features), -1)))
-
-    def forward(self, latent: Tensor, observation: Tensor) -> Tensor:
-        return self.decode(latent, self.features(observation))

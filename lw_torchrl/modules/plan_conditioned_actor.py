@@ -18,6 +18,7 @@ from lw_torchrl.modules.decoder import ActionDecoder, text_to_latent, unit_scale
 from lw_torchrl.modules.mentions import mentioned, swap_unmentioned
 from lw_torchrl.modules.observation_features import Features
 from lw_torchrl.modules.plan_attention import PlanAttention
+from lw_torchrl.modules.plan_focus import PlanFocus
 
 _IN_FORCE = 0.01  # a step whose condition does not hold beside one that does has a weight of 1e-4
 
@@ -36,6 +37,7 @@ class PlanConditionedActor(TensorDictModuleBase):
         features: what the decoder sees of the observation: "raw", the 39 numbers; "differences", the pairwise
             differences between hand, objects and goal; "both".
         feature_noise: standard deviation of the noise on the normalised features while training.
+        focus: the decoder also sees the way between the things that the steps in force compare, see :class:`PlanFocus`.
         swap_unmentioned: the probability with which, in training, an object or the goal is put where it is in another
             row, where no step in force mentions it.
         latent_size: D.
@@ -76,6 +78,7 @@ class PlanConditionedActor(TensorDictModuleBase):
         mix: Literal["latents", "actions"] = "latents",
         features: Features = "differences",
         feature_noise: float = 0.05,
+        focus: bool = False,
         swap_unmentioned: float = 0.0,
         latent_size: int = 64,
         width: int | tuple[int, ...] = 256,
@@ -93,6 +96,7 @@ class PlanConditionedActor(TensorDictModuleBase):
             "mix": mix,
             "features": features,
             "feature_noise": feature_noise,
+            "focus": focus,
             "swap_unmentioned": swap_unmentioned,
             "latent_size": latent_size,
             "width": width,
@@ -116,7 +120,9 @@ class PlanConditionedActor(TensorDictModuleBase):
         self.register_buffer("mentioned", mentioned(self.plans), persistent=False)
         self.attention = PlanAttention(self.plans)
         self.encoder = text_to_latent(vectors.shape[1], latent_size, encoder_width, encoder_depth)
-        self.decoder = ActionDecoder(latent_size, features, feature_noise, width, depth)
+        self.focus = PlanFocus(self.plans, feature_noise) if focus else None
+        more = 0 if self.focus is None else self.focus.width
+        self.decoder = ActionDecoder(latent_size, features, feature_noise, width, depth, more)
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -133,7 +139,10 @@ class PlanConditionedActor(TensorDictModuleBase):
         if self.training and self.config["swap_unmentioned"]:
             kept = ((weights > _IN_FORCE).unsqueeze(-1) & self.mentioned[task]).any(-2)
             observation = swap_unmentioned(observation, kept, self.config["swap_unmentioned"])
-        return weights, self.skill_index[task], self.decoder.features(observation)
+        seen = self.decoder.features(observation)
+        if self.focus is not None:
+            seen = torch.cat((seen, self.focus(observation, weights, task)), -1)
+        return weights, self.skill_index[task], seen
 
     def act(self, weights: Tensor, index: Tensor, seen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """From what :meth:`prepare` gives: action (B, 4), skill latent (B, D), and the weights again."""
