@@ -116,6 +116,11 @@ class Unit:
         assert self.preset.target is not None
         return base, Dataset(self.setting.targets, 1, self.preset.target, self.seed)
 
+    @property
+    def actor_options(self) -> dict[str, Any]:
+        """Of the actor that it trains."""
+        return dict(self.preset.actor) | (dict(self.preset.plan_actor) if self.method == "pcbc" else {})
+
     def describe(self, plans: Plans) -> dict[str, Any]:
         """Everything that its result hangs on, as JSON."""
         text = "".join(map(format_plan, plans.values()))
@@ -128,7 +133,7 @@ class Unit:
             "datasets": [asdict(dataset) for dataset in self.datasets],
         }
         if self.method != "scripted":
-            options = {"actor": dict(self.preset.actor), "training": asdict(self.preset.training)}
+            options = {"actor": self.actor_options, "training": asdict(self.preset.training)}
             described |= options | {"after_success": self.preset.after_success, "passes": self.preset.passes}
         return _plain(described)
 
@@ -145,10 +150,10 @@ Trained = PlanConditionedActor | DescriptorConditionedActor
 
 def _make_actor(unit: Unit, plans: Plans, seed: int) -> Trained:
     torch.manual_seed(seed)
-    options: dict[str, Any] = dict(unit.preset.actor)
     if unit.method == "pcbc":
-        return PlanConditionedActor(plans, **options)
-    return DescriptorConditionedActor(MT50, condition="description" if unit.method == "dc" else "one-hot", **options)
+        return PlanConditionedActor(plans, **unit.actor_options)
+    condition: Any = "description" if unit.method == "dc" else "one-hot"
+    return DescriptorConditionedActor(MT50, condition=condition, **unit.actor_options)
 
 
 def _transform(unit: Unit, plans: Plans) -> QAFTransform | None:

@@ -75,6 +75,7 @@ class Preset:
         after_success: drop what comes so many steps after the first success; None keeps all.
         passes: train for so many passes over the rows instead of ``training.steps`` minibatches.
         actor: options of the actors.
+        plan_actor: more options, of :class:`PlanConditionedActor` alone.
         training: of the optimizer.
     """
 
@@ -85,6 +86,7 @@ class Preset:
     passes: int | None
     actor: Mapping[str, Any] = field(hash=False)
     training: BehavioralCloningConfig
+    plan_actor: Mapping[str, Any] = field(default_factory=dict, hash=False)
 
 
 _STRONG = Preset(
@@ -99,7 +101,8 @@ _STRONG = Preset(
 _STRONG_ONE_SHOT = replace(
     _STRONG,
     target=TARGET,
-    actor=MappingProxyType({"features": "both", "width": 256, "feature_noise": 0.2}),
+    actor=MappingProxyType({"features": "differences", "width": 256, "feature_noise": 0.1}),
+    plan_actor=MappingProxyType({"focus": True, "swap_unmentioned": 0.5}),
     # Half of a minibatch is shared by ten base tasks, or by nine where the target is one of them: 180 suits both.
     training=BehavioralCloningConfig(steps=1_000, batch_size=180),
 )

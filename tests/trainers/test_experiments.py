@@ -18,6 +18,7 @@ PRESET = replace(
     PRESETS["strong"]["few-shot"],
     target=Execution("target", (0.0,)),
     actor={"features": "differences", "width": 32, "depth": 1},
+    plan_actor={"focus": True, "swap_unmentioned": 0.5},
     training=lw.BehavioralCloningConfig(steps=60, batch_size=20, checkpoint_every=20),
 )
 
@@ -85,6 +86,7 @@ def test_the_result_says_what_was_done(undisturbed, one):
         assert said["datasets"] == []
     else:
         assert said["actor"]["width"] == 32
+        assert said["actor"].get("focus", False) == (one.method == "pcbc")
         assert said["training"]["steps"] == 60
         assert said["datasets"][0]["execution"]["noise_scale"] == [0.0, 0.1, 0.2, 0.3, 0.4]
         assert len(said["datasets"]) == (2 if one.setting.targets else 1)

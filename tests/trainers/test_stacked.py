@@ -27,12 +27,14 @@ def make(kind, seed):
     torch.manual_seed(seed)
     if kind == "plan":
         return lw.PlanConditionedActor(PLANS, width=32)
+    if kind == "focused plan":
+        return lw.PlanConditionedActor(PLANS, width=32, focus=True, swap_unmentioned=0.5)
     if kind == "mixed actions":
         return lw.PlanConditionedActor(PLANS, width=32, mix="actions")
     return lw.DescriptorConditionedActor(TASKS, width=32, condition=kind)
 
 
-@pytest.mark.parametrize("kind", ["plan", "mixed actions", "description", "one-hot"])
+@pytest.mark.parametrize("kind", ["plan", "focused plan", "mixed actions", "description", "one-hot"])
 def test_every_loss_is_the_one_it_has_alone(demos, kind):
     together = lw.StackedBehavioralCloning(
         [make(kind, seed) for seed in range(3)], [replay(demos) for _ in range(3)], CONFIG, progress=False
@@ -71,3 +73,33 @@ def test_what_it_refuses(demos):
     trainer = lw.StackedBehavioralCloning([make("plan", 0), broken], [replay(demos), replay(demos)], CONFIG)
     with pytest.raises(ValueError, match="the loss of actor 1 is nan at step 0"):
         trainer.step()
+
+
+def test_it_carries_on_from_its_checkpoint(demos, tmp_path):
+    def trainer(config, checkpoint=None):
+        actors = [make("focused plan", seed) for seed in range(2)]
+        replays = [replay(demos) for _ in range(2)]
+        return lw.StackedBehavioralCloning(actors, replays, config, checkpoint=checkpoint, progress=False)
+
+    config = lw.BehavioralCloningConfig(steps=20, batch_size=30, checkpoint_every=10)
+    whole, path = trainer(config), tmp_path / "deep" / "checkpoint.zip"
+    losses = torch.stack([whole.step() for _ in range(20)])
+    first = trainer(config, path)
+    for _ in range(10):
+        first.step()
+    first.save()
+    first.step()  # lost
+    second = trainer(config, path)
+    assert second.steps == 10
+    assert torch.equal(torch.stack([second.step() for _ in range(10)]), losses[10:])
+    second.save()
+    done = trainer(config, path)
+    assert done.train().isnan().all()
+    for name, value in whole._parameters.items():
+        assert torch.equal(value, done._parameters[name])
+
+    with pytest.raises(ValueError, match="is of another configuration, its training differs in steps"):
+        trainer(lw.BehavioralCloningConfig(steps=21, batch_size=30, checkpoint_every=10), path)
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(ValueError, match="damaged"):
+        trainer(config, path)
