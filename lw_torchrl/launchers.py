@@ -27,7 +27,8 @@ def run_command(arguments: Sequence[str]) -> str:
         check=False,
     )
     if done.returncode:
-        raise RuntimeError(f"lw-torchrl {' '.join(arguments)} failed:\n{done.stderr.strip()[-2000:]}")
+        said = "\n".join(done.stderr.splitlines()[-5:])
+        raise RuntimeError(f"lw-torchrl {' '.join(arguments)} failed:\n{said}")
     return done.stdout
 
 
@@ -83,7 +84,7 @@ def _ray(commands: Sequence[Sequence[str]]) -> Iterator[tuple[int, str | Excepti
             try:
                 yield index, ray.get(done)
             except ray.exceptions.RayError as error:
-                yield index, error
+                yield index, getattr(error, "cause", None) or error  # what the task raised, without Ray's traceback
     finally:
         if started:
             ray.shutdown()

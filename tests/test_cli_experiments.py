@@ -130,6 +130,7 @@ def results(folder):
         result = json.loads(path.read_text())
         del result["config"]["seconds"]
         found[path.relative_to(folder).as_posix()] = result
+    found = dict(sorted(found.items()))
     return found, json.loads(next(folder.rglob("summary.json")).read_text())
 
 
@@ -152,3 +153,19 @@ def test_killed_at_five_random_moments_it_ends_the_same(tmp_path, setting):
     assert killed >= 3
     finish(start(setting, tmp_path / "killed"))
     assert results(tmp_path / "killed") == results(tmp_path / "whole")
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::FutureWarning", "ignore::DeprecationWarning")
+def test_every_launcher_gives_the_same(capsys, tmp_path):
+    found = {}
+    for launcher, jobs in (("local", 1), ("local", 2), ("ray", 1)):
+        out = tmp_path / f"{launcher}{jobs}"
+        more = ("--seeds", 0, 1, "--episodes", 1, "--launcher", launcher, "--jobs", jobs, "--out", out)
+        printed = run(capsys, "reproduce", "scripted", *more)
+        assert "[2/2] scripted/seed" in printed
+        assert "| scripted | 0." in printed or "| scripted | 1." in printed
+        found[launcher, jobs] = results(out)
+    assert found["local", 1] == found["local", 2] == found["ray", 1]
+    assert list(found["ray", 1][0]) == ["scripted/seed0/results.json", "scripted/seed1/results.json"]
+    assert (out / "scripted" / "tasks.png").is_file()

@@ -4,6 +4,7 @@ from lw_torchrl.modules.descriptor_conditioned_actor import DescriptorConditione
 from lw_torchrl.modules.observation_features import ObservationFeatures
 from lw_torchrl.modules.plan_attention import PlanAttention
 from lw_torchrl.modules.plan_conditioned_actor import PlanConditionedActor
+from lw_torchrl.modules.plan_focus import PlanFocus
 from lw_torchrl.modules.scripted_skill_actor import ScriptedSkillActor
 
 __all__ = [
@@ -11,5 +12,6 @@ __all__ = [
     "ObservationFeatures",
     "PlanAttention",
     "PlanConditionedActor",
+    "PlanFocus",
     "ScriptedSkillActor",
 ]

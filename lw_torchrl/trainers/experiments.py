@@ -9,22 +9,17 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-import torch
 from filelock import FileLock
 from tqdm.auto import tqdm
 
 from lw_torchrl._checks import check_choice
-from lw_torchrl.data import CoLearningSampler, LanguageWorldExperienceReplay, TaskBalancedSampler
 from lw_torchrl.data.collect import collect_demonstrations
-from lw_torchrl.envs import QAFTransform
 from lw_torchrl.evaluation import EvaluationResult, evaluate
 from lw_torchrl.language.plans import Plans, format_plan
-from lw_torchrl.language.tasks import MT50, resolve_tasks
-from lw_torchrl.modules import DescriptorConditionedActor, PlanConditionedActor, ScriptedSkillActor
-from lw_torchrl.trainers.behavioral_cloning import BehavioralCloningTrainer
-from lw_torchrl.trainers.checkpoint import load_actor, save_actor
+from lw_torchrl.language.tasks import resolve_tasks
+from lw_torchrl.modules import ScriptedSkillActor
 from lw_torchrl.trainers.recipes import DataSetting, Execution, Preset
-from lw_torchrl.trainers.stacked import StackedBehavioralCloning
+from lw_torchrl.trainers.unit_training import train_each, train_one
 
 METHODS = ("pcbc", "dc", "one-hot", "scripted")
 EVALUATION_SEED = 10_000
@@ -145,68 +140,6 @@ def _plain(value: Any) -> Any:
     return [_plain(one) for one in value] if isinstance(value, (list, tuple)) else value
 
 
-Trained = PlanConditionedActor | DescriptorConditionedActor
-
-
-def _make_actor(unit: Unit, plans: Plans, seed: int) -> Trained:
-    torch.manual_seed(seed)
-    if unit.method == "pcbc":
-        return PlanConditionedActor(plans, **unit.actor_options)
-    condition: Any = "description" if unit.method == "dc" else "one-hot"
-    return DescriptorConditionedActor(MT50, condition=condition, **unit.actor_options)
-
-
-def _transform(unit: Unit, plans: Plans) -> QAFTransform | None:
-    return QAFTransform(plans) if unit.method == "pcbc" else None
-
-
-def _train_one(unit: Unit, plans: Plans, out: Path, progress: bool) -> Trained:
-    """One policy for all tasks; training carries on from its checkpoint."""
-    replay = LanguageWorldExperienceReplay(
-        out / unit.datasets[0].folder,
-        sampler=TaskBalancedSampler(),
-        transform=_transform(unit, plans),
-        after_success=unit.preset.after_success,
-    )
-    config = replace(unit.preset.training, seed=unit.seed)
-    if unit.preset.passes is not None:
-        config = replace(config, steps=max(1, unit.preset.passes * len(replay) // config.batch_size))
-    actor = _make_actor(unit, plans, unit.seed)
-    checkpoint = out / unit.folder / "checkpoint.zip"
-    BehavioralCloningTrainer(actor, replay, config, checkpoint=checkpoint, progress=progress).train()
-    return actor
-
-
-def _train_each(unit: Unit, plans: Plans, out: Path, progress: bool) -> dict[str, Trained]:
-    """A policy for each target, all trained together; ``models/<target>.zip`` holds each, once they are done."""
-    targets = resolve_tasks(unit.setting.targets or ())
-    models = {target: out / unit.folder / "models" / f"{target}.zip" for target in targets}
-    if all(path.is_file() for path in models.values()):
-        return {target: load_actor(path) for target, path in models.items()}
-    roots = [out / dataset.folder for dataset in unit.datasets]
-    replays = [
-        LanguageWorldExperienceReplay(
-            roots,
-            episodes=[None, {target: 1}],
-            sampler=CoLearningSampler(target),
-            transform=_transform(unit, plans),
-            after_success=unit.preset.after_success,
-        )
-        for target in targets
-    ]
-    config = replace(unit.preset.training, seed=1_000 * unit.seed)  # the i-th model has the i-th seed from here
-    if unit.preset.passes is not None:  # over the base tasks, which have half of each minibatch
-        base = LanguageWorldExperienceReplay(roots[0], after_success=unit.preset.after_success)
-        config = replace(config, steps=max(1, 2 * unit.preset.passes * len(base) // config.batch_size))
-    actors = [_make_actor(unit, plans, config.seed + number) for number in range(len(targets))]
-    checkpoint = out / unit.folder / "checkpoint.zip"
-    StackedBehavioralCloning(actors, replays, config, checkpoint=checkpoint, progress=progress).train()
-    for actor, path in zip(actors, models.values(), strict=True):
-        save_actor(actor, path)
-    checkpoint.unlink()
-    return dict(zip(targets, actors, strict=True))
-
-
 def _evaluate(unit: Unit, plans: Plans, out: Path, tasks: tuple[str, ...], progress: bool) -> EvaluationResult:
     options: dict[str, Any] = {
         "episodes_per_task": unit.episodes,
@@ -217,8 +150,8 @@ def _evaluate(unit: Unit, plans: Plans, out: Path, tasks: tuple[str, ...], progr
     if unit.method == "scripted":
         return evaluate(ScriptedSkillActor(plans), tasks=tasks, progress=progress, **options)
     if unit.setting.targets is None:
-        return evaluate(_train_one(unit, plans, out, progress), tasks=tasks, progress=progress, **options)
-    actors = _train_each(unit, plans, out, progress)
+        return evaluate(train_one(unit, plans, out, progress), tasks=tasks, progress=progress, **options)
+    actors = train_each(unit, plans, out, progress)
     each = [
         evaluate(actors[task], tasks=task, progress=False, **options)
         for task in tqdm(sorted({*tasks} & {*actors}), desc="evaluating", unit="model", delay=1, disable=not progress)

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 import lw_torchrl as lw
-from lw_torchrl.trainers import experiments
+from lw_torchrl.trainers import experiments, unit_training
 from lw_torchrl.trainers.experiments import METHODS, Unit, load_result, run_unit
 from lw_torchrl.trainers.recipes import PRESETS, SETTINGS, DataSetting, Execution
 
@@ -164,7 +164,7 @@ def test_passes_count_rows(undisturbed, tmp_path, monkeypatch, setting, trainer,
         steps.append(arguments[2].steps)
         stop()
 
-    monkeypatch.setattr(experiments, trainer, see)
+    monkeypatch.setattr(unit_training, trainer, see)
     with pytest.raises(KeyboardInterrupt):
         run(unit(setting=setting), tmp_path, replace(PRESET, passes=2))
     rows = len(lw.LanguageWorldExperienceReplay(tmp_path / unit().datasets[0].folder, after_success=20))
