@@ -63,7 +63,7 @@ class LanguageWorldEnv(EnvBase):
         num_threads: of the simulation, by default the cores this process may use; never changes a result.
         reward: "sparse", the success as 0 and 1, or "dense", Meta-World's own.
         max_steps: steps until truncation.
-        strict: raise on a NaN action or an unstable simulation, instead of truncating the row with a warning.
+        strict: raise on a NaN action, instead of truncating the row with a warning as for an unstable simulation.
 
     Raises:
         ValueError: an unknown task or engine, or ``num_envs`` under the number of tasks.
@@ -228,11 +228,11 @@ class LanguageWorldEnv(EnvBase):
         stepped = active
         if math.isnan(action.sum()):  # of numbers in [-1, 1], so one of them is NaN
             broken = active & np.isnan(action).any(-1)
-            self._report(broken, "its action is NaN", "action must hold numbers")
+            self._report(broken, "its action is NaN", self.strict)
             stepped = active & ~broken
         result = self._engine.step(action, stepped)
         if (unstable := result.fault & stepped).any():
-            self._report(unstable, "its simulation became unstable", "the simulation must stay stable")
+            self._report(unstable, "its simulation became unstable")
         np.copyto(self._observation, result.observation, casting="same_kind", where=stepped[:, None])
         np.copyto(self._success, result.success & stepped, where=active)
         self._steps += active
@@ -241,7 +241,7 @@ class LanguageWorldEnv(EnvBase):
         reward = np.where(stepped, result.reward, 0.0).astype(np.float32)
         return self._state(reward=torch.from_numpy(reward).unsqueeze(-1))
 
-    def _report(self, rows: np.ndarray, what: str, must: str) -> None:
+    def _report(self, rows: np.ndarray, what: str, fatal: bool = False) -> None:
         if not rows.any():
             return
         row = int(np.flatnonzero(rows)[0])
@@ -249,8 +249,8 @@ class LanguageWorldEnv(EnvBase):
             f"row {row}: {what}, in task {self.row_tasks[row]!r}, seed {self._seed}, episode "
             f"{self._episode[row]}, step {self._steps[row]}" + (f" ({rows.sum()} rows)" if rows.sum() > 1 else "")
         )
-        if self.strict:
-            raise ValueError(f"{must}: {message}")
+        if fatal:
+            raise ValueError(f"action must hold numbers: {message}")
         self._fault |= rows
         warnings.warn(f"{message}; the row is truncated and flagged, the others go on", stacklevel=3)
 

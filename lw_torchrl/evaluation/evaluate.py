@@ -116,6 +116,9 @@ def evaluate(
         on_episode: called with each finished episode, (task, index, steps): steps has batch (T,) and the keys
             ``action``, ``("next", "success")``, ``("next", "reward")`` and those of ``also_record``.
 
+    Warns:
+        UserWarning: a simulation became unstable; its episode ends there, a failure unless it had succeeded.
+
     Returns:
         The result; ``.success_once`` maps each task to its success rate.
 

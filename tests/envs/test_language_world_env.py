@@ -849,11 +849,12 @@ def check_env_specs_quietly(env) -> None:
         check_env_specs(env, break_when_any_done="both")
 
 
-def test_a_fault_raises_where_strict():
+def test_strict_is_about_actions_not_about_faults():
     env, _ = with_fake(strict=True)
     state = advance(env, env.reset(), torch.zeros(3, 4))
-    with pytest.raises(ValueError, match=r"the simulation must stay stable: row 1: .*'push'"):
-        advance(env, state, torch.zeros(3, 4))
+    with pytest.warns(UserWarning, match="row 1: its simulation became unstable"):
+        state = advance(env, state, torch.zeros(3, 4))
+    assert state["fault"].flatten().tolist() == [False, True, False]
     env.close()
 
 

@@ -15,6 +15,7 @@ from lw_torchrl.data import LanguageWorldExperienceReplay, TaskBalancedSampler, 
 from lw_torchrl.envs import ExpertActor, QAFTransform
 from lw_torchrl.envs.metaworld_engine import MetaWorldEngine, make_metaworld_env
 from lw_torchrl.envs.seeding import action_noise, episode_seed
+from lw_torchrl.envs.vectorized_engine import VectorizedEngine
 from lw_torchrl.evaluation import evaluate
 from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.plans import ConditionalPlan, Plans
@@ -241,6 +242,26 @@ def test_the_mode_is_restored_after_an_error_too():
     assert actor.training
     with pytest.raises(ValueError, match="NaN"):
         run(actor, "reach", noise_scale=0.1)
+
+
+def test_an_unstable_simulation_is_a_failed_episode(monkeypatch):
+    step = VectorizedEngine.step
+    count = [0]
+
+    def upset(self, *arguments):
+        result = step(self, *arguments)
+        count[0] += 1
+        if count[0] == 4:
+            result.fault[1] = True
+        return result
+
+    monkeypatch.setattr(VectorizedEngine, "step", upset)
+    expert = ExpertActor("reach")
+    with pytest.warns(
+        UserWarning, match="row 1: its simulation became unstable, in task 'reach', seed 1000, episode 1"
+    ):
+        result = evaluate(expert, tasks="reach", episodes_per_task=3, seed=1000, num_envs=3, progress=False)
+    assert [episode.success for episode in result.episodes] == [True, False, True]
 
 
 def test_feature_noise_of_training_plays_no_part():
