@@ -99,7 +99,7 @@ class Comparison:
             f"{pair.methods[0]} - {pair.methods[1]}: {pair.difference}; probability of improvement {pair.improvement}"
             for pair in self.pairs
         ]
-        return _table(head, rows) + "".join(f"\n{line}  " for line in ["", *lines] if lines)
+        return "\n\n".join(filter(None, [_table(head, rows), "  \n".join(lines)]))
 
     def _mean(self, rates: Mapping[str, float]) -> float:
         return sum(rates[task] for task in self.tasks) / len(self.tasks)
