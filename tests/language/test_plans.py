@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from lw_torchrl.language.plan_files import load_plans, save_plans
 from lw_torchrl.language.plans import (
     ConditionalPlan,
     PlanError,
@@ -15,9 +16,7 @@ from lw_torchrl.language.plans import (
     PlanStep,
     as_plans,
     format_plan,
-    load_plans,
     parse_plan,
-    save_plans,
 )
 from lw_torchrl.language.queries import Clause, Query, QueryError, parse_query, supported_queries
 from lw_torchrl.language.tasks import GRIPPER, MT50, TASKS
