@@ -119,17 +119,18 @@ class Unit:
     def describe(self, plans: Plans) -> dict[str, Any]:
         """Everything that its result hangs on, as JSON."""
         text = "".join(map(format_plan, plans.values()))
-        described: dict[str, Any] = {
-            "setting": self.setting.name,
-            "method": self.method,
-            "seed": self.seed,
-            "preset": self.preset.name,
-            "plans": sha256(text.encode()).hexdigest()[:16] if self.method in ("pcbc", "scripted") else None,
-            "datasets": [asdict(dataset) for dataset in self.datasets],
-        }
+        plans_used = sha256(text.encode()).hexdigest()[:16] if self.method in ("pcbc", "scripted") else None
+        described: dict[str, Any] = {"method": self.method, "seed": self.seed, "plans": plans_used}
         if self.method != "scripted":
-            options = {"actor": self.actor_options, "training": asdict(self.preset.training)}
-            described |= options | {"after_success": self.preset.after_success, "passes": self.preset.passes}
+            described |= {
+                "setting": self.setting.name,
+                "preset": self.preset.name,
+                "datasets": [asdict(dataset) for dataset in self.datasets],
+                "actor": self.actor_options,
+                "training": asdict(self.preset.training),
+                "after_success": self.preset.after_success,
+                "passes": self.preset.passes,
+            }
         return _plain(described)
 
 
