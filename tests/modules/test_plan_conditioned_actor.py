@@ -89,11 +89,11 @@ def test_mixing_step_by_step_by_hand(mix):
         vectors = encode_texts([step.skill for step in steps])
         latents = actor.encoder(vectors / vectors.square().mean(-1, keepdim=True).sqrt())  # numbers of size 1
         mixed = weights @ latents
-        seen = state["observation"][row]
+        features = actor.decoder.features(state["observation"][row])
         if mix == "latents":
-            action = actor.decoder(mixed, seen)
+            action = actor.decoder.decode(mixed, features)
         else:
-            action = weights @ torch.stack([actor.decoder(latent, seen) for latent in latents])
+            action = weights @ torch.stack([actor.decoder.decode(latent, features) for latent in latents])
         torch.testing.assert_close(out["skill_weights"][row, : len(steps)], weights)
         torch.testing.assert_close(out["skill_latent"][row], mixed)
         torch.testing.assert_close(out["action"][row], action)
