@@ -54,6 +54,7 @@ from lw_torchrl.language.tasks import (
 )
 from lw_torchrl.language.text import TextEncoder, encode_texts
 from lw_torchrl.modules import (
+    ActorEnsemble,
     DescriptorConditionedActor,
     ObservationFeatures,
     PlanAttention,
@@ -69,6 +70,7 @@ __all__ = [
     "MT10",
     "MT50",
     "TASKS",
+    "ActorEnsemble",
     "BehavioralCloningConfig",
     "BehavioralCloningTrainer",
     "Clause",

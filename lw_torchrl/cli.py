@@ -160,7 +160,7 @@ def evaluate(
 
     _calm_torch()
     chosen: str | tuple[str, ...] = tasks[0] if len(tasks) == 1 else tasks
-    actor: lw.ExpertActor | lw.PlanConditionedActor | lw.DescriptorConditionedActor
+    actor: lw.ExpertActor | lw.PlanConditionedActor | lw.DescriptorConditionedActor | lw.ActorEnsemble
     if str(checkpoint) == "expert":
         chosen = chosen or "MT10"
         actor = lw.ExpertActor(chosen)
@@ -171,7 +171,7 @@ def evaluate(
                 f"seed must differ from the demonstrations' seed, {used}; an evaluation wants fresh states"
             )
         actor = lw.load_actor(checkpoint)
-        own = actor.tasks if isinstance(actor, lw.DescriptorConditionedActor) else tuple(actor.plans)
+        own = actor.tasks if hasattr(actor, "tasks") else tuple(actor.plans)
         chosen = chosen or own
     result = lw.evaluate(
         actor,
@@ -186,7 +186,7 @@ def evaluate(
     if out is not None:
         result.save(out / "results.json")
         lw.plot_success(result, out / "success.png", title=f"{checkpoint}, {episodes} episodes a task")
-        if isinstance(actor, lw.PlanConditionedActor):
+        if hasattr(actor, "plans"):
             shown = lw.resolve_tasks(chosen)[:3]
             rollouts = rollout_tasks(actor, shown, seed=seed, noise_scale=noise)
             write_recording(out / "rollout.rrd", actor, rollouts)

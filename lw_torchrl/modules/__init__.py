@@ -1,5 +1,6 @@
 """Policies as TensorDictModules: plan-conditioned, and the baseline on the task's description."""
 
+from lw_torchrl.modules.actor_ensemble import ActorEnsemble
 from lw_torchrl.modules.descriptor_conditioned_actor import DescriptorConditionedActor
 from lw_torchrl.modules.observation_features import ObservationFeatures
 from lw_torchrl.modules.plan_attention import PlanAttention
@@ -8,6 +9,7 @@ from lw_torchrl.modules.plan_focus import PlanFocus
 from lw_torchrl.modules.scripted_skill_actor import ScriptedSkillActor
 
 __all__ = [
+    "ActorEnsemble",
     "DescriptorConditionedActor",
     "ObservationFeatures",
     "PlanAttention",

@@ -14,17 +14,16 @@ from torchrl.checkpoint import Checkpoint, CheckpointError
 
 from lw_torchrl._checks import check_choice
 from lw_torchrl.language.plans import Plans, format_plan, parse_plan
-from lw_torchrl.modules import DescriptorConditionedActor, PlanConditionedActor
+from lw_torchrl.modules import ActorEnsemble, DescriptorConditionedActor, PlanConditionedActor
 
-ACTORS = {
-    "PlanConditionedActor": PlanConditionedActor,
-    "DescriptorConditionedActor": DescriptorConditionedActor,
-}
+ACTORS = ("ActorEnsemble", "DescriptorConditionedActor", "PlanConditionedActor")
 Actor = PlanConditionedActor | DescriptorConditionedActor
 
 
 def describe_actor(actor: nn.Module) -> dict[str, Any]:
     """What is needed to make the actor again, its weights aside, as JSON."""
+    if isinstance(actor, ActorEnsemble):
+        return {"kind": "ActorEnsemble", "members": [describe_actor(member) for member in actor.members]}
     if isinstance(actor, PlanConditionedActor):
         plans = {task: format_plan(plan) for task, plan in actor.plans.items()}
         return {"kind": "PlanConditionedActor", "options": actor.config, "plans": plans}
@@ -39,8 +38,10 @@ def describe_data(replay: Any) -> dict[str, Any] | None:
     return None if demonstrations is None else demonstrations.config.to_json()
 
 
-def _make_actor(found: dict[str, Any], text_encoder: Callable[[Sequence[str]], Tensor] | None) -> Actor:
+def _make_actor(found: dict[str, Any], text_encoder: Callable[[Sequence[str]], Tensor] | None) -> Actor | ActorEnsemble:
     check_choice("the checkpoint's actor", found["kind"], ACTORS)
+    if found["kind"] == "ActorEnsemble":
+        return ActorEnsemble([_make_actor(member, text_encoder) for member in found["members"]])
     if found["kind"] == "DescriptorConditionedActor":
         return DescriptorConditionedActor(found["tasks"], text_encoder=text_encoder, **found["options"])
     plans = Plans([parse_plan(text, task, f"plan of {task}") for task, text in found["plans"].items()])
@@ -65,7 +66,7 @@ def read_description(path: str | os.PathLike[str]) -> dict[str, Any]:
         raise ValueError(f"checkpoint: {str(path)!r} is damaged or none of ours ({error})") from error
 
 
-def save_actor(actor: Actor, path: str | os.PathLike[str]) -> None:
+def save_actor(actor: Actor | ActorEnsemble, path: str | os.PathLike[str]) -> None:
     """Write an actor alone, for :func:`load_actor`; an earlier file is replaced whole."""
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     Checkpoint(format="archive", description={"actor": describe_actor(actor)}, actor=actor).save(path)
@@ -85,7 +86,9 @@ def check_description(path: Path, ours: dict[str, Any]) -> None:
             )
 
 
-def load_actor(path: str | os.PathLike[str], *, text_encoder: Callable[[Sequence[str]], Tensor] | None = None) -> Actor:
+def load_actor(
+    path: str | os.PathLike[str], *, text_encoder: Callable[[Sequence[str]], Tensor] | None = None
+) -> Actor | ActorEnsemble:
     """Make the actor of a checkpoint, with its plans and weights, in eval mode.
 
     Args:

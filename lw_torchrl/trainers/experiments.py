@@ -128,6 +128,7 @@ class Unit:
                 "datasets": [asdict(dataset) for dataset in self.datasets],
                 "actor": self.actor_options,
                 "training": asdict(self.preset.training),
+                "members": self.preset.members,
                 "after_success": self.preset.after_success,
                 "passes": self.preset.passes,
             }

@@ -77,6 +77,7 @@ class Preset:
         actor: options of the actors.
         plan_actor: more options, of :class:`PlanConditionedActor` alone.
         training: of the optimizer.
+        members: how many actors a policy is, trained apart on the same demonstrations, their actions averaged.
     """
 
     name: str
@@ -87,6 +88,7 @@ class Preset:
     actor: Mapping[str, Any] = field(hash=False)
     training: BehavioralCloningConfig
     plan_actor: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    members: int = 1
 
 
 _STRONG = Preset(

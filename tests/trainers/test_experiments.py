@@ -1,9 +1,11 @@
 """The experiments' units: resumed anywhere they end with the same result."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import pytest
+import torch
 
 import lw_torchrl as lw
 from lw_torchrl.trainers import experiments, unit_training
@@ -21,10 +23,11 @@ PRESET = replace(
     plan_actor={"focus": True, "swap_unmentioned": 0.5},
     training=lw.BehavioralCloningConfig(steps=60, batch_size=20, checkpoint_every=20),
 )
+ENSEMBLE = replace(PRESET, name="ensemble", members=2)
 
 
-def unit(method="pcbc", seed=3, setting=TINY):
-    return Unit(setting, method, seed, PRESET, episodes=2)
+def unit(method="pcbc", seed=3, setting=TINY, preset=PRESET):
+    return Unit(setting, method, seed, preset, episodes=2)
 
 
 def task_of(one):
@@ -45,8 +48,9 @@ def rates(path):
 UNITS = [
     *(unit(method) for method in METHODS),
     *(unit(method, setting=TINY_ONE_SHOT) for method in METHODS[:-1]),
+    *(unit(method, setting=setting, preset=ENSEMBLE) for method in ("pcbc", "dc") for setting in (TINY, TINY_ONE_SHOT)),
 ]
-by_name = pytest.mark.parametrize("one", UNITS, ids=lambda one: f"{one.setting.name} {one.method}")
+by_name = pytest.mark.parametrize("one", UNITS, ids=lambda one: f"{one.setting.name} {one.preset.name} {one.method}")
 
 
 @pytest.fixture(scope="module")
@@ -91,6 +95,7 @@ def test_the_result_says_what_was_done(undisturbed, one):
         assert said["datasets"][0]["execution"]["noise_scale"] == [0.0, 0.1, 0.2, 0.3, 0.4]
         assert len(said["datasets"]) == (2 if one.setting.targets else 1)
         assert said["after_success"] == 20
+        assert said["members"] == (2 if one.preset is ENSEMBLE else 1)
 
 
 def test_a_result_of_another_configuration_is_refused(undisturbed):
@@ -104,10 +109,15 @@ def test_a_result_of_another_configuration_is_refused(undisturbed):
 
 
 @pytest.mark.parametrize(
-    ("setting", "trainer"), [(TINY, lw.BehavioralCloningTrainer), (TINY_ONE_SHOT, lw.StackedBehavioralCloning)]
+    ("setting", "preset", "trainer"),
+    [
+        (TINY, PRESET, lw.BehavioralCloningTrainer),
+        (TINY, ENSEMBLE, lw.StackedBehavioralCloning),
+        (TINY_ONE_SHOT, PRESET, lw.StackedBehavioralCloning),
+    ],
 )
-def test_stopped_in_training_and_resumed_it_ends_the_same(undisturbed, tmp_path, monkeypatch, setting, trainer):
-    one, step, count = unit(setting=setting), trainer.step, [0]
+def test_stopped_in_training_and_resumed_it_ends_the_same(undisturbed, tmp_path, monkeypatch, setting, preset, trainer):
+    one, step, count = unit(setting=setting, preset=preset), trainer.step, [0]
 
     def stops(self):
         count[0] += 1
@@ -135,6 +145,21 @@ def test_the_policies_of_one_shot_are_kept_one_by_one(undisturbed):
     actor = lw.load_actor(folder / "models" / "push.zip")
     result = lw.evaluate(actor, tasks="push", episodes_per_task=2, seed=10_003, stop_at_success=True, progress=False)
     assert result.success_once == lw.EvaluationResult.load(folder / "results.json").success_once
+
+
+@pytest.mark.parametrize(("setting", "file"), [(TINY, "policy.zip"), (TINY_ONE_SHOT, "models/push.zip")])
+@pytest.mark.parametrize("method", ["pcbc", "dc"])
+def test_an_ensemble_has_members_of_its_own_and_is_not_trained_twice(undisturbed, tmp_path, method, setting, file):
+    one = unit(method, setting=setting, preset=ENSEMBLE)
+    policy = lw.load_actor(undisturbed / one.folder / file)
+    assert isinstance(policy, lw.ActorEnsemble)
+    first, second = policy.members
+    assert not torch.equal(next(first.parameters()), next(second.parameters()))
+    shutil.copytree(undisturbed, tmp_path / "again")
+    (tmp_path / "again" / one.folder / "results.json").unlink()
+    result = run_unit(one, PLANS, tmp_path / "again", tasks=task_of(one), progress=False)
+    assert result.success_once == lw.EvaluationResult.load(undisturbed / one.folder / "results.json").success_once
+    assert not (tmp_path / "again" / one.folder / "checkpoint.zip").exists()
 
 
 def test_settings_are_the_papers():
