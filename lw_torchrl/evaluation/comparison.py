@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -99,7 +99,7 @@ class Comparison:
             f"{pair.methods[0]} - {pair.methods[1]}: {pair.difference}; probability of improvement {pair.improvement}"
             for pair in self.pairs
         ]
-        return "\n\n".join(filter(None, [_table(head, rows), "  \n".join(lines)]))
+        return "\n\n".join(filter(None, [markdown_table(head, rows), "  \n".join(lines)]))
 
     def _mean(self, rates: Mapping[str, float]) -> float:
         return sum(rates[task] for task in self.tasks) / len(self.tasks)
@@ -119,10 +119,11 @@ class Comparison:
                 spread = f" ({each[task].min:.2f}-{each[task].max:.2f})" if each[task].min < each[task].max else ""
                 cells.append(f"{each[task].mean:.2f}{spread}")
             rows.append([task, *cells, *(f"{rates[task]:.2f}" for rates in self.published.values())])
-        return _table(["task", *found, *self.published], rows)
+        return markdown_table(["task", *found, *self.published], rows)
 
 
-def _table(head: list[str], rows: list[list[str]]) -> str:
+def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Text columns of even width, as Markdown."""
     widths = [max(len(row[k]) for row in [head, *rows]) for k in range(len(head))]
     lines = [head, ["-" * width for width in widths], *rows]
     return "\n".join("| " + " | ".join(map(str.ljust, line, widths)) + " |" for line in lines)

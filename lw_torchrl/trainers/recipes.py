@@ -100,6 +100,13 @@ _STRONG = Preset(
     actor=MappingProxyType({"features": "differences", "width": 512}),
     training=BehavioralCloningConfig(steps=12_000, batch_size=500),
 )
+_STRONG_ZERO_SHOT = replace(
+    _STRONG,
+    actor=MappingProxyType({"features": "differences", "width": 512, "feature_noise": 0.1}),
+    plan_actor=MappingProxyType({"swap_unmentioned": 0.5}),
+    training=BehavioralCloningConfig(steps=6_000, batch_size=200),
+    members=4,
+)
 _STRONG_ONE_SHOT = replace(
     _STRONG,
     target=TARGET,
@@ -139,7 +146,7 @@ _PAPER_ONE_SHOT = replace(_PAPER, base=NOISY, target=CLEAN, training=replace(_PA
 
 PRESETS: Mapping[str, Mapping[str, Preset]] = MappingProxyType(
     {
-        "strong": {"zero-shot": _STRONG, "few-shot": _STRONG, "one-shot": _STRONG_ONE_SHOT},
+        "strong": {"zero-shot": _STRONG_ZERO_SHOT, "few-shot": _STRONG, "one-shot": _STRONG_ONE_SHOT},
         "paper": {"zero-shot": _PAPER, "few-shot": _PAPER, "one-shot": _PAPER_ONE_SHOT},
     }
 )
