@@ -7,12 +7,14 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT))
 from benchmarks import __main__ as cli  # noqa: E402
+from benchmarks import ablations  # noqa: E402
 from benchmarks.report import Row, Skipped, compare, part_of, under  # noqa: E402
 
 FIELDS = {"name", "ours", "unit", "rival", "theirs", "ratio", "spread", "target", "met", "note"}
@@ -82,3 +84,29 @@ def test_a_share_is_of_the_whole():
 def test_every_benchmark_is_explained():
     page = (ROOT / "docs" / "performance.md").read_text("utf-8")
     assert [name for name in cli.BENCHMARKS if f"`{name}`" not in page] == []
+
+
+def test_each_ablation_changes_one_ingredient_and_has_a_folder_of_its_own():
+    full = vars(ablations.FULL)
+    for change, preset in ablations.ABLATIONS.items():
+        different = {key for key, value in vars(preset).items() if value != full[key]} - {"name"}
+        assert len(different) == (change != "the recipe"), change
+    names = [preset.name for preset in ablations.ABLATIONS.values()]
+    assert len(set(names)) == len(names)
+
+
+def test_ablations_write_a_table_of_what_was_run(monkeypatch, tmp_path, capsys):
+    seen = []
+
+    def run(unit, plans, out):
+        seen.append((unit.preset.name, unit.preset.training.steps, unit.seed))
+        return SimpleNamespace(success_once={"reach": 1.0, "push": 0.5 + 0.25 * unit.seed})
+
+    monkeypatch.setattr(ablations, "run_unit", run)
+    ablations.main(ablations.Arguments(seeds=(0, 2), steps=3, out=tmp_path))
+    assert len(seen) == 2 * len(ablations.ABLATIONS)
+    assert seen[:2] == [("strong-3-steps", 3, 0), ("strong-3-steps", 3, 2)]
+    table = (tmp_path / "few-shot" / "ablations-3-steps.md").read_text("utf-8")
+    assert [line.split("|")[1].strip() for line in table.splitlines()[2:]] == list(ablations.ABLATIONS)
+    assert "0.750, 1.000" in table
+    assert table in capsys.readouterr().out
