@@ -80,7 +80,7 @@ def train(
     plans: str = "MT10",
     policy: Literal["plan", "descriptor"] = "plan",
     mix: Literal["latents", "actions"] = "latents",
-    features: Literal["raw", "differences", "both"] = "differences",
+    features: Literal["raw", "differences", "relative", "both"] = "differences",
     width: int = 256,
     depth: int = 3,
     steps: int = 8000,
@@ -99,7 +99,8 @@ def train(
         plans: MT10 or MT50 for the shipped plans, or a .plan file or a folder of them.
         policy: conditioned on the plan, or on the task's description, the baseline.
         mix: mix the skills' latents, as in the paper, or their actions.
-        features: what the policy sees: the raw observation, differences between hand, objects and goal, or both.
+        features: what the policy sees: the raw observation; differences between hand, objects and goal; relative, these
+            without the hand's height; or both the first and the second.
         width: of the action decoder's hidden layers.
         depth: number of them.
         steps: minibatches.

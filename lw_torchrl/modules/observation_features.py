@@ -10,10 +10,10 @@ from torch import Tensor, nn
 
 from lw_torchrl._checks import check_choice, check_scale
 
-Features = Literal["raw", "differences", "both"]
+Features = Literal["raw", "differences", "relative", "both"]
 _HAND, _OBJECT_1, _OBJECT_2, _GOAL = slice(0, 3), slice(4, 7), slice(11, 14), slice(36, 39)
 _FINE, _COARSE = 0.02, 0.1  # metres: where the two squashed copies of each difference bend
-_WIDTH = {"raw": 39, "differences": 56, "both": 39 + 56}
+_WIDTH = {"raw": 39, "differences": 56, "relative": 55, "both": 39 + 56}
 
 
 def differences(observation: Tensor) -> Tensor:
@@ -43,7 +43,8 @@ class ObservationFeatures(nn.Module):
     In training mode Gaussian noise is added to the normalised features, drawn from PyTorch's global generator.
 
     Args:
-        kind: "raw", the 39 numbers; "differences", see :func:`differences`; "both", one after the other.
+        kind: "raw", the 39 numbers; "differences", see :func:`differences`; "relative", the same without the hand's
+            height, which does not tell where the scene is; "both", the 39 numbers and the differences.
         noise: standard deviation of the noise, in standard deviations of each feature.
 
     Attributes:
@@ -73,7 +74,9 @@ class ObservationFeatures(nn.Module):
         if self.kind == "raw":
             return observation
         made = differences(observation)
-        return made if self.kind == "differences" else torch.cat((observation, made), -1)
+        if self.kind == "both":
+            return torch.cat((observation, made), -1)
+        return made[..., :-1] if self.kind == "relative" else made
 
     @torch.no_grad()
     def fit(self, observation: Tensor, weights: Tensor | None = None) -> None:

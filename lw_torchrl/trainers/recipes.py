@@ -102,7 +102,7 @@ _STRONG = Preset(
 )
 _STRONG_ZERO_SHOT = replace(
     _STRONG,
-    actor=MappingProxyType({"features": "differences", "width": 512, "feature_noise": 0.1}),
+    actor=MappingProxyType({"features": "relative", "width": 512, "feature_noise": 0.1}),
     plan_actor=MappingProxyType({"swap_unmentioned": 0.5}),
     training=BehavioralCloningConfig(steps=6_000, batch_size=200),
     members=4,

@@ -41,7 +41,7 @@ def counted(texts):
     return torch.tensor([[float(text.count(letter)) for letter in "aeiou"] for text in texts])
 
 
-@pytest.mark.parametrize("features", ["raw", "differences", "both"])
+@pytest.mark.parametrize("features", ["raw", "differences", "relative", "both"])
 @pytest.mark.parametrize("shape", [(), (5,), (3, 4)])
 def test_it_writes_an_action_on_any_leading_shape(features, shape):
     actor = make_actor(features=features)

@@ -57,7 +57,17 @@ def test_both_is_one_after_the_other():
     assert torch.equal(both[:, 39:], ObservationFeatures("differences")(observation))
 
 
-@pytest.mark.parametrize("kind", ["raw", "differences", "both"])
+@pytest.mark.parametrize(("kind", "same"), [("raw", False), ("differences", False), ("relative", True)])
+def test_relative_features_do_not_tell_where_the_scene_is(kind, same):
+    here = random_observation(20)
+    there = here.clone()
+    for first in (0, 4, 11, 36):
+        there[:, first : first + 3] += torch.tensor([0.1, -0.2, 0.3])
+    features = ObservationFeatures(kind)
+    assert torch.allclose(features(here), features(there), atol=1e-4) == same
+
+
+@pytest.mark.parametrize("kind", ["raw", "differences", "relative", "both"])
 def test_what_it_was_fitted_to_has_mean_zero_and_deviation_one(kind):
     features = ObservationFeatures(kind)
     observation = random_observation(40, 25)
@@ -126,7 +136,7 @@ def test_wrong_observations_are_refused(observation, said):
 
 
 @pytest.mark.parametrize("wrong", [torch.nan, torch.inf, -torch.inf])
-@pytest.mark.parametrize("kind", ["raw", "differences", "both"])
+@pytest.mark.parametrize("kind", ["raw", "differences", "relative", "both"])
 @pytest.mark.parametrize("call", ["forward", "fit"])
 def test_observations_that_are_no_numbers_are_refused(wrong, kind, call):
     observation = random_observation(3)

@@ -48,7 +48,7 @@ def make_loss(actor):
 
 
 @pytest.mark.parametrize("mix", ["latents", "actions"])
-@pytest.mark.parametrize("features", ["raw", "differences", "both"])
+@pytest.mark.parametrize("features", ["raw", "differences", "relative", "both"])
 @pytest.mark.parametrize("shape", [(), (5,), (3, 4)])
 def test_it_writes_the_documented_keys_on_any_leading_shape(mix, features, shape):
     actor = make_actor(mix=mix, features=features)
