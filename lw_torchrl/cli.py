@@ -100,7 +100,7 @@ def train(
         policy: conditioned on the plan, or on the task's description, the baseline.
         mix: mix the skills' latents, as in the paper, or their actions.
         features: what the policy sees: the raw observation; differences between hand, objects and goal; relative, these
-            without the hand's height; or both the first and the second.
+            without the hand's height and the gripper's opening; or both the first and the second.
         width: of the action decoder's hidden layers.
         depth: number of them.
         steps: minibatches.

@@ -13,7 +13,7 @@ from lw_torchrl._checks import check_choice, check_scale
 Features = Literal["raw", "differences", "relative", "both"]
 _HAND, _OBJECT_1, _OBJECT_2, _GOAL = slice(0, 3), slice(4, 7), slice(11, 14), slice(36, 39)
 _FINE, _COARSE = 0.02, 0.1  # metres: where the two squashed copies of each difference bend
-_WIDTH = {"raw": 39, "differences": 56, "relative": 55, "both": 39 + 56}
+_WIDTH = {"raw": 39, "differences": 56, "relative": 54, "both": 39 + 56}
 
 
 def differences(observation: Tensor) -> Tensor:
@@ -43,8 +43,9 @@ class ObservationFeatures(nn.Module):
     In training mode Gaussian noise is added to the normalised features, drawn from PyTorch's global generator.
 
     Args:
-        kind: "raw", the 39 numbers; "differences", see :func:`differences`; "relative", the same without the hand's
-            height, which does not tell where the scene is; "both", the 39 numbers and the differences.
+        kind: "raw", the 39 numbers; "differences", see :func:`differences`; "relative", the same without the
+            hand's height and the gripper's opening, which do not tell where things are to each other; "both", the 39
+            numbers and the differences.
         noise: standard deviation of the noise, in standard deviations of each feature.
 
     Attributes:
@@ -76,7 +77,7 @@ class ObservationFeatures(nn.Module):
         made = differences(observation)
         if self.kind == "both":
             return torch.cat((observation, made), -1)
-        return made[..., :-1] if self.kind == "relative" else made
+        return made[..., :-2] if self.kind == "relative" else made
 
     @torch.no_grad()
     def fit(self, observation: Tensor, weights: Tensor | None = None) -> None:

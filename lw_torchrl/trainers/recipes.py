@@ -104,7 +104,7 @@ _STRONG_ZERO_SHOT = replace(
     _STRONG,
     actor=MappingProxyType({"features": "relative", "width": 512, "feature_noise": 0.1}),
     plan_actor=MappingProxyType({"swap_unmentioned": 0.5}),
-    training=BehavioralCloningConfig(steps=6_000, batch_size=200),
+    training=BehavioralCloningConfig(steps=4_000, batch_size=200),
     members=4,
 )
 _STRONG_ONE_SHOT = replace(
