@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import torch
 import tyro
@@ -19,11 +20,11 @@ from lw_torchrl.trainers.recipes import CLEAN, NOISY, PRESETS, SETTINGS, Preset
 FULL = PRESETS["strong"]["few-shot"]
 
 
-def _without(name: str, **changes: object) -> Preset:
-    return replace(FULL, name=f"strong-without-{name}", **changes)  # type: ignore[arg-type]
+def _without(name: str, **changes: Any) -> Preset:
+    return replace(FULL, name=f"strong-without-{name}", **changes)
 
 
-def _actor(**options: object) -> dict[str, object]:
+def _actor(**options: Any) -> dict[str, Any]:
     return dict(FULL.actor) | options
 
 
@@ -64,10 +65,10 @@ def main(arguments: Arguments) -> None:
         if arguments.steps != FULL.training.steps:
             shorter = replace(shorter, name=f"{preset.name}-{arguments.steps}-steps")
         units = [Unit(SETTINGS["few-shot"], "pcbc", seed, shorter) for seed in arguments.seeds]
-        rates = [run_unit(unit, plans, arguments.out).success_once for unit in units]
-        means = [sum(one.values()) / len(one) for one in rates]
-        solved = [sum(rate >= 0.8 for rate in one.values()) for one in rates]
-        shown = (change, ", ".join(f"{mean:.3f}" for mean in means), ", ".join(map(str, solved)))
+        results = [run_unit(unit, plans, arguments.out) for unit in units]
+        means = ", ".join(f"{result.mean_success:.3f}" for result in results)
+        solved = ", ".join(str(lw.count_solved([list(result.success_once.values())])) for result in results)
+        shown = (change, means, solved)
         print(" | ".join(shown), flush=True)
         lines.append(shown)
     table = markdown_table(("few-shot PCBC", "mean, by seed", "tasks >= 0.8"), lines)

@@ -100,7 +100,8 @@ def test_ablations_write_a_table_of_what_was_run(monkeypatch, tmp_path, capsys):
 
     def run(unit, plans, out):
         seen.append((unit.preset.name, unit.preset.training.steps, unit.seed))
-        return SimpleNamespace(success_once={"reach": 1.0, "push": 0.5 + 0.25 * unit.seed})
+        rates = {"reach": 1.0, "push": 0.5 + 0.25 * unit.seed}
+        return SimpleNamespace(success_once=rates, mean_success=sum(rates.values()) / 2)
 
     monkeypatch.setattr(ablations, "run_unit", run)
     ablations.main(ablations.Arguments(seeds=(0, 2), steps=3, out=tmp_path))

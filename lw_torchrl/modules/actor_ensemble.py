@@ -9,6 +9,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import nn
 
+from lw_torchrl.language.plans import Plans
 from lw_torchrl.modules.descriptor_conditioned_actor import DescriptorConditionedActor
 from lw_torchrl.modules.plan_conditioned_actor import PlanConditionedActor
 
@@ -41,6 +42,9 @@ class ActorEnsemble(TensorDictModuleBase):
 
     Source: as the mean of ``torchrl.modules.EnsembleModule``.
     """
+
+    plans: Plans
+    tasks: tuple[str, ...]
 
     def __init__(self, members: Sequence[PlanConditionedActor | DescriptorConditionedActor]) -> None:
         super().__init__()

@@ -13,14 +13,14 @@ from lw_torchrl._checks import check_choice, check_scale
 Features = Literal["raw", "differences", "relative", "both"]
 _HAND, _OBJECT_1, _OBJECT_2, _GOAL = slice(0, 3), slice(4, 7), slice(11, 14), slice(36, 39)
 _FINE, _COARSE = 0.02, 0.1  # metres: where the two squashed copies of each difference bend
-_WIDTH = {"raw": 39, "differences": 56, "relative": 54, "both": 39 + 56}
+_WIDTH = {"raw": 39, "differences": 54 + 2, "relative": 54, "both": 39 + 54 + 2}
 
 
-def differences(observation: Tensor) -> Tensor:
-    """The pairwise differences between hand, both objects and goal, (..., 39) to (..., 56).
+def relative(observation: Tensor) -> Tensor:
+    """The pairwise differences between hand, both objects and goal, (..., 39) to (..., 54).
 
-    Six differences of three metres each, the same through tanh at 2 cm and at 10 cm, then the gripper's opening
-    and the hand's height. Differences to a second object that the task does not have are zero.
+    Six differences of three metres each, the same through tanh at 2 cm and at 10 cm. Differences to a second object
+    that the task does not have are zero.
     """
     places = [observation[..., place] for place in (_HAND, _OBJECT_1, _OBJECT_2, _GOAL)]
     absent = (places[2] == 0).all(-1, keepdim=True)
@@ -29,7 +29,12 @@ def differences(observation: Tensor) -> Tensor:
         difference = places[second] - places[first]
         pairs.append(torch.where(absent, 0.0, difference) if 2 in (first, second) else difference)
     d = torch.cat(pairs, -1)
-    return torch.cat((d, *squash(d), observation[..., 2:4]), -1)
+    return torch.cat((d, *squash(d)), -1)
+
+
+def differences(observation: Tensor) -> Tensor:
+    """:func:`relative`, the hand's height and the gripper's opening, (..., 39) to (..., 56)."""
+    return torch.cat((relative(observation), observation[..., 2:4]), -1)
 
 
 def squash(difference: Tensor) -> tuple[Tensor, Tensor]:
@@ -43,9 +48,8 @@ class ObservationFeatures(nn.Module):
     In training mode Gaussian noise is added to the normalised features, drawn from PyTorch's global generator.
 
     Args:
-        kind: "raw", the 39 numbers; "differences", see :func:`differences`; "relative", the same without the
-            hand's height and the gripper's opening, which do not tell where things are to each other; "both", the 39
-            numbers and the differences.
+        kind: "raw", the 39 numbers; "differences", see :func:`differences`; "relative", these without what does
+            not tell where things are to each other; "both", the 39 numbers and the differences.
         noise: standard deviation of the noise, in standard deviations of each feature.
 
     Attributes:
@@ -74,10 +78,10 @@ class ObservationFeatures(nn.Module):
             raise ValueError("observation must hold finite numbers, got NaN or infinity")
         if self.kind == "raw":
             return observation
+        if self.kind == "relative":
+            return relative(observation)
         made = differences(observation)
-        if self.kind == "both":
-            return torch.cat((observation, made), -1)
-        return made[..., :-2] if self.kind == "relative" else made
+        return made if self.kind == "differences" else torch.cat((observation, made), -1)
 
     @torch.no_grad()
     def fit(self, observation: Tensor, weights: Tensor | None = None) -> None:

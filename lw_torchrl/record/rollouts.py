@@ -15,14 +15,14 @@ from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.envs.qaf_transform import QAFTransform
 from lw_torchrl.language.plans import ConditionalPlan
 from lw_torchrl.language.tasks import TASKS, resolve_tasks
-from lw_torchrl.modules import PlanConditionedActor
+from lw_torchrl.modules import ActorEnsemble, PlanConditionedActor
 from lw_torchrl.record.rerun_logger import RerunLogger
 
 _KEYS = ["observation", "task_id", "action", "qaf", "skill_weights", ("next", "success"), ("next", "reward")]
 
 
 def rollout_tasks(
-    actor: PlanConditionedActor,
+    actor: PlanConditionedActor | ActorEnsemble,
     tasks: str | Iterable[str],
     *,
     seed: int,
@@ -57,7 +57,9 @@ def rollout_tasks(
 
 
 def write_recording(
-    path: str | os.PathLike[str], actor: PlanConditionedActor, rollouts: dict[str, TensorDictBase]
+    path: str | os.PathLike[str],
+    actor: PlanConditionedActor | ActorEnsemble,
+    rollouts: dict[str, TensorDictBase],
 ) -> None:
     """Write rollouts to a rerun file, each with its plan; the file is replaced whole."""
     with RerunLogger(path) as logger:

@@ -18,6 +18,7 @@ from lw_torchrl.modules import ActorEnsemble, DescriptorConditionedActor, PlanCo
 
 ACTORS = ("ActorEnsemble", "DescriptorConditionedActor", "PlanConditionedActor")
 Actor = PlanConditionedActor | DescriptorConditionedActor
+Policy = Actor | ActorEnsemble
 
 
 def describe_actor(actor: nn.Module) -> dict[str, Any]:
@@ -38,7 +39,7 @@ def describe_data(replay: Any) -> dict[str, Any] | None:
     return None if demonstrations is None else demonstrations.config.to_json()
 
 
-def _make_actor(found: dict[str, Any], text_encoder: Callable[[Sequence[str]], Tensor] | None) -> Actor | ActorEnsemble:
+def _make_actor(found: dict[str, Any], text_encoder: Callable[[Sequence[str]], Tensor] | None) -> Policy:
     check_choice("the checkpoint's actor", found["kind"], ACTORS)
     if found["kind"] == "ActorEnsemble":
         return ActorEnsemble([_make_actor(member, text_encoder) for member in found["members"]])
@@ -66,7 +67,7 @@ def read_description(path: str | os.PathLike[str]) -> dict[str, Any]:
         raise ValueError(f"checkpoint: {str(path)!r} is damaged or none of ours ({error})") from error
 
 
-def save_actor(actor: Actor | ActorEnsemble, path: str | os.PathLike[str]) -> None:
+def save_actor(actor: Policy, path: str | os.PathLike[str]) -> None:
     """Write an actor alone, for :func:`load_actor`; an earlier file is replaced whole."""
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     Checkpoint(format="archive", description={"actor": describe_actor(actor)}, actor=actor).save(path)
@@ -88,7 +89,7 @@ def check_description(path: Path, ours: dict[str, Any]) -> None:
 
 def load_actor(
     path: str | os.PathLike[str], *, text_encoder: Callable[[Sequence[str]], Tensor] | None = None
-) -> Actor | ActorEnsemble:
+) -> Policy:
     """Make the actor of a checkpoint, with its plans and weights, in eval mode.
 
     Args:
