@@ -10,6 +10,7 @@ from lw_torchrl.data import (
     JoinedDemonstrations,
     JoinedStorage,
     LanguageWorldExperienceReplay,
+    RandomYaw,
     TaskBalancedSampler,
     collect_demonstrations,
 )
@@ -102,6 +103,7 @@ __all__ = [
     "QueryError",
     "QueryMatch",
     "QueryProgram",
+    "RandomYaw",
     "RerunLogger",
     "ScriptedSkill",
     "ScriptedSkillActor",

@@ -40,7 +40,7 @@ class BehavioralCloningConfig:
         normalize: first take the statistics of the observation's features from the demonstrations.
         loss_function: between the actor's and the demonstrated action: "l1", "l2" or "smooth_l1".
         max_grad_norm: gradients are clipped to it.
-        seed: of the minibatches, and of what the actor draws while training.
+        seed: of the minibatches, and of what the buffer's transforms and the actor draw while training.
         checkpoint_every: steps between checkpoints; the last step always makes one.
     """
 
@@ -176,9 +176,9 @@ class BehavioralCloningTrainer:
 
     def step(self) -> float:
         """Train on one minibatch and return its loss."""
-        batch = self.replay.sample(self.config.batch_size)
-        with torch.random.fork_rng(devices=[]):  # what the actor draws hangs on the configuration's seed alone
+        with torch.random.fork_rng(devices=[]):  # what transforms and the actor draw hangs on the configuration's seed
             torch.set_rng_state(self.state.torch_generator)
+            batch = self.replay.sample(self.config.batch_size)
             loss = self.loss(batch)["loss_bc"]
             self.state.torch_generator = torch.get_rng_state()
         if not loss.isfinite():

@@ -64,7 +64,7 @@ class _States:
 class StackedBehavioralCloning:
     """Trains M actors, each on batches of its own, as :class:`BehavioralCloningTrainer` trains one.
 
-    Every product is done for all M at once. Each actor draws its batches and its feature noise from the seed that
+    Every product is done for all M at once. Each actor draws its batches, turns and feature noise from the seed that
     it would have alone, so its losses are those it would have alone, up to rounding.
 
     Args:
@@ -162,9 +162,9 @@ class StackedBehavioralCloning:
         """Train every actor on one minibatch and return their losses, (M,) float32."""
         prepared, targets = [], []
         for actor, replay, state in zip(self.actors, self.replays, self.states, strict=True):
-            batch = replay.sample(self.config.batch_size)
             with torch.random.fork_rng(devices=[]):
                 torch.set_rng_state(state.torch_generator)
+                batch = replay.sample(self.config.batch_size)
                 prepared.append(actor.prepare(batch))
                 state.torch_generator = torch.get_rng_state()
             targets.append(batch.get("action"))

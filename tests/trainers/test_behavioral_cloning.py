@@ -16,7 +16,7 @@ from torch import nn
 from torchrl.data import LazyTensorStorage, RandomSampler, SamplerWithoutReplacement, TensorDictReplayBuffer
 from torchrl.record.loggers import Logger
 
-from lw_torchrl.data import LanguageWorldExperienceReplay, TaskBalancedSampler, collect_demonstrations
+from lw_torchrl.data import LanguageWorldExperienceReplay, RandomYaw, TaskBalancedSampler, collect_demonstrations
 from lw_torchrl.envs import QAFTransform
 from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.modules import DescriptorConditionedActor, PlanConditionedActor
@@ -254,6 +254,25 @@ def test_stopped_anywhere_and_started_again_it_ends_with_the_same_bits(demos, un
     assert resumed.state.step == max(stops) // 5 * 5
     resumed.train()
     assert_same(everything(resumed), undisturbed)
+
+
+def test_what_a_transform_draws_hangs_on_the_seed_and_resumes_too(demos, tmp_path):
+    def trainer(noise, checkpoint=None, stop_at=None):
+        made = make_trainer(demos, checkpoint, stop_at=stop_at)
+        made.replay.append_transform(RandomYaw(0.5))
+        torch.manual_seed(noise)  # what else draws in this process must not matter
+        return made
+
+    whole = trainer(1)
+    whole.train()
+    with pytest.raises(KeyboardInterrupt):
+        trainer(2, tmp_path / "c.zip", stop_at=7).train()
+    resumed = trainer(3, tmp_path / "c.zip")
+    resumed.train()
+    assert_same(flat(resumed.actor.state_dict()), flat(whole.actor.state_dict()))
+    unturned = make_trainer(demos)
+    unturned.train()
+    assert not torch.equal(unturned.actor.decoder.network[0].weight, whole.actor.decoder.network[0].weight)
 
 
 @pytest.mark.parametrize("sampler", [RandomSampler, SamplerWithoutReplacement])

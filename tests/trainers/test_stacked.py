@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from torchrl.envs import Compose
 
 import lw_torchrl as lw
 
@@ -18,9 +19,8 @@ def demos(tmp_path_factory):
 
 
 def replay(demos):
-    return lw.LanguageWorldExperienceReplay(
-        demos, sampler=lw.TaskBalancedSampler(), transform=lw.QAFTransform(PLANS), after_success=20
-    )
+    turned = Compose(lw.QAFTransform(PLANS), lw.RandomYaw(0.3))
+    return lw.LanguageWorldExperienceReplay(demos, sampler=lw.TaskBalancedSampler(), transform=turned, after_success=20)
 
 
 def make(kind, seed):

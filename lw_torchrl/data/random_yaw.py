@@ -1,0 +1,77 @@
+"""RandomYaw: demonstrations as they would look, had the scene been turned about the vertical."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase, Transform
+
+from lw_torchrl._checks import check_scale
+
+# Where the observation's positions begin: hand, two objects, the same a step before, goal.
+_POSITIONS = (0, 4, 11, 18, 22, 29, 36)
+
+
+def _turned(values: Tensor, starts: tuple[int, ...], cos: Tensor, sin: Tensor) -> Tensor:
+    turned = values.clone()
+    for start in starts:
+        x, y = values[..., start], values[..., start + 1]
+        turned[..., start] = cos * x - sin * y
+        turned[..., start + 1] = sin * x + cos * y
+    return turned
+
+
+class RandomYaw(Transform):
+    """Turns each sampled row, its positions and its action alike, by a random angle about the vertical.
+
+    What is to the left of the hand in every demonstration of a task is a little in front of it or behind it in some
+    rows, so a policy learns to move along the way to the goal rather than in the direction that the demonstrations
+    happened to have. For replay buffers; where a :class:`QAFTransform` is used, put it first, since conditions speak of
+    the scene as it was.
+
+    Changes ``observation`` (B, 39) float32, and ``("next", "observation")`` where it is, and ``action`` (B, 4)
+    float32, whose way in the plane is shortened where it would leave [-1, 1], its direction kept. Orientations stay as
+    they were, and so do fixed places: use it with features that hold neither, "differences" or "relative". Angles are
+    drawn from PyTorch's global generator; the trainers seed it.
+
+    Args:
+        scale: standard deviation of the angle, in radians.
+
+    Raises:
+        ValueError: a negative or infinite scale.
+        TypeError: it is given to an environment.
+
+    Example:
+        >>> import lw_torchrl as lw, torch
+        >>> from tensordict import TensorDict
+        >>> row = TensorDict({"observation": torch.rand(2, 39), "action": torch.tensor([[0.5, 0.0, 0.1, 1.0]] * 2)}, [2])
+        >>> turned = lw.RandomYaw(0.3)(row)
+        >>> turned["action"][:, :2].norm(dim=-1)
+        tensor([0.5000, 0.5000])
+
+    Source: data augmentation by a symmetry of the task, as for images in ``torchvision.transforms.RandomRotation``.
+    """
+
+    def __init__(self, scale: float) -> None:
+        super().__init__(in_keys=["observation", "action"], out_keys=["observation", "action"])
+        self.scale = check_scale("scale", scale)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Turn each row of a sample."""
+        tensordict = tensordict.copy()  # of a buffer's whole range it may be the storage itself
+        observation, action = tensordict.get("observation"), tensordict.get("action")
+        angle = self.scale * torch.randn(observation.shape[:-1], device=observation.device)
+        cos, sin = angle.cos(), angle.sin()
+        tensordict.set("observation", _turned(observation, _POSITIONS, cos, sin))
+        if (following := tensordict.get(("next", "observation"), None)) is not None:
+            tensordict.set(("next", "observation"), _turned(following, _POSITIONS, cos, sin))
+        turned = _turned(action, (0,), cos, sin)
+        turned[..., :2] /= turned[..., :2].abs().amax(-1, keepdim=True).clamp(min=1.0)
+        return tensordict.set("action", turned)
+
+    def set_container(self, container: Transform | EnvBase) -> None:
+        """Join a buffer's transforms; an environment's actions cannot be turned after the fact."""
+        if isinstance(container, EnvBase):
+            raise TypeError("RandomYaw is for replay buffers: an environment has done its action before it is turned")
+        super().set_container(container)

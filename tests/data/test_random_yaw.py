@@ -1,0 +1,123 @@
+"""RandomYaw: everything is turned alike, and nothing else changes."""
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from torchrl.envs import Compose
+
+import lw_torchrl as lw
+
+PLACES = [slice(start, start + 2) for start in (0, 4, 11, 18, 22, 29, 36)]
+OTHER = [n for n in range(39) if not any(n in range(place.start, place.stop) for place in PLACES)]
+
+
+def rows(number=64, seed=0, reach=0.6):
+    generator = torch.Generator().manual_seed(seed)
+    draw = lambda *shape: torch.rand(*shape, generator=generator)  # noqa: E731
+    return TensorDict({"observation": draw(number, 39), "action": (2 * draw(number, 4) - 1) * reach}, [number])
+
+
+def angle(vectors):
+    return torch.atan2(vectors[..., 1], vectors[..., 0])
+
+
+def between(first, second):
+    """The angle from one to the other, in (-pi, pi]."""
+    return torch.remainder(angle(second) - angle(first) + torch.pi, 2 * torch.pi) - torch.pi
+
+
+@settings(deadline=None, max_examples=40)
+@given(scale=st.floats(0.0, 3.0), seed=st.integers(0, 10**6))
+def test_positions_and_action_turn_by_the_same_angle_and_keep_their_length(scale, seed):
+    was = rows(seed=seed)
+    torch.manual_seed(seed)
+    now = lw.RandomYaw(scale)(was.clone())
+    turned = between(was["action"], now["action"])
+    for place in PLACES:
+        before, after = was["observation"][:, place], now["observation"][:, place]
+        torch.testing.assert_close(after.norm(dim=-1), before.norm(dim=-1))
+        difference = torch.remainder(between(before, after) - turned + torch.pi, 2 * torch.pi) - torch.pi
+        assert difference.abs().max() < 1e-3
+    torch.testing.assert_close(now["action"].norm(dim=-1), was["action"].norm(dim=-1))
+
+
+def test_heights_orientations_and_the_gripper_stay():
+    was = rows()
+    now = lw.RandomYaw(0.5)(was.clone())
+    assert torch.equal(now["observation"][:, OTHER], was["observation"][:, OTHER])
+    assert torch.equal(now["action"][:, 2:], was["action"][:, 2:])
+    assert not torch.isclose(now["observation"][:, :2], was["observation"][:, :2]).any()
+
+
+def test_the_angles_are_normal_with_the_given_scale():
+    was = rows(20_000, reach=0.5)
+    torch.manual_seed(0)
+    turned = between(was["action"], lw.RandomYaw(0.3)(was.clone())["action"])
+    assert abs(turned.mean()) < 0.01
+    assert 0.29 < turned.std() < 0.31
+
+
+def test_an_action_that_would_leave_the_box_keeps_its_direction():
+    was = rows(1_000, reach=1.0)
+    was["action"][:, :2] = 1.0
+    now = lw.RandomYaw(0.4)(was.clone())
+    assert now["action"].abs().max() <= 1.0
+    torch.testing.assert_close(
+        between(was["action"], now["action"]),
+        between(was["observation"][:, :2], now["observation"][:, :2]),
+        atol=1e-4,
+        rtol=0,
+    )
+
+
+def test_an_absent_object_stays_absent():
+    was = rows()
+    was["observation"][:, 11:18] = 0.0
+    assert (lw.RandomYaw(1.0)(was)["observation"][:, 11:18] == 0).all()
+
+
+def test_the_next_observation_turns_with_its_row():
+    was = rows()
+    was["next", "observation"] = was["observation"].clone()
+    now = lw.RandomYaw(0.5)(was)
+    assert torch.equal(now["next", "observation"], now["observation"])
+
+
+def test_scale_0_changes_nothing_and_the_seed_fixes_the_rest():
+    was = rows()
+    assert (lw.RandomYaw(0.0)(was.clone()) == was).all()
+    found = []
+    for seed in (1, 1, 2):
+        torch.manual_seed(seed)
+        found.append(lw.RandomYaw(0.3)(was.clone())["observation"])
+    assert torch.equal(found[0], found[1])
+    assert not torch.equal(found[0], found[2])
+
+
+@pytest.mark.parametrize("scale", [-0.1, float("inf"), float("nan")])
+def test_a_wrong_scale_is_named(scale):
+    with pytest.raises(ValueError, match="scale must be finite and at least 0"):
+        lw.RandomYaw(scale)
+
+
+def test_it_refuses_to_turn_an_environment():
+    env = lw.LanguageWorldEnv("reach")
+    with pytest.raises(TypeError, match="RandomYaw is for replay buffers"):
+        env.append_transform(lw.RandomYaw(0.1))
+    env.close()
+
+
+def test_on_a_buffer_conditions_are_those_of_the_scene_as_it_was_and_the_storage_is_left_alone(tmp_path):
+    lw.collect_demonstrations("reach", episodes_per_task=1, root=tmp_path / "demos", max_steps=60, progress=False)
+    plans = lw.load_plans("MT10")
+    plain = lw.LanguageWorldExperienceReplay(tmp_path / "demos", transform=lw.QAFTransform(plans))
+    turned = lw.LanguageWorldExperienceReplay(
+        tmp_path / "demos", transform=Compose(lw.QAFTransform(plans), lw.RandomYaw(1.0))
+    )
+    was, now = plain[:], turned[:]
+    assert torch.equal(now["qaf"], was["qaf"])
+    assert not torch.allclose(now["observation"], was["observation"])
+    assert torch.equal(plain[:]["observation"], was["observation"])
+    assert not torch.equal(turned[:]["observation"], now["observation"]), "each sample is turned anew"
