@@ -45,9 +45,8 @@ class RandomYaw(Transform):
     Example:
         >>> import lw_torchrl as lw, torch
         >>> from tensordict import TensorDict
-        >>> row = TensorDict({"observation": torch.rand(2, 39), "action": torch.tensor([[0.5, 0.0, 0.1, 1.0]] * 2)}, [2])
-        >>> turned = lw.RandomYaw(0.3)(row)
-        >>> turned["action"][:, :2].norm(dim=-1)
+        >>> rows = TensorDict({"observation": torch.rand(2, 39), "action": torch.tensor([[0.5, 0.0, 0.1, 1.0]] * 2)}, 2)
+        >>> lw.RandomYaw(0.3)(rows)["action"][:, :2].norm(dim=-1)
         tensor([0.5000, 0.5000])
 
     Source: data augmentation by a symmetry of the task, as for images in ``torchvision.transforms.RandomRotation``.
