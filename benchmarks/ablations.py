@@ -15,7 +15,7 @@ import lw_torchrl as lw
 from lw_torchrl._files import write_text
 from lw_torchrl.evaluation.comparison import markdown_table
 from lw_torchrl.trainers.experiments import Unit, run_unit
-from lw_torchrl.trainers.recipes import CLEAN, NOISY, PRESETS, SETTINGS, Preset
+from lw_torchrl.trainers.recipes import CLEAN, NOISY, PRESETS, SETTINGS, Member, Preset
 
 FULL = PRESETS["strong"]["few-shot"]
 
@@ -24,8 +24,8 @@ def _without(name: str, **changes: Any) -> Preset:
     return replace(FULL, name=f"strong-without-{name}", **changes)
 
 
-def _actor(**options: Any) -> dict[str, Any]:
-    return dict(FULL.actor) | options
+def _members(**options: Any) -> tuple[Member, ...]:
+    return tuple(replace(member, actor={**member.actor, **options}) for member in FULL.members)
 
 
 ABLATIONS: Mapping[str, Preset] = MappingProxyType(
@@ -34,9 +34,9 @@ ABLATIONS: Mapping[str, Preset] = MappingProxyType(
         "clean demonstrations": _without("noise", base=CLEAN),
         "noise drawn anew at every step, failures kept": _without("holding", base=NOISY),
         "rows long after success kept": _without("cutting", after_success=None),
-        "the raw observation": _without("differences", actor=_actor(features="raw")),
-        "no feature noise": _without("feature-noise", actor=_actor(feature_noise=0.0)),
-        "width 256": _without("width", actor=_actor(width=256)),
+        "the raw observation": _without("differences", members=_members(features="raw")),
+        "no feature noise": _without("feature-noise", members=_members(feature_noise=0.0)),
+        "width 256": _without("width", members=_members(width=256)),
         "a constant learning rate": _without("cosine", training=replace(FULL.training, schedule="constant")),
     }
 )

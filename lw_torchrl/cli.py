@@ -157,7 +157,7 @@ def evaluate(
     """
     import lw_torchrl as lw
     from lw_torchrl.record.rollouts import rollout_tasks, write_recording
-    from lw_torchrl.trainers.checkpoint import read_description
+    from lw_torchrl.trainers.checkpoint import demonstration_seeds
 
     _calm_torch()
     chosen: str | tuple[str, ...] = tasks[0] if len(tasks) == 1 else tasks
@@ -166,10 +166,9 @@ def evaluate(
         chosen = chosen or "MT10"
         actor = lw.ExpertActor(chosen)
     else:
-        used = (read_description(checkpoint).get("data") or {}).get("seed")
-        if used == seed:
+        if seed in demonstration_seeds(checkpoint):
             raise ValueError(
-                f"seed must differ from the demonstrations' seed, {used}; an evaluation wants fresh states"
+                f"seed must differ from the demonstrations' seed, {seed}; an evaluation wants fresh states"
             )
         actor = lw.load_actor(checkpoint)
         own = actor.tasks if hasattr(actor, "tasks") else tuple(actor.plans)

@@ -15,17 +15,17 @@ from commands import fails, run
 
 import lw_torchrl as lw
 from lw_torchrl.trainers import experiments, recipes
-from lw_torchrl.trainers.recipes import PRESETS, DataSetting
+from lw_torchrl.trainers.recipes import PRESETS, DataSetting, Member
 
 TINY = """
 from dataclasses import replace
 from functools import partial
 import lw_torchrl as lw
 from lw_torchrl.trainers import experiments, recipes
-from lw_torchrl.trainers.recipes import PRESETS, DataSetting, Execution
+from lw_torchrl.trainers.recipes import PRESETS, DataSetting, Execution, Member
 
 training = lw.BehavioralCloningConfig(steps=100, batch_size=180, checkpoint_every=10)
-options = {"target": Execution("clean", (0.0,)), "actor": {"width": 16, "depth": 1}, "training": training}
+options = {"target": Execution("clean", (0.0,)), "members": (Member({"width": 16, "depth": 1}),), "training": training}
 recipes.SETTINGS = {
     "few-shot": DataSetting("few-shot", "MT10", 2), "one-shot": DataSetting("one-shot", "MT10", 1, targets="MT10")
 }
@@ -40,7 +40,7 @@ def tiny(monkeypatch):
     """Experiments of one demonstration and twenty steps."""
     small = replace(
         PRESETS["strong"]["few-shot"],
-        actor={"width": 16, "depth": 1},
+        members=(Member({"width": 16, "depth": 1}),),
         training=lw.BehavioralCloningConfig(steps=20, batch_size=20),
     )
     presets = {"strong": {"few-shot": small}, "paper": {"few-shot": replace(small, passes=500)}}
@@ -94,7 +94,7 @@ def test_plans_of_ones_own(capsys, tmp_path, tiny):
     out = run(capsys, "reproduce", "few-shot", "--seeds", 0, "--list", "--out", tmp_path, *own).split()
     assert out[1:] == [f"few-shot/strong-mine/{method}/seed0" for method in ("pcbc", "dc", "one-hot")]
     run(capsys, *arguments(tmp_path / "out", "--unit", out[1], *own, methods=["pcbc"], seeds=[0]))
-    actor = lw.load_actor(tmp_path / "out" / out[1] / "checkpoint.zip")
+    actor = lw.load_actor(tmp_path / "out" / out[1] / "policy.zip")
     assert actor.skills == ("move the gripper to the target",)
 
 

@@ -67,10 +67,23 @@ def read_description(path: str | os.PathLike[str]) -> dict[str, Any]:
         raise ValueError(f"checkpoint: {str(path)!r} is damaged or none of ours ({error})") from error
 
 
-def save_actor(actor: Policy, path: str | os.PathLike[str]) -> None:
-    """Write an actor alone, for :func:`load_actor`; an earlier file is replaced whole."""
+def save_actor(actor: Policy, path: str | os.PathLike[str], *, replay: Any = None) -> None:
+    """Write an actor alone, for :func:`load_actor`; an earlier file is replaced whole.
+
+    Args:
+        actor: what to write.
+        path: the file.
+        replay: the buffer that it was trained on; the file then says which demonstrations those were.
+    """
     Path(path).parent.mkdir(parents=True, exist_ok=True)
-    Checkpoint(format="archive", description={"actor": describe_actor(actor)}, actor=actor).save(path)
+    description = {"actor": describe_actor(actor), "data": describe_data(replay)}
+    Checkpoint(format="archive", description=description, actor=actor).save(path)
+
+
+def demonstration_seeds(path: str | os.PathLike[str]) -> set[int]:
+    """The seeds of the demonstrations that a checkpoint's actor was trained on, as far as the checkpoint says."""
+    data = read_description(path).get("data") or {}
+    return {part["seed"] for part in data.get("parts", [data]) if "seed" in part}
 
 
 def check_description(path: Path, ours: dict[str, Any]) -> None:

@@ -18,7 +18,7 @@ from lw_torchrl.evaluation import EvaluationResult, evaluate
 from lw_torchrl.language.plans import Plans, format_plan
 from lw_torchrl.language.tasks import resolve_tasks
 from lw_torchrl.modules import ScriptedSkillActor
-from lw_torchrl.trainers.recipes import DataSetting, Execution, Preset
+from lw_torchrl.trainers.recipes import DataSetting, Execution, Member, Preset
 from lw_torchrl.trainers.unit_training import train_each, train_one
 
 METHODS = ("pcbc", "dc", "one-hot", "scripted")
@@ -111,10 +111,9 @@ class Unit:
         assert self.preset.target is not None
         return base, Dataset(self.setting.targets, 1, self.preset.target, self.seed)
 
-    @property
-    def actor_options(self) -> dict[str, Any]:
-        """Of the actor that it trains."""
-        return dict(self.preset.actor) | (dict(self.preset.plan_actor) if self.method == "pcbc" else {})
+    def actor_options(self, member: Member) -> dict[str, Any]:
+        """Of one of its policy's actors."""
+        return {**member.actor, **(member.plan_actor if self.method == "pcbc" else {})}
 
     def describe(self, plans: Plans) -> dict[str, Any]:
         """Everything that its result hangs on, as JSON."""
@@ -126,9 +125,8 @@ class Unit:
                 "setting": self.setting.name,
                 "preset": self.preset.name,
                 "datasets": [asdict(dataset) for dataset in self.datasets],
-                "actor": self.actor_options,
+                "members": [{"actor": self.actor_options(one), "yaw": one.yaw} for one in self.preset.members],
                 "training": asdict(self.preset.training),
-                "members": self.preset.members,
                 "after_success": self.preset.after_success,
                 "passes": self.preset.passes,
             }

@@ -5,25 +5,25 @@ import shutil
 from dataclasses import replace
 
 import pytest
-import torch
 
 import lw_torchrl as lw
 from lw_torchrl.trainers import experiments, unit_training
 from lw_torchrl.trainers.experiments import METHODS, Unit, load_result, run_unit
-from lw_torchrl.trainers.recipes import PRESETS, SETTINGS, DataSetting, Execution
+from lw_torchrl.trainers.recipes import PRESETS, SETTINGS, DataSetting, Execution, Member
 
 PLANS = lw.load_plans("MT50")
 TINY = DataSetting("tiny", "reach", 2)
 TINY_ONE_SHOT = DataSetting("tiny-one-shot", "reach", 2, targets="push")
 ASTRAY = PRESETS["strong"]["few-shot"].base
+MEMBER = Member({"features": "differences", "width": 32, "depth": 1}, {"focus": True, "swap_unmentioned": 0.5})
 PRESET = replace(
     PRESETS["strong"]["few-shot"],
     target=Execution("target", (0.0,)),
-    actor={"features": "differences", "width": 32, "depth": 1},
-    plan_actor={"focus": True, "swap_unmentioned": 0.5},
+    members=(MEMBER,),
     training=lw.BehavioralCloningConfig(steps=60, batch_size=20, checkpoint_every=20),
 )
-ENSEMBLE = replace(PRESET, name="ensemble", members=2)
+OTHER = Member({"features": "relative", "width": 16, "depth": 1}, yaw=0.3)
+ENSEMBLE = replace(PRESET, name="ensemble", members=(MEMBER, OTHER))
 
 
 def unit(method="pcbc", seed=3, setting=TINY, preset=PRESET):
@@ -89,13 +89,15 @@ def test_the_result_says_what_was_done(undisturbed, one):
     if one.method == "scripted":
         assert said.keys() == {"method", "seed", "plans"}
     else:
-        assert said["actor"]["width"] == 32
-        assert said["actor"].get("focus", False) == (one.method == "pcbc")
+        first, *more = said["members"]
+        focus = {"focus": True, "swap_unmentioned": 0.5} if one.method == "pcbc" else {}
+        assert first == {"actor": {"features": "differences", "width": 32, "depth": 1, **focus}, "yaw": 0.0}
+        other = {"actor": {"features": "relative", "width": 16, "depth": 1}, "yaw": 0.3}
+        assert more == ([other] if one.preset is ENSEMBLE else [])
         assert said["training"]["steps"] == 60
         assert said["datasets"][0]["execution"]["noise_scale"] == [0.0, 0.1, 0.2, 0.3, 0.4]
         assert len(said["datasets"]) == (2 if one.setting.targets else 1)
         assert said["after_success"] == 20
-        assert said["members"] == (2 if one.preset is ENSEMBLE else 1)
 
 
 def test_a_result_of_another_configuration_is_refused(undisturbed):
@@ -109,19 +111,23 @@ def test_a_result_of_another_configuration_is_refused(undisturbed):
 
 
 @pytest.mark.parametrize(
-    ("setting", "preset", "trainer"),
+    ("setting", "preset", "stop"),
     [
-        (TINY, PRESET, lw.BehavioralCloningTrainer),
-        (TINY, ENSEMBLE, lw.StackedBehavioralCloning),
-        (TINY_ONE_SHOT, PRESET, lw.StackedBehavioralCloning),
+        (TINY, PRESET, 46),
+        (TINY_ONE_SHOT, PRESET, 46),
+        (TINY, ENSEMBLE, 46),
+        (TINY, ENSEMBLE, 106),
+        (TINY_ONE_SHOT, ENSEMBLE, 46),
+        (TINY_ONE_SHOT, ENSEMBLE, 106),
     ],
 )
-def test_stopped_in_training_and_resumed_it_ends_the_same(undisturbed, tmp_path, monkeypatch, setting, preset, trainer):
+def test_stopped_in_training_and_resumed_it_ends_the_same(undisturbed, tmp_path, monkeypatch, setting, preset, stop):
+    trainer = lw.BehavioralCloningTrainer if setting is TINY else lw.StackedBehavioralCloning
     one, step, count = unit(setting=setting, preset=preset), trainer.step, [0]
 
     def stops(self):
         count[0] += 1
-        if count[0] == 46:
+        if count[0] == stop:
             raise KeyboardInterrupt
         return step(self)
 
@@ -129,7 +135,7 @@ def test_stopped_in_training_and_resumed_it_ends_the_same(undisturbed, tmp_path,
     with pytest.raises(KeyboardInterrupt):
         run(one, tmp_path)
     run(one, tmp_path)
-    assert count[0] == 46 + 20  # from the checkpoint at step 40
+    assert count[0] == 60 * len(preset.members) + 6  # it carried on from the checkpoint before, one every 20 steps
     assert rates(tmp_path / one.folder) == rates(undisturbed / one.folder)
 
 
@@ -153,13 +159,12 @@ def test_an_ensemble_has_members_of_its_own_and_is_not_trained_twice(undisturbed
     one = unit(method, setting=setting, preset=ENSEMBLE)
     policy = lw.load_actor(undisturbed / one.folder / file)
     assert isinstance(policy, lw.ActorEnsemble)
-    first, second = policy.members
-    assert not torch.equal(next(first.parameters()), next(second.parameters()))
+    assert [actor.config["width"] for actor in policy.members] == [32, 16]
     shutil.copytree(undisturbed, tmp_path / "again")
     (tmp_path / "again" / one.folder / "results.json").unlink()
     result = run_unit(one, PLANS, tmp_path / "again", tasks=task_of(one), progress=False)
     assert result.success_once == lw.EvaluationResult.load(undisturbed / one.folder / "results.json").success_once
-    assert not (tmp_path / "again" / one.folder / "checkpoint.zip").exists()
+    assert not (tmp_path / "again" / one.folder / "checkpoint-0.zip").exists()
 
 
 def test_settings_are_the_papers():
@@ -169,8 +174,8 @@ def test_settings_are_the_papers():
     assert (one_shot.base, one_shot.episodes, one_shot.targets) == ("MT10", 100, "MT50")
     paper = PRESETS["paper"]["few-shot"]
     assert (paper.training.optimizer, paper.training.learning_rate, paper.training.momentum) == ("sgd", 1e-5, 0.995)
-    assert paper.actor["width"] == (128, 128, 128, 64, 32)
-    assert (paper.actor["encoder_width"], paper.actor["encoder_depth"]) == (64, 3)
+    assert paper.members[0].actor["width"] == (128, 128, 128, 64, 32)
+    assert (paper.members[0].actor["encoder_width"], paper.members[0].actor["encoder_depth"]) == (64, 3)
     assert (paper.passes, paper.base.noise_scale) == (500, (0.0,))
     assert PRESETS["paper"]["one-shot"].base.noise_scale == (0.1, 0.2, 0.3, 0.4)
     for preset in PRESETS.values():
