@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import nn
 
-from lw_torchrl.language.plans import Plans
+from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.modules.descriptor_conditioned_actor import DescriptorConditionedActor
 from lw_torchrl.modules.plan_conditioned_actor import PlanConditionedActor
 
 
 class ActorEnsemble(TensorDictModuleBase):
     """The mean action of actors that were trained apart on the same demonstrations: where these do not say what to
-    do, each fills the gap in its own way, and the mean strays less than one of them.
+    do, each fills the gap in its own way, and the mean strays less than one of them. Members that see different
+    features, or were trained on other augmentations, differ most.
 
     Reads what a member reads; writes ``action`` (B, 4) float32 in (-1, 1), and ``skill_weights`` (B, S) float32 where
     the members have plans.
@@ -68,3 +69,14 @@ class ActorEnsemble(TensorDictModuleBase):
         for key in self.out_keys[1:]:
             tensordict.set(key, done[0].get(key))
         return tensordict
+
+    def with_plans(self, plans: Plans | Mapping[str, ConditionalPlan]) -> ActorEnsemble:
+        """An ensemble that carries out other plans with the same weights: training either trains both.
+
+        Raises:
+            TypeError: the members are conditioned on descriptions.
+        """
+        members = [member for member in self.members if isinstance(member, PlanConditionedActor)]
+        if not members:
+            raise TypeError("with_plans is for members with plans, these are conditioned on descriptions")
+        return ActorEnsemble([member.with_plans(plans) for member in members]).train(self.training)

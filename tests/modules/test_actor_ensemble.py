@@ -14,7 +14,8 @@ PLANS = lw.load_plans("MT10")
 def make_members(number=3, kind="plans"):
     torch.manual_seed(0)
     if kind == "plans":
-        return [lw.PlanConditionedActor(PLANS, width=16, depth=1) for _ in range(number)]
+        kinds = ("differences", "relative", "both")  # what members see may differ
+        return [lw.PlanConditionedActor(PLANS, width=16 + n, depth=1, features=kinds[n % 3]) for n in range(number)]
     return [lw.DescriptorConditionedActor("MT10", width=16, depth=1) for _ in range(number)]
 
 
@@ -49,6 +50,18 @@ def test_one_member_alone_does_what_it_would_do():
     state = make_state()
     ensemble = lw.ActorEnsemble([member]).eval()
     assert torch.equal(ensemble(state.clone())["action"], member(state.clone())["action"])
+
+
+def test_with_plans_keeps_the_weights_and_the_mode():
+    ensemble = lw.ActorEnsemble(make_members(2)).eval()
+    plan = lw.ConditionalPlan("reach", [lw.PlanStep("the robot's gripper is open", "wave")])
+    other = ensemble.with_plans({"reach": plan})
+    assert not other.training
+    assert other.plans["reach"] == plan
+    for before, after in zip(ensemble.members, other.members, strict=True):
+        assert after.decoder is before.decoder
+    with pytest.raises(TypeError, match="with_plans is for members with plans"):
+        lw.ActorEnsemble(make_members(2, "descriptions")).with_plans({"reach": plan})
 
 
 def test_it_acts_in_the_environment():
