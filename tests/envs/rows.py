@@ -1,0 +1,57 @@
+"""Six rows of three tasks, and what the tests of LanguageWorldEnv do with them."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+FEW = ["door-open", "push", "reach"]
+ENGINES = ["vectorized", "metaworld"]
+ROWS = 6
+STEPS = 12
+STATE = ("observation", "task_id", "episode", "success", "fault")
+
+
+def actions_of(task: int, episode: int, steps: int) -> Tensor:
+    """(steps, 4) float32 in [-1, 1], random, of one episode."""
+    return torch.from_numpy(np.random.default_rng([task, episode]).uniform(-1, 1, (steps, 4)).astype(np.float32))
+
+
+def row_actions(state: TensorDictBase, step: int) -> Tensor:
+    pairs = zip(state["task_id"].tolist(), state["episode"].tolist(), strict=True)
+    return torch.stack([actions_of(task, episode, step + 1)[step] for task, episode in pairs])
+
+
+def advance(env, state: TensorDictBase, action: Tensor, **more: Tensor) -> TensorDictBase:
+    """The state after ``action``; the caller's tensors stay as they are."""
+    return env.step(state.select(*STATE).update({"action": action.clone(), **more}))["next"]
+
+
+def trajectories(env, steps: int, state: TensorDictBase | None = None) -> dict[tuple[int, int], dict[str, Tensor]]:
+    """(task_id, episode) to what each of its steps gave, the reset first, when every episode has its own actions."""
+    state = env.reset() if state is None else state
+    states = [state.select(*STATE)]
+    for step in range(steps):
+        state = advance(env, state, row_actions(state, step))
+        states.append(state.select(*STATE, "reward", "done"))
+    found = {}
+    for row, key in enumerate(zip(state["task_id"].tolist(), state["episode"].tolist(), strict=True)):
+        found[key] = {
+            "observation": torch.stack([s["observation"][row] for s in states]),
+            "success": torch.stack([s["success"][row] for s in states]),
+            "reward": torch.stack([s["reward"][row] for s in states[1:]]),
+        }
+    return found
+
+
+def same(left: TensorDictBase | dict, right: TensorDictBase | dict, rows=slice(None)) -> bool:
+    """Whether two states, or what two episodes gave, agree in every bit."""
+    keys = left.keys() & right.keys()
+    assert "observation" in keys
+    return all(torch.equal(left[key][rows], right[key][rows]) for key in keys)
+
+
+def others(*rows: int) -> Tensor:
+    return torch.tensor([row not in rows for row in range(ROWS)])

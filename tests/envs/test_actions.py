@@ -1,0 +1,84 @@
+"""Actions that LanguageWorldEnv clips, records as executed, or refuses."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from rows import ROWS, advance, same
+from torch import Tensor
+
+
+def layouts(values: Tensor) -> dict[str, Tensor]:
+    """The same (6, 4) numbers in the memory layouts in which a policy may hand them over."""
+    wide = torch.zeros(ROWS, 8)
+    wide[:, ::2] = values
+    return {
+        "contiguous": values.clone(),
+        "transposed": values.t().clone().t(),
+        "strided": wide[:, ::2],
+        "grad": values.clone().requires_grad_(),
+        "not a leaf": values.clone().requires_grad_() * 1.0,
+    }
+
+
+@pytest.mark.parametrize("layout", ["contiguous", "transposed", "strided", "grad", "not a leaf"])
+def test_actions_out_of_range_are_clipped_and_recorded_as_executed(any_env, layout):
+    wild = torch.linspace(-4, 4, 24).reshape(ROWS, 4)
+    wild[0, 0], wild[5, 3] = -torch.inf, torch.inf
+    any_env.set_seed(1)
+    expected = advance(any_env, any_env.reset(), wild.clamp(-1, 1))
+    any_env.set_seed(1)
+    state = any_env.step(any_env.reset().set("action", layouts(wild)[layout]))
+    assert torch.equal(state["action"], wild.clamp(-1, 1))
+    assert same(expected, state["next"])
+
+
+@pytest.mark.parametrize("shape", [(1, 4), (ROWS, 1), (1, 1)], ids=str)
+def test_expanded_actions_are_recorded_as_executed(any_env, shape):
+    wild = torch.linspace(-3, 2, 24)[: shape[0] * shape[1]].reshape(shape)
+    any_env.set_seed(1)
+    expected = advance(any_env, any_env.reset(), wild.clamp(-1, 1).expand(ROWS, 4))
+    any_env.set_seed(1)
+    state = any_env.step(any_env.reset().set("action", wild.clone().expand(ROWS, 4)))
+    assert torch.equal(state["action"], wild.clamp(-1, 1).expand(ROWS, 4))
+    assert same(expected, state["next"])
+
+
+def test_actions_that_share_memory_are_recorded_as_executed(env):
+    wild = torch.linspace(-3, 3, ROWS + 3).unfold(0, 4, 1)
+    env.set_seed(1)
+    state = env.step(env.reset().set("action", wild))
+    assert torch.equal(state["action"], wild.clamp(-1, 1))
+
+
+def test_actions_in_range_are_left_alone(any_env):
+    any_env.set_seed(1)
+    action = torch.linspace(-1, 1, 24).reshape(ROWS, 4)
+    state = any_env.step(any_env.reset().set("action", action))
+    assert state["action"].data_ptr() == action.data_ptr()
+    assert torch.equal(action, torch.linspace(-1, 1, 24).reshape(ROWS, 4))
+
+
+@pytest.mark.parametrize(
+    "action",
+    [
+        torch.zeros(ROWS, 5),
+        torch.zeros(ROWS, 3),
+        torch.zeros(ROWS),
+        torch.zeros(ROWS, 1, 4),
+        torch.zeros(ROWS, 4, dtype=torch.float64),
+        torch.zeros(ROWS, 4, dtype=torch.int64),
+        torch.zeros(ROWS, 4, dtype=torch.bfloat16),
+        None,
+    ],
+    ids=lambda a: "none" if a is None else f"{tuple(a.shape)}-{a.dtype}",
+)
+def test_a_wrong_action_is_named_and_moves_nothing(any_env, action):
+    any_env.set_seed(1)
+    state = any_env.reset()
+    given = "none" if action is None else str(action.dtype)
+    with pytest.raises(ValueError, match=rf"action must be float32 of shape \(6, 4\), got {given}"):
+        any_env.step(state.clone() if action is None else state.clone().set("action", action))
+    after = advance(any_env, state, torch.ones(ROWS, 4))
+    any_env.set_seed(1)
+    assert same(after, advance(any_env, any_env.reset(), torch.ones(ROWS, 4)))

@@ -1,0 +1,247 @@
+"""LanguageWorldEnv from step to step: partial resets and steps, the end of an episode, fresh tensors."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from rows import ENGINES, FEW, ROWS, STATE, STEPS, actions_of, advance, others, row_actions, same, trajectories
+from tensordict import TensorDict, TensorDictBase
+from torchrl.collectors import Collector
+from torchrl.envs import TransformedEnv
+
+import lw_torchrl as lw
+
+
+def test_partial_resets_touch_only_their_rows(any_env):
+    any_env.set_seed(4)
+    reference = trajectories(any_env, STEPS)
+    any_env.set_seed(4)
+    state = any_env.reset()
+    for step in range(5):
+        state = advance(any_env, state, row_actions(state, step))
+    before = state.clone()
+    mask = torch.tensor([False, True, False, False, True, False])
+    state = any_env.reset(state.clone().set("_reset", mask), select_reset_only=True)
+    assert same(before.exclude("reward"), state, ~mask)
+    assert state["episode"].tolist() == [0, 2, 0, 1, 3, 1]
+    clock = np.where(mask, 0, 5)
+    for _ in range(STEPS - 5):
+        keys = list(zip(state["task_id"].tolist(), state["episode"].tolist(), strict=True))
+        action = torch.stack([actions_of(*key, STEPS)[clock[row]] for row, key in enumerate(keys)])
+        state = advance(any_env, state, action)
+        clock += 1
+        for row in torch.nonzero(~mask).flatten().tolist():
+            assert torch.equal(state["observation"][row], reference[keys[row]]["observation"][clock[row]])
+    assert state["done"].flatten().tolist() == (~mask).tolist(), "rows that were reset have their own clock"
+
+
+def test_a_reset_mask_without_rows_does_nothing(env):
+    env.set_seed(0)
+    state = env.rand_step(env.reset())["next"]
+    again = env.reset(state.clone().set("_reset", torch.zeros(ROWS, dtype=torch.bool)))
+    assert same(state.exclude("reward"), again)
+
+
+@pytest.mark.parametrize("shape", [(ROWS,), (ROWS, 1)], ids=str)
+def test_a_step_mask_leaves_rows_where_they_are(any_env, shape):
+    """Rows that pause, with garbage for an action, do as rows that do not."""
+    any_env.set_seed(6)
+    reference = trajectories(any_env, STEPS)
+    any_env.set_seed(6)
+    state = any_env.reset()
+    keys = list(zip(state["task_id"].tolist(), state["episode"].tolist(), strict=True))
+    clock = np.zeros(ROWS, dtype=int)
+    rng = np.random.default_rng(1)
+    stepped, rested = 0, 0
+    for _ in range(40):
+        mask = torch.from_numpy((rng.random(ROWS) < 0.5) & (clock < STEPS))
+        action = torch.full((ROWS, 4), float("nan"))
+        for row in torch.nonzero(mask).flatten().tolist():
+            action[row] = actions_of(*keys[row], STEPS)[clock[row]]
+        before = state.clone()
+        state = advance(any_env, state, action, _step=mask.reshape(shape))
+        clock += mask.numpy()
+        assert same(before.select(*STATE), state.select(*STATE), ~mask)
+        if mask.any():
+            assert not state["reward"][~mask].any()
+            stepped, rested = stepped + int(mask.sum()), rested + int((~mask).sum())
+        for row, key in enumerate(keys):
+            assert torch.equal(state["observation"][row], reference[key]["observation"][clock[row]])
+            if mask[row]:
+                assert torch.equal(state["reward"][row], reference[key]["reward"][clock[row] - 1])
+    assert not state["fault"].any()
+    assert stepped == STEPS * ROWS
+    assert rested > 50
+
+
+def test_a_step_mask_without_rows_does_nothing(any_env):
+    any_env.set_seed(0)
+    state = any_env.reset()
+    idle = advance(any_env, state, torch.ones(ROWS, 4), _step=torch.zeros(ROWS, dtype=torch.bool))
+    assert same(state, idle.select(*STATE))
+    assert same(advance(any_env, idle, torch.ones(ROWS, 4)), advance_afresh(any_env))
+
+
+def advance_afresh(env) -> TensorDictBase:
+    env.set_seed(0)
+    return advance(env, env.reset(), torch.ones(ROWS, 4))
+
+
+def test_an_episode_ends_by_truncation_alone(any_env):
+    any_env.set_seed(0)
+    rollout = any_env.rollout(3 * STEPS)
+    assert rollout.batch_size == (ROWS, STEPS)
+    last = torch.arange(STEPS) == STEPS - 1
+    for key in ("done", "truncated"):
+        assert torch.equal(rollout["next", key].squeeze(-1), last.expand(ROWS, -1))
+    assert not rollout["next", "terminated"].any()
+    assert not rollout["next", "fault"].any()
+
+
+@pytest.mark.parametrize(
+    ("options", "length"),
+    [({}, 500), ({"max_steps": 510}, 510), ({"max_steps": 510, "engine": "metaworld"}, 510)],
+    ids=str,
+)
+def test_the_length_of_an_episode(options, length):
+    """500 steps, or more: Meta-World's own limit does not come first."""
+    env = lw.LanguageWorldEnv("reach", **options)
+    rollout = env.rollout(600, lambda td: td.set("action", torch.zeros(1, 4)))
+    assert rollout.batch_size == (1, length)
+    assert rollout["next", "truncated"].flatten().tolist() == [False] * (length - 1) + [True]
+    env.close()
+
+
+def test_a_row_that_has_ended_must_be_reset(any_env):
+    any_env.set_seed(0)
+    state = any_env.rollout(STEPS)[:, -1]["next"]
+    with pytest.raises(RuntimeError, match=r"rows \[0, 1, 2, 3, 4\] have ended or were never reset"):
+        advance(any_env, state, torch.zeros(ROWS, 4))
+    mask = ~others(2)
+    state = any_env.reset(state.clone().set("_reset", mask))
+    with pytest.raises(RuntimeError, match=r"rows \[0, 1, 3, 4, 5\]"):
+        advance(any_env, state, torch.zeros(ROWS, 4))
+    after = advance(any_env, state, torch.ones(ROWS, 4), _step=mask)
+    assert after["done"].flatten().tolist() == others(2).tolist()
+    assert not torch.equal(after["observation"][2], state["observation"][2])
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_closed_environment_says_so(engine):
+    env = lw.LanguageWorldEnv("reach", engine=engine)
+    state = env.reset()
+    assert not env.is_closed
+    env.close()
+    assert env.is_closed
+    with pytest.raises(RuntimeError, match="this environment is closed"):
+        env.step(state.set("action", torch.zeros(1, 4)))
+    with pytest.raises(RuntimeError, match="this environment is closed"):
+        env.reset()
+
+
+def test_a_row_that_was_never_reset_must_be():
+    env = lw.LanguageWorldEnv(["reach", "push"])
+    with pytest.raises(RuntimeError, match=r"rows \[0, 1\] have ended or were never reset"):
+        env.step(TensorDict({"action": torch.zeros(2, 4)}, [2]))
+    env.close()
+
+
+def test_rollouts_go_on_over_the_end_of_episodes(any_env):
+    any_env.set_seed(8)
+    steps = 2 * STEPS + 5
+    rollout = any_env.rollout(steps, break_when_any_done=False)
+    assert rollout.batch_size == (ROWS, steps)
+    rank = torch.tensor([0, 0, 0, 1, 1, 1])
+    for step in range(steps):
+        assert rollout["episode"][:, step].tolist() == (step // STEPS * 2 + rank).tolist()
+    assert torch.equal(rollout["episode"], rollout["next", "episode"])
+    assert (rollout["task_id"] == rollout["task_id"][:, :1]).all()
+    ended = rollout["next", "done"].squeeze(-1)
+    assert ended.nonzero()[:, 1].unique().tolist() == [STEPS - 1, 2 * STEPS - 1]
+    inside = ~ended[:, :-1]
+    following, current = rollout["observation"][:, 1:], rollout["next", "observation"][:, :-1]
+    assert torch.equal(following[inside], current[inside])
+    any_env.set_seed(8)
+    for episode in range(3):
+        assert torch.equal(any_env.reset()["observation"], rollout["observation"][:, episode * STEPS])
+
+
+def test_later_steps_overwrite_nothing(any_env):
+    any_env.set_seed(0)
+    states = [any_env.reset()]
+    copies = [states[0].clone()]
+    for step in range(6):
+        if step == 3:
+            states.append(any_env.reset(states[-1].clone().set("_reset", ~others(1, 4))))
+        else:
+            states.append(advance(any_env, states[-1], row_actions(states[-1], step)))
+        copies.append(states[-1].clone())
+    for state, copy in zip(states, copies, strict=True):
+        assert all(torch.equal(state[key], copy[key]) for key in copy.keys(True, True))
+    memory = [state[key].untyped_storage().data_ptr() for state in states for key in ("observation", "success", "done")]
+    assert len(set(memory)) == len(memory)
+
+
+def test_writing_to_a_state_does_not_reach_the_environment(env):
+    env.set_seed(0)
+    state = env.rand_step(env.reset())["next"]
+    kept = state.clone()
+    for key in (*STATE, "done", "truncated", "terminated"):
+        state[key].fill_(1)
+    resting = env._step(TensorDict({"action": torch.zeros(ROWS, 4), "_step": torch.zeros(ROWS, dtype=torch.bool)}))
+    assert same(kept.exclude("reward"), resting)
+
+
+def test_a_rollout_is_its_steps(any_env):
+    any_env.set_seed(9)
+    torch.manual_seed(0)
+    rollout = any_env.rollout(STEPS)
+    any_env.set_seed(9)
+    state = any_env.reset()
+    for step in range(STEPS):
+        assert torch.equal(state["observation"], rollout["observation"][:, step])
+        state = advance(any_env, state, rollout["action"][:, step])
+        assert same(state, rollout["next"][:, step])
+
+
+@pytest.mark.parametrize("transformed", [False, True])
+def test_a_collector_runs(plans, transformed):
+    made = lw.LanguageWorldEnv(FEW, num_envs=ROWS, seed=9, max_steps=STEPS)
+    env = TransformedEnv(made, lw.QAFTransform(plans)) if transformed else made
+    policy = row_policy()
+    expected = env.rollout(20, policy, break_when_any_done=False)
+    env.set_seed(9)
+    collector = Collector(env, policy, frames_per_batch=10 * ROWS, total_frames=20 * ROWS)
+    batches = torch.cat(list(collector), -1)
+    collector.shutdown()
+    assert batches.batch_size == (ROWS, 20)
+    for key in ("observation", "action", "episode", ("next", "reward"), ("next", "done")):
+        assert torch.equal(batches[key], expected[key]), key
+    assert batches["next", "done"].sum() == ROWS
+    assert batches["collector", "traj_ids"].unique().numel() == 2 * ROWS
+    assert made.is_closed, "the collector closes what it ran"
+
+
+def test_a_collector_gives_whole_episodes():
+    env = lw.LanguageWorldEnv(FEW, num_envs=ROWS, seed=9, max_steps=STEPS)
+    collector = Collector(
+        env, row_policy(), frames_per_batch=2 * ROWS, total_frames=24 * ROWS, trajs_per_batch=4, traj_format="cat"
+    )
+    batches = list(collector)
+    collector.shutdown()
+    assert len(batches) == 3
+    for batch in batches:
+        assert batch.batch_size == (4 * STEPS,)
+        assert batch["next", "done"].nonzero()[:, 0].tolist() == [STEPS * k - 1 for k in range(1, 5)]
+    pairs = [(b["task_id"][k].item(), b["episode"][k].item()) for b in batches for k in range(0, 48, STEPS)]
+    assert sorted(pairs) == sorted((lw.task_id(task), episode) for task in FEW for episode in range(4))
+
+
+def row_policy():
+    """A policy that hangs on the observation alone."""
+
+    def policy(tensordict: TensorDictBase) -> TensorDictBase:
+        return tensordict.set("action", (tensordict["observation"][:, :4] * 37).sin())
+
+    return policy
