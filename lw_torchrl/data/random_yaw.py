@@ -11,6 +11,7 @@ from lw_torchrl._checks import check_scale
 
 # Where the observation's positions begin: hand, two objects, the same a step before, goal.
 _POSITIONS = (0, 4, 11, 18, 22, 29, 36)
+_NOT_FOR_ENVIRONMENTS = "RandomYaw is for replay buffers: an environment has done its action before it is turned"
 
 
 def _turned(values: Tensor, starts: tuple[int, ...], cos: Tensor, sin: Tensor) -> Tensor:
@@ -30,16 +31,17 @@ class RandomYaw(Transform):
     happened to have. For replay buffers; where a :class:`QAFTransform` is used, put it first, since conditions speak of
     the scene as it was.
 
-    Changes ``observation`` (B, 39) float32, and ``("next", "observation")`` where it is, and ``action`` (B, 4)
-    float32, whose way in the plane is shortened where it would leave [-1, 1], its direction kept. Orientations stay as
-    they were, and so do fixed places: use it with features that hold neither, "differences" or "relative". Angles are
-    drawn from PyTorch's global generator; the trainers seed it.
+    Changes ``observation`` (B, 39) float32 and ``action`` (B, 4) float32, and ``("next", "observation")`` and
+    ``expert_action`` where they are. An action's way in the plane is shortened where it would leave [-1, 1], its
+    direction kept. Orientations stay as they were, and so do fixed places: use it with features that hold neither,
+    "differences" or "relative", and without ``focus``. Angles are drawn from PyTorch's global generator; the trainers
+    seed it.
 
     Args:
         scale: standard deviation of the angle, in radians.
 
     Raises:
-        ValueError: a negative or infinite scale.
+        ValueError: a negative or infinite scale; a sample without observation or action.
         TypeError: it is given to an environment.
 
     Example:
@@ -59,18 +61,25 @@ class RandomYaw(Transform):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Turn each row of a sample."""
         tensordict = tensordict.copy()  # of a buffer's whole range it may be the storage itself
-        observation, action = tensordict.get("observation"), tensordict.get("action")
+        observation = tensordict.get("observation", None)
+        if observation is None or "action" not in tensordict.keys():
+            raise ValueError(f"observation and action are needed, got {', '.join(map(str, tensordict.keys()))}")
         angle = self.scale * torch.randn(observation.shape[:-1], device=observation.device)
         cos, sin = angle.cos(), angle.sin()
         tensordict.set("observation", _turned(observation, _POSITIONS, cos, sin))
         if (following := tensordict.get(("next", "observation"), None)) is not None:
             tensordict.set(("next", "observation"), _turned(following, _POSITIONS, cos, sin))
-        turned = _turned(action, (0,), cos, sin)
-        turned[..., :2] /= turned[..., :2].abs().amax(-1, keepdim=True).clamp(min=1.0)
-        return tensordict.set("action", turned)
+        for name in {"action", "expert_action"} & set(tensordict.keys()):
+            turned = _turned(tensordict.get(name), (0,), cos, sin)
+            turned[..., :2] /= turned[..., :2].abs().amax(-1, keepdim=True).clamp(min=1.0)
+            tensordict.set(name, turned)
+        return tensordict
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        raise TypeError(_NOT_FOR_ENVIRONMENTS)
 
     def set_container(self, container: Transform | EnvBase) -> None:
         """Join a buffer's transforms; an environment's actions cannot be turned after the fact."""
         if isinstance(container, EnvBase):
-            raise TypeError("RandomYaw is for replay buffers: an environment has done its action before it is turned")
+            raise TypeError(_NOT_FOR_ENVIRONMENTS)
         super().set_container(container)

@@ -48,8 +48,8 @@ class ObservationFeatures(nn.Module):
     In training mode Gaussian noise is added to the normalised features, drawn from PyTorch's global generator.
 
     Args:
-        kind: "raw", the 39 numbers; "differences", see :func:`differences`; "relative", these without what does
-            not tell where things are to each other; "both", the 39 numbers and the differences.
+        kind: "raw", the 39 numbers; "differences", see :func:`differences`; "relative", these without the
+            hand's height and the gripper's opening; "both", the 39 numbers and the differences.
         noise: standard deviation of the noise, in standard deviations of each feature.
 
     Attributes:

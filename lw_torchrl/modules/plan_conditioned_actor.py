@@ -35,8 +35,8 @@ class PlanConditionedActor(TensorDictModuleBase):
         mix: "latents", decode the mixed latent, as in the paper; "actions", decode every step's latent and mix the
             actions.
         features: what the decoder sees of the observation: "raw", the 39 numbers; "differences", the pairwise
-            differences between hand, objects and goal; "relative", these alone, see
-            :class:`ObservationFeatures`; "both".
+            differences between hand, objects and goal, the hand's height and the gripper's opening; "relative", the
+            differences alone; "both", see :class:`ObservationFeatures`.
         feature_noise: standard deviation of the noise on the normalised features while training.
         focus: the decoder also sees the way between the things that the steps in force compare, see :class:`PlanFocus`.
         swap_unmentioned: the probability with which, in training, an object or the goal is put where it is in another

@@ -67,17 +67,16 @@ def read_description(path: str | os.PathLike[str]) -> dict[str, Any]:
         raise ValueError(f"checkpoint: {str(path)!r} is damaged or none of ours ({error})") from error
 
 
-def save_actor(actor: Policy, path: str | os.PathLike[str], *, replay: Any = None) -> None:
+def save_actor(actor: Policy, path: str | os.PathLike[str], **about: Any) -> None:
     """Write an actor alone, for :func:`load_actor`; an earlier file is replaced whole.
 
     Args:
         actor: what to write.
         path: the file.
-        replay: the buffer that it was trained on; the file then says which demonstrations those were.
+        **about: what else the file is to say, as JSON: ``data`` of :func:`describe_data`, say.
     """
     Path(path).parent.mkdir(parents=True, exist_ok=True)
-    description = {"actor": describe_actor(actor), "data": describe_data(replay)}
-    Checkpoint(format="archive", description=description, actor=actor).save(path)
+    Checkpoint(format="archive", description={"actor": describe_actor(actor), **about}, actor=actor).save(path)
 
 
 def demonstration_seeds(path: str | os.PathLike[str]) -> set[int]:
@@ -138,7 +137,7 @@ class TrainingState:
 
     def __init__(self, sampler: Any, generator: torch.Generator) -> None:
         self.sampler, self.generator, self.step = sampler, generator, 0
-        self.torch_generator = generator.get_state()  # of the random numbers that the actor draws while training
+        self.torch_generator = generator.get_state()  # of what transforms and the actor draw in training
 
     def state_dict(self) -> dict[str, Any]:
         return {

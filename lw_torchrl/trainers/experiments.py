@@ -177,7 +177,7 @@ def load_result(unit: Unit, plans: Plans, out: Path) -> EvaluationResult | None:
     if different:
         raise ValueError(
             f"out: {str(path)!r} is of another configuration, it differs in {', '.join(different)}; choose another "
-            "folder, or delete it to do the unit again"
+            f"folder, or delete {str(path.parent)!r} to do the unit again"
         )
     return result
 

@@ -16,7 +16,7 @@ from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.tasks import MT50, resolve_tasks
 from lw_torchrl.modules import ActorEnsemble, DescriptorConditionedActor, PlanConditionedActor
 from lw_torchrl.trainers.behavioral_cloning import BehavioralCloningConfig, BehavioralCloningTrainer
-from lw_torchrl.trainers.checkpoint import Actor, Policy, load_actor, save_actor
+from lw_torchrl.trainers.checkpoint import Actor, Policy, check_description, describe_data, load_actor, save_actor
 from lw_torchrl.trainers.recipes import Member
 from lw_torchrl.trainers.stacked import StackedBehavioralCloning
 
@@ -45,10 +45,22 @@ def _config(unit: Unit, rows: int, seed: int) -> BehavioralCloningConfig:
     return replace(config, steps=steps, seed=seed)
 
 
-def _keep(actors: Sequence[Actor], file: Path, replay: LanguageWorldExperienceReplay) -> Policy:
+def _keep(
+    unit: Unit, plans: Plans, actors: Sequence[Actor], file: Path, replay: LanguageWorldExperienceReplay
+) -> Policy:
     policy = actors[0] if len(actors) == 1 else ActorEnsemble(actors)
-    save_actor(policy, file, replay=replay)
+    save_actor(policy, file, data=describe_data(replay), unit=unit.describe(plans))
     return policy
+
+
+def _forget_checkpoints(folder: Path) -> None:
+    for checkpoint in folder.glob("checkpoint-*.zip"):
+        checkpoint.unlink()
+
+
+def _kept(unit: Unit, plans: Plans, file: Path) -> Policy:
+    check_description(file, {"unit": unit.describe(plans)})
+    return load_actor(file)
 
 
 def train_one(unit: Unit, plans: Plans, out: Path, progress: bool) -> Policy:
@@ -56,8 +68,9 @@ def train_one(unit: Unit, plans: Plans, out: Path, progress: bool) -> Policy:
     folder = out / unit.folder
     file = folder / "policy.zip"
     if file.is_file():
-        return load_actor(file)
-    actors, checkpoints = [], []
+        _forget_checkpoints(folder)
+        return _kept(unit, plans, file)
+    actors = []
     for number, member in enumerate(unit.preset.members):
         replay = LanguageWorldExperienceReplay(
             out / unit.datasets[0].folder,
@@ -67,28 +80,29 @@ def train_one(unit: Unit, plans: Plans, out: Path, progress: bool) -> Policy:
         )
         config = _config(unit, len(replay), unit.seed + 1_000 * number)
         actors.append(_make_actor(unit, member, plans, config.seed))
-        checkpoints.append(folder / f"checkpoint-{number}.zip")
-        BehavioralCloningTrainer(actors[-1], replay, config, checkpoint=checkpoints[-1], progress=progress).train()
-    policy = _keep(actors, file, replay)
-    for checkpoint in checkpoints:
-        checkpoint.unlink()
+        checkpoint = folder / f"checkpoint-{number}.zip"
+        BehavioralCloningTrainer(actors[-1], replay, config, checkpoint=checkpoint, progress=progress).train()
+    policy = _keep(unit, plans, actors, file, replay)
+    _forget_checkpoints(folder)
     return policy
 
 
 def train_each(unit: Unit, plans: Plans, out: Path, progress: bool) -> dict[str, Policy]:
     """A policy for each target, kept in ``models/<target>.zip``; all are trained together, member by member.
 
-    The i-th target's seed is the i-th from 1000 times the unit's.
+    The i-th target's seed is the i-th from 1000 times the unit's; the next member's follow.
     """
     folder = out / unit.folder
     targets = resolve_tasks(unit.setting.targets or ())
     files = {target: folder / "models" / f"{target}.zip" for target in targets}
     if all(file.is_file() for file in files.values()):
-        return {target: load_actor(file) for target, file in files.items()}
+        _forget_checkpoints(folder)
+        return {target: _kept(unit, plans, file) for target, file in files.items()}
     roots = [out / dataset.folder for dataset in unit.datasets]
-    # Passes are over the base tasks, which have half of each minibatch.
-    rows = 2 * len(LanguageWorldExperienceReplay(roots[0], after_success=unit.preset.after_success))
-    members, checkpoints = [], []
+    rows = 0
+    if unit.preset.passes is not None:  # over the base tasks, which have half of each minibatch
+        rows = 2 * len(LanguageWorldExperienceReplay(roots[0], after_success=unit.preset.after_success))
+    members = []
     for number, member in enumerate(unit.preset.members):
         config = _config(unit, rows, 1_000 * unit.seed + len(targets) * number)
         replays = [
@@ -102,12 +116,11 @@ def train_each(unit: Unit, plans: Plans, out: Path, progress: bool) -> dict[str,
             for target in targets
         ]
         members.append([_make_actor(unit, member, plans, config.seed + i) for i in range(len(targets))])
-        checkpoints.append(folder / f"checkpoint-{number}.zip")
-        StackedBehavioralCloning(members[-1], replays, config, checkpoint=checkpoints[-1], progress=progress).train()
+        checkpoint = folder / f"checkpoint-{number}.zip"
+        StackedBehavioralCloning(members[-1], replays, config, checkpoint=checkpoint, progress=progress).train()
     policies = {
-        target: _keep(actors, files[target], replay)
+        target: _keep(unit, plans, actors, files[target], replay)
         for target, replay, *actors in zip(targets, replays, *members, strict=True)
     }
-    for checkpoint in checkpoints:
-        checkpoint.unlink()
+    _forget_checkpoints(folder)
     return policies

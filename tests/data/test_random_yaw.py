@@ -5,7 +5,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
-from torchrl.envs import Compose
+from torchrl.envs import Compose, TransformedEnv
 
 import lw_torchrl as lw
 
@@ -102,11 +102,35 @@ def test_a_wrong_scale_is_named(scale):
         lw.RandomYaw(scale)
 
 
+@pytest.mark.parametrize("name", ["observation", "action"])
+def test_what_is_missing_is_named(name):
+    with pytest.raises(ValueError, match=f"observation and action are needed, got (?!{name})"):
+        lw.RandomYaw(0.1)(rows().exclude(name))
+
+
 def test_it_refuses_to_turn_an_environment():
     env = lw.LanguageWorldEnv("reach")
     with pytest.raises(TypeError, match="RandomYaw is for replay buffers"):
         env.append_transform(lw.RandomYaw(0.1))
+    queries = lw.QAFTransform(lw.load_plans("MT10"))
+    with pytest.raises(TypeError, match="RandomYaw is for replay buffers"):
+        TransformedEnv(env, Compose(queries, lw.RandomYaw(0.1))).rollout(1)
     env.close()
+
+
+def test_executed_and_expert_action_and_what_came_turn_alike(tmp_path):
+    lw.collect_demonstrations(
+        "reach", episodes_per_task=1, root=tmp_path / "demos", max_steps=40, noise_scale=0.2, progress=False
+    )
+    replay = lw.LanguageWorldExperienceReplay(tmp_path / "demos", label="executed")
+    was = replay[:].clone()
+    now = lw.RandomYaw(0.7)(was.clone())
+    turned = between(was["observation"][:, :2], now["observation"][:, :2])
+    for name in ("action", "expert_action"):
+        moves = was[name][:, :2].norm(dim=-1) > 0.05
+        torch.testing.assert_close(between(was[name], now[name])[moves], turned[moves], atol=1e-3, rtol=0)
+    after = between(was["next", "observation"][:, :2], now["next", "observation"][:, :2])
+    torch.testing.assert_close(after, turned, atol=1e-3, rtol=0)
 
 
 def test_on_a_buffer_conditions_are_those_of_the_scene_as_it_was_and_the_storage_is_left_alone(tmp_path):

@@ -8,6 +8,7 @@ import pytest
 
 import lw_torchrl as lw
 from lw_torchrl.trainers import experiments, unit_training
+from lw_torchrl.trainers.checkpoint import demonstration_seeds
 from lw_torchrl.trainers.experiments import METHODS, Unit, load_result, run_unit
 from lw_torchrl.trainers.recipes import PRESETS, SETTINGS, DataSetting, Execution, Member
 
@@ -164,7 +165,27 @@ def test_an_ensemble_has_members_of_its_own_and_is_not_trained_twice(undisturbed
     (tmp_path / "again" / one.folder / "results.json").unlink()
     result = run_unit(one, PLANS, tmp_path / "again", tasks=task_of(one), progress=False)
     assert result.success_once == lw.EvaluationResult.load(undisturbed / one.folder / "results.json").success_once
-    assert not (tmp_path / "again" / one.folder / "checkpoint-0.zip").exists()
+    assert not list((tmp_path / "again" / one.folder).glob("checkpoint*"))
+
+
+@pytest.mark.parametrize(("setting", "file"), [(TINY, "policy.zip"), (TINY_ONE_SHOT, "models/push.zip")])
+def test_a_policy_says_which_seed_its_demonstrations_had(undisturbed, setting, file):
+    assert demonstration_seeds(undisturbed / unit(setting=setting).folder / file) == {3}
+
+
+@pytest.mark.parametrize("setting", [TINY, TINY_ONE_SHOT])
+def test_a_policy_of_another_configuration_is_not_taken_for_this_one(undisturbed, tmp_path, setting):
+    shutil.copytree(undisturbed, tmp_path / "again")
+    one = unit(setting=setting)
+    folder = tmp_path / "again" / one.folder
+    (folder / "results.json").unlink()
+    (folder / "checkpoint-0.zip").write_bytes(b"left by a process that was killed")
+    longer = replace(PRESET, training=replace(PRESET.training, steps=61))
+    with pytest.raises(ValueError, match="is of another configuration, its unit differs in training"):
+        run(one, tmp_path / "again", longer)
+    run(one, tmp_path / "again")
+    assert rates(folder) == rates(undisturbed / one.folder)
+    assert not (folder / "checkpoint-0.zip").exists()
 
 
 def test_settings_are_the_papers():
