@@ -27,6 +27,11 @@ def unknown_name(argument: str, given: object, allowed: Iterable[str]) -> ValueE
     return ValueError(message)
 
 
+def missing_keys(found: Iterable[Any], *needed: str) -> ValueError:
+    """The error for a tensordict of the keys ``found`` that lacks one of two needed ones; the caller raises it."""
+    return ValueError(f"{' and '.join(needed)} are needed, got {', '.join(map(str, found))}")
+
+
 def check_choice(argument: str, given: Any, allowed: Iterable[str]) -> Any:
     """Return ``given`` if it is one of ``allowed``, else raise :class:`ValueError` with the nearest name."""
     names = list(allowed)

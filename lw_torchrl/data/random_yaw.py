@@ -7,7 +7,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase, Transform
 
-from lw_torchrl._checks import check_scale
+from lw_torchrl._checks import check_scale, missing_keys
 
 # Where the observation's positions begin: hand, two objects, the same a step before, goal.
 _POSITIONS = (0, 4, 11, 18, 22, 29, 36)
@@ -63,7 +63,7 @@ class RandomYaw(Transform):
         tensordict = tensordict.copy()  # of a buffer's whole range it may be the storage itself
         observation = tensordict.get("observation", None)
         if observation is None or "action" not in tensordict.keys():
-            raise ValueError(f"observation and action are needed, got {', '.join(map(str, tensordict.keys()))}")
+            raise missing_keys(tensordict.keys(), "observation", "action")
         angle = self.scale * torch.randn(observation.shape[:-1], device=observation.device)
         cos, sin = angle.cos(), angle.sin()
         tensordict.set("observation", _turned(observation, _POSITIONS, cos, sin))

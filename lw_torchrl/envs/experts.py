@@ -10,6 +10,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
+from lw_torchrl._checks import missing_keys
 from lw_torchrl.envs.engine import ACTION_SIZE, OBSERVATION_SIZE
 from lw_torchrl.envs.metaworld_engine import import_metaworld
 from lw_torchrl.language.tasks import resolve_tasks, task_id
@@ -49,7 +50,7 @@ class ExpertActor(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         observation, given = tensordict.get("observation", None), tensordict.get("task_id", None)
         if observation is None or given is None:
-            raise ValueError(f"observation and task_id are needed, got {', '.join(map(str, tensordict.keys()))}")
+            raise missing_keys(tensordict.keys(), "observation", "task_id")
         if observation.shape[-1:] != (OBSERVATION_SIZE,):
             raise ValueError(f"observation must have 39 numbers, got shape {tuple(observation.shape)}")
         if given.shape != observation.shape[:-1]:

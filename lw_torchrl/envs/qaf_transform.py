@@ -9,6 +9,7 @@ from tensordict import TensorDictBase
 from torchrl.data import Binary, Composite, TensorSpec
 from torchrl.envs import EnvBase, Transform
 
+from lw_torchrl._checks import missing_keys
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.query_program import QueryProgram
 
@@ -51,7 +52,7 @@ class QAFTransform(Transform):
     def _write(self, tensordict: TensorDictBase, task_ids: TensorDictBase) -> None:
         observation, task_id = tensordict.get("observation", None), task_ids.get("task_id", None)
         if observation is None or task_id is None:
-            raise ValueError(f"observation and task_id are needed, got {', '.join(map(str, tensordict.keys()))}")
+            raise missing_keys(tensordict.keys(), "observation", "task_id")
         tensordict.set("qaf", self.program(observation, task_id))
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:

@@ -78,6 +78,10 @@ class Member:
     plan_actor: Mapping[str, Any] = field(default_factory=dict, hash=False)
     yaw: float = 0.0
 
+    def __post_init__(self) -> None:
+        for name in ("actor", "plan_actor"):  # a frozen recipe's options are read-only, too
+            object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
+
 
 @dataclass(frozen=True)
 class Preset:
@@ -111,15 +115,16 @@ _STRONG = Preset(
     members=(Member({"features": "differences", "width": 512}),),
     training=BehavioralCloningConfig(steps=12_000, batch_size=500),
 )
-_TURNED = Member({"width": 512, "feature_noise": 0.1}, {"swap_unmentioned": 0.5}, yaw=0.3)
 _STRONG_ZERO_SHOT = replace(
     _STRONG,
     # Each leans on something else in tasks that it was never shown: on the demonstrations as they are, on the hand's
     # height and the gripper's opening, on neither.
     members=(
-        Member({"features": "differences", "width": 512}),
-        replace(_TURNED, actor={**_TURNED.actor, "features": "differences"}),
-        replace(_TURNED, actor={**_TURNED.actor, "features": "relative"}),
+        *_STRONG.members,
+        *(
+            Member({"features": features, "width": 512, "feature_noise": 0.1}, {"swap_unmentioned": 0.5}, yaw=0.3)
+            for features in ("differences", "relative")
+        ),
     ),
     training=BehavioralCloningConfig(steps=8_000, batch_size=200),
 )

@@ -46,10 +46,10 @@ def _config(unit: Unit, rows: int, seed: int) -> BehavioralCloningConfig:
 
 
 def _keep(
-    unit: Unit, plans: Plans, actors: Sequence[Actor], file: Path, replay: LanguageWorldExperienceReplay
+    described: dict[str, Any], actors: Sequence[Actor], file: Path, replay: LanguageWorldExperienceReplay
 ) -> Policy:
     policy = actors[0] if len(actors) == 1 else ActorEnsemble(actors)
-    save_actor(policy, file, data=describe_data(replay), unit=unit.describe(plans))
+    save_actor(policy, file, data=describe_data(replay), unit=described)
     return policy
 
 
@@ -58,18 +58,19 @@ def _forget_checkpoints(folder: Path) -> None:
         checkpoint.unlink()
 
 
-def _kept(unit: Unit, plans: Plans, file: Path) -> Policy:
-    check_description(file, {"unit": unit.describe(plans)})
+def _kept(described: dict[str, Any], file: Path) -> Policy:
+    check_description(file, {"unit": described})
     return load_actor(file)
 
 
 def train_one(unit: Unit, plans: Plans, out: Path, progress: bool) -> Policy:
     """One policy for all tasks, kept in ``policy.zip``; until all its members are done, each has a checkpoint."""
-    folder = out / unit.folder
+    folder, described = out / unit.folder, unit.describe(plans)
     file = folder / "policy.zip"
     if file.is_file():
+        policy = _kept(described, file)
         _forget_checkpoints(folder)
-        return _kept(unit, plans, file)
+        return policy
     actors = []
     for number, member in enumerate(unit.preset.members):
         replay = LanguageWorldExperienceReplay(
@@ -82,7 +83,7 @@ def train_one(unit: Unit, plans: Plans, out: Path, progress: bool) -> Policy:
         actors.append(_make_actor(unit, member, plans, config.seed))
         checkpoint = folder / f"checkpoint-{number}.zip"
         BehavioralCloningTrainer(actors[-1], replay, config, checkpoint=checkpoint, progress=progress).train()
-    policy = _keep(unit, plans, actors, file, replay)
+    policy = _keep(described, actors, file, replay)
     _forget_checkpoints(folder)
     return policy
 
@@ -92,12 +93,13 @@ def train_each(unit: Unit, plans: Plans, out: Path, progress: bool) -> dict[str,
 
     The i-th target's seed is the i-th from 1000 times the unit's; the next member's follow.
     """
-    folder = out / unit.folder
+    folder, described = out / unit.folder, unit.describe(plans)
     targets = resolve_tasks(unit.setting.targets or ())
     files = {target: folder / "models" / f"{target}.zip" for target in targets}
     if all(file.is_file() for file in files.values()):
+        policies = {target: _kept(described, file) for target, file in files.items()}
         _forget_checkpoints(folder)
-        return {target: _kept(unit, plans, file) for target, file in files.items()}
+        return policies
     roots = [out / dataset.folder for dataset in unit.datasets]
     rows = 0
     if unit.preset.passes is not None:  # over the base tasks, which have half of each minibatch
@@ -119,7 +121,7 @@ def train_each(unit: Unit, plans: Plans, out: Path, progress: bool) -> dict[str,
         checkpoint = folder / f"checkpoint-{number}.zip"
         StackedBehavioralCloning(members[-1], replays, config, checkpoint=checkpoint, progress=progress).train()
     policies = {
-        target: _keep(unit, plans, actors, files[target], replay)
+        target: _keep(described, actors, files[target], replay)
         for target, replay, *actors in zip(targets, replays, *members, strict=True)
     }
     _forget_checkpoints(folder)

@@ -23,9 +23,14 @@ def angle(vectors):
     return torch.atan2(vectors[..., 1], vectors[..., 0])
 
 
+def wrapped(angles):
+    """The same angles in [-pi, pi)."""
+    return torch.remainder(angles + torch.pi, 2 * torch.pi) - torch.pi
+
+
 def between(first, second):
-    """The angle from one to the other, in (-pi, pi]."""
-    return torch.remainder(angle(second) - angle(first) + torch.pi, 2 * torch.pi) - torch.pi
+    """The angle from one to the other."""
+    return wrapped(angle(second) - angle(first))
 
 
 @settings(deadline=None, max_examples=40)
@@ -38,8 +43,7 @@ def test_positions_and_action_turn_by_the_same_angle_and_keep_their_length(scale
     for place in PLACES:
         before, after = was["observation"][:, place], now["observation"][:, place]
         torch.testing.assert_close(after.norm(dim=-1), before.norm(dim=-1))
-        difference = torch.remainder(between(before, after) - turned + torch.pi, 2 * torch.pi) - torch.pi
-        assert difference.abs().max() < 1e-3
+        assert wrapped(between(before, after) - turned).abs().max() < 1e-3
     torch.testing.assert_close(now["action"].norm(dim=-1), was["action"].norm(dim=-1))
 
 

@@ -198,6 +198,8 @@ def test_settings_are_the_papers():
     assert paper.members[0].actor["width"] == (128, 128, 128, 64, 32)
     assert (paper.members[0].actor["encoder_width"], paper.members[0].actor["encoder_depth"]) == (64, 3)
     assert (paper.passes, paper.base.noise_scale) == (500, (0.0,))
+    with pytest.raises(TypeError, match="does not support item assignment"):
+        paper.members[0].actor["width"] = 8
     assert PRESETS["paper"]["one-shot"].base.noise_scale == (0.1, 0.2, 0.3, 0.4)
     for preset in PRESETS.values():
         assert preset.keys() == SETTINGS.keys()
