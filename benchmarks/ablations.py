@@ -14,8 +14,8 @@ import tyro
 import lw_torchrl as lw
 from lw_torchrl._files import write_text
 from lw_torchrl.evaluation.comparison import markdown_table
-from lw_torchrl.trainers.experiments import Unit, run_unit
-from lw_torchrl.trainers.recipes import CLEAN, NOISY, PRESETS, SETTINGS, Member, Preset
+from lw_torchrl.experiments.recipes import CLEAN, NOISY, PRESETS, SETTINGS, Member, Preset
+from lw_torchrl.experiments.runs import Run, execute_run
 
 FULL = PRESETS["strong"]["few-shot"]
 
@@ -54,7 +54,7 @@ class Arguments:
     steps: int = FULL.training.steps
     """Minibatches, of the recipe and of each change."""
     out: Path = Path("runs/reproduce")
-    """The experiments' folder: datasets and units that `lw-torchrl reproduce` left there are used."""
+    """The experiments' folder: datasets and runs that `lw-torchrl reproduce` left there are used."""
 
 
 def main(arguments: Arguments) -> None:
@@ -64,8 +64,8 @@ def main(arguments: Arguments) -> None:
         shorter = replace(preset, training=replace(preset.training, steps=arguments.steps))
         if arguments.steps != FULL.training.steps:
             shorter = replace(shorter, name=f"{preset.name}-{arguments.steps}-steps")
-        units = [Unit(SETTINGS["few-shot"], "pcbc", seed, shorter) for seed in arguments.seeds]
-        results = [run_unit(unit, plans, arguments.out) for unit in units]
+        runs = [Run(SETTINGS["few-shot"], "pcbc", seed, shorter) for seed in arguments.seeds]
+        results = [execute_run(run, plans, arguments.out) for run in runs]
         means = ", ".join(f"{result.mean_success:.3f}" for result in results)
         solved = ", ".join(str(lw.count_solved([list(result.success_once.values())])) for result in results)
         shown = (change, means, solved)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 import lw_torchrl as lw
 from benchmarks.report import Row, Settings, Skipped, compare, take_turns
-from lw_torchrl.envs.qaf_transform import plan_program
+from lw_torchrl.transforms.qaf import plan_program
 
 BATCH = 4096
 ASKED = 64  # states that the rival is asked about in one round; it works state by state

@@ -10,11 +10,10 @@ from lw_torchrl.data import (
     JoinedDemonstrations,
     JoinedStorage,
     LanguageWorldExperienceReplay,
-    RandomYaw,
     TaskBalancedSampler,
     collect_demonstrations,
 )
-from lw_torchrl.envs import Engine, EngineStep, ExpertActor, LanguageWorldEnv, QAFTransform, episode_seed
+from lw_torchrl.envs import Engine, EngineStep, ExpertActor, LanguageWorldEnv, episode_seed
 from lw_torchrl.evaluation import (
     EpisodeResult,
     Estimate,
@@ -64,6 +63,7 @@ from lw_torchrl.modules import (
 )
 from lw_torchrl.record import RerunLogger
 from lw_torchrl.trainers import BehavioralCloningConfig, BehavioralCloningTrainer, StackedBehavioralCloning, load_actor
+from lw_torchrl.transforms import QAFTransform, RandomYaw
 
 __version__ = "0.1.0"
 

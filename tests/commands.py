@@ -2,7 +2,7 @@
 
 import pytest
 
-from lw_torchrl.cli import main
+from lw_torchrl.cli.main import main
 
 
 def run(capsys, *args):

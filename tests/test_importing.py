@@ -8,7 +8,7 @@ from importlib.abc import MetaPathFinder
 
 import pytest
 
-from lw_torchrl.envs.metaworld_engine import import_metaworld
+from lw_torchrl.envs.engines.metaworld import import_metaworld
 
 
 class Failing(MetaPathFinder):

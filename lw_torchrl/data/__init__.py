@@ -3,7 +3,6 @@
 from lw_torchrl.data.co_learning import CoLearningSampler
 from lw_torchrl.data.collect import collect_demonstrations
 from lw_torchrl.data.dataset import CollectConfig, DatasetError, Demonstrations
-from lw_torchrl.data.random_yaw import RandomYaw
 from lw_torchrl.data.replay import LanguageWorldExperienceReplay
 from lw_torchrl.data.samplers import TaskBalancedSampler
 from lw_torchrl.data.selection import JoinedDemonstrations
@@ -17,7 +16,6 @@ __all__ = [
     "JoinedDemonstrations",
     "JoinedStorage",
     "LanguageWorldExperienceReplay",
-    "RandomYaw",
     "TaskBalancedSampler",
     "collect_demonstrations",
 ]

@@ -47,7 +47,7 @@ def _name(key: str | Sequence[str]) -> str:
     return key if isinstance(key, str) else "/".join(key)
 
 
-class _Shelf:
+class _EpisodeFiles:
     """The episodes so far, one file each; a file that says FAILED stands for one that was not kept."""
 
     def __init__(self, folder: Path) -> None:
@@ -89,7 +89,7 @@ class _Shelf:
                 path.unlink()
 
 
-def _open_shelf(root: Path, config: CollectConfig) -> _Shelf:
+def _open_episode_files(root: Path, config: CollectConfig) -> _EpisodeFiles:
     folder = root / PARTIAL
     stated = folder / "config.json"
     if stated.is_file():
@@ -109,9 +109,9 @@ def _open_shelf(root: Path, config: CollectConfig) -> _Shelf:
             raise DatasetError(f"root: {str(root)!r} is not empty and holds no dataset; choose another folder")
         folder.mkdir(parents=True, exist_ok=True)
         write_json(stated, config.to_json())
-    shelf = _Shelf(folder)
-    shelf.drop_damaged()
-    return shelf
+    files = _EpisodeFiles(folder)
+    files.drop_damaged()
+    return files
 
 
 def _difference(before: dict, config: CollectConfig) -> str:
@@ -119,15 +119,15 @@ def _difference(before: dict, config: CollectConfig) -> str:
     return ", ".join(f"{key} {before.get(key)!r}, now {now[key]!r}" for key in now if before.get(key) != now[key])
 
 
-def _take_stock(config: CollectConfig, shelf: _Shelf) -> tuple[dict[str, list[int]], dict[str, list[int]]]:
+def _take_stock(config: CollectConfig, files: _EpisodeFiles) -> tuple[dict[str, list[int]], dict[str, list[int]]]:
     """The kept episodes of each task, and those still to run. Candidates are taken in the order of their index, so
     which are kept depends neither on the number of environments nor on interruptions."""
     kept: dict[str, list[int]] = {}
     wanted: dict[str, list[int]] = {}
     for task in config.tasks:
         kept[task], candidate = [], 0
-        while len(kept[task]) < config.episodes_per_task and shelf.has(task, candidate):
-            if shelf.kept(task, candidate):
+        while len(kept[task]) < config.episodes_per_task and files.has(task, candidate):
+            if files.kept(task, candidate):
                 kept[task].append(candidate)
             candidate += 1
         missing = config.episodes_per_task - len(kept[task])
@@ -137,13 +137,13 @@ def _take_stock(config: CollectConfig, shelf: _Shelf) -> tuple[dict[str, list[in
                 "set redraw_failures=False"
             )
         ahead = range(candidate, candidate + missing)
-        wanted[task] = [episode for episode in ahead if not shelf.has(task, episode)]
+        wanted[task] = [episode for episode in ahead if not files.has(task, episode)]
     return kept, wanted
 
 
-def _run(config: CollectConfig, shelf: _Shelf, num_envs: int | None, progress: bool) -> dict[str, list[int]]:
-    """Run episodes until the shelf is full; returns the kept ones of each task."""
-    kept, wanted = _take_stock(config, shelf)
+def _run(config: CollectConfig, files: _EpisodeFiles, num_envs: int | None, progress: bool) -> dict[str, list[int]]:
+    """Run episodes until the files is full; returns the kept ones of each task."""
+    kept, wanted = _take_stock(config, files)
     missing = sum(map(len, wanted.values()))
     if not missing:
         return kept
@@ -175,14 +175,14 @@ def _run(config: CollectConfig, shelf: _Shelf, num_envs: int | None, progress: b
             )
             for task, episode, steps in episodes:
                 keep = not config.redraw_failures or bool(steps.get(("next", "success")).any())
-                shelf.put(task, episode, steps if keep else None)
-            kept, wanted = _take_stock(config, shelf)
+                files.put(task, episode, steps if keep else None)
+            kept, wanted = _take_stock(config, files)
             missing = sum(map(len, wanted.values()))
     env.close()
     return kept
 
 
-def _assemble(root: Path, config: CollectConfig, shelf: _Shelf, kept: dict[str, list[int]]) -> list[EpisodeInfo]:
+def _assemble(root: Path, config: CollectConfig, files: _EpisodeFiles, kept: dict[str, list[int]]) -> list[EpisodeInfo]:
     building = root / f"{PARTIAL}/rows"
     shutil.rmtree(building, ignore_errors=True)
     listed = [(task, episode) for task in config.tasks for episode in kept[task]]
@@ -190,7 +190,7 @@ def _assemble(root: Path, config: CollectConfig, shelf: _Shelf, kept: dict[str, 
     rows: TensorDictBase | None = None
     start = 0
     for number, (task, episode) in enumerate(listed):
-        steps = shelf.get(task, episode)
+        steps = files.get(task, episode)
         steps.set(("collector", "traj_ids"), torch.full(steps.batch_size, number))
         length = steps.batch_size[0]
         if rows is None:
@@ -286,9 +286,9 @@ def collect_demonstrations(
             )
         shutil.rmtree(folder / PARTIAL, ignore_errors=True)
         return found
-    shelf = _open_shelf(folder, config)
-    kept = _run(config, shelf, num_envs, progress)
-    infos = _assemble(folder, config, shelf, kept)
+    files = _open_episode_files(folder, config)
+    kept = _run(config, files, num_envs, progress)
+    infos = _assemble(folder, config, files, kept)
     attempts = {task: max(kept[task]) + 1 for task in config.tasks}
     write_metadata(folder, config, infos, attempts)
     shutil.rmtree(folder / PARTIAL, ignore_errors=True)

@@ -18,7 +18,7 @@ from lw_torchrl.envs.seeding import action_noise
 BLOCK = 64
 
 
-class Episode(NamedTuple):
+class FinishedEpisode(NamedTuple):
     """One finished episode.
 
     Attributes:
@@ -69,7 +69,7 @@ def run_episodes(
     stop_at_success: bool = False,
     clean_action: NestedKey | None = None,
     on_progress: Callable[[int], object] | None = None,
-) -> Iterator[Episode]:
+) -> Iterator[FinishedEpisode]:
     """Run each task's listed episodes once and yield them as they finish.
 
     A row that finishes takes the next episode of its task; one without work costs nothing.
@@ -144,6 +144,6 @@ def run_episodes(
         if on_progress is not None:
             on_progress(int(active.sum()) + int((base.max_steps - steps)[idle.numpy()].sum()))
         for row in torch.nonzero(idle).flatten().tolist():
-            yield Episode(base.row_tasks[row], int(episode[row]), buffers[row, : steps[row]].clone())
+            yield FinishedEpisode(base.row_tasks[row], int(episode[row]), buffers[row, : steps[row]].clone())
         idle = idle | ~active
         state = step_mdp(state, exclude_action=True, keep_other=True)

@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from lw_torchrl._checks import missing_keys
 from lw_torchrl.envs.engine import ACTION_SIZE, OBSERVATION_SIZE
-from lw_torchrl.envs.metaworld_engine import import_metaworld
+from lw_torchrl.envs.engines.metaworld import import_metaworld
 from lw_torchrl.language.tasks import resolve_tasks, task_id
 
 

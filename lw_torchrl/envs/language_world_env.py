@@ -14,7 +14,7 @@ from torch import Tensor
 
 from lw_torchrl._checks import check_choice, check_int
 from lw_torchrl.envs.engine import ACTION_SIZE, OBSERVATION_SIZE, Engine
-from lw_torchrl.envs.metaworld_engine import MetaWorldEngine, naming_absent_renderer
+from lw_torchrl.envs.engines.metaworld import MetaWorldEngine, naming_absent_renderer
 from lw_torchrl.envs.seeding import episode_seed
 from lw_torchrl.language.tasks import resolve_tasks, task_id
 
@@ -22,7 +22,7 @@ with naming_absent_renderer():  # these import MuJoCo
     from torchrl.data import Bounded, Categorical, Composite, Unbounded
     from torchrl.envs import EnvBase
 
-    from lw_torchrl.envs.vectorized_engine import VectorizedEngine
+    from lw_torchrl.envs.engines.vectorized.engine import VectorizedEngine
 
 ENGINES: dict[str, Callable[..., Engine]] = {"vectorized": VectorizedEngine, "metaworld": MetaWorldEngine}
 

@@ -1,8 +1,8 @@
 """Evaluation: exactly k episodes of each task, their results, statistics over seeds, and figures."""
 
-from lw_torchrl.evaluation.comparison import Comparison, Pair
-from lw_torchrl.evaluation.evaluate import evaluate
+from lw_torchrl.evaluation.comparison import MethodComparison, Pair
 from lw_torchrl.evaluation.figures import plot_sorted_tasks, plot_success
+from lw_torchrl.evaluation.protocol import evaluate
 from lw_torchrl.evaluation.published import published, published_curves, published_plans
 from lw_torchrl.evaluation.result import EpisodeResult, EvaluationResult
 from lw_torchrl.evaluation.statistics import (
@@ -16,10 +16,10 @@ from lw_torchrl.evaluation.statistics import (
 from lw_torchrl.evaluation.summary import Summary, TaskSummary, summarize, summarize_rates
 
 __all__ = [
-    "Comparison",
     "EpisodeResult",
     "Estimate",
     "EvaluationResult",
+    "MethodComparison",
     "Pair",
     "Summary",
     "TaskSummary",

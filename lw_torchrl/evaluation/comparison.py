@@ -1,4 +1,4 @@
-"""Comparison: the methods of one experiment side by side, task by task and pair by pair."""
+"""MethodComparison: the methods of one experiment side by side, task by task and pair by pair."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Pair:
     improvement: Estimate
 
 
-class Comparison:
+class MethodComparison:
     """Several methods' summaries, which have the same tasks.
 
     Args:
@@ -41,7 +41,7 @@ class Comparison:
         >>> from lw_torchrl.evaluation import summarize_rates
         >>> a = summarize_rates({"push": [0.5, 0.7], "reach": [1.0, 0.9]})
         >>> b = summarize_rates({"push": [0.3, 0.3], "reach": [0.6, 0.7]})
-        >>> print(Comparison({"a": a, "b": b}).pairs[0].difference)
+        >>> print(MethodComparison({"a": a, "b": b}).pairs[0].difference)
         0.300 [0.225, 0.375]
     """
 

@@ -10,9 +10,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lw_torchrl.envs.episodes import Episode
+from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.envs.experts import ExpertActor
-from lw_torchrl.evaluation.evaluate import evaluate
+from lw_torchrl.evaluation.protocol import evaluate
 from lw_torchrl.evaluation.result import EvaluationResult
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.tasks import resolve_tasks
@@ -55,7 +55,7 @@ class PlanUse:
         self.plans = as_plans(plans)
         self._seen: dict[str, list[tuple[Tensor, Tensor | None, int, bool]]] = {}
 
-    def __call__(self, episode: Episode) -> None:
+    def __call__(self, episode: FinishedEpisode) -> None:
         hits = episode.steps.get(("next", "success")).flatten().nonzero().flatten()
         before = int(hits[0]) + 1 if len(hits) else len(episode.steps)
         steps = len(self.plans[episode.task].steps)

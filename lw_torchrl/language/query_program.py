@@ -13,7 +13,7 @@ from torch import Tensor
 
 from lw_torchrl.language.queries import Clause, Query, check_query
 from lw_torchrl.language.relations import PREDICATES, Comparison
-from lw_torchrl.language.tasks import TASKS, Coordinate, Task, get_task, place, task_id
+from lw_torchrl.language.tasks import TASKS, Coordinate, Task, coordinate_index, get_task, task_id
 
 _OBSERVATION = 39
 _OPENING = 3  # index of the gripper's opening in the observation
@@ -86,7 +86,10 @@ def _compile(queries: Mapping[Task, Sequence[Query]]) -> tuple[_Tables, Tensor]:
     def index(atom: _Atom, side: int) -> list[int]:
         first, second, _, part = atom
         position = (first, second)[side if part.sense == "<" else 1 - side]
-        return [place(c if axis in part.axes else 0.0, constants) for axis, c in zip("xyz", position, strict=True)]
+        return [
+            coordinate_index(c if axis in part.axes else 0.0, constants)
+            for axis, c in zip("xyz", position, strict=True)
+        ]
 
     def shift(atom: _Atom) -> list[float]:
         *_, found, part = atom

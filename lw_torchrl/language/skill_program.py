@@ -9,7 +9,7 @@ from torch import Tensor
 
 from lw_torchrl._checks import unknown_name
 from lw_torchrl.language.skills import ScriptedSkill, load_skills
-from lw_torchrl.language.tasks import TASKS, Task, get_task, place, task_id
+from lw_torchrl.language.tasks import TASKS, Task, coordinate_index, get_task, task_id
 
 _OBSERVATION = 39
 _KEPT_ROWS = 4096  # of the last batch, the most to keep the tables of
@@ -66,8 +66,8 @@ class SkillProgram:
             self._column[task_id(task.name)] = t
             for s, skill in enumerate(listed):
                 target, moved = task.object(skill.target), task.object(skill.moved)
-                index[t, 0, s] = torch.tensor([place(c, constants) for c in target.position])
-                index[t, 1, s] = torch.tensor([place(c, constants) for c in moved.position])
+                index[t, 0, s] = torch.tensor([coordinate_index(c, constants) for c in target.position])
+                index[t, 1, s] = torch.tensor([coordinate_index(c, constants) for c in moved.position])
                 offsets = torch.tensor([skill.offset, target.offset, moved.offset], dtype=torch.float64)
                 numbers[t, 0, s] = torch.tensor(skill.gain, dtype=torch.float64)
                 numbers[t, 1, s] = numbers[t, 0, s] * (offsets[0] + offsets[1] - offsets[2])

@@ -30,7 +30,7 @@ def _is_number(value: object) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e9
 
 
-def place(coordinate: Coordinate, constants: list[float]) -> int:
+def coordinate_index(coordinate: Coordinate, constants: list[float]) -> int:
     """Where a coordinate stands in the 39 numbers of an observation followed by ``constants``, which grow at need."""
     if isinstance(coordinate, int):
         return coordinate

@@ -1,28 +1,23 @@
 """Text encoders: English to vectors. The shipped texts' vectors are data of the package; other texts need the extra.
 
-The vectors were made once by all-MiniLM-L6-v2 through sentence-transformers: ``python -m lw_torchrl.language.text``
+The vectors were made once by all-MiniLM-L6-v2 through sentence-transformers; :mod:`lw_torchrl.language.shipped_texts`
 makes them again, after a description or a plan has changed.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 from importlib.resources import as_file, files
-from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from lw_torchrl._files import replacing
-from lw_torchrl.language.plan_files import load_plans
-from lw_torchrl.language.tasks import TASKS
-
 TEXT_DIMENSION = 384
-_TABLE = "embeddings.npz"
+TABLE = "embeddings.npz"
 
 
 class TextEncoder(Protocol):
@@ -35,7 +30,7 @@ class TextEncoder(Protocol):
 
 @lru_cache(maxsize=1)
 def _shipped() -> dict[str, Tensor]:
-    with as_file(files("lw_torchrl.language") / "data" / _TABLE) as path:
+    with as_file(files("lw_torchrl.language") / "data" / TABLE) as path:
         if not path.is_file():
             return {}
         with np.load(path, allow_pickle=False) as table:
@@ -90,24 +85,3 @@ def encode_texts(texts: Sequence[str]) -> Tensor:
     new = sorted({text for text in texts if text not in shipped})
     found = dict(zip(new, sentence_encoder(new), strict=True)) if new else {}
     return torch.stack([shipped[text] if text in shipped else found[text] for text in texts])
-
-
-def shipped_texts() -> list[str]:
-    """The task descriptions and the skills of the shipped plans, sorted."""
-    skills = {*load_plans("MT50").skills, *load_plans("MT50", skills="MT10").skills}
-    return sorted({task.description for task in TASKS.values()} | skills)
-
-
-def write_table(path: Path, texts: Iterable[str]) -> None:
-    """Encode ``texts`` and write them with their vectors, half precision, as an .npz without pickles."""
-    listed = list(texts)
-    with replacing(path) as temporary:
-        np.savez_compressed(
-            temporary, texts=np.array(listed), vectors=sentence_encoder(listed).numpy().astype(np.float16)
-        )
-
-
-if __name__ == "__main__":
-    target = Path(__file__).parent / "data" / _TABLE
-    write_table(target, shipped_texts())
-    print(f"{len(shipped_texts())} texts written to {target.name}")

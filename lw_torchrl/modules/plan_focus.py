@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from lw_torchrl._checks import check_scale
 from lw_torchrl.language.plans import Plans, PlanStep
-from lw_torchrl.language.tasks import MT50, Task, place, task_id
+from lw_torchrl.language.tasks import MT50, Task, coordinate_index, task_id
 from lw_torchrl.modules.observation_features import squash
 
 _OBSERVATION = 39
@@ -54,7 +54,7 @@ class PlanFocus(nn.Module):
                 for pair, names in enumerate(_pairs(step)):
                     at = (task_id(task), number, pair)
                     for side, position in enumerate(self._positions(names, plan.definition)):
-                        index[(side, *at)] = torch.tensor([place(c, constants) for c in position[0]])
+                        index[(side, *at)] = torch.tensor([coordinate_index(c, constants) for c in position[0]])
                         offset[at] += torch.tensor(position[1]) * (2 * side - 1)
         # The tables come from the plans, not from training: they are not part of the state that is saved.
         self.register_buffer("first", index[0], persistent=False)

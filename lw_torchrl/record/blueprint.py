@@ -12,7 +12,7 @@ from lw_torchrl.record.scene import (
     EPISODE_TIMELINE,
     SECONDS_TIMELINE,
     Color,
-    Episode,
+    RecordedEpisode,
     entity_path,
     time_columns,
 )
@@ -51,7 +51,7 @@ def log_plan(stream: RecordingStream, root: str, task: str, steps: Sequence[tupl
     stream.log(f"{root}/plan", document, static=True)
 
 
-def log_curves(stream: RecordingStream, root: str, episode: Episode) -> None:
+def log_curves(stream: RecordingStream, root: str, episode: RecordedEpisode) -> None:
     """The numbers over time: ``root``/action, and, where there are any, /skill_weights and /reward."""
     import rerun as rr
 
@@ -74,7 +74,7 @@ def log_curves(stream: RecordingStream, root: str, episode: Episode) -> None:
         send("reward", rows + 1, episode.reward[:, None], ["reward"])
 
 
-def log_lanes(stream: RecordingStream, root: str, episode: Episode) -> int:
+def log_lanes(stream: RecordingStream, root: str, episode: RecordedEpisode) -> int:
     """What holds when, under ``root``/lanes: "condition-1" and so on, "skill", "success".
 
     A lane has an entry where its state changes, and an empty one at the end. Returns the number of lanes.

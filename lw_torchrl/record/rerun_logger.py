@@ -26,7 +26,7 @@ from lw_torchrl.record.blueprint import (
     make_blueprint,
     metric_views,
 )
-from lw_torchrl.record.scene import CONTROL_PERIOD, Episode, PlanLike, entity_path, log_scene, time_columns
+from lw_torchrl.record.scene import CONTROL_PERIOD, PlanLike, RecordedEpisode, entity_path, log_scene, time_columns
 
 if TYPE_CHECKING:
     from rerun import RecordingStream
@@ -312,7 +312,7 @@ class RerunLogger(Logger):
         """
         stream = self._open()
         name = self._episode_name(task, name)
-        episode = Episode.from_rollout(rollout, objects, plan)
+        episode = RecordedEpisode.from_rollout(rollout, objects, plan)
         root = entity_path(name)
         trails = log_scene(stream, root, episode)
         if episode.steps:

@@ -12,11 +12,11 @@ from torchrl.envs import TransformedEnv
 
 from lw_torchrl.envs.episodes import in_blocks, run_episodes
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
-from lw_torchrl.envs.qaf_transform import QAFTransform
 from lw_torchrl.language.plans import ConditionalPlan
 from lw_torchrl.language.tasks import TASKS, resolve_tasks
 from lw_torchrl.modules import ActorEnsemble, PlanConditionedActor
 from lw_torchrl.record.rerun_logger import RerunLogger
+from lw_torchrl.transforms.qaf import QAFTransform
 
 _KEYS = ["observation", "task_id", "action", "qaf", "skill_weights", ("next", "success"), ("next", "reward")]
 

@@ -57,7 +57,7 @@ class PlanLike(Protocol):
 
 
 @dataclass(frozen=True)
-class Episode:
+class RecordedEpisode:
     """T rows of one episode, checked, on the CPU; S is the number of steps of its plan.
 
     Attributes:
@@ -91,7 +91,9 @@ class Episode:
         return len(self.observation)
 
     @classmethod
-    def from_rollout(cls, rollout: TensorDictBase, objects: Mapping[str, Any], plan: PlanLike | None = None) -> Episode:
+    def from_rollout(
+        cls, rollout: TensorDictBase, objects: Mapping[str, Any], plan: PlanLike | None = None
+    ) -> RecordedEpisode:
         """Check a rollout; see :meth:`lw_torchrl.RerunLogger.log_episode` for the keys and the errors."""
         if not isinstance(rollout, TensorDictBase):
             raise TypeError(f"rollout must be a TensorDict, got {type(rollout).__name__}")
@@ -186,7 +188,7 @@ def time_columns(steps: NDArray[np.int64], period: float = CONTROL_PERIOD) -> li
     ]
 
 
-def log_scene(stream: RecordingStream, root: str, episode: Episode) -> list[str]:
+def log_scene(stream: RecordingStream, root: str, episode: RecordedEpisode) -> list[str]:
     """Draw the table, the gripper, the objects, their paths and the goal under ``root``/scene.
 
     Returns:

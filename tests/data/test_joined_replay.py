@@ -17,11 +17,11 @@ from lw_torchrl.data import (
     selection,
 )
 from lw_torchrl.data.dataset import load_rows
-from lw_torchrl.envs import QAFTransform
 from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.tasks import task_id
 from lw_torchrl.modules import PlanConditionedActor
 from lw_torchrl.trainers import BehavioralCloningConfig, BehavioralCloningTrainer
+from lw_torchrl.transforms import QAFTransform
 
 STEPS = 50
 

@@ -16,7 +16,7 @@ from torch import nn
 from torchrl.envs import GymLikeEnv, TransformedEnv
 
 import lw_torchrl as lw
-from lw_torchrl.envs.episodes import Episode, in_blocks, run_episodes
+from lw_torchrl.envs.episodes import FinishedEpisode, in_blocks, run_episodes
 from lw_torchrl.envs.seeding import action_noise
 
 TASKS = ["push", "reach"]
@@ -163,7 +163,7 @@ def test_what_is_recorded_is_the_callers():
     episodes = run_episodes(env, wavy, {"push": [0, 1], "reach": [0]}, keys=["observation", ("next", "success")])
     with torch.no_grad():
         first = next(episodes)
-        assert isinstance(first, Episode)
+        assert isinstance(first, FinishedEpisode)
         kept = first.steps.clone()
         rest = list(episodes)
     assert same(first.steps, kept)

@@ -1,8 +1,8 @@
-"""Comparison: methods side by side, with tables that a reader can check by hand."""
+"""MethodComparison: methods side by side, with tables that a reader can check by hand."""
 
 import pytest
 
-from lw_torchrl.evaluation import Comparison, mean_difference, probability_of_improvement, summarize_rates
+from lw_torchrl.evaluation import MethodComparison, mean_difference, probability_of_improvement, summarize_rates
 
 A = summarize_rates({"push": [0.9, 0.7], "assembly": [0.5, 0.3]})
 B = summarize_rates({"assembly": [0.4, 0.4], "push": [0.2, 0.2]})
@@ -10,18 +10,18 @@ PUBLISHED = {"published, last": {"push": 0.8, "assembly": 0.1, "reach": 1.0}}
 
 
 def test_pairs_match_tasks_by_name():
-    (pair,) = Comparison({"a": A, "b": B}).pairs
+    (pair,) = MethodComparison({"a": A, "b": B}).pairs
     rates = [[0.9, 0.5], [0.7, 0.3]], [[0.2, 0.4], [0.2, 0.4]]
     assert pair.methods == ("a", "b")
     assert pair.difference == mean_difference(*rates)
     assert pair.difference.value == pytest.approx(0.3)
     assert pair.improvement == probability_of_improvement(*rates)
-    whole = Comparison({"a": A, "b": B}, whole_seeds=True).pairs[0]
+    whole = MethodComparison({"a": A, "b": B}, whole_seeds=True).pairs[0]
     assert whole.difference == mean_difference(*rates, whole_seeds=True)
 
 
 def test_tables():
-    comparison = Comparison({"a": A, "b": B}, PUBLISHED)
+    comparison = MethodComparison({"a": A, "b": B}, PUBLISHED)
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in comparison.per_task().splitlines()]
     assert rows[0] == ["task", "a", "b", "published, last"]
     assert rows[2:] == [
@@ -37,7 +37,7 @@ def test_tables():
 
 
 def test_one_method_alone_has_no_pairs():
-    comparison = Comparison({"a": summarize_rates({"push": [0.9]})})
+    comparison = MethodComparison({"a": summarize_rates({"push": [0.9]})})
     assert comparison.pairs == []
     assert comparison.headline().count("\n") == 2
     assert "outside" not in comparison.headline()
@@ -46,6 +46,6 @@ def test_one_method_alone_has_no_pairs():
 
 def test_what_it_refuses():
     with pytest.raises(ValueError, match="at least one method"):
-        Comparison({})
+        MethodComparison({})
     with pytest.raises(ValueError, match=r"'a' and 'c' do not share the tasks \['assembly'\]"):
-        Comparison({"a": A, "c": summarize_rates({"push": [0.1, 0.2]})})
+        MethodComparison({"a": A, "c": summarize_rates({"push": [0.1, 0.2]})})

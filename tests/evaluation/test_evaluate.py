@@ -12,15 +12,16 @@ from torch import nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from lw_torchrl.data import LanguageWorldExperienceReplay, TaskBalancedSampler, collect_demonstrations
-from lw_torchrl.envs import ExpertActor, QAFTransform
-from lw_torchrl.envs.metaworld_engine import MetaWorldEngine, make_metaworld_env
+from lw_torchrl.envs import ExpertActor
+from lw_torchrl.envs.engines.metaworld import MetaWorldEngine, make_metaworld_env
+from lw_torchrl.envs.engines.vectorized.engine import VectorizedEngine
 from lw_torchrl.envs.seeding import action_noise, episode_seed
-from lw_torchrl.envs.vectorized_engine import VectorizedEngine
 from lw_torchrl.evaluation import evaluate
 from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.modules import DescriptorConditionedActor, PlanConditionedActor
 from lw_torchrl.trainers import BehavioralCloningConfig, BehavioralCloningTrainer
+from lw_torchrl.transforms import QAFTransform
 
 PLANS = load_plans("MT10")
 SEED = 1000

@@ -4,7 +4,7 @@ import torch
 from tensordict import TensorDict
 
 import lw_torchrl as lw
-from lw_torchrl.envs.episodes import Episode
+from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.evaluation.plan_use import PlanUse
 
 PLANS = {"reach": lw.load_plans("MT10")["reach"]}  # three steps
@@ -20,7 +20,7 @@ def episode(number, steps, success_at=None, weights=True):
     found = TensorDict({"qaf": qaf, "next": TensorDict({"success": success}, [len(steps)])}, [len(steps)])
     if weights:
         found["skill_weights"] = torch.nn.functional.one_hot(chosen.clamp(min=0), 4).float()
-    return Episode("reach", number, found)
+    return FinishedEpisode("reach", number, found)
 
 
 def test_shares_of_states_to_twenty_steps_after_the_first_success():

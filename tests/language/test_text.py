@@ -10,6 +10,7 @@ import torch
 
 from lw_torchrl.language import text
 from lw_torchrl.language.plan_files import load_plans
+from lw_torchrl.language.shipped_texts import shipped_texts, write_table
 from lw_torchrl.language.tasks import TASKS
 
 NEW = "juggle three drawers while whistling"
@@ -43,12 +44,12 @@ def encoded():
 
 
 def test_every_description_and_skill_is_shipped():
-    assert set(text.shipped_texts()) == {*DESCRIPTIONS, *SKILLS}
-    assert text._shipped().keys() >= set(text.shipped_texts())
+    assert set(shipped_texts()) == {*DESCRIPTIONS, *SKILLS}
+    assert text._shipped().keys() >= set(shipped_texts())
 
 
 def test_the_table_holds_nothing_that_is_not_used():
-    assert text._shipped().keys() <= set(text.shipped_texts())
+    assert text._shipped().keys() <= set(shipped_texts())
 
 
 def test_shipped_texts_need_no_text_model(without_extra):
@@ -94,8 +95,8 @@ def test_a_new_text_without_the_extra_says_what_to_install(without_extra):
 def test_writing_the_table_gives_what_is_shipped(tmp_path, encoded, monkeypatch):
     path = tmp_path / "embeddings.npz"
     texts, vectors = encoded
-    monkeypatch.setattr(text, "sentence_encoder", lambda listed: vectors)
-    text.write_table(path, texts)
+    monkeypatch.setattr("lw_torchrl.language.shipped_texts.sentence_encoder", lambda listed: vectors)
+    write_table(path, texts)
     with text.np.load(path, allow_pickle=False) as table:
         assert table["texts"].tolist() == texts
         found = torch.from_numpy(table["vectors"].astype("float32"))

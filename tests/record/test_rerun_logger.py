@@ -148,7 +148,7 @@ def test_timelines(tmp_path):
 
 
 def test_control_period_is_metaworlds():
-    from lw_torchrl.envs.metaworld_engine import make_metaworld_env
+    from lw_torchrl.envs.engines.metaworld import make_metaworld_env
     from lw_torchrl.record.scene import CONTROL_PERIOD
 
     env = make_metaworld_env("reach")

@@ -16,11 +16,11 @@ from torch import nn
 from torchrl.data import LazyTensorStorage, RandomSampler, SamplerWithoutReplacement, TensorDictReplayBuffer
 from torchrl.record.loggers import Logger
 
-from lw_torchrl.data import LanguageWorldExperienceReplay, RandomYaw, TaskBalancedSampler, collect_demonstrations
-from lw_torchrl.envs import QAFTransform
+from lw_torchrl.data import LanguageWorldExperienceReplay, TaskBalancedSampler, collect_demonstrations
 from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.modules import DescriptorConditionedActor, PlanConditionedActor
 from lw_torchrl.trainers import BehavioralCloningConfig, BehavioralCloningTrainer
+from lw_torchrl.transforms import QAFTransform, RandomYaw
 
 SMALL = dict(latent_size=4, width=16, depth=1, encoder_width=8)
 CONFIG = BehavioralCloningConfig(steps=12, batch_size=8, checkpoint_every=5, learning_rate=1e-2)

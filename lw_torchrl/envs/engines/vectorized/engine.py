@@ -12,15 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lw_torchrl._checks import check_choice, check_int
-from lw_torchrl.envs._crew import Crew, Shard, split_into_shards
-from lw_torchrl.envs._models import SharedModel, borrow_model, check_versions, return_models
-from lw_torchrl.envs._readings import CURRENT, WIDTH
-from lw_torchrl.envs._simulated_row import WARNING_KINDS, SimulatedRow, is_stable
-from lw_torchrl.envs._simulation_table import simulation_table
-from lw_torchrl.envs._task_program import make_task_program, model_path
-from lw_torchrl.envs._vectorized_observation import Observer
-from lw_torchrl.envs._vectorized_success import SuccessJudge
 from lw_torchrl.envs.engine import ACTION_SIZE, OBSERVATION_SIZE, EngineStep
+from lw_torchrl.envs.engines.vectorized.models import SharedModel, borrow_model, check_versions, return_models
+from lw_torchrl.envs.engines.vectorized.observation import Observer
+from lw_torchrl.envs.engines.vectorized.sensors import CURRENT, WIDTH
+from lw_torchrl.envs.engines.vectorized.simulated_row import WARNING_KINDS, SimulatedRow, is_stable
+from lw_torchrl.envs.engines.vectorized.simulation_table import simulation_table
+from lw_torchrl.envs.engines.vectorized.success import SuccessFunction
+from lw_torchrl.envs.engines.vectorized.task_logic import make_task_logic, model_path
+from lw_torchrl.envs.engines.vectorized.worker_pool import RowGroup, WorkerPool, split_into_groups
 
 Rows = NDArray[np.intp]
 Array = NDArray[np.float64]
@@ -40,7 +40,7 @@ def available_cores() -> int:
 class VectorizedEngine:
     """Simulates all rows together: physics in threads, everything else in NumPy over all rows at once.
 
-    It gives the very numbers of :class:`~lw_torchrl.envs.metaworld_engine.MetaWorldEngine`, whatever the
+    It gives the very numbers of :class:`~lw_torchrl.envs.engines.metaworld.MetaWorldEngine`, whatever the
     number of threads. The rows of one XML file share a compiled model; each has only a state of its own.
 
     A row faults when its action is not finite, or when its simulation becomes unstable. It then repeats its
@@ -80,23 +80,23 @@ class VectorizedEngine:
         num_threads = check_int("num_threads", num_threads, minimum=1)
         table = simulation_table()
         tasks = [check_choice("task", task, table) for task in tasks]
-        self._shards = split_into_shards([model_path(task) for task in tasks], num_threads)
-        self._shard_of = np.empty(len(tasks), dtype=np.intp)
+        self._groups = split_into_groups([model_path(task) for task in tasks], num_threads)
+        self._group_of_row = np.empty(len(tasks), dtype=np.intp)
         builders: list[Any] = [None] * len(tasks)
         models: list[SharedModel] = []
         # A borrowed model goes back even if the engine is never closed.
         self._return_models = weakref.finalize(self, return_models, models)
-        for number, shard in enumerate(self._shards):
-            models.append(borrow_model(model_path(tasks[shard.rows[0]])))
-            programs = {task: make_task_program(task, models[-1]) for task in {tasks[row] for row in shard.rows}}
-            for row in shard.rows:
-                self._shard_of[row] = number
+        for number, group in enumerate(self._groups):
+            models.append(borrow_model(model_path(tasks[group.rows[0]])))
+            programs = {task: make_task_logic(task, models[-1]) for task in {tasks[row] for row in group.rows}}
+            for row in group.rows:
+                self._group_of_row[row] = number
                 builders[row] = programs[tasks[row]]
         self._rows = [
             SimulatedRow(table[task], models[number], builder)
-            for task, number, builder in zip(tasks, self._shard_of, builders, strict=True)
+            for task, number, builder in zip(tasks, self._group_of_row, builders, strict=True)
         ]
-        self._crew = Crew(num_threads)
+        self._pool = WorkerPool(num_threads)
 
         n = len(tasks)
         bounds = [builder.sawyer_observation_space for builder in builders]
@@ -112,7 +112,7 @@ class VectorizedEngine:
         self._observation = np.zeros((n, OBSERVATION_SIZE))
         self._started = np.zeros(n, dtype=bool)
         self._faulted = np.zeros(n, dtype=bool)
-        self._group: _Group | None = None
+        self._running: _RunningRows | None = None
 
     def reset(self, rows: Sequence[int], seeds: Sequence[int]) -> Array:
         """Start an episode in each of ``rows``, as Meta-World's ``env.seed(seed); env.reset()`` does.
@@ -131,7 +131,7 @@ class VectorizedEngine:
             self._mocap[row] = self._rows[row].mocap
             self._goal[row] = self._rows[row].goal
 
-        self._crew.work(self._by_shard(index), reset)
+        self._pool.work(self._by_group(index), reset)
         self._current[index] = self._observation[index, CURRENT]
         self._faulted[index] = False
         self._started[index] = True
@@ -154,36 +154,36 @@ class VectorizedEngine:
         reward, success = np.zeros(n), np.zeros(n, dtype=bool)
         running = active & ~self._faulted
         if running.any():
-            self._step_running(self._group_of(running), action, reward, success)
+            self._step_running(self._running_rows(running), action, reward, success)
         return EngineStep(self._observation.copy(), reward, success, active & self._faulted)
 
     def close(self) -> None:
         """End the threads and give the models back, for the next engine of this process."""
-        self._crew.close()
+        self._pool.close()
         self._rows = []
-        self._group = None
+        self._running = None
         self._return_models()
 
-    def _step_running(self, group: _Group, action: NDArray[Any], reward: Array, success: Truth) -> None:
-        rows = group.rows
+    def _step_running(self, running: _RunningRows, action: NDArray[Any], reward: Array, success: Truth) -> None:
+        rows = running.rows
         action = action[rows]
         shift = np.minimum(np.maximum(action[:, :3], -1), 1) * self._action_scale
-        mocap = np.minimum(np.maximum(self._mocap[rows] + shift, group.mocap_low), group.mocap_high)
+        mocap = np.minimum(np.maximum(self._mocap[rows] + shift, running.mocap_low), running.mocap_high)
         self._mocap[rows] = mocap
-        readings = np.empty((len(rows), WIDTH))
+        sensors = np.empty((len(rows), WIDTH))
         warnings = np.empty((len(rows), WARNING_KINDS), dtype=np.int32)
         control = action[:, 3:] * FINGERS
 
         def simulate(k: int) -> None:
-            group.members[k].simulate(mocap[k], control[k], readings[k], warnings[k])
+            running.members[k].simulate(mocap[k], control[k], sensors[k], warnings[k])
 
-        self._crew.work(group.shards, simulate)
+        self._pool.work(running.groups, simulate)
 
-        current = group.observer.current(readings)
+        current = running.observer.current(sensors)
         goal = self._goal[rows]
         observation = np.concatenate((current, self._current[rows], goal), axis=1)
-        np.clip(observation, group.low, group.high, out=observation)
-        achieved = group.judge(readings, current, goal)
+        np.clip(observation, running.low, running.high, out=observation)
+        achieved = running.success(sensors, current, goal)
         stable = is_stable(observation, warnings)
         if not stable.all():
             self._faulted[rows[~stable]] = True
@@ -203,21 +203,21 @@ class VectorizedEngine:
         else:
             reward[rows] = achieved
 
-    def _group_of(self, running: Truth) -> _Group:
+    def _running_rows(self, running: Truth) -> _RunningRows:
         """What steps exactly these rows; kept for the next step, for the mask seldom changes."""
         key = running.tobytes()
-        if self._group is None or self._group.key != key:
-            self._group = _Group(self, running, key)
-        return self._group
+        if self._running is None or self._running.key != key:
+            self._running = _RunningRows(self, running, key)
+        return self._running
 
-    def _by_shard(self, rows: Rows) -> list[tuple[Shard, list[int]]]:
+    def _by_group(self, rows: Rows) -> list[tuple[RowGroup, list[int]]]:
         items: dict[int, list[int]] = defaultdict(list)
-        for row, number in zip(rows.tolist(), self._shard_of[rows].tolist(), strict=True):
+        for row, number in zip(rows.tolist(), self._group_of_row[rows].tolist(), strict=True):
             items[number].append(row)
-        return [(self._shards[number], members) for number, members in items.items()]
+        return [(self._groups[number], members) for number, members in items.items()]
 
 
-class _Group:
+class _RunningRows:
     """Everything about one set of running rows that does not change from step to step."""
 
     def __init__(self, engine: VectorizedEngine, running: Truth, key: bytes) -> None:
@@ -226,9 +226,9 @@ class _Group:
         self.members = members = [engine._rows[row] for row in rows]
         sources = [member.sources for member in members]
         self.observer = Observer(sources)
-        self.judge = SuccessJudge(sources, lambda k: members[k].program)
+        self.success = SuccessFunction(sources, lambda k: members[k].program)
         place = {row: k for k, row in enumerate(rows.tolist())}
-        self.shards = [(shard, [place[row] for row in items]) for shard, items in engine._by_shard(rows)]
+        self.groups = [(group, [place[row] for row in items]) for group, items in engine._by_group(rows)]
         self.low, self.high = engine._low[rows], engine._high[rows]
         self.mocap_low, self.mocap_high = engine._mocap_low[rows], engine._mocap_high[rows]
 

@@ -16,9 +16,9 @@ import pytest
 from commands import fails, run
 
 import lw_torchrl as lw
-from lw_torchrl import cli
-from lw_torchrl.cli import main
-from lw_torchrl.demo import QUICK
+import lw_torchrl.cli.main as cli
+from lw_torchrl.cli.main import main
+from lw_torchrl.experiments.demo import QUICK
 
 COMMANDS = (
     "demo",
@@ -261,7 +261,15 @@ def test_the_baseline_trains_and_is_evaluated(capsys, demos, tmp_path):
 
 
 def start_demo(out):
-    command = [sys.executable, "-c", "from lw_torchrl.cli import main; main()", "demo", "--quick", "--out", str(out)]
+    command = [
+        sys.executable,
+        "-c",
+        "from lw_torchrl.cli.main import main; main()",
+        "demo",
+        "--quick",
+        "--out",
+        str(out),
+    ]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
 
 

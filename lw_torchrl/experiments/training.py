@@ -1,46 +1,44 @@
-"""How a unit of an experiment trains: one policy for all tasks, or one for each target."""
+"""How a run of an experiment trains: one policy for all tasks, or one for each target."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torchrl.envs import Compose, Transform
 
-from lw_torchrl.data import CoLearningSampler, LanguageWorldExperienceReplay, RandomYaw, TaskBalancedSampler
-from lw_torchrl.envs import QAFTransform
+from lw_torchrl.data import CoLearningSampler, LanguageWorldExperienceReplay, TaskBalancedSampler
+from lw_torchrl.experiments.recipes import Member
+from lw_torchrl.experiments.runs import Run
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.tasks import MT50, resolve_tasks
 from lw_torchrl.modules import ActorEnsemble, DescriptorConditionedActor, PlanConditionedActor
 from lw_torchrl.trainers.behavioral_cloning import BehavioralCloningConfig, BehavioralCloningTrainer
 from lw_torchrl.trainers.checkpoint import Actor, Policy, check_description, describe_data, load_actor, save_actor
-from lw_torchrl.trainers.recipes import Member
 from lw_torchrl.trainers.stacked import StackedBehavioralCloning
-
-if TYPE_CHECKING:
-    from lw_torchrl.trainers.experiments import Unit
+from lw_torchrl.transforms import QAFTransform, RandomYaw
 
 
-def _make_actor(unit: Unit, member: Member, plans: Plans, seed: int) -> Actor:
+def _make_actor(run: Run, member: Member, plans: Plans, seed: int) -> Actor:
     torch.manual_seed(seed)
-    options = unit.actor_options(member)
-    if unit.method == "pcbc":
+    options = run.actor_options(member)
+    if run.method == "pcbc":
         return PlanConditionedActor(plans, **options)
-    condition: Any = "description" if unit.method == "dc" else "one-hot"
+    condition: Any = "description" if run.method == "dc" else "one-hot"
     return DescriptorConditionedActor(MT50, condition=condition, **options)
 
 
-def _transform(unit: Unit, member: Member, plans: Plans) -> Transform:
-    queries = [QAFTransform(plans)] if unit.method == "pcbc" else []
+def _transform(run: Run, member: Member, plans: Plans) -> Transform:
+    queries = [QAFTransform(plans)] if run.method == "pcbc" else []
     return Compose(*queries, *([RandomYaw(member.yaw)] if member.yaw else []))
 
 
-def _config(unit: Unit, rows: int, seed: int) -> BehavioralCloningConfig:
+def _config(run: Run, rows: int, seed: int) -> BehavioralCloningConfig:
     """The preset's, with as many steps as its passes over so many rows take, where it counts passes."""
-    config, passes = unit.preset.training, unit.preset.passes
+    config, passes = run.preset.training, run.preset.passes
     steps = config.steps if passes is None else max(1, passes * rows // config.batch_size)
     return replace(config, steps=steps, seed=seed)
 
@@ -49,7 +47,7 @@ def _keep(
     described: dict[str, Any], actors: Sequence[Actor], file: Path, replay: LanguageWorldExperienceReplay
 ) -> Policy:
     policy = actors[0] if len(actors) == 1 else ActorEnsemble(actors)
-    save_actor(policy, file, data=describe_data(replay), unit=described)
+    save_actor(policy, file, data=describe_data(replay), run=described)
     return policy
 
 
@@ -59,28 +57,28 @@ def _forget_checkpoints(folder: Path) -> None:
 
 
 def _kept(described: dict[str, Any], file: Path) -> Policy:
-    check_description(file, {"unit": described})
+    check_description(file, {"run": described})
     return load_actor(file)
 
 
-def train_one(unit: Unit, plans: Plans, out: Path, progress: bool) -> Policy:
+def train_one(run: Run, plans: Plans, out: Path, progress: bool) -> Policy:
     """One policy for all tasks, kept in ``policy.zip``; until all its members are done, each has a checkpoint."""
-    folder, described = out / unit.folder, unit.describe(plans)
+    folder, described = out / run.folder, run.describe(plans)
     file = folder / "policy.zip"
     if file.is_file():
         policy = _kept(described, file)
         _forget_checkpoints(folder)
         return policy
     actors = []
-    for number, member in enumerate(unit.preset.members):
+    for number, member in enumerate(run.preset.members):
         replay = LanguageWorldExperienceReplay(
-            out / unit.datasets[0].folder,
+            out / run.datasets[0].folder,
             sampler=TaskBalancedSampler(),
-            transform=_transform(unit, member, plans),
-            after_success=unit.preset.after_success,
+            transform=_transform(run, member, plans),
+            after_success=run.preset.after_success,
         )
-        config = _config(unit, len(replay), unit.seed + 1_000 * number)
-        actors.append(_make_actor(unit, member, plans, config.seed))
+        config = _config(run, len(replay), run.seed + 1_000 * number)
+        actors.append(_make_actor(run, member, plans, config.seed))
         checkpoint = folder / f"checkpoint-{number}.zip"
         BehavioralCloningTrainer(actors[-1], replay, config, checkpoint=checkpoint, progress=progress).train()
     policy = _keep(described, actors, file, replay)
@@ -88,36 +86,36 @@ def train_one(unit: Unit, plans: Plans, out: Path, progress: bool) -> Policy:
     return policy
 
 
-def train_each(unit: Unit, plans: Plans, out: Path, progress: bool) -> dict[str, Policy]:
+def train_each(run: Run, plans: Plans, out: Path, progress: bool) -> dict[str, Policy]:
     """A policy for each target, kept in ``models/<target>.zip``; all are trained together, member by member.
 
-    The i-th target's seed is the i-th from 1000 times the unit's; the next member's follow.
+    The i-th target's seed is the i-th from 1000 times the run's; the next member's follow.
     """
-    folder, described = out / unit.folder, unit.describe(plans)
-    targets = resolve_tasks(unit.setting.targets or ())
+    folder, described = out / run.folder, run.describe(plans)
+    targets = resolve_tasks(run.setting.targets or ())
     files = {target: folder / "models" / f"{target}.zip" for target in targets}
     if all(file.is_file() for file in files.values()):
         policies = {target: _kept(described, file) for target, file in files.items()}
         _forget_checkpoints(folder)
         return policies
-    roots = [out / dataset.folder for dataset in unit.datasets]
+    roots = [out / dataset.folder for dataset in run.datasets]
     rows = 0
-    if unit.preset.passes is not None:  # over the base tasks, which have half of each minibatch
-        rows = 2 * len(LanguageWorldExperienceReplay(roots[0], after_success=unit.preset.after_success))
+    if run.preset.passes is not None:  # over the base tasks, which have half of each minibatch
+        rows = 2 * len(LanguageWorldExperienceReplay(roots[0], after_success=run.preset.after_success))
     members = []
-    for number, member in enumerate(unit.preset.members):
-        config = _config(unit, rows, 1_000 * unit.seed + len(targets) * number)
+    for number, member in enumerate(run.preset.members):
+        config = _config(run, rows, 1_000 * run.seed + len(targets) * number)
         replays = [
             LanguageWorldExperienceReplay(
                 roots,
                 episodes=[None, {target: 1}],
                 sampler=CoLearningSampler(target),
-                transform=_transform(unit, member, plans),
-                after_success=unit.preset.after_success,
+                transform=_transform(run, member, plans),
+                after_success=run.preset.after_success,
             )
             for target in targets
         ]
-        members.append([_make_actor(unit, member, plans, config.seed + i) for i in range(len(targets))])
+        members.append([_make_actor(run, member, plans, config.seed + i) for i in range(len(targets))])
         checkpoint = folder / f"checkpoint-{number}.zip"
         StackedBehavioralCloning(members[-1], replays, config, checkpoint=checkpoint, progress=progress).train()
     policies = {

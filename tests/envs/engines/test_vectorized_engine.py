@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lw_torchrl.envs._crew import Crew, Shard, split_into_shards
-from lw_torchrl.envs._models import borrow_model, return_models
-from lw_torchrl.envs._simulation_table import parse_simulation_table, simulation_table
-from lw_torchrl.envs._task_program import model_path
-from lw_torchrl.envs._vectorized_observation import quaternion_of_matrix, row_norm
 from lw_torchrl.envs.engine import EngineStep
-from lw_torchrl.envs.metaworld_engine import MetaWorldEngine
-from lw_torchrl.envs.vectorized_engine import VectorizedEngine
+from lw_torchrl.envs.engines.metaworld import MetaWorldEngine
+from lw_torchrl.envs.engines.vectorized.engine import VectorizedEngine
+from lw_torchrl.envs.engines.vectorized.models import borrow_model, return_models
+from lw_torchrl.envs.engines.vectorized.observation import quaternion_of_matrix, row_norm
+from lw_torchrl.envs.engines.vectorized.simulation_table import parse_simulation_table, simulation_table
+from lw_torchrl.envs.engines.vectorized.task_logic import model_path
+from lw_torchrl.envs.engines.vectorized.worker_pool import RowGroup, WorkerPool, split_into_groups
 
 TASKS = list(simulation_table())
 
@@ -385,44 +385,44 @@ def test_norms_have_the_bits_of_one_norm():
 
 def test_rows_of_one_model_stay_together_unless_a_thread_would_starve():
     keys = ["a", "b", "a", "c", "a", "b"]
-    assert {shard.rows for shard in split_into_shards(keys, 1)} == {(0, 2, 4), (1, 5), (3,)}
-    assert {shard.rows for shard in split_into_shards(["a"] * 8, 2)} == {(0, 1), (2, 3), (4, 5), (6, 7)}
-    assert len(split_into_shards([str(k % 36) for k in range(1000)], 2)) == 36
+    assert {group.rows for group in split_into_groups(keys, 1)} == {(0, 2, 4), (1, 5), (3,)}
+    assert {group.rows for group in split_into_groups(["a"] * 8, 2)} == {(0, 1), (2, 3), (4, 5), (6, 7)}
+    assert len(split_into_groups([str(k % 36) for k in range(1000)], 2)) == 36
 
 
 @pytest.mark.parametrize("threads", [1, 4])
-def test_a_crew_does_each_item_once_and_a_shard_in_turn(threads):
-    crew = Crew(threads)
-    jobs = [(Shard(range(k, k + 5)), range(k, k + 5)) for k in range(0, 100, 5)]
+def test_a_worker_pool_does_each_item_once_and_a_group_in_turn(threads):
+    pool = WorkerPool(threads)
+    jobs = [(RowGroup(range(k, k + 5)), range(k, k + 5)) for k in range(0, 100, 5)]
     busy = [threading.Lock() for _ in jobs]
     done = []
 
     def do(item: int) -> None:
         lock = busy[item // 5]
-        assert lock.acquire(blocking=False), "two threads in one shard"
+        assert lock.acquire(blocking=False), "two threads in one group"
         time.sleep(1e-4)
         done.append(item)
         lock.release()
 
-    crew.work(jobs, do)
+    pool.work(jobs, do)
     assert sorted(done) == list(range(100))
-    crew.close()
+    pool.close()
 
 
-def test_a_crew_works_side_by_side():
-    crew, meeting = Crew(3), threading.Barrier(3, timeout=10)
-    crew.work([(Shard([k]), [k]) for k in range(3)], lambda item: meeting.wait())
-    crew.close()
+def test_a_worker_pool_works_side_by_side():
+    pool, meeting = WorkerPool(3), threading.Barrier(3, timeout=10)
+    pool.work([(RowGroup([k]), [k]) for k in range(3)], lambda item: meeting.wait())
+    pool.close()
 
 
 @pytest.mark.parametrize("threads", [1, 3])
 def test_an_error_in_a_thread_reaches_the_caller(threads):
-    crew = Crew(threads)
+    pool = WorkerPool(threads)
 
     def do(item: int) -> None:
         if item == 7:
             raise ZeroDivisionError("item 7")
 
     with pytest.raises(ZeroDivisionError, match="item 7"):
-        crew.work([(Shard([k]), [k]) for k in range(20)], do)
-    crew.close()
+        pool.work([(RowGroup([k]), [k]) for k in range(20)], do)
+    pool.close()

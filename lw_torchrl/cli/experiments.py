@@ -1,4 +1,4 @@
-"""``lw-torchrl reproduce``: the paper's experiments, unit by unit."""
+"""``lw-torchrl reproduce``: the paper's experiments, run by run."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Literal
 from tyro.conf import Positional
 
 if TYPE_CHECKING:
+    from lw_torchrl.experiments.runs import Dataset, Run
     from lw_torchrl.language.plans import Plans
-    from lw_torchrl.trainers.experiments import Dataset, Unit
 
 Experiment = Literal["zero-shot", "few-shot", "one-shot", "scripted", "all"]
 Method = Literal["pcbc", "dc", "one-hot", "scripted"]
@@ -29,14 +29,14 @@ def reproduce(
     episodes: int = 20,
     launcher: Literal["local", "ray"] = "local",
     jobs: int = 1,
-    unit: str | None = None,
+    run: str | None = None,
     list: bool = False,
     out: Path = Path("runs/reproduce"),
 ) -> None:
     """Run the paper's experiments and compare them with the published results. Stopped and started again it carries on.
 
-    A unit is a dataset, or the policy of one method and seed with its evaluation (in one-shot, a policy for each of the
-    50 tasks). Each can be run by a command of its own, with --unit, by any scheduler; datasets first. The summary is
+    A run is a dataset, or the policy of one method and seed with its evaluation (in one-shot, a policy for each of the
+    50 tasks). Each can be run by a command of its own, with --run, by any scheduler; datasets first. The summary is
     written when the command is run without it.
 
     Example: lw-torchrl reproduce few-shot --seeds 0 1 2 --methods pcbc dc
@@ -52,15 +52,16 @@ def reproduce(
         plans: a folder of plans for all 50 tasks, or a .json file of pairs, instead of ours.
         episodes: evaluated for each task, on seeds that no training used, action noise 0.1.
         launcher: local, on this machine; ray, on a Ray cluster, or on all cores of this machine.
-        jobs: units run at a time by the launcher local.
-        unit: run this one alone, such as few-shot/strong/pcbc/seed0.
-        list: print the names of the units and do nothing.
+        jobs: runs run at a time by the launcher local.
+        run: run this one alone, such as few-shot/strong/pcbc/seed0.
+        list: print the names of the runs and do nothing.
         out: where everything goes; on a cluster, a folder that all its machines share.
     """
     from lw_torchrl._checks import check_choice, check_int
-    from lw_torchrl.cli import _calm_torch
-    from lw_torchrl.trainers.experiments import METHODS, Unit, run_unit
-    from lw_torchrl.trainers.recipes import PRESETS, SETTINGS
+    from lw_torchrl.cli.threads import use_one_thread
+    from lw_torchrl.experiments.execution import execute_run
+    from lw_torchrl.experiments.recipes import PRESETS, SETTINGS
+    from lw_torchrl.experiments.runs import METHODS, Run
 
     check_int("jobs", jobs, minimum=1)
     recipes = PRESETS[preset]
@@ -75,24 +76,24 @@ def reproduce(
         methods = ("scripted",)
     assert methods is not None
     plans_name = "" if plans is None else plans.stem
-    units = [
-        Unit(SETTINGS[name], method, seed, recipes[name], episodes, plans_name)
+    runs = [
+        Run(SETTINGS[name], method, seed, recipes[name], episodes, plans_name)
         for name in (["few-shot"] if experiment == "scripted" else SETTINGS)
         if experiment in (name, "scripted", "all")
         for method in methods
         for seed in seeds
     ]
-    datasets = {str(dataset.folder): dataset for one in units for dataset in one.datasets}
-    named = {str(one.folder): one for one in units}
+    datasets = {str(dataset.folder): dataset for one in runs for dataset in one.datasets}
+    named = {str(one.folder): one for one in runs}
     if list:
         print("\n".join([*datasets, *named]))
         return
     load = _Plans(plans)
-    _calm_torch()
-    if unit in datasets:
-        datasets[unit].collect(out, progress=True)
-    elif unit is not None:
-        result = run_unit(one := named[check_choice("unit", unit, [*datasets, *named])], load(one), out)
+    use_one_thread()
+    if run in datasets:
+        datasets[run].collect(out, progress=True)
+    elif run is not None:
+        result = execute_run(one := named[check_choice("run", run, [*datasets, *named])], load(one), out)
         print(f"{one.folder}: mean success {result.mean_success:.3f}, {result.config['seconds']:.0f} s")
     else:
         if launcher == "local" and jobs == 1:
@@ -104,62 +105,62 @@ def reproduce(
             given += [] if plans is None else ["--plans", str(plans)]
             for stage in (datasets, named):
                 _report(len(stage), _there(stage, given, launcher, jobs))
-        _summarize(units, load, out)
+        _summarize(runs, load, out)
 
 
 class _Plans:
-    """The plans that a unit uses, each set read once."""
+    """The plans that a run uses, each set read once."""
 
     def __init__(self, source: Path | None) -> None:
         self.source = source
         self.known: dict[str, Plans] = {}
 
-    def __call__(self, unit: Unit) -> Plans:
+    def __call__(self, run: Run) -> Plans:
         from lw_torchrl.language.plan_files import load_plans
 
-        zero_shot = unit.setting.name == "zero-shot" and unit.method != "scripted"
+        zero_shot = run.setting.name == "zero-shot" and run.method != "scripted"
         skills: Literal["MT10", "own"] = "MT10" if zero_shot else "own"
         if skills not in self.known:
             self.known[skills] = load_plans("MT50", skills=skills) if self.source is None else load_plans(self.source)
         return self.known[skills]
 
 
-def _here(named: dict[str, Unit], load: Callable[[Unit], Plans], out: Path) -> Iterator[str]:
-    from lw_torchrl.trainers.experiments import run_unit
+def _here(named: dict[str, Run], load: Callable[[Run], Plans], out: Path) -> Iterator[str]:
+    from lw_torchrl.experiments.execution import execute_run
 
     for name, one in named.items():
-        result = run_unit(one, load(one), out)
+        result = execute_run(one, load(one), out)
         yield f"{name}: mean success {result.mean_success:.3f}, {result.config['seconds']:.0f} s"
 
 
 def _there(
-    named: dict[str, Dataset] | dict[str, Unit], given: list[str], launcher: Literal["local", "ray"], jobs: int
+    named: dict[str, Dataset] | dict[str, Run], given: list[str], launcher: Literal["local", "ray"], jobs: int
 ) -> Iterator[str]:
-    from lw_torchrl.launchers import run_commands
+    from lw_torchrl.experiments.launchers import run_commands
 
     names = [*named]
-    for index, printed in run_commands([["reproduce", *given, "--unit", name] for name in names], launcher, jobs):
+    for index, printed in run_commands([["reproduce", *given, "--run", name] for name in names], launcher, jobs):
         yield printed.strip() or names[index]
 
 
 def _report(total: int, lines: Iterator[str]) -> None:
-    """Print what each unit says as it ends, and how long the others will take."""
+    """Print what each run says as it ends, and how long the others will take."""
     started = time.perf_counter()
     for number, line in enumerate(lines, 1):
         left = (time.perf_counter() - started) / number * (total - number)
         print(f"[{number}/{total}] {line}; about {left / 60:.0f} min left", flush=True)
 
 
-def _summarize(units: list[Unit], load: Callable[[Unit], Plans], out: Path) -> None:
+def _summarize(runs: list[Run], load: Callable[[Run], Plans], out: Path) -> None:
     """A summary, tables and a figure for each setting, from the results on disk."""
     from lw_torchrl._files import write_json, write_text
-    from lw_torchrl.evaluation import Comparison, EvaluationResult, plot_sorted_tasks, published_curves, summarize
-    from lw_torchrl.trainers.experiments import load_result
+    from lw_torchrl.evaluation import EvaluationResult, MethodComparison, plot_sorted_tasks, published_curves, summarize
+    from lw_torchrl.experiments.execution import load_result
 
     found: dict[Path, dict[str, dict[int, EvaluationResult]]] = {}
     settings = {}
-    for one in units:
-        alone = all(other.method == "scripted" for other in units)
+    for one in runs:
+        alone = all(other.method == "scripted" for other in runs)
         group = one.folder.parent if alone else one.group
         result = load_result(one, load(one), out)
         assert result is not None
@@ -170,7 +171,7 @@ def _summarize(units: list[Unit], load: Callable[[Unit], Plans], out: Path) -> N
         # One policy for all tasks can be good or bad at all of them alike; a policy for each task cannot.
         options = {"whole_seeds": setting is not None and setting.targets is None}
         published = {} if setting is None else published_curves(setting.name, ("PCBC", "DC"))
-        comparison = Comparison(
+        comparison = MethodComparison(
             {method: summarize(results, **options) for method, results in methods.items()}, published, **options
         )
         folder = out / group

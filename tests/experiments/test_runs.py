@@ -1,4 +1,4 @@
-"""The experiments' units: resumed anywhere they end with the same result."""
+"""The experiments' runs: resumed anywhere they end with the same result."""
 
 import json
 import shutil
@@ -7,10 +7,11 @@ from dataclasses import replace
 import pytest
 
 import lw_torchrl as lw
-from lw_torchrl.trainers import experiments, unit_training
+from lw_torchrl.experiments import execution, training
+from lw_torchrl.experiments.execution import execute_run, load_result
+from lw_torchrl.experiments.recipes import PRESETS, SETTINGS, DataSetting, Execution, Member
+from lw_torchrl.experiments.runs import METHODS, Run
 from lw_torchrl.trainers.checkpoint import demonstration_seeds
-from lw_torchrl.trainers.experiments import METHODS, Unit, load_result, run_unit
-from lw_torchrl.trainers.recipes import PRESETS, SETTINGS, DataSetting, Execution, Member
 
 PLANS = lw.load_plans("MT50")
 TINY = DataSetting("tiny", "reach", 2)
@@ -27,17 +28,17 @@ OTHER = Member({"features": "relative", "width": 16, "depth": 1}, yaw=0.3)
 ENSEMBLE = replace(PRESET, name="ensemble", members=(MEMBER, OTHER))
 
 
-def unit(method="pcbc", seed=3, setting=TINY, preset=PRESET):
-    return Unit(setting, method, seed, preset, episodes=2)
+def a_run(method="pcbc", seed=3, setting=TINY, preset=PRESET):
+    return Run(setting, method, seed, preset, episodes=2)
 
 
 def task_of(one):
     return one.setting.targets or "reach"
 
 
-def run(one, out, preset=None):
+def execute(one, out, preset=None):
     one = one if preset is None else replace(one, preset=preset)
-    return run_unit(one, PLANS, out, tasks=task_of(one), progress=False)
+    return execute_run(one, PLANS, out, tasks=task_of(one), progress=False)
 
 
 def rates(path):
@@ -46,19 +47,23 @@ def rates(path):
     return found["episodes"], found["config"]
 
 
-UNITS = [
-    *(unit(method) for method in METHODS),
-    *(unit(method, setting=TINY_ONE_SHOT) for method in METHODS[:-1]),
-    *(unit(method, setting=setting, preset=ENSEMBLE) for method in ("pcbc", "dc") for setting in (TINY, TINY_ONE_SHOT)),
+RUNS = [
+    *(a_run(method) for method in METHODS),
+    *(a_run(method, setting=TINY_ONE_SHOT) for method in METHODS[:-1]),
+    *(
+        a_run(method, setting=setting, preset=ENSEMBLE)
+        for method in ("pcbc", "dc")
+        for setting in (TINY, TINY_ONE_SHOT)
+    ),
 ]
-by_name = pytest.mark.parametrize("one", UNITS, ids=lambda one: f"{one.setting.name} {one.preset.name} {one.method}")
+by_name = pytest.mark.parametrize("one", RUNS, ids=lambda one: f"{one.setting.name} {one.preset.name} {one.method}")
 
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory):
     out = tmp_path_factory.mktemp("undisturbed")
-    for one in UNITS:
-        run(one, out)
+    for one in RUNS:
+        execute(one, out)
     return out
 
 
@@ -67,24 +72,24 @@ def test_a_unit_leaves_its_result_and_is_not_done_twice(undisturbed, one, monkey
     episodes, config = rates(undisturbed / one.folder)
     assert [episode["task"] for episode in episodes] == [task_of(one)] * 2
     assert (config["seed"], config["noise_scale"], config["tasks"]) == (10_003, 0.1, [task_of(one)])
-    monkeypatch.setattr(experiments, "evaluate", lambda *_, **__: pytest.fail("evaluated again"))
-    assert len(run(one, undisturbed).episodes) == 2
+    monkeypatch.setattr(execution, "evaluate", lambda *_, **__: pytest.fail("evaluated again"))
+    assert len(execute(one, undisturbed).episodes) == 2
 
 
 def test_folders(undisturbed):
-    assert unit().folder.as_posix() == "tiny/strong/pcbc/seed3"
-    assert unit("scripted").folder.as_posix() == "scripted/seed3"
-    assert unit("scripted", setting=TINY_ONE_SHOT).folder == unit("scripted").folder
-    named = replace(unit(), plans_name="palm")
+    assert a_run().folder.as_posix() == "tiny/strong/pcbc/seed3"
+    assert a_run("scripted").folder.as_posix() == "scripted/seed3"
+    assert a_run("scripted", setting=TINY_ONE_SHOT).folder == a_run("scripted").folder
+    named = replace(a_run(), plans_name="palm")
     assert named.folder.as_posix() == "tiny/strong-palm/pcbc/seed3"
     found = {path.name for path in (undisturbed / "demonstrations").iterdir() if path.name[0] != "."}
     assert found == {"reachx2-astray-seed3", "pushx1-target-seed3"}
-    assert unit(seed=4).datasets != unit().datasets
+    assert a_run(seed=4).datasets != a_run().datasets
 
 
 @by_name
 def test_the_result_says_what_was_done(undisturbed, one):
-    said = rates(undisturbed / one.folder)[1]["unit"]
+    said = rates(undisturbed / one.folder)[1]["run"]
     assert (said["method"], said["seed"]) == (one.method, 3)
     assert (said["plans"] is None) == (one.method in ("dc", "one-hot"))
     if one.method == "scripted":
@@ -104,11 +109,11 @@ def test_the_result_says_what_was_done(undisturbed, one):
 def test_a_result_of_another_configuration_is_refused(undisturbed):
     longer = replace(PRESET, training=replace(PRESET.training, steps=61))
     with pytest.raises(ValueError, match="is of another configuration, it differs in training; choose another folder"):
-        run(unit("dc"), undisturbed, longer)
+        execute(a_run("dc"), undisturbed, longer)
     with pytest.raises(ValueError, match="differs in plans"):
-        load_result(unit(), lw.load_plans("MT50", skills="MT10"), undisturbed)
+        load_result(a_run(), lw.load_plans("MT50", skills="MT10"), undisturbed)
     with pytest.raises(ValueError, match="differs in episodes"):
-        load_result(replace(unit(), episodes=3), PLANS, undisturbed)
+        load_result(replace(a_run(), episodes=3), PLANS, undisturbed)
 
 
 @pytest.mark.parametrize(
@@ -124,7 +129,7 @@ def test_a_result_of_another_configuration_is_refused(undisturbed):
 )
 def test_stopped_in_training_and_resumed_it_ends_the_same(undisturbed, tmp_path, monkeypatch, setting, preset, stop):
     trainer = lw.BehavioralCloningTrainer if setting is TINY else lw.StackedBehavioralCloning
-    one, step, count = unit(setting=setting, preset=preset), trainer.step, [0]
+    one, step, count = a_run(setting=setting, preset=preset), trainer.step, [0]
 
     def stops(self):
         count[0] += 1
@@ -134,20 +139,20 @@ def test_stopped_in_training_and_resumed_it_ends_the_same(undisturbed, tmp_path,
 
     monkeypatch.setattr(trainer, "step", stops)
     with pytest.raises(KeyboardInterrupt):
-        run(one, tmp_path)
-    run(one, tmp_path)
+        execute(one, tmp_path)
+    execute(one, tmp_path)
     assert count[0] == 60 * len(preset.members) + 6  # it carried on from the checkpoint before, one every 20 steps
     assert rates(tmp_path / one.folder) == rates(undisturbed / one.folder)
 
 
 def test_scripts_are_the_same_in_every_setting_and_run_once(undisturbed, monkeypatch):
-    monkeypatch.setattr(experiments, "evaluate", lambda *_, **__: pytest.fail("evaluated again"))
-    other = unit("scripted", setting=TINY_ONE_SHOT)
-    assert load_result(other, PLANS, undisturbed) == load_result(unit("scripted"), PLANS, undisturbed)
+    monkeypatch.setattr(execution, "evaluate", lambda *_, **__: pytest.fail("evaluated again"))
+    other = a_run("scripted", setting=TINY_ONE_SHOT)
+    assert load_result(other, PLANS, undisturbed) == load_result(a_run("scripted"), PLANS, undisturbed)
 
 
 def test_the_policies_of_one_shot_are_kept_one_by_one(undisturbed):
-    folder = undisturbed / unit(setting=TINY_ONE_SHOT).folder
+    folder = undisturbed / a_run(setting=TINY_ONE_SHOT).folder
     assert sorted(path.name for path in folder.iterdir()) == ["models", "results.json"]
     actor = lw.load_actor(folder / "models" / "push.zip")
     result = lw.evaluate(actor, tasks="push", episodes_per_task=2, seed=10_003, stop_at_success=True, progress=False)
@@ -157,33 +162,33 @@ def test_the_policies_of_one_shot_are_kept_one_by_one(undisturbed):
 @pytest.mark.parametrize(("setting", "file"), [(TINY, "policy.zip"), (TINY_ONE_SHOT, "models/push.zip")])
 @pytest.mark.parametrize("method", ["pcbc", "dc"])
 def test_an_ensemble_has_members_of_its_own_and_is_not_trained_twice(undisturbed, tmp_path, method, setting, file):
-    one = unit(method, setting=setting, preset=ENSEMBLE)
+    one = a_run(method, setting=setting, preset=ENSEMBLE)
     policy = lw.load_actor(undisturbed / one.folder / file)
     assert isinstance(policy, lw.ActorEnsemble)
     assert [actor.config["width"] for actor in policy.members] == [32, 16]
     shutil.copytree(undisturbed, tmp_path / "again")
     (tmp_path / "again" / one.folder / "results.json").unlink()
-    result = run_unit(one, PLANS, tmp_path / "again", tasks=task_of(one), progress=False)
+    result = execute_run(one, PLANS, tmp_path / "again", tasks=task_of(one), progress=False)
     assert result.success_once == lw.EvaluationResult.load(undisturbed / one.folder / "results.json").success_once
     assert not list((tmp_path / "again" / one.folder).glob("checkpoint*"))
 
 
 @pytest.mark.parametrize(("setting", "file"), [(TINY, "policy.zip"), (TINY_ONE_SHOT, "models/push.zip")])
 def test_a_policy_says_which_seed_its_demonstrations_had(undisturbed, setting, file):
-    assert demonstration_seeds(undisturbed / unit(setting=setting).folder / file) == {3}
+    assert demonstration_seeds(undisturbed / a_run(setting=setting).folder / file) == {3}
 
 
 @pytest.mark.parametrize("setting", [TINY, TINY_ONE_SHOT])
 def test_a_policy_of_another_configuration_is_not_taken_for_this_one(undisturbed, tmp_path, setting):
     shutil.copytree(undisturbed, tmp_path / "again")
-    one = unit(setting=setting)
+    one = a_run(setting=setting)
     folder = tmp_path / "again" / one.folder
     (folder / "results.json").unlink()
     (folder / "checkpoint-0.zip").write_bytes(b"left by a process that was killed")
     longer = replace(PRESET, training=replace(PRESET.training, steps=61))
-    with pytest.raises(ValueError, match="is of another configuration, its unit differs in training"):
-        run(one, tmp_path / "again", longer)
-    run(one, tmp_path / "again")
+    with pytest.raises(ValueError, match="is of another configuration, its run differs in training"):
+        execute(one, tmp_path / "again", longer)
+    execute(one, tmp_path / "again")
     assert rates(folder) == rates(undisturbed / one.folder)
     assert not (folder / "checkpoint-0.zip").exists()
 
@@ -205,7 +210,7 @@ def test_settings_are_the_papers():
         assert preset.keys() == SETTINGS.keys()
         assert preset["one-shot"].training.batch_size % 180 == 0
     with pytest.raises(ValueError, match=r"method must be one of 'pcbc', .*did you mean 'pcbc'"):
-        Unit(TINY, "pbc", 0, PRESET)
+        Run(TINY, "pbc", 0, PRESET)
 
 
 @pytest.mark.parametrize(
@@ -223,8 +228,8 @@ def test_passes_count_rows(undisturbed, tmp_path, monkeypatch, setting, trainer,
         steps.append(arguments[2].steps)
         stop()
 
-    monkeypatch.setattr(unit_training, trainer, see)
+    monkeypatch.setattr(training, trainer, see)
     with pytest.raises(KeyboardInterrupt):
-        run(unit(setting=setting), tmp_path, replace(PRESET, passes=2))
-    rows = len(lw.LanguageWorldExperienceReplay(tmp_path / unit().datasets[0].folder, after_success=20))
+        execute(a_run(setting=setting), tmp_path, replace(PRESET, passes=2))
+    rows = len(lw.LanguageWorldExperienceReplay(tmp_path / a_run().datasets[0].folder, after_success=20))
     assert steps == [2 * rows // share]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,7 +10,9 @@ from typing import Any, Literal
 import tyro
 from tyro.conf import Positional
 
-from lw_torchrl import cli_experiments, cli_language
+from lw_torchrl.cli import experiments as cli_experiments
+from lw_torchrl.cli import language as cli_language
+from lw_torchrl.cli.threads import use_one_thread
 
 
 def demo(out: Path | None = None, quick: bool = False) -> None:
@@ -24,9 +25,9 @@ def demo(out: Path | None = None, quick: bool = False) -> None:
             runs/demo-quick with --quick.
         quick: two tasks and little training, in under a minute; not a measure of anything.
     """
-    from lw_torchrl.demo import QUICK, DemoConfig, run_demo
+    from lw_torchrl.experiments.demo import QUICK, DemoConfig, run_demo
 
-    _calm_torch()
+    use_one_thread()
     run_demo(out or Path("runs/demo-quick" if quick else "runs/demo"), QUICK if quick else DemoConfig())
 
 
@@ -113,7 +114,7 @@ def train(
 
     import lw_torchrl as lw
 
-    _calm_torch()
+    use_one_thread()
     options = {"features": features, "width": width, "depth": depth}
     config = lw.BehavioralCloningConfig(steps=steps, batch_size=batch_size, learning_rate=learning_rate, seed=seed)
     replay = lw.LanguageWorldExperienceReplay(data, sampler=lw.TaskBalancedSampler(), after_success=after_success)
@@ -159,7 +160,7 @@ def evaluate(
     from lw_torchrl.record.rollouts import rollout_tasks, write_recording
     from lw_torchrl.trainers.checkpoint import demonstration_seeds
 
-    _calm_torch()
+    use_one_thread()
     chosen: str | tuple[str, ...] = tasks[0] if len(tasks) == 1 else tasks
     actor: lw.ExpertActor | lw.PlanConditionedActor | lw.DescriptorConditionedActor | lw.ActorEnsemble
     if str(checkpoint) == "expert":
@@ -282,14 +283,6 @@ COMMANDS: dict[str, Any] = {
     "check": cli_language.check,
     "reproduce": cli_experiments.reproduce,
 }
-
-
-def _calm_torch() -> None:
-    # Networks this small gain little from a second thread, and lose much where another process wants the core.
-    if "OMP_NUM_THREADS" not in os.environ:
-        import torch
-
-        torch.set_num_threads(1)
 
 
 def main(args: Sequence[str] | None = None) -> None:

@@ -15,13 +15,13 @@ from tqdm.auto import tqdm
 
 from lw_torchrl._checks import check_int, check_scale
 from lw_torchrl.envs.engine import ACTION_SIZE
-from lw_torchrl.envs.episodes import Episode, in_blocks, run_episodes
+from lw_torchrl.envs.episodes import FinishedEpisode, in_blocks, run_episodes
 from lw_torchrl.envs.experts import ExpertActor
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
-from lw_torchrl.envs.qaf_transform import QAFTransform
 from lw_torchrl.evaluation.result import EpisodeResult, EvaluationResult
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.tasks import resolve_tasks
+from lw_torchrl.transforms.qaf import QAFTransform
 
 _ROWS = 256  # more hardly make a step of all of them cheaper per row, and cost memory
 
@@ -88,7 +88,7 @@ def evaluate(
     num_threads: int | None = None,
     progress: bool = True,
     also_record: Sequence[NestedKey] = (),
-    on_episode: Callable[[Episode], object] | None = None,
+    on_episode: Callable[[FinishedEpisode], object] | None = None,
 ) -> EvaluationResult:
     """Run episodes 0 to k - 1 of each task and report how they went.
 

@@ -1,35 +1,25 @@
-"""The paper's experiments as units of work: datasets, and policies trained on them and evaluated."""
+"""The paper's experiments as runs of work: datasets, and policies trained on them and evaluated."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 from filelock import FileLock
-from tqdm.auto import tqdm
 
 from lw_torchrl._checks import check_choice
 from lw_torchrl.data.collect import collect_demonstrations
-from lw_torchrl.evaluation import EvaluationResult, evaluate
+from lw_torchrl.experiments.recipes import DataSetting, Execution, Member, Preset
 from lw_torchrl.language.plans import Plans, format_plan
-from lw_torchrl.language.tasks import resolve_tasks
-from lw_torchrl.modules import ScriptedSkillActor
-from lw_torchrl.trainers.recipes import DataSetting, Execution, Member, Preset
-from lw_torchrl.trainers.unit_training import train_each, train_one
 
 METHODS = ("pcbc", "dc", "one-hot", "scripted")
-EVALUATION_SEED = 10_000
-"""Training seeds count from 0; the evaluation of training seed k has seed 10000 + k."""
-RESULTS = "results.json"
 
 
 @dataclass(frozen=True)
 class Dataset:
-    """Demonstrations that units share: a unit of work itself.
+    """Demonstrations that runs share: a run of work itself.
 
     Attributes:
         tasks: "MT10" or another argument of :func:`resolve_tasks`.
@@ -66,7 +56,7 @@ class Dataset:
 
 
 @dataclass(frozen=True)
-class Unit:
+class Run:
     """One policy, or one for each target, or plans with scripts, of one training seed: what a scheduler runs.
 
     Attributes:
@@ -138,83 +128,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _plain(one) for key, one in value.items()}
     return [_plain(one) for one in value] if isinstance(value, (list, tuple)) else value
-
-
-def _evaluate(unit: Unit, plans: Plans, out: Path, tasks: tuple[str, ...], progress: bool) -> EvaluationResult:
-    options: dict[str, Any] = {
-        "episodes_per_task": unit.episodes,
-        "seed": EVALUATION_SEED + unit.seed,
-        "noise_scale": 0.1,
-        "stop_at_success": True,
-    }
-    if unit.method == "scripted":
-        return evaluate(ScriptedSkillActor(plans), tasks=tasks, progress=progress, **options)
-    if unit.setting.targets is None:
-        return evaluate(train_one(unit, plans, out, progress), tasks=tasks, progress=progress, **options)
-    actors = train_each(unit, plans, out, progress)
-    each = [
-        evaluate(actors[task], tasks=task, progress=False, **options)
-        for task in tqdm(sorted({*tasks} & {*actors}), desc="evaluating", unit="model", delay=1, disable=not progress)
-    ]
-    shown = [task for one in each for task in one.config["tasks"]]
-    return EvaluationResult(each[0].config | {"tasks": shown}, tuple(e for one in each for e in one.episodes))
-
-
-def load_result(unit: Unit, plans: Plans, out: Path) -> EvaluationResult | None:
-    """The result of a unit, if it is there.
-
-    Raises:
-        ValueError: it is of another configuration.
-    """
-    path = out / unit.folder / RESULTS
-    if not path.is_file():
-        return None
-    result = EvaluationResult.load(path)
-    found, ours = result.config.get("unit") or {}, unit.describe(plans)
-    different = [key for key in ours if found.get(key) != ours[key]]
-    if result.config.get("episodes_per_task") != unit.episodes:
-        different.append("episodes")
-    if different:
-        raise ValueError(
-            f"out: {str(path)!r} is of another configuration, it differs in {', '.join(different)}; choose another "
-            f"folder, or delete {str(path.parent)!r} to do the unit again"
-        )
-    return result
-
-
-def run_unit(
-    unit: Unit,
-    plans: Plans,
-    out: Path,
-    *,
-    tasks: str | Sequence[str] = "MT50",
-    progress: bool = True,
-) -> EvaluationResult:
-    """Do a unit, or what is left of it; its result is written last, to ``out/unit.folder/results.json``.
-
-    Args:
-        unit: what to do.
-        plans: a plan for each of the 50 tasks.
-        out: the experiments' folder.
-        tasks: to evaluate.
-        progress: show progress bars.
-
-    Returns:
-        The evaluation of the last checkpoint, action noise 0.1; ``config["unit"]`` says what was done, and
-        ``config["seconds"]`` how long this call took.
-
-    Raises:
-        ValueError: ``out`` holds the same unit of another configuration.
-
-    Source: paper section 'Conditional Plan Experiments'.
-    """
-    if (done := load_result(unit, plans, out)) is not None:
-        return done
-    started = time.perf_counter()
-    for dataset in unit.datasets:
-        dataset.collect(out, progress)
-    result = _evaluate(unit, plans, out, resolve_tasks(tasks), progress)
-    spent = {"unit": unit.describe(plans), "seconds": round(time.perf_counter() - started, 1)}
-    result = replace(result, config=result.config | spent)
-    result.save(out / unit.folder / RESULTS)
-    return result

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
-from lw_torchrl.envs._simulation_table import PLACES, Place, TaskSources
+from lw_torchrl.envs.engines.vectorized.simulation_table import PLACES, Place, TaskSources
 
 Array = NDArray[np.float64]
 
-# One row of readings. The first 18 numbers are laid out like the observation, whose number 3, the opening of
+# One row of sensors. The first 18 numbers are laid out like the observation, whose number 3, the opening of
 # the gripper, is computed. What a task does not have is left to chance.
 HAND = slice(0, 3)
 GRIPPER = 3
@@ -33,7 +33,7 @@ WIDTH = 43
 MATRIX_OF = "matrix of "
 
 
-class StateWindow:
+class StateView:
     """The arrays of a MuJoCo state as one, so that a single ``take`` reads from any of them.
 
     MuJoCo keeps them all in one block of memory. Joining ten small arrays instead costs four times as much,
@@ -94,8 +94,8 @@ def _address(array: Array) -> int:
     return array.__array_interface__["data"][0]
 
 
-def reading_index(window: StateWindow, sources: TaskSources) -> NDArray[np.intp]:
-    """(WIDTH,) which numbers of the window make a task's row of readings."""
+def sensor_index(window: StateView, sources: TaskSources) -> NDArray[np.intp]:
+    """(WIDTH,) which numbers of the window make a task's row of sensors."""
     success = sources.success
     parts = [
         (HAND, window.position("body hand")),

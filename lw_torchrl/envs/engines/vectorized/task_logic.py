@@ -12,8 +12,8 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from lw_torchrl._checks import check_choice
-from lw_torchrl.envs._models import SharedModel
-from lw_torchrl.envs.metaworld_engine import import_metaworld
+from lw_torchrl.envs.engines.metaworld import import_metaworld
+from lw_torchrl.envs.engines.vectorized.models import SharedModel
 
 WARNED_ALREADY = 1000
 """MuJoCo prints a warning, and writes MUJOCO_LOG.TXT, only when its count of that kind is zero. We start the
@@ -25,10 +25,10 @@ def silence_warnings(data: Any) -> None:
     data.warning.number[:] = WARNED_ALREADY
 
 
-class TaskProgram:
+class TaskLogic:
     """A Meta-World environment without a simulator of its own.
 
-    Mixed into one of Meta-World's classes by :func:`make_task_program`. It is built once for each model;
+    Mixed into one of Meta-World's classes by :func:`make_task_logic`. It is built once for each model;
     every episode of every row then runs on a light copy (:meth:`on`) that shares everything but the state.
     """
 
@@ -59,7 +59,7 @@ class TaskProgram:
     def _initialize_simulation(self) -> tuple[Any, Any]:
         return self.model, mujoco.MjData(self.model)
 
-    def on(self, data: Any) -> TaskProgram:
+    def on(self, data: Any) -> TaskLogic:
         """A copy of this program, as it was when built, that works on ``data``."""
         program = object.__new__(type(self))
         program.__dict__.update(self.__dict__)
@@ -118,7 +118,7 @@ def _task_class(task: str) -> Any:
 @cache
 def _program_class(task: str) -> Any:
     base = _task_class(task)
-    return type(f"{base.__name__}Program", (TaskProgram, base), {})
+    return type(f"{base.__name__}Program", (TaskLogic, base), {})
 
 
 def model_path(task: str) -> str:
@@ -127,6 +127,6 @@ def model_path(task: str) -> str:
     return object.__new__(task_class).model_name
 
 
-def make_task_program(task: str, shared: SharedModel) -> Any:
+def make_task_logic(task: str, shared: SharedModel) -> Any:
     """Meta-World's program of ``task`` on a shared model."""
     return _program_class(task)(shared.model)

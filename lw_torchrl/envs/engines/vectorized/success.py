@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl.envs._readings import GRIPPER, JOINT, LEFT_TIP, OBJECT, POINT, RIGHT_TIP, SECOND
-from lw_torchrl.envs._simulation_table import TaskSources
-from lw_torchrl.envs._vectorized_observation import row_norm
+from lw_torchrl.envs.engines.vectorized.observation import row_norm
+from lw_torchrl.envs.engines.vectorized.sensors import GRIPPER, JOINT, LEFT_TIP, OBJECT, POINT, RIGHT_TIP, SECOND
+from lw_torchrl.envs.engines.vectorized.simulation_table import TaskSources
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -26,14 +26,14 @@ class Scene(NamedTuple):
 
     Attributes:
         near: whether the point is as close to the goal as the table asks.
-        readings: what was read from the states.
+        sensors: what was read from the states.
         current: the first 18 numbers of the observations.
         goal: (rows, 3) the goals.
         point: (rows, 3) what is to come close to them.
     """
 
     near: Truth
-    readings: Array
+    sensors: Array
     current: Array
     goal: Array
     point: Array
@@ -44,13 +44,13 @@ STICK_SIDEWAYS = 0.04  # metres between the stick's end and the handle
 STICK_UPWARD = 0.06
 
 
-class SuccessJudge:
+class SuccessFunction:
     """Judges a fixed set of rows.
 
     Args:
         sources: each row's task.
-        programs: gives a row's :class:`~lw_torchrl.envs._task_program.TaskProgram` of its present episode,
-            for the one rule that looks at contacts.
+        programs: gives a row's :class:`~lw_torchrl.envs.engines.vectorized.task_logic.TaskLogic` of its present
+            episode, for the one rule that looks at contacts.
     """
 
     def __init__(self, sources: Sequence[TaskSources], programs: Callable[[int], Any]) -> None:
@@ -74,11 +74,11 @@ class SuccessJudge:
             for name in sorted({rule for rule in rules if rule is not None})
         ]
 
-    def __call__(self, readings: Array, current: Array, goal: Array) -> Truth:
+    def __call__(self, sensors: Array, current: Array, goal: Array) -> Truth:
         """(rows,) whether each row stands in success.
 
         Args:
-            readings: (rows, WIDTH) what was read from the states.
+            sensors: (rows, WIDTH) what was read from the states.
             current: (rows, 18) the first numbers of the observations.
             goal: (rows, 3) the goals.
         """
@@ -86,16 +86,16 @@ class SuccessJudge:
         if self._seconds.size:
             point[self._seconds] = current[self._seconds, SECOND]
         if self._grippers.size:
-            tips = readings[self._grippers]
+            tips = sensors[self._grippers]
             point[self._grippers] = (tips[:, RIGHT_TIP] + tips[:, LEFT_TIP]) / 2.0
         if self._places.size:
-            point[self._places] = readings[self._places, POINT]
+            point[self._places] = sensors[self._places, POINT]
         if self._at_height.size:
             goal = goal.copy()
             goal[self._at_height, 2] = self._goal_height
         distance = row_norm((point + self._offset - goal) * self._axes)
         success = (distance <= self._within) & (distance < self._under)
-        scene = Scene(success, readings, current, goal, point)
+        scene = Scene(success, sensors, current, goal, point)
         for rule, rows in self._rules:
             success[rows] = rule(self, rows, scene)
         return success
@@ -110,17 +110,17 @@ class SuccessJudge:
 
     def _joint_above(self, rows: Index, scene: Scene) -> Truth:
         """The joint has moved further than ``above``."""
-        return scene.readings[rows, JOINT.start] > self._above[rows]
+        return scene.sensors[rows, JOINT.start] > self._above[rows]
 
     def _joint_near(self, rows: Index, scene: Scene) -> Truth:
         """The joint is within ``within`` of ``angle``."""
-        return np.abs(scene.readings[rows, JOINT.start] - self._angle[rows]) <= self._within[rows]
+        return np.abs(scene.sensors[rows, JOINT.start] - self._angle[rows]) <= self._within[rows]
 
     def _stick_inserted(self, rows: Index, scene: Scene) -> Truth:
         """The container is at the goal, and the stick's end is through its handle."""
         held = scene.near[rows]
         if held.any():
-            end, handle = scene.readings[rows, POINT], scene.current[rows, SECOND]
+            end, handle = scene.sensors[rows, POINT], scene.current[rows, SECOND]
             aside = np.abs(end - handle)
             held &= end[:, 0] >= handle[:, 0]
             held &= (aside[:, 1] <= STICK_SIDEWAYS) & (aside[:, 2] <= STICK_UPWARD)
@@ -136,13 +136,13 @@ class SuccessJudge:
         return held
 
 
-RULES: dict[str, Callable[[SuccessJudge, Index, Scene], Truth]] = {
-    "point below goal": SuccessJudge._point_below_goal,
-    "object above goal": SuccessJudge._object_above_goal,
-    "joint above": SuccessJudge._joint_above,
-    "joint near": SuccessJudge._joint_near,
-    "stick inserted": SuccessJudge._stick_inserted,
-    "stick held": SuccessJudge._stick_held,
+RULES: dict[str, Callable[[SuccessFunction, Index, Scene], Truth]] = {
+    "point below goal": SuccessFunction._point_below_goal,
+    "object above goal": SuccessFunction._object_above_goal,
+    "joint above": SuccessFunction._joint_above,
+    "joint near": SuccessFunction._joint_near,
+    "stick inserted": SuccessFunction._stick_inserted,
+    "stick held": SuccessFunction._stick_held,
 }
 
 

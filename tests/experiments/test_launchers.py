@@ -1,10 +1,10 @@
-"""Units run in processes of this machine or as tasks of Ray: the same results, and errors that tell."""
+"""Runs run in processes of this machine or as tasks of Ray: the same results, and errors that tell."""
 
 import sys
 
 import pytest
 
-from lw_torchrl.launchers import run_command, run_commands
+from lw_torchrl.experiments.launchers import run_command, run_commands
 
 FAILS = ["plans", "no-such-folder"]
 

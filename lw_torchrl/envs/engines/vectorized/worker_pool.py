@@ -1,4 +1,4 @@
-"""Shards of rows, and the threads that work through them."""
+"""Groups of rows, and the threads that work through them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from math import ceil
 from time import perf_counter
 
 
-class Shard:
+class RowGroup:
     """Rows that share a model, and so take turns.
 
     Attributes:
@@ -23,55 +23,55 @@ class Shard:
         self.seconds = 1.0
 
 
-def split_into_shards(keys: Sequence[str], num_threads: int) -> list[Shard]:
-    """Put the rows with one key (the model's file) together, in several shards only where one alone would
+def split_into_groups(keys: Sequence[str], num_threads: int) -> list[RowGroup]:
+    """Put the rows with one key (the model's file) together, in several groups only where one alone would
     keep a thread busy for more than half of its share.
     """
     by_key: dict[str, list[int]] = defaultdict(list)
     for row, key in enumerate(keys):
         by_key[key].append(row)
     largest = len(keys) if num_threads == 1 else ceil(len(keys) / (2 * num_threads))
-    shards = []
+    groups = []
     for rows in by_key.values():
         parts = ceil(len(rows) / largest)
         bounds = [len(rows) * part // parts for part in range(parts + 1)]
-        shards += [Shard(rows[low:high]) for low, high in pairwise(bounds)]
-    return shards
+        groups += [RowGroup(rows[low:high]) for low, high in pairwise(bounds)]
+    return groups
 
 
-class Crew:
-    """Threads that take one shard after another until none is left.
+class WorkerPool:
+    """Threads that take one group after another until none is left.
 
-    A shard is in the hands of one thread at a time, so its rows may share a model; which thread that is
-    changes no result. Shards that took long last time are begun first, which evens out the ends.
+    A group is in the hands of one thread at a time, so its rows may share a model; which thread that is
+    changes no result. Groups that took long last time are begun first, which evens out the ends.
     """
 
     def __init__(self, num_threads: int) -> None:
         self._helpers = num_threads - 1
-        self._pool = ThreadPoolExecutor(self._helpers, "lw_torchrl") if self._helpers else None
+        self._threads = ThreadPoolExecutor(self._helpers, "lw_torchrl") if self._helpers else None
 
-    def work(self, shards: Iterable[tuple[Shard, Sequence[int]]], do: Callable[[int], None]) -> None:
-        """Call ``do(item)`` for every item of every ``(shard, items)``, the items of a shard in turn."""
-        if self._pool is None:
-            for _, items in shards:
+    def work(self, groups: Iterable[tuple[RowGroup, Sequence[int]]], do: Callable[[int], None]) -> None:
+        """Call ``do(item)`` for every item of every ``(group, items)``, the items of a group in turn."""
+        if self._threads is None:
+            for _, items in groups:
                 for item in items:
                     do(item)
             return
-        waiting = deque(sorted(shards, key=lambda job: job[0].seconds * len(job[1]), reverse=True))
+        waiting = deque(sorted(groups, key=lambda job: job[0].seconds * len(job[1]), reverse=True))
 
         def work_through() -> None:
             while True:
                 try:
-                    shard, items = waiting.popleft()
+                    group, items = waiting.popleft()
                 except IndexError:
                     return
                 start = perf_counter()
                 for item in items:
                     do(item)
-                shard.seconds = (perf_counter() - start) / len(items)
+                group.seconds = (perf_counter() - start) / len(items)
 
         helpers = min(self._helpers, len(waiting) - 1)
-        futures = [self._pool.submit(work_through) for _ in range(helpers)]
+        futures = [self._threads.submit(work_through) for _ in range(helpers)]
         try:
             work_through()
         finally:
@@ -82,5 +82,5 @@ class Crew:
 
     def close(self) -> None:
         """End the threads."""
-        if self._pool is not None:
-            self._pool.shutdown()
+        if self._threads is not None:
+            self._threads.shutdown()

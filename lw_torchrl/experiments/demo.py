@@ -10,13 +10,13 @@ import torch
 
 from lw_torchrl._files import write_json
 from lw_torchrl.data import LanguageWorldExperienceReplay, TaskBalancedSampler, collect_demonstrations
-from lw_torchrl.envs import QAFTransform
 from lw_torchrl.evaluation import EvaluationResult, evaluate, plot_success
 from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.tasks import MT10
 from lw_torchrl.modules import PlanConditionedActor
 from lw_torchrl.record.rollouts import active_skills, rollout_tasks, write_recording
 from lw_torchrl.trainers import BehavioralCloningConfig, BehavioralCloningTrainer
+from lw_torchrl.transforms import QAFTransform
 
 RECORDED = ("drawer-open", "window-open")
 

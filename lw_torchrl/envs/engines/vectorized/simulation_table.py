@@ -108,5 +108,5 @@ def parse_simulation_table(text: str) -> dict[str, TaskSources]:
 @cache
 def simulation_table() -> Mapping[str, TaskSources]:
     """The sources of all 50 tasks, by task name."""
-    text = (files("lw_torchrl.envs") / "data/simulation.toml").read_text(encoding="utf-8")
+    text = (files("lw_torchrl.envs.engines.vectorized") / "data/simulation.toml").read_text(encoding="utf-8")
     return MappingProxyType(parse_simulation_table(text))

@@ -1,4 +1,4 @@
-"""``lw-torchrl reproduce``: units one by one, then a summary, tables and a figure beside the published curves."""
+"""``lw-torchrl reproduce``: runs one by one, then a summary, tables and a figure beside the published curves."""
 
 import json
 import os
@@ -14,15 +14,15 @@ import pytest
 from commands import fails, run
 
 import lw_torchrl as lw
-from lw_torchrl.trainers import experiments, recipes
-from lw_torchrl.trainers.recipes import PRESETS, DataSetting, Member
+from lw_torchrl.experiments import execution, recipes
+from lw_torchrl.experiments.recipes import PRESETS, DataSetting, Member
 
 TINY = """
 from dataclasses import replace
 from functools import partial
 import lw_torchrl as lw
-from lw_torchrl.trainers import experiments, recipes
-from lw_torchrl.trainers.recipes import PRESETS, DataSetting, Execution, Member
+from lw_torchrl.experiments import execution, recipes, runs
+from lw_torchrl.experiments.recipes import PRESETS, DataSetting, Execution, Member
 
 training = lw.BehavioralCloningConfig(steps=100, batch_size=180, checkpoint_every=10)
 options = {"target": Execution("clean", (0.0,)), "members": (Member({"width": 16, "depth": 1}),), "training": training}
@@ -30,8 +30,8 @@ recipes.SETTINGS = {
     "few-shot": DataSetting("few-shot", "MT10", 2), "one-shot": DataSetting("one-shot", "MT10", 1, targets="MT10")
 }
 recipes.PRESETS = {"strong": {name: replace(PRESETS["strong"][name], **options) for name in recipes.SETTINGS}}
-experiments.evaluate = partial(lw.evaluate, max_steps=60)
-experiments.collect_demonstrations = partial(lw.collect_demonstrations, max_steps=100)
+execution.evaluate = partial(lw.evaluate, max_steps=60)
+runs.collect_demonstrations = partial(lw.collect_demonstrations, max_steps=100)
 """
 
 
@@ -45,7 +45,7 @@ def tiny(monkeypatch):
     )
     presets = {"strong": {"few-shot": small}, "paper": {"few-shot": replace(small, passes=500)}}
     monkeypatch.setattr(recipes, "PRESETS", MappingProxyType(presets))
-    monkeypatch.setattr(experiments, "evaluate", partial(lw.evaluate, max_steps=60))
+    monkeypatch.setattr(execution, "evaluate", partial(lw.evaluate, max_steps=60))
     monkeypatch.setattr(recipes, "SETTINGS", MappingProxyType({"few-shot": DataSetting("few-shot", "reach", 1)}))
 
 
@@ -62,10 +62,10 @@ def test_units_and_their_summary(capsys, tmp_path, tiny):
     ]
     assert not any(tmp_path.iterdir())
 
-    run(capsys, *arguments(tmp_path, "--unit", listed[1]))
+    run(capsys, *arguments(tmp_path, "--run", listed[1]))
     assert (tmp_path / listed[1] / "metadata.json").is_file()
     assert not (tmp_path / listed[0]).exists()
-    out = run(capsys, *arguments(tmp_path, "--unit", listed[-1]))
+    out = run(capsys, *arguments(tmp_path, "--run", listed[-1]))
     assert "few-shot/strong/dc/seed1: mean success 0." in out
     assert not (tmp_path / "few-shot" / "strong" / "pcbc").exists()
     first = (tmp_path / listed[-1] / "results.json").read_text()
@@ -93,14 +93,14 @@ def test_plans_of_ones_own(capsys, tmp_path, tiny):
     own = ("--plans", tmp_path / "mine.json")
     out = run(capsys, "reproduce", "few-shot", "--seeds", 0, "--list", "--out", tmp_path, *own).split()
     assert out[1:] == [f"few-shot/strong-mine/{method}/seed0" for method in ("pcbc", "dc", "one-hot")]
-    run(capsys, *arguments(tmp_path / "out", "--unit", out[1], *own, methods=["pcbc"], seeds=[0]))
+    run(capsys, *arguments(tmp_path / "out", "--run", out[1], *own, methods=["pcbc"], seeds=[0]))
     actor = lw.load_actor(tmp_path / "out" / out[1] / "policy.zip")
     assert actor.skills == ("move the gripper to the target",)
 
 
 def test_what_it_refuses(capsys, tmp_path, tiny):
-    message = fails(capsys, *arguments(tmp_path, "--unit", "few-shot/strong/pbc/seed0"))
-    assert "unit must be one of" in message
+    message = fails(capsys, *arguments(tmp_path, "--run", "few-shot/strong/pbc/seed0"))
+    assert "run must be one of" in message
     assert "did you mean 'few-shot/strong/pcbc/seed0'" in message
     assert "passes is for the preset paper" in fails(capsys, *arguments(tmp_path, "--passes", 3))
     assert "passes must be at least 1" in fails(capsys, *arguments(tmp_path, "--preset", "paper", "--passes", 0))
@@ -110,7 +110,7 @@ def test_what_it_refuses(capsys, tmp_path, tiny):
 def start(program, out, *more):
     """``lw-torchrl reproduce`` on tiny experiments in a process of its own."""
     said = [str(one) for one in ("--methods", "pcbc", "--seeds", 0, "--episodes", 1, "--out", out, *more)]
-    code = f"{TINY}\nfrom lw_torchrl.cli import main\nmain(['reproduce', {program!r}, *{said!r}])"
+    code = f"{TINY}\nfrom lw_torchrl.cli.main import main\nmain(['reproduce', {program!r}, *{said!r}])"
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
     return subprocess.Popen(
         [sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True

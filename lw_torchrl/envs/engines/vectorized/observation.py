@@ -1,4 +1,4 @@
-"""Observations of many rows at once, from their readings."""
+"""Observations of many rows at once, from their sensors."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl.envs._readings import (
+from lw_torchrl.envs.engines.vectorized.sensors import (
     CURRENT,
     GRIPPER,
     JOINT,
@@ -20,7 +20,7 @@ from lw_torchrl.envs._readings import (
     SECOND,
     SECOND_QUATERNION,
 )
-from lw_torchrl.envs._simulation_table import TaskSources
+from lw_torchrl.envs.engines.vectorized.simulation_table import TaskSources
 
 Array = NDArray[np.float64]
 
@@ -45,19 +45,19 @@ class Observer:
         self._second_offset = np.array([row.second_offset for row in sources if row.second is not None])
         self._constant, self._is_constant = _constants(sources)
 
-    def current(self, readings: Array) -> Array:
+    def current(self, sensors: Array) -> Array:
         """(rows, 18) the part of the observation that describes the present state alone."""
-        current = readings[:, CURRENT].copy()
+        current = sensors[:, CURRENT].copy()
         np.copyto(current, self._constant, where=self._is_constant)
-        span = row_norm(readings[:, RIGHT_CLAW] - readings[:, LEFT_CLAW])
+        span = row_norm(sensors[:, RIGHT_CLAW] - sensors[:, LEFT_CLAW])
         current[:, GRIPPER] = np.minimum(span / WIDEST_GRIP, 1.0)
         current[:, OBJECT] += self._offset
         if self._seconds.size:
             current[self._seconds, SECOND] += self._second_offset
         if self._matrices.size:
-            current[self._matrices, QUATERNION] = quaternion_of_matrix(readings[self._matrices, MATRIX])
+            current[self._matrices, QUATERNION] = quaternion_of_matrix(sensors[self._matrices, MATRIX])
         if self._dials.size:
-            angle = readings[self._dials, JOINT.start]
+            angle = sensors[self._dials, JOINT.start]
             current[self._dials, OBJECT.start] += np.sin(angle) * DIAL_RADIUS
             current[self._dials, OBJECT.start + 1] -= np.cos(angle) * DIAL_RADIUS
         return current

@@ -8,10 +8,10 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl.envs._models import SharedModel
-from lw_torchrl.envs._readings import StateWindow, reading_index
-from lw_torchrl.envs._simulation_table import TaskSources
-from lw_torchrl.envs._task_program import WARNED_ALREADY
+from lw_torchrl.envs.engines.vectorized.models import SharedModel
+from lw_torchrl.envs.engines.vectorized.sensors import StateView, sensor_index
+from lw_torchrl.envs.engines.vectorized.simulation_table import TaskSources
+from lw_torchrl.envs.engines.vectorized.task_logic import WARNED_ALREADY
 
 Array = NDArray[np.float64]
 
@@ -42,9 +42,9 @@ class SimulatedRow:
         self._substeps: int = builder.frame_skip
         self._mocap: Array = self._data.mocap_pos[0]
         self._control: Array = self._data.ctrl
-        window = StateWindow(self._model, self._data)
+        window = StateView(self._model, self._data)
         self._numbers = window.numbers
-        self._reading_index = reading_index(window, sources)
+        self._sensor_index = sensor_index(window, sources)
         self._warnings: NDArray[np.int32] = self._data.warning.number[UNSTABLE]
 
     def reset(self, seed: int) -> Array:
@@ -67,11 +67,11 @@ class SimulatedRow:
         """(3,) where the last reset put the goal."""
         return self.program.present_goal()
 
-    def simulate(self, mocap: Array, control: Array, readings: Array, warnings: NDArray[np.int32]) -> None:
+    def simulate(self, mocap: Array, control: Array, sensors: Array, warnings: NDArray[np.int32]) -> None:
         """One step of the environment: five of physics, and one more look without moving.
 
         That look, ``mj_forward``, also leaves the accelerations from which the next step's solver starts, so
-        without it the numbers would drift apart from Meta-World's. ``readings`` (WIDTH,) and ``warnings`` (3,)
+        without it the numbers would drift apart from Meta-World's. ``sensors`` (WIDTH,) and ``warnings`` (3,)
         are filled at once, while the state is still in the processor's cache.
         """
         self._take_model()
@@ -79,7 +79,7 @@ class SimulatedRow:
         self._control[...] = control
         mujoco.mj_step(self._model, self._data, self._substeps)
         mujoco.mj_forward(self._model, self._data)
-        self._numbers.take(self._reading_index, out=readings, mode="clip")
+        self._numbers.take(self._sensor_index, out=sensors, mode="clip")
         warnings[...] = self._warnings
 
     def dense_reward(self, action: NDArray[Any], observation: Array) -> float:

@@ -1,0 +1,1 @@
+"""The command line, ``lw-torchrl``: one file for each group of commands."""

@@ -1,0 +1,1 @@
+"""The paper's experiments: recipes, the runs they make, how each trains, where they run; and the demo."""

@@ -1,0 +1,102 @@
+"""Executing a run: its datasets, its training, its evaluation, and the result that is written last."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from tqdm.auto import tqdm
+
+from lw_torchrl.evaluation import EvaluationResult, evaluate
+from lw_torchrl.experiments.runs import Run
+from lw_torchrl.experiments.training import train_each, train_one
+from lw_torchrl.language.plans import Plans
+from lw_torchrl.language.tasks import resolve_tasks
+from lw_torchrl.modules import ScriptedSkillActor
+
+EVALUATION_SEED = 10_000
+"""Training seeds count from 0; the evaluation of training seed k has seed 10000 + k."""
+RESULTS = "results.json"
+
+
+def _evaluate(run: Run, plans: Plans, out: Path, tasks: tuple[str, ...], progress: bool) -> EvaluationResult:
+    options: dict[str, Any] = {
+        "episodes_per_task": run.episodes,
+        "seed": EVALUATION_SEED + run.seed,
+        "noise_scale": 0.1,
+        "stop_at_success": True,
+    }
+    if run.method == "scripted":
+        return evaluate(ScriptedSkillActor(plans), tasks=tasks, progress=progress, **options)
+    if run.setting.targets is None:
+        return evaluate(train_one(run, plans, out, progress), tasks=tasks, progress=progress, **options)
+    actors = train_each(run, plans, out, progress)
+    each = [
+        evaluate(actors[task], tasks=task, progress=False, **options)
+        for task in tqdm(sorted({*tasks} & {*actors}), desc="evaluating", unit="model", delay=1, disable=not progress)
+    ]
+    shown = [task for one in each for task in one.config["tasks"]]
+    return EvaluationResult(each[0].config | {"tasks": shown}, tuple(e for one in each for e in one.episodes))
+
+
+def load_result(run: Run, plans: Plans, out: Path) -> EvaluationResult | None:
+    """The result of a run, if it is there.
+
+    Raises:
+        ValueError: it is of another configuration.
+    """
+    path = out / run.folder / RESULTS
+    if not path.is_file():
+        return None
+    result = EvaluationResult.load(path)
+    found, ours = result.config.get("run") or {}, run.describe(plans)
+    different = [key for key in ours if found.get(key) != ours[key]]
+    if result.config.get("episodes_per_task") != run.episodes:
+        different.append("episodes")
+    if different:
+        raise ValueError(
+            f"out: {str(path)!r} is of another configuration, it differs in {', '.join(different)}; choose another "
+            f"folder, or delete {str(path.parent)!r} to do the run again"
+        )
+    return result
+
+
+def execute_run(
+    run: Run,
+    plans: Plans,
+    out: Path,
+    *,
+    tasks: str | Sequence[str] = "MT50",
+    progress: bool = True,
+) -> EvaluationResult:
+    """Do a run, or what is left of it; its result is written last, to ``out/run.folder/results.json``.
+
+    Args:
+        run: what to do.
+        plans: a plan for each of the 50 tasks.
+        out: the experiments' folder.
+        tasks: to evaluate.
+        progress: show progress bars.
+
+    Returns:
+        The evaluation of the last checkpoint, action noise 0.1; ``config["run"]`` says what was done, and
+        ``config["seconds"]`` how long this call took.
+
+    Raises:
+        ValueError: ``out`` holds the same run of another configuration.
+
+    Source: paper section 'Conditional Plan Experiments'.
+    """
+    if (done := load_result(run, plans, out)) is not None:
+        return done
+    started = time.perf_counter()
+    for dataset in run.datasets:
+        dataset.collect(out, progress)
+    result = _evaluate(run, plans, out, resolve_tasks(tasks), progress)
+    spent = {"run": run.describe(plans), "seconds": round(time.perf_counter() - started, 1)}
+    result = replace(result, config=result.config | spent)
+    result.save(out / run.folder / RESULTS)
+    return result

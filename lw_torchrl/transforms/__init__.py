@@ -1,0 +1,6 @@
+"""TorchRL transforms: query answers for environments and replay buffers, and augmentation."""
+
+from lw_torchrl.transforms.qaf import QAFTransform
+from lw_torchrl.transforms.random_yaw import RandomYaw
+
+__all__ = ["QAFTransform", "RandomYaw"]
