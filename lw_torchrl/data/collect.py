@@ -37,6 +37,7 @@ _KEYS = [
     "episode",
     "action",
     "expert_action",
+    "unclipped_action",
     *(("next", key) for key in ("observation", "task_id", "reward", "success", "done", "terminated", "truncated")),
 ]
 _FAILED = b"FAILED"
@@ -148,7 +149,7 @@ def _run(config: CollectConfig, files: _EpisodeFiles, num_envs: int | None, prog
     if not missing:
         return kept
     rows = max(len(config.tasks), min(50, missing)) if num_envs is None else num_envs
-    env = LanguageWorldEnv(config.tasks, num_envs=rows, seed=config.seed, max_steps=config.max_steps)
+    env = LanguageWorldEnv(config.tasks, num_envs=rows, seed=config.seed, max_steps=config.max_steps, reward="dense")
     policy = ExpertActor(config.tasks)
     scales = [(s, s, s, s * config.gripper_noise_factor) for s in config.noise_scale]
     total = config.episodes_per_task * len(config.tasks)
@@ -192,6 +193,8 @@ def _assemble(root: Path, config: CollectConfig, files: _EpisodeFiles, kept: dic
     for number, (task, episode) in enumerate(listed):
         steps = files.get(task, episode)
         steps.set(("collector", "traj_ids"), torch.full(steps.batch_size, number))
+        steps.rename_key_(("next", "reward"), ("next", "reward_dense"))
+        steps.set(("next", "reward_sparse"), steps.get(("next", "success")).float())
         length = steps.batch_size[0]
         if rows is None:
             total = length * len(listed)  # episodes end by truncation alone, so all are equally long
@@ -229,8 +232,10 @@ def collect_demonstrations(
         observation: (R, 39) float32, metres; next/observation likewise.
         task_id, episode: (R,) int64; next/task_id likewise. collector/traj_ids: (R,) int64, unique per episode.
         action: (R, 4) float32 in [-1, 1], as executed, noise included.
-        expert_action: (R, 4) float32 in [-1, 1], what the expert wanted in the same state.
-        next/reward: (R, 1) float32; next/success, next/done, next/terminated, next/truncated: (R, 1) bool.
+        expert_action: (R, 4) float32 in [-1, 1], what the expert wanted in the same state; unclipped_action: (R, 4)
+            float32, what its script asked for.
+        next/reward_sparse, next/reward_dense: (R, 1) float32, the success as 0 and 1, and Meta-World's reward.
+        next/success, next/done, next/terminated, next/truncated: (R, 1) bool.
 
     Args:
         tasks: as for :func:`resolve_tasks`.

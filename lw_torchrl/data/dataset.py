@@ -22,7 +22,7 @@ from tensordict import TensorDict, TensorDictBase
 from lw_torchrl._files import write_json
 
 FORMAT = "lw_torchrl.demonstrations"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 DATA, METADATA, PARTIAL = "data", "metadata.json", ".partial"
 COLUMNS: dict[tuple[str, ...], tuple[tuple[int, ...], torch.dtype]] = {
     ("observation",): ((39,), torch.float32),
@@ -30,10 +30,12 @@ COLUMNS: dict[tuple[str, ...], tuple[tuple[int, ...], torch.dtype]] = {
     ("episode",): ((), torch.int64),
     ("action",): ((4,), torch.float32),
     ("expert_action",): ((4,), torch.float32),
+    ("unclipped_action",): ((4,), torch.float32),
     ("collector", "traj_ids"): ((), torch.int64),
     ("next", "observation"): ((39,), torch.float32),
     ("next", "task_id"): ((), torch.int64),
-    ("next", "reward"): ((1,), torch.float32),
+    ("next", "reward_sparse"): ((1,), torch.float32),
+    ("next", "reward_dense"): ((1,), torch.float32),
     **{("next", flag): ((1,), torch.bool) for flag in ("success", "done", "terminated", "truncated")},
 }
 _PACKAGES = ("lw_torchrl", "metaworld", "mujoco", "numpy", "tensordict", "torch", "torchrl")

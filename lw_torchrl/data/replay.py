@@ -17,7 +17,14 @@ from torchrl.envs import Transform
 
 from lw_torchrl._checks import check_choice, check_int
 from lw_torchrl.data.dataset import DATA, Demonstrations, read_metadata
-from lw_torchrl.data.selection import EpisodeChoice, JoinedDemonstrations, choose_episodes, read_part
+from lw_torchrl.data.selection import (
+    LABELS,
+    EpisodeChoice,
+    JoinedDemonstrations,
+    Label,
+    choose_episodes,
+    read_part,
+)
 from lw_torchrl.data.storage import JoinedStorage
 
 
@@ -52,8 +59,11 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         batch_size: rows of a sample.
         sampler: a TorchRL sampler, :class:`TaskBalancedSampler` say; None for uniform.
         transform: applied to each sample.
-        label: what ``action`` holds. "expert": what the expert wanted; reward and next are left out, since they
-            belong to the executed action. "executed": what was executed, with reward and next.
+        label: what ``action`` holds. "expert": what the expert wanted, in [-1, 1]; "unclipped": what its script asked
+            for, up to 25; of both, reward and next are left out, since they belong to the executed action. "executed":
+            what was executed, with reward and next.
+        reward: what ``("next", "reward")`` holds with label="executed": "sparse", the success as 0 and 1, or "dense",
+            Meta-World's own.
         after_success: drop the steps that come more than so many after the first success; None keeps all.
         **kwargs: for :class:`torchrl.data.TensorDictReplayBuffer`: generator, prefetch, pin_memory, ...
 
@@ -86,11 +96,13 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         batch_size: int | None = None,
         sampler: Sampler | None = None,
         transform: Transform | None = None,
-        label: Literal["expert", "executed"] = "expert",
+        label: Label = "expert",
+        reward: Literal["sparse", "dense"] = "sparse",
         after_success: int | None = None,
         **kwargs: Any,
     ) -> None:
-        check_choice("label", label, ("expert", "executed"))
+        check_choice("label", label, LABELS)
+        check_choice("reward", reward, ("sparse", "dense"))
         if batch_size is not None:
             check_int("batch_size", batch_size, minimum=1)
         if after_success is not None:
@@ -106,7 +118,7 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
             whole = read_metadata(folder)
             shown.append(choose_episodes(whole, choice, f"episodes[{number}]" if joined else "episodes"))
             rows, keep = read_part(
-                whole, shown[-1], label=label, after_success=after_success, first_trajectory=trajectories
+                whole, shown[-1], label=label, reward=reward, after_success=after_success, first_trajectory=trajectories
             )
             parts.append(rows)
             kept.append(keep)
@@ -120,7 +132,7 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
             self.demonstrations = shown[0]
             storage = TensorStorage(parts[0] if kept[0] is None else parts[0][kept[0]])  # the second is in memory
         self.root = self.roots[0]
-        self.label = label
+        self.label, self.reward = label, reward
         super().__init__(
             storage=storage,
             sampler=sampler,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
 from tensordict import TensorDictBase
@@ -14,6 +14,8 @@ from lw_torchrl._checks import check_int, unknown_name
 from lw_torchrl.data.dataset import CollectConfig, Demonstrations, EpisodeInfo, load_rows
 
 TRAJECTORY = ("collector", "traj_ids")
+Label = Literal["expert", "unclipped", "executed"]
+LABELS = get_args(Label)
 EpisodeChoice = int | Mapping[str, int | Sequence[int]] | None
 """All episodes; the first so many of each task; or, for each task to take, the first so many or these."""
 
@@ -86,7 +88,8 @@ def read_part(
     whole: Demonstrations,
     chosen: Demonstrations,
     *,
-    label: Literal["expert", "executed"],
+    label: Label,
+    reward: Literal["sparse", "dense"],
     after_success: int | None,
     first_trajectory: int = 0,
 ) -> tuple[TensorDictBase, Tensor | None]:
@@ -96,10 +99,12 @@ def read_part(
     ``first_trajectory`` added to the trajectories' ids.
     """
     rows = load_rows(whole)
-    if label == "expert":
-        rows = rows.exclude("next", "action").rename_key_("expert_action", "action")
-    else:
+    if label == "executed":
         rows = rows.clone(recurse=False)
+        rows.set(("next", "reward"), rows.get(("next", f"reward_{reward}")))
+    else:
+        taken, other = ("expert_action", "unclipped_action")[:: 1 if label == "expert" else -1]
+        rows = rows.exclude("next", "action", other).rename_key_(taken, "action")
     if first_trajectory:
         rows.set(TRAJECTORY, rows.get(TRAJECTORY) + first_trajectory)
     if chosen.episodes == whole.episodes and after_success is None:

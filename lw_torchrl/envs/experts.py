@@ -20,7 +20,8 @@ class ExpertActor(TensorDictModuleBase):
     """Meta-World's scripted policy of each row's task.
 
     Reads ``observation`` (B, 39) float32 and ``task_id`` (B,) int64; writes ``action`` (B, 4) float32, clipped to
-    [-1, 1], since the scripts ask for far more. Rows that a ``_step`` mask (B,) leaves out get zeros.
+    [-1, 1], and ``unclipped_action`` (B, 4) float32, what the script asked for, far more as a rule. Rows that a
+    ``_step`` mask (B,) leaves out get zeros.
 
     Args:
         tasks: the tasks it must know, as for :func:`resolve_tasks`.
@@ -39,7 +40,7 @@ class ExpertActor(TensorDictModuleBase):
     """
 
     in_keys = ["observation", "task_id"]
-    out_keys = ["action"]
+    out_keys = ["action", "unclipped_action"]
 
     def __init__(self, tasks: str | Iterable[str]) -> None:
         super().__init__()
@@ -72,5 +73,6 @@ class ExpertActor(TensorDictModuleBase):
                 if task not in self._policies:
                     raise ValueError(f"task_id {task} is none of this expert's tasks: {', '.join(self.tasks)}")
                 action[row] = self._policies[task].get_action(state)
-        clipped = torch.from_numpy(action.clip(-1.0, 1.0)).to(observation.device)
-        return tensordict.set("action", clipped.reshape(*observation.shape[:-1], ACTION_SIZE))
+        asked = torch.from_numpy(action).to(observation.device).reshape(*observation.shape[:-1], ACTION_SIZE)
+        tensordict.set("unclipped_action", asked)
+        return tensordict.set("action", asked.clamp(-1.0, 1.0))

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
 
+from lw_torchrl.data.selection import Label
 from lw_torchrl.trainers.behavioral_cloning import BehavioralCloningConfig
 
 
@@ -91,6 +92,7 @@ class Preset:
         name: "strong", ours; "paper", the published recipe.
         base: how the base tasks are demonstrated.
         target: how a target task is demonstrated, once, where the setting has targets.
+        label: which of the expert's actions is imitated, as for :class:`LanguageWorldExperienceReplay`.
         after_success: drop what comes so many steps after the first success; None keeps all.
         passes: train for so many passes over the rows instead of ``training.steps`` minibatches.
         members: the actors of a policy, each trained by itself on the same demonstrations.
@@ -100,6 +102,7 @@ class Preset:
     name: str
     base: Execution
     target: Execution | None
+    label: Label
     after_success: int | None
     passes: int | None
     members: tuple[Member, ...]
@@ -110,6 +113,7 @@ _STRONG = Preset(
     "strong",
     base=LED_ASTRAY,
     target=None,
+    label="expert",
     after_success=20,
     passes=None,
     members=(Member({"features": "differences", "width": 512}),),
@@ -143,6 +147,7 @@ _PAPER = Preset(
     "paper",
     base=CLEAN,
     target=None,
+    label="unclipped",  # as the authors' code: the scripts ask for up to 25, which is what makes so small a step move
     after_success=None,
     passes=500,
     members=(
@@ -153,6 +158,7 @@ _PAPER = Preset(
                 "encoder_width": 64,
                 "encoder_depth": 3,
                 "width": (128, 128, 128, 64, 32),
+                "squash": False,
             }
         ),
     ),

@@ -75,6 +75,7 @@ def train_one(run: Run, plans: Plans, out: Path, progress: bool) -> Policy:
             out / run.datasets[0].folder,
             sampler=TaskBalancedSampler(),
             transform=_transform(run, member, plans),
+            label=run.preset.label,
             after_success=run.preset.after_success,
         )
         config = _config(run, len(replay), run.seed + 1_000 * number)
@@ -111,6 +112,7 @@ def train_each(run: Run, plans: Plans, out: Path, progress: bool) -> dict[str, P
                 episodes=[None, {target: 1}],
                 sampler=CoLearningSampler(target),
                 transform=_transform(run, member, plans),
+                label=run.preset.label,
                 after_success=run.preset.after_success,
             )
             for target in targets

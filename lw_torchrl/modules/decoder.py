@@ -47,12 +47,13 @@ def text_to_latent(text_size: int, latent_size: int, width: int, depth: int) -> 
 
 
 class ActionDecoder(nn.Module):
-    """Makes an observation's features, and with a latent (..., D) float32 an action (..., 4) float32 in (-1, 1).
+    """Makes an observation's features, and with a latent (..., D) float32 an action (..., 4) float32.
 
     Args:
         latent_size: D.
         features, feature_noise: what it sees of the observation, see :class:`ObservationFeatures`.
         width, depth: of the hidden layers; a tuple of widths says both.
+        squash: keep each number of the action in (-1, 1) by tanh; without, the environment clips.
         more: the number of features that the actor adds to them.
     """
 
@@ -63,9 +64,11 @@ class ActionDecoder(nn.Module):
         feature_noise: float,
         width: int | Sequence[int],
         depth: int,
+        squash: bool = True,
         more: int = 0,
     ) -> None:
         super().__init__()
+        self.squash = squash
         self.features = ObservationFeatures(features, feature_noise)
         widths = [width] * check_int("depth", depth, minimum=0) if isinstance(width, int) else list(width)
         self.network = MLP(
@@ -77,4 +80,5 @@ class ActionDecoder(nn.Module):
 
     def decode(self, latent: Tensor, features: Tensor) -> Tensor:
         """From features already made, (..., F)."""
-        return torch.tanh(self.network(torch.cat((latent, features), -1)))
+        action = self.network(torch.cat((latent, features), -1))
+        return torch.tanh(action) if self.squash else action

@@ -29,7 +29,7 @@ class DescriptorConditionedActor(TensorDictModuleBase):
     Args:
         tasks: the tasks it is to act in, as for :func:`resolve_tasks`.
         condition: "description", the text's vector; "one-hot", one number for each task, which knows no words.
-        features, feature_noise, latent_size, width, depth, encoder_width, encoder_depth, text_encoder: as for
+        features, feature_noise, latent_size, width, depth, encoder_width, encoder_depth, squash, text_encoder: as for
             :class:`PlanConditionedActor`, with the same networks.
 
     Raises:
@@ -62,6 +62,7 @@ class DescriptorConditionedActor(TensorDictModuleBase):
         depth: int = 3,
         encoder_width: int = 128,
         encoder_depth: int = 1,
+        squash: bool = True,
         text_encoder: Callable[[Sequence[str]], Tensor] | None = None,
     ) -> None:
         super().__init__()
@@ -75,6 +76,7 @@ class DescriptorConditionedActor(TensorDictModuleBase):
             "depth": depth,
             "encoder_width": encoder_width,
             "encoder_depth": encoder_depth,
+            "squash": squash,
         }
         encode = text_encoder or (encode_texts if condition == "description" else _one_hot)
         found = encode([TASKS[task].description for task in self.tasks])
@@ -88,7 +90,7 @@ class DescriptorConditionedActor(TensorDictModuleBase):
         self.register_buffer("description_vectors", vectors, persistent=False)
         self.register_buffer("known", known, persistent=False)
         self.encoder = text_to_latent(found.shape[1], latent_size, encoder_width, encoder_depth)
-        self.decoder = ActionDecoder(latent_size, features, feature_noise, width, depth)
+        self.decoder = ActionDecoder(latent_size, features, feature_noise, width, depth, squash)
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -44,6 +44,7 @@ class PlanConditionedActor(TensorDictModuleBase):
         latent_size: D.
         width, depth: hidden layers of the action decoder; a tuple of widths says both.
         encoder_width, encoder_depth: hidden layers of the skill encoder.
+        squash: keep each number of the action in (-1, 1) by tanh; without, as in the paper, the environment clips.
         text_encoder: texts to vectors (n, E) float32; None for the shipped sentence encoder.
 
     Attributes:
@@ -86,6 +87,7 @@ class PlanConditionedActor(TensorDictModuleBase):
         depth: int = 3,
         encoder_width: int = 128,
         encoder_depth: int = 1,
+        squash: bool = True,
         text_encoder: Callable[[Sequence[str]], Tensor] | None = None,
     ) -> None:
         super().__init__()
@@ -104,6 +106,7 @@ class PlanConditionedActor(TensorDictModuleBase):
             "depth": depth,
             "encoder_width": encoder_width,
             "encoder_depth": encoder_depth,
+            "squash": squash,
         }
         self.text_encoder = text_encoder
         self.skills = self.plans.skills
@@ -123,7 +126,7 @@ class PlanConditionedActor(TensorDictModuleBase):
         self.encoder = text_to_latent(vectors.shape[1], latent_size, encoder_width, encoder_depth)
         self.focus = PlanFocus(self.plans, feature_noise) if focus else None
         more = 0 if self.focus is None else self.focus.width
-        self.decoder = ActionDecoder(latent_size, features, feature_noise, width, depth, more)
+        self.decoder = ActionDecoder(latent_size, features, feature_noise, width, depth, squash, more)
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
