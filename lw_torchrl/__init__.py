@@ -59,10 +59,18 @@ from lw_torchrl.modules import (
     ObservationFeatures,
     PlanAttention,
     PlanConditionedActor,
+    Policy,
+    QueryEvaluator,
     ScriptedSkillActor,
 )
 from lw_torchrl.record import RerunLogger
-from lw_torchrl.trainers import BehavioralCloningConfig, BehavioralCloningTrainer, StackedBehavioralCloning, load_actor
+from lw_torchrl.trainers import (
+    BehavioralCloningConfig,
+    BehavioralCloningTrainer,
+    StackedBehavioralCloning,
+    load_actor,
+    save_actor,
+)
 from lw_torchrl.transforms import QAFTransform, RandomYaw
 
 __version__ = "0.1.0"
@@ -98,9 +106,11 @@ __all__ = [
     "PlanError",
     "PlanStep",
     "Plans",
+    "Policy",
     "QAFTransform",
     "Query",
     "QueryError",
+    "QueryEvaluator",
     "QueryMatch",
     "QueryProgram",
     "RandomYaw",
@@ -138,6 +148,7 @@ __all__ = [
     "published_curves",
     "published_plans",
     "resolve_tasks",
+    "save_actor",
     "save_plans",
     "summarize",
     "summarize_rates",

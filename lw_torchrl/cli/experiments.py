@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, cast
 
 from tyro.conf import Positional
 
@@ -61,7 +61,8 @@ def reproduce(
     from lw_torchrl.cli.threads import use_one_thread
     from lw_torchrl.experiments.execution import execute_run
     from lw_torchrl.experiments.recipes import PRESETS, SETTINGS
-    from lw_torchrl.experiments.runs import METHODS, Run
+    from lw_torchrl.experiments.runs import SCRIPTED, Run
+    from lw_torchrl.modules.policy import METHODS
 
     check_int("jobs", jobs, minimum=1)
     recipes = PRESETS[preset]
@@ -71,9 +72,9 @@ def reproduce(
             raise ValueError("passes is for the preset paper; ours counts minibatches")
         recipes = {name: replace(recipe, passes=passes) for name, recipe in recipes.items()}
     if methods is None:
-        methods = METHODS if plans is None else METHODS[:-1]  # type: ignore[assignment]
-    if experiment == "scripted":
-        methods = ("scripted",)
+        methods = cast("tuple[Method, ...]", (*METHODS, *([SCRIPTED] if plans is None else [])))
+    if experiment == SCRIPTED:
+        methods = (SCRIPTED,)  # type: ignore[assignment]
     assert methods is not None
     plans_name = "" if plans is None else plans.stem
     runs = [

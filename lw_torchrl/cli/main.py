@@ -79,7 +79,7 @@ def train(
     /,
     out: Path,
     plans: str = "MT10",
-    policy: Literal["plan", "descriptor"] = "plan",
+    method: str = "pcbc",
     mix: Literal["latents", "actions"] = "latents",
     features: Literal["raw", "differences", "relative", "both"] = "differences",
     width: int = 256,
@@ -98,7 +98,7 @@ def train(
         data: a dataset's folder, of `lw-torchrl collect`.
         out: the checkpoint, one file.
         plans: MT10 or MT50 for the shipped plans, or a .plan file or a folder of them.
-        policy: conditioned on the plan, or on the task's description, the baseline.
+        method: pcbc, conditioned on the plan; or a baseline: dc, on the task's description, one-hot, on its number.
         mix: mix the skills' latents, as in the paper, or their actions.
         features: what the policy sees: the raw observation; differences between hand, objects and goal; relative, these
             without the hand's height and the gripper's opening; or both the first and the second.
@@ -113,20 +113,21 @@ def train(
     import torch
 
     import lw_torchrl as lw
+    from lw_torchrl._checks import check_choice
+    from lw_torchrl.modules.policy import METHODS, make_policy, policy_class
 
     use_one_thread()
-    options = {"features": features, "width": width, "depth": depth}
+    options: dict[str, Any] = {"features": features, "width": width, "depth": depth}
     config = lw.BehavioralCloningConfig(steps=steps, batch_size=batch_size, learning_rate=learning_rate, seed=seed)
     replay = lw.LanguageWorldExperienceReplay(data, sampler=lw.TaskBalancedSampler(), after_success=after_success)
     torch.manual_seed(seed)
-    actor: lw.PlanConditionedActor | lw.DescriptorConditionedActor
-    if policy == "plan":
-        loaded = lw.load_plans(plans)
-        loaded.require(replay.tasks)
-        replay.append_transform(lw.QAFTransform(loaded))
-        actor = lw.PlanConditionedActor(loaded, mix=mix, **options)  # type: ignore[arg-type]
-    else:
-        actor = lw.DescriptorConditionedActor(replay.tasks, **options)  # type: ignore[arg-type]
+    loaded = lw.load_plans(plans)
+    loaded.require(replay.tasks)
+    if policy_class(METHODS[check_choice("method", method, METHODS)].policy).plan_options:
+        options["mix"] = mix
+    actor = make_policy(method, loaded, **options)
+    if (transform := actor.transform()) is not None:
+        replay.append_transform(transform)
     loss = lw.BehavioralCloningTrainer(actor, replay, config, checkpoint=out).train()
     print(f"trained to step {steps}" + ("" if loss != loss else f", loss {loss:.4f}") + f": {out}")
 
@@ -157,25 +158,24 @@ def evaluate(
         out: folder for results.json, success.png and rollout.rrd.
     """
     import lw_torchrl as lw
+    from lw_torchrl.modules.policy import Policy
     from lw_torchrl.record.rollouts import rollout_tasks, write_recording
     from lw_torchrl.trainers.checkpoint import demonstration_seeds
 
     use_one_thread()
     chosen: str | tuple[str, ...] = tasks[0] if len(tasks) == 1 else tasks
-    actor: lw.ExpertActor | lw.PlanConditionedActor | lw.DescriptorConditionedActor | lw.ActorEnsemble
+    policy: Policy | None = None
     if str(checkpoint) == "expert":
         chosen = chosen or "MT10"
-        actor = lw.ExpertActor(chosen)
     else:
         if seed in demonstration_seeds(checkpoint):
             raise ValueError(
                 f"seed must differ from the demonstrations' seed, {seed}; an evaluation wants fresh states"
             )
-        actor = lw.load_actor(checkpoint)
-        own = actor.tasks if hasattr(actor, "tasks") else tuple(actor.plans)
-        chosen = chosen or own
+        policy = lw.load_actor(checkpoint)
+        chosen = chosen or policy.tasks
     result = lw.evaluate(
-        actor,
+        policy or lw.ExpertActor(chosen),
         tasks=chosen,
         episodes_per_task=episodes,
         seed=seed,
@@ -187,10 +187,10 @@ def evaluate(
     if out is not None:
         result.save(out / "results.json")
         lw.plot_success(result, out / "success.png", title=f"{checkpoint}, {episodes} episodes a task")
-        if hasattr(actor, "plans"):
+        if policy is not None:
             shown = lw.resolve_tasks(chosen)[:3]
-            rollouts = rollout_tasks(actor, shown, seed=seed, noise_scale=noise)
-            write_recording(out / "rollout.rrd", actor, rollouts)
+            rollouts = rollout_tasks(policy, shown, seed=seed, noise_scale=noise)
+            write_recording(out / "rollout.rrd", policy, rollouts)
         print(f"written to {out}")
 
 

@@ -41,6 +41,7 @@ class ExpertActor(TensorDictModuleBase):
 
     in_keys = ["observation", "task_id"]
     out_keys = ["action", "unclipped_action"]
+    row_by_row = True  # no network: its rows need no blocks of one size
 
     def __init__(self, tasks: str | Iterable[str]) -> None:
         super().__init__()

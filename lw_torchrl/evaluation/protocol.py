@@ -16,31 +16,36 @@ from tqdm.auto import tqdm
 from lw_torchrl._checks import check_int, check_scale
 from lw_torchrl.envs.engine import ACTION_SIZE
 from lw_torchrl.envs.episodes import FinishedEpisode, in_blocks, run_episodes
-from lw_torchrl.envs.experts import ExpertActor
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.evaluation.result import EpisodeResult, EvaluationResult
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.tasks import resolve_tasks
-from lw_torchrl.transforms.qaf import QAFTransform
+from lw_torchrl.modules.policy import plans_of, transform_of
 
 _ROWS = 256  # more hardly make a step of all of them cheaper per row, and cost memory
 
 
 def actor_plans(actor: Any, plans: Plans | Mapping[str, ConditionalPlan] | None) -> Plans | None:
     """The plans to answer queries for: those given, or the actor's own; different ones are an error."""
-    own = getattr(actor, "plans", None)
+    own = plans_of(actor)
     if plans is None:
         return own
     given = as_plans(plans)
     if own is not None:
-        shared = [task for task in given if task in own]
-        if different := [task for task in shared if given[task] != own[task]]:
+        if different := given.differences(own):
             raise ValueError(
                 f"plans differ from the actor's own for {', '.join(different)}; pass plans=None, or evaluate "
                 "actor.with_plans(plans)"
             )
         return own
     return given
+
+
+def make_env(actor: Any, plans: Plans | None, base: LanguageWorldEnv) -> EnvBase:
+    """The environment with what must run before the actor, and the answers to the plans' queries beside it."""
+    answered = plans_of(actor) if plans is None else plans
+    transform = transform_of(actor, answered)
+    return base if transform is None else TransformedEnv(base, transform)
 
 
 def _result(task: str, episode: int, steps: TensorDictBase, stopped_early: bool, keep_actions: bool) -> EpisodeResult:
@@ -60,7 +65,9 @@ def _result(task: str, episode: int, steps: TensorDictBase, stopped_early: bool,
 def _checked(policy: Callable[[TensorDictBase], TensorDictBase]) -> Callable[[TensorDictBase], TensorDictBase]:
     def run(tensordict: TensorDictBase) -> TensorDictBase:
         tensordict = policy(tensordict)
-        action, shape = tensordict.get("action"), (*tensordict.batch_size, ACTION_SIZE)
+        action, shape = tensordict.get("action", None), (*tensordict.batch_size, ACTION_SIZE)
+        if action is None:
+            raise ValueError(f"the actor must write 'action', got {', '.join(map(str, tensordict.keys()))}")
         if action.shape != shape or action.dtype != torch.float32:
             raise ValueError(
                 f"the actor's action must be float32 of shape {shape}, got {action.dtype} of shape "
@@ -154,9 +161,9 @@ def evaluate(
         max_steps=max_steps,
         strict=True,
     )
-    env: EnvBase = base if answered is None else TransformedEnv(base, QAFTransform(answered))
-    # A script works row by row already; anything else is run on blocks, so that rows do not feel one another.
-    policy = actor if isinstance(actor, ExpertActor) else in_blocks(actor)
+    env = make_env(actor, answered, base)
+    # Networks are run on blocks, so that rows do not feel one another.
+    policy = actor if getattr(actor, "row_by_row", False) else in_blocks(actor)
     training = getattr(actor, "training", False)
     if isinstance(actor, torch.nn.Module):
         actor.eval()

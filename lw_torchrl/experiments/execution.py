@@ -11,7 +11,7 @@ from typing import Any
 from tqdm.auto import tqdm
 
 from lw_torchrl.evaluation import EvaluationResult, evaluate
-from lw_torchrl.experiments.runs import Run
+from lw_torchrl.experiments.runs import SCRIPTED, Run
 from lw_torchrl.experiments.training import train_each, train_one
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.tasks import resolve_tasks
@@ -29,7 +29,7 @@ def _evaluate(run: Run, plans: Plans, out: Path, tasks: tuple[str, ...], progres
         "noise_scale": 0.1,
         "stop_at_success": True,
     }
-    if run.method == "scripted":
+    if run.method == SCRIPTED:
         return evaluate(ScriptedSkillActor(plans), tasks=tasks, progress=progress, **options)
     if run.setting.targets is None:
         return evaluate(train_one(run, plans, out, progress), tasks=tasks, progress=progress, **options)

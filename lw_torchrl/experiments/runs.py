@@ -13,8 +13,10 @@ from lw_torchrl._checks import check_choice
 from lw_torchrl.data.collect import collect_demonstrations
 from lw_torchrl.experiments.recipes import DataSetting, Execution, Member, Preset
 from lw_torchrl.language.plans import Plans, format_plan
+from lw_torchrl.modules.policy import METHODS, policy_class
 
-METHODS = ("pcbc", "dc", "one-hot", "scripted")
+SCRIPTED = "scripted"
+"""Plans with scripted skills: a method beside those of :data:`lw_torchrl.modules.policy.METHODS`, without training."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,7 @@ class Run:
 
     Attributes:
         setting: what data it sees; scripts see none, and are the same in every setting.
-        method: one of :data:`METHODS`.
+        method: one of :data:`~lw_torchrl.modules.policy.METHODS`, or "scripted".
         seed: of demonstrations, initial weights and minibatches.
         preset: how to train.
         episodes: evaluated for each task.
@@ -76,7 +78,7 @@ class Run:
     plans_name: str = ""
 
     def __post_init__(self) -> None:
-        check_choice("method", self.method, METHODS)
+        check_choice("method", self.method, (*METHODS, SCRIPTED))
 
     @property
     def group(self) -> Path:
@@ -86,14 +88,14 @@ class Run:
     @property
     def folder(self) -> Path:
         """Where its files go, below the experiments' folder."""
-        if self.method == "scripted":
+        if self.method == SCRIPTED:
             return Path("-".join(filter(None, ("scripted", self.plans_name)))) / f"seed{self.seed}"
         return self.group / self.method / f"seed{self.seed}"
 
     @property
     def datasets(self) -> tuple[Dataset, ...]:
         """What it is trained on: the base tasks' demonstrations, and the targets'."""
-        if self.method == "scripted":
+        if self.method == SCRIPTED:
             return ()
         base = Dataset(self.setting.base, self.setting.episodes, self.preset.base, self.seed)
         if self.setting.targets is None:
@@ -103,14 +105,16 @@ class Run:
 
     def actor_options(self, member: Member) -> dict[str, Any]:
         """Of one of its policy's actors."""
-        return {**member.actor, **(member.plan_actor if self.method == "pcbc" else {})}
+        more = member.plan_actor if policy_class(METHODS[self.method].policy).plan_options else {}
+        return {**member.actor, **more}
 
     def describe(self, plans: Plans) -> dict[str, Any]:
         """Everything that its result hangs on, as JSON."""
         text = "".join(map(format_plan, plans.values()))
-        plans_used = sha256(text.encode()).hexdigest()[:16] if self.method in ("pcbc", "scripted") else None
+        reads_plans = self.method == SCRIPTED or policy_class(METHODS[self.method].policy).plan_options
+        plans_used = sha256(text.encode()).hexdigest()[:16] if reads_plans else None
         described: dict[str, Any] = {"method": self.method, "seed": self.seed, "plans": plans_used}
-        if self.method != "scripted":
+        if self.method != SCRIPTED:
             described |= {
                 "setting": self.setting.name,
                 "preset": self.preset.name,

@@ -14,26 +14,23 @@ from lw_torchrl.data import CoLearningSampler, LanguageWorldExperienceReplay, Ta
 from lw_torchrl.experiments.recipes import Member
 from lw_torchrl.experiments.runs import Run
 from lw_torchrl.language.plans import Plans
-from lw_torchrl.language.tasks import MT50, resolve_tasks
-from lw_torchrl.modules import ActorEnsemble, DescriptorConditionedActor, PlanConditionedActor
+from lw_torchrl.language.tasks import resolve_tasks
+from lw_torchrl.modules import ActorEnsemble
+from lw_torchrl.modules.policy import Policy, make_policy
 from lw_torchrl.trainers.behavioral_cloning import BehavioralCloningConfig, BehavioralCloningTrainer
-from lw_torchrl.trainers.checkpoint import Actor, Policy, check_description, describe_data, load_actor, save_actor
+from lw_torchrl.trainers.checkpoint import check_description, describe_data, load_actor, save_actor
 from lw_torchrl.trainers.stacked import StackedBehavioralCloning
-from lw_torchrl.transforms import QAFTransform, RandomYaw
+from lw_torchrl.transforms import RandomYaw
 
 
-def _make_actor(run: Run, member: Member, plans: Plans, seed: int) -> Actor:
+def _make_actor(run: Run, member: Member, plans: Plans, seed: int) -> Policy:
     torch.manual_seed(seed)
-    options = run.actor_options(member)
-    if run.method == "pcbc":
-        return PlanConditionedActor(plans, **options)
-    condition: Any = "description" if run.method == "dc" else "one-hot"
-    return DescriptorConditionedActor(MT50, condition=condition, **options)
+    return make_policy(run.method, plans, **run.actor_options(member))
 
 
-def _transform(run: Run, member: Member, plans: Plans) -> Transform:
-    queries = [QAFTransform(plans)] if run.method == "pcbc" else []
-    return Compose(*queries, *([RandomYaw(member.yaw)] if member.yaw else []))
+def _transform(actor: Policy, member: Member) -> Transform:
+    queries = actor.transform()
+    return Compose(*([] if queries is None else [queries]), *([RandomYaw(member.yaw)] if member.yaw else []))
 
 
 def _config(run: Run, rows: int, seed: int) -> BehavioralCloningConfig:
@@ -44,7 +41,7 @@ def _config(run: Run, rows: int, seed: int) -> BehavioralCloningConfig:
 
 
 def _keep(
-    described: dict[str, Any], actors: Sequence[Actor], file: Path, replay: LanguageWorldExperienceReplay
+    described: dict[str, Any], actors: Sequence[Policy], file: Path, replay: LanguageWorldExperienceReplay
 ) -> Policy:
     policy = actors[0] if len(actors) == 1 else ActorEnsemble(actors)
     save_actor(policy, file, data=describe_data(replay), run=described)
@@ -74,12 +71,12 @@ def train_one(run: Run, plans: Plans, out: Path, progress: bool) -> Policy:
         replay = LanguageWorldExperienceReplay(
             out / run.datasets[0].folder,
             sampler=TaskBalancedSampler(),
-            transform=_transform(run, member, plans),
             label=run.preset.label,
             after_success=run.preset.after_success,
         )
         config = _config(run, len(replay), run.seed + 1_000 * number)
         actors.append(_make_actor(run, member, plans, config.seed))
+        replay.append_transform(_transform(actors[-1], member))
         checkpoint = folder / f"checkpoint-{number}.zip"
         BehavioralCloningTrainer(actors[-1], replay, config, checkpoint=checkpoint, progress=progress).train()
     policy = _keep(described, actors, file, replay)
@@ -106,23 +103,24 @@ def train_each(run: Run, plans: Plans, out: Path, progress: bool) -> dict[str, P
     members = []
     for number, member in enumerate(run.preset.members):
         config = _config(run, rows, 1_000 * run.seed + len(targets) * number)
+        actors = [_make_actor(run, member, plans, config.seed + i) for i in range(len(targets))]
         replays = [
             LanguageWorldExperienceReplay(
                 roots,
                 episodes=[None, {target: 1}],
                 sampler=CoLearningSampler(target),
-                transform=_transform(run, member, plans),
+                transform=_transform(actor, member),
                 label=run.preset.label,
                 after_success=run.preset.after_success,
             )
-            for target in targets
+            for target, actor in zip(targets, actors, strict=True)
         ]
-        members.append([_make_actor(run, member, plans, config.seed + i) for i in range(len(targets))])
+        members.append(actors)
         checkpoint = folder / f"checkpoint-{number}.zip"
         StackedBehavioralCloning(members[-1], replays, config, checkpoint=checkpoint, progress=progress).train()
     policies = {
-        target: _keep(described, actors, files[target], replay)
-        for target, replay, *actors in zip(targets, replays, *members, strict=True)
+        target: _keep(described, each, files[target], replay)
+        for target, replay, *each in zip(targets, replays, *members, strict=True)
     }
     _forget_checkpoints(folder)
     return policies

@@ -153,6 +153,21 @@ class Plans(Mapping[str, ConditionalPlan]):
     def skills(self) -> tuple[str, ...]:
         return tuple(sorted({step.skill for plan in self.values() for step in plan.steps}))
 
+    @property
+    def fingerprint(self) -> str:
+        return repr([(t, [(str(s.condition), s.skill) for s in p.steps], p.definition) for t, p in self.items()])
+
+    def to_json(self) -> dict:
+        return {task: format_plan(plan) for task, plan in self.items()}
+
+    @classmethod
+    def from_json(cls, found: dict) -> Plans:
+        return cls([parse_plan(text, task) for task, text in found.items()])
+
+    def differences(self, other: Plans) -> list[str]:
+        """The tasks of both whose plans, or the tasks' definitions, differ."""
+        return [t for t in self if t in other and (self[t], self[t].definition) != (other[t], other[t].definition)]
+
     def require(self, tasks: Iterable[str]) -> None:
         """Raise :class:`PlanError` if one of ``tasks`` has no plan here."""
         if missing := [task for task in tasks if task not in self]:

@@ -222,7 +222,7 @@ def task_id(name: str) -> int:
     return _RANK[check_task(name)]
 
 
-def resolve_tasks(tasks: str | Iterable[str]) -> tuple[str, ...]:
+def resolve_tasks(tasks: str | Iterable[str], *, known=None) -> tuple[str, ...]:
     """The names behind a set, a task, or a list of tasks, sorted by name.
 
     Args:

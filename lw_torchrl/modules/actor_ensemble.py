@@ -1,37 +1,38 @@
-"""ActorEnsemble: several actors as one, which does the mean of what they would do."""
+"""ActorEnsemble: several policies as one, which does the mean of what they would do."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase, dispatch
-from torch import nn
+from tensordict.nn import dispatch
+from torch import Tensor, nn
+from torchrl.envs import Transform
 
 from lw_torchrl.language.plans import ConditionalPlan, Plans
-from lw_torchrl.modules.descriptor_conditioned_actor import DescriptorConditionedActor
-from lw_torchrl.modules.plan_conditioned_actor import PlanConditionedActor
+from lw_torchrl.modules.policy import Policy, TextEncoding, from_description
 
 
-class ActorEnsemble(TensorDictModuleBase):
-    """The mean action of actors that were trained apart on the same demonstrations: where these do not say what to
+class ActorEnsemble(Policy):
+    """The mean action of policies that were trained apart on the same demonstrations: where these do not say what to
     do, each fills the gap in its own way, and the mean strays less than one of them. Members that see different
     features, or were trained on other augmentations, differ most.
 
-    Reads what a member reads; writes ``action`` (B, 4) float32 in (-1, 1), and ``skill_weights`` (B, S) float32 where
-    the members have plans.
+    Reads what a member reads; writes ``action`` (B, 4) float32, and ``skill_weights`` (B, S) float32 where the members
+    have plans: the mean of the members' own.
 
     Args:
-        members: M actors of one kind with the same plans, or the same tasks.
+        members: M policies with the same plans, or the same tasks, and the same keys.
 
     Attributes:
-        members: the actors.
+        members: the policies.
         plans: their plans, where they have plans.
-        tasks: their tasks, where they are conditioned on descriptions.
+        tasks: their tasks.
 
     Raises:
-        ValueError: no member, or members of different kinds, plans or tasks.
+        ValueError: no member, or members of different plans, tasks or keys.
 
     Example:
         >>> import lw_torchrl as lw
@@ -44,31 +45,52 @@ class ActorEnsemble(TensorDictModuleBase):
     Source: as the mean of ``torchrl.modules.EnsembleModule``.
     """
 
-    plans: Plans
-    tasks: tuple[str, ...]
-
-    def __init__(self, members: Sequence[PlanConditionedActor | DescriptorConditionedActor]) -> None:
+    def __init__(self, members: Sequence[Policy]) -> None:
         super().__init__()
         if not members:
-            raise ValueError("members must be at least one actor, got none")
+            raise ValueError("members must be at least one policy, got none")
         first = members[0]
-        for name in ("plans", "tasks"):
-            if any(getattr(one, name, None) != getattr(first, name, None) for one in members):
+        for name, of in (("plans", _fingerprint), ("tasks", _tasks), ("in_keys", _read), ("out_keys", _written)):
+            if any(of(one) != of(first) for one in members):
                 raise ValueError(f"members must have the same {name}")
-            if hasattr(first, name):
-                setattr(self, name, getattr(first, name))
         self.members = nn.ModuleList(members)
+        self.plans, self.tasks = first.plans, first.tasks
         self.in_keys = first.in_keys
-        self.out_keys = ["action", "skill_weights"] if hasattr(first, "plans") else ["action"]
+        self.out_keys = first.out_keys[: 1 if first.plans is None else 2]
+        self._own_evaluators = any(getattr(member, "evaluator", None) is not None for member in members)
+
+    def transform(self) -> Transform | None:
+        """As a member's."""
+        return self._each[0].transform()
+
+    @property
+    def _each(self) -> list[Policy]:
+        return list(self.members)  # type: ignore[arg-type]
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        # The conditions' truth alone gives the weights, so they are every member's.
-        done = [member(tensordict.copy()) for member in self.members]
-        tensordict.set("action", torch.stack([one.get("action") for one in done]).mean(0))
-        for key in self.out_keys[1:]:
-            tensordict.set(key, done[0].get(key))
+        """Write ``out_keys``."""
+        done = [member.act(*member.prepare(tensordict)) for member in self._each]
+        tensordict.set(self.out_keys[0], torch.stack([action for action, *_ in done]).mean(0))
+        for key in self.out_keys[1:]:  # exact truth gives every member the same weights
+            weights = [weights for _, weights, *_ in done]
+            tensordict.set(key, torch.stack(weights).mean(0) if self._own_evaluators else weights[0])
         return tensordict
+
+    def fit_normalization(self, observation: Tensor, weights: Tensor | None = None) -> None:
+        """That of each member."""
+        for member in self._each:
+            member.fit_normalization(observation, weights)
+
+    def describe(self) -> dict[str, Any]:
+        return {"kind": "ActorEnsemble", "options": {}, "members": [member.describe() for member in self._each]}
+
+    @classmethod
+    def from_description(cls, found: Mapping[str, Any], text_encoder: TextEncoding | None = None) -> ActorEnsemble:
+        members = found["members"]
+        if not isinstance(members, list) or any(one.get("kind") == "ActorEnsemble" for one in members):
+            raise ValueError("members of an ensemble must be a list of policies that are no ensembles")
+        return cls([from_description(member, text_encoder) for member in members])
 
     def with_plans(self, plans: Plans | Mapping[str, ConditionalPlan]) -> ActorEnsemble:
         """An ensemble that carries out other plans with the same weights: training either trains both.
@@ -76,7 +98,20 @@ class ActorEnsemble(TensorDictModuleBase):
         Raises:
             TypeError: the members are conditioned on descriptions.
         """
-        members = [member for member in self.members if isinstance(member, PlanConditionedActor)]
-        if not members:
-            raise TypeError("with_plans is for members with plans, these are conditioned on descriptions")
-        return ActorEnsemble([member.with_plans(plans) for member in members]).train(self.training)
+        return ActorEnsemble([member.with_plans(plans) for member in self._each]).train(self.training)
+
+
+def _fingerprint(policy: Policy) -> str | None:
+    return None if policy.plans is None else policy.plans.fingerprint
+
+
+def _tasks(policy: Policy) -> tuple[str, ...]:
+    return policy.tasks
+
+
+def _read(policy: Policy) -> list:
+    return policy.in_keys
+
+
+def _written(policy: Policy) -> list:
+    return policy.out_keys

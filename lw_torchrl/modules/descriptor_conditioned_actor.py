@@ -2,35 +2,49 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase, dispatch
+from tensordict.utils import NestedKey
 from torch import Tensor
 
 from lw_torchrl._checks import check_choice
-from lw_torchrl.language.tasks import MT50, TASKS, resolve_tasks, task_id
+from lw_torchrl._keys import as_keys
+from lw_torchrl.language.plans import Plans
+from lw_torchrl.language.tasks import MT50, TASKS, Task, resolve_tasks, task_id
 from lw_torchrl.language.text import encode_texts
 from lw_torchrl.modules.decoder import ActionDecoder, check_task_ids, text_to_latent, unit_scale
 from lw_torchrl.modules.observation_features import Features
+from lw_torchrl.modules.policy import Policy, TextEncoding
+
+
+def _definitions(tasks: str | Iterable[str | Task]) -> dict[str, Task]:
+    """The tasks by name, sorted by it."""
+    if isinstance(tasks, str) or not isinstance(tasks, Iterable):
+        return {name: TASKS[name] for name in resolve_tasks(tasks)}
+    listed = list(tasks)
+    own = {task.name: task for task in listed if isinstance(task, Task)}
+    names = resolve_tasks([task.name if isinstance(task, Task) else task for task in listed], known={**TASKS, **own})
+    return {name: own.get(name) or TASKS[name] for name in names}
 
 
 def _one_hot(texts: Sequence[str]) -> Tensor:
     return torch.eye(len(texts))
 
 
-class DescriptorConditionedActor(TensorDictModuleBase):
+class DescriptorConditionedActor(Policy):
     """The description's latent and the observation give the action: the paper's descriptor conditioning (DC).
 
     Reads ``observation`` (B, 39) float32 and ``task_id`` (B,) int64; writes ``action`` (B, 4) float32 in (-1, 1).
 
     Args:
-        tasks: the tasks it is to act in, as for :func:`resolve_tasks`.
+        tasks: the tasks it is to act in, as for :func:`resolve_tasks`; a :class:`Task` in a list brings its own
+            description.
         condition: "description", the text's vector; "one-hot", one number for each task, which knows no words.
-        features, feature_noise, latent_size, width, depth, encoder_width, encoder_depth, squash, text_encoder: as for
-            :class:`PlanConditionedActor`, with the same networks.
+        features, feature_noise, latent_size, width, depth, encoder_width, encoder_depth, squash, text_encoder,
+            in_keys, out_keys: as for :class:`PlanConditionedActor`, with the same networks.
 
     Raises:
         ValueError: an unknown task, a wrong option, or at call time a task_id outside ``tasks``.
@@ -45,14 +59,12 @@ class DescriptorConditionedActor(TensorDictModuleBase):
     Source: paper section 'Conditional Plan Experiments'.
     """
 
-    in_keys = ["observation", "task_id"]
-    out_keys = ["action"]
-    description_vectors: Tensor
+    text_vectors: Tensor
     known: Tensor
 
     def __init__(
         self,
-        tasks: str | Iterable[str],
+        tasks: str | Iterable[str | Task],
         *,
         condition: Literal["description", "one-hot"] = "description",
         features: Features = "differences",
@@ -63,10 +75,15 @@ class DescriptorConditionedActor(TensorDictModuleBase):
         encoder_width: int = 128,
         encoder_depth: int = 1,
         squash: bool = True,
-        text_encoder: Callable[[Sequence[str]], Tensor] | None = None,
+        text_encoder: TextEncoding | None = None,
+        in_keys: Sequence[NestedKey] | None = None,
+        out_keys: Sequence[NestedKey] | None = None,
     ) -> None:
         super().__init__()
-        self.tasks = resolve_tasks(tasks)
+        self.definitions = _definitions(tasks)
+        self.tasks = tuple(self.definitions)
+        self.in_keys = as_keys("in_keys", in_keys, ("observation", "task_id"))
+        self.out_keys = as_keys("out_keys", out_keys, ("action",))
         self.config: dict[str, Any] = {
             "condition": check_choice("condition", condition, ("description", "one-hot")),
             "features": features,
@@ -77,9 +94,11 @@ class DescriptorConditionedActor(TensorDictModuleBase):
             "encoder_width": encoder_width,
             "encoder_depth": encoder_depth,
             "squash": squash,
+            "in_keys": self.in_keys,
+            "out_keys": self.out_keys,
         }
         encode = text_encoder or (encode_texts if condition == "description" else _one_hot)
-        found = encode([TASKS[task].description for task in self.tasks])
+        found = encode([task.description for task in self.definitions.values()])
         if found.ndim != 2 or len(found) != len(self.tasks):
             raise ValueError(f"text_encoder must give ({len(self.tasks)}, E), got shape {tuple(found.shape)}")
         ids = torch.tensor([task_id(task) for task in self.tasks])
@@ -87,25 +106,38 @@ class DescriptorConditionedActor(TensorDictModuleBase):
         vectors[ids] = unit_scale(found)
         known = torch.zeros(len(MT50), dtype=torch.bool)
         known[ids] = True
-        self.register_buffer("description_vectors", vectors, persistent=False)
+        self.register_buffer("text_vectors", vectors, persistent=False)
         self.register_buffer("known", known, persistent=False)
         self.encoder = text_to_latent(found.shape[1], latent_size, encoder_width, encoder_depth)
         self.decoder = ActionDecoder(latent_size, features, feature_noise, width, depth, squash)
 
-    @dispatch
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return tensordict.set("action", self.act(*self.prepare(tensordict))[0])
+    @classmethod
+    def for_plans(
+        cls, plans: Plans, *, text_encoder: TextEncoding | None = None, **options: Any
+    ) -> DescriptorConditionedActor:
+        return cls([plan.definition for plan in plans.values()], text_encoder=text_encoder, **options)
 
-    def prepare(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+    def prepare(self, tensordict: TensorDictBase) -> tuple[Tensor, ...]:
         """What no trained parameter touches: task_id (B,) int64, and the observation's features (B, F)."""
-        task = tensordict.get("task_id")
+        observation, task = self.read(tensordict)
         check_task_ids(task, self.known, "tasks this actor was not made for")
-        return task, self.decoder.features(tensordict.get("observation"))
+        return task, self.decoder.features(observation)
 
-    def act(self, task: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
-        """From what :meth:`prepare` gives: action (B, 4), and the task's latent (B, D)."""
-        latent = self.encoder(self.description_vectors)[task]
-        return self.decoder.decode(latent, seen), latent
+    def act(self, *prepared: Tensor) -> tuple[Tensor]:
+        """From what :meth:`prepare` gives: action (B, 4)."""
+        task, seen = prepared
+        return (self.decoder.decode(self.encoder(self.text_vectors)[task], seen),)
+
+    def describe(self) -> dict[str, Any]:
+        tasks = [name if task == TASKS.get(name) else task.to_json() for name, task in self.definitions.items()]
+        return super().describe() | {"tasks": tasks}
+
+    @classmethod
+    def from_description(
+        cls, found: Mapping[str, Any], text_encoder: TextEncoding | None = None
+    ) -> DescriptorConditionedActor:
+        tasks = [one if isinstance(one, str) else Task.from_json(one) for one in found["tasks"]]
+        return cls(tasks, text_encoder=text_encoder, **found["options"])
 
     def fit_normalization(self, observation: Tensor, weights: Tensor | None = None) -> None:
         """Take the features' mean and standard deviation, in place, from observations (R, 39) float32; ``weights`` (R,)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
 from torch import Tensor
 
+from lw_torchrl._checks import missing_keys
+from lw_torchrl._keys import as_keys
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.tasks import MT50, task_id
 from lw_torchrl.modules.decoder import check_task_ids
@@ -22,6 +25,11 @@ def step_mask(plans: Plans) -> Tensor:
     return mask
 
 
+def attend(logits: Tensor, steps: Tensor) -> Tensor:
+    """Softmax of logits (B, S) over the steps that there are, (B, S) bool; 0 on the others."""
+    return logits.masked_fill(~steps, -torch.inf).softmax(-1)
+
+
 class PlanAttention(TensorDictModuleBase):
     """Softmax over a plan's real steps of the logits 10·truth - 5; uniform over them where no condition holds.
 
@@ -30,6 +38,7 @@ class PlanAttention(TensorDictModuleBase):
 
     Args:
         plans: the plans whose steps are attended to.
+        in_keys, out_keys: other names for what it reads and writes, in the order above; nested ones too.
 
     Raises:
         ValueError: at call time, ``qaf`` of another number of steps, or a task_id without a plan.
@@ -47,12 +56,18 @@ class PlanAttention(TensorDictModuleBase):
     Source: paper section 'Plan Conditioning'.
     """
 
-    in_keys = ["qaf", "task_id"]
-    out_keys = ["skill_weights"]
     mask: Tensor
 
-    def __init__(self, plans: Plans | Mapping[str, ConditionalPlan]) -> None:
+    def __init__(
+        self,
+        plans: Plans | Mapping[str, ConditionalPlan],
+        *,
+        in_keys: Sequence[NestedKey] | None = None,
+        out_keys: Sequence[NestedKey] | None = None,
+    ) -> None:
         super().__init__()
+        self.in_keys = as_keys("in_keys", in_keys, ("qaf", "task_id"))
+        self.out_keys = as_keys("out_keys", out_keys, ("skill_weights",))
         self.plans = as_plans(plans)
         self.register_buffer("mask", step_mask(self.plans), persistent=False)
 
@@ -63,9 +78,15 @@ class PlanAttention(TensorDictModuleBase):
                 f"qaf must have shape {(*task_id.shape, self.mask.shape[-1])}, one column for each step of the actor's "
                 f"plans, got {tuple(qaf.shape)}; give QAFTransform the same plans"
             )
+        return attend(10.0 * qaf.to(torch.float32) - 5.0, self.steps(task_id))
+
+    def steps(self, task_id: Tensor) -> Tensor:
+        """(B,) int64 to (B, S) bool, whether the task's plan has that step."""
         check_task_ids(task_id, self.mask[:, 0], f"tasks without a plan in {self.plans!r}")
-        logits = 10.0 * qaf.to(torch.float32) - 5.0
-        return logits.masked_fill(~self.mask[task_id], -torch.inf).softmax(-1)
+        return self.mask[task_id]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return tensordict.set("skill_weights", self.weights(tensordict.get("qaf"), tensordict.get("task_id")))
+        qaf, task_id = (tensordict.get(key, None) for key in self.in_keys)
+        if qaf is None or task_id is None:
+            raise missing_keys(tensordict.keys(True, True), *self.in_keys)
+        return tensordict.set(self.out_keys[0], self.weights(qaf, task_id))

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Literal
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
 from torch import Tensor
 
 from lw_torchrl._checks import check_choice
+from lw_torchrl._keys import as_keys
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.skill_program import SkillProgram
 from lw_torchrl.language.skills import ScriptedSkill
 from lw_torchrl.language.tasks import MT50, task_id
+from lw_torchrl.modules.policy import Policy, TextEncoding
+from lw_torchrl.transforms.qaf import QAFTransform
 
 
-class ScriptedSkillActor(TensorDictModuleBase):
+class ScriptedSkillActor(Policy):
     """Runs the skill of a true step of the plan; where none is true, that of the last step.
 
     Reads ``observation`` (B, 39) float32, ``task_id`` (B,) int64 and ``qaf`` (B, S) bool; writes ``action`` (B, 4)
@@ -29,6 +32,7 @@ class ScriptedSkillActor(TensorDictModuleBase):
             them, in equal parts.
         skills: the scripted skills by text, as from :func:`load_skills`; None for the shipped ones.
         seed: of the random choice.
+        in_keys, out_keys: other names for what it reads and writes, in the order above; nested ones too.
 
     Raises:
         ValueError: a wrong option, a skill text that is no scripted skill (with the nearest), or one that speaks of
@@ -43,9 +47,6 @@ class ScriptedSkillActor(TensorDictModuleBase):
     Source: paper sections 'Scripted Skills' and 'Conditional Plan Generation'.
     """
 
-    in_keys = ["observation", "task_id", "qaf"]
-    out_keys = ["action", "skill_weights"]
-
     def __init__(
         self,
         plans: Plans | Mapping[str, ConditionalPlan],
@@ -53,9 +54,15 @@ class ScriptedSkillActor(TensorDictModuleBase):
         *,
         skills: Mapping[str, ScriptedSkill] | None = None,
         seed: int = 0,
+        in_keys: Sequence[NestedKey] | None = None,
+        out_keys: Sequence[NestedKey] | None = None,
     ) -> None:
         super().__init__()
-        self.plans = as_plans(plans)
+        self.plans: Plans = as_plans(plans)
+        self.tasks = tuple(self.plans)
+        self.in_keys = as_keys("in_keys", in_keys, ("observation", "task_id", "qaf"))
+        self.out_keys = as_keys("out_keys", out_keys, ("action", "skill_weights"))
+        self.config = {"select": select, "seed": seed, "in_keys": self.in_keys, "out_keys": self.out_keys}
         self.select = check_choice("select", select, ("first", "random", "mix"))
         self._skills = skills
         self.program = SkillProgram(
@@ -67,9 +74,27 @@ class ScriptedSkillActor(TensorDictModuleBase):
         self._last = last
         self._generator = torch.Generator().manual_seed(seed)
 
+    @classmethod
+    def for_plans(cls, plans: Plans, *, text_encoder: TextEncoding | None = None, **options: Any) -> ScriptedSkillActor:
+        return cls(plans, **options)
+
+    def transform(self) -> QAFTransform:
+        """Query answers."""
+        return QAFTransform(self.plans, in_keys=self.in_keys[:2], out_keys=self.in_keys[2:])
+
     def with_plans(self, plans: Plans | Mapping[str, ConditionalPlan]) -> ScriptedSkillActor:
         """The same skills under other plans."""
-        return ScriptedSkillActor(plans, self.select, skills=self._skills, seed=self._generator.initial_seed())
+        return ScriptedSkillActor(plans, skills=self._skills, **self.config)
+
+    def describe(self) -> dict[str, Any]:
+        """As :meth:`Policy.describe`; :class:`TypeError` with skills of one's own, which no policy file holds."""
+        if self._skills is not None:
+            raise TypeError("a ScriptedSkillActor with skills of your own cannot be saved: keep their file instead")
+        return super().describe() | {"plans": self.plans.to_json()}
+
+    @classmethod
+    def from_description(cls, found: Mapping[str, Any], text_encoder: TextEncoding | None = None) -> ScriptedSkillActor:
+        return cls(Plans.from_json(found["plans"]), **found["options"])
 
     def _weights(self, qaf: Tensor, given: Tensor) -> Tensor:
         last = torch.nn.functional.one_hot(self._last.to(given.device)[given], qaf.shape[-1]).bool()
@@ -83,9 +108,12 @@ class ScriptedSkillActor(TensorDictModuleBase):
             chosen = score.argmax(-1)
         return torch.nn.functional.one_hot(chosen, qaf.shape[-1]).float()
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        observation, given, qaf = (tensordict.get(key) for key in self.in_keys)
-        weights = self._weights(qaf.bool(), given)
-        actions = self.program(observation, given)
-        tensordict.set("skill_weights", weights)
-        return tensordict.set("action", (weights.unsqueeze(-1) * actions).sum(-2))
+    def prepare(self, tensordict: TensorDictBase) -> tuple[Tensor, ...]:
+        """The weights (B, S), and the action of each step's skill (B, S, 4)."""
+        observation, given, qaf = self.read(tensordict)
+        return self._weights(qaf.bool(), given), self.program(observation, given)
+
+    def act(self, *prepared: Tensor) -> tuple[Tensor, Tensor]:
+        """From what :meth:`prepare` gives: action (B, 4), and the weights."""
+        weights, actions = prepared
+        return (weights.unsqueeze(-1) * actions).sum(-2), weights

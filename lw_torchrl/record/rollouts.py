@@ -8,21 +8,22 @@ from itertools import groupby
 
 import torch
 from tensordict import TensorDictBase
-from torchrl.envs import TransformedEnv
+from tensordict.utils import NestedKey
 
 from lw_torchrl.envs.episodes import in_blocks, run_episodes
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
+from lw_torchrl.evaluation.protocol import make_env
 from lw_torchrl.language.plans import ConditionalPlan
 from lw_torchrl.language.tasks import TASKS, resolve_tasks
-from lw_torchrl.modules import ActorEnsemble, PlanConditionedActor
+from lw_torchrl.modules.policy import Policy, plans_of
 from lw_torchrl.record.rerun_logger import RerunLogger
-from lw_torchrl.transforms.qaf import QAFTransform
 
-_KEYS = ["observation", "task_id", "action", "qaf", "skill_weights", ("next", "success"), ("next", "reward")]
+_KEYS: list[NestedKey] = ["observation", "task_id", "action", ("next", "success"), ("next", "reward")]
+_PLAN_KEYS = {"qaf", "skill_weights"}
 
 
 def rollout_tasks(
-    actor: PlanConditionedActor | ActorEnsemble,
+    actor: Policy,
     tasks: str | Iterable[str],
     *,
     seed: int,
@@ -33,13 +34,13 @@ def rollout_tasks(
     """One episode of each task, the same as :func:`lw_torchrl.evaluate` runs it.
 
     Returns:
-        Task to a TensorDict of batch (T,): observation (T, 39) and action (T, 4) float32, task_id (T,) int64, qaf
-        (T, S) bool, skill_weights (T, S) float32, next/success (T, 1) bool, next/reward (T, 1) float32.
+        Task to a TensorDict of batch (T,): observation (T, 39) and action (T, 4) float32, task_id (T,) int64,
+        next/success (T, 1) bool, next/reward (T, 1) float32; where the actor has plans qaf (T, S) bool, and
+        skill_weights (T, S) float32 where it writes them.
     """
     names = resolve_tasks(tasks)
-    env = TransformedEnv(
-        LanguageWorldEnv(names, seed=seed, max_steps=max_steps, strict=True), QAFTransform(actor.plans)
-    )
+    env = make_env(actor, None, LanguageWorldEnv(names, seed=seed, max_steps=max_steps, strict=True))
+    written = {"qaf", *actor.out_keys} if plans_of(actor) is not None else set()
     try:
         with torch.no_grad():
             return {
@@ -48,7 +49,7 @@ def rollout_tasks(
                     env,
                     in_blocks(actor.eval()),
                     {task: [episode] for task in names},
-                    keys=_KEYS,
+                    keys=[*_KEYS, *sorted(_PLAN_KEYS & written)],
                     noise=(lambda _: (noise_scale,) * 4) if noise_scale else None,
                 )
             }
@@ -58,14 +59,17 @@ def rollout_tasks(
 
 def write_recording(
     path: str | os.PathLike[str],
-    actor: PlanConditionedActor | ActorEnsemble,
+    actor: Policy,
     rollouts: dict[str, TensorDictBase],
 ) -> None:
-    """Write rollouts to a rerun file, each with its plan; the file is replaced whole."""
+    """Write rollouts to a rerun file, each with its plan where there is one; the file is replaced whole."""
+    plans = plans_of(actor)
     with RerunLogger(path) as logger:
         for task, rollout in rollouts.items():
-            objects = TASKS[task].positions(rollout.get("observation"))
-            logger.log_episode(rollout, task=task, objects=objects, plan=actor.plans[task])
+            plan = None if plans is None else plans[task]
+            definition = TASKS[task] if plan is None else plan.definition
+            objects = definition.positions(rollout.get("observation"))
+            logger.log_episode(rollout, task=task, objects=objects, plan=plan)
 
 
 def active_skills(rollout: TensorDictBase, plan: ConditionalPlan) -> list[tuple[str, int]]:

@@ -13,14 +13,21 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torch.nn.utils import clip_grad_norm_
-from torchrl.checkpoint import Checkpoint
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.objectives import BCLoss
 from torchrl.record.loggers import Logger
 from tqdm.auto import tqdm
 
 from lw_torchrl._checks import check_choice, check_int, check_scale
-from lw_torchrl.trainers.checkpoint import TrainingState, check_description, describe_actor, describe_data, load_into
+from lw_torchrl.modules.policy import Policy
+from lw_torchrl.trainers.checkpoint import (
+    check_can_be_saved,
+    check_description,
+    describe_data,
+    load_training,
+    write,
+)
+from lw_torchrl.trainers.training_state import TrainingState, load_state, state_of
 
 LOSSES = ("l1", "l2", "smooth_l1")
 
@@ -84,7 +91,7 @@ def make_optimizer(
     return optimizer, torch.optim.lr_scheduler.LambdaLR(optimizer, lambda _: 1.0)
 
 
-def fit_normalization(actor: Any, replay: TensorDictReplayBuffer) -> None:
+def fit_normalization(actor: Policy, replay: TensorDictReplayBuffer) -> None:
     """Give the actor the statistics of the buffer's rows, each as often as :class:`CoLearningSampler` draws it.
 
     Without the weights a target's few rows would not count, and its features lie far outside the base tasks' range.
@@ -97,8 +104,8 @@ def fit_normalization(actor: Any, replay: TensorDictReplayBuffer) -> None:
 class BehavioralCloningTrainer:
     """Trains an actor to give the demonstrated actions.
 
-    Any TensorDictModule that writes ``action`` can be trained; one with ``fit_normalization`` first takes its
-    statistics from the demonstrations.
+    Any TensorDictModule that writes ``action`` can be trained; a :class:`Policy` first takes its statistics from the
+    demonstrations, and it alone can have a checkpoint.
 
     Args:
         actor: it is trained in place.
@@ -110,8 +117,10 @@ class BehavioralCloningTrainer:
         progress: show a progress bar.
 
     Raises:
-        ValueError: the checkpoint is damaged, of another architecture, or of another configuration; or, in
-            :meth:`train`, the loss is no number.
+        ValueError: the checkpoint is damaged, of another architecture, or of another configuration; the actor writes no
+            ``action``; or, in :meth:`train`, the loss is no number.
+        TypeError: a checkpoint for an actor that is no :class:`Policy`.
+        OSError: the checkpoint cannot be written; the earlier one stays.
 
     Example:
         >>> import lw_torchrl as lw, tempfile
@@ -141,6 +150,8 @@ class BehavioralCloningTrainer:
         self.actor, self.replay, self.logger, self.progress = actor, replay, logger, progress
         self.config = config = config or BehavioralCloningConfig()
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
+        if self.checkpoint is not None:
+            check_can_be_saved(actor)
         if replay._prefetch:
             raise ValueError("replay must not prefetch: batches drawn ahead would be lost when training is resumed")
         generator = torch.Generator().manual_seed(config.seed)
@@ -151,28 +162,22 @@ class BehavioralCloningTrainer:
         self.optimizer, self.schedule = make_optimizer(self.loss.parameters(), config)
         self.state = TrainingState(replay.sampler, generator)
         if self.checkpoint is not None and self.checkpoint.exists():
-            check_description(self.checkpoint, self._describe())
-            load_into(self.checkpoint, **self._components())
-        elif config.normalize and hasattr(actor, "fit_normalization"):
+            policy = check_can_be_saved(actor)
+            check_description(self.checkpoint, self._describe(policy))
+            found = load_training(self.checkpoint, policy, policy.state_dict())
+            load_state(self.checkpoint, found, self.optimizer, self.schedule, [self.state])
+        elif config.normalize and isinstance(actor, Policy):
             fit_normalization(actor, replay)
 
-    def _describe(self) -> dict[str, Any]:
-        data = describe_data(self.replay)
-        return {"actor": describe_actor(self.actor), "training": asdict(self.config), "data": data}
-
-    def _components(self) -> dict[str, Any]:
-        return {
-            "actor": self.actor,
-            "optimizer": self.optimizer,
-            "schedule": self.schedule,
-            "state": self.state,
-        }
+    def _describe(self, policy: Policy) -> dict[str, Any]:
+        return {"actor": policy.describe(), "training": asdict(self.config), "data": describe_data(self.replay)}
 
     def save(self) -> None:
         """Write the checkpoint; an earlier one is replaced whole."""
         if self.checkpoint is not None:
-            self.checkpoint.parent.mkdir(parents=True, exist_ok=True)
-            Checkpoint(format="archive", description=self._describe(), **self._components()).save(self.checkpoint)
+            policy = check_can_be_saved(self.actor)
+            state = state_of(self.optimizer, self.schedule, [self.state])
+            write(self.checkpoint, self._describe(policy), policy, policy.state_dict(), state)
 
     def step(self) -> float:
         """Train on one minibatch and return its loss."""

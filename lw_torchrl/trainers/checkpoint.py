@@ -1,36 +1,33 @@
-"""Checkpoints: one file, replaced whole, read without unpickling, that holds an actor and how its training stands."""
+"""Policy files: one file of JSON and safetensors that holds a policy, and how its training stands.
+
+    description.json       format and version, the policy's description, and what training added to it
+    weights.safetensors    the policy's state
+    texts.safetensors      the vectors that its texts had: another text encoder is found out
+    training.safetensors   optimizer, schedule, sampler and generators, while it is trained
+
+Nothing is unpickled, and what the file says of sizes is held against what it holds before anything is made.
+"""
 
 from __future__ import annotations
 
+import json
 import os
-import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torchrl.checkpoint import Checkpoint, CheckpointError
+from torch.nn.modules.module import register_module_parameter_registration_hook
 
-from lw_torchrl._checks import check_choice
-from lw_torchrl.language.plans import Plans, format_plan, parse_plan
-from lw_torchrl.modules import ActorEnsemble, DescriptorConditionedActor, PlanConditionedActor
+from lw_torchrl._state_tree import check_like, join, split
+from lw_torchrl._tensor_archive import ArchiveError, TensorArchive, write_archive
+from lw_torchrl.modules.policy import Policy, TextEncoding, from_description
 
-ACTORS = ("ActorEnsemble", "DescriptorConditionedActor", "PlanConditionedActor")
-Actor = PlanConditionedActor | DescriptorConditionedActor
-Policy = Actor | ActorEnsemble
-
-
-def describe_actor(actor: nn.Module) -> dict[str, Any]:
-    """What is needed to make the actor again, its weights aside, as JSON."""
-    if isinstance(actor, ActorEnsemble):
-        return {"kind": "ActorEnsemble", "members": [describe_actor(member) for member in actor.members]}
-    if isinstance(actor, PlanConditionedActor):
-        plans = {task: format_plan(plan) for task, plan in actor.plans.items()}
-        return {"kind": "PlanConditionedActor", "options": actor.config, "plans": plans}
-    if isinstance(actor, DescriptorConditionedActor):
-        return {"kind": "DescriptorConditionedActor", "options": actor.config, "tasks": list(actor.tasks)}
-    return {"kind": type(actor).__name__}
+FORMAT = "lw_torchrl.policy"
+FORMAT_VERSION = 2
+_TEXT_TOLERANCE = 0.01  # of numbers of size 1: more than machines differ, far less than encoders do
 
 
 def describe_data(replay: Any) -> dict[str, Any] | None:
@@ -39,59 +36,139 @@ def describe_data(replay: Any) -> dict[str, Any] | None:
     return None if demonstrations is None else demonstrations.config.to_json()
 
 
-def _make_actor(found: dict[str, Any], text_encoder: Callable[[Sequence[str]], Tensor] | None) -> Policy:
-    check_choice("the checkpoint's actor", found["kind"], ACTORS)
-    if found["kind"] == "ActorEnsemble":
-        return ActorEnsemble([_make_actor(member, text_encoder) for member in found["members"]])
-    if found["kind"] == "DescriptorConditionedActor":
-        return DescriptorConditionedActor(found["tasks"], text_encoder=text_encoder, **found["options"])
-    plans = Plans([parse_plan(text, task, f"plan of {task}") for task, text in found["plans"].items()])
-    return PlanConditionedActor(plans, text_encoder=text_encoder, **found["options"])
-
-
-def read_description(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """The description that a checkpoint was saved with.
+def check_can_be_saved(actor: Any) -> Policy:
+    """Return the actor if a policy file can hold it: what cannot be loaded again is refused before any training.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it is no checkpoint of ours, or damaged.
+        TypeError: it is no :class:`Policy`.
+        ValueError: it is one that its own description does not make again.
     """
-    if not Path(path).exists():
-        raise FileNotFoundError(f"checkpoint: no file {str(path)!r}; `lw-torchrl train` writes one")
-    try:
-        found = Checkpoint(description=None).load(path, components=["description"]).values["description"]
-        if not isinstance(found, dict) or not isinstance(found.get("actor"), dict):
-            raise ValueError("it describes no actor")
-        return found
-    except (CheckpointError, zipfile.BadZipFile, OSError, ValueError, KeyError) as error:
-        raise ValueError(f"checkpoint: {str(path)!r} is damaged or none of ours ({error})") from error
+    if not isinstance(actor, Policy):
+        raise TypeError(
+            f"actor must be a Policy to be kept in a file, got {type(actor).__name__}: save the policy inside of it, "
+            "derive your class from lw_torchrl.Policy, or train without a checkpoint"
+        )
+    actor.describe()
+    return actor
 
 
 def save_actor(actor: Policy, path: str | os.PathLike[str], **about: Any) -> None:
-    """Write an actor alone, for :func:`load_actor`; an earlier file is replaced whole.
+    """Write a policy, for :func:`load_actor`; an earlier file is replaced whole.
 
     Args:
         actor: what to write.
         path: the file.
-        **about: what else the file is to say, as JSON: ``data`` of :func:`describe_data`, say.
+        **about: what else the file is to say, as JSON.
+
+    Raises:
+        TypeError: the actor is no :class:`Policy`.
+        OSError: it cannot be written; an earlier file stays.
+
+    Example:
+        >>> import lw_torchrl as lw, os, tempfile
+        >>> path = os.path.join(tempfile.mkdtemp(), "policy.zip")
+        >>> lw.save_actor(lw.PlanConditionedActor(lw.load_plans("MT10"), width=8), path)
+        >>> lw.load_actor(path).config["width"]
+        8
     """
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    Checkpoint(format="archive", description={"actor": describe_actor(actor), **about}, actor=actor).save(path)
+    checked = check_can_be_saved(actor)
+    write(path, {"actor": checked.describe(), **about}, checked, checked.state_dict())
+
+
+def write(
+    path: str | os.PathLike[str],
+    described: Mapping[str, Any],
+    actor: Policy,
+    weights: Mapping[str, Tensor],
+    training: Mapping[str, Any] | None = None,
+) -> None:
+    """Write a policy file.
+
+    Args:
+        path: the file.
+        described: what it says, as JSON, ``actor`` among it.
+        actor: whose texts' vectors it holds.
+        weights: the actor's, or those of many stacked.
+        training: how their training stands, where they are trained.
+    """
+    groups: dict[str, Mapping[str, Tensor]] = {"weights": weights, "texts": _text_vectors(actor)}
+    described = {"format": FORMAT, "version": FORMAT_VERSION, **described}
+    if training is not None:
+        tensors: dict[str, Tensor] = {}
+        described["state"] = split(training, tensors)
+        groups["training"] = tensors
+    try:
+        write_archive(path, described, groups)
+    except OSError as error:
+        raise OSError(
+            error.errno,
+            f"checkpoint: {str(path)!r} cannot be written ({error.strerror}); what stood there before is as it was",
+        ) from error
+
+
+def _text_vectors(actor: nn.Module) -> dict[str, Tensor]:
+    return {name: buffer for name, buffer in actor.named_buffers() if name.rpartition(".")[2] == "text_vectors"}
+
+
+def _open(path: str | os.PathLike[str]) -> TensorArchive:
+    if not Path(path).exists():
+        raise FileNotFoundError(f"checkpoint: no file {str(path)!r}; `lw-torchrl train` writes one")
+    try:
+        found = TensorArchive(path)
+    except (ArchiveError, OSError) as error:
+        old = _is_version_1(Path(path))
+        raise ValueError(
+            f"checkpoint: {str(path)!r} is of version 1, whose files can run code when they are read; this package "
+            f"reads version {FORMAT_VERSION}. Train it again"
+            if old
+            else f"checkpoint: {str(path)!r} is damaged or none of ours ({error})"
+        ) from error
+    if (found.description.get("format"), found.description.get("version")) != (FORMAT, FORMAT_VERSION):
+        raise ValueError(
+            f"checkpoint: {str(path)!r} is of format {found.description.get('format')!r:.60} version "
+            f"{found.description.get('version')!r:.60}; this package reads {FORMAT!r} version {FORMAT_VERSION}"
+        )
+    if not isinstance(found.description.get("actor"), dict):
+        raise ValueError(f"checkpoint: {str(path)!r} is damaged or none of ours (it describes no actor)")
+    return found
+
+
+def _is_version_1(path: Path) -> bool:
+    """Whether it is an archive of TorchRL's ``Checkpoint``, told by its entries' names alone."""
+    import zipfile
+
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return any(name.startswith(("components/", "manifest", "description/")) for name in archive.namelist())
+    except Exception:  # whatever is wrong with it, it is none
+        return False
+
+
+def read_description(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """The description that a policy file was saved with.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is no policy file, or damaged.
+    """
+    return _open(path).description
 
 
 def demonstration_seeds(path: str | os.PathLike[str]) -> set[int]:
-    """The seeds of the demonstrations that a checkpoint's actor was trained on, as far as the checkpoint says."""
-    data = read_description(path).get("data") or {}
-    return {part["seed"] for part in data.get("parts", [data]) if "seed" in part}
+    """The seeds of the demonstrations that a file's policy was trained on, as far as the file says."""
+    data = read_description(path).get("data")
+    parts = data.get("parts", [data]) if isinstance(data, dict) else []
+    return {part["seed"] for part in parts if isinstance(part, dict) and isinstance(part.get("seed"), int)}
 
 
 def check_description(path: Path, ours: dict[str, Any]) -> None:
-    """Raise :class:`ValueError` unless the checkpoint was saved with the description ``ours``."""
-    found = read_description(path)
+    """Raise :class:`ValueError` unless the file was saved with the description ``ours``."""
+    found, ours = read_description(path), json.loads(json.dumps(ours))  # JSON has lists alone
     for part in ours:
         if found.get(part) != ours[part]:
             before, now = found.get(part) or {}, ours[part] or {}
-            different = [key for key in {**before, **now} if before.get(key) != now.get(key)]
+            both = before if isinstance(before, dict) else {}
+            different = sorted(key for key in {**both, **now} if both.get(key) != now.get(key))
             kind = "architecture" if part == "actor" else "configuration"
             raise ValueError(
                 f"checkpoint: {str(path)!r} is of another {kind}, its {part} differs in "
@@ -99,57 +176,109 @@ def check_description(path: Path, ours: dict[str, Any]) -> None:
             )
 
 
-def load_actor(
-    path: str | os.PathLike[str], *, text_encoder: Callable[[Sequence[str]], Tensor] | None = None
-) -> Policy:
-    """Make the actor of a checkpoint, with its plans and weights, in eval mode.
+def load_actor(path: str | os.PathLike[str], *, text_encoder: TextEncoding | None = None) -> Policy:
+    """Make the policy of a file, with its plans and weights, in eval mode.
 
     Args:
-        path: the checkpoint.
-        text_encoder: the one that the actor was made with, if it was not the shipped one.
+        path: the file.
+        text_encoder: the one that the policy was made with, if it was not the shipped one.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it is damaged, or of another architecture than it says.
+        ValueError: it is damaged, or its weights, sizes or texts are not those that it says; or the text encoder is
+            another than the policy was trained with.
+        ImportError: its texts are not shipped, and the extra ``[text]`` is not installed.
     """
-    described = read_description(path)["actor"]
+    archive = _open(path)
     try:
-        actor = _make_actor(described, text_encoder)
-    except (ValueError, TypeError, KeyError) as error:
-        raise ValueError(f"checkpoint: the actor of {str(path)!r} cannot be made ({error})") from error
-    load_into(path, actor=actor)
+        weights, texts = archive.tensors("weights"), archive.tensors("texts")
+        numbers = sum(tensor.numel() for tensor in weights.values())
+        _check_options(archive.description["actor"], numbers)
+        with _at_most(numbers):
+            actor = from_description(archive.description["actor"], text_encoder)
+        _check_texts(texts, _text_vectors(actor))
+        _copy(weights, actor.state_dict())
+    except ImportError:
+        raise
+    except Exception as error:  # a file from a stranger may say anything
+        raise ValueError(f"checkpoint: the actor of {str(path)!r} cannot be made ({_first_line(error)})") from error
     return actor.eval()
 
 
-def load_into(path: str | os.PathLike[str], **components: Any) -> None:
-    """Load named components of a checkpoint into live objects; :class:`ValueError` if they do not fit."""
+def load_training(path: str | os.PathLike[str], actor: Policy, weights: Mapping[str, Tensor]) -> dict[str, Any]:
+    """Copy a file's weights into those of live actors, in place, and return the state of their training.
+
+    Raises:
+        ValueError: they do not fit, or the file has no training state.
+    """
+    archive = _open(path)
     try:
-        Checkpoint(**components).load(path, components=list(components))
-    except zipfile.BadZipFile as error:
-        raise ValueError(f"checkpoint: {str(path)!r} is damaged ({error})") from error
-    except (CheckpointError, RuntimeError, KeyError) as error:
-        reason = str(error).split("\n")[0]
-        raise ValueError(f"checkpoint: {str(path)!r} does not fit, it is of another architecture ({reason})") from error
+        state = join(archive.description.get("state"), archive.tensors("training"))
+        if not isinstance(state, dict):
+            raise ValueError("it has no training state")
+        _check_texts(archive.tensors("texts"), _text_vectors(actor))
+        _copy(archive.tensors("weights"), weights)
+    except (ValueError, RecursionError) as error:
+        raise misfit(path, error) from error
+    return state
 
 
-class TrainingState:
-    """What a trainer must remember beside actor, optimizer and schedule, as tensors."""
+def misfit(path: str | os.PathLike[str], error: Exception) -> ValueError:
+    """The error for a file whose parts do not fit; the caller raises it."""
+    return ValueError(
+        f"checkpoint: {str(path)!r} does not fit, it is of another architecture or damaged ({_first_line(error)})"
+    )
 
-    def __init__(self, sampler: Any, generator: torch.Generator) -> None:
-        self.sampler, self.generator, self.step = sampler, generator, 0
-        self.torch_generator = generator.get_state()  # of what transforms and the actor draw in training
 
-    def state_dict(self) -> dict[str, Any]:
-        return {
-            "step": torch.tensor(self.step),
-            "generator": self.generator.get_state(),
-            "torch_generator": self.torch_generator.clone(),
-            "sampler": dict(self.sampler.state_dict()),
-        }
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0][:400]
 
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self.step = int(state_dict["step"])
-        self.generator.set_state(state_dict["generator"].clone())
-        self.torch_generator = state_dict["torch_generator"].clone()
-        if state_dict.get("sampler"):
-            self.sampler.load_state_dict(state_dict["sampler"])
+
+def _check_options(found: Any, numbers: int) -> None:
+    """Refuse integers that no network of so many numbers can have, before lists of that length are made."""
+    inside = found.values() if isinstance(found, dict) else found if isinstance(found, list) else ()
+    if isinstance(found, int) and abs(found) > max(numbers, 2**16):
+        raise ValueError(f"it says {found:.3g}, but holds only {numbers} numbers")
+    for one in inside:
+        _check_options(one, numbers)
+
+
+@contextmanager
+def _at_most(numbers: int) -> Iterator[None]:
+    """Stop a module that is being made as soon as its parameters are more than ``numbers``, before they are filled."""
+    made = 0
+
+    def count(module: nn.Module, name: str, parameter: nn.Parameter | None) -> None:
+        nonlocal made
+        made += 0 if parameter is None else parameter.numel()
+        if made > numbers:
+            raise ValueError(f"it describes a network of more than the {numbers} numbers that it holds")
+
+    handle = register_module_parameter_registration_hook(count)
+    try:
+        yield
+    finally:
+        handle.remove()
+
+
+@torch.no_grad()
+def _copy(stored: Mapping[str, Tensor], live: Mapping[str, Tensor]) -> None:
+    check_like(stored, dict(live), "weights")
+    for name, tensor in live.items():
+        tensor.copy_(stored[name])
+
+
+def _check_texts(stored: Mapping[str, Tensor], ours: Mapping[str, Tensor]) -> None:
+    """Raise :class:`ValueError` unless the texts have the vectors that they had when the file was written."""
+    for name, vectors in ours.items():
+        found = stored.get(name)
+        if found is None or found.shape != vectors.shape or found.dtype != vectors.dtype:
+            said = "none" if found is None else tuple(found.shape)
+            raise ValueError(
+                f"text_encoder gives vectors of shape {tuple(vectors.shape)}, the policy was made with {said}"
+            )
+        if not torch.allclose(found, vectors.cpu(), atol=_TEXT_TOLERANCE, rtol=0.0):
+            raise ValueError(
+                "text_encoder is not the one that the policy was made with: its texts have other vectors; pass that "
+                "one as text_encoder"
+            )

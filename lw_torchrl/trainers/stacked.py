@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -11,14 +11,20 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 from torch.func import functional_call, stack_module_state, vmap
-from torchrl.checkpoint import Checkpoint
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.objectives.utils import distance_loss
 from tqdm.auto import tqdm
 
-from lw_torchrl.modules import DescriptorConditionedActor, PlanConditionedActor
+from lw_torchrl.modules.policy import Policy
 from lw_torchrl.trainers.behavioral_cloning import BehavioralCloningConfig, fit_normalization, make_optimizer
-from lw_torchrl.trainers.checkpoint import TrainingState, check_description, describe_actor, describe_data, load_into
+from lw_torchrl.trainers.checkpoint import (
+    check_can_be_saved,
+    check_description,
+    describe_data,
+    load_training,
+    write,
+)
+from lw_torchrl.trainers.training_state import TrainingState, load_state, state_of
 
 
 class _Act(nn.Module):
@@ -32,35 +38,6 @@ class _Act(nn.Module):
         return self.actor.act(*prepared)[0]
 
 
-class _Parameters:
-    """Tensors by name as a checkpoint's component."""
-
-    def __init__(self, tensors: Mapping[str, Tensor]) -> None:
-        self.tensors = tensors
-
-    def state_dict(self) -> dict[str, Any]:
-        return {name: tensor.detach().clone() for name, tensor in self.tensors.items()}
-
-    @torch.no_grad()
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        for name, tensor in self.tensors.items():
-            tensor.copy_(state_dict[name])
-
-
-class _States:
-    """Training states by number as a checkpoint's component."""
-
-    def __init__(self, states: Sequence[TrainingState]) -> None:
-        self.states = states
-
-    def state_dict(self) -> dict[str, Any]:
-        return {str(number): state.state_dict() for number, state in enumerate(self.states)}
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        for number, state in enumerate(self.states):
-            state.load_state_dict(state_dict[str(number)])
-
-
 class StackedBehavioralCloning:
     """Trains M actors, each on batches of its own, as :class:`BehavioralCloningTrainer` trains one.
 
@@ -68,7 +45,7 @@ class StackedBehavioralCloning:
     it would have alone, so its losses are those it would have alone, up to rounding.
 
     Args:
-        actors: M actors of one architecture, with ``prepare`` and ``act``; they are trained in place.
+        actors: M policies of one architecture; they are trained in place.
         replays: M buffers; the i-th actor's batches come from the i-th.
         config: how to train each; the i-th has the seed ``config.seed + i``.
         checkpoint: a file to write checkpoints to. If it is there already, training carries on from it.
@@ -97,7 +74,7 @@ class StackedBehavioralCloning:
 
     def __init__(
         self,
-        actors: Sequence[PlanConditionedActor | DescriptorConditionedActor],
+        actors: Sequence[Policy],
         replays: Sequence[TensorDictReplayBuffer],
         config: BehavioralCloningConfig | None = None,
         *,
@@ -109,6 +86,8 @@ class StackedBehavioralCloning:
             raise ValueError(f"replays must be as many as actors, at least one, got {len(replays)} and {len(actors)}")
         self.actors, self.replays, self.progress = list(actors), list(replays), progress
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
+        if self.checkpoint is not None:
+            check_can_be_saved(self.actors[0])
         self.states = []
         for number, (actor, replay) in enumerate(zip(actors, replays, strict=True)):
             generator = torch.Generator().manual_seed(config.seed + number)
@@ -129,29 +108,22 @@ class StackedBehavioralCloning:
         self.optimizer, self.schedule = make_optimizer(list(self._parameters.values()), config)
         if self.checkpoint is not None and self.checkpoint.exists():
             check_description(self.checkpoint, self._describe())
-            load_into(self.checkpoint, **self._components())
+            found = load_training(self.checkpoint, self.actors[0], self._parameters)
+            load_state(self.checkpoint, found, self.optimizer, self.schedule, self.states)
 
     def _describe(self) -> dict[str, Any]:
         data = {str(number): describe_data(replay) for number, replay in enumerate(self.replays)}
         return {
-            "actor": describe_actor(self.actors[0]) | {"number": len(self.actors)},
+            "actor": self.actors[0].describe() | {"number": len(self.actors)},
             "training": asdict(self.config),
             "data": data,
-        }
-
-    def _components(self) -> dict[str, Any]:
-        return {
-            "parameters": _Parameters(self._parameters),
-            "optimizer": self.optimizer,
-            "schedule": self.schedule,
-            "states": _States(self.states),
         }
 
     def save(self) -> None:
         """Write the checkpoint; an earlier one is replaced whole."""
         if self.checkpoint is not None:
-            self.checkpoint.parent.mkdir(parents=True, exist_ok=True)
-            Checkpoint(format="archive", description=self._describe(), **self._components()).save(self.checkpoint)
+            state = state_of(self.optimizer, self.schedule, self.states)
+            write(self.checkpoint, self._describe(), self.actors[0], self._parameters, state)
 
     @property
     def steps(self) -> int:

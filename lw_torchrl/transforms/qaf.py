@@ -44,7 +44,7 @@ class QAFTransform(Transform):
     Source: paper section 'Query Answering Function'.
     """
 
-    def __init__(self, plans: Plans | Mapping[str, ConditionalPlan]) -> None:
+    def __init__(self, plans: Plans | Mapping[str, ConditionalPlan], in_keys=None, out_keys=None) -> None:
         super().__init__(in_keys=["observation"], out_keys=["qaf"])
         self.plans = as_plans(plans)
         self.program = plan_program(self.plans)

@@ -60,7 +60,7 @@ def test_with_plans_keeps_the_weights_and_the_mode():
     assert other.plans["reach"] == plan
     for before, after in zip(ensemble.members, other.members, strict=True):
         assert after.decoder is before.decoder
-    with pytest.raises(TypeError, match="with_plans is for members with plans"):
+    with pytest.raises(TypeError, match="with_plans is for policies with plans"):
         lw.ActorEnsemble(make_members(2, "descriptions")).with_plans({"reach": plan})
 
 
@@ -82,7 +82,7 @@ def test_saved_and_loaded_it_does_the_same(kind, tmp_path):
 
 
 def test_members_that_do_not_belong_together_are_refused():
-    with pytest.raises(ValueError, match="members must be at least one actor"):
+    with pytest.raises(ValueError, match="members must be at least one policy"):
         lw.ActorEnsemble([])
     with pytest.raises(ValueError, match="members must have the same plans"):
         lw.ActorEnsemble([*make_members(1), lw.PlanConditionedActor({"reach": PLANS["reach"]})])

@@ -225,7 +225,7 @@ def test_a_text_encoder_of_ones_own():
     actor = make_actor(text_encoder=encoder)
     assert seen == [PLANS.skills]
     assert actor.skills == PLANS.skills
-    assert actor.skill_vectors.dtype == torch.float32
+    assert actor.text_vectors.dtype == torch.float32
     assert next(actor.encoder.parameters()).shape[1] == 5
     actor(make_state(3))["action"].sum().backward()
 

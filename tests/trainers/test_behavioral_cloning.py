@@ -192,11 +192,9 @@ def test_any_module_that_writes_an_action_can_be_trained(demos, tmp_path):
         torch.manual_seed(0)
         return TensorDictModule(nn.Linear(39, 4), in_keys=["observation"], out_keys=["action"])
 
-    trainer = make_trainer(demos, tmp_path / "c.zip", actor=make())
-    assert trainer.train() < 1.0
-    again = make_trainer(demos, tmp_path / "c.zip", actor=make())
-    assert again.state.step == CONFIG.steps
-    assert torch.equal(again.actor.module.weight, trainer.actor.module.weight)
+    assert make_trainer(demos, None, actor=make()).train() < 1.0
+    with pytest.raises(TypeError, match="actor must be a Policy to be kept in a file"):
+        make_trainer(demos, tmp_path / "c.zip", actor=make())
 
 
 def test_the_seed_fixes_the_training(demos, undisturbed):
@@ -364,7 +362,7 @@ def test_killed_at_any_moment_the_checkpoint_is_whole_and_training_the_same(demo
     assert int(done.stdout) >= 3
 
 
-@pytest.mark.parametrize("failing", ["zipfile.ZipFile.write", "os.replace", "json.dump"])
+@pytest.mark.parametrize("failing", ["zipfile.ZipFile.writestr", "os.replace"])
 def test_a_disk_that_fills_while_saving_leaves_the_old_checkpoint(demos, tmp_path, monkeypatch, failing):
     path = tmp_path / "checkpoint.zip"
     with pytest.raises(KeyboardInterrupt):

@@ -8,14 +8,17 @@ import zipfile
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import nn
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from lw_torchrl.data import TaskBalancedSampler
 from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.plans import ConditionalPlan, Plans
+from lw_torchrl.language.skills import load_skills
 from lw_torchrl.language.tasks import MT10, task_id
-from lw_torchrl.modules import DescriptorConditionedActor, PlanConditionedActor
-from lw_torchrl.trainers import BehavioralCloningConfig, BehavioralCloningTrainer, load_actor
+from lw_torchrl.modules import DescriptorConditionedActor, PlanConditionedActor, ScriptedSkillActor
+from lw_torchrl.trainers import BehavioralCloningConfig, BehavioralCloningTrainer, load_actor, save_actor
 from lw_torchrl.trainers.checkpoint import read_description
 
 SMALL = dict(latent_size=4, width=16, depth=1, encoder_width=8)
@@ -105,10 +108,44 @@ def test_plans_and_text_encoder_of_ones_own(tmp_path):
     assert torch.equal(loaded(state.clone())["action"], actor(state.clone())["action"])
 
 
-def test_another_text_encoder_does_not_fit(saved):
-    path, _ = saved
-    with pytest.raises(ValueError, match=r"checkpoint: .* does not fit"):
-        load_actor(path, text_encoder=counted)
+def test_another_text_encoder_is_found_out(saved, tmp_path):
+    """Of another dimension, and, what no shape tells, of the same one."""
+    with pytest.raises(ValueError, match=r"cannot be made .text_encoder gives vectors of shape"):
+        load_actor(saved[0], text_encoder=counted)
+    path = tmp_path / "own.zip"
+    save_actor(PlanConditionedActor(own_plans(), text_encoder=counted, **SMALL), path)
+    for other in (
+        lambda texts: counted(texts).flip(-1),
+        lambda texts: counted([text.replace("e", "a") for text in texts]),
+    ):
+        with pytest.raises(ValueError, match="text_encoder is not the one that the policy was made with"):
+            load_actor(path, text_encoder=other)
+    load_actor(path, text_encoder=lambda texts: counted(texts) * 3.0)  # the same after scaling
+
+
+def test_the_encoder_of_a_policy_on_descriptions_is_found_out_too(tmp_path):
+    save_actor(DescriptorConditionedActor("MT10", text_encoder=counted, **SMALL), tmp_path / "own.zip")
+    with pytest.raises(ValueError, match="text_encoder is not the one that the policy was made with"):
+        load_actor(tmp_path / "own.zip", text_encoder=lambda texts: counted(texts).flip(-1))
+
+
+def test_what_cannot_be_loaded_is_refused_before_training(tmp_path):
+    module = TensorDictModule(nn.Linear(39, 4), in_keys=["observation"], out_keys=["action"])
+    with pytest.raises(TypeError, match="actor must be a Policy to be kept in a file, got TensorDictModule"):
+        train(module, tmp_path / "c.zip")
+    with pytest.raises(TypeError, match="actor must be a Policy"):
+        save_actor(module, tmp_path / "c.zip")
+    assert not list(tmp_path.iterdir())
+
+
+def test_plans_with_scripted_skills_are_a_policy_file_too(tmp_path):
+    actor = ScriptedSkillActor(PLANS, "mix")
+    save_actor(actor, tmp_path / "scripted.zip")
+    loaded = load_actor(tmp_path / "scripted.zip")
+    state = make_rows(seed=1).exclude("action")
+    assert torch.equal(loaded(state.clone())["action"], actor(state.clone())["action"])
+    with pytest.raises(TypeError, match="with skills of your own cannot be saved"):
+        save_actor(ScriptedSkillActor(PLANS, skills=load_skills()), tmp_path / "own.zip")
 
 
 def test_the_loaded_actor_outlives_the_file(saved, tmp_path):
@@ -124,7 +161,7 @@ def test_the_loaded_actor_outlives_the_file(saved, tmp_path):
 
 def test_a_checkpoint_holds_no_pickle(saved):
     with zipfile.ZipFile(saved[0]) as archive:
-        assert {name.rpartition(".")[2] for name in archive.namelist()} == {"json", "memmap"}
+        assert {name.rpartition(".")[2] for name in archive.namelist()} == {"json", "safetensors"}
 
 
 def test_the_description_says_how_it_was_made(saved):
@@ -176,8 +213,8 @@ def rewrite(source, target, change):
 
 
 DAMAGE = {
-    "no manifest": lambda name, content: None if name == "manifest.json" else content,
-    "no actor": lambda name, content: None if "actor" in name else content,
+    "no description": lambda name, content: None if "description" in name else content,
+    "no weights": lambda name, content: None if "weights" in name else content,
     "half a description": lambda name, content: content[:50] if "description" in name else content,
     "another description": lambda name, content: b"[1, 2]" if "description" in name else content,
     "an actor of no kind": lambda name, content: content.replace(b"PlanConditionedActor", b"ElephantActor"),
@@ -196,7 +233,7 @@ def test_a_damaged_checkpoint_is_refused(saved, tmp_path, name):
 def test_flipped_bits_in_the_weights_are_found(saved, tmp_path):
     content = bytearray(saved[0].read_bytes())
     with zipfile.ZipFile(saved[0]) as archive:
-        info = max((i for i in archive.infolist() if "-actor/" in i.filename), key=lambda i: i.file_size)
+        info = archive.getinfo("weights.safetensors")
     middle = info.header_offset + len(info.filename) + 30 + info.file_size // 2
     content[middle] ^= 0xFF
     path = tmp_path / "c.zip"

@@ -1,0 +1,29 @@
+"""Keys of tensordicts as arguments."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from tensordict.utils import NestedKey, unravel_key
+
+
+def as_keys(argument: str, given: Sequence[NestedKey] | None, default: Sequence[str]) -> list[NestedKey]:
+    """The keys ``given``, as many as the default ones and in their order; None for those.
+
+    Raises:
+        ValueError: another number of keys, or the same twice.
+        TypeError: what is no key.
+
+    Example:
+        >>> as_keys("in_keys", [("agent", "observation"), "task"], ("observation", "task_id"))
+        [('agent', 'observation'), 'task']
+    """
+    if given is None:
+        return list(default)
+    if isinstance(given, str) or not isinstance(given, Sequence):
+        raise TypeError(f"{argument} must be a list of {len(default)} keys, for {', '.join(default)}, got {given!r}")
+    # A list is a nested key too: JSON has no tuples.
+    keys = [unravel_key(tuple(key) if isinstance(key, list) else key) for key in given]
+    if len(keys) != len(default) or len(set(keys)) != len(keys):
+        raise ValueError(f"{argument} must be {len(default)} different keys, for {', '.join(default)}, got {given!r}")
+    return keys

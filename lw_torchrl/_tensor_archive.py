@@ -1,0 +1,131 @@
+"""One file of JSON and tensors, read without unpickling and without believing what it says of its own size.
+
+A zip archive whose entries are stored as they are: ``description.json``, and ``<group>.safetensors`` for each group of
+tensors, whose SHA-256 the description states.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import re
+import zipfile
+from collections.abc import Mapping
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError
+from safetensors.torch import load, save
+from torch import Tensor
+
+from lw_torchrl._files import replacing
+
+_DESCRIPTION = "description.json"
+_MOST_JSON = 64 * 2**20  # bytes; 50 plans take 100 kB
+_GROUP = re.compile(r"([a-z_]{1,40})\.safetensors")
+
+
+class ArchiveError(ValueError):
+    """A file that is no archive of ours, or damaged."""
+
+
+def write_archive(
+    path: str | os.PathLike[str], description: Mapping[str, Any], groups: Mapping[str, Mapping[str, Tensor]]
+) -> None:
+    """Write a file whole or not at all.
+
+    Args:
+        path: the file.
+        description: JSON; ``sha256`` is added to it.
+        groups: name to tensors by name; they may share no memory.
+
+    Raises:
+        OSError: the disk is full, say; an earlier file stays as it was.
+    """
+    data = {
+        f"{name}.safetensors": save({key: tensor.detach().cpu().contiguous() for key, tensor in tensors.items()})
+        for name, tensors in groups.items()
+    }
+    stated = {**description, "sha256": {name: sha256(content).hexdigest() for name, content in data.items()}}
+    text = json.dumps(stated, indent=1, allow_nan=False).encode()
+    with replacing(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
+        for name, content in {_DESCRIPTION: text, **data}.items():
+            archive.writestr(name, content)
+
+
+class TensorArchive:
+    """A file that :func:`write_archive` wrote, in memory.
+
+    Args:
+        path: the file.
+
+    Attributes:
+        description: its JSON.
+        groups: the names of the groups of tensors.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ArchiveError: (a ValueError) it is no such file, or damaged.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        try:
+            self._data = _entries(Path(path).read_bytes())
+            self.description = _parse(self._data.pop(_DESCRIPTION))
+        except (zipfile.BadZipFile, NotImplementedError, EOFError, KeyError, RuntimeError, OverflowError) as error:
+            raise ArchiveError(f"{type(error).__name__}: {error}") from error
+        stated = self.description.get("sha256")
+        if not isinstance(stated, dict) or set(stated) != set(self._data):
+            raise ArchiveError("its entries are not those that it describes")
+        for name, content in self._data.items():
+            if sha256(content).hexdigest() != stated[name]:
+                raise ArchiveError(f"{name} is not what was written: its SHA-256 differs")
+        self.groups = {name.removesuffix(".safetensors") for name in self._data}
+
+    def tensors(self, group: str) -> dict[str, Tensor]:
+        """The tensors of a group by name.
+
+        Raises:
+            ArchiveError: (a ValueError) there is no such group, or it cannot be read.
+        """
+        name = f"{group}.safetensors"
+        if name not in self._data:
+            raise ArchiveError(f"it holds no {name}")
+        try:
+            return load(self._data[name])
+        except (SafetensorError, ValueError, KeyError, TypeError, RuntimeError, OverflowError) as error:
+            raise ArchiveError(f"{name}: {error}") from error
+
+
+def _entries(content: bytes) -> dict[str, bytes]:
+    """The entries of a zip archive, none of which may be compressed: what is read is no more than the file holds."""
+    found: dict[str, bytes] = {}
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        for entry in archive.infolist():
+            if entry.filename != _DESCRIPTION and not _GROUP.fullmatch(entry.filename):
+                raise ArchiveError(f"it has an entry {entry.filename[:60]!r}, which no file of ours has")
+            if entry.filename in found:
+                raise ArchiveError(f"it has {entry.filename} twice")
+            if entry.compress_type != zipfile.ZIP_STORED or entry.file_size != entry.compress_size:
+                raise ArchiveError(f"{entry.filename} is compressed, which no file of ours is")
+            if entry.file_size > (_MOST_JSON if entry.filename == _DESCRIPTION else len(content)):
+                raise ArchiveError(f"{entry.filename} says that it has {entry.file_size} bytes")
+            found[entry.filename] = archive.read(entry)
+    if _DESCRIPTION not in found:
+        raise ArchiveError(f"it has no {_DESCRIPTION}")
+    return found
+
+
+def _parse(text: bytes) -> dict[str, Any]:
+    def refuse(name: str) -> Any:
+        raise ValueError(f"{name} is no number")
+
+    try:
+        found = json.loads(text.decode("utf-8"), parse_constant=refuse)
+    except (ValueError, RecursionError) as error:
+        raise ArchiveError(f"{_DESCRIPTION}: {error}") from error
+    if not isinstance(found, dict):
+        raise ArchiveError(f"{_DESCRIPTION} must be an object, got {type(found).__name__}")
+    return found

@@ -1,0 +1,181 @@
+"""Policy: the contract of everything that acts, and the tables that find policies and their parts by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import import_module
+from typing import Any, ClassVar
+
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, dispatch
+from torch import Tensor
+from torchrl.envs import Transform
+
+from lw_torchrl._checks import check_choice, missing_keys
+from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
+from lw_torchrl.transforms.qaf import QAFTransform
+
+TextEncoding = Callable[[Sequence[str]], Tensor]
+
+POLICIES: dict[str, str | type[Policy]] = {
+    "ActorEnsemble": "lw_torchrl.modules.actor_ensemble",
+    "DescriptorConditionedActor": "lw_torchrl.modules.descriptor_conditioned_actor",
+    "PlanConditionedActor": "lw_torchrl.modules.plan_conditioned_actor",
+    "ScriptedSkillActor": "lw_torchrl.modules.scripted_skill_actor",
+}
+"""The class's name, as policy files say it, to the module that has the class, or to the class itself."""
+
+
+@dataclass(frozen=True)
+class Method:
+    """A way to condition a policy on its task.
+
+    Attributes:
+        policy: a name in :data:`POLICIES`.
+        options: of that class.
+    """
+
+    policy: str
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+
+METHODS: dict[str, Method] = {
+    "pcbc": Method("PlanConditionedActor"),
+    "dc": Method("DescriptorConditionedActor", {"condition": "description"}),
+    "one-hot": Method("DescriptorConditionedActor", {"condition": "one-hot"}),
+}
+"""What ``train --method`` and ``reproduce --methods`` offer: on plans, on the task's description, on its number."""
+
+
+class Policy(TensorDictModuleBase):
+    """A module that acts, and knows what it was made of.
+
+    A subclass splits its work in two, :meth:`prepare` and :meth:`act`; ``out_keys`` names what :meth:`act` returns, in
+    its order, the action first.
+
+    Attributes:
+        config: the keyword arguments that make it again, as JSON.
+        plans: what it carries out; None where it is not conditioned on plans.
+        tasks: the names of the tasks that it can act in.
+        plan_options: whether its class has options that speak of a plan's steps, ``focus`` say.
+        row_by_row: whether a row's action is the same to the last bit whatever rows stand beside it; networks' are
+            not, and are run on blocks of one size.
+
+    Source: the contract that ``torchrl.objectives`` and :func:`lw_torchrl.evaluate` rely on.
+    """
+
+    config: dict[str, Any]
+    plans: Plans | None = None
+    tasks: tuple[str, ...]
+    plan_options: ClassVar[bool] = False
+    row_by_row: ClassVar[bool] = False
+
+    @classmethod
+    def for_plans(cls, plans: Plans, *, text_encoder: TextEncoding | None = None, **options: Any) -> Policy:
+        """One for the tasks of ``plans``."""
+        raise NotImplementedError(f"{cls.__name__} must say how it is made for plans: override for_plans")
+
+    def transform(self) -> Transform | None:
+        """A new transform that writes what the policy reads and the environment does not give; None for none."""
+        return None
+
+    def prepare(self, tensordict: TensorDictBase) -> tuple[Tensor, ...]:
+        """What no trained parameter touches; all checks of values are here, outside of vmap."""
+        raise NotImplementedError(f"{type(self).__name__} must override prepare and act")
+
+    def act(self, *prepared: Tensor) -> tuple[Tensor, ...]:
+        """From what :meth:`prepare` gives to a tensor for each of ``out_keys``; can be vmapped over parameters."""
+        raise NotImplementedError(f"{type(self).__name__} must override prepare and act")
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``out_keys``."""
+        for key, value in zip(self.out_keys, self.act(*self.prepare(tensordict)), strict=True):
+            tensordict.set(key, value)
+        return tensordict
+
+    def read(self, tensordict: TensorDictBase) -> list[Tensor]:
+        """The tensors of ``in_keys``; :class:`ValueError` names those that are missing."""
+        found = [tensordict.get(key, None) for key in self.in_keys]
+        if any(one is None for one in found):
+            raise missing_keys(tensordict.keys(True, True), *self.in_keys)
+        return found
+
+    def fit_normalization(self, observation: Tensor, weights: Tensor | None = None) -> None:
+        """Take the statistics of observations (R, 39) float32, in place; ``weights`` (R,) float32, with the sum 1, tell
+        how much each counts. Here: there is nothing to normalise."""
+
+    def describe(self) -> dict[str, Any]:
+        """All that :meth:`from_description` needs to make it again, its weights aside, as JSON."""
+        return {"kind": type(self).__name__, "options": self.config}
+
+    @classmethod
+    def from_description(cls, found: Mapping[str, Any], text_encoder: TextEncoding | None = None) -> Policy:
+        """Make what :meth:`describe` described, with fresh weights."""
+        return cls(**found["options"])
+
+    def with_plans(self, plans: Plans | Mapping[str, ConditionalPlan]) -> Policy:
+        """The same weights under other plans.
+
+        Raises:
+            TypeError: the policy is not conditioned on plans.
+        """
+        raise TypeError(f"with_plans is for policies with plans, {type(self).__name__} is conditioned on descriptions")
+
+
+def policy_class(kind: Any) -> type[Policy]:
+    """The class of a name in :data:`POLICIES`; :class:`ValueError` names the nearest if there is none."""
+    entry = POLICIES[check_choice("kind of policy", kind, POLICIES)]
+    return getattr(import_module(entry), kind) if isinstance(entry, str) else entry
+
+
+def make_policy(
+    method: str,
+    plans: Plans | Mapping[str, ConditionalPlan],
+    *,
+    text_encoder: TextEncoding | None = None,
+    **options: Any,
+) -> Policy:
+    """A policy of a method for the tasks of some plans.
+
+    Args:
+        method: one of :data:`METHODS`.
+        plans: what it carries out, or, where the method knows no plans, the tasks that it is for.
+        text_encoder: texts to vectors (n, E) float32; None for the shipped sentence encoder.
+        **options: of the policy's class.
+
+    Raises:
+        ValueError: another method (with the nearest), or a wrong option.
+
+    Example:
+        >>> import lw_torchrl as lw
+        >>> make_policy("dc", lw.load_plans("MT10"), width=64).tasks == lw.MT10
+        True
+    """
+    chosen = METHODS[check_choice("method", method, METHODS)]
+    return policy_class(chosen.policy).for_plans(
+        as_plans(plans), text_encoder=text_encoder, **{**chosen.options, **options}
+    )
+
+
+def from_description(found: Any, text_encoder: TextEncoding | None = None) -> Policy:
+    """Make the policy that :meth:`Policy.describe` described, with fresh weights.
+
+    Raises:
+        ValueError: it is no description, or of a kind that :data:`POLICIES` lacks.
+    """
+    if not isinstance(found, Mapping) or not isinstance(found.get("options"), Mapping):
+        raise ValueError(f"a policy's description must have kind and options, got {found!r:.80}")
+    return policy_class(found.get("kind")).from_description(found, text_encoder)
+
+
+def plans_of(actor: Any) -> Plans | None:
+    """The plans that an actor carries out, be it a :class:`Policy` or any module with ``plans``."""
+    return getattr(actor, "plans", None)
+
+
+def transform_of(actor: Any, plans: Plans | None) -> Transform | None:
+    """What must run before an actor: what it asks for itself, or else the answers to the queries of ``plans``."""
+    own = actor.transform() if isinstance(actor, Policy) else None
+    return QAFTransform(plans) if own is None and plans is not None else own

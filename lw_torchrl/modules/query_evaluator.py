@@ -1,0 +1,85 @@
+"""QueryEvaluator: what answers a plan's conditions inside a policy, in the query answering function's place."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib import import_module
+from typing import Any
+
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+
+from lw_torchrl._checks import check_choice
+from lw_torchrl.language.plans import Plans
+
+EVALUATORS: dict[str, str | type[QueryEvaluator]] = {}
+"""The class's name, as policy files say it, to the module that has the class, or to the class itself."""
+
+
+class QueryEvaluator(TensorDictModuleBase):
+    """A module inside a policy that answers the plans' conditions: saved with the policy, and trained by its loss.
+
+    A subclass gives :meth:`logits` and, in ``config``, the keyword arguments that make it again beside the plans.
+
+    Reads ``in_keys``, ``observation`` (B, 39) float32 and ``task_id`` (B,) int64 unless it says otherwise; writes
+    ``qaf_logits`` (B, S) float32, positive where a condition of the row's plan holds, in the order of its steps. The
+    policy's attention is a softmax of the logits over the steps that there are; exact truth is worth 5 and -5.
+
+    Args:
+        plans: whose conditions it answers.
+
+    Example:
+        >>> import lw_torchrl as lw, torch
+        >>> class Guess(QueryEvaluator):
+        ...     def logits(self, observation, task_id):
+        ...         return torch.zeros(*task_id.shape, self.plans.num_steps)
+        >>> plans = lw.load_plans("MT10")
+        >>> actor = lw.PlanConditionedActor(plans, evaluator=Guess(plans))
+        >>> actor.in_keys
+        ['observation', 'task_id']
+
+    Source: paper section 'Differentiability and Optimization', which names a visual question answering model.
+    """
+
+    config: dict[str, Any]
+
+    def __init__(self, plans: Plans) -> None:
+        super().__init__()
+        self.plans = plans
+        self.config = {}
+        self.in_keys: list[NestedKey] = ["observation", "task_id"]
+        self.out_keys: list[NestedKey] = ["qaf_logits"]
+
+    def logits(self, *read: Tensor) -> Tensor:
+        """The tensors of ``in_keys`` to (B, S) float32."""
+        raise NotImplementedError(f"{type(self).__name__} must override logits")
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``qaf_logits``."""
+        return tensordict.set(self.out_keys[0], self.logits(*(tensordict.get(key) for key in self.in_keys)))
+
+    def with_plans(self, plans: Plans) -> QueryEvaluator:
+        """The same weights for the conditions of other plans."""
+        other = type(self)(plans, **self.config)
+        other.load_state_dict(self.state_dict())
+        return other.train(self.training)
+
+    def describe(self) -> dict[str, Any]:
+        """All that :func:`evaluator_from_description` needs beside the plans, as JSON."""
+        return {"kind": type(self).__name__, "options": self.config}
+
+
+def evaluator_from_description(found: Any, plans: Plans) -> QueryEvaluator:
+    """Make the evaluator that :meth:`QueryEvaluator.describe` described, with fresh weights.
+
+    Raises:
+        ValueError: it is no description, or of a kind that :data:`EVALUATORS` lacks.
+    """
+    if not isinstance(found, Mapping) or not isinstance(found.get("options"), Mapping):
+        raise ValueError(f"an evaluator's description must have kind and options, got {found!r:.80}")
+    kind: str = check_choice("kind of evaluator", found.get("kind"), EVALUATORS)
+    entry = EVALUATORS[kind]
+    made = getattr(import_module(entry), kind) if isinstance(entry, str) else entry
+    return made(plans, **found["options"])
