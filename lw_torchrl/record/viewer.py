@@ -60,8 +60,8 @@ def open_viewer(
 
     Raises:
         FileNotFoundError: there is no such file, or rerun's viewer is not installed.
-        ValueError: the file is no recording, the picture's name does not end in ".png", the size is no "WxH",
-            or the recording has no such step.
+        ValueError: the file is no recording, or a cut one; the picture's name does not end in ".png", the size is no
+            "WxH", or the recording has no such step.
         RuntimeError: the viewer ended with an error; the message says what to do about it.
 
     Example:
@@ -74,13 +74,14 @@ def open_viewer(
         check_int("step", step, minimum=0)
         if screenshot is None:
             raise ValueError("step is the moment of a picture; give screenshot as well")
+    if screenshot is not None and Path(screenshot).suffix != ".png":
+        raise ValueError(f"screenshot must end in '.png', got {str(screenshot)!r}")
+    _verify(recording)
     if screenshot is None:
         with _viewer(recording, "--window-size", window_size) as (process, output):
             if process.wait():
                 raise _failure(output)
         return
-    if Path(screenshot).suffix != ".png":
-        raise ValueError(f"screenshot must end in '.png', got {str(screenshot)!r}")
     with replacing(screenshot) as picture:
         _take_picture(recording, picture.absolute(), window_size, step)
         if not picture.is_file() or picture.read_bytes()[: len(PNG_MAGIC)] != PNG_MAGIC:
@@ -98,6 +99,19 @@ def check_recording(path: str | os.PathLike[str]) -> Path:
     if head[:3] != RRD_MAGIC:
         raise ValueError(f"{str(recording)!r} is no rerun recording: it begins with {head!r}")
     return recording
+
+
+def _verify(recording: Path) -> None:
+    """Raise :class:`ValueError` for a recording that is cut or damaged: the viewer would wait for the rest of it."""
+    done = subprocess.run([_binary(), "rrd", "verify", str(recording)], capture_output=True, text=True, check=False)
+    if done.returncode:
+        said = [line for line in _plain(done.stdout + done.stderr).splitlines() if str(recording) in line]
+        reason = said[0].rpartition(": ")[2] if said else "rerun cannot read it"
+        raise ValueError(f"recording {str(recording)!r} is cut or damaged: {reason}")
+
+
+def _plain(text: str) -> str:
+    return re.sub(r"\x1b\[[0-9;]*m", "", text)
 
 
 def _binary() -> str:
@@ -137,7 +151,7 @@ def _viewer(*arguments: str | Path) -> Iterator[tuple[subprocess.Popen[bytes], I
 
 def _failure(output: IO[bytes]) -> RuntimeError:
     output.seek(0)
-    text = re.sub(r"\x1b\[[0-9;]*m", "", output.read().decode("utf-8", "replace"))
+    text = _plain(output.read().decode("utf-8", "replace"))
     for pattern, reason in REASONS:
         if re.search(pattern, text):
             return RuntimeError(f"rerun's viewer stopped: {reason}.")

@@ -19,7 +19,7 @@ from torchrl.record.loggers import Logger
 from tqdm.auto import tqdm
 
 from lw_torchrl._checks import check_choice, check_int, check_scale
-from lw_torchrl.modules.policy import Policy
+from lw_torchrl.modules.policy import Policy, plans_of
 from lw_torchrl.trainers.checkpoint import (
     check_can_be_saved,
     check_description,
@@ -91,6 +91,20 @@ def make_optimizer(
     return optimizer, torch.optim.lr_scheduler.LambdaLR(optimizer, lambda _: 1.0)
 
 
+def check_belongs(actor: Any, replay: TensorDictReplayBuffer) -> None:
+    """Raise :class:`ValueError` unless the actor writes ``action``, and the buffer answers the queries of its plans."""
+    if "action" not in actor.out_keys:
+        raise ValueError(f"actor must write 'action', it writes {', '.join(map(str, actor.out_keys))}")
+    own = plans_of(actor)
+    for transform in replay.transform if own is not None else ():
+        answered = plans_of(transform)
+        if answered is not None and own is not None and (different := answered.differences(own)):
+            raise ValueError(
+                f"replay's QAFTransform must have the actor's plans, they differ for {', '.join(different)}; use "
+                "actor.transform()"
+            )
+
+
 def fit_normalization(actor: Policy, replay: TensorDictReplayBuffer) -> None:
     """Give the actor the statistics of the buffer's rows, each as often as :class:`CoLearningSampler` draws it.
 
@@ -150,6 +164,7 @@ class BehavioralCloningTrainer:
         self.actor, self.replay, self.logger, self.progress = actor, replay, logger, progress
         self.config = config = config or BehavioralCloningConfig()
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
+        check_belongs(actor, replay)
         if self.checkpoint is not None:
             check_can_be_saved(actor)
         if replay._prefetch:

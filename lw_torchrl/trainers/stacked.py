@@ -16,7 +16,12 @@ from torchrl.objectives.utils import distance_loss
 from tqdm.auto import tqdm
 
 from lw_torchrl.modules.policy import Policy
-from lw_torchrl.trainers.behavioral_cloning import BehavioralCloningConfig, fit_normalization, make_optimizer
+from lw_torchrl.trainers.behavioral_cloning import (
+    BehavioralCloningConfig,
+    check_belongs,
+    fit_normalization,
+    make_optimizer,
+)
 from lw_torchrl.trainers.checkpoint import (
     check_can_be_saved,
     check_description,
@@ -90,6 +95,7 @@ class StackedBehavioralCloning:
             check_can_be_saved(self.actors[0])
         self.states = []
         for number, (actor, replay) in enumerate(zip(actors, replays, strict=True)):
+            check_belongs(actor, replay)
             generator = torch.Generator().manual_seed(config.seed + number)
             replay.set_rng(generator)
             self.states.append(TrainingState(replay.sampler, generator))
