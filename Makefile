@@ -1,17 +1,27 @@
 # make demo    train, evaluate and record a plan-conditioned policy on MT10
-# make test    the whole test suite, warnings as errors
+# make test    the whole test suite, warnings as errors; JOBS=4 for four processes instead of two
 # make check   ruff and mypy
 # make bench   what everything costs, against rivals (docs/performance.md)
 # make setup   the environment alone (.venv)
+# make test-python PYTHON=python3.13   the suite under another interpreter, in an environment of its own
+#
+# On Linux pip's own torch brings gigabytes of CUDA. For the small one, or for another CUDA, name PyTorch's index when the
+# environment is first made (https://pytorch.org/get-started/locally/ has the list):
+#     make setup TORCH_INDEX=https://download.pytorch.org/whl/cpu
 PYTHON ?= python3
-BIN := .venv/bin
-READY := .venv/.ready
+VENV ?= .venv
+JOBS ?= 2
+TORCH_INDEX ?=
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
 
-.PHONY: demo test check setup bench clean
+.PHONY: demo test test-python check setup bench clean
 demo: $(READY)
 	$(BIN)/lw-torchrl demo
 test: $(READY)
-	OMP_NUM_THREADS=1 $(BIN)/pytest
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n $(JOBS) --dist worksteal
+test-python:
+	$(MAKE) test VENV=.venv-$(notdir $(PYTHON)) PYTHON=$(PYTHON)
 check: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -23,9 +33,9 @@ bench: $(READY)
 # pip, not uv: constraints.txt pins torch, and pip is what honours the wheel an environment provides.
 $(READY): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "lw_torchrl needs Python 3.11 or newer; this is %s. Try: make PYTHON=python3.11" % sys.version.split()[0])'
-	test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --disable-pip-version-check $(addprefix --extra-index-url ,$(TORCH_INDEX)) -c constraints.txt -e '.[dev]'
 	@touch $@
 
 clean:
-	rm -rf .venv runs
+	rm -rf .venv .venv-* runs

@@ -13,9 +13,11 @@ import tyro
 
 import lw_torchrl as lw
 from lw_torchrl._files import write_text
+from lw_torchrl.evaluation import count_solved
 from lw_torchrl.evaluation.comparison import markdown_table
+from lw_torchrl.experiments.execution import execute_run
 from lw_torchrl.experiments.recipes import CLEAN, NOISY, PRESETS, SETTINGS, Member, Preset
-from lw_torchrl.experiments.runs import Run, execute_run
+from lw_torchrl.experiments.runs import Run
 
 FULL = PRESETS["strong"]["few-shot"]
 
@@ -67,7 +69,7 @@ def main(arguments: Arguments) -> None:
         runs = [Run(SETTINGS["few-shot"], "pcbc", seed, shorter) for seed in arguments.seeds]
         results = [execute_run(run, plans, arguments.out) for run in runs]
         means = ", ".join(f"{result.mean_success:.3f}" for result in results)
-        solved = ", ".join(str(lw.count_solved([list(result.success_once.values())])) for result in results)
+        solved = ", ".join(str(count_solved([list(result.success_once.values())])) for result in results)
         shown = (change, means, solved)
         print(" | ".join(shown), flush=True)
         lines.append(shown)

@@ -10,6 +10,7 @@ from torchrl.data import ReplayBufferEnsemble, TensorDictReplayBuffer, TensorSto
 
 import lw_torchrl as lw
 from benchmarks.report import Row, Settings, compare, take_turns
+from lw_torchrl.data import JoinedStorage
 
 TASKS, BATCH, CALLS = 50, 200, 20
 TARGET = "coffee-push"
@@ -89,7 +90,7 @@ def _co_learning(settings: Settings, count: int) -> list[Row]:
     base = _rows(count, torch.tensor([lw.task_id(task) for task in lw.MT10]).repeat_interleave(size))
     target = _rows(500, torch.full((500,), lw.task_id(TARGET)))
     ours = TensorDictReplayBuffer(
-        storage=lw.JoinedStorage([base, target]),
+        storage=JoinedStorage([base, target]),
         sampler=lw.CoLearningSampler(TARGET),
         batch_size=BATCH,
         collate_fn=lambda batch: batch,

@@ -1,157 +1,92 @@
-"""Language-World and Plan Conditioned Behavioral Cloning as TorchRL components."""
+"""Language-World and Plan Conditioned Behavioral Cloning as TorchRL components.
 
-# First, since where TorchRL loads MuJoCo it names a rendering library that is absent.
-import lw_torchrl.envs  # noqa: F401
-from lw_torchrl.data import (
-    CoLearningSampler,
-    CollectConfig,
-    DatasetError,
-    Demonstrations,
-    JoinedDemonstrations,
-    JoinedStorage,
-    LanguageWorldExperienceReplay,
-    TaskBalancedSampler,
-    collect_demonstrations,
-)
-from lw_torchrl.envs import Engine, EngineStep, ExpertActor, LanguageWorldEnv, episode_seed
-from lw_torchrl.evaluation import (
-    EpisodeResult,
-    Estimate,
-    EvaluationResult,
-    Summary,
-    TaskSummary,
-    count_solved,
-    evaluate,
-    interquartile_mean,
-    mean_difference,
-    mean_rate,
-    plot_sorted_tasks,
-    plot_success,
-    probability_of_improvement,
-    published,
-    published_curves,
-    published_plans,
-    summarize,
-    summarize_rates,
-)
-from lw_torchrl.language.plan_files import load_plans, save_plans
-from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans, PlanStep
-from lw_torchrl.language.queries import Clause, Query, QueryError, parse_query, supported_queries
-from lw_torchrl.language.query_program import QueryProgram
-from lw_torchrl.language.query_search import QueryMatch, nearest_query
-from lw_torchrl.language.skill_program import SkillProgram
-from lw_torchrl.language.skills import ScriptedSkill, SkillError, load_skills, nearest_skill
-from lw_torchrl.language.tasks import (
-    MT10,
-    MT50,
-    TASKS,
-    NamedObject,
-    Task,
-    TaskError,
-    load_tasks,
-    resolve_tasks,
-    task_id,
-)
-from lw_torchrl.language.text import TextEncoder, encode_texts
-from lw_torchrl.modules import (
-    ActorEnsemble,
-    DescriptorConditionedActor,
-    ObservationFeatures,
-    PlanAttention,
-    PlanConditionedActor,
-    Policy,
-    QueryEvaluator,
-    ScriptedSkillActor,
-)
-from lw_torchrl.record import RerunLogger
-from lw_torchrl.trainers import (
-    BehavioralCloningConfig,
-    BehavioralCloningTrainer,
-    StackedBehavioralCloning,
-    load_actor,
-    save_actor,
-)
-from lw_torchrl.transforms import QAFTransform, RandomYaw
+Names are imported when they are first used: ``import lw_torchrl`` loads neither torch nor MuJoCo.
+"""
 
-__version__ = "0.1.0"
+from __future__ import annotations
 
-__all__ = [
-    "MT10",
-    "MT50",
-    "TASKS",
-    "ActorEnsemble",
-    "BehavioralCloningConfig",
-    "BehavioralCloningTrainer",
-    "Clause",
-    "CoLearningSampler",
-    "CollectConfig",
-    "ConditionalPlan",
-    "DatasetError",
-    "Demonstrations",
-    "DescriptorConditionedActor",
-    "Engine",
-    "EngineStep",
-    "EpisodeResult",
-    "Estimate",
-    "EvaluationResult",
-    "ExpertActor",
-    "JoinedDemonstrations",
-    "JoinedStorage",
-    "LanguageWorldEnv",
-    "LanguageWorldExperienceReplay",
-    "NamedObject",
-    "ObservationFeatures",
-    "PlanAttention",
-    "PlanConditionedActor",
-    "PlanError",
-    "PlanStep",
-    "Plans",
-    "Policy",
-    "QAFTransform",
-    "Query",
-    "QueryError",
-    "QueryEvaluator",
-    "QueryMatch",
-    "QueryProgram",
-    "RandomYaw",
-    "RerunLogger",
-    "ScriptedSkill",
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:  # the table below, for type checkers and editors
+    from lw_torchrl.data import CoLearningSampler as CoLearningSampler
+    from lw_torchrl.data import LanguageWorldExperienceReplay as LanguageWorldExperienceReplay
+    from lw_torchrl.data import TaskBalancedSampler as TaskBalancedSampler
+    from lw_torchrl.data import collect_demonstrations as collect_demonstrations
+    from lw_torchrl.envs import ExpertActor as ExpertActor
+    from lw_torchrl.envs import LanguageWorldEnv as LanguageWorldEnv
+    from lw_torchrl.evaluation import EvaluationResult as EvaluationResult
+    from lw_torchrl.evaluation import evaluate as evaluate
+    from lw_torchrl.evaluation import plot_success as plot_success
+    from lw_torchrl.language.plan_files import load_plans as load_plans
+    from lw_torchrl.language.plan_files import save_plans as save_plans
+    from lw_torchrl.language.plans import ConditionalPlan as ConditionalPlan
+    from lw_torchrl.language.plans import PlanError as PlanError
+    from lw_torchrl.language.plans import Plans as Plans
+    from lw_torchrl.language.plans import PlanStep as PlanStep
+    from lw_torchrl.language.queries import QueryError as QueryError
+    from lw_torchrl.language.queries import parse_query as parse_query
+    from lw_torchrl.language.queries import supported_queries as supported_queries
+    from lw_torchrl.language.query_program import QueryProgram as QueryProgram
+    from lw_torchrl.language.query_search import nearest_query as nearest_query
+    from lw_torchrl.language.skills import load_skills as load_skills
+    from lw_torchrl.language.skills import nearest_skill as nearest_skill
+    from lw_torchrl.language.tasks import MT10 as MT10
+    from lw_torchrl.language.tasks import MT50 as MT50
+    from lw_torchrl.language.tasks import TASKS as TASKS
+    from lw_torchrl.language.tasks import Task as Task
+    from lw_torchrl.language.tasks import load_tasks as load_tasks
+    from lw_torchrl.language.tasks import resolve_tasks as resolve_tasks
+    from lw_torchrl.language.tasks import task_id as task_id
+    from lw_torchrl.modules import ActorEnsemble as ActorEnsemble
+    from lw_torchrl.modules import DescriptorConditionedActor as DescriptorConditionedActor
+    from lw_torchrl.modules import PlanConditionedActor as PlanConditionedActor
+    from lw_torchrl.modules import Policy as Policy
+    from lw_torchrl.modules import QueryEvaluator as QueryEvaluator
+    from lw_torchrl.modules import ScriptedSkillActor as ScriptedSkillActor
+    from lw_torchrl.record import RerunLogger as RerunLogger
+    from lw_torchrl.trainers import BehavioralCloningConfig as BehavioralCloningConfig
+    from lw_torchrl.trainers import BehavioralCloningTrainer as BehavioralCloningTrainer
+    from lw_torchrl.trainers import StackedBehavioralCloning as StackedBehavioralCloning
+    from lw_torchrl.trainers import load_actor as load_actor
+    from lw_torchrl.trainers import save_actor as save_actor
+    from lw_torchrl.transforms import QAFTransform as QAFTransform
+    from lw_torchrl.transforms import RandomYaw as RandomYaw
+
+__version__ = "0.2.0"
+
+_NAMES = {
+    "lw_torchrl.data": "CoLearningSampler LanguageWorldExperienceReplay TaskBalancedSampler collect_demonstrations",
+    "lw_torchrl.envs": "ExpertActor LanguageWorldEnv",
+    "lw_torchrl.evaluation": "EvaluationResult evaluate plot_success",
+    "lw_torchrl.language.plan_files": "load_plans save_plans",
+    "lw_torchrl.language.plans": "ConditionalPlan PlanError Plans PlanStep",
+    "lw_torchrl.language.queries": "QueryError parse_query supported_queries",
+    "lw_torchrl.language.query_program": "QueryProgram",
+    "lw_torchrl.language.query_search": "nearest_query",
+    "lw_torchrl.language.skills": "load_skills nearest_skill",
+    "lw_torchrl.language.tasks": "MT10 MT50 TASKS Task load_tasks resolve_tasks task_id",
+    "lw_torchrl.modules": "ActorEnsemble DescriptorConditionedActor PlanConditionedActor Policy QueryEvaluator "
     "ScriptedSkillActor",
-    "SkillError",
-    "SkillProgram",
-    "StackedBehavioralCloning",
-    "Summary",
-    "Task",
-    "TaskBalancedSampler",
-    "TaskError",
-    "TaskSummary",
-    "TextEncoder",
-    "collect_demonstrations",
-    "count_solved",
-    "encode_texts",
-    "episode_seed",
-    "evaluate",
-    "interquartile_mean",
-    "load_actor",
-    "load_plans",
-    "load_skills",
-    "load_tasks",
-    "mean_difference",
-    "mean_rate",
-    "nearest_query",
-    "nearest_skill",
-    "parse_query",
-    "plot_sorted_tasks",
-    "plot_success",
-    "probability_of_improvement",
-    "published",
-    "published_curves",
-    "published_plans",
-    "resolve_tasks",
-    "save_actor",
-    "save_plans",
-    "summarize",
-    "summarize_rates",
-    "supported_queries",
-    "task_id",
-]
+    "lw_torchrl.record": "RerunLogger",
+    "lw_torchrl.trainers": "BehavioralCloningConfig BehavioralCloningTrainer StackedBehavioralCloning "
+    "load_actor save_actor",
+    "lw_torchrl.transforms": "QAFTransform RandomYaw",
+}
+_ROOM = {name: room for room, names in _NAMES.items() for name in names.split()}
+_PACKAGES = ("data", "envs", "evaluation", "experiments", "language", "modules", "record", "trainers", "transforms")
+
+__all__ = sorted(_ROOM)
+
+
+def __getattr__(name: str) -> object:
+    if name in _PACKAGES:
+        return import_module(f"lw_torchrl.{name}")
+    if name not in _ROOM:
+        raise AttributeError(f"module 'lw_torchrl' has no attribute {name!r}")
+    found = globals()[name] = getattr(import_module(_ROOM[name]), name)
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__, *_PACKAGES})

@@ -103,7 +103,7 @@ def test_ablations_write_a_table_of_what_was_run(monkeypatch, tmp_path, capsys):
         rates = {"reach": 1.0, "push": 0.5 + 0.25 * unit.seed}
         return SimpleNamespace(success_once=rates, mean_success=sum(rates.values()) / 2)
 
-    monkeypatch.setattr(ablations, "run_unit", run)
+    monkeypatch.setattr(ablations, "execute_run", run)
     ablations.main(ablations.Arguments(seeds=(0, 2), steps=3, out=tmp_path))
     assert len(seen) == 2 * len(ablations.ABLATIONS)
     assert seen[:2] == [("strong-3-steps", 3, 0), ("strong-3-steps", 3, 2)]

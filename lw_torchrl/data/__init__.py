@@ -1,5 +1,6 @@
 """Demonstrations: collecting them, reading them as a replay buffer, sampling them in exact proportions."""
 
+import lw_torchrl._torchrl  # noqa: F401
 from lw_torchrl.data.co_learning import CoLearningSampler
 from lw_torchrl.data.collect import collect_demonstrations
 from lw_torchrl.data.dataset import CollectConfig, DatasetError, Demonstrations

@@ -11,18 +11,15 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.data import Bounded, Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase
 
 from lw_torchrl._checks import check_choice, check_int
 from lw_torchrl.envs.engine import ACTION_SIZE, OBSERVATION_SIZE, Engine
-from lw_torchrl.envs.engines.metaworld import MetaWorldEngine, naming_absent_renderer
+from lw_torchrl.envs.engines.metaworld import MetaWorldEngine
+from lw_torchrl.envs.engines.vectorized.engine import VectorizedEngine
 from lw_torchrl.envs.seeding import episode_seed
 from lw_torchrl.language.tasks import resolve_tasks, task_id
-
-with naming_absent_renderer():  # these import MuJoCo
-    from torchrl.data import Bounded, Categorical, Composite, Unbounded
-    from torchrl.envs import EnvBase
-
-    from lw_torchrl.envs.engines.vectorized.engine import VectorizedEngine
 
 ENGINES: dict[str, Callable[..., Engine]] = {"vectorized": VectorizedEngine, "metaworld": MetaWorldEngine}
 

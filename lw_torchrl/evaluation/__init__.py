@@ -1,5 +1,6 @@
 """Evaluation: exactly k episodes of each task, their results, statistics over seeds, and figures."""
 
+import lw_torchrl._torchrl  # noqa: F401
 from lw_torchrl.evaluation.comparison import MethodComparison, Pair
 from lw_torchrl.evaluation.figures import plot_sorted_tasks, plot_success
 from lw_torchrl.evaluation.protocol import evaluate

@@ -169,10 +169,10 @@ def summarize(results: Mapping[Any, EvaluationResult] | Sequence[EvaluationResul
             their episodes_per_task, noise_scale or max_steps differ.
 
     Example:
-        >>> import lw_torchrl as lw
-        >>> episodes = tuple(lw.EpisodeResult("reach", k, k > 0, 9, None, None) for k in range(2))
-        >>> result = lw.EvaluationResult({"tasks": ["reach"], "episodes_per_task": 2}, episodes)
-        >>> lw.summarize({7: result}).by_seed
+        >>> from lw_torchrl.evaluation import EpisodeResult, EvaluationResult, summarize
+        >>> episodes = tuple(EpisodeResult("reach", k, k > 0, 9, None, None) for k in range(2))
+        >>> result = EvaluationResult({"tasks": ["reach"], "episodes_per_task": 2}, episodes)
+        >>> summarize({7: result}).by_seed
         {'7': 0.5}
     """
     named = dict(results) if isinstance(results, Mapping) else dict(enumerate(results))

@@ -1,5 +1,6 @@
 """Policies as TensorDictModules: plan-conditioned ones, the baselines, and what they are made of."""
 
+import lw_torchrl._torchrl  # noqa: F401
 from lw_torchrl.modules.actor_ensemble import ActorEnsemble
 from lw_torchrl.modules.descriptor_conditioned_actor import DescriptorConditionedActor
 from lw_torchrl.modules.observation_features import ObservationFeatures

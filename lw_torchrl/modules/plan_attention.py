@@ -49,7 +49,7 @@ class PlanAttention(TensorDictModuleBase):
         >>> plans = lw.load_plans("MT10")
         >>> reach = torch.tensor([lw.task_id("reach")])
         >>> state = TensorDict(qaf=torch.zeros(1, plans.num_steps, dtype=torch.bool), task_id=reach)
-        >>> weights = lw.PlanAttention(plans)(state)["skill_weights"]
+        >>> weights = PlanAttention(plans)(state)["skill_weights"]
         >>> len(plans["reach"].steps), int((weights > 0).sum())
         (3, 3)
 

@@ -3,6 +3,7 @@
 Importing this package loads no rerun; constructing a :class:`RerunLogger` does.
 """
 
+import lw_torchrl._torchrl  # noqa: F401
 from lw_torchrl.record.rerun_logger import RerunLogger
 from lw_torchrl.record.viewer import open_viewer
 

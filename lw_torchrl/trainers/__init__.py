@@ -1,5 +1,6 @@
 """Training: behavioral cloning of one actor or of many at once, and the checkpoints that it leaves."""
 
+import lw_torchrl._torchrl  # noqa: F401
 from lw_torchrl.trainers.behavioral_cloning import BehavioralCloningConfig, BehavioralCloningTrainer
 from lw_torchrl.trainers.checkpoint import load_actor, save_actor
 from lw_torchrl.trainers.stacked import StackedBehavioralCloning

@@ -12,6 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import TransformedEnv, check_env_specs
 
 import lw_torchrl as lw
+from lw_torchrl.envs import episode_seed
 from lw_torchrl.envs.engine import EngineStep
 
 
@@ -112,7 +113,7 @@ def test_an_unstable_simulation_is_a_fault_of_its_row(metaworld_env, tmp_path, m
 
     fresh = env.reset(again.clone().set("_reset", ~rest), select_reset_only=True)
     own = metaworld_env("push")
-    own.seed(lw.episode_seed("push", 0, 4))
+    own.seed(episode_seed("push", 0, 4))
     assert np.array_equal(fresh["observation"][1].numpy(), own.reset()[0].astype(np.float32))
     after = advance(env, fresh, torch.full((3, 4), 0.5))
     assert np.array_equal(after["observation"][1].numpy(), own.step(np.full(4, 0.5, np.float32))[0].astype(np.float32))
@@ -160,7 +161,7 @@ def test_an_engine_of_ones_own():
     assert engine.tasks == FEW
     assert engine.options == {"reward": "dense", "num_threads": 2}
     state = env.reset()
-    assert engine.resets == [([0, 1, 2], [lw.episode_seed(task, 4, 0) for task in FEW])]
+    assert engine.resets == [([0, 1, 2], [episode_seed(task, 4, 0) for task in FEW])]
     assert state["observation"].dtype == torch.float32
     action = torch.full((3, 4), 0.1)
     action[2] = 7.0
@@ -175,7 +176,7 @@ def test_an_engine_of_ones_own():
     assert state["reward"].dtype == torch.float32
     assert state["success"].flatten().tolist() == [True, False, True]
     env.reset(TensorDict({"_reset": torch.tensor([False, False, True])}, [3]))
-    assert engine.resets[1] == ([2], [lw.episode_seed("reach", 4, 1)])
+    assert engine.resets[1] == ([2], [episode_seed("reach", 4, 1)])
     env.close()
     assert engine.closed == 1
     env.close(raise_if_closed=False)

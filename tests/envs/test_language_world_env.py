@@ -12,6 +12,7 @@ from tensordict import TensorDict
 from torchrl.envs import TransformedEnv, check_env_specs
 
 import lw_torchrl as lw
+from lw_torchrl.envs import episode_seed
 
 
 @pytest.mark.parametrize("task", lw.MT50)
@@ -184,7 +185,7 @@ def test_every_task_starts_and_moves_as_metaworlds_own(mt50, metaworld_env):
     wrong, moved = [], 0
     for number, task in enumerate(lw.MT50):
         own = metaworld_env(task)
-        own.seed(lw.episode_seed(task, 3, 17))
+        own.seed(episode_seed(task, 3, 17))
         expected = [own.reset()[0].astype(np.float32)]
         rewards = []
         for action in actions[:, number].numpy():
@@ -197,7 +198,7 @@ def test_every_task_starts_and_moves_as_metaworlds_own(mt50, metaworld_env):
         if [state["reward"][number].item() for state in states[1:]] != rewards:
             wrong.append((task, "reward"))
         moved += not np.array_equal(got[0], got[-1])
-        own.seed(lw.episode_seed(task, 3, 0))
+        own.seed(episode_seed(task, 3, 0))
         if not np.array_equal(first[number].numpy(), own.reset()[0].astype(np.float32)):
             wrong.append((task, "episode 0"))
         own.close()
@@ -215,7 +216,7 @@ def test_eighty_steps_and_dense_reward_are_metaworlds_own(metaworld_env, scale, 
     state = env.reset()
     owns = [metaworld_env(task) for task in tasks]
     for own, task in zip(owns, tasks, strict=True):
-        own.seed(lw.episode_seed(task, 2, 0))
+        own.seed(episode_seed(task, 2, 0))
         own.reset()
     successes = 0
     generator = torch.Generator().manual_seed(0)

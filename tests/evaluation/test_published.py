@@ -7,6 +7,7 @@ import re
 import pytest
 
 import lw_torchrl as lw
+from lw_torchrl.evaluation import published, published_curves, published_plans
 
 MEANS = {
     ("zero-shot", "PCBC"): (0.258, 0.4035),
@@ -20,7 +21,7 @@ MEANS = {
 
 @pytest.mark.parametrize(("setting", "method"), MEANS)
 def test_they_are_complete_and_average_to_the_published_means(setting, method):
-    last, best = (lw.published(setting, method, which) for which in ("last", "best"))
+    last, best = (published(setting, method, which) for which in ("last", "best"))
     assert tuple(last) == tuple(best) == lw.MT50
     assert all(0 <= rate <= 1 for rate in (*last.values(), *best.values()))
     # 4 seeds of 20 episodes
@@ -31,37 +32,37 @@ def test_they_are_complete_and_average_to_the_published_means(setting, method):
 
 
 def test_the_default_is_the_last_evaluation_of_pcbc():
-    assert lw.published("few-shot") == lw.published("few-shot", "PCBC", "last")
+    assert published("few-shot") == published("few-shot", "PCBC", "last")
 
 
 @pytest.mark.parametrize("model", ["PaLM 2", "GPT-3.5", "GPT-3"])
 def test_the_generated_plans_rates(model):
-    found = lw.published_plans(model)
+    found = published_plans(model)
     assert tuple(found) == lw.MT50
     assert all(len(rates) == 5 and all(0 <= rate <= 1 for rate in rates) for rates in found.values())
 
 
 def test_palm_2_solves_what_it_solved():
-    mean = sum(sum(rates) / 5 for rates in lw.published_plans("PaLM 2").values()) / 50
+    mean = sum(sum(rates) / 5 for rates in published_plans("PaLM 2").values()) / 50
     assert mean == pytest.approx(0.32952)
 
 
 def test_curves_are_labelled_for_what_they_are():
-    curves = lw.published_curves("zero-shot", ["PCBC", "DC"])
+    curves = published_curves("zero-shot", ["PCBC", "DC"])
     assert list(curves) == [
         "PCBC published, best of the last 10 evaluations",
         "PCBC published, last",
         "DC published, best of the last 10 evaluations",
         "DC published, last",
     ]
-    assert curves["DC published, last"] == lw.published("zero-shot", "DC", "last")
-    assert curves["PCBC published, best of the last 10 evaluations"] == lw.published("zero-shot", which="best")
-    assert lw.published_curves("zero-shot", "DC") == {k: v for k, v in curves.items() if k.startswith("DC")}
+    assert curves["DC published, last"] == published("zero-shot", "DC", "last")
+    assert curves["PCBC published, best of the last 10 evaluations"] == published("zero-shot", which="best")
+    assert published_curves("zero-shot", "DC") == {k: v for k, v in curves.items() if k.startswith("DC")}
 
 
 def test_what_a_caller_changes_stays_his():
-    lw.published("few-shot")["reach"] = 2.0
-    assert lw.published("few-shot")["reach"] <= 1.0
+    published("few-shot")["reach"] = 2.0
+    assert published("few-shot")["reach"] <= 1.0
 
 
 @pytest.mark.parametrize(
@@ -74,9 +75,9 @@ def test_what_a_caller_changes_stays_his():
 )
 def test_what_was_not_published_is_refused(arguments, message):
     with pytest.raises(ValueError, match=re.escape(message)):
-        lw.published(*arguments)
+        published(*arguments)
 
 
 def test_another_model_is_refused():
     with pytest.raises(ValueError, match=r"model must be one of 'PaLM 2', 'GPT-3.5', 'GPT-3', got 'GPT-4'"):
-        lw.published_plans("GPT-4")
+        published_plans("GPT-4")

@@ -12,11 +12,17 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.stats import mannwhitneyu, trim_mean
 
-import lw_torchrl as lw
+from lw_torchrl.evaluation import (
+    count_solved,
+    interquartile_mean,
+    mean_difference,
+    mean_rate,
+    probability_of_improvement,
+)
 from lw_torchrl.evaluation.statistics import Estimate
 
-ONE = [lw.mean_rate, lw.interquartile_mean]
-TWO = [lw.mean_difference, lw.probability_of_improvement]
+ONE = [mean_rate, interquartile_mean]
+TWO = [mean_difference, probability_of_improvement]
 FEW = {"resamples": 50}
 
 
@@ -34,7 +40,7 @@ def pairs(draw):
 
 @given(rates())
 def test_the_interquartile_mean_is_scipys(x):
-    assert lw.interquartile_mean(x, **FEW).value == pytest.approx(trim_mean(x, 0.25, axis=None))
+    assert interquartile_mean(x, **FEW).value == pytest.approx(trim_mean(x, 0.25, axis=None))
 
 
 @settings(deadline=None)  # scipy's first call is slow
@@ -42,7 +48,7 @@ def test_the_interquartile_mean_is_scipys(x):
 def test_the_probability_of_improvement_is_scipys(pair):
     x, y = pair
     expected = mannwhitneyu(x, y, axis=0, method="asymptotic").statistic.mean() / (len(x) * len(y))
-    assert lw.probability_of_improvement(x, y, **FEW).value == pytest.approx(expected)
+    assert probability_of_improvement(x, y, **FEW).value == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(
@@ -56,16 +62,16 @@ def test_the_probability_of_improvement_is_scipys(pair):
     ],
 )
 def test_the_probability_of_improvement_by_hand(x, y, expected):
-    found = lw.probability_of_improvement(x, y)
+    found = probability_of_improvement(x, y)
     assert (found.value, found.low, found.high) == (expected,) * 3
 
 
 @given(pairs())
 def test_a_comparison_the_other_way_round_is_its_mirror(pair):
     x, y = pair
-    there, back = (lw.mean_difference(*order, **FEW).value for order in ((x, y), (y, x)))
+    there, back = (mean_difference(*order, **FEW).value for order in ((x, y), (y, x)))
     assert there == pytest.approx(-back)
-    there, back = (lw.probability_of_improvement(*order, **FEW).value for order in ((x, y), (y, x)))
+    there, back = (probability_of_improvement(*order, **FEW).value for order in ((x, y), (y, x)))
     assert there == pytest.approx(1 - back)
 
 
@@ -78,7 +84,7 @@ def test_an_order_of_the_seeds_does_not_matter_and_intervals_stay_in_range(pair,
     if min(len(x), len(y)) == 1:
         assert found.low is found.high is None
     else:
-        bottom = 0 if function is lw.probability_of_improvement else -1
+        bottom = 0 if function is probability_of_improvement else -1
         assert bottom - 1e-9 <= found.low <= found.high <= 1 + 1e-9
 
 
@@ -111,15 +117,15 @@ def test_intervals_hold_the_truth_in_about_95_of_100_cases():
     """With 20 seeds; 400 repeats make a standard error of 0.011, 300 resamples cost about 0.01."""
     x = lambda rng: rng.binomial(20, P, (20, 20)) / 20  # noqa: E731
     y = lambda rng: rng.binomial(20, Q, (20, 20)) / 20  # noqa: E731
-    assert holds(lw.mean_rate, P.mean(), lambda rng: [x(rng)]) == pytest.approx(0.94, abs=0.03)
-    difference = holds(lw.mean_difference, (P - Q).mean(), lambda rng: [x(rng), y(rng)])
+    assert holds(mean_rate, P.mean(), lambda rng: [x(rng)]) == pytest.approx(0.94, abs=0.03)
+    difference = holds(mean_difference, (P - Q).mean(), lambda rng: [x(rng), y(rng)])
     assert difference == pytest.approx(0.94, abs=0.03)
 
 
 def test_the_interval_of_the_probability_of_improvement_holds_the_truth():
     """X is uniform on [0.2, 1], Y on [0, 0.8]: Y is above X with probability 0.75² / 2."""
     found = holds(
-        lw.probability_of_improvement,
+        probability_of_improvement,
         1 - 0.75**2 / 2,
         lambda rng: [0.2 + 0.8 * rng.random((20, 5)), 0.8 * rng.random((20, 5))],
         repeats=300,
@@ -128,23 +134,23 @@ def test_the_interval_of_the_probability_of_improvement_holds_the_truth():
 
 
 def test_few_seeds_are_too_narrow_as_documented():
-    three = holds(lw.mean_rate, P.mean(), lambda rng: [rng.binomial(20, P, (3, 20)) / 20])
+    three = holds(mean_rate, P.mean(), lambda rng: [rng.binomial(20, P, (3, 20)) / 20])
     assert 0.82 < three < 0.92
 
 
 def test_whole_seeds_are_for_seeds_that_move_all_tasks_alike():
     draw = lambda rng: [np.clip(0.5 + 0.05 * rng.standard_normal((20, 1)) + np.zeros((20, 30)), 0, 1)]  # noqa: E731
-    assert holds(lw.mean_rate, 0.5, draw) < 0.5
-    assert holds(lw.mean_rate, 0.5, draw, whole_seeds=True) == pytest.approx(0.93, abs=0.04)
+    assert holds(mean_rate, 0.5, draw) < 0.5
+    assert holds(mean_rate, 0.5, draw, whole_seeds=True) == pytest.approx(0.93, abs=0.04)
 
 
 def test_resampling_tasks_asks_about_other_tasks():
     rng = np.random.default_rng(0)
     x = np.clip(P + 0.02 * rng.standard_normal((5, 20)), 0, 1)
-    these, alike = lw.mean_rate(x), lw.mean_rate(x, resample_tasks=True)
+    these, alike = mean_rate(x), mean_rate(x, resample_tasks=True)
     assert alike.high - alike.low > 4 * (these.high - these.low)
     # Tasks are paired: what both methods find hard widens nothing.
-    difference = lw.mean_difference(x, x * 0 + np.clip(P - 0.1, 0, 1), resample_tasks=True)
+    difference = mean_difference(x, x * 0 + np.clip(P - 0.1, 0, 1), resample_tasks=True)
     assert difference.high - difference.low < 0.3 * (alike.high - alike.low)
 
 
@@ -168,23 +174,23 @@ def test_ten_thousand_resamples_are_fast(function):
 
 def test_memory_bounds_change_nothing_but_the_draw(monkeypatch):
     x = np.random.default_rng(1).random((4, 13))
-    whole = lw.mean_rate(x)
+    whole = mean_rate(x)
     monkeypatch.setattr("lw_torchrl.evaluation.statistics._CHUNK", 5000)
-    pieces = lw.mean_rate(x)
+    pieces = mean_rate(x)
     assert pieces.low == pytest.approx(whole.low, abs=0.01)
     assert pieces.high == pytest.approx(whole.high, abs=0.01)
 
 
 def test_tasks_solved_are_counted_at_the_threshold():
-    assert lw.count_solved([[0.8, 0.79, 1.0], [0.8, 0.8, 0.6]]) == 2
-    assert lw.count_solved([[0.75], [0.85], [0.8]]) == 1  # their float mean is below 0.8
-    assert lw.count_solved([[0.5, 0.4]], threshold=0.5) == 1
+    assert count_solved([[0.8, 0.79, 1.0], [0.8, 0.8, 0.6]]) == 2
+    assert count_solved([[0.75], [0.85], [0.8]]) == 1  # their float mean is below 0.8
+    assert count_solved([[0.5, 0.4]], threshold=0.5) == 1
 
 
 def test_an_estimate_reads_well_and_is_json():
     assert str(Estimate(0.5, 0.4, 0.6)) == "0.500 [0.400, 0.600]"
-    assert str(lw.mean_rate([[0.5, 1.0]])) == "0.750"
-    assert json.loads(json.dumps(lw.mean_rate([[0.5, 1.0]]).to_json())) == {"value": 0.75, "low": None, "high": None}
+    assert str(mean_rate([[0.5, 1.0]])) == "0.750"
+    assert json.loads(json.dumps(mean_rate([[0.5, 1.0]]).to_json())) == {"value": 0.75, "low": None, "high": None}
 
 
 @pytest.mark.parametrize(
@@ -198,7 +204,7 @@ def test_an_estimate_reads_well_and_is_json():
         ([["half"]], TypeError, "rates must be an array of numbers"),
     ],
 )
-@pytest.mark.parametrize("function", [*ONE, lw.count_solved])
+@pytest.mark.parametrize("function", [*ONE, count_solved])
 def test_wrong_rates_are_refused(function, given_rates, error, message):
     with pytest.raises(error, match=message):
         function(given_rates)
@@ -223,9 +229,9 @@ def test_methods_need_the_same_tasks(function):
 )
 def test_wrong_options_are_refused(options, error, message):
     with pytest.raises(error, match=message):
-        lw.mean_rate([[0.5], [0.6]], **options)
+        mean_rate([[0.5], [0.6]], **options)
 
 
 def test_a_wrong_threshold_is_refused():
     with pytest.raises(ValueError, match=r"threshold must be in \(0, 1\], got 80"):
-        lw.count_solved([[0.5]], threshold=80)
+        count_solved([[0.5]], threshold=80)

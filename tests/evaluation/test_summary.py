@@ -10,6 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import lw_torchrl as lw
+from lw_torchrl.evaluation import (
+    EpisodeResult,
+    Estimate,
+    TaskSummary,
+    interquartile_mean,
+    mean_rate,
+    summarize,
+    summarize_rates,
+)
 
 RATES = {"push": [0.5, 0.75], "reach": [1.0, 0.75], "sweep": [0.0, 0.0]}
 
@@ -17,7 +26,7 @@ RATES = {"push": [0.5, 0.75], "reach": [1.0, 0.75], "sweep": [0.0, 0.0]}
 def make_result(hits, trials=4, **config):
     """Task to how many of its episodes succeeded."""
     episodes = [
-        lw.EpisodeResult(task, k, k < count, 5 if k < count else None, None, None)
+        EpisodeResult(task, k, k < count, 5 if k < count else None, None, None)
         for task, count in hits.items()
         for k in range(trials)
     ]
@@ -29,38 +38,38 @@ RESULTS = {3: make_result({"push": 2, "reach": 4, "sweep": 0}), 7: make_result({
 
 
 def test_results_and_rates_give_the_same_summary():
-    summary = lw.summarize(RESULTS)
-    assert summary == lw.summarize_rates(RATES, seeds=[3, 7])
+    summary = summarize(RESULTS)
+    assert summary == summarize_rates(RATES, seeds=[3, 7])
     assert summary.seeds == ("3", "7")
-    assert lw.summarize(list(RESULTS.values())).seeds == ("0", "1")
+    assert summarize(list(RESULTS.values())).seeds == ("0", "1")
 
 
 def test_the_numbers_by_hand():
-    summary = lw.summarize(RESULTS)
+    summary = summarize(RESULTS)
     assert summary.mean.value == pytest.approx(0.5)
     assert summary.solved == 1
-    assert summary.per_task["push"] == lw.TaskSummary(mean=0.625, min=0.5, max=0.75)
+    assert summary.per_task["push"] == TaskSummary(mean=0.625, min=0.5, max=0.75)
     assert summary.by_seed == {"3": 0.5, "7": 0.5}
     assert summary.array.tolist() == [[0.5, 1.0, 0.0], [0.75, 0.75, 0.0]]
-    assert summary.iqm == lw.interquartile_mean(summary.array)
-    assert summary.mean == lw.mean_rate(summary.array)
+    assert summary.iqm == interquartile_mean(summary.array)
+    assert summary.mean == mean_rate(summary.array)
 
 
 def test_tasks_in_another_order_are_the_same_tasks():
     other = make_result({"sweep": 0, "reach": 3, "push": 3})
-    assert lw.summarize({3: RESULTS[3], 7: other}) == lw.summarize(RESULTS)
+    assert summarize({3: RESULTS[3], 7: other}) == summarize(RESULTS)
 
 
 def test_options_reach_the_statistics():
-    summary = lw.summarize(RESULTS, threshold=0.6, resamples=100, seed=4, whole_seeds=True)
+    summary = summarize(RESULTS, threshold=0.6, resamples=100, seed=4, whole_seeds=True)
     assert summary.solved == 2
     assert summary.threshold == 0.6
-    assert summary.mean == lw.mean_rate(summary.array, resamples=100, seed=4, whole_seeds=True)
+    assert summary.mean == mean_rate(summary.array, resamples=100, seed=4, whole_seeds=True)
 
 
 def test_one_seed_has_no_interval():
-    summary = lw.summarize([RESULTS[3]])
-    assert summary.mean == lw.Estimate(0.5)
+    summary = summarize([RESULTS[3]])
+    assert summary.mean == Estimate(0.5)
     assert "mean 0.500, IQM 0.500; 1 of 3 tasks >= 0.8; 1 seed" in summary.table()
 
 
@@ -75,7 +84,7 @@ def test_one_seed_has_no_interval():
     )
 )
 def test_it_is_json_and_consistent(rates):
-    summary = lw.summarize_rates(rates, resamples=20)
+    summary = summarize_rates(rates, resamples=20)
     found = json.loads(json.dumps(summary.to_json(), allow_nan=False))
     assert {task: row["rates"] for task, row in found["tasks"].items()} == rates
     assert found["mean"]["value"] == pytest.approx(np.mean([row["mean"] for row in found["tasks"].values()]))
@@ -86,7 +95,7 @@ def test_it_is_json_and_consistent(rates):
 
 def test_the_table():
     beside = {"published, last": {"push": 0.25, "reach": 1.0, "sweep": 0.25}, "of some tasks": {"push": 0.125}}
-    lines = lw.summarize(RESULTS).table(beside).splitlines()
+    lines = summarize(RESULTS).table(beside).splitlines()
     assert lines[0].startswith("mean 0.500 [")
     assert lines[0].endswith("; 1 of 3 tasks >= 0.8; 2 seeds")
     assert lines[1].split() == ["task", "mean", "min", "max", "(1)", "(2)"]
@@ -95,7 +104,7 @@ def test_the_table():
     assert lines[5].split() == ["mean", "0.50", "0.50", "0.50", "0.50", "-"]
     assert lines[6:] == ["(1) published, last", "(2) of some tasks"]
     assert len({len(line) for line in lines[1:6]}) == 1
-    assert len(lw.summarize(RESULTS).table().splitlines()) == 6
+    assert len(summarize(RESULTS).table().splitlines()) == 6
 
 
 @pytest.mark.parametrize(
@@ -114,13 +123,13 @@ def test_the_table():
 )
 def test_results_that_cannot_be_averaged_are_refused(other, message):
     with pytest.raises(ValueError, match=message):
-        lw.summarize({3: RESULTS[3], 7: other})
+        summarize({3: RESULTS[3], 7: other})
 
 
 @pytest.mark.parametrize("nothing", [{}, []])
 def test_no_results_are_refused(nothing):
     with pytest.raises(ValueError, match="results must hold at least one result, got none"):
-        lw.summarize(nothing)
+        summarize(nothing)
 
 
 @pytest.mark.parametrize(
@@ -136,4 +145,4 @@ def test_no_results_are_refused(nothing):
 )
 def test_wrong_rates_are_refused(rates, seeds, message):
     with pytest.raises(ValueError, match=message):
-        lw.summarize_rates(rates, seeds=seeds)
+        summarize_rates(rates, seeds=seeds)

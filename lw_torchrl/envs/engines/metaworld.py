@@ -2,35 +2,14 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lw_torchrl._rendering import naming_absent_renderer
 from lw_torchrl.envs.engine import OBSERVATION_SIZE, EngineStep
-
-RENDER_LIBRARIES = {
-    "egl": "libEGL (Debian: apt-get install libegl1)",
-    "osmesa": "OSMesa (Debian: apt-get install libosmesa6)",
-}
-
-
-@contextmanager
-def naming_absent_renderer() -> Iterator[None]:
-    """Say what the obscure AttributeError of importing MuJoCo means: the library that MUJOCO_GL asks for is absent."""
-    try:
-        yield
-    except AttributeError as error:
-        backend = os.environ.get("MUJOCO_GL", "").lower()
-        if backend not in RENDER_LIBRARIES:
-            raise
-        raise ImportError(
-            f"MUJOCO_GL is {backend!r}, but {RENDER_LIBRARIES[backend]} is not installed. Install it, or unset "
-            "MUJOCO_GL: only camera images need it."
-        ) from error
 
 
 def import_metaworld() -> Any:
