@@ -12,8 +12,9 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-OBSERVATION_SIZE = 39
-ACTION_SIZE = 4
+from lw_torchrl.language.observation import ACTION_SIZE, OBSERVATION_SIZE
+
+__all__ = ["ACTION_SIZE", "OBSERVATION_SIZE", "Engine", "EngineStep"]
 
 
 class EngineStep(NamedTuple):

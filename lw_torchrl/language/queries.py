@@ -15,6 +15,7 @@ from functools import lru_cache
 
 from rapidfuzz import fuzz, process
 
+from lw_torchrl.language.observation import FIRST, SECOND, places
 from lw_torchrl.language.relations import PREDICATES, RELATIONS, TOUCHING, UNARY
 from lw_torchrl.language.tasks import GRIPPER, Task, get_task
 
@@ -77,7 +78,7 @@ def base_clauses(task: Task) -> tuple[Clause, ...]:
                 for negated in (False, True):
                     clauses.append(Clause(first, relation, second, negated))
     for thing in task.objects:
-        if not thing.ours and thing.position in ((4, 5, 6), (11, 12, 13)):
+        if not thing.ours and thing.position in (places(FIRST), places(SECOND)):
             clauses += [Clause(thing.name, TOUCHING), Clause(thing.name, TOUCHING, negated=True)]
     clauses += [Clause(GRIPPER, "open"), Clause(GRIPPER, "closed")]
     return tuple(clauses)

@@ -11,12 +11,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from lw_torchrl.language.observation import OBSERVATION_SIZE, OPENING
 from lw_torchrl.language.queries import Clause, Query, check_query
 from lw_torchrl.language.relations import PREDICATES, Comparison
 from lw_torchrl.language.tasks import TASKS, Coordinate, Task, coordinate_index, get_task, task_id
 
-_OBSERVATION = 39
-_OPENING = 3  # index of the gripper's opening in the observation
 _ORIGIN = (0.0, 0.0, 0.0)
 # Of the origin and itself, the padding of the tables: far from changing its truth at any temperature.
 _ALWAYS = Comparison("xyz", "<", 1e4, temperature=1e-6)
@@ -49,7 +48,7 @@ class _Tables:
 
 
 def _clause_atoms(clause: Clause, task: Task) -> list[_Atom]:
-    first: _Position = (0.0, 0.0, _OPENING)
+    first: _Position = (0.0, 0.0, OPENING)
     second: _Position = _ORIGIN
     shift = _NO_SHIFT
     if clause.predicate not in ("open", "closed"):
@@ -269,7 +268,7 @@ class QueryProgram:
 
 def _values(observation: Tensor, tables: _Tables, constants: Tensor, floor: float = 0.0) -> Tensor:
     """What each atom compares, (B, A) metres. The length of nothing has no gradient: ``floor`` keeps away from it."""
-    numbers = torch.cat((observation.reshape(-1, _OBSERVATION), constants), 1)
+    numbers = torch.cat((observation.reshape(-1, OBSERVATION_SIZE), constants), 1)
     d = (numbers.gather(1, tables.first) - numbers.gather(1, tables.second)).unflatten(1, (3, -1)) + tables.shift
     x, y, z = d.unbind(1)
     squared = x.square() + y.square() + z.square()
@@ -277,9 +276,9 @@ def _values(observation: Tensor, tables: _Tables, constants: Tensor, floor: floa
 
 
 def _check_batch(observation: Tensor, task_id: Tensor) -> None:
-    if observation.shape[-1:] != (_OBSERVATION,) or not observation.is_floating_point():
+    if observation.shape[-1:] != (OBSERVATION_SIZE,) or not observation.is_floating_point():
         raise ValueError(
-            f"observation must be float of shape (..., {_OBSERVATION}), got {observation.dtype} of shape "
+            f"observation must be float of shape (..., {OBSERVATION_SIZE}), got {observation.dtype} of shape "
             f"{tuple(observation.shape)}"
         )
     if task_id.shape != observation.shape[:-1] or task_id.dtype not in (torch.int64, torch.int32):

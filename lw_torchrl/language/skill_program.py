@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from lw_torchrl._checks import unknown_name
+from lw_torchrl.language.observation import OBSERVATION_SIZE
 from lw_torchrl.language.skills import ScriptedSkill, load_skills
 from lw_torchrl.language.tasks import TASKS, Task, coordinate_index, get_task, task_id
 
-_OBSERVATION = 39
 _KEPT_ROWS = 4096  # of the last batch, the most to keep the tables of
 
 
@@ -59,7 +59,7 @@ class SkillProgram:
         self.num_skills = max(map(len, found.values()))
         self._column = torch.full((len(TASKS),), -1)
         constants = [0.0]
-        index = torch.full((len(found), 2, self.num_skills, 3), _OBSERVATION)
+        index = torch.full((len(found), 2, self.num_skills, 3), OBSERVATION_SIZE)
         numbers = torch.zeros(len(found), 2, self.num_skills, 3, dtype=torch.float64)  # gain, gain times offset
         effort = torch.zeros(len(found), self.num_skills, 4, dtype=torch.float64)
         for t, (task, listed) in enumerate(found.items()):
@@ -105,13 +105,13 @@ class SkillProgram:
         Raises:
             ValueError: a wrong shape, or a task without skills.
         """
-        if observation.shape[-1:] != (_OBSERVATION,) or task_id.shape != observation.shape[:-1]:
+        if observation.shape[-1:] != (OBSERVATION_SIZE,) or task_id.shape != observation.shape[:-1]:
             raise ValueError(
-                f"observation must be of shape (..., {_OBSERVATION}) and task_id of (...), got "
+                f"observation must be of shape (..., {OBSERVATION_SIZE}) and task_id of (...), got "
                 f"{tuple(observation.shape)} and {tuple(task_id.shape)}"
             )
         target, moved, gain, offset, effort, constants = self._selected(task_id.reshape(-1), observation)
-        state = torch.cat((observation.reshape(-1, _OBSERVATION), constants), 1)
+        state = torch.cat((observation.reshape(-1, OBSERVATION_SIZE), constants), 1)
         shift = torch.addcmul(offset, gain, state.gather(1, target) - state.gather(1, moved)).clamp_(-1.0, 1.0)
         action = effort.clone()
         action[..., :3] = shift.unflatten(1, (-1, 3))

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from lw_torchrl._checks import unknown_name
+from lw_torchrl.language.observation import OBSERVATION_SIZE
 
 GRIPPER = "robot's gripper"
 Coordinate = int | float
@@ -36,7 +37,7 @@ def coordinate_index(coordinate: Coordinate, constants: list[float]) -> int:
         return coordinate
     if coordinate not in constants:
         constants.append(coordinate)
-    return 39 + constants.index(coordinate)
+    return OBSERVATION_SIZE + constants.index(coordinate)
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ class NamedObject:
         for coordinate in self.position:
             if not _is_number(coordinate):
                 raise ValueError(f"position of {self.name!r} must hold ints and finite floats, got {self.position!r}")
-            if isinstance(coordinate, int) and not 0 <= coordinate < 39:
+            if isinstance(coordinate, int) and not 0 <= coordinate < OBSERVATION_SIZE:
                 raise ValueError(f"position of {self.name!r}: obs[{coordinate}] is outside the 39 numbers, 0 to 38")
         if len(self.offset) != 3 or not all(map(_is_number, self.offset)):
             raise ValueError(f"offset of {self.name!r} must be three numbers in metres, got {self.offset!r}")

@@ -7,12 +7,22 @@ import re
 import torch
 from torch import Tensor
 
+from lw_torchrl.language.observation import (
+    FIRST,
+    FIRST_QUATERNION,
+    GOAL,
+    SECOND,
+    SECOND_QUATERNION,
+    a_step_before,
+    places,
+)
 from lw_torchrl.language.plans import Plans, PlanStep
 from lw_torchrl.language.tasks import MT50, Task, task_id
 
 # The numbers of each thing that an observation tells of, now and a step before: two objects, with their quaternions,
 # and the goal, which has no past.
-_PLACES = ((*range(4, 11), *range(22, 29)), (*range(11, 18), *range(29, 36)), (36, 37, 38))
+_THINGS = (slice(FIRST.start, FIRST_QUATERNION.stop), slice(SECOND.start, SECOND_QUATERNION.stop))
+_PLACES = (*((*places(thing), *places(a_step_before(thing))) for thing in _THINGS), places(GOAL))
 
 
 def _names(step: PlanStep, task: Task) -> set[str]:

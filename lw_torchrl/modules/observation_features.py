@@ -9,11 +9,11 @@ import torch
 from torch import Tensor, nn
 
 from lw_torchrl._checks import check_choice, check_scale
+from lw_torchrl.language.observation import HAND, OBSERVATION_SIZE, OPENING, POSITIONS
 
 Features = Literal["raw", "differences", "relative", "both"]
-_HAND, _OBJECT_1, _OBJECT_2, _GOAL = slice(0, 3), slice(4, 7), slice(11, 14), slice(36, 39)
 _FINE, _COARSE = 0.02, 0.1  # metres: where the two squashed copies of each difference bend
-_WIDTH = {"raw": 39, "differences": 54 + 2, "relative": 54, "both": 39 + 54 + 2}
+_WIDTH = {"raw": OBSERVATION_SIZE, "differences": 54 + 2, "relative": 54, "both": OBSERVATION_SIZE + 54 + 2}
 
 
 def relative(observation: Tensor) -> Tensor:
@@ -22,7 +22,7 @@ def relative(observation: Tensor) -> Tensor:
     Six differences of three metres each, the same through tanh at 2 cm and at 10 cm. Differences to a second object
     that the task does not have are zero.
     """
-    places = [observation[..., place] for place in (_HAND, _OBJECT_1, _OBJECT_2, _GOAL)]
+    places = [observation[..., place] for place in POSITIONS]
     absent = (places[2] == 0).all(-1, keepdim=True)
     pairs = []
     for first, second in combinations(range(4), 2):
@@ -34,7 +34,7 @@ def relative(observation: Tensor) -> Tensor:
 
 def differences(observation: Tensor) -> Tensor:
     """:func:`relative`, the hand's height and the gripper's opening, (..., 39) to (..., 56)."""
-    return torch.cat((relative(observation), observation[..., 2:4]), -1)
+    return torch.cat((relative(observation), observation[..., HAND.stop - 1 : OPENING + 1]), -1)
 
 
 def squash(difference: Tensor) -> tuple[Tensor, Tensor]:
@@ -69,7 +69,7 @@ class ObservationFeatures(nn.Module):
         self.register_buffer("std", torch.ones(self.width))
 
     def _select(self, observation: Tensor) -> Tensor:
-        if observation.shape[-1:] != (39,) or observation.dtype != torch.float32:
+        if observation.shape[-1:] != (OBSERVATION_SIZE,) or observation.dtype != torch.float32:
             raise ValueError(
                 f"observation must be float32 of shape (..., 39), got {observation.dtype} of shape "
                 f"{tuple(observation.shape)}"
@@ -96,7 +96,7 @@ class ObservationFeatures(nn.Module):
         Raises:
             ValueError: the observations hold NaN or infinity.
         """
-        found = self._select(observation.reshape(-1, 39))
+        found = self._select(observation.reshape(-1, OBSERVATION_SIZE))
         if weights is None:
             mean, std = found.mean(0), found.std(0, unbiased=False)
         else:

@@ -6,11 +6,11 @@ import torch
 from torch import Tensor, nn
 
 from lw_torchrl._checks import check_scale
+from lw_torchrl.language.observation import OBSERVATION_SIZE
 from lw_torchrl.language.plans import Plans, PlanStep
 from lw_torchrl.language.tasks import MT50, Task, coordinate_index, task_id
 from lw_torchrl.modules.observation_features import squash
 
-_OBSERVATION = 39
 _PAIRS = 2  # of a step: those of its first and of its last clause that compares two things
 _SCALE = 0.1  # metres
 
@@ -47,7 +47,7 @@ class PlanFocus(nn.Module):
         self.noise = check_scale("feature_noise", noise)
         constants = [0.0]
         shape = (len(MT50), plans.num_steps, _PAIRS, 3)
-        index = torch.full((2, *shape), _OBSERVATION)  # the constant 0
+        index = torch.full((2, *shape), OBSERVATION_SIZE)  # the constant 0
         offset = torch.zeros(shape)
         for task, plan in plans.items():
             for number, step in enumerate(plan.steps):

@@ -8,9 +8,9 @@ from torch import Tensor
 from torchrl.envs import EnvBase, Transform
 
 from lw_torchrl._checks import check_scale, missing_keys
+from lw_torchrl.language.observation import FIRST, HAND, POSITIONS, SECOND, a_step_before
 
-# Where the observation's positions begin: hand, two objects, the same a step before, goal.
-_POSITIONS = (0, 4, 11, 18, 22, 29, 36)
+_STARTS = tuple(part.start for part in (*POSITIONS, *map(a_step_before, (HAND, FIRST, SECOND))))
 _NOT_FOR_ENVIRONMENTS = "RandomYaw is for replay buffers: an environment has done its action before it is turned"
 
 
@@ -66,9 +66,9 @@ class RandomYaw(Transform):
             raise missing_keys(tensordict.keys(), "observation", "action")
         angle = self.scale * torch.randn(observation.shape[:-1], device=observation.device)
         cos, sin = angle.cos(), angle.sin()
-        tensordict.set("observation", _turned(observation, _POSITIONS, cos, sin))
+        tensordict.set("observation", _turned(observation, _STARTS, cos, sin))
         if (following := tensordict.get(("next", "observation"), None)) is not None:
-            tensordict.set(("next", "observation"), _turned(following, _POSITIONS, cos, sin))
+            tensordict.set(("next", "observation"), _turned(following, _STARTS, cos, sin))
         for name in {"action", "expert_action"} & set(tensordict.keys()):
             turned = _turned(tensordict.get(name), (0,), cos, sin)
             turned[..., :2] /= turned[..., :2].abs().amax(-1, keepdim=True).clamp(min=1.0)
