@@ -18,8 +18,10 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 
 from lw_torchrl._files import write_json
+from lw_torchrl.language.tasks import task_id
 
 FORMAT = "lw_torchrl.demonstrations"
 FORMAT_VERSION = 2
@@ -102,6 +104,8 @@ class Demonstrations:
         root: its folder.
         config: how it was collected.
         versions: of the packages that made it.
+        task_ids: task name to the number that stands for it in the files; rows are shown with today's
+            :func:`~lw_torchrl.task_id`, whatever it was then.
         episodes: in the order of the rows.
         attempts: task name to the episodes run, failures that were redrawn among them.
     """
@@ -109,6 +113,7 @@ class Demonstrations:
     root: Path
     config: CollectConfig
     versions: dict[str, str]
+    task_ids: dict[str, int]
     episodes: tuple[EpisodeInfo, ...]
     attempts: dict[str, int]
 
@@ -142,6 +147,7 @@ def write_metadata(
             "version": FORMAT_VERSION,
             "config": config.to_json(),
             "versions": package_versions(),
+            "task_ids": {task: task_id(task) for task in config.tasks},
             "attempts": attempts,
             "episodes": {
                 key: [getattr(episode, key) for episode in episodes] for key in EpisodeInfo.__dataclass_fields__
@@ -173,7 +179,8 @@ def read_metadata(root: str | os.PathLike[str]) -> Demonstrations:
         if found["format"] != FORMAT or found["version"] != FORMAT_VERSION:
             raise DatasetError(
                 f"root: {str(path)!r} is of format {found['format']!r} version {found['version']!r}; this package "
-                f"reads {FORMAT!r} version {FORMAT_VERSION}. Collect it again."
+                f"reads {FORMAT!r} version {FORMAT_VERSION}. Collect it again with the same collect_demonstrations, into "
+                "another folder or after deleting this one"
             )
         config: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in found["config"].items()}
         columns = found["episodes"]
@@ -184,7 +191,8 @@ def read_metadata(root: str | os.PathLike[str]) -> Demonstrations:
             if episode.start != start:
                 raise ValueError(f"an episode starts at row {episode.start!r} instead of {start}")
             start += episode.length
-        return Demonstrations(folder, CollectConfig(**config), found["versions"], episodes, found["attempts"])
+        task_ids = {task: found["task_ids"][task] for task in config["tasks"]}
+        return Demonstrations(folder, CollectConfig(**config), found["versions"], task_ids, episodes, found["attempts"])
     except DatasetError:
         raise
     except (KeyError, TypeError, ValueError) as error:
@@ -203,8 +211,18 @@ def _check_files(folder: Path, rows: int) -> None:
             raise ValueError(f"{'/'.join(key)}.memmap has {size} bytes, not {rows * prod(tail) * dtype.itemsize}")
 
 
+def _renumbered(demonstrations: Demonstrations) -> Tensor:
+    """Today's task_id of each row: (R,) int64."""
+    episodes = demonstrations.episodes
+    numbers = torch.tensor([task_id(episode.task) for episode in episodes])
+    return numbers.repeat_interleave(torch.tensor([episode.length for episode in episodes]))
+
+
 def load_rows(demonstrations: Demonstrations) -> TensorDictBase:
     """The rows of a dataset, memory-mapped and read without unpickling.
+
+    Where tasks were numbered otherwise when the dataset was made, ``task_id`` and ``("next", "task_id")`` are today's
+    numbers, in memory.
 
     Raises:
         DatasetError: (a ValueError) a column is missing, damaged, or not as long as the metadata say.
@@ -214,7 +232,11 @@ def load_rows(demonstrations: Demonstrations) -> TensorDictBase:
         (rows,) = json.loads((folder / "meta.json").read_text("utf-8"))["shape"]
         if rows == expected:
             _check_files(folder, rows)
-            return TensorDict.load_memmap(folder, allow_pickle=False)
+            found = TensorDict.load_memmap(folder, allow_pickle=False)
+            if any(task_id(task) != number for task, number in demonstrations.task_ids.items()):
+                found.set("task_id", now := _renumbered(demonstrations))
+                found.set(("next", "task_id"), now.clone())
+            return found
     except Exception as error:
         reason = f"{type(error).__name__}: {error}"
         raise DatasetError(

@@ -23,6 +23,11 @@ def _turned(values: Tensor, starts: tuple[int, ...], cos: Tensor, sin: Tensor) -
     return turned
 
 
+def _reach(action: Tensor) -> Tensor:
+    """The larger of the two numbers in the plane, (..., 1)."""
+    return action[..., :2].abs().amax(-1, keepdim=True)
+
+
 class RandomYaw(Transform):
     """Turns each sampled row, its positions and its action alike, by a random angle about the vertical.
 
@@ -31,9 +36,9 @@ class RandomYaw(Transform):
     happened to have. For replay buffers; where a :class:`QAFTransform` is used, put it first, since conditions speak of
     the scene as it was.
 
-    Changes ``observation`` (B, 39) float32 and ``action`` (B, 4) float32, and ``("next", "observation")`` and
-    ``expert_action`` where they are. An action's way in the plane is shortened where it would leave [-1, 1], its
-    direction kept. Orientations stay as they were, and so do fixed places: use it with features that hold neither,
+    Changes ``observation`` (B, 39) float32 and ``action`` (B, 4) float32, and ``("next", "observation")``,
+    ``expert_action`` and ``unclipped_action`` where they are. An action's way in the plane is shortened where turning
+    would lead it out of [-1, 1], its direction kept; one that was outside before keeps its length. Orientations stay as they were, and so do fixed places: use it with features that hold neither,
     "differences" or "relative", and without ``focus``. Angles are drawn from PyTorch's global generator; the trainers
     seed it.
 
@@ -69,9 +74,10 @@ class RandomYaw(Transform):
         tensordict.set("observation", _turned(observation, _STARTS, cos, sin))
         if (following := tensordict.get(("next", "observation"), None)) is not None:
             tensordict.set(("next", "observation"), _turned(following, _STARTS, cos, sin))
-        for name in {"action", "expert_action"} & set(tensordict.keys()):
-            turned = _turned(tensordict.get(name), (0,), cos, sin)
-            turned[..., :2] /= turned[..., :2].abs().amax(-1, keepdim=True).clamp(min=1.0)
+        for name in {"action", "expert_action", "unclipped_action"} & set(tensordict.keys()):
+            action = tensordict.get(name)
+            turned = _turned(action, (0,), cos, sin)
+            turned[..., :2] /= torch.where(_reach(action) <= 1.0, _reach(turned).clamp(min=1.0), 1.0)
             tensordict.set(name, turned)
         return tensordict
 

@@ -10,6 +10,7 @@ import textwrap
 import zipfile
 from importlib.metadata import version
 
+import metaworld
 import numpy as np
 import pytest
 import torch
@@ -19,6 +20,7 @@ from lw_torchrl.data import collect as collect_module
 from lw_torchrl.data.dataset import load_rows, read_metadata
 from lw_torchrl.envs.engines.metaworld import make_metaworld_env
 from lw_torchrl.envs.experts import ExpertActor
+from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.envs.seeding import action_noise, episode_seed
 from lw_torchrl.language.tasks import MT50
 
@@ -60,10 +62,12 @@ def test_the_rows_have_the_documented_keys_shapes_and_dtypes(rows):
         "episode": ((total,), number),
         "action": ((total, 4), torch.float32),
         "expert_action": ((total, 4), torch.float32),
+        "unclipped_action": ((total, 4), torch.float32),
         ("collector", "traj_ids"): ((total,), number),
         ("next", "observation"): ((total, 39), torch.float32),
         ("next", "task_id"): ((total,), number),
-        ("next", "reward"): ((total, 1), torch.float32),
+        ("next", "reward_sparse"): ((total, 1), torch.float32),
+        ("next", "reward_dense"): ((total, 1), torch.float32),
         **{("next", key): ((total, 1), flag) for key in ("success", "done", "terminated", "truncated")},
     }
     assert rows.batch_size == (total,)
@@ -86,7 +90,21 @@ def test_episodes_lie_one_after_another_and_end_by_truncation(made, rows):
         assert not part["next", "terminated"].any()
         for key in ("done", "truncated"):
             assert part["next", key].flatten().tolist() == [False] * (STEPS - 1) + [True]
-        assert torch.equal(part["next", "reward"], part["next", "success"].float())
+
+
+@pytest.mark.parametrize("kind", ["sparse", "dense"])
+@pytest.mark.parametrize("task", TASKS)
+def test_both_rewards_are_those_of_an_environment_with_that_reward(made, rows, task, kind):
+    env = LanguageWorldEnv(task, num_envs=EPISODES, seed=SEED, max_steps=STEPS, reward=kind)
+    first = next(episode.start for episode in made.episodes if episode.task == task)
+    part = rows[first : first + EPISODES * STEPS].reshape(EPISODES, STEPS)
+    state = env.reset()
+    assert torch.equal(state["episode"], part["episode"][:, 0])
+    for t in range(STEPS):
+        state = env.step(state.set("action", part["action"][:, t].clone()))["next"]
+        assert torch.equal(state["reward"], part["next", f"reward_{kind}"][:, t])
+    assert kind == "sparse" or part["next", "reward_dense"].unique().numel() > STEPS
+    env.close()
 
 
 def test_the_metadata_say_how_it_was_made(made, tmp_path):
@@ -98,6 +116,7 @@ def test_the_metadata_say_how_it_was_made(made, tmp_path):
     packages = ("lw_torchrl", "metaworld", "mujoco", "numpy", "tensordict", "torch", "torchrl")
     assert found["versions"] == {name: version(name) for name in packages}
     assert read_metadata(made.root) == made
+    assert found["task_ids"] == made.task_ids == {task: MT50.index(task) for task in TASKS}
     assert not (made.root / ".partial").exists()
 
 
@@ -140,6 +159,17 @@ def test_held_noise_keeps_each_draw(tmp_path):
 def test_the_expert_action_is_what_the_expert_wants_in_the_stored_state(rows):
     wanted = ExpertActor(TASKS)(rows.select("observation", "task_id").clone())["action"]
     assert torch.equal(wanted, rows["expert_action"])
+
+
+@pytest.mark.filterwarnings("ignore:Constant.s. may be too high")
+@pytest.mark.parametrize("task", TASKS)
+def test_the_unclipped_action_is_what_meta_worlds_own_script_asks_for(rows, task):
+    script = metaworld.policies.ENV_POLICY_MAP[f"{task}-v3"]()
+    part = rows[rows["task_id"] == MT50.index(task)]
+    asked = [script.get_action(observation.astype(np.float64)) for observation in part["observation"].numpy()]
+    assert np.array_equal(part["unclipped_action"].numpy(), np.stack(asked).astype(np.float32))
+    assert torch.equal(part["unclipped_action"].clamp(-1, 1), part["expert_action"])
+    assert rows["unclipped_action"].abs().max() > 1, "the test wants an action that is clipped"
 
 
 @pytest.mark.parametrize("task", TASKS)

@@ -11,8 +11,9 @@ import pytest
 import torch
 from tensordict import NonTensorData, TensorDict
 
-from lw_torchrl.data import DatasetError, LanguageWorldExperienceReplay, collect_demonstrations
+from lw_torchrl.data import DatasetError, LanguageWorldExperienceReplay, TaskBalancedSampler, collect_demonstrations
 from lw_torchrl.data.dataset import FORMAT, FORMAT_VERSION, load_rows, read_metadata
+from lw_torchrl.language.tasks import task_id
 
 
 def tree(root):
@@ -87,6 +88,44 @@ def test_a_folder_of_something_else_is_no_dataset(root):
 def test_another_format_or_version_says_both(root, format, number):
     edit(root, lambda found: found.update(format=format, version=number))
     refused(root, f"format {format!r} version {number}.*reads {FORMAT!r} version {FORMAT_VERSION}")
+
+
+def test_a_dataset_of_version_1_says_so_and_what_to_do(root):
+    edit(root, lambda found: found.update(version=1))
+    refused(root, "version 1; this package reads .* version 2. Collect it again with the same collect_demonstrations")
+
+
+@pytest.mark.parametrize("stored", [7, 50, 2**62])
+def test_tasks_are_numbered_as_today_whatever_their_numbers_were(root, made, stored):
+    """A 51st task would number the 50 anew."""
+    today, before = load_rows(made), tree(root)
+    for name in ("task_id", "next/task_id"):
+        np.full(10, stored).tofile(root / "data" / f"{name}.memmap")
+    edit(root, lambda found: found.update(task_ids={"reach": stored}))
+    changed = tree(root)
+    assert {name for name in before if before[name] != changed[name]} == {
+        "metadata.json",
+        "data/task_id.memmap",
+        "data/next/task_id.memmap",
+    }
+    found = read_metadata(root)
+    assert found.task_ids == {"reach": stored}
+    assert (load_rows(found) == today).all()
+    replay = LanguageWorldExperienceReplay(root, label="executed", batch_size=4, sampler=TaskBalancedSampler())
+    assert replay.sample()["next", "task_id"].tolist() == [task_id("reach")] * 4
+    assert tree(root) == changed
+
+
+def test_a_dataset_of_several_tasks_is_renumbered_row_by_row(tmp_path):
+    root = tmp_path / "demos"
+    tasks = ["drawer-open", "push", "reach"]
+    collect_demonstrations(tasks, episodes_per_task=2, root=root, max_steps=3, progress=False)
+    today = load_rows(read_metadata(root)).clone()
+    stored = {"drawer-open": task_id("reach"), "push": task_id("drawer-open"), "reach": 50}
+    for name in ("task_id", "next/task_id"):
+        np.repeat(list(stored.values()), 6).tofile(root / "data" / f"{name}.memmap")
+    edit(root, lambda found: found.update(task_ids=stored))
+    assert (load_rows(read_metadata(root)) == today).all()
 
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9, 0.999])

@@ -45,11 +45,23 @@ def test_the_label_is_what_the_expert_wanted(made, rows):
     assert torch.equal(found["observation"], rows["observation"])
 
 
-def test_or_what_was_executed_with_its_consequences(made, rows):
-    found = LanguageWorldExperienceReplay(made.root, label="executed")[:]
+def test_or_what_its_script_asked_for(made, rows):
+    found = LanguageWorldExperienceReplay(made.root, label="unclipped")[:]
+    assert torch.equal(found["action"], rows["unclipped_action"])
+    assert found["action"].abs().max() > 1
+    assert set(found.keys(True, True)) == {"observation", "task_id", "episode", "action", ("collector", "traj_ids")}
+
+
+@pytest.mark.parametrize("reward", ["sparse", "dense"])
+def test_or_what_was_executed_with_its_consequences(made, rows, reward):
+    replay = LanguageWorldExperienceReplay(made.root, label="executed", reward=reward)
+    found = replay[:]
     assert not torch.equal(rows["action"], rows["expert_action"])
-    assert set(found.keys(True, True)) == set(rows.keys(True, True))
-    assert (found == rows).all()
+    assert set(found.keys(True, True)) == {*rows.keys(True, True), ("next", "reward")}
+    assert (found.exclude(("next", "reward")) == rows).all()
+    assert torch.equal(found["next", "reward"], rows["next", f"reward_{reward}"])
+    assert not torch.equal(rows["next", "reward_sparse"], rows["next", "reward_dense"])
+    assert (replay.label, replay.reward) == ("executed", reward)
 
 
 @pytest.mark.parametrize("label", ["expert", "executed"])
@@ -74,8 +86,9 @@ def test_after_success_drops_exactly_the_later_rows(made, rows, label, after):
         for key in ("done", "truncated"):
             assert torch.equal(found["next", key].flatten(), ends)
         assert not found["next", "terminated"].any()
-        for key in ("observation", "reward", "success"):
+        for key in ("observation", "reward_dense", "success"):
             assert torch.equal(found["next", key], expected["next", key])
+        assert torch.equal(found["next", "reward"], expected["next", "success"].float())
 
 
 def test_dropping_rows_leaves_the_dataset_alone(made, rows):
@@ -135,7 +148,11 @@ def test_it_knows_its_tasks_and_where_it_lies(made):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (dict(label="experts"), "label must be one of 'expert', 'executed', got 'experts'; did you mean 'expert'"),
+        (
+            dict(label="experts"),
+            "label must be one of 'expert', 'unclipped', 'executed', got 'experts'; did you mean 'expert'",
+        ),
+        (dict(reward="spars"), "reward must be one of 'sparse', 'dense', got 'spars'; did you mean 'sparse'"),
         (dict(batch_size=0), "batch_size must be at least 1, got 0"),
         (dict(after_success=-1), "after_success must be at least 0, got -1"),
     ],

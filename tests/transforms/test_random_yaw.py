@@ -76,6 +76,30 @@ def test_an_action_that_would_leave_the_box_keeps_its_direction():
     )
 
 
+def test_an_action_that_was_outside_the_box_keeps_its_length():
+    """The scripts' unclipped actions are labels up to 25: shortened, they would be others."""
+    was = rows(1_000, reach=20.0)
+    now = lw.RandomYaw(0.4)(was.clone())
+    outside = was["action"][:, :2].abs().amax(-1) > 1
+    assert outside.any()
+    assert not outside.all()
+    lengths = [td["action"][:, :2].norm(dim=-1)[outside] for td in (was, now)]
+    torch.testing.assert_close(*lengths)
+    assert now["action"][~outside][:, :2].abs().max() <= 1
+
+
+def test_actions_inside_the_box_are_turned_bit_for_bit_as_ever():
+    was = rows(1_000, reach=1.0)
+    torch.manual_seed(0)
+    now = lw.RandomYaw(0.4)(was.clone())["action"]
+    torch.manual_seed(0)
+    angle = 0.4 * torch.randn(1_000)
+    x, y = was["action"][:, 0], was["action"][:, 1]
+    turned = torch.stack([angle.cos() * x - angle.sin() * y, angle.sin() * x + angle.cos() * y], -1)
+    turned /= turned.abs().amax(-1, keepdim=True).clamp(min=1.0)
+    assert torch.equal(now[:, :2], turned)
+
+
 def test_an_absent_object_stays_absent():
     was = rows()
     was["observation"][:, 11:18] = 0.0
@@ -130,7 +154,7 @@ def test_executed_and_expert_action_and_what_came_turn_alike(tmp_path):
     was = replay[:].clone()
     now = lw.RandomYaw(0.7)(was.clone())
     turned = between(was["observation"][:, :2], now["observation"][:, :2])
-    for name in ("action", "expert_action"):
+    for name in ("action", "expert_action", "unclipped_action"):
         moves = was[name][:, :2].norm(dim=-1) > 0.05
         torch.testing.assert_close(between(was[name], now[name])[moves], turned[moves], atol=1e-3, rtol=0)
     after = between(was["next", "observation"][:, :2], now["next", "observation"][:, :2])
