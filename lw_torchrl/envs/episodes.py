@@ -78,7 +78,7 @@ def run_episodes(
         env: a LanguageWorldEnv, with transforms or without.
         policy: called on all N rows, with a ``_step`` mask of those that count.
         episodes: task name to episode indices.
-        keys: what to record of each step, ``("next", "success")`` say.
+        keys: what to record of each step, ``("next", "success")`` say; ``action`` is the executed one.
         noise: episode index to the four standard deviations of the noise added to the action, from the same
             (task, seed, episode) as the episode itself; None for none.
         noise_hold: the steps for which each draw of the noise is kept.
@@ -130,6 +130,7 @@ def run_episodes(
         state.set("action", torch.where(active.unsqueeze(-1), action, 0.0))
         state.set("_step", active)
         state = env.step(state)
+        state.set("action", state.get(("next", "executed_action")))
         recorded = state.select(*keys)
         if buffers is None:
             buffers = recorded.unsqueeze(1).expand(rows, base.max_steps).clone()

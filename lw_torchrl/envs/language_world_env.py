@@ -45,8 +45,10 @@ class LanguageWorldEnv(EnvBase):
         episode: (N,) int64, index of the episode.
         success: (N, 1) bool, Meta-World's success at this step.
         fault: (N, 1) bool, the row was truncated because its action was NaN or its simulation became unstable.
-        action: (N, 4) float32 in [-1, 1], end-effector displacement xyz and gripper effort. Numbers out of range
-            are clipped as Meta-World does, in place, so that what was executed is what is recorded.
+        action: (N, 4) float32, end-effector displacement xyz and gripper effort, each in [-1, 1]. The environment never
+            writes it: a policy's numbers out of range stay as they were sampled, so that their likelihood stays true.
+        executed_action: (N, 4) float32 in [-1, 1], what was done in the step that led here: the action, clipped as
+            Meta-World does. Zeros after a reset, and for a row that was not stepped.
         reward: (N, 1) float32; done, terminated, truncated: (N, 1) bool, terminated always false.
 
     A ``_step`` mask leaves rows where they are; a ``_reset`` mask resets only its rows.
@@ -124,6 +126,7 @@ class LanguageWorldEnv(EnvBase):
             episode=Unbounded((n,), dtype=torch.int64),
             success=flag.clone(),
             fault=flag.clone(),
+            executed_action=Bounded(-1.0, 1.0, (n, ACTION_SIZE)),
             shape=(n,),
         )
         # What a reset may read: a TransformedEnv hands down nothing of the reset tensordict that is not state.
@@ -142,7 +145,7 @@ class LanguageWorldEnv(EnvBase):
         """The seed that, with task and episode, fixes every reset."""
         return self._seed
 
-    def _state(self, **more: Tensor) -> TensorDict:
+    def _state(self, executed_action: Tensor, **more: Tensor) -> TensorDict:
         over = torch.from_numpy(self._over.copy()).unsqueeze(-1)
         return TensorDict(
             {
@@ -151,6 +154,7 @@ class LanguageWorldEnv(EnvBase):
                 "episode": torch.from_numpy(self._episode.copy()),
                 "success": torch.from_numpy(self._success.copy()).unsqueeze(-1),
                 "fault": torch.from_numpy(self._fault.copy()).unsqueeze(-1),
+                "executed_action": executed_action,
                 "done": over,
                 "terminated": torch.zeros_like(over),
                 "truncated": over.clone(),
@@ -195,29 +199,18 @@ class LanguageWorldEnv(EnvBase):
         self._steps[rows] = 0
         for flag in (self._over, self._fault, self._success):
             flag[rows] = False
-        return self._state()
+        return self._state(torch.zeros(*self.batch_size, ACTION_SIZE))
 
-    def _executed(self, tensordict: TensorDictBase) -> Tensor:
+    def _clipped(self, tensordict: TensorDictBase) -> Tensor:
         action = tensordict.get("action", None)
         if action is None or action.shape != (*self.batch_size, ACTION_SIZE) or action.dtype != torch.float32:
             given = "none" if action is None else f"{action.dtype} of shape {tuple(action.shape)}"
             raise ValueError(f"action must be float32 of shape {(*self.batch_size, ACTION_SIZE)}, got {given}")
-        executed = action.detach().clamp(-1.0, 1.0)
-        if not torch.equal(executed, action):
-            # In place, since a transformed environment steps a copy of the caller's tensordict; once where an
-            # expanded tensor repeats its memory. If it repeats it otherwise, it cannot be written to; then the
-            # caller's entry is replaced where it can be.
-            once = tuple(slice(0, 1) if stride == 0 else slice(None) for stride in action.stride())
-            with torch.no_grad():
-                try:
-                    action[once].copy_(executed[once])
-                except RuntimeError:
-                    tensordict.set("action", executed)
-        return executed
+        return action.detach().clamp(-1.0, 1.0)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         self._check_open()
-        action = self._executed(tensordict).cpu().numpy()
+        action = self._clipped(tensordict).cpu().numpy()
         active = self._mask(tensordict, "_step")
         if (active & self._over).any():
             rows = np.flatnonzero(active & self._over)[:5].tolist()
@@ -236,7 +229,8 @@ class LanguageWorldEnv(EnvBase):
         self._over |= self._fault
         self._over |= self._steps >= self.max_steps
         reward = np.where(stepped, result.reward, 0.0).astype(np.float32)
-        return self._state(reward=torch.from_numpy(reward).unsqueeze(-1))
+        executed = np.where(stepped[:, None], action, np.float32(0.0))
+        return self._state(torch.from_numpy(executed), reward=torch.from_numpy(reward).unsqueeze(-1))
 
     def _report(self, rows: np.ndarray, what: str, fatal: bool = False) -> None:
         if not rows.any():

@@ -7,7 +7,8 @@ from collections.abc import Mapping
 import torch
 from tensordict import TensorDictBase
 from torchrl.data import Binary, Composite, TensorSpec
-from torchrl.envs import EnvBase, Transform
+from torchrl.envs import EnvBase, Transform, TransformedEnv
+from torchrl.envs.batched_envs import BatchedEnvBase
 
 from lw_torchrl._checks import missing_keys
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
@@ -77,7 +78,10 @@ class QAFTransform(Transform):
             env = self.container
         except ValueError:  # a Compose that is in no environment, or not yet
             return
-        self.plans.require(getattr(env, "tasks", ()))
+        while isinstance(env, TransformedEnv):
+            env = env.base_env
+        if not isinstance(env, BatchedEnvBase):  # whose workers may not be there yet
+            self.plans.require(getattr(env, "tasks", ()))
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add ``qaf`` to the specs."""

@@ -1,10 +1,10 @@
-"""Actions that LanguageWorldEnv clips, records as executed, or refuses."""
+"""Actions that LanguageWorldEnv leaves as they are, executes clipped, or refuses."""
 
 from __future__ import annotations
 
 import pytest
 import torch
-from rows import ROWS, advance, same
+from rows import ROWS, advance, others, same
 from torch import Tensor
 
 
@@ -22,33 +22,44 @@ def layouts(values: Tensor) -> dict[str, Tensor]:
 
 
 @pytest.mark.parametrize("layout", ["contiguous", "transposed", "strided", "grad", "not a leaf"])
-def test_actions_out_of_range_are_clipped_and_recorded_as_executed(any_env, layout):
+def test_an_action_out_of_range_stays_and_what_was_executed_is_said(any_env, layout):
     wild = torch.linspace(-4, 4, 24).reshape(ROWS, 4)
     wild[0, 0], wild[5, 3] = -torch.inf, torch.inf
     any_env.set_seed(1)
     expected = advance(any_env, any_env.reset(), wild.clamp(-1, 1))
     any_env.set_seed(1)
-    state = any_env.step(any_env.reset().set("action", layouts(wild)[layout]))
-    assert torch.equal(state["action"], wild.clamp(-1, 1))
+    given = layouts(wild)[layout]
+    state = any_env.step(any_env.reset().set("action", given))
+    assert torch.equal(state["action"], wild)
+    assert torch.equal(given, wild)
+    assert torch.equal(state["next", "executed_action"], wild.clamp(-1, 1))
+    assert not state["next", "executed_action"].requires_grad
     assert same(expected, state["next"])
 
 
 @pytest.mark.parametrize("shape", [(1, 4), (ROWS, 1), (1, 1)], ids=str)
-def test_expanded_actions_are_recorded_as_executed(any_env, shape):
+def test_expanded_actions_are_executed(any_env, shape):
     wild = torch.linspace(-3, 2, 24)[: shape[0] * shape[1]].reshape(shape)
     any_env.set_seed(1)
     expected = advance(any_env, any_env.reset(), wild.clamp(-1, 1).expand(ROWS, 4))
     any_env.set_seed(1)
     state = any_env.step(any_env.reset().set("action", wild.clone().expand(ROWS, 4)))
-    assert torch.equal(state["action"], wild.clamp(-1, 1).expand(ROWS, 4))
+    assert torch.equal(state["action"], wild.expand(ROWS, 4))
+    assert torch.equal(state["next", "executed_action"], wild.clamp(-1, 1).expand(ROWS, 4))
     assert same(expected, state["next"])
 
 
-def test_actions_that_share_memory_are_recorded_as_executed(env):
-    wild = torch.linspace(-3, 3, ROWS + 3).unfold(0, 4, 1)
+def test_nothing_is_executed_at_a_reset_nor_in_a_row_at_rest_nor_where_the_action_is_nan(env):
     env.set_seed(1)
-    state = env.step(env.reset().set("action", wild))
-    assert torch.equal(state["action"], wild.clamp(-1, 1))
+    state = env.reset()
+    assert not state["executed_action"].any()
+    action = torch.full((ROWS, 4), 0.5)
+    action[1, 2] = float("nan")
+    with pytest.warns(UserWarning, match="row 1: its action is NaN"):
+        state = advance(env, state, action, _step=others(0))
+    moved = others(0, 1)
+    assert torch.equal(state["executed_action"], action.where(moved[:, None], torch.zeros(())))
+    assert not env.reset(state.clone().set("_reset", ~moved))["executed_action"][~moved].any()
 
 
 def test_actions_in_range_are_left_alone(any_env):
@@ -57,6 +68,7 @@ def test_actions_in_range_are_left_alone(any_env):
     state = any_env.step(any_env.reset().set("action", action))
     assert state["action"].data_ptr() == action.data_ptr()
     assert torch.equal(action, torch.linspace(-1, 1, 24).reshape(ROWS, 4))
+    assert torch.equal(state["next", "executed_action"], action)
 
 
 @pytest.mark.parametrize(
