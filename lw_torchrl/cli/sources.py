@@ -1,0 +1,78 @@
+"""What a user brings to a command, under the same option everywhere: --task-file, --plans, --skill-file,
+--text-encoder."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from lw_torchrl.language.plans import Plans
+    from lw_torchrl.language.tasks import Task
+
+
+def read_tasks(task_file: Path | None) -> Mapping[str, Task]:
+    """The 50 tasks, with those of --task-file in their place or beside them."""
+    from lw_torchrl.language.tasks import TASKS, load_tasks
+
+    return TASKS if task_file is None else load_tasks(task_file)
+
+
+def read_plans(sources: Sequence[str], tasks: Mapping[str, Task], skills: Literal["own", "MT10"] = "own") -> Plans:
+    """The plans of --plans: MT10, MT50, files and folders; where two have a plan for a task, the later one's counts."""
+    from lw_torchrl.language.plan_files import load_plans
+    from lw_torchrl.language.plans import ConditionalPlan, Plans
+
+    found: dict[str, ConditionalPlan] = {}
+    for source in sources:
+        shipped = source in ("MT10", "MT50")
+        found.update(load_plans(source, skills=skills if shipped else "own", tasks=tasks))
+    if not found:
+        raise ValueError("--plans must name at least one source of plans: MT10, MT50, a file or a folder")
+    return Plans(found)
+
+
+def read_encoder(name: str | None) -> Callable[[Sequence[str]], Tensor] | None:
+    """The function that --text-encoder names, "package.module:function"; the working folder is searched first.
+
+    Raises:
+        ValueError: it is no such name, or names nothing that can be called.
+    """
+    if name is None:
+        return None
+    module, _, function = name.partition(":")
+    if not module or not function.isidentifier():
+        raise ValueError(f"--text-encoder must be like my_texts:encode, a module and a function, got {name!r}")
+    if "" not in sys.path:
+        sys.path.insert(0, "")
+    try:
+        found: Any = getattr(import_module(module), function)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(f"--text-encoder {name!r} names no function: {error}") from error
+    if not callable(found):
+        raise ValueError(f"--text-encoder {name!r} must name a function, it names {type(found).__name__}")
+    return found
+
+
+def make_logger(kind: Literal["csv", "tensorboard", "wandb"], out: Path) -> Any:
+    """The TorchRL logger of --logger, in a folder beside ``out``."""
+    from torchrl.record import loggers
+
+    folder = out.parent / "logs"
+    try:
+        if kind == "csv":
+            return loggers.CSVLogger(exp_name=out.stem, log_dir=str(folder))
+        if kind == "tensorboard":
+            from torchrl.record.loggers.tensorboard import TensorboardLogger
+
+            return TensorboardLogger(exp_name=out.stem, log_dir=str(folder))
+        from torchrl.record.loggers.wandb import WandbLogger
+
+        return WandbLogger(exp_name=out.stem, save_dir=str(folder))
+    except ImportError as error:
+        raise ImportError(f"--logger {kind} needs the package {kind}: pip install {kind}") from error
