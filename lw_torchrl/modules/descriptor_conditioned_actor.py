@@ -11,9 +11,10 @@ from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor
 
 from lw_torchrl._checks import check_choice
-from lw_torchrl.language.tasks import MT50, TASKS, resolve_tasks, task_id
+from lw_torchrl.language.task_index import TaskIndex
+from lw_torchrl.language.tasks import MT50, TASKS, resolve_tasks
 from lw_torchrl.language.text import encode_texts
-from lw_torchrl.modules.decoder import ActionDecoder, check_task_ids, text_to_latent, unit_scale
+from lw_torchrl.modules.decoder import ActionDecoder, text_to_latent, unit_scale
 from lw_torchrl.modules.observation_features import Features
 
 
@@ -48,7 +49,6 @@ class DescriptorConditionedActor(TensorDictModuleBase):
     in_keys = ["observation", "task_id"]
     out_keys = ["action"]
     description_vectors: Tensor
-    known: Tensor
 
     def __init__(
         self,
@@ -80,13 +80,12 @@ class DescriptorConditionedActor(TensorDictModuleBase):
         found = encode([TASKS[task].description for task in self.tasks])
         if found.ndim != 2 or len(found) != len(self.tasks):
             raise ValueError(f"text_encoder must give ({len(self.tasks)}, E), got shape {tuple(found.shape)}")
-        ids = torch.tensor([task_id(task) for task in self.tasks])
-        vectors = torch.zeros(len(MT50), found.shape[1])
-        vectors[ids] = unit_scale(found)
-        known = torch.zeros(len(MT50), dtype=torch.bool)
-        known[ids] = True
+        self.index = TaskIndex(self.tasks)
+        order = [self.tasks.index(task) for task in self.index.tasks]
+        # A product of another number of rows rounds differently: whatever the tasks, there are 50 or more.
+        fill = found.new_zeros(max(0, len(MT50) - len(order)), found.shape[1])
+        vectors = torch.cat((unit_scale(found)[order], fill))
         self.register_buffer("description_vectors", vectors, persistent=False)
-        self.register_buffer("known", known, persistent=False)
         self.encoder = text_to_latent(found.shape[1], latent_size, encoder_width, encoder_depth)
         self.decoder = ActionDecoder(latent_size, features, feature_noise, width, depth)
 
@@ -95,14 +94,14 @@ class DescriptorConditionedActor(TensorDictModuleBase):
         return tensordict.set("action", self.act(*self.prepare(tensordict))[0])
 
     def prepare(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """What no trained parameter touches: task_id (B,) int64, and the observation's features (B, F)."""
+        """What no trained parameter touches: each task's row (B,) int64, and the observation's features (B, F)."""
         task = tensordict.get("task_id")
-        check_task_ids(task, self.known, "tasks this actor was not made for")
-        return task, self.decoder.features(tensordict.get("observation"))
+        rows = self.index.rows(task, "tasks this actor was not made for")
+        return rows, self.decoder.features(tensordict.get("observation"))
 
-    def act(self, task: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
+    def act(self, rows: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
         """From what :meth:`prepare` gives: action (B, 4), and the task's latent (B, D)."""
-        latent = self.encoder(self.description_vectors)[task]
+        latent = self.encoder(self.description_vectors)[rows]
         return self.decoder.decode(latent, seen), latent
 
     def fit_normalization(self, observation: Tensor, weights: Tensor | None = None) -> None:
