@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from difflib import get_close_matches
+from reprlib import Repr
 from typing import Any
 
 
@@ -21,7 +22,7 @@ def unknown_name(argument: str, given: object, allowed: Iterable[str]) -> ValueE
     """
     names = list(allowed)
     listed = ", ".join(repr(name) for name in names[:12]) + (", ..." if len(names) > 12 else "")
-    message = f"{argument} must be one of {listed}, got {given!r}"
+    message = f"{argument} must be one of {listed}, got {shown(given)}"
     if isinstance(given, str) and (close := nearest(given, names)):
         message += "; did you mean " + " or ".join(repr(name) for name in close) + "?"
     return ValueError(message)
@@ -57,3 +58,20 @@ def check_scale(argument: str, given: Any) -> float:
     if not 0.0 <= given < float("inf"):
         raise ValueError(f"{argument} must be finite and at least 0, got {given!r}")
     return float(given)
+
+
+_SHOWN = Repr()
+_SHOWN.maxlevel, _SHOWN.maxstring, _SHOWN.maxother, _SHOWN.maxlist, _SHOWN.maxtuple, _SHOWN.maxdict = 3, 80, 80, 8, 8, 8
+
+
+def shown(value: object) -> str:
+    """``repr`` for an error's text: short, and safe of any value, also of one nested deep or of a huge number.
+
+    Example:
+        >>> shown([0.1, "obs[37]", 10**5000])
+        'a list'
+    """
+    try:
+        return _SHOWN.repr(value)
+    except (ValueError, RecursionError):  # a number of more digits than Python writes
+        return f"a {type(value).__name__}"

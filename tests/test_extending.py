@@ -28,13 +28,13 @@ TASK = """
 description = "Touch the block."
 objects.block = "obs[4:7]"
 """
-PLAN = '''
+PLAN = """
 def touch_the_block(robot):
     if check("the gripper is not beside the block"):
         robot.go("to the block")
     if check("the gripper is beside the block"):
         robot.stay("at the block")
-'''
+"""
 SKILLS = {
     text: ScriptedSkill(text, "block", gain=(gain,) * 3)
     for text, gain in (("go to the block", 10.0), ("stay at the block", 0.0))
@@ -122,7 +122,9 @@ def plans(tmp_path, monkeypatch):
 def replay(plans):
     """What the plan's scripts do in our engine."""
     env = TransformedEnv(
-        lw.LanguageWorldEnv([plan.definition for plan in plans.values()], num_envs=8, engine=PointEngine, max_steps=STEPS),
+        lw.LanguageWorldEnv(
+            [plan.definition for plan in plans.values()], num_envs=8, engine=PointEngine, max_steps=STEPS
+        ),
         lw.QAFTransform(plans),
     )
     rows = env.rollout(STEPS, lw.ScriptedSkillActor(plans, skills=SKILLS)).reshape(-1)
@@ -196,7 +198,9 @@ def test_an_own_task_travels_with_its_policy(plans, tmp_path):
 def test_a_foreign_module_acts_and_trains_too(plans, replay):
     torch.manual_seed(0)
     module = TensorDictModule(nn.Linear(39, 4), in_keys=["observation"], out_keys=["action"])
-    lw.BehavioralCloningTrainer(module, replay, lw.BehavioralCloningConfig(steps=5, batch_size=8), progress=False).train()
+    lw.BehavioralCloningTrainer(
+        module, replay, lw.BehavioralCloningConfig(steps=5, batch_size=8), progress=False
+    ).train()
     definitions = [plan.definition for plan in plans.values()]
     result = lw.evaluate(module, tasks=definitions, episodes_per_task=2, seed=1, engine=PointEngine, max_steps=5)
     assert json.loads(json.dumps(result.config))["tasks"] == ["touch-the-block"]

@@ -80,8 +80,7 @@ class ConditionalPlan:
     definition: Task = field(default=None, compare=False, repr=False)  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
-        check_task(self.task)
-        definition = TASKS[self.task] if self.definition is None else self.definition
+        definition = TASKS[check_task(self.task)] if self.definition is None else self.definition
         if definition.name != self.task:
             raise PlanError(f"definition of plan {self.task!r} is of another task, {definition.name!r}")
         object.__setattr__(self, "definition", definition)

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
 from functools import reduce
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,22 +13,21 @@ from torch import Tensor
 from lw_torchrl.language.observation import OBSERVATION_SIZE, OPENING
 from lw_torchrl.language.queries import Clause, Query, check_query
 from lw_torchrl.language.relations import PREDICATES, Comparison
-from lw_torchrl.language.tasks import TASKS, Coordinate, Task, coordinate_index, get_task, task_id
+from lw_torchrl.language.task_index import TaskIndex, TaskTables, readable
+from lw_torchrl.language.tasks import Coordinate, Task, coordinate_index, get_task
 
 _ORIGIN = (0.0, 0.0, 0.0)
 # Of the origin and itself, the padding of the tables: far from changing its truth at any temperature.
 _ALWAYS = Comparison("xyz", "<", 1e4, temperature=1e-6)
 _NEVER = Comparison("xyz", "<", -1e4, temperature=1e-6)
 _LEAST, _MOST = 1e-6, 1e4  # of the size of a logit, and of metres where a length has a gradient
-_KEPT_ROWS = 4096  # of the last batch, the most to keep the tables of
 
 _Position = tuple[Coordinate, Coordinate, Coordinate]
 _Atom = tuple[_Position, _Position, tuple[float, float, float], Comparison]
 _NO_SHIFT = (0.0, 0.0, 0.0)
 
 
-@dataclass
-class _Tables:
+class _Tables(NamedTuple):
     """A task's atoms (A), each a comparison of the difference of two positions, and which two atoms make up each
     clause (K) of each query (S). The first dimension is of tasks (T) where compiled, of rows where selected."""
 
@@ -42,9 +40,7 @@ class _Tables:
     temperature: Tensor  # (T, A) float64, metres to one logit
     atoms: Tensor  # (T, 2*K*S) int64
     negated: Tensor  # (T, K, S) bool, take the clause's complement
-
-    def apply(self, function: Callable[[Tensor], Tensor]) -> _Tables:
-        return _Tables(**{field.name: function(getattr(self, field.name)) for field in fields(self)})
+    constants: Tensor  # (T, C) float64, read as if they followed the observation
 
 
 def _clause_atoms(clause: Clause, task: Task) -> list[_Atom]:
@@ -73,8 +69,7 @@ def _task_atoms(task: Task, queries: Sequence[Query], steps: int, width: int) ->
     return atoms, places, [[negated for _, negated in row] for row in padded]
 
 
-def _compile(queries: Mapping[Task, Sequence[Query]]) -> tuple[_Tables, Tensor]:
-    """The tables, and the constants (C,) float64 that are read as if they followed the observation."""
+def _compile(queries: Mapping[Task, Sequence[Query]]) -> _Tables:
     steps = max(map(len, queries.values()))
     width = max(len(query.clauses) for listed in queries.values() for query in listed)
     found = [_task_atoms(task, listed, steps, width) for task, listed in queries.items()]
@@ -100,7 +95,7 @@ def _compile(queries: Mapping[Task, Sequence[Query]]) -> tuple[_Tables, Tensor]:
         values = torch.tensor([[value(atom) for atom in atoms] for atoms in listed], dtype=dtype)
         return values.movedim(1, -1).contiguous()
 
-    tables = _Tables(
+    return _Tables(
         first=table(lambda atom: index(atom, 0)).flatten(1),
         second=table(lambda atom: index(atom, 1)).flatten(1),
         shift=table(shift, torch.float64),
@@ -110,8 +105,8 @@ def _compile(queries: Mapping[Task, Sequence[Query]]) -> tuple[_Tables, Tensor]:
         temperature=table(lambda atom: atom[3].temperature, torch.float64),
         atoms=torch.tensor([places for _, places, _ in found]).permute(0, 3, 2, 1).flatten(1),
         negated=torch.tensor([negated for _, _, negated in found]).transpose(1, 2).contiguous(),
+        constants=torch.tensor([constants] * len(listed), dtype=torch.float64),
     )
-    return tables, torch.tensor(constants, dtype=torch.float64)
 
 
 class QueryProgram:
@@ -156,49 +151,15 @@ class QueryProgram:
         self.queries = dict(sorted(((task.name, found) for task, found in compiled.items())))
         self.tasks = tuple(self.queries)
         self.num_queries = max(map(len, compiled.values()))
-        self._compiled, self._constants = _compile(compiled)
-        self._column = torch.full((len(TASKS),), -1)  # of a task_id in the tables, -1 for tasks without queries
-        self._column[[task_id(task.name) for task in compiled]] = torch.arange(len(compiled))
-        self._moved: dict[tuple[torch.device, torch.dtype], tuple[_Tables, Tensor, Tensor]] = {}
-        self._last: tuple[Tensor, _Tables, Tensor] | None = None
+        index = TaskIndex(self.tasks)
+        in_order = dict(sorted(compiled.items(), key=lambda item: index.row(item[0].name)))
+        self._tables = TaskTables(index, _compile(in_order))
 
     def __repr__(self) -> str:
         return f"QueryProgram({len(self.tasks)} tasks, num_queries={self.num_queries})"
 
-    def _selected(self, observation: Tensor, task_id: Tensor) -> tuple[_Tables, Tensor]:
-        """The tables and constants for each row of a batch; kept for the next call, since the rows of an environment
-        keep their tasks."""
-        last = self._last
-        compiling = torch.compiler.is_compiling()
-        if last is not None and not compiling:
-            ids, tables, constants = last
-            same = ids.device == task_id.device and constants.dtype == observation.dtype
-            if same and torch.equal(ids, task_id):
-                return tables, constants
-        device, dtype = observation.device, observation.dtype
-        if (device, dtype) not in self._moved:
-            self._moved[device, dtype] = (
-                self._compiled.apply(lambda table: table.to(device, dtype if table.is_floating_point() else None)),
-                self._constants.to(device, dtype),
-                self._column.to(device),
-            )
-        compiled, constants, column = self._moved[device, dtype]
-        if not compiling:
-            self._check_tasks(task_id, column)
-        chosen = column[task_id]
-        tables = compiled.apply(lambda table: table.index_select(0, chosen))
-        constants = constants.expand(len(chosen), -1)
-        if not compiling and len(chosen) <= _KEPT_ROWS:
-            self._last = (task_id.clone(), tables, constants)
-        return tables, constants
-
-    def _check_tasks(self, task_id: Tensor, column: Tensor) -> None:
-        known = (task_id >= 0) & (task_id < len(TASKS))
-        known &= column[task_id.clamp(0, len(TASKS) - 1)] >= 0
-        if not known.all():
-            wrong = sorted(set(task_id[~known].tolist()))[:5]
-            names = [f"{i} ({list(TASKS)[i]})" if 0 <= i < len(TASKS) else str(i) for i in wrong]
-            raise ValueError(f"task_id holds {', '.join(names)}, for which there are no queries; {self!r}")
+    def _selected(self, observation: Tensor, task_id: Tensor) -> _Tables:
+        return self._tables.select(task_id.reshape(-1), observation, f"tasks without queries in {self!r}")
 
     def __call__(self, observation: Tensor, task_id: Tensor) -> Tensor:
         """Answer the queries.
@@ -214,8 +175,8 @@ class QueryProgram:
             ValueError: wrong shape or dtype, NaN or infinity in the observation, or a task without queries.
         """
         _check_batch(observation, task_id)
-        tables, constants = self._selected(observation, task_id.reshape(-1))
-        holds = (_values(observation, tables, constants) < tables.threshold) ^ tables.flipped
+        tables = self._selected(observation, task_id)
+        holds = (_values(observation, tables) < tables.threshold) ^ tables.flipped
         one, other = self._clauses(holds, tables)
         clauses = ((one & other) ^ tables.negated).unbind(1)  # & of a few is far faster than all() over a short axis
         return reduce(torch.logical_and, clauses).reshape(*task_id.shape, self.num_queries)
@@ -252,8 +213,8 @@ class QueryProgram:
         holds = self(observation.detach(), task_id)
         near = observation if observation.dtype in (torch.float32, torch.float64) else observation.float()
         near = near.clamp(-_MOST, _MOST)  # squares of larger numbers overflow
-        tables, constants = self._selected(near, task_id.reshape(-1))
-        margin = (tables.threshold - _values(near, tables, constants, floor=_LEAST)) / tables.temperature / temperature
+        tables = self._selected(near, task_id)
+        margin = (tables.threshold - _values(near, tables, floor=_LEAST)) / tables.temperature / temperature
         one, other = self._clauses(torch.where(tables.flipped, -margin, margin), tables)
         clause = torch.minimum(one, other)
         soft = torch.where(tables.negated, -clause, clause).amin(1).float().reshape(holds.shape)
@@ -266,9 +227,9 @@ class QueryProgram:
         return atoms.gather(1, tables.atoms).unflatten(1, (2, *tables.negated.shape[1:])).unbind(1)
 
 
-def _values(observation: Tensor, tables: _Tables, constants: Tensor, floor: float = 0.0) -> Tensor:
+def _values(observation: Tensor, tables: _Tables, floor: float = 0.0) -> Tensor:
     """What each atom compares, (B, A) metres. The length of nothing has no gradient: ``floor`` keeps away from it."""
-    numbers = torch.cat((observation.reshape(-1, OBSERVATION_SIZE), constants), 1)
+    numbers = torch.cat((observation.reshape(-1, OBSERVATION_SIZE), tables.constants), 1)
     d = (numbers.gather(1, tables.first) - numbers.gather(1, tables.second)).unflatten(1, (3, -1)) + tables.shift
     x, y, z = d.unbind(1)
     squared = x.square() + y.square() + z.square()
@@ -286,7 +247,10 @@ def _check_batch(observation: Tensor, task_id: Tensor) -> None:
             f"task_id must be int64 of shape {tuple(observation.shape[:-1])}, one per observation, got "
             f"{task_id.dtype} of shape {tuple(task_id.shape)}"
         )
-    if torch.compiler.is_compiling() or math.isfinite(observation.sum().item()):  # the sum is fast; it may overflow
-        return
-    if not observation.isfinite().all():
-        raise ValueError("observation must hold finite numbers, got NaN or infinity")
+    problem = "observation must hold finite numbers, got NaN or infinity"
+    if torch.compiler.is_compiling():
+        torch._assert_async(observation.isfinite().all(), problem)
+    elif readable(observation) and not (
+        math.isfinite(observation.sum().item()) or observation.isfinite().all()  # the sum is fast; it may overflow
+    ):
+        raise ValueError(problem)

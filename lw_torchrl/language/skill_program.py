@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -10,9 +11,19 @@ from torch import Tensor
 from lw_torchrl._checks import unknown_name
 from lw_torchrl.language.observation import OBSERVATION_SIZE
 from lw_torchrl.language.skills import ScriptedSkill, load_skills
-from lw_torchrl.language.tasks import TASKS, Task, coordinate_index, get_task, task_id
+from lw_torchrl.language.task_index import TaskIndex, TaskTables
+from lw_torchrl.language.tasks import Task, coordinate_index, get_task
 
-_KEPT_ROWS = 4096  # of the last batch, the most to keep the tables of
+
+class _Tables(NamedTuple):
+    """The skills (S) of a task; the first dimension is of tasks (T) where compiled, of rows where selected."""
+
+    target: Tensor  # (T, 3*S) int64, index of each coordinate of where to
+    moved: Tensor  # (T, 3*S) int64, of what is to arrive there
+    gain: Tensor  # (T, 3*S) float64
+    shift: Tensor  # (T, 3*S) float64, gain times offset
+    effort: Tensor  # (T, S, 4) float64, zeros and the gripper's
+    constants: Tensor  # (T, C) float64, read as if they followed the observation
 
 
 class SkillProgram:
@@ -57,39 +68,24 @@ class SkillProgram:
             for task, listed in skills.items()
         }
         self.num_skills = max(map(len, found.values()))
-        self._column = torch.full((len(TASKS),), -1)
+        index = TaskIndex(task.name for task in found)
         constants = [0.0]
-        index = torch.full((len(found), 2, self.num_skills, 3), OBSERVATION_SIZE)
+        place = torch.full((len(found), 2, self.num_skills, 3), OBSERVATION_SIZE)
         numbers = torch.zeros(len(found), 2, self.num_skills, 3, dtype=torch.float64)  # gain, gain times offset
         effort = torch.zeros(len(found), self.num_skills, 4, dtype=torch.float64)
-        for t, (task, listed) in enumerate(found.items()):
-            self._column[task_id(task.name)] = t
+        for task, listed in found.items():
+            t = index.row(task.name)
             for s, skill in enumerate(listed):
-                target, moved = task.object(skill.target), task.object(skill.moved)
-                index[t, 0, s] = torch.tensor([coordinate_index(c, constants) for c in target.position])
-                index[t, 1, s] = torch.tensor([coordinate_index(c, constants) for c in moved.position])
-                offsets = torch.tensor([skill.offset, target.offset, moved.offset], dtype=torch.float64)
+                ends = task.object(skill.target), task.object(skill.moved)
+                for side, end in enumerate(ends):
+                    place[t, side, s] = torch.tensor([coordinate_index(c, constants) for c in end.position])
+                offsets = torch.tensor([skill.offset, *(end.offset for end in ends)], dtype=torch.float64)
                 numbers[t, 0, s] = torch.tensor(skill.gain, dtype=torch.float64)
                 numbers[t, 1, s] = numbers[t, 0, s] * (offsets[0] + offsets[1] - offsets[2])
                 effort[t, s, 3] = skill.gripper
-        self._tables = (*index.flatten(2).unbind(1), *numbers.flatten(2).unbind(1), effort)
-        self._constants = torch.tensor(constants, dtype=torch.float64)
-        self._last: tuple[Tensor, torch.dtype, tuple[Tensor, ...]] | None = None
-
-    def _selected(self, task_ids: Tensor, observation: Tensor) -> tuple[Tensor, ...]:
-        """The tables' rows for a batch, kept for the next: the rows of an environment keep their tasks."""
-        if self._last is not None:
-            ids, dtype, tables = self._last
-            if dtype == observation.dtype and ids.device == observation.device and torch.equal(ids, task_ids):
-                return tables
-        row = self._column.to(task_ids.device)[task_ids.clamp(0, len(TASKS) - 1)]
-        if not (known := (row >= 0) & (task_ids >= 0) & (task_ids < len(TASKS))).all():
-            raise ValueError(f"task_id {int(task_ids[~known][0])} has no skills")
-        moved = [table.to(observation if table.is_floating_point() else observation.device) for table in self._tables]
-        tables = (*(table[row] for table in moved), self._constants.to(observation).expand(len(row), -1))
-        if len(row) <= _KEPT_ROWS:
-            self._last = (task_ids.clone(), observation.dtype, tables)
-        return tables
+        fixed = torch.tensor([constants] * len(found), dtype=torch.float64)
+        (target, moved), (gain, shift) = place.flatten(2).unbind(1), numbers.flatten(2).unbind(1)
+        self._tables = TaskTables(index, _Tables(target, moved, gain, shift, effort, fixed))
 
     def __call__(self, observation: Tensor, task_id: Tensor) -> Tensor:
         """The action of each skill.
@@ -110,10 +106,11 @@ class SkillProgram:
                 f"observation must be of shape (..., {OBSERVATION_SIZE}) and task_id of (...), got "
                 f"{tuple(observation.shape)} and {tuple(task_id.shape)}"
             )
-        target, moved, gain, offset, effort, constants = self._selected(task_id.reshape(-1), observation)
-        state = torch.cat((observation.reshape(-1, OBSERVATION_SIZE), constants), 1)
-        shift = torch.addcmul(offset, gain, state.gather(1, target) - state.gather(1, moved)).clamp_(-1.0, 1.0)
-        action = effort.clone()
+        tables = self._tables.select(task_id.reshape(-1), observation, "tasks without skills")
+        state = torch.cat((observation.reshape(-1, OBSERVATION_SIZE), tables.constants), 1)
+        way = state.gather(1, tables.target) - state.gather(1, tables.moved)
+        shift = torch.addcmul(tables.shift, tables.gain, way).clamp_(-1.0, 1.0)
+        action = tables.effort.clone()
         action[..., :3] = shift.unflatten(1, (-1, 3))
         return action.reshape(*task_id.shape, self.num_skills, 4)
 

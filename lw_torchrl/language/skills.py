@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import math
 import os
-import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from functools import cache
 from importlib.resources import files
+from importlib.resources.abc import Traversable
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 from rapidfuzz import fuzz, process
 
-from lw_torchrl._checks import nearest
-from lw_torchrl.language.tasks import GRIPPER, Task, check_task, get_task
+from lw_torchrl._checks import nearest, shown
+from lw_torchrl._files import read_toml
+from lw_torchrl.language.named_objects import is_number
+from lw_torchrl.language.tasks import GRIPPER, TASKS, Task, check_task, get_task
 
 Triple = tuple[float, float, float]
 
@@ -63,20 +64,16 @@ class ScriptedSkill:
         for name in ("target", "moved"):
             if not isinstance(getattr(self, name), str):
                 raise SkillError(
-                    f"{name} of skill {self.text!r} must be the name of an object, got {getattr(self, name)!r}"
+                    f"{name} of skill {self.text!r} must be the name of an object, got {shown(getattr(self, name))}"
                 )
         for name in ("offset", "gain"):
             numbers = getattr(self, name)
-            if (
-                not isinstance(numbers, (list, tuple))
-                or len(numbers) != 3
-                or not all(isinstance(x, (int, float)) and math.isfinite(x) for x in numbers)
-            ):
-                raise SkillError(f"{name} of skill {self.text!r} must be three numbers, got {numbers!r}")
+            if not isinstance(numbers, (list, tuple)) or len(numbers) != 3 or not all(map(is_number, numbers)):
+                raise SkillError(f"{name} of skill {self.text!r} must be three numbers, got {shown(numbers)}")
         if min(self.gain) < 0:
             raise SkillError(f"gain of skill {self.text!r} must not be negative, got {self.gain!r}")
-        if not isinstance(self.gripper, (int, float)) or not -1 <= self.gripper <= 1:
-            raise SkillError(f"gripper of skill {self.text!r} must lie in [-1, 1], got {self.gripper!r}")
+        if not is_number(self.gripper) or not -1 <= self.gripper <= 1:
+            raise SkillError(f"gripper of skill {self.text!r} must lie in [-1, 1], got {shown(self.gripper)}")
 
     def for_task(self, task: str | Task) -> ScriptedSkill:
         """The skill as this task has it; :class:`SkillError` if it speaks of objects that the task lacks."""
@@ -101,20 +98,20 @@ class ScriptedSkill:
 _KEYS = tuple(f.name for f in fields(ScriptedSkill) if f.name not in ("text", "variants"))
 
 
-def _skill(text: str, row: Any, source: str) -> ScriptedSkill:
+def _skill(text: str, row: Any, source: str, tasks: Mapping[str, Task]) -> ScriptedSkill:
     if not isinstance(row, Mapping):
-        raise SkillError(f"{source}: skill {text!r} must be a table, got {row!r}")
+        raise SkillError(f"{source}: skill {text!r} must be a table, got {shown(row)}")
     given = dict(row)
     listed = given.pop("for", {})
     if not isinstance(listed, Mapping) or not all(isinstance(change, Mapping) for change in listed.values()):
-        raise SkillError(f"{source}: for of skill {text!r} must map task names to tables, got {listed!r}")
+        raise SkillError(f"{source}: for of skill {text!r} must map task names to tables, got {shown(listed)}")
     variants = {}
     for task, change in listed.items():
         try:
-            check_task(task)
+            check_task(task, tasks)
         except ValueError as error:
             raise SkillError(f"{source}: skill {text!r}: {error}") from error
-        variants[task] = _skill(text, {**given, **change}, f"{source}, for {task}")
+        variants[task] = _skill(text, {**given, **change}, f"{source}, for {task}", tasks)
     for key in given:
         if key not in _KEYS:
             close = nearest(key, _KEYS, n=1)
@@ -137,28 +134,27 @@ def _skill(text: str, row: Any, source: str) -> ScriptedSkill:
 
 @cache
 def _shipped() -> Mapping[str, ScriptedSkill]:
-    text = (files("lw_torchrl.language") / "data" / "skills.toml").read_text("utf-8")
-    return MappingProxyType(_read(text, "skills.toml"))
+    return MappingProxyType(_read(files("lw_torchrl.language") / "data" / "skills.toml", TASKS))
 
 
-def _read(text: str, source: str) -> dict[str, ScriptedSkill]:
-    try:
-        table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise SkillError(f"{source}: {error}") from error
-    return {name: _skill(name, row, source) for name, row in sorted(table.items())}
+def _read(file: Path | Traversable, tasks: Mapping[str, Task]) -> dict[str, ScriptedSkill]:
+    table = read_toml(file, SkillError)
+    return {name: _skill(name, row, str(file), tasks) for name, row in sorted(table.items())}
 
 
-def load_skills(path: str | os.PathLike[str] | None = None) -> Mapping[str, ScriptedSkill]:
+def load_skills(
+    path: str | os.PathLike[str] | None = None, *, tasks: Mapping[str, Task] = TASKS
+) -> Mapping[str, ScriptedSkill]:
     """The scripted skills by their text.
 
     Args:
         path: a file like data/skills.toml, whose skills join ours or replace those with the same text; None for
             ours alone.
+        tasks: whose names its ``for`` tables may have, as from :func:`load_tasks`.
 
     Raises:
         FileNotFoundError: there is no such file.
-        SkillError: (a ValueError) it is no TOML, or a skill in it is malformed.
+        SkillError: (a ValueError) it is no TOML in UTF-8, or a skill in it is malformed.
 
     Example:
         >>> load_skills()["place the gripper above the puck"].target
@@ -166,8 +162,7 @@ def load_skills(path: str | os.PathLike[str] | None = None) -> Mapping[str, Scri
     """
     if path is None:
         return _shipped()
-    file = Path(path)
-    return MappingProxyType({**_shipped(), **_read(file.read_text("utf-8"), str(file))})
+    return MappingProxyType({**_shipped(), **_read(Path(path), tasks)})
 
 
 def nearest_skill(

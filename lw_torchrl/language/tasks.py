@@ -1,13 +1,13 @@
-"""The 50 tasks: names, descriptions, and the objects that queries name. The table itself is data/tasks.toml."""
+"""Tasks: names, descriptions, and the objects that queries name. The table of the 50 is data/tasks.toml."""
 
 from __future__ import annotations
 
 import os
 import re
-import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from hashlib import blake2b
 from importlib.resources import files
 from pathlib import Path
 from types import MappingProxyType
@@ -16,64 +16,41 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lw_torchrl._checks import unknown_name
-from lw_torchrl.language.observation import OBSERVATION_SIZE
+from lw_torchrl._checks import nearest, shown, unknown_name
+from lw_torchrl._files import read_toml
+from lw_torchrl.language.named_objects import (
+    GRIPPER,
+    Coordinate,
+    NamedObject,
+    coordinate_index,
+    read_point,
+    read_position,
+    write_position,
+)
 
-GRIPPER = "robot's gripper"
-Coordinate = int | float
-"""An int is an index into the observation, a float a fixed number of metres."""
+__all__ = [
+    "GRIPPER",
+    "MT10",
+    "MT50",
+    "TASKS",
+    "Coordinate",
+    "NamedObject",
+    "Task",
+    "TaskError",
+    "check_task",
+    "coordinate_index",
+    "get_task",
+    "load_tasks",
+    "resolve_tasks",
+    "task_id",
+]
 
-_SLICE = re.compile(r"obs\[(\d+):(\d+)\]")
-_INDEX = re.compile(r"obs\[(\d+)\]")
+_NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
+_OWN_IDS = 2**31 - 50  # so that an id is an int32 too
 
 
-def _is_number(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e9
-
-
-def coordinate_index(coordinate: Coordinate, constants: list[float]) -> int:
-    """Where a coordinate stands in the 39 numbers of an observation followed by ``constants``, which grow at need."""
-    if isinstance(coordinate, int):
-        return coordinate
-    if coordinate not in constants:
-        constants.append(coordinate)
-    return OBSERVATION_SIZE + constants.index(coordinate)
-
-
-@dataclass(frozen=True)
-class NamedObject:
-    """An object that queries can name.
-
-    Attributes:
-        name: "drawer handle", in lower case and without an article.
-        position: where x, y and z are found: an int is an index into the 39 numbers of the observation,
-            a float is a fixed place in metres.
-        offset: added to it, metres; a point beside an object has one.
-        ours: a point that we named, and the published object list has not.
-
-    Raises:
-        ValueError: the name is not plain lower-case words, or a coordinate lies outside the observation.
-    """
-
-    name: str
-    position: tuple[Coordinate, Coordinate, Coordinate]
-    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    ours: bool = False
-
-    def __post_init__(self) -> None:
-        if not re.fullmatch(r"[a-z][a-z0-9'-]*( [a-z0-9][a-z0-9'-]*)*", self.name):
-            raise ValueError(f"name must be lower-case words like 'drawer handle', got {self.name!r}")
-        if {"and", "is", "not", "the"} & set(self.name.split()):
-            raise ValueError(f"name may not contain 'and', 'is', 'not' or 'the', got {self.name!r}")
-        if len(self.position) != 3:
-            raise ValueError(f"position of {self.name!r} must have 3 coordinates, got {self.position!r}")
-        for coordinate in self.position:
-            if not _is_number(coordinate):
-                raise ValueError(f"position of {self.name!r} must hold ints and finite floats, got {self.position!r}")
-            if isinstance(coordinate, int) and not 0 <= coordinate < OBSERVATION_SIZE:
-                raise ValueError(f"position of {self.name!r}: obs[{coordinate}] is outside the 39 numbers, 0 to 38")
-        if len(self.offset) != 3 or not all(map(_is_number, self.offset)):
-            raise ValueError(f"offset of {self.name!r} must be three numbers in metres, got {self.offset!r}")
+class TaskError(ValueError):
+    """A task that cannot be read or written, or a file of such tasks."""
 
 
 @dataclass(frozen=True)
@@ -81,12 +58,13 @@ class Task:
     """One manipulation task in words.
 
     Attributes:
-        name: "drawer-open", Meta-World's name without its version.
+        name: "drawer-open", Meta-World's name without its version; of a task of your own, any lower-case words joined
+            by hyphens.
         description: one sentence that says what is to be done.
         objects: the named objects, the robot's gripper first; then the points that we named.
 
     Raises:
-        ValueError: two objects have the same name, or the first is not the gripper.
+        ValueError: another kind of name, two objects of the same name, or the first is not the gripper.
     """
 
     name: str
@@ -94,6 +72,7 @@ class Task:
     objects: tuple[NamedObject, ...]
 
     def __post_init__(self) -> None:
+        _check_name(self.name)
         names = [named.name for named in self.objects]
         if not names or names[0] != GRIPPER:
             raise ValueError(f"objects of task {self.name!r} must begin with {GRIPPER!r}, got {names}")
@@ -130,70 +109,79 @@ class Task:
             for named in self.objects
         }
 
+    def to_json(self) -> dict[str, Any]:
+        """The task as a row of tasks.toml.
 
-def _position(name: str, at: Any) -> tuple[Coordinate, Coordinate, Coordinate]:
-    if isinstance(at, str) and (match := _SLICE.fullmatch(at)):
-        start, stop = map(int, match.groups())
-        if stop - start == 3:
-            return (start, start + 1, start + 2)
-    if isinstance(at, list) and len(at) == 3:
-        found = [int(match[1]) if isinstance(c, str) and (match := _INDEX.fullmatch(c)) else c for c in at]
-        if all(map(_is_number, found)):
-            x, y, z = (c if isinstance(o, str) else float(c) for c, o in zip(found, at, strict=True))
-            return (x, y, z)
-    raise ValueError(f"position of {name!r} must be like 'obs[4:7]' or [0.1, 'obs[37]', 0.0], got {at!r}")
+        Raises:
+            TaskError: (a ValueError) such a row cannot hold it: a gripper elsewhere, a point with an offset from a
+                place where there is no object.
 
+        Example:
+            >>> TASKS["reach"].to_json()["objects"]
+            {'reach target': 'obs[36:39]'}
+        """
+        row: dict[str, Any] = {"description": self.description, "objects": {}, "points": {}}
+        published = {named.position: named.name for named in reversed(self.objects) if not named.ours}
+        for named in self.objects[1:]:
+            at: Any = write_position(named.position)
+            if any(named.offset):
+                at = {"object": published.get(named.position, ""), "offset": list(named.offset)}
+            row["points" if named.ours else "objects"][named.name] = at
+        try:
+            same = Task.from_json(self.name, row) == self
+        except TaskError:
+            same = False
+        if not same:
+            raise TaskError(f"task {self.name!r} cannot be written as a row of tasks.toml, it holds {self.objects!r}")
+        return {key: found for key, found in row.items() if found}
 
-class TaskError(ValueError):
-    """A file of tasks that cannot be read."""
+    @classmethod
+    def from_json(cls, name: str, row: Any) -> Task:
+        """The task of a row of tasks.toml, as :meth:`to_json` gives it; any other value is a :class:`TaskError`."""
+        try:
+            return _task(name, row)
+        except (ValueError, TypeError) as error:
+            raise TaskError(f"task {shown(name)}: {error}") from error
 
 
 _KEYS = ("description", "objects", "points", "mt10")
 
 
-def _point(name: str, at: Any, objects: Mapping[str, NamedObject]) -> NamedObject:
-    if not isinstance(at, Mapping):
-        return NamedObject(name, _position(name, at), ours=True)
-    for key in at:
-        if key not in ("object", "offset"):
-            raise unknown_name(f"key of point {name!r}", key, ("object", "offset"))
-    if set(at) != {"object", "offset"}:
-        raise ValueError(f"point {name!r} must have object and offset, got {', '.join(at) or 'neither'}")
-    if at["object"] not in list(objects):
-        raise unknown_name(f"object of point {name!r}", at["object"], objects)
-    offset = at["offset"]
-    if not isinstance(offset, list) or len(offset) != 3 or not all(map(_is_number, offset)):
-        raise ValueError(f"offset of {name!r} must be three numbers in metres, got {offset!r}")
-    return NamedObject(name, objects[at["object"]].position, (offset[0], offset[1], offset[2]), ours=True)
+def _check_name(name: object) -> str:
+    if not isinstance(name, str):
+        raise TypeError(f"task must be a task's name, got {shown(name)} ({type(name).__name__})")
+    if not _NAME.fullmatch(name):
+        raise ValueError(f"task must be lower-case words joined by hyphens, like 'drawer-open', got {shown(name)}")
+    return name
 
 
 def _table(key: str, row: Mapping[str, Any]) -> Mapping[str, Any]:
     found = row.get(key, {})
-    if not isinstance(found, Mapping):
-        raise ValueError(f"{key} must be a table of names and positions, got {found!r}")
+    if not isinstance(found, Mapping) or not all(isinstance(name, str) for name in found):
+        raise ValueError(f"{key} must be a table of names and positions, got {shown(found)}")
     return found
 
 
 def _task(name: str, row: Any) -> Task:
     if not isinstance(row, Mapping):
-        raise ValueError(f"must be a table, got {row!r}")
+        raise ValueError(f"must be a table, got {shown(row)}")
     for key in row:
         if key not in _KEYS:
             raise unknown_name("key", key, _KEYS)
     description = row.get("description")
     if not isinstance(description, str) or not description.strip():
-        raise ValueError(f"description must be a sentence, got {description!r}")
+        raise ValueError(f"description must be a sentence, got {shown(description)}")
     objects = {GRIPPER: NamedObject(GRIPPER, (0, 1, 2))}
     for named, at in _table("objects", row).items():
         if named in objects:
             raise ValueError(f"objects may not name {named!r}, which every task has")
-        objects[named] = NamedObject(named, _position(named, at))
-    points = [_point(named, at, objects) for named, at in _table("points", row).items()]
+        objects[named] = NamedObject(named, read_position(named, at))
+    points = [read_point(named, at, objects) for named, at in _table("points", row).items()]
     return Task(name, description, (*objects.values(), *points))
 
 
 def _load() -> tuple[Mapping[str, Task], tuple[str, ...]]:
-    table = tomllib.loads((files("lw_torchrl.language") / "data" / "tasks.toml").read_text("utf-8"))
+    table = read_toml(files("lw_torchrl.language") / "data" / "tasks.toml", TaskError)
     tasks = {name: _task(name, row) for name, row in sorted(table.items())}
     return MappingProxyType(tasks), tuple(sorted(name for name, row in table.items() if row.get("mt10")))
 
@@ -204,30 +192,43 @@ MT50: tuple[str, ...] = tuple(TASKS)
 _RANK = {name: rank for rank, name in enumerate(MT50)}
 
 
-def check_task(name: object) -> str:
-    """Return ``name`` if it names one of the 50 tasks, else raise :class:`ValueError` with the nearest name."""
+def check_task(name: object, tasks: Mapping[str, Task] = TASKS) -> str:
+    """Return ``name`` if it names one of ``tasks``, else raise :class:`ValueError` with the nearest name."""
     if not isinstance(name, str):
-        raise TypeError(f"task must be a task's name, got {name!r} ({type(name).__name__})")
-    if name not in TASKS:
-        raise unknown_name("task", name, TASKS)
+        raise TypeError(f"task must be a task's name, got {shown(name)} ({type(name).__name__})")
+    if name not in tasks:
+        raise unknown_name("task", name, tasks)
     return name
 
 
 def task_id(name: str) -> int:
-    """The integer of a task: the rank of its name among the 50 sorted names, from 0.
+    """The integer of a task: of the 50, the rank of the name among the sorted names, from 0; of any other, a number
+    from 50 to 2³¹ - 1 that is made of the name alone.
+
+    So it is the same in every process and file, and a 51st task renumbers none. A misspelt name has an id too; whoever
+    is given it says which tasks it knows.
+
+    Raises:
+        ValueError: the name is not lower-case words joined by hyphens.
+        TypeError: it is no string.
 
     Example:
-        >>> task_id("assembly"), task_id("window-open")
-        (0, 49)
+        >>> task_id("assembly"), task_id("window-open"), task_id("stack-blocks")
+        (0, 49, 650718257)
     """
-    return _RANK[check_task(name)]
+    known = _RANK.get(name) if isinstance(name, str) else None
+    if known is not None:
+        return known
+    digest = blake2b(_check_name(name).encode(), digest_size=8).digest()
+    return len(MT50) + int.from_bytes(digest, "big") % _OWN_IDS
 
 
-def resolve_tasks(tasks: str | Iterable[str], *, known=None) -> tuple[str, ...]:
+def resolve_tasks(names: str | Iterable[str], *, tasks: Mapping[str, Task] = TASKS) -> tuple[str, ...]:
     """The names behind a set, a task, or a list of tasks, sorted by name.
 
     Args:
-        tasks: "MT10", "MT50", one task's name, or an iterable of names.
+        names: "MT10", "MT50", one task's name, or an iterable of names.
+        tasks: the tasks there are, by name, as from :func:`load_tasks`.
 
     Returns:
         10, 50, 1 or n names.
@@ -240,41 +241,42 @@ def resolve_tasks(tasks: str | Iterable[str], *, known=None) -> tuple[str, ...]:
         >>> resolve_tasks(["push", "door-open"])
         ('door-open', 'push')
     """
-    if isinstance(tasks, str):
-        if tasks in ("MT10", "MT50"):
-            return MT10 if tasks == "MT10" else MT50
-        if tasks not in TASKS:
-            raise unknown_name("tasks", tasks, ("MT10", "MT50", *TASKS))
-        return (tasks,)
-    if not isinstance(tasks, Iterable):
-        raise TypeError(f"tasks must be 'MT10', 'MT50', a task's name or a list of names, got {tasks!r}")
-    names = [check_task(name) for name in tasks]
-    if not names:
+    if isinstance(names, str):
+        if names in ("MT10", "MT50"):
+            return resolve_tasks(MT10 if names == "MT10" else MT50, tasks=tasks)
+        if names not in tasks:
+            raise unknown_name("tasks", names, ("MT10", "MT50", *tasks))
+        return (names,)
+    if not isinstance(names, Iterable):
+        raise TypeError(f"tasks must be 'MT10', 'MT50', a task's name or a list of names, got {shown(names)}")
+    found = [check_task(name, tasks) for name in names]
+    if not found:
         raise ValueError("tasks must name at least one task, got an empty list")
-    if len(set(names)) != len(names):
-        repeated = sorted({name for name in names if names.count(name) > 1})
+    if len(set(found)) != len(found):
+        repeated = sorted({name for name in found if found.count(name) > 1})
         raise ValueError(f"tasks must name each task once, got {', '.join(repeated)} more than once")
-    return tuple(sorted(names))
+    return tuple(sorted(found))
 
 
 def get_task(task: str | Task) -> Task:
-    """The :class:`Task` of a name; a Task is returned as it is."""
+    """The :class:`Task` of a name of the 50; a Task is returned as it is."""
     return task if isinstance(task, Task) else TASKS[check_task(task)]
 
 
 def load_tasks(path: str | os.PathLike[str]) -> Mapping[str, Task]:
-    """All 50 tasks, some of them as a file of one's own has them: other objects, points or words.
+    """All 50 tasks and those of a file of one's own: some of the 50 with other objects, points or words, or tasks that
+    the simulator does not have.
 
     Args:
-        path: a file in the format of data/tasks.toml. The simulator knows 50 tasks, so the names are theirs.
+        path: a file in the format of data/tasks.toml. A task with a new name must name its objects.
 
     Returns:
-        Task name to :class:`Task`; pass one wherever a task is asked for, or all of them to
-        :func:`~lw_torchrl.load_plans`.
+        Task name to :class:`Task`, sorted; pass one wherever a task is asked for, or all of them to
+        :func:`~lw_torchrl.load_plans` and :func:`resolve_tasks`.
 
     Raises:
         FileNotFoundError: there is no such file.
-        TaskError: (a ValueError) it is no TOML, names an unknown task, or a task in it is malformed.
+        TaskError: (a ValueError) it is no TOML, or a task in it is malformed.
 
     Example:
         >>> import os, tempfile
@@ -288,14 +290,16 @@ def load_tasks(path: str | os.PathLike[str]) -> Mapping[str, Task]:
         >>> folder.cleanup()
     """
     file = Path(path)
-    try:
-        table = tomllib.loads(file.read_text("utf-8-sig"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise TaskError(f"{file}: {error}") from error
     found = dict(TASKS)
-    for name, row in table.items():
+    for name, row in read_toml(file, TaskError).items():
         try:
-            found[check_task(name)] = _task(name, row)
-        except ValueError as error:
-            raise TaskError(f"{file}, task {name!r}: {error}") from error
-    return MappingProxyType(found)
+            found[name] = Task.from_json(name, row)
+            if name not in TASKS and len(found[name].objects) == 1:
+                close = nearest(name, TASKS, n=1)
+                raise TaskError(
+                    f"task {name!r}: is none of the 50, so it must name its objects"
+                    + (f"; did you mean {close[0]!r}?" if close else "")
+                )
+        except TaskError as error:
+            raise TaskError(f"{file}, {error}") from error
+    return MappingProxyType(dict(sorted(found.items())))

@@ -9,7 +9,6 @@ from torch import Tensor, nn
 from torchrl.modules import MLP
 
 from lw_torchrl._checks import check_int
-from lw_torchrl.language.tasks import MT50
 from lw_torchrl.modules.observation_features import Features, ObservationFeatures
 
 
@@ -18,20 +17,6 @@ def unit_scale(vectors: Tensor) -> Tensor:
     numbers are so small that a fresh network hardly tells texts apart."""
     vectors = vectors.to(torch.float32)
     return vectors / vectors.square().mean(-1, keepdim=True).sqrt().clamp(min=1e-6)
-
-
-def check_task_ids(task_id: Tensor, known: Tensor, problem: str) -> None:
-    """Raise :class:`ValueError` unless ``known`` (50,) bool holds for each of ``task_id`` (B,) int64."""
-    if torch.compiler.is_compiling():
-        return
-    if task_id.dtype not in (torch.int64, torch.int32):
-        raise ValueError(f"task_id must be int64, got {task_id.dtype}")
-    inside = (task_id >= 0) & (task_id < len(MT50))
-    good = inside & known[task_id.clamp(0, len(MT50) - 1)]
-    if not good.all():
-        wrong = sorted(set(task_id[~good].tolist()))
-        names = [MT50[i] if 0 <= i < len(MT50) else f"{i} (no task)" for i in wrong]
-        raise ValueError(f"task_id names {problem}: {', '.join(names)}")
 
 
 def text_to_latent(text_size: int, latent_size: int, width: int, depth: int) -> MLP:

@@ -13,9 +13,10 @@ from torch import Tensor
 from lw_torchrl._checks import check_choice
 from lw_torchrl._keys import as_keys
 from lw_torchrl.language.plans import Plans
-from lw_torchrl.language.tasks import MT50, TASKS, Task, resolve_tasks, task_id
+from lw_torchrl.language.task_index import TaskIndex
+from lw_torchrl.language.tasks import MT50, TASKS, Task, resolve_tasks
 from lw_torchrl.language.text import encode_texts
-from lw_torchrl.modules.decoder import ActionDecoder, check_task_ids, text_to_latent, unit_scale
+from lw_torchrl.modules.decoder import ActionDecoder, text_to_latent, unit_scale
 from lw_torchrl.modules.observation_features import Features
 from lw_torchrl.modules.policy import Policy, TextEncoding
 
@@ -26,7 +27,7 @@ def _definitions(tasks: str | Iterable[str | Task]) -> dict[str, Task]:
         return {name: TASKS[name] for name in resolve_tasks(tasks)}
     listed = list(tasks)
     own = {task.name: task for task in listed if isinstance(task, Task)}
-    names = resolve_tasks([task.name if isinstance(task, Task) else task for task in listed], known={**TASKS, **own})
+    names = resolve_tasks([task.name if isinstance(task, Task) else task for task in listed], tasks={**TASKS, **own})
     return {name: own.get(name) or TASKS[name] for name in names}
 
 
@@ -60,7 +61,6 @@ class DescriptorConditionedActor(Policy):
     """
 
     text_vectors: Tensor
-    known: Tensor
 
     def __init__(
         self,
@@ -101,13 +101,12 @@ class DescriptorConditionedActor(Policy):
         found = encode([task.description for task in self.definitions.values()])
         if found.ndim != 2 or len(found) != len(self.tasks):
             raise ValueError(f"text_encoder must give ({len(self.tasks)}, E), got shape {tuple(found.shape)}")
-        ids = torch.tensor([task_id(task) for task in self.tasks])
-        vectors = torch.zeros(len(MT50), found.shape[1])
-        vectors[ids] = unit_scale(found)
-        known = torch.zeros(len(MT50), dtype=torch.bool)
-        known[ids] = True
+        self.index = TaskIndex(self.tasks)
+        order = [self.tasks.index(task) for task in self.index.tasks]
+        # A product of another number of rows rounds differently: whatever the tasks, there are 50 or more.
+        fill = found.new_zeros(max(0, len(MT50) - len(order)), found.shape[1])
+        vectors = torch.cat((unit_scale(found)[order], fill))
         self.register_buffer("text_vectors", vectors, persistent=False)
-        self.register_buffer("known", known, persistent=False)
         self.encoder = text_to_latent(found.shape[1], latent_size, encoder_width, encoder_depth)
         self.decoder = ActionDecoder(latent_size, features, feature_noise, width, depth, squash)
 
@@ -118,25 +117,26 @@ class DescriptorConditionedActor(Policy):
         return cls([plan.definition for plan in plans.values()], text_encoder=text_encoder, **options)
 
     def prepare(self, tensordict: TensorDictBase) -> tuple[Tensor, ...]:
-        """What no trained parameter touches: task_id (B,) int64, and the observation's features (B, F)."""
-        observation, task = self.read(tensordict)
-        check_task_ids(task, self.known, "tasks this actor was not made for")
-        return task, self.decoder.features(observation)
+        """What no trained parameter touches: each task's row (B,) int64, and the observation's features (B, F)."""
+        observation, task_id = self.read(tensordict)
+        rows = self.index.rows(task_id, "tasks this actor was not made for")
+        return rows, self.decoder.features(observation)
 
     def act(self, *prepared: Tensor) -> tuple[Tensor]:
         """From what :meth:`prepare` gives: action (B, 4)."""
-        task, seen = prepared
-        return (self.decoder.decode(self.encoder(self.text_vectors)[task], seen),)
+        rows, seen = prepared
+        return (self.decoder.decode(self.encoder(self.text_vectors)[rows], seen),)
 
     def describe(self) -> dict[str, Any]:
-        tasks = [name if task == TASKS.get(name) else task.to_json() for name, task in self.definitions.items()]
-        return super().describe() | {"tasks": tasks}
+        own = {name: task.to_json() for name, task in self.definitions.items() if task != TASKS.get(name)}
+        return super().describe() | {"tasks": list(self.tasks), "own_tasks": own}
 
     @classmethod
     def from_description(
         cls, found: Mapping[str, Any], text_encoder: TextEncoding | None = None
     ) -> DescriptorConditionedActor:
-        tasks = [one if isinstance(one, str) else Task.from_json(one) for one in found["tasks"]]
+        own = {name: Task.from_json(name, row) for name, row in found["own_tasks"].items()}
+        tasks = [own.get(name, name) for name in found["tasks"]]
         return cls(tasks, text_encoder=text_encoder, **found["options"])
 
     def fit_normalization(self, observation: Tensor, weights: Tensor | None = None) -> None:

@@ -13,16 +13,7 @@ from torch import Tensor
 from lw_torchrl._checks import missing_keys
 from lw_torchrl._keys import as_keys
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
-from lw_torchrl.language.tasks import MT50, task_id
-from lw_torchrl.modules.decoder import check_task_ids
-
-
-def step_mask(plans: Plans) -> Tensor:
-    """(50, S) bool, true where the task of that task_id has a step."""
-    mask = torch.zeros(len(MT50), plans.num_steps, dtype=torch.bool)
-    for task, plan in plans.items():
-        mask[task_id(task), : len(plan.steps)] = True
-    return mask
+from lw_torchrl.language.task_index import TaskIndex
 
 
 def attend(logits: Tensor, steps: Tensor) -> Tensor:
@@ -69,21 +60,27 @@ class PlanAttention(TensorDictModuleBase):
         self.in_keys = as_keys("in_keys", in_keys, ("qaf", "task_id"))
         self.out_keys = as_keys("out_keys", out_keys, ("skill_weights",))
         self.plans = as_plans(plans)
-        self.register_buffer("mask", step_mask(self.plans), persistent=False)
+        self.index = TaskIndex(self.plans)
+        lengths = torch.tensor([len(self.plans[task].steps) for task in self.index.tasks])
+        self.register_buffer("mask", torch.arange(self.plans.num_steps) < lengths.unsqueeze(-1), persistent=False)
+
+    def rows(self, task_id: Tensor) -> Tensor:
+        """The row of each task in tables that have one for each plan, (...) int64; :class:`ValueError` for a task
+        without a plan."""
+        return self.index.rows(task_id, f"tasks without a plan in {self.plans!r}")
 
     def weights(self, qaf: Tensor, task_id: Tensor) -> Tensor:
         """(B, S) truth and (B,) int64 to (B, S) float32 attention."""
-        if qaf.shape != (*task_id.shape, self.mask.shape[-1]):
+        return self.over_steps(qaf, self.rows(task_id))
+
+    def over_steps(self, qaf: Tensor, rows: Tensor) -> Tensor:
+        """:meth:`weights` from what :meth:`rows` gives."""
+        if qaf.shape != (*rows.shape, self.mask.shape[-1]):
             raise ValueError(
-                f"qaf must have shape {(*task_id.shape, self.mask.shape[-1])}, one column for each step of the actor's "
+                f"qaf must have shape {(*rows.shape, self.mask.shape[-1])}, one column for each step of the actor's "
                 f"plans, got {tuple(qaf.shape)}; give QAFTransform the same plans"
             )
-        return attend(10.0 * qaf.to(torch.float32) - 5.0, self.steps(task_id))
-
-    def steps(self, task_id: Tensor) -> Tensor:
-        """(B,) int64 to (B, S) bool, whether the task's plan has that step."""
-        check_task_ids(task_id, self.mask[:, 0], f"tasks without a plan in {self.plans!r}")
-        return self.mask[task_id]
+        return attend(10.0 * qaf.to(torch.float32) - 5.0, self.mask[rows])
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         qaf, task_id = (tensordict.get(key, None) for key in self.in_keys)

@@ -13,7 +13,6 @@ from torch import Tensor
 from lw_torchrl._checks import check_choice, check_scale
 from lw_torchrl._keys import as_keys
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
-from lw_torchrl.language.tasks import MT50, task_id
 from lw_torchrl.language.text import encode_texts
 from lw_torchrl.modules.decoder import ActionDecoder, text_to_latent, unit_scale
 from lw_torchrl.modules.mentions import mentioned, swap_unmentioned
@@ -139,16 +138,15 @@ class PlanConditionedActor(Policy):
         vectors = (encode_texts if text_encoder is None else text_encoder)(self.skills)
         if vectors.ndim != 2 or len(vectors) != len(self.skills):
             raise ValueError(f"text_encoder must give ({len(self.skills)}, E), got shape {tuple(vectors.shape)}")
-        index = torch.zeros(len(MT50), self.plans.num_steps, dtype=torch.int64)
-        for task, plan in self.plans.items():
-            index[task_id(task), : len(plan.steps)] = torch.tensor(
-                [self.skills.index(step.skill) for step in plan.steps]
-            )
+        self.attention = PlanAttention(self.plans)
+        index = torch.zeros(len(self.plans), self.plans.num_steps, dtype=torch.int64)
+        for row, task in enumerate(self.attention.index.tasks):
+            steps = self.plans[task].steps
+            index[row, : len(steps)] = torch.tensor([self.skills.index(step.skill) for step in steps])
         # The tables come from the plans, not from training: they are not part of the state that is saved.
         self.register_buffer("text_vectors", unit_scale(vectors), persistent=False)
         self.register_buffer("skill_index", index, persistent=False)
-        self.register_buffer("mentioned", mentioned(self.plans), persistent=False)
-        self.attention = PlanAttention(self.plans)
+        self.register_buffer("mentioned", mentioned(self.plans, self.attention.index), persistent=False)
         self.encoder = text_to_latent(vectors.shape[1], latent_size, encoder_width, encoder_depth)
         self.focus = PlanFocus(self.plans, feature_noise) if focus else None
         more = 0 if self.focus is None else self.focus.width
@@ -171,18 +169,18 @@ class PlanConditionedActor(Policy):
         observation's features (B, F). With an evaluator, in the attention's place the steps that there are (B, S) bool,
         and behind the features what the evaluator reads."""
         observation, task, *rest = self.read(tensordict)
+        rows = self.attention.rows(task)
         if self.evaluator is not None:
             asked = [tensordict.get(key) for key in self.evaluator.in_keys]
-            steps, index = self.attention.steps(task), self.skill_index[task]
-            return steps, index, self.decoder.features(observation), *asked
-        weights = self.attention.weights(rest[0], task)
+            return self.attention.mask[rows], self.skill_index[rows], self.decoder.features(observation), *asked
+        weights = self.attention.over_steps(rest[0], rows)
         if self.training and self.config["swap_unmentioned"]:
-            kept = ((weights > _IN_FORCE).unsqueeze(-1) & self.mentioned[task]).any(-2)
+            kept = ((weights > _IN_FORCE).unsqueeze(-1) & self.mentioned[rows]).any(-2)
             observation = swap_unmentioned(observation, kept, self.config["swap_unmentioned"])
         seen = self.decoder.features(observation)
         if self.focus is not None:
             seen = torch.cat((seen, self.focus(observation, weights, task)), -1)
-        return weights, self.skill_index[task], seen
+        return weights, self.skill_index[rows], seen
 
     def act(self, *prepared: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """From what :meth:`prepare` gives: action (B, 4), attention (B, S), skill latent (B, D)."""

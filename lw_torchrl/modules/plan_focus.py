@@ -8,7 +8,8 @@ from torch import Tensor, nn
 from lw_torchrl._checks import check_scale
 from lw_torchrl.language.observation import OBSERVATION_SIZE
 from lw_torchrl.language.plans import Plans, PlanStep
-from lw_torchrl.language.tasks import MT50, Task, coordinate_index, task_id
+from lw_torchrl.language.task_index import TaskIndex
+from lw_torchrl.language.tasks import Task, coordinate_index
 from lw_torchrl.modules.observation_features import squash
 
 _PAIRS = 2  # of a step: those of its first and of its last clause that compares two things
@@ -46,13 +47,14 @@ class PlanFocus(nn.Module):
         super().__init__()
         self.noise = check_scale("feature_noise", noise)
         constants = [0.0]
-        shape = (len(MT50), plans.num_steps, _PAIRS, 3)
+        self.index = TaskIndex(plans)
+        shape = (len(plans), plans.num_steps, _PAIRS, 3)
         index = torch.full((2, *shape), OBSERVATION_SIZE)  # the constant 0
         offset = torch.zeros(shape)
         for task, plan in plans.items():
             for number, step in enumerate(plan.steps):
                 for pair, names in enumerate(_pairs(step)):
-                    at = (task_id(task), number, pair)
+                    at = (self.index.row(task), number, pair)
                     for side, position in enumerate(self._positions(names, plan.definition)):
                         index[(side, *at)] = torch.tensor([coordinate_index(c, constants) for c in position[0]])
                         offset[at] += torch.tensor(position[1]) * (2 * side - 1)
@@ -69,9 +71,10 @@ class PlanFocus(nn.Module):
     def forward(self, observation: Tensor, weights: Tensor, task_id: Tensor) -> Tensor:
         """(..., 39) float32, attention (..., S) float32 and (...) int64 to (..., 18) float32."""
         known = torch.cat((observation, self.constants.expand(*observation.shape[:-1], -1)), -1)
-        first, second = self.first[task_id], self.second[task_id]  # (..., S, 2, 3)
+        rows = self.index.rows(task_id, "tasks without a plan")
+        first, second = self.first[rows], self.second[rows]  # (..., S, 2, 3)
         flat = (*first.shape[: task_id.ndim], -1)
         way = (known.gather(-1, second.reshape(flat)) - known.gather(-1, first.reshape(flat))).reshape(first.shape)
-        way = (weights[..., None, None] * (way + self.offset[task_id])).sum(-3).flatten(-2)
+        way = (weights[..., None, None] * (way + self.offset[rows])).sum(-3).flatten(-2)
         found = torch.cat((way / _SCALE, *squash(way)), -1)
         return found + self.noise * torch.randn_like(found) if self.training and self.noise else found

@@ -15,7 +15,7 @@ from lw_torchrl._keys import as_keys
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.skill_program import SkillProgram
 from lw_torchrl.language.skills import ScriptedSkill
-from lw_torchrl.language.tasks import MT50, task_id
+from lw_torchrl.language.task_index import TaskIndex
 from lw_torchrl.modules.policy import Policy, TextEncoding
 from lw_torchrl.transforms.qaf import QAFTransform
 
@@ -68,9 +68,8 @@ class ScriptedSkillActor(Policy):
         self.program = SkillProgram(
             {plan.definition: [step.skill for step in plan.steps] for plan in self.plans.values()}, skills
         )
-        last = torch.zeros(len(MT50), dtype=torch.int64)
-        for task, plan in self.plans.items():
-            last[task_id(task)] = len(plan.steps) - 1
+        self.index = TaskIndex(self.plans)
+        last = torch.tensor([len(self.plans[task].steps) - 1 for task in self.index.tasks])
         self._last = last
         self._generator = torch.Generator().manual_seed(seed)
 
@@ -96,8 +95,9 @@ class ScriptedSkillActor(Policy):
     def from_description(cls, found: Mapping[str, Any], text_encoder: TextEncoding | None = None) -> ScriptedSkillActor:
         return cls(Plans.from_json(found["plans"]), **found["options"])
 
-    def _weights(self, qaf: Tensor, given: Tensor) -> Tensor:
-        last = torch.nn.functional.one_hot(self._last.to(given.device)[given], qaf.shape[-1]).bool()
+    def _weights(self, qaf: Tensor, task_id: Tensor) -> Tensor:
+        rows = self.index.rows(task_id, f"tasks without a plan in {self.plans!r}")
+        last = torch.nn.functional.one_hot(self._last.to(rows.device)[rows], qaf.shape[-1]).bool()
         true = torch.where(qaf.any(-1, keepdim=True), qaf, last).float()
         if self.select == "mix":
             return true / true.sum(-1, keepdim=True)

@@ -1,5 +1,7 @@
 """The 50 tasks against the published package, and the ways to name them."""
 
+import json
+
 import language_world as oracle
 import numpy as np
 import pytest
@@ -156,11 +158,27 @@ def test_a_repeated_name_is_named_alone():
     assert "reach" not in str(caught.value)
 
 
-@pytest.mark.parametrize("function", [check_task, task_id, get_task])
+@pytest.mark.parametrize("function", [check_task, get_task])
 @pytest.mark.parametrize("name", ["reahc", "", "Reach", " reach", "reach-v3"])
 def test_an_unknown_task_is_a_value_error(function, name):
     with pytest.raises(ValueError, match="task must be one of"):
         function(name)
+
+
+OWN = {"stack-blocks": 650718257, "reahc": 893438262, "reach-v3": 94884373, "x": 950319221}
+
+
+@pytest.mark.parametrize(("name", "number"), OWN.items())
+def test_any_other_name_has_an_id_of_its_own_that_never_changes(name, number):
+    assert task_id(name) == number
+    assert 50 <= number < 2**31
+
+
+@pytest.mark.parametrize("name", ["", "Reach", " reach", "reach_v3", "reach-", "-", "../reach", "3d", "reach\n", "ré"])
+def test_a_name_that_no_task_may_have(name):
+    for function in (task_id, lambda given: Task(given, "Do it.", (NamedObject(GRIPPER, (0, 1, 2)),))):
+        with pytest.raises(ValueError, match="lower-case words joined by hyphens"):
+            function(name)
 
 
 @pytest.mark.parametrize("function", [check_task, task_id, get_task])
@@ -249,6 +267,67 @@ def test_a_task_of_ones_own_is_taken_wherever_a_task_is_asked_for(tmp_path):
     assert (program.logits(state, ids) > 0).tolist() == [True, True]
 
 
+STACK = PUSH + '[stack-blocks]\ndescription = "Stack them."\nobjects.block = "obs[4:7]"\nobjects.tower = "obs[11:14]"\n'
+
+
+def test_tasks_that_the_simulator_does_not_have(tmp_path):
+    mine = load(tmp_path, STACK)
+    assert list(mine) == sorted([*TASKS, "stack-blocks"])
+    assert mine["stack-blocks"].object_names == (GRIPPER, "block", "tower")
+    assert resolve_tasks(["stack-blocks", "push"], tasks=mine) == ("push", "stack-blocks")
+    assert resolve_tasks("stack-blocks", tasks=mine) == ("stack-blocks",)
+    assert resolve_tasks("MT50", tasks=mine) == MT50
+    with pytest.raises(ValueError, match="did you mean 'stack-blocks'"):
+        resolve_tasks(["stack-block"], tasks=mine)
+    with pytest.raises(ValueError, match="must be one of"):
+        resolve_tasks(["stack-blocks"])
+
+
+@pytest.mark.parametrize("name", MT50)
+def test_a_task_is_the_same_read_from_its_json(name):
+    row = json.loads(json.dumps(TASKS[name].to_json()))
+    assert Task.from_json(name, row) == TASKS[name]
+
+
+def test_a_task_that_is_no_row_of_the_table():
+    beside = NamedObject("edge", (4, 5, 6), (0.1, 0.0, 0.0), ours=True)
+    with pytest.raises(TaskError, match="cannot be written"):
+        Task("mine", "Mine.", (NamedObject(GRIPPER, (0, 1, 2)), beside)).to_json()
+    with pytest.raises(TaskError, match="cannot be written"):
+        Task("mine", "Mine.", (NamedObject(GRIPPER, (4, 5, 6)),)).to_json()
+
+
+DEEP = []
+for _ in range(10**5):
+    DEEP = [DEEP]
+
+
+HOSTILE = dict(none=None, text="obs[4:7]", empty=[], deep=DEEP, huge=10**5000, inner={"a": DEEP}, key={3: 4})
+
+
+@pytest.mark.parametrize("kind", HOSTILE)
+@pytest.mark.parametrize("place", ["row", "description", "objects", "points", "object", "point", "offset", "beside"])
+def test_hostile_values_are_task_errors(kind, place):
+    value = HOSTILE[kind]
+    row = Task.to_json(TASKS["assembly"])
+    if place == "row":
+        row = value
+    elif place in row:
+        row[place] = value
+    elif place == "object":
+        row["objects"]["wrench"] = value
+    elif place == "point":
+        row["points"]["wrench handle"] = value
+    else:
+        row["points"]["wrench handle"]["object" if place == "beside" else place] = value
+    if kind == "text" and place in ("description", "object", "point"):
+        assert Task.from_json("assembly", row).name == "assembly"
+        return
+    with pytest.raises(TaskError, match="task 'assembly'") as caught:
+        Task.from_json("assembly", row)
+    assert len(str(caught.value)) < 500
+
+
 def test_our_own_table_is_such_a_file():
     from importlib.resources import files
 
@@ -264,8 +343,8 @@ def test_a_byte_order_mark_is_no_part_of_the_first_key(tmp_path):
     ("text", "says"),
     [
         ("[push", ["']'", "end of document"]),
-        (PUSH.replace("[push]", "[psuh]"), ["'psuh'", "did you mean 'push'"]),
-        (PUSH.replace("[push]", '["push-v3"]'), ["'push-v3'", "'push'"]),
+        ('[psuh]\ndescription = "Push."', ["'psuh'", "must name its objects", "did you mean 'push'"]),
+        (PUSH.replace("[push]", '["Push it"]'), ["'Push it'", "lower-case words joined by hyphens"]),
         ("push = 3", ["'push'", "table", "3"]),
         (PUSH + 'object.puck = "obs[4:7]"', ["'push'", "'object'", "did you mean 'objects'"]),
         (PUSH + 'point.puck = "obs[4:7]"', ["'push'", "'point'", "'points'"]),

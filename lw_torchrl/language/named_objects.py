@@ -1,0 +1,110 @@
+"""What queries can name: objects and points, and where the observation tells their positions."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from lw_torchrl._checks import shown, unknown_name
+from lw_torchrl.language.observation import OBSERVATION_SIZE
+
+GRIPPER = "robot's gripper"
+Coordinate = int | float
+"""An int is an index into the observation, a float a fixed number of metres."""
+
+_SLICE = re.compile(r"obs\[([0-9]{1,4}):([0-9]{1,4})\]")
+_INDEX = re.compile(r"obs\[([0-9]{1,4})\]")
+
+
+def is_number(value: object) -> bool:
+    """Whether ``value`` is a number that is plausible in metres, gains or efforts: neither bool nor NaN, and not
+    huge."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e9
+
+
+def coordinate_index(coordinate: Coordinate, constants: list[float]) -> int:
+    """Where a coordinate stands in the 39 numbers of an observation followed by ``constants``, which grow at need."""
+    if isinstance(coordinate, int):
+        return coordinate
+    if coordinate not in constants:
+        constants.append(coordinate)
+    return OBSERVATION_SIZE + constants.index(coordinate)
+
+
+@dataclass(frozen=True)
+class NamedObject:
+    """An object that queries can name.
+
+    Attributes:
+        name: "drawer handle", in lower case and without an article.
+        position: where x, y and z are found: an int is an index into the 39 numbers of the observation,
+            a float is a fixed place in metres.
+        offset: added to it, metres; a point beside an object has one.
+        ours: a point that we named, and the published object list has not.
+
+    Raises:
+        ValueError: the name is not plain lower-case words, or a coordinate lies outside the observation.
+    """
+
+    name: str
+    position: tuple[Coordinate, Coordinate, Coordinate]
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    ours: bool = False
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r"[a-z][a-z0-9'-]*( [a-z0-9][a-z0-9'-]*)*", self.name):
+            raise ValueError(f"name must be lower-case words like 'drawer handle', got {shown(self.name)}")
+        if {"and", "is", "not", "the"} & set(self.name.split()):
+            raise ValueError(f"name may not contain 'and', 'is', 'not' or 'the', got {shown(self.name)}")
+        if len(self.position) != 3:
+            raise ValueError(f"position of {self.name!r} must have 3 coordinates, got {shown(self.position)}")
+        for coordinate in self.position:
+            if not is_number(coordinate):
+                raise ValueError(
+                    f"position of {self.name!r} must hold ints and finite floats, got {shown(self.position)}"
+                )
+            if isinstance(coordinate, int) and not 0 <= coordinate < OBSERVATION_SIZE:
+                raise ValueError(f"position of {self.name!r}: obs[{coordinate}] is outside the 39 numbers, 0 to 38")
+        if len(self.offset) != 3 or not all(map(is_number, self.offset)):
+            raise ValueError(f"offset of {self.name!r} must be three numbers in metres, got {shown(self.offset)}")
+
+
+def read_position(name: str, at: Any) -> tuple[Coordinate, Coordinate, Coordinate]:
+    """The position that "obs[4:7]" or [0.1, "obs[37]", 0.0] stand for in tasks.toml."""
+    if isinstance(at, str) and (match := _SLICE.fullmatch(at)):
+        start, stop = map(int, match.groups())
+        if stop - start == 3:
+            return (start, start + 1, start + 2)
+    if isinstance(at, list) and len(at) == 3:
+        found = [int(match[1]) if isinstance(c, str) and (match := _INDEX.fullmatch(c)) else c for c in at]
+        if all(map(is_number, found)):
+            x, y, z = (c if isinstance(o, str) else float(c) for c, o in zip(found, at, strict=True))
+            return (x, y, z)
+    raise ValueError(f"position of {name!r} must be like 'obs[4:7]' or [0.1, 'obs[37]', 0.0], got {shown(at)}")
+
+
+def write_position(position: tuple[Coordinate, Coordinate, Coordinate]) -> str | list[str | float]:
+    """What :func:`read_position` reads back."""
+    first = position[0]
+    if isinstance(first, int) and position == (first, first + 1, first + 2):
+        return f"obs[{first}:{first + 3}]"
+    return [f"obs[{c}]" if isinstance(c, int) else c for c in position]
+
+
+def read_point(name: str, at: Any, objects: Mapping[str, NamedObject]) -> NamedObject:
+    """A point of tasks.toml: a position, or {object = ..., offset = [x, y, z]}."""
+    if not isinstance(at, Mapping):
+        return NamedObject(name, read_position(name, at), ours=True)
+    for key in at:
+        if key not in ("object", "offset"):
+            raise unknown_name(f"key of point {name!r}", key, ("object", "offset"))
+    if set(at) != {"object", "offset"}:
+        raise ValueError(f"point {name!r} must have object and offset, got {', '.join(at) or 'neither'}")
+    if at["object"] not in list(objects):
+        raise unknown_name(f"object of point {name!r}", at["object"], objects)
+    offset = at["offset"]
+    if not isinstance(offset, list) or len(offset) != 3 or not all(map(is_number, offset)):
+        raise ValueError(f"offset of {name!r} must be three numbers in metres, got {shown(offset)}")
+    return NamedObject(name, objects[at["object"]].position, (offset[0], offset[1], offset[2]), ours=True)

@@ -1,0 +1,153 @@
+"""From task ids to rows of tables that have a row for each task."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Generic, TypeVar
+
+import torch
+from torch import Tensor
+from torch._C._functorch import is_functorch_wrapped_tensor
+from torch._subclasses.fake_tensor import FakeTensor
+
+from lw_torchrl.language.tasks import MT50, task_id
+
+_Kind = tuple[torch.device, torch.dtype, bool]
+_KEPT_ROWS = 4096  # of the last batch, the most to keep the tables of
+Tables = TypeVar("Tables", bound=tuple[Tensor, ...])
+
+
+def readable(*tensors: Tensor) -> bool:
+    """Whether Python may look at the tensors' numbers, and keep them: not while something is compiled or exported, nor
+    inside a transform of ``torch.func``."""
+    return not torch.compiler.is_compiling() and not any(
+        is_functorch_wrapped_tensor(tensor) or isinstance(tensor, FakeTensor) for tensor in tensors
+    )
+
+
+class TaskIndex:
+    """The rows that tasks have in a table: they are in the order of their ids, the 50 before any others.
+
+    It follows the ids to their device.
+
+    Args:
+        tasks: names, in any order.
+
+    Attributes:
+        tasks: the names in the order of their rows.
+
+    Raises:
+        ValueError: a name that is none, one given twice, or two that have the same id.
+
+    Example:
+        >>> index = TaskIndex(["reach", "stack-blocks", "push"])
+        >>> index.tasks
+        ('push', 'reach', 'stack-blocks')
+        >>> index.rows(torch.tensor([task_id("reach"), task_id("push")]), "tasks without a plan").tolist()
+        [1, 0]
+    """
+
+    def __init__(self, tasks: Iterable[str]) -> None:
+        names: dict[int, str] = {}
+        for name in tasks:
+            number = task_id(name)
+            if number in names:
+                same = "is given twice" if names[number] == name else f"and {names[number]!r} have the same id"
+                raise ValueError(f"tasks must differ in their ids: {name!r} {same}; choose another name")
+            names[number] = name
+        self.tasks = tuple(names[number] for number in sorted(names))
+        self._ids = torch.tensor([*sorted(names), -1])  # -1 is no task's, for ids beyond the last
+
+    def row(self, task: str) -> int:
+        """The row of a task's name."""
+        return self.tasks.index(task)
+
+    def rows(self, task_id: Tensor, problem: str) -> Tensor:
+        """The row of each task.
+
+        Args:
+            task_id: (...) int64.
+            problem: what is the matter with an id that has no row, "tasks without a plan".
+
+        Returns:
+            (...) int64. Where an unknown id cannot be told, inside ``torch.vmap``, it gets a row beyond the last.
+
+        Raises:
+            ValueError: another dtype, or an id that has no row; compiled, a RuntimeError when it is run.
+        """
+        if task_id.dtype not in (torch.int64, torch.int32):
+            raise ValueError(f"task_id must be int64, got {task_id.dtype}")
+        known = readable(task_id)
+        ids = self._ids
+        if ids.device != task_id.device:
+            ids = ids.to(task_id.device)
+            if known:
+                self._ids = ids
+        given = task_id.long()
+        rows = torch.searchsorted(ids[:-1], given)
+        found = ids.index_select(0, rows.reshape(-1)).reshape(rows.shape)
+        if known:
+            if not torch.equal(found, given):
+                raise ValueError(f"task_id names {problem}: {self._name(given[found != given])}")
+            return rows
+        if torch.compiler.is_compiling():
+            torch._assert_async((found == given).all(), f"task_id names {problem}")
+        return torch.where(found == given, rows, len(self.tasks))
+
+    @staticmethod
+    def _name(wrong: Tensor) -> str:
+        listed = wrong.unique().tolist()[:5]
+        return ", ".join(MT50[i] if 0 <= i < len(MT50) else f"{i} (none of the 50)" for i in listed)
+
+
+class TaskTables(Generic[Tables]):
+    """Tables with a row for each task, and their rows for a batch.
+
+    The rows of an environment keep their tasks, so what the last batch selected is kept for the next one.
+
+    Args:
+        index: which row is whose.
+        tables: a named tuple of tensors, each (T, ...).
+    """
+
+    def __init__(self, index: TaskIndex, tables: Tables) -> None:
+        self.index, self.tables = index, tables
+        self._moved: dict[_Kind, Tables] = {}
+        self._last: tuple[Tensor, _Kind, Tables] | None = None
+
+    def select(self, task_id: Tensor, observation: Tensor, problem: str) -> Tables:
+        """The tables' rows for a batch.
+
+        Args:
+            task_id: (B,) int64.
+            observation: whose device the tables are moved to; tables of floats take its dtype.
+            problem: as for :meth:`TaskIndex.rows`.
+
+        Returns:
+            The tables, each (B, ...).
+        """
+        device, dtype = observation.device, observation.dtype
+        if not readable(observation, task_id):
+            return self._pick(self._to(device, dtype), task_id, problem)
+        # Autograd refuses what was made in inference mode.
+        kind = device, dtype, torch.is_inference_mode_enabled()
+        if self._last is not None:
+            ids, of, selected = self._last
+            if of == kind and ids.device == task_id.device and torch.equal(ids, task_id):
+                return selected
+        if kind not in self._moved:
+            self._moved[kind] = self._to(device, dtype)
+        selected = self._pick(self._moved[kind], task_id, problem)
+        if len(task_id) <= _KEPT_ROWS:
+            self._last = (task_id.clone(), kind, selected)
+        return selected
+
+    def _to(self, device: torch.device, dtype: torch.dtype) -> Tables:
+        return self._make(table.to(device, dtype if table.is_floating_point() else None) for table in self.tables)
+
+    def _pick(self, tables: Tables, task_id: Tensor, problem: str) -> Tables:
+        rows = self.index.rows(task_id, problem)
+        return self._make(table.index_select(0, rows) for table in tables)
+
+    def _make(self, tables: Iterable[Tensor]) -> Tables:
+        return type(self.tables)(*tables)

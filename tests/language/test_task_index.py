@@ -1,0 +1,131 @@
+"""TaskIndex and TaskTables: the row of each task, wrong ids told, compiled, exported and inside vmap too."""
+
+from typing import NamedTuple
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor, nn
+
+import lw_torchrl as lw
+from lw_torchrl.language import task_index
+from lw_torchrl.language.task_index import TaskIndex, TaskTables
+
+NAMES = st.sampled_from([*lw.MT50, "stack-blocks", "wipe", "pour-tea", "x"])
+
+
+@settings(deadline=None)
+@given(tasks=st.lists(NAMES, min_size=1, unique=True), shape=st.lists(st.integers(0, 4), max_size=3), data=st.data())
+def test_rows_are_in_the_order_of_the_ids_for_any_shape(tasks, shape, data):
+    index = TaskIndex(tasks)
+    ids = [lw.task_id(task) for task in index.tasks]
+    assert ids == sorted(ids)
+    assert sorted(index.tasks) == sorted(tasks)
+    seed = data.draw(st.integers(0, 2**31))
+    rows = torch.randint(len(tasks), shape, generator=torch.Generator().manual_seed(seed))
+    given_ids = torch.tensor(ids)[rows]
+    assert torch.equal(index.rows(given_ids, "wrong"), rows)
+    assert torch.equal(index.rows(given_ids.int(), "wrong"), rows)
+    assert [index.row(task) for task in index.tasks] == list(range(len(tasks)))
+
+
+@pytest.mark.parametrize("wrong", [-1, 0, 50, 2**31, 2**63 - 1, -(2**63), lw.task_id("wipe")])
+def test_an_id_without_a_row_is_named(wrong):
+    index = TaskIndex(["push", "reach", "stack-blocks"])
+    with pytest.raises(ValueError, match=r"task_id names tasks without a plan: ") as caught:
+        index.rows(torch.tensor([[lw.task_id("push"), wrong]]), "tasks without a plan")
+    named = "assembly" if wrong == 0 else f"{wrong} (none of the 50)"
+    assert str(caught.value).endswith(f": {named}")
+
+
+def test_two_names_of_one_id_are_refused(monkeypatch):
+    monkeypatch.setattr(task_index, "task_id", len)
+    with pytest.raises(ValueError, match="'pour' and 'wipe' have the same id"):
+        TaskIndex(["wipe", "pour"])
+    with pytest.raises(ValueError, match="'wipe' is given twice"):
+        TaskIndex(["wipe", "wipe"])
+
+
+def test_floats_are_no_ids():
+    with pytest.raises(ValueError, match=r"task_id must be int64, got torch\.float32"):
+        TaskIndex(["push"]).rows(torch.zeros(2), "wrong")
+
+
+class Numbers(NamedTuple):
+    whole: Tensor
+    real: Tensor
+
+
+def tables():
+    return TaskTables(TaskIndex(["push", "reach"]), Numbers(torch.tensor([[1], [2]]), torch.tensor([[0.1], [0.2]])))
+
+
+class Reader(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.tables = tables()
+
+    def forward(self, observation, task_id):
+        found = self.tables.select(task_id, observation, "tasks without numbers")
+        return found.whole + found.real
+
+
+IDS = torch.tensor([lw.task_id("reach"), lw.task_id("push"), lw.task_id("reach")])
+STATES = torch.zeros(3, 39)
+EXPECTED = torch.tensor([[2.2], [1.1], [2.2]])
+
+
+def test_what_is_kept_is_of_this_batch_dtype_and_mode():
+    reader = Reader()
+    for _ in range(2):
+        assert torch.equal(reader(STATES, IDS), EXPECTED)
+        assert torch.equal(reader(STATES, IDS.flip(0)[:2]), EXPECTED.flip(0)[:2])
+        assert reader(STATES.double(), IDS).dtype == torch.float64
+        with torch.inference_mode():
+            reader(STATES, IDS)
+        selected = reader.tables.select(IDS, STATES, "")
+        weight = torch.ones(3, 1, requires_grad=True)
+        (weight * selected.real).sum().backward()  # refused of a table made in inference mode
+    ids = IDS.clone()
+    reader(STATES, ids)
+    ids[0] = lw.task_id("push")  # the caller's tensor, changed in place
+    assert reader(STATES, ids)[0].item() == pytest.approx(1.1)
+
+
+@pytest.fixture(scope="module")
+def compiled():
+    return torch.compile(Reader(), fullgraph=True, backend="aot_eager")
+
+
+def test_compiled_it_answers_and_tells_an_unknown_id(compiled):
+    assert torch.equal(compiled(STATES, IDS), EXPECTED)
+    wrong = IDS.clone()
+    wrong[1] = lw.task_id("wipe")
+    with pytest.raises(RuntimeError, match="tasks without numbers"):
+        compiled(STATES, wrong)
+
+
+def test_exported_it_answers_and_leaves_nothing_behind():
+    reader = Reader()
+    exported = torch.export.export(reader, (STATES, IDS)).module()
+    assert torch.equal(exported(STATES, IDS), EXPECTED)
+    assert torch.equal(reader(STATES, IDS), EXPECTED)
+    with pytest.raises(RuntimeError, match="tasks without numbers"):
+        exported(STATES, IDS + 1)
+
+
+def test_inside_vmap_an_unknown_id_gets_nobodys_numbers():
+    reader = Reader()
+    each = torch.vmap(lambda state, task: reader(state.unsqueeze(0), task.unsqueeze(0))[0])
+    assert torch.equal(each(STATES, IDS), EXPECTED)
+    assert torch.equal(reader(STATES, IDS), EXPECTED)
+    with pytest.raises((IndexError, RuntimeError), match="out of"):
+        each(STATES, IDS + 1)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_it_follows_the_ids_to_their_device():
+    reader = Reader()
+    assert torch.equal(reader(STATES.cuda(), IDS.cuda()).cpu(), EXPECTED)
+    assert torch.equal(reader(STATES, IDS), EXPECTED)
