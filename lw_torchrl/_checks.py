@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable
 from difflib import get_close_matches
 from reprlib import Repr
@@ -55,7 +56,7 @@ def check_scale(argument: str, given: Any) -> float:
     """Return ``given`` as a finite float of at least 0."""
     if isinstance(given, bool) or not isinstance(given, (int, float)):
         raise TypeError(f"{argument} must be a number, got {given!r} ({type(given).__name__})")
-    if not 0.0 <= given < float("inf"):
+    if not 0.0 <= given <= sys.float_info.max:
         raise ValueError(f"{argument} must be finite and at least 0, got {given!r}")
     return float(given)
 

@@ -1,29 +1,92 @@
-"""Files that are replaced whole or not at all."""
+"""Files that are replaced whole or not at all, and JSON that is read whole or refused."""
 
 from __future__ import annotations
 
+import errno
 import json
 import os
+import re
 import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
+
+JSON_LIMIT = 32 * 2**20
+"""Bytes of a JSON file; read, it takes some twenty times as much memory."""
 
 
 @contextmanager
-def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A temporary path beside ``path`` to write to; it takes the name when the block ends without an error."""
+def replacing(path: str | os.PathLike[str], *, sync: bool = True) -> Iterator[Path]:
+    """A temporary path beside ``path`` to write to; it takes the name when the block ends without an error.
+
+    Whenever the process is killed or the machine stops, ``path`` is the old file or the new one, whole. What a killed
+    process left beside it goes at the next write, see :func:`sweep`. Waiting for the disk takes some 10 ms; without
+    ``sync`` it is whole after a kill, but not if the machine stops.
+    """
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
+    sweep(target)
     # The suffix stays, since writers choose the format by it.
     temporary = target.with_name(f".{target.stem}.{os.getpid()}.tmp{target.suffix}")
     try:
         yield temporary
+        if sync:
+            flush(temporary)
         os.replace(temporary, target)
+        if sync:
+            flush(target.parent)
+    except OSError as error:
+        if error.errno is not None and error.filename is None:
+            error.filename = str(target)  # a full disk does not say which file it was
+        raise
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def flush(path: Path) -> None:
+    """Return once a file's content, or a folder's list of names, is on the disk."""
+    if os.name != "posix" and path.is_dir():
+        return  # a folder cannot be opened there
+    handle = os.open(path, os.O_RDONLY if os.name == "posix" else os.O_RDWR)
+    try:
+        os.fsync(handle)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # a file system that cannot
+            raise
+    finally:
+        os.close(handle)
+
+
+def sweep(target: str | os.PathLike[str]) -> list[Path]:
+    """Remove the temporary files that killed writers of ``target`` left beside it; returns them.
+
+    A file of a process of this machine that still runs stays, unless that process is this one.
+    """
+    path = Path(target)
+    pattern = re.compile(re.escape(f".{path.stem}.") + r"([1-9][0-9]{0,9})\.tmp" + re.escape(path.suffix))
+    left = []
+    for name in os.listdir(path.parent) if path.parent.is_dir() else ():
+        if (match := pattern.fullmatch(name)) and not _runs(int(match[1])):
+            path.with_name(name).unlink(missing_ok=True)
+            left.append(path.with_name(name))
+    return left
+
+
+def _runs(process: int) -> bool:
+    """Whether another process of this number runs."""
+    if process == os.getpid():
+        return False
+    if os.name != "posix":
+        return True  # there, signal 0 would end it
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        return True
+    return True
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
@@ -52,3 +115,61 @@ def read_toml(path: Path | Traversable, error: type[ValueError]) -> dict[str, An
         return tomllib.loads(text)
     except (ValueError, RecursionError) as fault:  # too long a number is a ValueError, too deep a nesting the other
         raise error(f"{path}: {fault}") from fault
+
+
+def read_json(path: str | os.PathLike[str], what: str, *, limit: int = JSON_LIMIT) -> dict[str, Any]:
+    """The object in a JSON file.
+
+    Args:
+        path: the file.
+        what: what it should be, for the error: "root: the metadata".
+        limit: bytes that it may have.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is larger, no UTF-8, no JSON (NaN and Infinity are none), nested too deeply, names something
+            twice, holds a number too long to read, or is no object.
+    """
+    file = Path(path)
+    try:
+        if file.exists() and not file.is_file():
+            raise ValueError("it is no file")
+        with file.open("rb") as stream:
+            content = stream.read(limit + 1)
+        if len(content) > limit:
+            raise ValueError(f"it is larger than {limit} bytes")
+        return parse_json(content)
+    except ValueError as error:
+        raise ValueError(f"{what} {str(file)!r} cannot be read: {error}") from error
+
+
+def parse_json(content: bytes) -> dict[str, Any]:
+    """The object that JSON in UTF-8 says; :class:`ValueError` for anything else, as :func:`read_json` raises it."""
+    try:
+        found = json.loads(
+            content.decode("utf-8"), object_pairs_hook=_object, parse_constant=_no_number, parse_float=_number
+        )
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
+    if not isinstance(found, dict):
+        raise ValueError(f"it must be an object, got {type(found).__name__}")
+    return found
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for name, value in pairs:
+        if name in found:
+            raise ValueError(f"it names {name[:100]!r} more than once")
+        found[name] = value
+    return found
+
+
+def _no_number(text: str) -> NoReturn:
+    raise ValueError(f"it holds {text}, which is no JSON")
+
+
+def _number(text: str) -> float:
+    if abs(found := float(text)) == float("inf"):
+        raise ValueError(f"it holds {text[:40]}, which is too large a number")
+    return found

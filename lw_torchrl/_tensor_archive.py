@@ -20,7 +20,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor
 
-from lw_torchrl._files import replacing
+from lw_torchrl._files import parse_json, replacing
 
 _DESCRIPTION = "description.json"
 _MOST_JSON = 64 * 2**20  # bytes; 50 plans take 100 kB
@@ -73,8 +73,10 @@ class TensorArchive:
     def __init__(self, path: str | os.PathLike[str]) -> None:
         try:
             self._data = _entries(Path(path).read_bytes())
-            self.description = _parse(self._data.pop(_DESCRIPTION))
-        except (zipfile.BadZipFile, NotImplementedError, EOFError, KeyError, RuntimeError, OverflowError) as error:
+            self.description = parse_json(self._data.pop(_DESCRIPTION))
+        except ArchiveError:
+            raise
+        except (zipfile.BadZipFile, NotImplementedError, EOFError, KeyError, RuntimeError, ValueError) as error:
             raise ArchiveError(f"{type(error).__name__}: {error}") from error
         stated = self.description.get("sha256")
         if not isinstance(stated, dict) or set(stated) != set(self._data):
@@ -115,17 +117,4 @@ def _entries(content: bytes) -> dict[str, bytes]:
             found[entry.filename] = archive.read(entry)
     if _DESCRIPTION not in found:
         raise ArchiveError(f"it has no {_DESCRIPTION}")
-    return found
-
-
-def _parse(text: bytes) -> dict[str, Any]:
-    def refuse(name: str) -> Any:
-        raise ValueError(f"{name} is no number")
-
-    try:
-        found = json.loads(text.decode("utf-8"), parse_constant=refuse)
-    except (ValueError, RecursionError) as error:
-        raise ArchiveError(f"{_DESCRIPTION}: {error}") from error
-    if not isinstance(found, dict):
-        raise ArchiveError(f"{_DESCRIPTION} must be an object, got {type(found).__name__}")
     return found

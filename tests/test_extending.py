@@ -179,7 +179,7 @@ def test_a_kind_that_is_not_there_is_named(plans, replay, tmp_path, monkeypatch)
     monkeypatch.setitem(POLICIES, "LearnedTaskActor", LearnedTaskActor)
     lw.save_actor(LearnedTaskActor(plans), tmp_path / "policy.zip")
     monkeypatch.delitem(POLICIES, "LearnedTaskActor")
-    with pytest.raises(ValueError, match="kind of policy must be one of .*got 'LearnedTaskActor'"):
+    with pytest.raises(ValueError, match=r"kind of policy must be one of .*got 'LearnedTaskActor'"):
         lw.load_actor(tmp_path / "policy.zip")
 
 

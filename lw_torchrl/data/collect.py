@@ -2,36 +2,45 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
-from collections.abc import Iterable, Sequence
+import warnings
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing
 from pathlib import Path
 
-import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tqdm.auto import tqdm
 
-from lw_torchrl._checks import check_int, check_scale
-from lw_torchrl._files import replacing, write_json
+from lw_torchrl._files import flush, write_json
 from lw_torchrl.data.dataset import (
     DATA,
     METADATA,
     PARTIAL,
     CollectConfig,
+    DamagedDatasetError,
     DatasetError,
     Demonstrations,
     EpisodeInfo,
-    read_metadata,
-    write_metadata,
+)
+from lw_torchrl.data.episode_files import EpisodeFiles, no_room
+from lw_torchrl.data.metadata import read_config, read_metadata, write_metadata
+from lw_torchrl.data.rows import (
+    ROW_BYTES,
+    describe_episode,
+    holds_columns,
+    load_rows,
+    read_rows,
+    whole_episodes,
+    write_rows,
 )
 from lw_torchrl.envs.episodes import run_episodes
 from lw_torchrl.envs.experts import ExpertActor
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
-from lw_torchrl.language.tasks import resolve_tasks
+from lw_torchrl.language.tasks import resolve_tasks, task_id
 
-_KEYS = [
+_RECORDED = [
     "observation",
     "task_id",
     "episode",
@@ -40,87 +49,67 @@ _KEYS = [
     "unclipped_action",
     *(("next", key) for key in ("observation", "task_id", "reward", "success", "done", "terminated", "truncated")),
 ]
-_FAILED = b"FAILED"
 _MAX_ATTEMPTS = 20  # episodes run for each one that is kept, before redrawing gives up
 
 
-def _name(key: str | Sequence[str]) -> str:
-    return key if isinstance(key, str) else "/".join(key)
-
-
-class _EpisodeFiles:
-    """The episodes so far, one file each; a file that says FAILED stands for one that was not kept."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-
-    def _path(self, task: str, episode: int) -> Path:
-        return self.folder / f"{task}.{episode}.npz"
-
-    def put(self, task: str, episode: int, steps: TensorDictBase | None) -> None:
-        with replacing(self._path(task, episode)) as path:
-            if steps is None:
-                path.write_bytes(_FAILED)
-            else:
-                np.savez(path, **{_name(key): steps.get(key).numpy() for key in _KEYS})
-
-    def has(self, task: str, episode: int) -> bool:
-        return self._path(task, episode).is_file()
-
-    def kept(self, task: str, episode: int) -> bool:
-        return self._path(task, episode).stat().st_size != len(_FAILED)
-
-    def get(self, task: str, episode: int) -> TensorDict:
-        with np.load(self._path(task, episode), allow_pickle=False) as found:
-            arrays = {_name(key): torch.from_numpy(found[_name(key)]) for key in _KEYS}
-        steps = TensorDict({}, batch_size=arrays["task_id"].shape)
-        for key in _KEYS:
-            steps.set(key, arrays[_name(key)])
-        return steps
-
-    def drop_damaged(self) -> None:
-        for path in self.folder.glob("*.npz"):
-            if path.read_bytes() == _FAILED:
-                continue
-            try:
-                with path.open("rb") as file, np.load(file, allow_pickle=False) as found:
-                    for key in _KEYS:
-                        found[_name(key)]  # read it: the checksum tells
-            except Exception:  # whatever is wrong with it, the episode can be run again
-                path.unlink()
-
-
-def _open_episode_files(root: Path, config: CollectConfig) -> _EpisodeFiles:
+def _open_episode_files(root: Path, config: CollectConfig) -> EpisodeFiles:
     folder = root / PARTIAL
     stated = folder / "config.json"
     if stated.is_file():
-        try:
-            before = json.loads(stated.read_text("utf-8"))
-        except ValueError as error:
-            raise DatasetError(
-                f"root: {str(stated)!r} is damaged ({error}); delete {str(root)!r} to start again"
-            ) from error
-        if before != config.to_json():
-            raise DatasetError(
-                f"root: {str(root)!r} holds a half-made dataset of another configuration "
-                f"({_difference(before, config)}); choose another root, or delete it to start again"
-            )
+        _check_same(read_config(stated), config, f"root: {str(root)!r} holds a half-made dataset")
     else:
-        if root.is_dir() and any(root.iterdir()) and not folder.is_dir():
-            raise DatasetError(f"root: {str(root)!r} is not empty and holds no dataset; choose another folder")
-        folder.mkdir(parents=True, exist_ok=True)
         write_json(stated, config.to_json())
-    files = _EpisodeFiles(folder)
+    files = EpisodeFiles(folder, config.tasks, config.max_steps)
     files.drop_damaged()
     return files
 
 
-def _difference(before: dict, config: CollectConfig) -> str:
-    now = config.to_json()
-    return ", ".join(f"{key} {before.get(key)!r}, now {now[key]!r}" for key in now if before.get(key) != now[key])
+def _check_same(before: CollectConfig, config: CollectConfig, what: str) -> None:
+    if before != config:
+        was, now = before.to_json(), config.to_json()
+        differ = ", ".join(f"{key} {was[key]!r}, now {now[key]!r}" for key in now if was[key] != now[key])
+        raise DatasetError(
+            f"{what} of another configuration ({differ}); choose another folder, or delete it to start again"
+        )
 
 
-def _take_stock(config: CollectConfig, files: _EpisodeFiles) -> tuple[dict[str, list[int]], dict[str, list[int]]]:
+def _finished(root: Path, config: CollectConfig, progress: bool) -> Demonstrations | None:
+    """The dataset in a folder if all of it is as it was written. Of a damaged one, what is whole goes back among the
+    episode files, so that it is a half-made one."""
+    whole: list[EpisodeInfo] = []
+    try:
+        found = read_metadata(root)
+    except DamagedDatasetError as error:
+        if not holds_columns(root / DATA):
+            raise DatasetError(
+                f"root: {str(root)!r} holds no dataset, or one damaged beyond telling ({error}); choose another "
+                "folder, or delete it to start again"
+            ) from error
+        reason = str(error)
+    else:
+        _check_same(found.config, config, f"root: {str(root)!r} holds a dataset")
+        whole = whole_episodes(found, progress=progress)
+        try:
+            load_rows(found)
+            if len(whole) == len(found.episodes):
+                return found
+            reason = "rows differ from their checksums"
+        except DamagedDatasetError as error:
+            reason = str(error)
+    kept = f"{len(whole)} of {config.episodes_per_task * len(config.tasks)} episodes"
+    warnings.warn(
+        f"root: {str(root)!r} is damaged; {kept} are kept, the others are run again ({reason})",
+        stacklevel=3,
+    )
+    files = _open_episode_files(root, config)
+    for info in whole:
+        if not files.has(info.task, info.episode):
+            files.put(info.task, info.episode, read_rows(root / DATA, info.start, info.length))
+    (root / METADATA).unlink()
+    return None
+
+
+def _take_stock(config: CollectConfig, files: EpisodeFiles) -> tuple[dict[str, list[int]], dict[str, list[int]]]:
     """The kept episodes of each task, and those still to run. Candidates are taken in the order of their index, so
     which are kept depends neither on the number of environments nor on interruptions."""
     kept: dict[str, list[int]] = {}
@@ -142,8 +131,8 @@ def _take_stock(config: CollectConfig, files: _EpisodeFiles) -> tuple[dict[str, 
     return kept, wanted
 
 
-def _run(config: CollectConfig, files: _EpisodeFiles, num_envs: int | None, progress: bool) -> dict[str, list[int]]:
-    """Run episodes until the files is full; returns the kept ones of each task."""
+def _run(config: CollectConfig, files: EpisodeFiles, num_envs: int | None, progress: bool) -> dict[str, list[int]]:
+    """Run episodes until the files are full; returns the kept ones of each task."""
     kept, wanted = _take_stock(config, files)
     missing = sum(map(len, wanted.values()))
     if not missing:
@@ -161,14 +150,14 @@ def _run(config: CollectConfig, files: _EpisodeFiles, num_envs: int | None, prog
         delay=1,
         disable=not progress,
     )
-    with bar:
+    with bar, closing(env):
         while missing:
             bar.n = (total - missing) * config.max_steps  # steps back by the failures that are drawn again
             episodes = run_episodes(
                 env,
                 policy,
                 wanted,
-                keys=_KEYS,
+                keys=_RECORDED,
                 noise=(lambda n: scales[n % len(scales)]) if any(config.noise_scale) else None,
                 noise_hold=config.noise_hold,
                 clean_action="expert_action",
@@ -176,37 +165,45 @@ def _run(config: CollectConfig, files: _EpisodeFiles, num_envs: int | None, prog
             )
             for task, episode, steps in episodes:
                 keep = not config.redraw_failures or bool(steps.get(("next", "success")).any())
-                files.put(task, episode, steps if keep else None)
+                files.put(task, episode, _as_rows(steps) if keep else None)
             kept, wanted = _take_stock(config, files)
             missing = sum(map(len, wanted.values()))
-    env.close()
     return kept
 
 
-def _assemble(root: Path, config: CollectConfig, files: _EpisodeFiles, kept: dict[str, list[int]]) -> list[EpisodeInfo]:
-    building = root / f"{PARTIAL}/rows"
-    shutil.rmtree(building, ignore_errors=True)
+def _as_rows(steps: TensorDictBase) -> TensorDictBase:
+    """Recorded steps with a dataset's columns, the trajectory's number aside."""
+    steps.rename_key_(("next", "reward"), ("next", "reward_dense"))
+    return steps.set(("next", "reward_sparse"), steps.get(("next", "success")).float())
+
+
+def _assemble(root: Path, config: CollectConfig, files: EpisodeFiles, kept: dict[str, list[int]]) -> None:
+    """Make the dataset of the kept episodes."""
     listed = [(task, episode) for task in config.tasks for episode in kept[task]]
     infos: list[EpisodeInfo] = []
-    rows: TensorDictBase | None = None
-    start = 0
-    for number, (task, episode) in enumerate(listed):
-        steps = files.get(task, episode)
-        steps.set(("collector", "traj_ids"), torch.full(steps.batch_size, number))
-        steps.rename_key_(("next", "reward"), ("next", "reward_dense"))
-        steps.set(("next", "reward_sparse"), steps.get(("next", "success")).float())
-        length = steps.batch_size[0]
-        if rows is None:
-            total = length * len(listed)  # episodes end by truncation alone, so all are equally long
-            rows = steps[0].expand(total).memmap_like(building)
-        rows[start : start + length] = steps
-        successes = steps.get(("next", "success")).flatten().nonzero().flatten()
-        first = int(successes[0]) + 1 if len(successes) else None
-        infos.append(EpisodeInfo(task, episode, start, length, first is not None, first))
-        start += length
-    shutil.rmtree(root / DATA, ignore_errors=True)
-    os.replace(building, root / DATA)
-    return infos
+
+    def episodes() -> Iterator[TensorDictBase]:
+        start = 0
+        for number, (task, episode) in enumerate(listed):
+            rows = files.get(task, episode)
+            for key in ("task_id", ("next", "task_id")):
+                rows.set(key, torch.full(rows.batch_size, task_id(task)))  # they may have had other numbers then
+            rows.set(("collector", "traj_ids"), torch.full(rows.batch_size, number))
+            infos.append(describe_episode(task, episode, start, rows))
+            start += len(rows)
+            yield rows
+
+    building = files.folder / "rows"
+    for old in (building, root / DATA):
+        shutil.rmtree(old, ignore_errors=True)
+    try:
+        write_rows(building, episodes())
+        os.replace(building, root / DATA)
+        flush(root)
+        write_metadata(root, config, infos, {task: max(kept[task]) + 1 for task in config.tasks})
+    except OSError as error:
+        shutil.rmtree(building, ignore_errors=True)
+        raise no_room(root, len(listed) * config.max_steps * ROW_BYTES, error) from error
 
 
 def collect_demonstrations(
@@ -225,8 +222,9 @@ def collect_demonstrations(
 ) -> Demonstrations:
     """Run Meta-World's scripted experts and write their episodes to a dataset.
 
-    Killed and called again it carries on; called on a finished dataset of the same configuration it returns at
-    once. The dataset does not depend on ``num_envs`` or on interruptions.
+    Killed, or out of disk, and called again it carries on. Called on a finished dataset of the same configuration it
+    reads that through: if all is as it was written it returns, else it keeps the whole episodes and runs the others
+    again. The dataset depends on neither ``num_envs`` nor interruptions nor damage.
 
     Each row is a step, in TorchRL's TED layout (R rows):
         observation: (R, 39) float32, metres; next/observation likewise.
@@ -255,8 +253,12 @@ def collect_demonstrations(
     Returns:
         The finished dataset's description.
 
+    Warns:
+        UserWarning: a finished dataset was damaged.
+
     Raises:
         ValueError: a wrong argument; DatasetError where ``root`` holds something else.
+        OSError: there is no room; nothing is lost.
         RuntimeError: redrawing found too few successes.
 
     Example:
@@ -266,35 +268,28 @@ def collect_demonstrations(
         >>> demos.num_steps, demos.success_rate
         (80, {'reach': 1.0})
     """
-    scales = (noise_scale,) if isinstance(noise_scale, (int, float)) else tuple(noise_scale)
-    if not scales:
-        raise ValueError("noise_scale must hold at least one number, got an empty sequence")
     config = CollectConfig(
         tasks=resolve_tasks(tasks),
-        episodes_per_task=check_int("episodes_per_task", episodes_per_task, minimum=1),
-        seed=check_int("seed", seed),
-        noise_scale=tuple(check_scale("noise_scale", scale) for scale in scales),
-        noise_hold=check_int("noise_hold", noise_hold, minimum=1),
-        gripper_noise_factor=check_scale("gripper_noise_factor", gripper_noise_factor),
+        episodes_per_task=episodes_per_task,
+        seed=seed,
+        noise_scale=(noise_scale,) if isinstance(noise_scale, (int, float)) else tuple(noise_scale),
+        noise_hold=noise_hold,
+        gripper_noise_factor=gripper_noise_factor,
         redraw_failures=bool(redraw_failures),
-        max_steps=check_int("max_steps", max_steps, minimum=1),
+        max_steps=max_steps,
     )
     folder = Path(root)
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"root must be a folder, {str(folder)!r} is a file")
+    found = None
     if (folder / METADATA).is_file():
+        found = _finished(folder, config, progress)
+    elif folder.is_dir() and any(folder.iterdir()) and not (folder / PARTIAL).is_dir():
+        raise DatasetError(f"root: {str(folder)!r} is not empty and holds no dataset; choose another folder")
+    if found is None:
+        files = _open_episode_files(folder, config)
+        kept = _run(config, files, num_envs, progress)
+        _assemble(folder, config, files, kept)
         found = read_metadata(folder)
-        if found.config != config:
-            raise DatasetError(
-                f"root: {str(folder)!r} holds a dataset of another configuration "
-                f"({_difference(found.config.to_json(), config)}); choose another folder"
-            )
-        shutil.rmtree(folder / PARTIAL, ignore_errors=True)
-        return found
-    files = _open_episode_files(folder, config)
-    kept = _run(config, files, num_envs, progress)
-    infos = _assemble(folder, config, files, kept)
-    attempts = {task: max(kept[task]) + 1 for task in config.tasks}
-    write_metadata(folder, config, infos, attempts)
     shutil.rmtree(folder / PARTIAL, ignore_errors=True)
-    return read_metadata(folder)
+    return found

@@ -16,7 +16,8 @@ from torchrl.data.replay_buffers.storages import Storage
 from torchrl.envs import Transform
 
 from lw_torchrl._checks import check_choice, check_int
-from lw_torchrl.data.dataset import DATA, Demonstrations, read_metadata
+from lw_torchrl.data.dataset import DATA, Demonstrations
+from lw_torchrl.data.metadata import read_metadata
 from lw_torchrl.data.selection import (
     LABELS,
     EpisodeChoice,

@@ -11,7 +11,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from lw_torchrl._checks import check_int, unknown_name
-from lw_torchrl.data.dataset import CollectConfig, Demonstrations, EpisodeInfo, load_rows
+from lw_torchrl.data.dataset import CollectConfig, Demonstrations, EpisodeInfo
+from lw_torchrl.data.rows import load_rows
 
 TRAJECTORY = ("collector", "traj_ids")
 Label = Literal["expert", "unclipped", "executed"]

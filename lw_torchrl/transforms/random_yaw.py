@@ -38,9 +38,9 @@ class RandomYaw(Transform):
 
     Changes ``observation`` (B, 39) float32 and ``action`` (B, 4) float32, and ``("next", "observation")``,
     ``expert_action`` and ``unclipped_action`` where they are. An action's way in the plane is shortened where turning
-    would lead it out of [-1, 1], its direction kept; one that was outside before keeps its length. Orientations
-    stay as they were, and so do fixed places: use it with features that hold neither, "differences" or "relative", and
-    without ``focus``. Angles are drawn from PyTorch's global generator; the trainers seed it.
+    would lead it out of [-1, 1], its direction kept; one that was outside before keeps its length. Orientations stay as
+    they were, and so do fixed places: use it with features that hold neither, "differences" or "relative", and without
+    ``focus``. Angles are drawn from PyTorch's global generator; the trainers seed it.
 
     Args:
         scale: standard deviation of the angle, in radians.

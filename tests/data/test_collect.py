@@ -17,7 +17,8 @@ import torch
 
 from lw_torchrl.data import CollectConfig, DatasetError, collect_demonstrations
 from lw_torchrl.data import collect as collect_module
-from lw_torchrl.data.dataset import load_rows, read_metadata
+from lw_torchrl.data.metadata import read_metadata
+from lw_torchrl.data.rows import load_rows
 from lw_torchrl.envs.engines.metaworld import make_metaworld_env
 from lw_torchrl.envs.experts import ExpertActor
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
@@ -262,7 +263,7 @@ def test_redrawing_gives_up_where_nothing_succeeds(tmp_path):
 
 def interrupt_after(monkeypatch, episodes):
     """Stop collecting, as Ctrl-C does, after so many episodes have been put away."""
-    put, left = collect_module._EpisodeFiles.put, [episodes]
+    put, left = collect_module.EpisodeFiles.put, [episodes]
 
     def stopping(self, *args):
         if not left[0]:
@@ -270,7 +271,7 @@ def interrupt_after(monkeypatch, episodes):
         left[0] -= 1
         put(self, *args)
 
-    monkeypatch.setattr(collect_module._EpisodeFiles, "put", stopping)
+    monkeypatch.setattr(collect_module.EpisodeFiles, "put", stopping)
 
 
 # One process that starts the same call again and again and kills it: importing once, forking for each try.
@@ -369,9 +370,9 @@ def test_an_interrupted_dataset_carries_on_without_doing_episodes_twice(half_mad
     shards = list((half_made / ".partial").glob("*.npz"))
     assert len(shards) == 4
     done = []
-    put = collect_module._EpisodeFiles.put
+    put = collect_module.EpisodeFiles.put
     monkeypatch.setattr(
-        collect_module._EpisodeFiles,
+        collect_module.EpisodeFiles,
         "put",
         lambda self, task, episode, steps: (done.append(task), put(self, task, episode, steps)),
     )
@@ -463,9 +464,11 @@ def test_another_configuration_is_refused_with_what_differs(made, name):
 
 
 @pytest.mark.parametrize("name", CHANGES)
-def test_another_configuration_is_refused_of_a_half_made_dataset_too(tmp_path, name):
+def test_another_configuration_is_refused_of_a_half_made_dataset_too(tmp_path, name, monkeypatch):
     root = tmp_path / "half"
-    collect_module._open_episode_files(root, CONFIG)
+    interrupt_after(monkeypatch, 0)
+    with pytest.raises(KeyboardInterrupt):
+        collect(root)
     before = tree(root)
     with pytest.raises(DatasetError, match=CHANGES[name][1]):
         collect(root, **CHANGES[name][0])

@@ -1,0 +1,184 @@
+"""The rows of a dataset: a file for each column, written through files and read through a memory map.
+
+They are what ``TensorDict.memmap`` writes, so ``TensorDict.load_memmap`` reads them too. Here they are mapped column by
+column, as :data:`COLUMNS` says: nothing that lies in the folder can ask for another shape, class or pickle. Writing
+goes through files, since a full disk under a memory map ends the process without a word.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from contextlib import ExitStack
+from math import prod
+from pathlib import Path
+from typing import Any
+from zlib import crc32
+
+import torch
+from tensordict import MemoryMappedTensor, TensorDict, TensorDictBase
+from torch import Tensor
+from tqdm.auto import tqdm
+
+from lw_torchrl._files import flush, read_json
+from lw_torchrl.data.dataset import DATA, DamagedDatasetError, DatasetError, Demonstrations, EpisodeInfo
+from lw_torchrl.language.tasks import task_id
+
+Column = tuple[str, ...]
+COLUMNS: dict[Column, tuple[tuple[int, ...], torch.dtype]] = {
+    ("observation",): ((39,), torch.float32),
+    ("task_id",): ((), torch.int64),
+    ("episode",): ((), torch.int64),
+    ("action",): ((4,), torch.float32),
+    ("expert_action",): ((4,), torch.float32),
+    ("unclipped_action",): ((4,), torch.float32),
+    ("collector", "traj_ids"): ((), torch.int64),
+    ("next", "observation"): ((39,), torch.float32),
+    ("next", "task_id"): ((), torch.int64),
+    ("next", "reward_sparse"): ((1,), torch.float32),
+    ("next", "reward_dense"): ((1,), torch.float32),
+    **{("next", flag): ((1,), torch.bool) for flag in ("success", "done", "terminated", "truncated")},
+}
+_META = "meta.json"
+_WIDTH = {key: prod(tail) * dtype.itemsize for key, (tail, dtype) in COLUMNS.items()}
+ROW_BYTES = sum(_WIDTH.values())
+
+
+def _path(folder: Path, key: Column) -> Path:
+    return folder.joinpath(*key[:-1], f"{key[-1]}.memmap")
+
+
+def _meta(rows: int) -> dict[str, dict[str, Any]]:
+    """What the description in each folder says, as TensorDict writes it; the folder of the rows is ""."""
+    found: dict[str, dict[str, Any]] = {"": {}}
+    for (*parents, name), (tail, dtype) in COLUMNS.items():
+        for parent in parents:
+            found[""][parent] = {"type": "TensorDict"}
+        leaf = {"device": "cpu", "shape": [rows, *tail], "dtype": str(dtype), "is_nested": False}
+        found.setdefault("/".join(parents), {})[name] = leaf
+    about = {"shape": [rows], "device": "cpu", "_type": "<class 'tensordict._td.TensorDict'>"}
+    return {folder: entries | about for folder, entries in found.items()}
+
+
+def write_rows(folder: Path, episodes: Iterable[TensorDictBase]) -> None:
+    """Write episodes, each of the columns of :data:`COLUMNS`, one after another, and see them onto the disk.
+
+    Raises:
+        OSError: there is no room for them; the folder holds a part of them then.
+    """
+    rows = 0
+    for name in _meta(0):
+        (folder / name).mkdir(parents=True, exist_ok=True)
+    with ExitStack() as stack:
+        files = {key: stack.enter_context(_path(folder, key).open("wb")) for key in COLUMNS}
+        for steps in episodes:
+            rows += len(steps)
+            for key, file in files.items():
+                file.write(steps.get(key).contiguous().numpy().data)
+    for name, entries in _meta(rows).items():
+        (folder / name / _META).write_text(json.dumps(entries, separators=(",", ":")), encoding="utf-8")
+    for path in sorted(folder.rglob("*"), reverse=True):
+        flush(path)
+    flush(folder)
+
+
+def read_rows(folder: Path, start: int, length: int) -> TensorDict | None:
+    """Some rows as they lie in the files, in memory; None where a column is missing or too short."""
+    found = TensorDict({}, [length])
+    for key, (tail, dtype) in COLUMNS.items():
+        path, width = _path(folder, key), _WIDTH[key]
+        if not path.is_file() or path.stat().st_size < (start + length) * width:
+            return None
+        with path.open("rb") as file:
+            file.seek(start * width)
+            content = bytearray(file.read(length * width))
+        found.set(key, torch.frombuffer(content, dtype=dtype).reshape(length, *tail))
+    return found
+
+
+def describe_episode(task: str, episode: int, start: int, rows: TensorDictBase) -> EpisodeInfo:
+    """What the metadata say of an episode of these rows."""
+    checksum = 0
+    for key in COLUMNS:
+        checksum = crc32(rows.get(key).contiguous().numpy().data, checksum)
+    hits = rows.get(("next", "success")).flatten().nonzero().flatten()
+    first = int(hits[0]) + 1 if len(hits) else None
+    return EpisodeInfo(task, episode, start, len(rows), first is not None, first, checksum)
+
+
+def whole_episodes(demonstrations: Demonstrations, *, progress: bool) -> list[EpisodeInfo]:
+    """The episodes whose rows are as they were written, by their checksums and what else the metadata say of them."""
+    whole = []
+    bar = tqdm(demonstrations.episodes, desc="checking", unit="episode", delay=1, disable=not progress)
+    for info in bar:
+        rows = read_rows(demonstrations.root / DATA, info.start, info.length)
+        if rows is None or describe_episode(info.task, info.episode, info.start, rows) != info:
+            continue
+        if (rows["task_id"] == demonstrations.task_ids[info.task]).all() and (rows["episode"] == info.episode).all():
+            whole.append(info)
+    return whole
+
+
+def surplus(folder: Path) -> list[str]:
+    """What lies among the rows and is no part of them; hidden files do not count."""
+    ours = {_path(folder, key) for key in COLUMNS} | {folder / name / _META for name in _meta(0)}
+    folders = {folder / name for name in _meta(0)}
+    there = [path for one in folders if one.is_dir() for path in one.iterdir() if not path.name.startswith(".")]
+    return sorted(str(path.relative_to(folder)) for path in there if path not in ours | folders)
+
+
+def holds_columns(folder: Path) -> bool:
+    """Whether a folder holds columns of a dataset, and nothing else."""
+    return any(_path(folder, key).is_file() for key in COLUMNS) and not surplus(folder)
+
+
+def _check_files(folder: Path, rows: int) -> None:
+    """Raise if the files are not what they should be. Mapping a file that is too short would lengthen it."""
+    for name, expected in _meta(rows).items():
+        found = read_json(folder / name / _META, "the description", limit=2**20)
+        if not name and found.get("shape") != [rows]:
+            raise ValueError(f"they are of shape {found.get('shape')}, the metadata say {rows} rows")
+        if odd := [key for key in {**expected, **found} if expected.get(key) != found.get(key)]:
+            raise ValueError(f"{name}/{_META} differs from what was written, in {', '.join(map(repr, odd[:5]))}")
+    for key, width in _WIDTH.items():
+        if (size := _path(folder, key).stat().st_size) != rows * width:
+            raise ValueError(f"{'/'.join(key)}.memmap has {size} bytes, not {rows * width}")
+
+
+def _renumbered(demonstrations: Demonstrations) -> Tensor:
+    """Today's task_id of each row: (R,) int64."""
+    episodes = demonstrations.episodes
+    numbers = torch.tensor([task_id(episode.task) for episode in episodes])
+    return numbers.repeat_interleave(torch.tensor([episode.length for episode in episodes]))
+
+
+def load_rows(demonstrations: Demonstrations) -> TensorDictBase:
+    """The rows of a dataset, memory-mapped.
+
+    Where tasks were numbered otherwise when the dataset was made, ``task_id`` and ``("next", "task_id")`` are today's
+    numbers, in memory.
+
+    Raises:
+        DatasetError: (a ValueError) a column is missing, damaged, or not as long as the metadata say; or something
+            else lies among them.
+    """
+    folder, number = demonstrations.root / DATA, demonstrations.num_steps
+    if odd := surplus(folder):
+        raise DatasetError(
+            f"root: {', '.join(map(repr, odd[:5]))} in {str(folder)!r} is no part of a dataset; move it elsewhere"
+        )
+    rows = TensorDict({}, [number], device="cpu")
+    try:
+        _check_files(folder, number)
+        for key, (tail, dtype) in COLUMNS.items():
+            path = str(_path(folder, key))
+            rows.set(key, MemoryMappedTensor.from_filename(path, dtype=dtype, shape=(number, *tail)))
+    except (OSError, ValueError, RuntimeError) as error:
+        raise DamagedDatasetError(
+            f"root: the rows in {str(folder)!r} cannot be read ({error}); the same collect_demonstrations keeps the "
+            "episodes that are whole and collects the others again"
+        ) from error
+    if any(task_id(task) != stored for task, stored in demonstrations.task_ids.items()):
+        rows.set("task_id", now := _renumbered(demonstrations))
+        rows.set(("next", "task_id"), now.clone())
+    return rows
