@@ -14,11 +14,12 @@ from torch.func import functional_call, stack_module_state, vmap
 from torchrl.checkpoint import Checkpoint
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.objectives.utils import distance_loss
-from tqdm.auto import tqdm
 
+from lw_torchrl._progress import Progress
 from lw_torchrl.modules import DescriptorConditionedActor, PlanConditionedActor
 from lw_torchrl.trainers.behavioral_cloning import BehavioralCloningConfig, fit_normalization, make_optimizer
 from lw_torchrl.trainers.checkpoint import TrainingState, check_description, describe_actor, describe_data, load_into
+from lw_torchrl.trainers.interrupts import interrupts_between_steps
 
 
 class _Act(nn.Module):
@@ -191,26 +192,22 @@ class StackedBehavioralCloning:
             gradient.mul_(factor.reshape(-1, *[1] * (gradient.ndim - 1)))
 
     def train(self) -> Tensor:
-        """Train to the last step and give the actors their weights.
+        """Train to the last step and give the actors their weights; Ctrl-C as in :class:`BehavioralCloningTrainer`.
 
         Returns:
             (M,) float32, each actor's mean loss over the last 100 steps made; NaN if there were none left to make.
         """
         recent = [torch.full((len(self.actors),), torch.nan)] * (self.steps == self.config.steps)
-        bar = tqdm(
-            total=self.config.steps,
-            initial=self.steps,
-            desc=f"training {len(self.actors)} models",
-            unit="step",
-            delay=1,
-            disable=not self.progress,
-        )
-        with bar:
-            while self.steps < self.config.steps:
+        what = f"training {len(self.actors)} models"
+        bar = Progress(what, self.config.steps, "step", initial=self.steps, show=self.progress)
+        with bar, interrupts_between_steps() as interrupt:
+            while self.steps < self.config.steps and not interrupt.asked:
                 recent = [*recent[-99:], self.step()]
                 bar.update()
                 if self.steps % self.config.checkpoint_every == 0 or self.steps == self.config.steps:
                     self.save()
+            if interrupt.asked:
+                self.save()
         self.write_back()
         return torch.stack(recent).mean(0)
 
