@@ -10,9 +10,9 @@ from types import FrameType
 
 
 class Interrupt:
-    """Whether Ctrl-C was pressed."""
+    """Whether Ctrl-C was pressed, once or again."""
 
-    asked = False
+    asked = insisted = False
 
 
 @contextmanager
@@ -20,8 +20,7 @@ def interrupts_between_steps() -> Iterator[Interrupt]:
     """Within the block the first Ctrl-C only sets ``asked``; the loop looks at it, and ends the block when it can.
 
     The end of the block then raises :class:`KeyboardInterrupt`; a second Ctrl-C does so at once. In another thread than
-    the main one, and where SIGINT is ignored, nothing is changed. In the midst of a step the exception may surface as
-    another: TorchRL's losses catch what a tensordict raises.
+    the main one, and where SIGINT is ignored, nothing is changed.
     """
     interrupt = Interrupt()
     before = signal.getsignal(signal.SIGINT) if threading.current_thread() is threading.main_thread() else None
@@ -30,13 +29,17 @@ def interrupts_between_steps() -> Iterator[Interrupt]:
         return
 
     def ask(number: int, frame: FrameType | None) -> None:
-        if interrupt.asked:
+        interrupt.insisted, interrupt.asked = interrupt.asked, True
+        if interrupt.insisted:
             before(number, frame)
-        interrupt.asked = True
 
     signal.signal(signal.SIGINT, ask)
     try:
         yield interrupt
+    except Exception as error:
+        if interrupt.insisted:  # in the midst of a step it may surface as another: losses catch what tensordicts raise
+            raise KeyboardInterrupt from error
+        raise
     finally:
         signal.signal(signal.SIGINT, before)
     if interrupt.asked:
