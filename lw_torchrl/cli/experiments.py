@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Literal, cast
 
 from tyro.conf import Positional
 
+from lw_torchrl.cli.outputs import check_folder
+
 if TYPE_CHECKING:
     from lw_torchrl.experiments.runs import Dataset, Run
     from lw_torchrl.language.plans import Plans
@@ -57,6 +59,8 @@ def reproduce(
         list: print the names of the runs and do nothing.
         out: where everything goes; on a cluster, a folder that all its machines share.
     """
+    if not list:
+        check_folder("--out", out)
     from lw_torchrl._checks import check_choice, check_int
     from lw_torchrl.cli.threads import use_one_thread
     from lw_torchrl.experiments.execution import execute_run
@@ -69,7 +73,7 @@ def reproduce(
     if passes is not None:
         check_int("passes", passes, minimum=1)
         if preset != "paper":
-            raise ValueError("passes is for the preset paper; ours counts minibatches")
+            raise ValueError("--passes is for --preset paper; ours counts minibatches")
         recipes = {name: replace(recipe, passes=passes) for name, recipe in recipes.items()}
     if methods is None:
         methods = cast("tuple[Method, ...]", (*METHODS, *([SCRIPTED] if plans is None else [])))

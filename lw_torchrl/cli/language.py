@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Literal
 
 from tyro.conf import Positional
 
+from lw_torchrl.cli.outputs import check_folder
+
 if TYPE_CHECKING:
     from lw_torchrl.language.skills import ScriptedSkill
     from lw_torchrl.language.tasks import Task
@@ -20,13 +22,17 @@ def _print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str
     from rich.console import Console
     from rich.table import Table
 
+    class Printer(Console):
+        def on_broken_pipe(self) -> None:  # rich's own exits with status 1
+            raise
+
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
     for number, column in enumerate(columns):
         table.add_column(column, no_wrap=number == 0)
     for row in rows:
         table.add_row(*row)
     wide = None if sys.stdout.isatty() else 160
-    Console(highlight=False, markup=False, width=wide).print(table)
+    Printer(highlight=False, markup=False, width=wide).print(table)
 
 
 def tasks(names: Positional[tuple[str, ...]] = (), /) -> None:
@@ -257,6 +263,7 @@ def scripted(
         full: run all 500 steps, instead of stopping at the first success.
         out: folder for results.json, plan_use.json and success.png.
     """
+    check_folder("--out", out)
     import lw_torchrl as lw
     from lw_torchrl._files import write_json
     from lw_torchrl.evaluation.plan_use import PlanUse

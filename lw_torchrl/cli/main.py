@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal
+from types import FrameType
+from typing import Any, Literal, NoReturn
 
 import tyro
 from tyro.conf import Positional
 
+from lw_torchrl import __version__
 from lw_torchrl.cli import experiments as cli_experiments
 from lw_torchrl.cli import language as cli_language
+from lw_torchrl.cli.errors import in_its_words
+from lw_torchrl.cli.outputs import check_file, check_folder
+from lw_torchrl.cli.streams import check_arguments, complain, nobody_reads, sound_streams
 from lw_torchrl.cli.threads import use_one_thread
 
 
@@ -25,10 +33,11 @@ def demo(out: Path | None = None, quick: bool = False) -> None:
             runs/demo-quick with --quick.
         quick: two tasks and little training, in under a minute; not a measure of anything.
     """
+    folder = check_folder("--out", out or Path("runs/demo-quick" if quick else "runs/demo"))
     from lw_torchrl.experiments.demo import QUICK, DemoConfig, run_demo
 
     use_one_thread()
-    run_demo(out or Path("runs/demo-quick" if quick else "runs/demo"), QUICK if quick else DemoConfig())
+    run_demo(folder, QUICK if quick else DemoConfig())
 
 
 def collect(
@@ -56,6 +65,7 @@ def collect(
         redraw_failures: keep successful episodes only.
         num_envs: environments stepped together; the dataset does not depend on it.
     """
+    check_folder("--out", out)
     from lw_torchrl.data import collect_demonstrations
 
     made = collect_demonstrations(
@@ -110,6 +120,7 @@ def train(
         after_success: leave out steps so long after an episode's first success; None keeps all.
         seed: of the initial weights and the minibatches.
     """
+    check_file("--out", out)
     import torch
 
     import lw_torchrl as lw
@@ -157,6 +168,8 @@ def evaluate(
         num_envs: environments stepped together; the result does not depend on it.
         out: folder for results.json, success.png and rollout.rrd.
     """
+    if out is not None:
+        check_folder("--out", out)
     import lw_torchrl as lw
     from lw_torchrl.modules.policy import Policy
     from lw_torchrl.record.rollouts import rollout_tasks, write_recording
@@ -211,6 +224,8 @@ def view(
         step: the step at which to take the picture; the last if none is given.
         window_size: of the picture, WIDTHxHEIGHT.
     """
+    if screenshot is not None:
+        check_file("--screenshot", screenshot)
     from lw_torchrl.record import open_viewer
 
     open_viewer(recording, screenshot, window_size, step=step)
@@ -285,18 +300,69 @@ COMMANDS: dict[str, Any] = {
 }
 
 
+RESUMABLE = ("demo", "collect", "train", "reproduce")
+
+
 def main(args: Sequence[str] | None = None) -> None:
-    """Run the command line; an error a user can mend is one line and exit status 2."""
+    """Run the command line; an error a user can mend is one line and exit status 2, Ctrl-C is 130."""
+    given = sys.argv[1:] if args is None else list(args)
+    interrupts: list[int] = []
+    with sound_streams(), _noting(interrupts):
+        try:
+            _run(given)
+        except KeyboardInterrupt:
+            _stop(given)
+        except Exception as error:
+            if interrupts:  # raised within a library, Ctrl-C may surface as something else
+                _stop(given)
+            if not isinstance(error, (ValueError, TypeError, OSError, ImportError, RuntimeError)):
+                raise
+            if isinstance(error, BrokenPipeError) and nobody_reads():
+                raise
+            command = given[0] if given else ""
+            message = str(error)
+            if command in COMMANDS:
+                message = in_its_words(command, COMMANDS[command], message)
+            complain(f"lw-torchrl: error: {message}")
+            sys.exit(2)
+
+
+def _run(given: Sequence[str]) -> None:
+    check_arguments(given)
+    if list(given) == ["--version"]:
+        print(f"lw-torchrl {__version__}")
+        return
     try:
         tyro.extras.subcommand_cli_from_dict(
             COMMANDS,
             prog="lw-torchrl",
-            description="Language-World with TorchRL: policies carried by plans in English.",
-            args=args,
+            description="Language-World with TorchRL: policies carried by plans in English. --version tells which.",
+            args=given,
         )
-    except (ValueError, TypeError, OSError, ImportError, RuntimeError) as error:
-        print(f"lw-torchrl: error: {error}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        print("\nlw-torchrl: stopped; the same command carries on from here", file=sys.stderr)
-        sys.exit(130)
+    finally:
+        sys.stdout.flush()
+
+
+@contextmanager
+def _noting(interrupts: list[int]) -> Iterator[None]:
+    """Within the block Ctrl-C also leaves a note."""
+    before = signal.getsignal(signal.SIGINT) if threading.current_thread() is threading.main_thread() else None
+    if before is not signal.default_int_handler:
+        yield
+        return
+
+    def note(number: int, frame: FrameType | None) -> None:
+        interrupts.append(number)
+        signal.default_int_handler(number, frame)
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _stop(given: Sequence[str]) -> NoReturn:
+    resumed = "; the same command carries on from here" if given and given[0] in RESUMABLE else ""
+    complain(f"\nlw-torchrl: stopped{resumed}")
+    sys.exit(130)

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import torch
 from tensordict import TensorDictBase
-from tqdm.auto import tqdm
 
 from lw_torchrl._files import flush, write_json
+from lw_torchrl._progress import Progress
 from lw_torchrl.data.dataset import (
     DATA,
     METADATA,
@@ -142,17 +142,11 @@ def _run(config: CollectConfig, files: EpisodeFiles, num_envs: int | None, progr
     policy = ExpertActor(config.tasks)
     scales = [(s, s, s, s * config.gripper_noise_factor) for s in config.noise_scale]
     total = config.episodes_per_task * len(config.tasks)
-    bar = tqdm(
-        total=total * config.max_steps,
-        desc="collecting",
-        unit="step",
-        unit_scale=True,
-        delay=1,
-        disable=not progress,
-    )
+    before = (total - missing) * config.max_steps
+    bar = Progress("collecting", total * config.max_steps, "step", initial=before, show=progress)
     with bar, closing(env):
         while missing:
-            bar.n = (total - missing) * config.max_steps  # steps back by the failures that are drawn again
+            bar.set_done((total - missing) * config.max_steps)  # steps back by the failures that are drawn again
             episodes = run_episodes(
                 env,
                 policy,

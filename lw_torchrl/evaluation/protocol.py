@@ -11,9 +11,9 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from tqdm.auto import tqdm
 
 from lw_torchrl._checks import check_int, check_scale
+from lw_torchrl._progress import Progress
 from lw_torchrl.envs.engine import ACTION_SIZE
 from lw_torchrl.envs.episodes import FinishedEpisode, in_blocks, run_episodes
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
@@ -168,14 +168,7 @@ def evaluate(
     if isinstance(actor, torch.nn.Module):
         actor.eval()
     found: list[EpisodeResult] = []
-    bar = tqdm(
-        total=len(names) * episodes_per_task * max_steps,
-        desc="evaluating",
-        unit="step",
-        unit_scale=True,
-        delay=1,
-        disable=not progress,
-    )
+    bar = Progress("evaluating", len(names) * episodes_per_task * max_steps, "step", show=progress)
     try:
         with bar, torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
             for finished in run_episodes(

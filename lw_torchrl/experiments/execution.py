@@ -8,8 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from tqdm.auto import tqdm
-
+from lw_torchrl._progress import Progress
 from lw_torchrl.evaluation import EvaluationResult, evaluate
 from lw_torchrl.experiments.runs import SCRIPTED, Run
 from lw_torchrl.experiments.training import train_each, train_one
@@ -34,10 +33,12 @@ def _evaluate(run: Run, plans: Plans, out: Path, tasks: tuple[str, ...], progres
     if run.setting.targets is None:
         return evaluate(train_one(run, plans, out, progress), tasks=tasks, progress=progress, **options)
     actors = train_each(run, plans, out, progress)
-    each = [
-        evaluate(actors[task], tasks=task, progress=False, **options)
-        for task in tqdm(sorted({*tasks} & {*actors}), desc="evaluating", unit="model", delay=1, disable=not progress)
-    ]
+    found = sorted({*tasks} & {*actors})
+    each = []
+    with Progress("evaluating", len(found), "model", show=progress) as bar:
+        for task in found:
+            each.append(evaluate(actors[task], tasks=task, progress=False, **options))
+            bar.update()
     shown = [task for one in each for task in one.config["tasks"]]
     return EvaluationResult(each[0].config | {"tasks": shown}, tuple(e for one in each for e in one.episodes))
 

@@ -16,9 +16,9 @@ from torch.nn.utils import clip_grad_norm_
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.objectives import BCLoss
 from torchrl.record.loggers import Logger
-from tqdm.auto import tqdm
 
 from lw_torchrl._checks import check_choice, check_int, check_scale
+from lw_torchrl._progress import Progress
 from lw_torchrl.modules.policy import Policy, plans_of
 from lw_torchrl.trainers.checkpoint import (
     check_can_be_saved,
@@ -27,6 +27,7 @@ from lw_torchrl.trainers.checkpoint import (
     load_training,
     write,
 )
+from lw_torchrl.trainers.interrupts import interrupts_between_steps
 from lw_torchrl.trainers.training_state import TrainingState, load_state, state_of
 
 LOSSES = ("l1", "l2", "smooth_l1")
@@ -217,33 +218,30 @@ class BehavioralCloningTrainer:
     def train(self) -> float:
         """Train to the last step, from wherever training stands.
 
+        Ctrl-C ends it between two steps, with a checkpoint; a second Ctrl-C at once.
+
         Returns:
             The mean loss over the last 100 steps made; NaN if there were none left to make.
         """
         losses: list[float] = []
         self.actor.train()
         every, total = self.config.checkpoint_every, self.config.steps
-        bar = tqdm(
-            total=total,
-            initial=self.state.step,
-            desc="training",
-            unit="step",
-            delay=1,
-            disable=not self.progress,
-        )
-        with bar:
-            while self.state.step < total:
+        bar = Progress("training", total, "step", initial=self.state.step, show=self.progress)
+        with bar, interrupts_between_steps() as interrupt:
+            while self.state.step < total and not interrupt.asked:
                 losses.append(self.step())
                 step = self.state.step
                 bar.update()
                 if step % 100 == 0 or step == total:
                     mean = sum(losses[-100:]) / len(losses[-100:])
-                    bar.set_postfix(loss=f"{mean:.4f}", refresh=False)
+                    bar.note(loss=f"{mean:.4f}")
                     if self.logger is not None:
                         self.logger.log_scalar("train/loss", mean, step=step)
                         self.logger.log_scalar("train/learning_rate", self.schedule.get_last_lr()[0], step=step)
                 if step % every == 0 or step == total:
                     self.save()
+            if interrupt.asked:
+                self.save()
         self.actor.eval()
         recent = losses[-100:]
         return sum(recent) / len(recent) if recent else float("nan")

@@ -13,8 +13,8 @@ from torch import Tensor, nn
 from torch.func import functional_call, stack_module_state, vmap
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.objectives.utils import distance_loss
-from tqdm.auto import tqdm
 
+from lw_torchrl._progress import Progress
 from lw_torchrl.modules.policy import Policy
 from lw_torchrl.trainers.behavioral_cloning import (
     BehavioralCloningConfig,
@@ -29,6 +29,7 @@ from lw_torchrl.trainers.checkpoint import (
     load_training,
     write,
 )
+from lw_torchrl.trainers.interrupts import interrupts_between_steps
 from lw_torchrl.trainers.training_state import TrainingState, load_state, state_of
 
 
@@ -169,26 +170,22 @@ class StackedBehavioralCloning:
             gradient.mul_(factor.reshape(-1, *[1] * (gradient.ndim - 1)))
 
     def train(self) -> Tensor:
-        """Train to the last step and give the actors their weights.
+        """Train to the last step and give the actors their weights; Ctrl-C as in :class:`BehavioralCloningTrainer`.
 
         Returns:
             (M,) float32, each actor's mean loss over the last 100 steps made; NaN if there were none left to make.
         """
         recent = [torch.full((len(self.actors),), torch.nan)] * (self.steps == self.config.steps)
-        bar = tqdm(
-            total=self.config.steps,
-            initial=self.steps,
-            desc=f"training {len(self.actors)} models",
-            unit="step",
-            delay=1,
-            disable=not self.progress,
-        )
-        with bar:
-            while self.steps < self.config.steps:
+        what = f"training {len(self.actors)} models"
+        bar = Progress(what, self.config.steps, "step", initial=self.steps, show=self.progress)
+        with bar, interrupts_between_steps() as interrupt:
+            while self.steps < self.config.steps and not interrupt.asked:
                 recent = [*recent[-99:], self.step()]
                 bar.update()
                 if self.steps % self.config.checkpoint_every == 0 or self.steps == self.config.steps:
                     self.save()
+            if interrupt.asked:
+                self.save()
         self.write_back()
         return torch.stack(recent).mean(0)
 

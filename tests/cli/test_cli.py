@@ -144,19 +144,22 @@ def test_without_a_text_all_queries_that_hold_are_listed(capsys):
         (["query", "raech"], "reach"),
         (["query", "reach", "is the gripper purple"], "purple"),
         (["query", "reach", "the gripper is near the teapot"], "teapot"),
-        (["query", "reach", "--step", "501"], "step must be at most 500, got 501"),
-        (["query", "reach", "--step", "-1"], "step must be at least 0, got -1"),
-        (["query", "reach", "--episode", "-1"], "episode must be at least 0, got -1"),
+        (["query", "reach", "--step", "501"], "error: --step must be at most 500, got 501"),
+        (["query", "reach", "--step", "-1"], "error: --step must be at least 0, got -1"),
+        (["query", "reach", "--episode", "-1"], "error: --episode must be at least 0, got -1"),
         (["collect", "raech", "--out", "OUT"], "did you mean 'reach'"),
         (["collect", "--out", "OUT"], "tasks"),
-        (["collect", "reach", "--out", "OUT", "--episodes", "0"], "episodes_per_task must be at least 1, got 0"),
-        (["collect", "reach", "--out", "OUT", "--noise", "-1"], "noise_scale"),
-        (["collect", "reach", "--out", "OUT", "--num-envs", "0"], "num_envs must be at least 1, got 0"),
-        (["train", "NOWHERE", "--out", "OUT"], "root: no dataset folder"),
+        (["collect", "reach", "--out", "OUT", "--episodes", "0"], "error: --episodes must be at least 1, got 0"),
+        (["collect", "reach", "--out", "OUT", "--noise", "-1"], "error: --noise must be finite and at least 0"),
+        (["collect", "reach", "--out", "OUT", "--num-envs", "0"], "error: --num-envs must be at least 1, got 0"),
+        (["train", "NOWHERE", "--out", "OUT"], "error: data: no dataset folder"),
         (["evaluate", "NOWHERE"], "checkpoint: no file"),
         (["evaluate", "expert", "--tasks", "raech"], "did you mean 'reach'"),
-        (["evaluate", "expert", "--tasks", "reach", "--episodes", "0"], "episodes_per_task must be at least 1"),
+        (["evaluate", "expert", "--tasks", "reach", "--episodes", "0"], "error: --episodes must be at least 1"),
         (["view", "NOWHERE"], "NOWHERE"),
+        (["train", "NOWHERE", "--out", "OUT", "--learning-rate", "-1"], "error: --learning-rate must be finite"),
+        (["scripted", "reach", "--episodes", "0", "--out", "OUT"], "error: --episodes must be at least 1"),
+        (["reproduce", "few-shot", "--jobs", "0", "--out", "OUT"], "error: --jobs must be at least 1"),
     ],
 )
 def test_an_error_is_one_line_and_code_2(capsys, tmp_path, monkeypatch, args, message):
@@ -233,7 +236,7 @@ def test_evaluate_writes_result_figure_and_recording(capsys, checkpoint, tmp_pat
 
 def test_evaluating_on_the_demonstrations_seed_is_refused(capsys, checkpoint, tmp_path):
     error = fails(capsys, "evaluate", checkpoint, "--seed", 0, "--out", tmp_path / "runs")
-    assert "seed must differ from the demonstrations' seed, 0" in error
+    assert "error: --seed must differ from the demonstrations' seed, 0" in error
     assert not (tmp_path / "runs").exists()
 
 

@@ -102,7 +102,7 @@ def test_what_it_refuses(capsys, tmp_path, tiny):
     message = fails(capsys, *arguments(tmp_path, "--run", "few-shot/strong/pbc/seed0"))
     assert "run must be one of" in message
     assert "did you mean 'few-shot/strong/pcbc/seed0'" in message
-    assert "passes is for the preset paper" in fails(capsys, *arguments(tmp_path, "--passes", 3))
+    assert "--passes is for --preset paper" in fails(capsys, *arguments(tmp_path, "--passes", 3))
     assert "passes must be at least 1" in fails(capsys, *arguments(tmp_path, "--preset", "paper", "--passes", 0))
     assert "jobs must be at least 1" in fails(capsys, *arguments(tmp_path, "--jobs", 0))
 

@@ -1,0 +1,78 @@
+"""How far a long piece of work is: a bar on a terminal and in a notebook, else a line of text every 30 seconds."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import Any
+
+DELAY, EVERY = 1.0, 30.0  # seconds: before a bar is shown, and between lines
+
+
+def _duration(seconds: float) -> str:
+    """
+    Example:
+        >>> _duration(42.0), _duration(700.0), _duration(9000.0)
+        ('42 s', '12 min', '2.5 h')
+    """
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+
+
+class Progress:
+    """Shows how far work is, on the standard error, while the block lasts.
+
+    Args:
+        what: is being done: "training".
+        total: units of work.
+        unit: of work, in the singular: "step".
+        initial: units done before.
+        show: False shows nothing.
+    """
+
+    def __init__(self, what: str, total: int, unit: str, *, initial: int = 0, show: bool = True) -> None:
+        self.what, self.total, self.unit, self.initial = what, total, unit, initial
+        self.done, self.notes = initial, ""
+        self._bar: Any = None
+        if show and sys.stderr is not None and (sys.stderr.isatty() or "ipykernel" in sys.modules):
+            from tqdm.auto import tqdm
+
+            scaled = total >= 100_000
+            self._bar = tqdm(total=total, initial=initial, desc=what, unit=unit, unit_scale=scaled, delay=DELAY)
+        self._started = time.monotonic()
+        self._next = self._started + EVERY if show and sys.stderr is not None and self._bar is None else float("inf")
+
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self._bar is not None:
+            self._bar.close()
+
+    def update(self, units: int = 1) -> None:
+        """So many more units are done."""
+        self.done += units
+        if self._bar is not None:
+            self._bar.update(units)
+        elif (now := time.monotonic()) >= self._next:
+            self._next = now + EVERY
+            self._print_line(now - self._started)
+
+    def set_done(self, units: int) -> None:
+        """So many units are done in all; fewer than before where some must be done again."""
+        self.done = units
+        if self._bar is not None:
+            self._bar.n = units
+
+    def note(self, **notes: str) -> None:
+        """What is shown beside, ``loss="0.012"``."""
+        self.notes = "".join(f", {name} {value}" for name, value in notes.items())
+        if self._bar is not None:
+            self._bar.set_postfix(notes, refresh=False)
+
+    def _print_line(self, seconds: float) -> None:
+        left = ""
+        if self.done > self.initial:
+            left = f", {_duration(seconds / (self.done - self.initial) * (self.total - self.done))} left"
+        print(f"{self.what}: {self.done}/{self.total} {self.unit}s{left}{self.notes}", file=sys.stderr, flush=True)

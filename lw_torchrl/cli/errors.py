@@ -1,0 +1,51 @@
+"""Errors in the words of the command line: options and arguments of the command, where Python's have other names."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from inspect import Parameter, signature
+
+# Of each command, the names that the functions behind it use, and the command's own.
+OWN_NAMES = {
+    "demo": {"root": "out", "checkpoint": "out"},
+    "collect": {"episodes_per_task": "episodes", "noise_scale": "noise", "root": "out"},
+    "train": {"root": "data", "checkpoint": "out"},
+    "evaluate": {"episodes_per_task": "episodes", "noise_scale": "noise"},
+    "view": {"path": "recording"},
+    "scripted": {"episodes_per_task": "episodes", "noise_scale": "noise", "tasks": "names"},
+    "tasks": {"tasks": "names"},
+    "plans": {"tasks": "names"},
+    "skills": {"skills": "file"},
+    "check": {"plans": "file"},
+    "reproduce": {"episodes_per_task": "episodes", "root": "out", "checkpoint": "out"},
+}
+
+
+def in_its_words(command: str, function: Callable[..., object], message: str) -> str:
+    """The message with the command's names for what it is about.
+
+    A name at its beginning that the rest speaks of is one; elsewhere only a name that no English word is.
+
+    Example:
+        >>> def collect(*, episodes: int, redraw_failures: bool): ...
+        >>> in_its_words("collect", collect, "episodes_per_task must be at least 1, got 0")
+        '--episodes must be at least 1, got 0'
+        >>> in_its_words("collect", collect, "too few; set redraw_failures=False")
+        'too few; set --no-redraw-failures'
+    """
+    parameters = signature(function).parameters
+    own = OWN_NAMES.get(command, {})
+
+    def shown(match: re.Match[str]) -> str:
+        given = match[1]
+        name = given if given in parameters and given not in own else own.get(given, "")
+        if name not in parameters:
+            return match[0]
+        if parameters[name].kind is Parameter.POSITIONAL_ONLY:
+            return name
+        option = name.replace("_", "-")
+        return f"--no-{option}" if match[2] == "=False" else f"--{option}"
+
+    message = re.sub(r"^([a-z_]+)()(?=:| must| differ)", shown, message)
+    return re.sub(r"(?<![\w-])([a-z]+(?:_[a-z]+)+)(=False|=True)?\b", shown, message)

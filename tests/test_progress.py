@@ -1,0 +1,89 @@
+"""Progress: a bar on a terminal, else a line of text every 30 seconds, and nothing before a second has passed."""
+
+from __future__ import annotations
+
+import io
+import sys
+
+import pytest
+
+from lw_torchrl import _progress
+from lw_torchrl._progress import Progress
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """Seconds that a test counts itself."""
+    now = [100.0]
+    monkeypatch.setattr(_progress.time, "monotonic", lambda: now[0])
+
+    def wait(seconds):
+        now[0] += seconds
+
+    return wait
+
+
+def test_off_a_terminal_a_line_every_30_seconds(capsys, clock):
+    with Progress("training", 8000, "step", initial=500) as progress:
+        progress.note(loss="0.012")
+        for _ in range(3000):
+            clock(0.1)
+            progress.update()
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 9 or len(lines) == 10
+    assert lines[0].startswith("training: ")
+    assert lines[-1] == f"training: {lines[-1].split()[1]} steps, 8 min left, loss 0.012"
+    assert abs(int(lines[4].split()[1].split("/")[0]) - 2000) <= 5
+    assert "\r" not in "".join(lines)
+
+
+def test_work_done_again_and_work_not_begun(capsys, clock):
+    with Progress("collecting", 1000, "step", initial=400) as progress:
+        clock(31)
+        progress.update(0)
+        progress.update(200)
+        clock(31)
+        progress.set_done(500)
+        progress.update(0)
+    assert capsys.readouterr().err.splitlines() == [
+        "collecting: 400/1000 steps",
+        "collecting: 500/1000 steps, 5 min left",
+    ]
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_nothing_is_shown_of_short_work(monkeypatch, terminal):
+    stream = Terminal() if terminal else io.StringIO()
+    monkeypatch.setattr(sys, "stderr", stream)
+    with Progress("evaluating", 10, "step") as progress:
+        for _ in range(10):
+            progress.update()
+    assert stream.getvalue() == ""
+
+
+def test_on_a_terminal_a_bar(monkeypatch):
+    monkeypatch.setattr(sys, "stderr", stream := Terminal())
+    monkeypatch.setattr(_progress, "DELAY", 0.0)
+    with Progress("training", 4, "step", initial=1) as progress:
+        progress.note(loss="0.5")
+        progress.update(3)
+        progress.set_done(2)
+        progress.update()
+    assert "training" in stream.getvalue()
+    assert "loss=0.5" in stream.getvalue()
+    assert "3/4" in stream.getvalue()
+
+
+@pytest.mark.parametrize("stream", [None, "a terminal"])
+def test_nothing_where_it_is_off_or_there_is_no_stream(monkeypatch, clock, stream):
+    monkeypatch.setattr(sys, "stderr", shown := None if stream is None else Terminal())
+    with Progress("training", 4, "step", show=stream is None) as progress:
+        clock(100)
+        progress.update()
+    assert progress.done == 1
+    assert shown is None or shown.getvalue() == ""

@@ -1,0 +1,176 @@
+"""Ctrl-C in training: it ends between two steps, with a checkpoint of where it stands, every time."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import threading
+from itertools import pairwise
+
+import pytest
+import torch
+from torchrl.envs import Transform
+
+import lw_torchrl as lw
+
+SMALL = {"width": 16, "depth": 1}
+CONFIG = lw.BehavioralCloningConfig(steps=40, batch_size=20, checkpoint_every=30)
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory):
+    root = tmp_path_factory.mktemp("interrupts") / "demos"
+    lw.collect_demonstrations(["push", "reach"], episodes_per_task=1, root=root, max_steps=60, progress=False)
+    return root
+
+
+class PressCtrlC(Transform):
+    """Sends SIGINT while the sixth minibatch is drawn, as often as it is told to."""
+
+    def __init__(self, times=1):
+        super().__init__()
+        self.count, self.times = 0, times
+
+    def forward(self, tensordict):
+        self.count += 1
+        if self.count == 6:
+            for _ in range(self.times):
+                signal.raise_signal(signal.SIGINT)
+        return tensordict
+
+
+def make(demos, checkpoint, stacked, *, times=0):
+    def replay(press):
+        found = lw.LanguageWorldExperienceReplay(demos, sampler=lw.TaskBalancedSampler())
+        if press:
+            found.append_transform(PressCtrlC(times))
+        return found
+
+    torch.manual_seed(0)
+    actors = [lw.DescriptorConditionedActor(["push", "reach"], **SMALL) for _ in range(1 + stacked)]
+    if stacked:
+        return lw.StackedBehavioralCloning(
+            actors, [replay(times), replay(0)], CONFIG, checkpoint=checkpoint, progress=False
+        )
+    return lw.BehavioralCloningTrainer(actors[0], replay(times), CONFIG, checkpoint=checkpoint, progress=False)
+
+
+def weights(trainer):
+    actors = trainer.actors if hasattr(trainer, "actors") else [trainer.actor]
+    return torch.cat([p.detach().flatten() for actor in actors for p in actor.parameters()])
+
+
+@pytest.mark.parametrize("stacked", [False, True])
+def test_it_ends_after_the_step_and_carries_on(demos, tmp_path, stacked):
+    handler = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        make(demos, tmp_path / "c.zip", stacked, times=1).train()
+    assert signal.getsignal(signal.SIGINT) is handler
+    resumed = make(demos, tmp_path / "c.zip", stacked)
+    assert (resumed.steps if stacked else resumed.state.step) == 6
+    resumed.train()
+    whole = make(demos, None, stacked)
+    whole.train()
+    assert torch.equal(weights(resumed), weights(whole))
+
+
+@pytest.mark.parametrize("stacked", [False, True])
+def test_the_second_time_it_ends_at_once(demos, tmp_path, stacked):
+    trainer = make(demos, tmp_path / "c.zip", stacked, times=2)
+    handler = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        trainer.train()
+    assert signal.getsignal(signal.SIGINT) is handler
+    assert (trainer.steps if stacked else trainer.state.step) == 5
+    assert not (tmp_path / "c.zip").exists()
+
+
+def test_where_it_is_ignored_it_is_ignored(demos, tmp_path):
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        trainer = make(demos, tmp_path / "c.zip", False, times=1)
+        trainer.train()
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert trainer.state.step == CONFIG.steps
+
+
+def test_in_another_thread_nothing_is_changed(demos):
+    trainer = make(demos, None, False)
+    thread = threading.Thread(target=trainer.train)
+    thread.start()
+    thread.join()
+    assert trainer.state.step == CONFIG.steps
+
+
+# One process imports everything; each run is a fork of it, which gets the signal at a random moment of its work.
+FORKS = """
+import json, os, random, signal, sys, time
+import lw_torchrl as lw
+from lw_torchrl.cli.main import main
+from lw_torchrl.evaluation import protocol  # imported here, since it takes seconds
+
+arguments, runs, owner, method = json.loads(sys.argv[1])
+place = getattr(lw, owner)
+chance = random.Random(0)
+found = []
+for run in range(runs):
+    begun, begin = os.pipe()
+    child = os.fork()
+    if not child:
+        original = getattr(place, method)
+        def noted(self, *args):
+            setattr(place, method, original)
+            state = getattr(self, "state", None)
+            os.write(begin, str(state.step if state else 0).encode())
+            return original(self, *args)
+        setattr(place, method, noted)
+        try:
+            main(arguments)
+            os._exit(0)
+        except SystemExit as error:
+            os._exit(error.code)
+        finally:
+            os._exit(1)
+    os.close(begin)
+    step = int(os.read(begun, 20))  # at which its work began
+    os.close(begun)
+    time.sleep(chance.uniform(0, 0.15))
+    os.kill(child, signal.SIGINT)
+    status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    found.append((status, step))
+print(json.dumps(found))
+"""
+
+
+def interrupted(arguments, runs, *method):
+    """(exit status, step at which it began) of each run."""
+    given = json.dumps(([str(one) for one in arguments], runs, *method))
+    done = subprocess.run([sys.executable, "-c", FORKS, given], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert "Traceback" not in done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def test_twenty_times_at_random_moments(demos, tmp_path):
+    """Each run carries on from the one before; none loses a step that it made."""
+    file = tmp_path / "policy.zip"
+    arguments = ["train", demos, "--out", file, "--steps", 10**6, "--batch-size", 20, "--width", 16, "--depth", 1]
+    found = interrupted(arguments, 20, "BehavioralCloningTrainer", "step")
+    assert [status for status, _ in found] == [130] * 20
+    steps = [step for _, step in found]
+    assert steps[0] == 0
+    assert all(before < after for before, after in pairwise(steps)), steps
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [("collect", "reach", "push", "--out", "OUT"), ("evaluate", "expert"), ("demo", "--quick", "--out", "OUT")],
+    ids=lambda arguments: arguments[0],
+)
+def test_other_work(tmp_path, arguments):
+    given = [tmp_path / "out" if one == "OUT" else one for one in arguments]
+    assert interrupted(given, 4, "LanguageWorldEnv", "_step") == [[130, 0]] * 4
