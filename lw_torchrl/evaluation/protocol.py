@@ -19,7 +19,7 @@ from lw_torchrl.envs.episodes import FinishedEpisode, in_blocks, run_episodes
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.evaluation.result import EpisodeResult, EvaluationResult
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
-from lw_torchrl.language.tasks import resolve_tasks
+from lw_torchrl.language.tasks import TASKS, Task, named_tasks
 from lw_torchrl.modules.policy import plans_of, transform_of
 
 _ROWS = 256  # more hardly make a step of all of them cheaper per row, and cost memory
@@ -39,6 +39,12 @@ def actor_plans(actor: Any, plans: Plans | Mapping[str, ConditionalPlan] | None)
             )
         return own
     return given
+
+
+def tasks_of(tasks: str | Task | Iterable[str | Task], plans: Plans | None) -> dict[str, Task]:
+    """The tasks by name; a name of the user's own stands for the task that its plan is for."""
+    own = {} if plans is None else {plan.task: plan.definition for plan in plans.values() if plan.task not in TASKS}
+    return named_tasks(tasks, known={**TASKS, **own})
 
 
 def make_env(actor: Any, plans: Plans | None, base: LanguageWorldEnv) -> EnvBase:
@@ -81,7 +87,7 @@ def _checked(policy: Callable[[TensorDictBase], TensorDictBase]) -> Callable[[Te
 def evaluate(
     actor: TensorDictModuleBase | Callable[[TensorDictBase], TensorDictBase],
     *,
-    tasks: str | Iterable[str],
+    tasks: str | Task | Iterable[str | Task],
     plans: Plans | Mapping[str, ConditionalPlan] | None = None,
     episodes_per_task: int = 20,
     seed: int,
@@ -141,10 +147,11 @@ def evaluate(
 
     Source: paper section 'Conditional Plan Experiments': 20 episodes, action noise 0.1.
     """
-    names = resolve_tasks(tasks)
+    answered = actor_plans(actor, plans)
+    chosen = tasks_of(tasks, answered)
+    names = tuple(chosen)
     check_int("episodes_per_task", episodes_per_task, minimum=1)
     check_scale("noise_scale", noise_scale)
-    answered = actor_plans(actor, plans)
     most = len(names) * episodes_per_task  # a row more would have nothing to do
     if num_envs is None:
         num_envs = len(names) * max(1, min(episodes_per_task, _ROWS // len(names)))
@@ -152,7 +159,7 @@ def evaluate(
     if answered is not None:
         answered.require(names)
     base = LanguageWorldEnv(
-        names,
+        list(chosen.values()) if set(chosen) - set(TASKS) else list(chosen),  # type: ignore[arg-type]
         num_envs=num_envs,
         seed=seed,
         engine=engine,

@@ -41,6 +41,7 @@ __all__ = [
     "coordinate_index",
     "get_task",
     "load_tasks",
+    "named_tasks",
     "resolve_tasks",
     "task_id",
 ]
@@ -256,6 +257,29 @@ def resolve_tasks(names: str | Iterable[str], *, tasks: Mapping[str, Task] = TAS
         repeated = sorted({name for name in found if found.count(name) > 1})
         raise ValueError(f"tasks must name each task once, got {', '.join(repeated)} more than once")
     return tuple(sorted(found))
+
+
+def named_tasks(tasks: str | Task | Iterable[str | Task], *, known: Mapping[str, Task] = TASKS) -> dict[str, Task]:
+    """Task names, sorted, to the tasks of a set, a name, a Task, or a list of names and Tasks.
+
+    Args:
+        tasks: as for :func:`resolve_tasks`; a :class:`Task` counts for itself, whatever else has its name.
+        known: the tasks that names stand for, as from :func:`load_tasks`.
+
+    Raises:
+        ValueError, TypeError: as for :func:`resolve_tasks`.
+
+    Example:
+        >>> list(named_tasks(["push", TASKS["door-open"]]))
+        ['door-open', 'push']
+    """
+    if isinstance(tasks, str) or not isinstance(tasks, (Task, Iterable)):
+        return {name: known[name] for name in resolve_tasks(tasks, tasks=known)}
+    listed = [tasks] if isinstance(tasks, Task) else list(tasks)
+    own = {task.name: task for task in listed if isinstance(task, Task)}
+    names = [task.name if isinstance(task, Task) else task for task in listed]
+    there = {**known, **own}
+    return {name: there[name] for name in resolve_tasks(names, tasks=there)}
 
 
 def get_task(task: str | Task) -> Task:

@@ -14,21 +14,11 @@ from lw_torchrl._checks import check_choice
 from lw_torchrl._keys import as_keys
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.task_index import TaskIndex
-from lw_torchrl.language.tasks import MT50, TASKS, Task, resolve_tasks
+from lw_torchrl.language.tasks import MT50, TASKS, Task, named_tasks
 from lw_torchrl.language.text import encode_texts
 from lw_torchrl.modules.decoder import ActionDecoder, text_to_latent, unit_scale
 from lw_torchrl.modules.observation_features import Features
 from lw_torchrl.modules.policy import Policy, TextEncoding
-
-
-def _definitions(tasks: str | Iterable[str | Task]) -> dict[str, Task]:
-    """The tasks by name, sorted by it."""
-    if isinstance(tasks, str) or not isinstance(tasks, Iterable):
-        return {name: TASKS[name] for name in resolve_tasks(tasks)}
-    listed = list(tasks)
-    own = {task.name: task for task in listed if isinstance(task, Task)}
-    names = resolve_tasks([task.name if isinstance(task, Task) else task for task in listed], tasks={**TASKS, **own})
-    return {name: own.get(name) or TASKS[name] for name in names}
 
 
 def _one_hot(texts: Sequence[str]) -> Tensor:
@@ -80,7 +70,7 @@ class DescriptorConditionedActor(Policy):
         out_keys: Sequence[NestedKey] | None = None,
     ) -> None:
         super().__init__()
-        self.definitions = _definitions(tasks)
+        self.definitions = named_tasks(tasks)
         self.tasks = tuple(self.definitions)
         self.in_keys = as_keys("in_keys", in_keys, ("observation", "task_id"))
         self.out_keys = as_keys("out_keys", out_keys, ("action",))

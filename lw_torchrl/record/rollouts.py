@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable
 from itertools import groupby
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -12,9 +13,9 @@ from tensordict.utils import NestedKey
 
 from lw_torchrl.envs.episodes import in_blocks, run_episodes
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
-from lw_torchrl.evaluation.protocol import make_env
+from lw_torchrl.evaluation.protocol import make_env, tasks_of
 from lw_torchrl.language.plans import ConditionalPlan
-from lw_torchrl.language.tasks import TASKS, resolve_tasks
+from lw_torchrl.language.tasks import TASKS, Task
 from lw_torchrl.modules.policy import Policy, plans_of
 from lw_torchrl.record.rerun_logger import RerunLogger
 
@@ -24,12 +25,13 @@ _PLAN_KEYS = {"qaf", "skill_weights"}
 
 def rollout_tasks(
     actor: Policy,
-    tasks: str | Iterable[str],
+    tasks: str | Task | Iterable[str | Task],
     *,
     seed: int,
     episode: int = 0,
     noise_scale: float = 0.1,
     max_steps: int = 500,
+    engine: Any = "vectorized",
 ) -> dict[str, TensorDictBase]:
     """One episode of each task, the same as :func:`lw_torchrl.evaluate` runs it.
 
@@ -38,8 +40,10 @@ def rollout_tasks(
         next/success (T, 1) bool, next/reward (T, 1) float32; where the actor has plans qaf (T, S) bool, and
         skill_weights (T, S) float32 where it writes them.
     """
-    names = resolve_tasks(tasks)
-    env = make_env(actor, None, LanguageWorldEnv(names, seed=seed, max_steps=max_steps, strict=True))
+    chosen = tasks_of(tasks, plans_of(actor))
+    rows: Any = list(chosen.values()) if set(chosen) - set(TASKS) else list(chosen)
+    base = LanguageWorldEnv(rows, seed=seed, max_steps=max_steps, engine=engine, strict=True)
+    env = make_env(actor, None, base)
     written = {"qaf", *actor.out_keys} if plans_of(actor) is not None else set()
     try:
         with torch.no_grad():
@@ -48,7 +52,7 @@ def rollout_tasks(
                 for found in run_episodes(
                     env,
                     in_blocks(actor.eval()),
-                    {task: [episode] for task in names},
+                    {task: [episode] for task in chosen},
                     keys=[*_KEYS, *sorted(_PLAN_KEYS & written)],
                     noise=(lambda _: (noise_scale,) * 4) if noise_scale else None,
                 )

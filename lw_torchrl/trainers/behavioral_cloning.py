@@ -18,6 +18,7 @@ from torchrl.objectives import BCLoss
 from torchrl.record.loggers import Logger
 
 from lw_torchrl._checks import check_choice, check_int, check_scale
+from lw_torchrl._files import sweep
 from lw_torchrl._progress import Progress
 from lw_torchrl.modules.policy import Policy, plans_of
 from lw_torchrl.trainers.checkpoint import (
@@ -167,6 +168,7 @@ class BehavioralCloningTrainer:
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
         check_belongs(actor, replay)
         if self.checkpoint is not None:
+            sweep(self.checkpoint)
             check_can_be_saved(actor)
         if replay._prefetch:
             raise ValueError("replay must not prefetch: batches drawn ahead would be lost when training is resumed")

@@ -14,6 +14,7 @@ from torch.func import functional_call, stack_module_state, vmap
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.objectives.utils import distance_loss
 
+from lw_torchrl._files import sweep
 from lw_torchrl._progress import Progress
 from lw_torchrl.modules.policy import Policy
 from lw_torchrl.trainers.behavioral_cloning import (
@@ -93,6 +94,7 @@ class StackedBehavioralCloning:
         self.actors, self.replays, self.progress = list(actors), list(replays), progress
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
         if self.checkpoint is not None:
+            sweep(self.checkpoint)
             check_can_be_saved(self.actors[0])
         self.states = []
         for number, (actor, replay) in enumerate(zip(actors, replays, strict=True)):
