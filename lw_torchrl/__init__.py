@@ -63,7 +63,7 @@ from lw_torchrl.modules import (
 )
 from lw_torchrl.record import RerunLogger
 from lw_torchrl.trainers import BehavioralCloningConfig, BehavioralCloningTrainer, StackedBehavioralCloning, load_actor
-from lw_torchrl.transforms import QAFTransform, RandomYaw
+from lw_torchrl.transforms import EnvState, QAFTransform, RandomYaw
 
 __version__ = "0.1.0"
 
@@ -83,6 +83,7 @@ __all__ = [
     "DescriptorConditionedActor",
     "Engine",
     "EngineStep",
+    "EnvState",
     "EpisodeResult",
     "Estimate",
     "EvaluationResult",

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDictBase, unravel_key
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase, Transform
 
 from lw_torchrl._checks import check_scale, missing_keys
+from lw_torchrl.transforms.containers import check_keys
 
 # Where the observation's positions begin: hand, two objects, the same a step before, goal.
 _POSITIONS = (0, 4, 11, 18, 22, 29, 36)
+_KEYS = ("observation", "action", "expert_action")
 _NOT_FOR_ENVIRONMENTS = "RandomYaw is for replay buffers: an environment has done its action before it is turned"
 
 
@@ -31,14 +36,16 @@ class RandomYaw(Transform):
     happened to have. For replay buffers; where a :class:`QAFTransform` is used, put it first, since conditions speak of
     the scene as it was.
 
-    Changes ``observation`` (B, 39) float32 and ``action`` (B, 4) float32, and ``("next", "observation")`` and
-    ``expert_action`` where they are. An action's way in the plane is shortened where it would leave [-1, 1], its
-    direction kept. Orientations stay as they were, and so do fixed places: use it with features that hold neither,
-    "differences" or "relative", and without ``focus``. Angles are drawn from PyTorch's global generator; the trainers
-    seed it.
+    Changes ``observation`` (B, 39) float32 and ``action`` (B, 4) float32, and, where they are, ``expert_action``
+    (B, 4) float32 and ``("next", "observation")``. An action's way in the plane is shortened where it would leave
+    [-1, 1], its direction kept. Orientations stay as they were, and so do fixed places: use it with features that hold
+    neither, "differences" or "relative", and without ``focus``. Angles are drawn from PyTorch's global generator; the
+    trainers seed it.
 
     Args:
         scale: standard deviation of the angle, in radians.
+        in_keys: where the observation, the action and the expert's action are, in this order; a key may be nested.
+        out_keys: where they go, turned; None for the same places.
 
     Raises:
         ValueError: a negative or infinite scale; a sample without observation or action.
@@ -54,25 +61,37 @@ class RandomYaw(Transform):
     Source: data augmentation by a symmetry of the task, as for images in ``torchvision.transforms.RandomRotation``.
     """
 
-    def __init__(self, scale: float) -> None:
-        super().__init__(in_keys=["observation", "action"], out_keys=["observation", "action"])
+    def __init__(
+        self,
+        scale: float,
+        *,
+        in_keys: Sequence[NestedKey] = _KEYS,
+        out_keys: Sequence[NestedKey] | None = None,
+    ) -> None:
+        super().__init__(
+            in_keys=check_keys("in_keys", in_keys, *_KEYS),
+            out_keys=check_keys("out_keys", in_keys if out_keys is None else out_keys, *_KEYS),
+        )
         self.scale = check_scale("scale", scale)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Turn each row of a sample."""
         tensordict = tensordict.copy()  # of a buffer's whole range it may be the storage itself
-        observation = tensordict.get("observation", None)
-        if observation is None or "action" not in tensordict.keys():
-            raise missing_keys(tensordict.keys(), "observation", "action")
+        seen, *actions = zip(self.in_keys, self.out_keys, strict=True)
+        observation = tensordict.get(seen[0], None)
+        if observation is None or tensordict.get(actions[0][0], None) is None:
+            raise missing_keys(tensordict.keys(True, True), *map(str, self.in_keys[:2]))
         angle = self.scale * torch.randn(observation.shape[:-1], device=observation.device)
         cos, sin = angle.cos(), angle.sin()
-        tensordict.set("observation", _turned(observation, _POSITIONS, cos, sin))
-        if (following := tensordict.get(("next", "observation"), None)) is not None:
-            tensordict.set(("next", "observation"), _turned(following, _POSITIONS, cos, sin))
-        for name in {"action", "expert_action"} & set(tensordict.keys()):
-            turned = _turned(tensordict.get(name), (0,), cos, sin)
+        tensordict.set(seen[1], _turned(observation, _POSITIONS, cos, sin))
+        if (following := tensordict.get(unravel_key(("next", seen[0])), None)) is not None:
+            tensordict.set(unravel_key(("next", seen[1])), _turned(following, _POSITIONS, cos, sin))
+        for key, turned_key in actions:
+            if (action := tensordict.get(key, None)) is None:
+                continue
+            turned = _turned(action, (0,), cos, sin)
             turned[..., :2] /= turned[..., :2].abs().amax(-1, keepdim=True).clamp(min=1.0)
-            tensordict.set(name, turned)
+            tensordict.set(turned_key, turned)
         return tensordict
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
