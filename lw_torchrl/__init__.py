@@ -50,6 +50,7 @@ if TYPE_CHECKING:  # the table below, for type checkers and editors
     from lw_torchrl.trainers import StackedBehavioralCloning as StackedBehavioralCloning
     from lw_torchrl.trainers import load_actor as load_actor
     from lw_torchrl.trainers import save_actor as save_actor
+    from lw_torchrl.transforms import EnvState as EnvState
     from lw_torchrl.transforms import QAFTransform as QAFTransform
     from lw_torchrl.transforms import RandomYaw as RandomYaw
 
@@ -71,7 +72,7 @@ _NAMES = {
     "lw_torchrl.record": "RerunLogger",
     "lw_torchrl.trainers": "BehavioralCloningConfig BehavioralCloningTrainer StackedBehavioralCloning "
     "load_actor save_actor",
-    "lw_torchrl.transforms": "QAFTransform RandomYaw",
+    "lw_torchrl.transforms": "EnvState QAFTransform RandomYaw",
 }
 _ROOM = {name: room for room, names in _NAMES.items() for name in names.split()}
 _PACKAGES = ("data", "envs", "evaluation", "experiments", "language", "modules", "record", "trainers", "transforms")

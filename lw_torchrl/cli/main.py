@@ -252,9 +252,6 @@ def query(
         seed: of the episode.
         episode: its index.
     """
-    import torch
-    from tensordict import TensorDict
-
     import lw_torchrl as lw
     from lw_torchrl._checks import check_int
     from lw_torchrl.language.tasks import check_task
@@ -268,7 +265,7 @@ def query(
     if check_int("step", step, minimum=0) > 500:
         raise ValueError(f"step must be at most 500, got {step}")
     env = lw.LanguageWorldEnv(name, seed=seed)
-    state = env.reset(TensorDict({"episode": torch.tensor([episode])}, [1]))
+    state = env.reset(episode=episode)
     if step:
         state = env.rollout(step, lw.ExpertActor(name), auto_reset=False, tensordict=state)[:, -1]["next"]
     truths = lw.QueryProgram({name: listed})(state["observation"], state["task_id"])[0].tolist()

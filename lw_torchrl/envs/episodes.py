@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.envs import EnvBase, TransformedEnv, step_mdp
 
@@ -110,14 +110,13 @@ def run_episodes(
                 episode[row], starting[row], steps[row] = number, True, 0
                 if noise is not None:
                     scale = np.asarray(noise(number), dtype=np.float32)
-                    drawn = action_noise(base.row_tasks[row], base.seed, number, base.max_steps, noise_hold)
+                    drawn = action_noise(base.task_of_row[row], base.seed, number, base.max_steps, noise_hold)
                     noises[row] = drawn * scale
         active = (active & ~idle) | starting
         if not active.any():
             return
         if starting.any():
-            request = TensorDict({"_reset": starting, "episode": episode.clone()}, [rows])
-            state = env.reset(state.update(request)).exclude("_reset")
+            state = env.reset(state.set("_reset", starting), episode=episode).exclude("_reset")
         state.set("_step", active)
         state = policy(state)
         action = state.get("action")

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+import os
 import warnings
-from collections.abc import Callable, Iterable
-from typing import Any, Literal
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, Literal, NoReturn
 
 import numpy as np
 import torch
@@ -16,18 +17,10 @@ from torchrl.envs import EnvBase
 
 from lw_torchrl._checks import check_choice, check_int
 from lw_torchrl.envs.engine import ACTION_SIZE, OBSERVATION_SIZE, Engine
-from lw_torchrl.envs.engines.metaworld import MetaWorldEngine
-from lw_torchrl.envs.engines.vectorized.engine import VectorizedEngine
-from lw_torchrl.envs.seeding import episode_seed
-from lw_torchrl.language.tasks import resolve_tasks, task_id
-
-ENGINES: dict[str, Callable[..., Engine]] = {"vectorized": VectorizedEngine, "metaworld": MetaWorldEngine}
-
-
-def _make_engine(engine: str | Callable[..., Engine], rows: list[str], **options: Any) -> Engine:
-    if callable(engine):
-        return engine(rows, **options)
-    return ENGINES[check_choice("engine", engine, ENGINES)](rows, **options)
+from lw_torchrl.envs.engines import make_engine
+from lw_torchrl.envs.episode_counter import EpisodeCounter, check_worker
+from lw_torchrl.envs.workers import torchrl_worker
+from lw_torchrl.language.tasks import MT50, Task, named_tasks, task_id
 
 
 class LanguageWorldEnv(EnvBase):
@@ -35,9 +28,24 @@ class LanguageWorldEnv(EnvBase):
     initial state and goal at every reset, the goal observed, 500 steps, ended by truncation alone.
 
     Row i keeps the task ``tasks[i % n]`` for life. The m-th reset of the r-th of a task's R rows is that task's
-    episode m·R + r, unless the reset tensordict's ``episode`` names another. An episode starts as Meta-World's
-    own environment does after ``env.seed(episode_seed(task, seed, episode)); env.reset()``, whatever ran before
-    or beside it.
+    episode m·R + r. An episode starts as Meta-World's own environment does after
+    ``env.seed(episode_seed(task, seed, episode)); env.reset()``, whatever ran before or beside it.
+
+    ``env.reset(episode=7)`` or ``env.reset(episode=tensor)``, int64 (N,), asks for episodes; that counts as a reset
+    too. A SerialEnv or ParallelEnv takes ``reset(list_of_kwargs=[{"episode": ...}, ...])``. The ``episode`` in a
+    tensordict is an output, which a reset ignores. ``reset(tensordict, set_state=True)`` goes to the beginning of the
+    tensordict's ``episode``; it refuses an ``observation`` that is not the first, since physics in the middle of an
+    episode cannot be restored, and it does not reach through a TransformedEnv, which hands down no outputs.
+
+    In the w-th of W workers the m-th reset is episode (m·W + w)·R + r: W workers run what one environment of W·R rows
+    would. TorchRL's SerialEnv, ParallelEnv, AsyncEnvPool and multi-process collectors are recognised where they call
+    the function that makes the environment; for anything else (Ray, RPC, processes of your own) say ``worker=(w, W)``,
+    or give each another seed.
+
+    ``state_dict`` holds the seed and the counters, so that one which loads it goes on with the next episodes; it must
+    be reset first. A TransformedEnv, and a Collector with it, saves it by its
+    :class:`~lw_torchrl.transforms.QAFTransform` or :class:`~lw_torchrl.transforms.EnvState`; call
+    ``collector.reset()`` after ``collector.load_state_dict``.
 
     Keys (B = (N,)):
         observation: (N, 39) float32, Meta-World's vector: metres, gripper opening in [0, 1], quaternions.
@@ -54,7 +62,8 @@ class LanguageWorldEnv(EnvBase):
     A ``_step`` mask leaves rows where they are; a ``_reset`` mask resets only its rows.
 
     Args:
-        tasks: "MT10", "MT50", a task's name, or a list of names.
+        tasks: "MT10", "MT50", a task's name, or a list of names. A :class:`~lw_torchrl.Task` stands for its name; one
+            that Meta-World does not have needs an engine of your own.
         num_envs: N, at least the number of tasks; None for one environment each.
         seed: any integer; :meth:`set_seed` starts again at episode 0.
         engine: "vectorized", the fast one; "metaworld" for Meta-World's own environments in a loop, which gives the
@@ -63,9 +72,12 @@ class LanguageWorldEnv(EnvBase):
         reward: "sparse", the success as 0 and 1, or "dense", Meta-World's own.
         max_steps: steps until truncation.
         strict: raise on a NaN action, instead of truncating the row with a warning as for an unstable simulation.
+        worker: (w, W), which of how many environments like this one it is; None asks TorchRL.
 
     Raises:
-        ValueError: an unknown task or engine, or ``num_envs`` under the number of tasks.
+        ValueError: an unknown task or engine, ``num_envs`` under the number of tasks, or a wrong ``episode``.
+        RuntimeError: a step of a row that has ended; a reset or step in a forked process that did not make it.
+        TypeError: it is pickled or copied; pass the function that makes it.
         ImportError: a rendering library named by MUJOCO_GL is absent, or the vectorized engine does not know the
             installed version of Meta-World or MuJoCo.
 
@@ -79,9 +91,11 @@ class LanguageWorldEnv(EnvBase):
     Source: paper section 'Task Formalism'; ``metaworld.sawyer_xyz_env.SawyerXYZEnv``.
     """
 
+    _supports_set_state = True
+
     def __init__(
         self,
-        tasks: str | Iterable[str],
+        tasks: str | Task | Iterable[str | Task],
         *,
         num_envs: int | None = None,
         seed: int = 0,
@@ -90,8 +104,10 @@ class LanguageWorldEnv(EnvBase):
         reward: Literal["sparse", "dense"] = "sparse",
         max_steps: int = 500,
         strict: bool = False,
+        worker: tuple[int, int] | None = None,
     ) -> None:
-        self.tasks = resolve_tasks(tasks)
+        named = named_tasks(tasks)
+        self.tasks = tuple(named)
         n = len(self.tasks)
         num_envs = n if num_envs is None else check_int("num_envs", num_envs, minimum=1)
         if num_envs < n:
@@ -102,48 +118,77 @@ class LanguageWorldEnv(EnvBase):
         self.max_steps = check_int("max_steps", max_steps, minimum=1)
         self.strict = strict
         self.row_tasks = tuple(self.tasks[i % n] for i in range(num_envs))
-        self._seed = check_int("seed", seed)
+        self.worker = torchrl_worker() if worker is None else check_worker(worker)
+        self._process = os.getpid()
+        self._counter = EpisodeCounter([named[t] for t in self.row_tasks], check_int("seed", seed), self.worker)
         super().__init__(device=torch.device("cpu"), batch_size=(num_envs,))
-        self._make_specs(num_envs)
         self._task_id = torch.tensor([task_id(task) for task in self.row_tasks])
-        self._rank = np.arange(num_envs) // n  # r, the row's rank among the rows of its task
-        self._copies = np.bincount(np.arange(num_envs) % n, minlength=n)[np.arange(num_envs) % n]  # R
-        self._resets = np.zeros(num_envs, dtype=np.int64)
+        self._make_specs(num_envs)
         self._episode = np.full(num_envs, -1, dtype=np.int64)
         self._steps = np.zeros(num_envs, dtype=np.int64)
         self._over = np.ones(num_envs, dtype=bool)
         self._fault = np.zeros(num_envs, dtype=bool)
         self._success = np.zeros(num_envs, dtype=bool)
         self._observation = np.zeros((num_envs, OBSERVATION_SIZE), dtype=np.float32)
-        self._engine = _make_engine(engine, list(self.row_tasks), reward=reward, num_threads=num_threads)
+        self._engine = make_engine(engine, self.row_tasks, reward=reward, num_threads=num_threads)
         self.is_closed = False  # EnvBase starts with True
 
     def _make_specs(self, n: int) -> None:
         flag = Categorical(2, shape=(n, 1), dtype=torch.bool)
+        ids = len(MT50) if int(self._task_id.max()) < len(MT50) else 2**32  # a task of one's own has a hash
         self.observation_spec = Composite(
             observation=Unbounded((n, OBSERVATION_SIZE)),
-            task_id=Categorical(50, shape=(n,), dtype=torch.int64),
+            task_id=Categorical(ids, shape=(n,), dtype=torch.int64),
             episode=Unbounded((n,), dtype=torch.int64),
             success=flag.clone(),
             fault=flag.clone(),
             executed_action=Bounded(-1.0, 1.0, (n, ACTION_SIZE)),
             shape=(n,),
         )
-        # What a reset may read: a TransformedEnv hands down nothing of the reset tensordict that is not state.
-        self.state_spec = Composite(episode=Unbounded((n,), dtype=torch.int64), shape=(n,))
         self.action_spec = Bounded(-1.0, 1.0, (n, ACTION_SIZE))
         self.reward_spec = Unbounded((n, 1))
         self.done_spec = Composite(done=flag.clone(), terminated=flag.clone(), truncated=flag.clone(), shape=(n,))
 
     def _set_seed(self, seed: int | None) -> None:
-        if seed is not None:
-            self._seed = check_int("seed", seed)
-        self._resets[:] = 0
+        self._counter.start_again(seed)
+
+    @property
+    def task_of_row(self) -> tuple[Task, ...]:
+        """The :class:`~lw_torchrl.Task` of each row."""
+        return self._counter.tasks
 
     @property
     def seed(self) -> int:
         """The seed that, with task and episode, fixes every reset."""
-        return self._seed
+        return self._counter.seed
+
+    def get_extra_state(self) -> Tensor:
+        """What ``state_dict`` holds: tasks, seed and episode counters, as bytes (n,) uint8."""
+        return self._counter.dump()
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """Take seed and counters; the episodes that ran are over."""
+        self._counter.load(state)
+        self._over[:] = True
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
+        """Take seed and episode counters from another's ``state_dict()``, and want a reset.
+
+        Raises:
+            ValueError: the state is of other tasks or rows; with ``strict``, there is none.
+        """
+        if strict and not state_dict:
+            raise ValueError(
+                "state_dict is empty: a Collector saves the state of an environment only in a TransformedEnv with a "
+                "QAFTransform or EnvState, or in a SerialEnv or ParallelEnv; strict=False begins at the first episode"
+            )
+        return super().load_state_dict(state_dict, strict=strict, assign=assign)
+
+    def __getstate__(self) -> NoReturn:
+        raise TypeError(
+            "a LanguageWorldEnv holds running simulators and can be neither pickled nor copied: pass a function that "
+            "makes it, lambda: LanguageWorldEnv(...)"
+        )
 
     def _state(self, executed_action: Tensor, **more: Tensor) -> TensorDict:
         over = torch.from_numpy(self._over.copy()).unsqueeze(-1)
@@ -170,36 +215,51 @@ class LanguageWorldEnv(EnvBase):
             return np.ones(self.batch_size[0], dtype=bool)
         return mask.reshape(self.batch_size).cpu().numpy()
 
-    def _check_open(self) -> None:
+    def _check_usable(self) -> None:
         if self.is_closed:
             raise RuntimeError("this environment is closed (a collector closes its own at its end): make a new one")
+        if os.getpid() != self._process:
+            raise RuntimeError(
+                "this environment was made in the process that this one was forked from, and its threads stayed there: "
+                "make the environment in this process (give ParallelEnv or a collector a function that makes it)"
+            )
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDict:
-        self._check_open()
+    def _reset(
+        self, tensordict: TensorDictBase | None = None, *, episode: int | Tensor | None = None, set_state: bool = False
+    ) -> TensorDict:
+        self._check_usable()
         rows = np.flatnonzero(self._mask(tensordict, "_reset"))
-        named = None if tensordict is None else tensordict.get("episode", None)
-        if named is None:
-            episodes = (self._resets * self._copies + self._rank)[rows]
-        else:
-            if named.numel() != len(self.row_tasks) or named.dtype not in (torch.int64, torch.int32):
+        if set_state:
+            if episode is not None:
+                raise ValueError("episode and set_state=True each name an episode: give one of them")
+            if tensordict is None or (episode := tensordict.get("episode", None)) is None:
                 raise ValueError(
-                    f"episode must be int64 of shape {tuple(self.batch_size)}, got {named.dtype} of shape "
-                    f"{tuple(named.shape)}"
+                    "set_state=True needs episode in the tensordict; a TransformedEnv does not hand it down: "
+                    "reset(episode=tensordict['episode'])"
                 )
-            episodes = named.reshape(self.batch_size).cpu().numpy()[rows]
-            if (episodes < 0).any():
-                raise ValueError(f"episode must be at least 0, got {episodes.min()}")
-        seeds = [
-            episode_seed(self.row_tasks[row], self._seed, int(episode))
-            for row, episode in zip(rows, episodes, strict=True)
-        ]
-        self._observation[rows] = self._engine.reset(rows.tolist(), seeds)
-        self._resets[rows] += 1
+        episodes = self._counter.next(rows) if episode is None else self._counter.asked(episode, rows)
+        self._observation[rows] = self._engine.reset(rows.tolist(), self._counter.seeds(rows, episodes))
+        self._counter.resets[rows] += 1
         self._episode[rows] = episodes
         self._steps[rows] = 0
         for flag in (self._over, self._fault, self._success):
             flag[rows] = False
+        if set_state:
+            self._check_beginning(tensordict, rows)
         return self._state(torch.zeros(*self.batch_size, ACTION_SIZE))
+
+    def _check_beginning(self, tensordict: TensorDictBase, rows: np.ndarray) -> None:
+        wanted = tensordict.get("observation", None)
+        if wanted is None:
+            return
+        later = rows[(wanted.cpu().numpy()[rows] != self._observation[rows]).any(-1)]
+        if len(later):
+            self._over[later] = True
+            raise ValueError(
+                f"set_state=True goes to the beginning of an episode, and the observation of rows {later[:5].tolist()} "
+                "is of a later step, or of another seed: physics in the middle cannot be restored. Leave observation "
+                "out, or repeat the episode's executed actions from its beginning"
+            )
 
     def _clipped(self, tensordict: TensorDictBase) -> Tensor:
         action = tensordict.get("action", None)
@@ -209,12 +269,15 @@ class LanguageWorldEnv(EnvBase):
         return action.detach().clamp(-1.0, 1.0)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        self._check_open()
+        self._check_usable()
         action = self._clipped(tensordict).cpu().numpy()
         active = self._mask(tensordict, "_step")
         if (active & self._over).any():
             rows = np.flatnonzero(active & self._over)[:5].tolist()
-            raise RuntimeError(f"rows {rows} have ended or were never reset: reset them before the next step")
+            raise RuntimeError(
+                f"rows {rows} have ended or were never reset, or not since load_state_dict: reset them before the "
+                "next step (env.reset(), collector.reset())"
+            )
         stepped = active
         if math.isnan(action.sum()):  # of numbers in [-1, 1], so one of them is NaN
             broken = active & np.isnan(action).any(-1)
@@ -237,7 +300,7 @@ class LanguageWorldEnv(EnvBase):
             return
         row = int(np.flatnonzero(rows)[0])
         message = (
-            f"row {row}: {what}, in task {self.row_tasks[row]!r}, seed {self._seed}, episode "
+            f"row {row}: {what}, in task {self.row_tasks[row]!r}, seed {self.seed}, episode "
             f"{self._episode[row]}, step {self._steps[row]}" + (f" ({rows.sum()} rows)" if rows.sum() > 1 else "")
         )
         if fatal:

@@ -8,21 +8,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lw_torchrl._checks import check_int
-from lw_torchrl.language.tasks import check_task
+from lw_torchrl.language.tasks import Task, get_task
 
 
-def _hash(purpose: str, task: str, seed: int, episode: int) -> int:
-    text = (
-        f"lw_torchrl/{purpose}/{check_task(task)}/{check_int('seed', seed)}/{check_int('episode', episode, minimum=0)}"
-    )
+def _hash(purpose: str, task: str | Task, seed: int, episode: int) -> int:
+    name = get_task(task).name
+    text = f"lw_torchrl/{purpose}/{name}/{check_int('seed', seed)}/{check_int('episode', episode, minimum=0)}"
     return int.from_bytes(blake2b(text.encode(), digest_size=8).digest(), "little") >> 1
 
 
-def episode_seed(task: str, seed: int, episode: int) -> int:
+def episode_seed(task: str | Task, seed: int, episode: int) -> int:
     """The seed of one episode: a stable hash, so that no two (task, seed, episode) share their randomness.
 
     Args:
-        task: a task's name, "pick-place".
+        task: a task's name, "pick-place"; for a task of one's own, the Task.
         seed: the environment's seed, any integer.
         episode: index of the episode, from 0.
 
@@ -41,7 +40,7 @@ def episode_seed(task: str, seed: int, episode: int) -> int:
     return _hash("episode", task, seed, episode)
 
 
-def action_noise(task: str, seed: int, episode: int, steps: int, hold: int = 1) -> NDArray[np.float32]:
+def action_noise(task: str | Task, seed: int, episode: int, steps: int, hold: int = 1) -> NDArray[np.float32]:
     """Standard normal noise for the actions of one episode, (steps, 4) float32, the same wherever it is drawn; each
     draw is kept for ``hold`` steps."""
     generator = np.random.Generator(np.random.Philox(_hash("noise", task, seed, episode)))

@@ -159,7 +159,7 @@ def evaluate(
     if answered is not None:
         answered.require(names)
     base = LanguageWorldEnv(
-        list(chosen.values()) if set(chosen) - set(TASKS) else list(chosen),  # type: ignore[arg-type]
+        list(chosen.values()),
         num_envs=num_envs,
         seed=seed,
         engine=engine,

@@ -41,8 +41,7 @@ def rollout_tasks(
         skill_weights (T, S) float32 where it writes them.
     """
     chosen = tasks_of(tasks, plans_of(actor))
-    rows: Any = list(chosen.values()) if set(chosen) - set(TASKS) else list(chosen)
-    base = LanguageWorldEnv(rows, seed=seed, max_steps=max_steps, engine=engine, strict=True)
+    base = LanguageWorldEnv(list(chosen.values()), seed=seed, max_steps=max_steps, engine=engine, strict=True)
     env = make_env(actor, None, base)
     written = {"qaf", *actor.out_keys} if plans_of(actor) is not None else set()
     try:

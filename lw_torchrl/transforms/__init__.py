@@ -1,7 +1,8 @@
 """TorchRL transforms: query answers for environments and replay buffers, and augmentation."""
 
 import lw_torchrl._torchrl  # noqa: F401
+from lw_torchrl.transforms.env_state import EnvState
 from lw_torchrl.transforms.qaf import QAFTransform
 from lw_torchrl.transforms.random_yaw import RandomYaw
 
-__all__ = ["QAFTransform", "RandomYaw"]
+__all__ = ["EnvState", "QAFTransform", "RandomYaw"]

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
 from torchrl.data import Binary, Composite, TensorSpec
-from torchrl.envs import EnvBase, Transform, TransformedEnv
+from torchrl.envs import EnvBase, Transform
 from torchrl.envs.batched_envs import BatchedEnvBase
 
 from lw_torchrl._checks import missing_keys
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.query_program import QueryProgram
+from lw_torchrl.transforms.containers import base_env, check_keys, refuse_changed
+from lw_torchrl.transforms.env_state import KeepsEnvState
 
 
 def plan_program(plans: Plans) -> QueryProgram:
@@ -20,19 +24,23 @@ def plan_program(plans: Plans) -> QueryProgram:
     return QueryProgram({plan.definition: [step.condition for step in plan.steps] for plan in plans.values()})
 
 
-class QAFTransform(Transform):
+class QAFTransform(KeepsEnvState):
     """Writes ``qaf``, in an environment and on a replay buffer.
 
     Reads ``observation`` (B, 39) float32 and ``task_id`` (B,) int64; writes ``qaf`` (B, S) bool, the truth of each
     condition of the row's plan, in the order of its steps, false beyond its last. On a replay buffer it writes
-    ``("next", "qaf")`` too, wherever ``("next", "observation")`` is.
+    ``("next", "qaf")`` too, wherever ``("next", "observation")`` is. Conditions speak of metres, so it comes before
+    whatever changes the observation: a normaliser, :class:`RandomYaw`. In an environment its ``state_dict`` holds the
+    environment's, as :class:`EnvState` does.
 
     Args:
         plans: a plan for each task that will be seen.
+        in_keys: where observation and task_id are, in this order; a key may be nested.
+        out_keys: where the truth goes.
 
     Raises:
         PlanError: (a ValueError) the environment has a task without a plan.
-        ValueError: a task_id without a plan, or a malformed observation.
+        ValueError: a task_id without a plan, a malformed observation, or a transform before it that changes it.
 
     Example:
         >>> from torchrl.envs import TransformedEnv
@@ -45,19 +53,28 @@ class QAFTransform(Transform):
     Source: paper section 'Query Answering Function'.
     """
 
-    def __init__(self, plans: Plans | Mapping[str, ConditionalPlan], in_keys=None, out_keys=None) -> None:
-        super().__init__(in_keys=["observation"], out_keys=["qaf"])
+    def __init__(
+        self,
+        plans: Plans | Mapping[str, ConditionalPlan],
+        *,
+        in_keys: Sequence[NestedKey] = ("observation", "task_id"),
+        out_keys: Sequence[NestedKey] = ("qaf",),
+    ) -> None:
+        super().__init__(
+            in_keys=check_keys("in_keys", in_keys, "observation", "task_id"),
+            out_keys=check_keys("out_keys", out_keys, "qaf"),
+        )
         self.plans = as_plans(plans)
         self.program = plan_program(self.plans)
 
-    def _write(self, tensordict: TensorDictBase, task_ids: TensorDictBase) -> None:
-        observation, task_id = tensordict.get("observation", None), task_ids.get("task_id", None)
+    def _write(self, tensordict: TensorDictBase, task_id: Tensor | None) -> None:
+        observation = tensordict.get(self.in_keys[0], None)
         if observation is None or task_id is None:
-            raise missing_keys(tensordict.keys(), "observation", "task_id")
-        tensordict.set("qaf", self.program(observation, task_id))
+            raise missing_keys(tensordict.keys(True, True), *map(str, self.in_keys))
+        tensordict.set(self.out_keys[0], self.program(observation, task_id))
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        self._write(next_tensordict, next_tensordict)
+        self._write(next_tensordict, next_tensordict.get(self.in_keys[1], None))
         return next_tensordict
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
@@ -65,29 +82,28 @@ class QAFTransform(Transform):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``qaf``, and ``("next", "qaf")`` where there is a next observation."""
-        self._write(tensordict, tensordict)
-        if ("next", "observation") in tensordict.keys(True):
-            following = tensordict.get("next")
-            self._write(following, following if "task_id" in following.keys() else tensordict)
+        refuse_changed(self, self.in_keys[0])
+        task_id = tensordict.get(self.in_keys[1], None)
+        self._write(tensordict, task_id)
+        following = tensordict.get("next", None)
+        if following is not None and following.get(self.in_keys[0], None) is not None:
+            self._write(following, following.get(self.in_keys[1], task_id))
         return tensordict
 
     def set_container(self, container: Transform | EnvBase) -> None:
         """Join an environment, every task of which must have a plan."""
         super().set_container(container)
-        try:
-            env = self.container
-        except ValueError:  # a Compose that is in no environment, or not yet
-            return
-        while isinstance(env, TransformedEnv):
-            env = env.base_env
+        refuse_changed(self, self.in_keys[0])
+        env = base_env(self)
         if not isinstance(env, BatchedEnvBase):  # whose workers may not be there yet
             self.plans.require(getattr(env, "tasks", ()))
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add ``qaf`` to the specs."""
         assert isinstance(observation_spec, Composite)
+        refuse_changed(self, self.in_keys[0])  # it may have been put there later
         steps = self.program.num_queries
-        observation_spec["qaf"] = Binary(
+        observation_spec[self.out_keys[0]] = Binary(
             steps, shape=(*observation_spec.shape, steps), dtype=torch.bool, device=observation_spec.device
         )
         return observation_spec

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDictBase, unravel_key
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase, Transform
 
 from lw_torchrl._checks import check_scale, missing_keys
 from lw_torchrl.language.observation import FIRST, HAND, POSITIONS, SECOND, a_step_before
+from lw_torchrl.transforms.containers import check_keys
 
 _STARTS = tuple(part.start for part in (*POSITIONS, *map(a_step_before, (HAND, FIRST, SECOND))))
+_KEYS = ("observation", "action", "expert_action", "unclipped_action")
 _NOT_FOR_ENVIRONMENTS = "RandomYaw is for replay buffers: an environment has done its action before it is turned"
 
 
@@ -36,14 +41,17 @@ class RandomYaw(Transform):
     happened to have. For replay buffers; where a :class:`QAFTransform` is used, put it first, since conditions speak of
     the scene as it was.
 
-    Changes ``observation`` (B, 39) float32 and ``action`` (B, 4) float32, and ``("next", "observation")``,
-    ``expert_action`` and ``unclipped_action`` where they are. An action's way in the plane is shortened where turning
-    would lead it out of [-1, 1], its direction kept; one that was outside before keeps its length. Orientations stay as
-    they were, and so do fixed places: use it with features that hold neither, "differences" or "relative", and without
-    ``focus``. Angles are drawn from PyTorch's global generator; the trainers seed it.
+    Changes ``observation`` (B, 39) float32 and ``action`` (B, 4) float32, and, where they are, ``expert_action`` and
+    ``unclipped_action`` (B, 4) float32 and ``("next", "observation")``. An action's way in the plane is shortened where
+    turning would lead it out of [-1, 1], its direction kept; one that was outside before keeps its length. Orientations
+    stay as they were, and so do fixed places: use it with features that hold neither, "differences" or "relative", and
+    without ``focus``. Angles are drawn from PyTorch's global generator; the trainers seed it.
 
     Args:
         scale: standard deviation of the angle, in radians.
+        in_keys: where observation, action, the expert's action and the unclipped one are, in this order; a key may be
+            nested.
+        out_keys: where they go, turned; None for the same places.
 
     Raises:
         ValueError: a negative or infinite scale; a sample without observation or action.
@@ -59,26 +67,37 @@ class RandomYaw(Transform):
     Source: data augmentation by a symmetry of the task, as for images in ``torchvision.transforms.RandomRotation``.
     """
 
-    def __init__(self, scale: float) -> None:
-        super().__init__(in_keys=["observation", "action"], out_keys=["observation", "action"])
+    def __init__(
+        self,
+        scale: float,
+        *,
+        in_keys: Sequence[NestedKey] = _KEYS,
+        out_keys: Sequence[NestedKey] | None = None,
+    ) -> None:
+        super().__init__(
+            in_keys=check_keys("in_keys", in_keys, *_KEYS),
+            out_keys=check_keys("out_keys", in_keys if out_keys is None else out_keys, *_KEYS),
+        )
         self.scale = check_scale("scale", scale)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Turn each row of a sample."""
         tensordict = tensordict.copy()  # of a buffer's whole range it may be the storage itself
-        observation = tensordict.get("observation", None)
-        if observation is None or "action" not in tensordict.keys():
-            raise missing_keys(tensordict.keys(), "observation", "action")
+        seen, *actions = zip(self.in_keys, self.out_keys, strict=True)
+        observation = tensordict.get(seen[0], None)
+        if observation is None or tensordict.get(actions[0][0], None) is None:
+            raise missing_keys(tensordict.keys(True, True), *map(str, self.in_keys[:2]))
         angle = self.scale * torch.randn(observation.shape[:-1], device=observation.device)
         cos, sin = angle.cos(), angle.sin()
-        tensordict.set("observation", _turned(observation, _STARTS, cos, sin))
-        if (following := tensordict.get(("next", "observation"), None)) is not None:
-            tensordict.set(("next", "observation"), _turned(following, _STARTS, cos, sin))
-        for name in {"action", "expert_action", "unclipped_action"} & set(tensordict.keys()):
-            action = tensordict.get(name)
+        tensordict.set(seen[1], _turned(observation, _STARTS, cos, sin))
+        if (following := tensordict.get(unravel_key(("next", seen[0])), None)) is not None:
+            tensordict.set(unravel_key(("next", seen[1])), _turned(following, _STARTS, cos, sin))
+        for key, turned_key in actions:
+            if (action := tensordict.get(key, None)) is None:
+                continue
             turned = _turned(action, (0,), cos, sin)
             turned[..., :2] /= torch.where(_reach(action) <= 1.0, _reach(turned).clamp(min=1.0), 1.0)
-            tensordict.set(name, turned)
+            tensordict.set(turned_key, turned)
         return tensordict
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:

@@ -60,7 +60,7 @@ def network() -> Callable[[TensorDictBase], TensorDictBase]:
 def alone(task: str, episode: int) -> TensorDictBase:
     """One episode under ``wavy``, stepped by hand in an environment of one row."""
     env = lw.LanguageWorldEnv(task, seed=SEED, max_steps=STEPS, reward="dense")
-    state = env.reset(TensorDict({"episode": torch.tensor([episode])}, [1]))
+    state = env.reset(episode=episode)
     steps = []
     for _ in range(STEPS):
         steps.append(env.step(wavy(state)).clone())

@@ -37,7 +37,7 @@ def test_a_row_with_a_nan_action_is_truncated_and_the_others_go_on(any_env):
     with pytest.raises(RuntimeError, match=r"rows \[4\] have ended"):
         advance(any_env, state, action)
 
-    state = any_env.reset(state.clone().set("_reset", ~others(4)))  # its ``episode`` names the same one again
+    state = any_env.reset(state.clone().set("_reset", ~others(4)), episode=1)
     assert state["episode"].tolist() == [0, 0, 0, 1, 1, 1]
     assert not state["fault"].any()
     assert not state["done"].any()

@@ -7,7 +7,7 @@ import gc
 import numpy as np
 import pytest
 import torch
-from rows import ENGINES, FEW, ROWS, STEPS, actions_of, advance, others, same, trajectories
+from rows import ENGINES, FEW, ROWS, STEPS, actions_of, advance, same, trajectories
 from tensordict import TensorDict
 from torchrl.envs import TransformedEnv, check_env_specs
 
@@ -51,6 +51,7 @@ def test_keys_shapes_and_types(env):
         "observation": ((6, 39), torch.float32),
         "task_id": ((6,), torch.int64),
         "episode": ((6,), torch.int64),
+        "executed_action": ((6, 4), torch.float32),
     }
     for key, (shape, dtype) in expected.items():
         for part in (state, state["next"]):
@@ -99,43 +100,11 @@ def test_episodes_are_dealt_by_row_and_reset():
         assert state["episode"].tolist() == [m * n + r for m, n, r in zip(resets, rows, rank, strict=True)]
         mask = torch.from_numpy(rng.random(7) < 0.5)
         resets = [m + int(reset) for m, reset in zip(resets, mask, strict=True)]
-        # As auto-reset does: what the state says of its episode does not name the next one.
-        state = env.reset(state.clone().set("_reset", mask), select_reset_only=True)
+        state = env.reset(state.clone().set("_reset", mask))
     assert max(resets) > min(resets)
     env.set_seed(0)
     assert env.reset()["episode"].tolist() == rank, "set_seed starts again at episode 0"
     env.close()
-
-
-def test_a_reset_may_name_its_episode(any_env):
-    any_env.set_seed(3)
-    first, second = any_env.reset(), any_env.reset()
-    assert second["episode"].tolist() == [2, 2, 2, 3, 3, 3]
-    any_env.set_seed(3)
-    named = any_env.reset(TensorDict({"episode": torch.tensor([2, 0, 2, 0, 2, 9])}, [ROWS]))
-    assert named["episode"].tolist() == [2, 0, 2, 0, 2, 9]
-    for row, source, origin in [(0, second, 0), (1, first, 1), (2, second, 2), (3, first, 0), (4, second, 1)]:
-        assert torch.equal(named["observation"][row], source["observation"][origin])
-    assert any_env.reset()["episode"].tolist() == [2, 2, 2, 3, 3, 3], "it counts as a reset"
-    state = any_env.reset()
-    request = state.clone().set("_reset", ~others(1))
-    request["episode"][1] = 9
-    partial = any_env.reset(request)
-    assert partial["episode"].tolist() == [4, 9, 4, 5, 5, 5]
-    assert torch.equal(
-        partial["observation"][1], any_env.reset(TensorDict({"episode": torch.full((6,), 9)}, [6]))["observation"][1]
-    )
-    assert same(partial, state, others(1))
-
-
-def test_a_named_episode_is_the_same_trajectory(any_env):
-    any_env.set_seed(3)
-    expected = trajectories(any_env, STEPS) | trajectories(any_env, STEPS)
-    any_env.set_seed(3)
-    request = TensorDict({"episode": torch.tensor([3, 1, 0, 2, 2, 1])}, [ROWS])
-    got = trajectories(any_env, STEPS, any_env.reset(request))
-    assert len(got) == ROWS
-    assert all(same(expected[key], got[key]) for key in got)
 
 
 def test_seeds_and_episodes_matter(env):
@@ -175,7 +144,7 @@ def test_every_task_starts_and_moves_as_metaworlds_own(mt50, metaworld_env):
     mt50.rollout(7)
     mt50.reset(TensorDict({"_reset": torch.arange(50) % 3 == 0}, [50]))
     mt50.rollout(4)
-    named = mt50.reset(TensorDict({"episode": torch.full((50,), 17)}, [50]))
+    named = mt50.reset(episode=17)
     states = [named]
     actions = torch.stack([actions_of(number, 17, 8) for number in range(50)], 1)
     for action in actions:
@@ -275,6 +244,11 @@ def test_sparse_reward_is_the_success(engine):
         ("reach", {"engine": 3}, (TypeError, ValueError), "engine must be"),
         ("reach", {"engine": None}, (TypeError, ValueError), "engine must be"),
         ("reach", {"reward": "spars"}, ValueError, "reward must be one of .* did you mean 'sparse'"),
+        ("reach", {"worker": 1}, TypeError, r"worker must be a pair \(rank, of\), got 1"),
+        ("reach", {"worker": (2, 2)}, ValueError, "rank must be under the number of workers, 2, got 2"),
+        ("reach", {"worker": (-1, 2)}, ValueError, "rank must be at least 0, got -1"),
+        ("reach", {"worker": (0, 0)}, ValueError, "of must be at least 1, got 0"),
+        ("reach", {"worker": (0.0, 2)}, TypeError, "rank must be an integer, got 0.0"),
         ("reach", {"num_threads": 0}, ValueError, "num_threads must be at least 1, got 0"),
         ("reach", {"num_threads": 1.5}, TypeError, "num_threads must be an integer"),
         ("reach", {"max_steps": 0}, ValueError, "max_steps must be at least 1, got 0"),
@@ -286,21 +260,3 @@ def test_mistakes_are_named(tasks, options, error, message):
     with pytest.raises(error, match=message):
         lw.LanguageWorldEnv(tasks, **options)
     gc.collect()  # what is half made goes without a word
-
-
-@pytest.mark.parametrize(
-    ("episode", "message"),
-    [
-        (torch.tensor([0, 1, 2, -3, 0, 0]), "episode must be at least 0, got -3"),
-        (torch.zeros(ROWS), r"episode must be int64 of shape \(6,\), got torch.float32"),
-        (torch.zeros(ROWS, 2, dtype=torch.int64), r"episode must be int64 of shape \(6,\), got .*\(6, 2\)"),
-    ],
-    ids=["negative", "float", "shape"],
-)
-def test_a_wrong_episode_is_named(any_env, episode, message):
-    any_env.set_seed(0)
-    state = any_env.reset()
-    with pytest.raises(ValueError, match=message):
-        any_env.reset(TensorDict({"episode": episode}, [ROWS]))
-    assert any_env.reset()["episode"].tolist() == [2, 2, 2, 3, 3, 3], "it did not count"
-    assert state["episode"].tolist() == [0, 0, 0, 1, 1, 1]

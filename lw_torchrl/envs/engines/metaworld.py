@@ -8,8 +8,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from lw_torchrl._checks import check_choice
 from lw_torchrl._rendering import naming_absent_renderer
 from lw_torchrl.envs.engine import OBSERVATION_SIZE, EngineStep
+from lw_torchrl.language.tasks import MT50
 
 
 def import_metaworld() -> Any:
@@ -28,6 +30,7 @@ def make_metaworld_env(task: str, *, max_steps: int = 500) -> Any:
     import_metaworld()
     from metaworld.env_dict import ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE
 
+    check_choice("task", task, MT50)
     env = ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE[f"{task}-v3-goal-observable"](seed=0)
     env._freeze_rand_vec = False
     env.seeded_rand_vec = True
@@ -42,6 +45,9 @@ class MetaWorldEngine:
         tasks: the task of each row.
         reward: "sparse" for the success as 0 and 1, "dense" for Meta-World's own reward.
         num_threads: accepted for the interface; Meta-World's Python holds one thread.
+
+    Raises:
+        ValueError: a task that Meta-World does not have.
     """
 
     def __init__(

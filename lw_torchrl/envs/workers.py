@@ -1,0 +1,76 @@
+"""Which of TorchRL's workers an environment is made in: one factory, called in each, must not give the same episodes.
+
+TorchRL tells a factory nothing of its worker. But the factory is called from within TorchRL's own functions, and these
+know: we look for them on the call stack, which needs no state and gives the same in every run.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping
+from multiprocessing import current_process, parent_process
+from types import FrameType
+from typing import Any
+
+MANY = 2**16
+"""Stands for the number of workers where TorchRL does not tell it: more than there are."""
+
+Locals = Mapping[str, Any]
+
+
+def _by_process(level: int) -> tuple[int, int]:
+    return current_process()._identity[level] - 1, MANY
+
+
+def _threads(found: Locals) -> tuple[int, int]:
+    if found["self"].num_envs > 1:
+        raise RuntimeError(
+            "a ThreadingAsyncEnvPool does not say which of its environments this is: say it yourself, "
+            "worker=(rank, of), or they would all run the same episodes"
+        )
+    return 0, 1
+
+
+# Where TorchRL (0.14) calls a factory: module and function to its (rank, of), from the function's local variables.
+_WORKERS: dict[tuple[str, str], Callable[[Locals], tuple[int, int]]] = {
+    ("torchrl.envs.batched_envs", "SerialEnv._start_workers"): lambda found: (found["idx"], found["_num_workers"]),
+    # An environment of environments, which starts its own at its first reset.
+    ("torchrl.envs.batched_envs", "SerialEnv._reset"): lambda found: (found["i"], found["self"].num_workers),
+    ("torchrl.envs.async_envs", "ThreadingAsyncEnvPool._setup"): _threads,
+}
+_WORKER_PROCESSES: dict[tuple[str, str], Callable[[Locals], tuple[int, int]]] = {
+    ("torchrl.envs.batched_envs", "_run_worker_pipe_shared_mem"): lambda found: (
+        found["worker_idx"],
+        len(found["shm_done_flags"]),
+    ),
+    ("torchrl.envs.batched_envs", "_run_worker_pipe_direct"): lambda found: _by_process(-1),
+    ("torchrl.envs.async_envs", "ProcessorAsyncEnvPool._env_exec"): lambda found: (found["i"], MANY),
+    ("torchrl.collectors._runner", "_main_async_collector_impl"): lambda found: (found["idx"], MANY),
+}
+
+
+def torchrl_worker() -> tuple[int, int]:
+    """(rank, of) of the worker that this is called in, (0, 1) where there is none.
+
+    Workers within workers are counted through. SerialEnv and ParallelEnv say how many there are; for collectors and
+    AsyncEnvPool ``of`` is :data:`MANY`. A ParallelEnv without shared buffers says nothing: its workers are told apart
+    by the order in which the parent started them.
+
+    Raises:
+        RuntimeError: in a ThreadingAsyncEnvPool of several environments, which cannot be told apart.
+    """
+    rank, of, processes = 0, 1, 0
+    frame: FrameType | None = sys._getframe(1)
+    while frame is not None:
+        place = (frame.f_globals.get("__name__", ""), frame.f_code.co_qualname)
+        if (tell := _WORKERS.get(place) or _WORKER_PROCESSES.get(place)) is not None:
+            outer, count = tell(frame.f_locals)
+            rank, of = rank + outer * of, of * count
+            processes += place in _WORKER_PROCESSES
+        frame = frame.f_back
+    parent = parent_process()
+    if processes == 1 and parent is not None and parent.name.startswith("_ProcessNoWarn"):
+        # A collector's worker spawned this one, so its stack is not below ours; fork leaves it there.
+        outer, count = _by_process(-2)
+        rank, of = rank + outer * of, of * count
+    return rank, of

@@ -1,0 +1,68 @@
+"""Where a transform finds itself: the environment under it, and what runs before it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from tensordict import unravel_key
+from tensordict.utils import NestedKey
+from torchrl.envs import Compose, EnvBase, RenameTransform, Transform, TransformedEnv
+
+
+def check_keys(argument: str, given: Any, *names: str) -> list[NestedKey]:
+    """Return ``given`` as a list of one key for each of ``names``; a key may be nested, a tuple."""
+    if isinstance(given, str) or not isinstance(given, Sequence) or len(given) != len(names):
+        raise ValueError(f"{argument} must be a list of {len(names)}, in this order: {', '.join(names)}; got {given!r}")
+    return [unravel_key(key) for key in given]
+
+
+def base_env(transform: Transform) -> EnvBase | None:
+    """The environment under all transforms, None on a replay buffer and in a Compose that is nowhere yet."""
+    try:
+        env = transform.container
+    except ValueError:
+        return None
+    while isinstance(env, TransformedEnv):
+        env = env.base_env
+    return env
+
+
+def refuse_changed(transform: Transform, key: NestedKey) -> None:
+    """Raise :class:`ValueError` where a transform that runs before this one changes what it is to read."""
+    for entry in (key, unravel_key(("next", key))):
+        for earlier in reversed(_before(transform)):
+            written = [unravel_key(out) for out in earlier.__dict__.get("_out_keys") or ()]
+            if entry not in written:
+                continue
+            if isinstance(earlier, RenameTransform):
+                entry = unravel_key(earlier.in_keys[written.index(entry)])
+                continue
+            name = type(transform).__name__
+            raise ValueError(
+                f"{type(earlier).__name__} changes {entry!r} before {name} reads it, which is made for the observation "
+                f"as it was: put {name} before {type(earlier).__name__}"
+            )
+
+
+def _before(transform: Transform) -> list[Transform]:
+    found: list[Transform] = []
+    inner, container = transform, _container(transform)
+    while isinstance(container, Compose):
+        place = next(n for n, member in enumerate(container.transforms) if member is inner)
+        found = [one for member in container.transforms[:place] for one in _flat(member)] + found
+        inner, container = container, _container(container)
+    while isinstance(container, TransformedEnv) and isinstance(container := container.base_env, TransformedEnv):
+        found = _flat(container.transform) + found
+    return found
+
+
+def _container(transform: Transform) -> Compose | EnvBase | None:
+    reference = transform.__dict__.get("_container")
+    return None if reference is None else reference()
+
+
+def _flat(transform: Transform) -> list[Transform]:
+    if isinstance(transform, Compose):
+        return [one for member in transform.transforms for one in _flat(member)]
+    return [transform]

@@ -1,0 +1,174 @@
+"""Asking for episodes: a reset goes by its own count or by ``episode=``, and never by a tensordict's output."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from rows import FEW, ROWS, STEPS, advance, others, row_actions, same, trajectories
+from tensordict import TensorDict
+from torchrl.envs import ParallelEnv, SerialEnv, StepCounter, TransformedEnv
+
+import lw_torchrl as lw
+
+pytestmark = pytest.mark.filterwarnings("error")
+
+
+def make_env() -> lw.LanguageWorldEnv:
+    return lw.LanguageWorldEnv(["push", "reach"], num_envs=2, seed=3, max_steps=3, num_threads=1)
+
+
+def make_transformed() -> TransformedEnv:
+    return TransformedEnv(make_env(), lw.QAFTransform(lw.load_plans("MT10")))
+
+
+BATCHED = {
+    "serial": lambda: SerialEnv(2, make_transformed),
+    "serial, plain": lambda: SerialEnv(2, make_env),
+    "parallel": lambda: ParallelEnv(2, make_transformed, mp_start_method="fork"),
+    "parallel, no buffers": lambda: ParallelEnv(2, make_env, mp_start_method="fork", use_buffers=False),
+    "transformed outside": lambda: TransformedEnv(SerialEnv(2, make_env), StepCounter()),
+}
+
+
+# --- outputs are no requests ---------------------------------------------------------------------------------------
+
+
+def test_a_loop_of_ones_own_goes_from_episode_to_episode(any_env):
+    any_env.set_seed(3)
+    state, seen = any_env.reset(), []
+    for _ in range(3):
+        seen.append(state["episode"].tolist())
+        for step in range(2):
+            state = advance(any_env, state, row_actions(state, step))
+        state = any_env.reset(state)
+    assert seen == [[0, 0, 0, 1, 1, 1], [2, 2, 2, 3, 3, 3], [4, 4, 4, 5, 5, 5]]
+
+
+def test_a_partial_reset_goes_on_too(any_env):
+    any_env.set_seed(3)
+    state = any_env.reset()
+    state = any_env.reset(state.clone().set("_reset", ~others(1)))
+    assert state["episode"].tolist() == [0, 2, 0, 1, 1, 1]
+
+
+def test_a_rollout_from_a_state_goes_on_too(any_env):
+    any_env.set_seed(3)
+    last = any_env.rollout(STEPS)[:, -1]["next"]
+    further = any_env.rollout(2, auto_reset=False, tensordict=last.exclude("reward"))
+    assert further["episode"][:, 0].tolist() == [2, 2, 2, 3, 3, 3]
+    assert any_env.rollout(1, tensordict=last.exclude("reward"))["episode"][:, 0].tolist() == [4, 4, 4, 5, 5, 5]
+
+
+@pytest.mark.filterwarnings("ignore:No explicit `?device")
+@pytest.mark.parametrize("name", BATCHED)
+def test_batched_environments_go_on_and_may_be_asked(name):
+    env = BATCHED[name]()
+    env.set_seed(3)
+    rollout = env.rollout(7, break_when_any_done=False)
+    assert len(rollout["episode"][..., ::3].flatten(0, 1).unique(dim=-1)[0]) == 3
+    state = env.rollout(3)[..., -1]["next"].exclude("reward")
+    before = state["episode"].clone()
+    following = env.reset(state)
+    assert not (following["episode"] == before).any()
+    if name != "transformed outside":
+        mask = torch.tensor([[True, True], [False, False]]).unsqueeze(-1)
+        partial = env.reset(following.clone().set("_reset", mask))
+        assert (partial["episode"] == following["episode"]).tolist() == [[False, False], [True, True]]
+    asked = env.reset(list_of_kwargs=[{"episode": 5}, {"episode": torch.tensor([8, 9])}])
+    assert asked["episode"].tolist() == [[5, 5], [8, 9]]
+    assert (env.reset(episode=4)["episode"] == 4).all()
+    env.close()
+
+
+# --- asking --------------------------------------------------------------------------------------------------------
+
+
+def test_a_reset_may_ask_for_its_episodes(any_env):
+    any_env.set_seed(3)
+    first, second = any_env.reset(), any_env.reset()
+    assert second["episode"].tolist() == [2, 2, 2, 3, 3, 3]
+    any_env.set_seed(3)
+    named = any_env.reset(episode=torch.tensor([2, 0, 2, 0, 2, 9]))
+    assert named["episode"].tolist() == [2, 0, 2, 0, 2, 9]
+    for row, source, origin in [(0, second, 0), (1, first, 1), (2, second, 2), (3, first, 0), (4, second, 1)]:
+        assert torch.equal(named["observation"][row], source["observation"][origin])
+    assert any_env.reset()["episode"].tolist() == [2, 2, 2, 3, 3, 3], "it counts as a reset"
+    state = any_env.reset()
+    partial = any_env.reset(state.clone().set("_reset", ~others(1)), episode=9)
+    assert partial["episode"].tolist() == [4, 9, 4, 5, 5, 5]
+    assert torch.equal(partial["observation"][1], any_env.reset(episode=np.int64(9))["observation"][1])
+    assert same(partial, state, others(1))
+
+
+def test_an_episode_asked_for_is_the_same_trajectory(any_env):
+    any_env.set_seed(3)
+    expected = trajectories(any_env, STEPS) | trajectories(any_env, STEPS)
+    any_env.set_seed(3)
+    got = trajectories(any_env, STEPS, any_env.reset(episode=torch.tensor([3, 1, 0, 2, 2, 1])))
+    assert len(got) == ROWS
+    assert all(same(expected[key], got[key]) for key in got)
+
+
+@pytest.mark.parametrize(
+    ("episode", "error", "message"),
+    [
+        (torch.tensor([0, 1, 2, -3, 0, 0]), ValueError, "episode must be at least 0, got -3"),
+        (-1, ValueError, "episode must be at least 0, got -1"),
+        (torch.zeros(ROWS), ValueError, r"episode must be an integer, or int64 of shape \(6,\).*got torch.float32"),
+        (torch.zeros(ROWS, 2, dtype=torch.int64), ValueError, r"episode must be .*\(6,\).* got .*\(6, 2\)"),
+        (torch.zeros(5, dtype=torch.int64), ValueError, r"episode must be .*\(6,\).* got .*\(5,\)"),
+        (torch.ones(ROWS, dtype=torch.bool), ValueError, "episode must be .* got torch.bool"),
+        (1.0, TypeError, "episode must be an integer, got 1.0"),
+        (True, TypeError, "episode must be an integer, got True"),
+        ([0] * ROWS, TypeError, "episode must be an integer, got"),
+    ],
+    ids=str,
+)
+def test_a_wrong_episode_is_named(any_env, episode, error, message):
+    any_env.set_seed(0)
+    state = any_env.reset()
+    with pytest.raises(error, match=message):
+        any_env.reset(episode=episode)
+    assert any_env.reset()["episode"].tolist() == [2, 2, 2, 3, 3, 3], "it did not count"
+    assert state["episode"].tolist() == [0, 0, 0, 1, 1, 1]
+
+
+def test_a_misspelt_request_is_an_error(any_env):
+    with pytest.raises(TypeError, match="episodes"):
+        any_env.reset(episodes=3)
+
+
+# --- TorchRL's set_state -------------------------------------------------------------------------------------------
+
+
+def test_a_state_is_the_beginning_of_its_episode(env):
+    env.set_seed(3)
+    first = env.reset()
+    env.rollout(4)
+    again = env.reset(first.clone(), set_state=True)
+    assert same(first, again)
+    bare = TensorDict({"episode": torch.tensor([7, 0, 7, 0, 7, 0])}, [ROWS])
+    assert env.reset(bare, set_state=True)["episode"].tolist() == [7, 0, 7, 0, 7, 0]
+    assert env.reset(first.clone(), set_state=False)["episode"].tolist() != first["episode"].tolist()
+
+
+def test_the_middle_of_an_episode_is_refused(env):
+    env.set_seed(3)
+    state = env.reset()
+    later = advance(env, state, row_actions(state, 0))
+    with pytest.raises(ValueError, match=r"set_state=True goes to the beginning .* rows \[0, 1, 2, 3, 4\]"):
+        env.reset(later.exclude("reward"), set_state=True)
+    with pytest.raises(RuntimeError, match="have ended or were never reset"):
+        advance(env, state, row_actions(state, 0))
+
+
+def test_a_state_needs_its_episode_and_no_other(env, plans):
+    with pytest.raises(ValueError, match="set_state=True needs episode in the tensordict"):
+        env.reset(set_state=True)
+    state = env.reset()
+    with pytest.raises(ValueError, match="episode and set_state=True each name an episode"):
+        env.reset(state, set_state=True, episode=3)
+    transformed = TransformedEnv(env, lw.QAFTransform({task: plans[task] for task in FEW}))
+    with pytest.raises(ValueError, match=r"a TransformedEnv does not hand it down: reset\(episode=tensordict"):
+        transformed.reset(transformed.reset(), set_state=True)

@@ -1,0 +1,187 @@
+"""in_keys and out_keys are obeyed, and what would change the observation first is refused."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs import (
+    Compose,
+    ObservationNorm,
+    RenameTransform,
+    SerialEnv,
+    StepCounter,
+    TransformedEnv,
+    VecNormV2,
+    check_env_specs,
+)
+
+import lw_torchrl as lw
+
+PLANS = lw.load_plans("MT10")
+NESTED = {"in_keys": [("robot", "state"), ("robot", "task")], "out_keys": [("plan", "truth")]}
+
+
+def make_env() -> lw.LanguageWorldEnv:
+    return lw.LanguageWorldEnv(["push", "reach"], num_envs=2, seed=0, max_steps=5, num_threads=1)
+
+
+def queries(**options) -> lw.QAFTransform:
+    return lw.QAFTransform(PLANS, **options)
+
+
+def norm(key="observation", out="observation") -> ObservationNorm:
+    return ObservationNorm(loc=0.0, scale=2.0, in_keys=[key], out_keys=[out])
+
+
+def rows(number: int = 6) -> TensorDict:
+    observation, following = torch.rand(2, number, 39)
+    ids = torch.tensor([lw.task_id("push"), lw.task_id("reach")]).repeat(number // 2)
+    sample = TensorDict({"observation": observation, "task_id": ids, "action": torch.rand(number, 4)}, [number])
+    return sample.set("next", TensorDict({"observation": following}, [number]))
+
+
+def nested(sample: TensorDict) -> TensorDict:
+    moved = {
+        ("robot", "state"): sample["observation"],
+        ("robot", "task"): sample["task_id"],
+        ("robot", "move"): sample["action"],
+        ("next", "robot", "state"): sample["next", "observation"],
+    }
+    found = TensorDict({}, sample.batch_size)
+    for key, value in moved.items():
+        found.set(key, value.clone())
+    return found
+
+
+# --- keys ----------------------------------------------------------------------------------------------------------
+
+
+def test_nested_keys_on_a_sample():
+    sample = rows()
+    plain, moved = queries()(sample.clone()), queries(**NESTED)(nested(sample))
+    assert torch.equal(moved["plan", "truth"], plain["qaf"])
+    assert torch.equal(moved["next", "plan", "truth"], plain["next", "qaf"])
+    assert "qaf" not in moved.keys(True)
+
+
+def test_nested_keys_in_an_environment():
+    rename = RenameTransform(in_keys=["observation", "task_id"], out_keys=NESTED["in_keys"])
+    env = TransformedEnv(make_env(), Compose(rename, queries(**NESTED)))
+    check_env_specs(env)
+    plain = TransformedEnv(make_env(), queries())
+    env.set_seed(0)
+    plain.set_seed(0)
+    found, expected = (e.rollout(4, lambda td: td.set("action", torch.ones(2, 4))) for e in (env, plain))
+    assert torch.equal(found["plan", "truth"], expected["qaf"])
+    assert torch.equal(found["next", "plan", "truth"], expected["next", "qaf"])
+    env.close()
+    plain.close()
+
+
+def test_a_sample_may_be_turned_elsewhere():
+    sample = rows()
+    torch.manual_seed(0)
+    expected = lw.RandomYaw(0.5)(sample.clone())
+    torch.manual_seed(0)
+    keys = [("robot", "state"), ("robot", "move"), ("robot", "expert")]
+    found = lw.RandomYaw(0.5, in_keys=keys)(nested(sample))
+    assert torch.equal(found["robot", "state"], expected["observation"])
+    assert torch.equal(found["next", "robot", "state"], expected["next", "observation"])
+    assert torch.equal(found["robot", "move"], expected["action"])
+    torch.manual_seed(0)
+    beside = lw.RandomYaw(0.5, out_keys=["turned", "turned_action", "turned_expert_action"])(sample.clone())
+    assert torch.equal(beside["observation"], sample["observation"])
+    assert torch.equal(beside["action"], sample["action"])
+    assert torch.equal(beside["turned"], expected["observation"])
+    assert torch.equal(beside["next", "turned"], expected["next", "observation"])
+    assert torch.equal(beside["turned_action"], expected["action"])
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: queries(in_keys=["observation"]), "in_keys must be a list of 2, in this order: observation, task_id"),
+        (lambda: queries(in_keys="observation"), "in_keys must be a list of 2.* got 'observation'"),
+        (lambda: queries(out_keys="qaf"), "out_keys must be a list of 1, in this order: qaf; got 'qaf'"),
+        (lambda: queries(out_keys=[]), "out_keys must be a list of 1"),
+        (lambda: lw.RandomYaw(0.1, in_keys=["observation", "action"]), "in_keys must be a list of 3.* expert_action"),
+        (lambda: lw.RandomYaw(0.1, out_keys=["observation"]), "out_keys must be a list of 3"),
+    ],
+)
+def test_a_wrong_list_of_keys_is_named(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_a_missing_nested_entry_is_named():
+    with pytest.raises(ValueError, match=r"\('robot', 'state'\) and \('robot', 'task'\) are needed"):
+        queries(**NESTED)(rows())
+
+
+# --- order ---------------------------------------------------------------------------------------------------------
+
+BEFORE = {
+    "ObservationNorm": norm,
+    "VecNormV2": lambda: VecNormV2(in_keys=["observation"]),
+    "Compose": lambda: Compose(StepCounter(), norm()),
+    "next": lambda: norm(("next", "observation"), ("next", "observation")),
+    "renamed": lambda: Compose(norm("observation", "raw"), RenameTransform(in_keys=["raw"], out_keys=["observation"])),
+}
+
+
+@pytest.mark.filterwarnings("ignore:Support of VecNormV2 for containers with non-empty batch-size")
+@pytest.mark.parametrize("name", BEFORE)
+def test_what_changes_the_observation_may_not_come_first(name):
+    message = r"(ObservationNorm|VecNormV2) changes .* before QAFTransform reads it.* put QAFTransform before"
+    if name == "renamed":
+        message = "changes 'raw' before QAFTransform reads it"
+    with pytest.raises(ValueError, match=message):
+        Compose(BEFORE[name](), queries())
+    env = make_env()
+    if name != "next":
+        with pytest.raises(ValueError, match=message):
+            TransformedEnv(env, Compose(BEFORE[name](), queries()))
+        with pytest.raises(ValueError, match=message):
+            TransformedEnv(env, BEFORE[name]()).append_transform(queries())
+        with pytest.raises(ValueError, match=message):
+            TransformedEnv(TransformedEnv(env, BEFORE[name](), auto_unwrap=False), queries(), auto_unwrap=False)
+    env.close()
+
+
+def test_what_is_put_before_it_later_is_refused_too():
+    env = TransformedEnv(make_env(), queries())
+    env.insert_transform(0, norm())
+    with pytest.raises(ValueError, match="ObservationNorm changes 'observation' before QAFTransform reads it"):
+        env.rollout(2)
+    env.close()
+    replay = TensorDictReplayBuffer(storage=LazyTensorStorage(6), transform=queries(), batch_size=6)
+    replay.extend(rows())
+    replay.sample()
+    replay.insert_transform(0, lw.RandomYaw(0.5))
+    with pytest.raises(ValueError, match="RandomYaw changes 'observation' before QAFTransform reads it"):
+        replay.sample()
+
+
+def test_turning_comes_after_the_queries():
+    with pytest.raises(ValueError, match="put QAFTransform before RandomYaw"):
+        Compose(lw.RandomYaw(0.5), queries())
+    with pytest.raises(ValueError, match="put QAFTransform before RandomYaw"):
+        TensorDictReplayBuffer(storage=LazyTensorStorage(6), transform=Compose(lw.RandomYaw(0.5), queries()))
+
+
+def test_the_right_order_answers_on_the_observation_as_it_was():
+    plain = TransformedEnv(make_env(), queries())
+    env = TransformedEnv(make_env(), Compose(StepCounter(), queries(), norm(), norm("observation", "again")))
+    found, expected = env.reset(), plain.reset()
+    assert torch.equal(found["qaf"], expected["qaf"])
+    assert torch.equal(found["observation"], expected["observation"] * 2.0)
+    env.close()
+    plain.close()
+
+
+def test_over_workers_that_are_not_there_yet():
+    env = TransformedEnv(SerialEnv(2, make_env), queries())
+    assert env.reset()["qaf"].shape[:2] == (2, 2)
+    env.close()
