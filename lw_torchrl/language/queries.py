@@ -16,12 +16,11 @@ from functools import lru_cache
 from rapidfuzz import fuzz, process
 
 from lw_torchrl.language.observation import FIRST, SECOND, places
-from lw_torchrl.language.relations import PREDICATES, RELATIONS, TOUCHING, UNARY
+from lw_torchrl.language.relations import PREDICATES, PUBLISHED, RELATIONS, TOUCHING, UNARY
 from lw_torchrl.language.tasks import GRIPPER, Task, get_task
 
 ARTICLES = ("the", "a", "an")
 _ALIASES = {"gripper": GRIPPER, "robot gripper": GRIPPER}
-_LONGEST_FIRST = sorted(PREDICATES, key=len, reverse=True)
 
 
 @dataclass(frozen=True)
@@ -30,7 +29,7 @@ class Clause:
 
     Attributes:
         subject: an object's name.
-        predicate: one of the 13 relations, "touching the table", "open" or "closed".
+        predicate: one of the relations, "touching the table", "open" or "closed".
         object: the second object of a relation, else None.
         negated: whether the clause says that the predicate does not hold.
     """
@@ -65,14 +64,14 @@ class QueryError(ValueError):
 
 
 @lru_cache(maxsize=256)
-def base_clauses(task: Task) -> tuple[Clause, ...]:
+def base_clauses(task: Task, relations: tuple[str, ...]) -> tuple[Clause, ...]:
     """The clauses that :func:`supported_queries` lists as texts."""
     clauses = []
     for first in task.object_names:
         for second in task.object_names:
             if first == second:
                 continue
-            for relation in RELATIONS:
+            for relation in relations:
                 if relation == "around" and first != GRIPPER:
                     continue
                 for negated in (False, True):
@@ -85,8 +84,8 @@ def base_clauses(task: Task) -> tuple[Clause, ...]:
 
 
 @lru_cache(maxsize=256)
-def _supported(task: Task) -> tuple[str, ...]:
-    return tuple(map(str, base_clauses(task)))
+def _supported(task: Task, relations: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(map(str, base_clauses(task, relations)))
 
 
 def supported_queries(task: str | Task, published_only: bool = False) -> tuple[str, ...]:
@@ -97,7 +96,8 @@ def supported_queries(task: str | Task, published_only: bool = False) -> tuple[s
 
     Args:
         task: a task or its name.
-        published_only: leave out the points that we named; what remains is the published enumeration.
+        published_only: leave out the points that we named, and relations that were added; what remains is the
+            published enumeration.
 
     Raises:
         ValueError: the task is unknown.
@@ -107,7 +107,7 @@ def supported_queries(task: str | Task, published_only: bool = False) -> tuple[s
         (52, "the robot's gripper is near the reach target")
     """
     found = get_task(task)
-    return _supported(found.published if published_only else found)
+    return _supported(found.published, PUBLISHED) if published_only else _supported(found, tuple(RELATIONS))
 
 
 def _cut(text: str, most: int = 80) -> str:
@@ -171,7 +171,7 @@ class _ClauseParser:
             self.inferred = f"the {subject} is "
         if not negated:
             negated = self.take("isn't") or (self.take("is") and self.take("not")) or self.take("not")
-        predicate = next((name for name in _LONGEST_FIRST if self.take(name)), None)
+        predicate = next((name for name in sorted(PREDICATES, key=len, reverse=True) if self.take(name)), None)
         if predicate is None:
             raise self.error("one of " + ", ".join(map(repr, PREDICATES)))
         if predicate in ("open", "closed") and subject != GRIPPER:

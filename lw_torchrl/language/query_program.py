@@ -28,17 +28,18 @@ _NO_SHIFT = (0.0, 0.0, 0.0)
 
 
 class _Tables(NamedTuple):
-    """A task's atoms (A), each a comparison of the difference of two positions, and which two atoms make up each
-    clause (K) of each query (S). The first dimension is of tasks (T) where compiled, of rows where selected."""
+    """A task's atoms (A), each a comparison of the difference of two positions, and which J atoms make up
+    each clause (K) of each query (S). The first dimension is of tasks (T) where compiled, of rows where selected."""
 
     first: Tensor  # (T, 3*A) int64, index of each coordinate of the first position; of 0 for an axis left out
     second: Tensor  # (T, 3*A) int64
     shift: Tensor  # (T, 3, A) float64, metres, added to the difference
     length: Tensor  # (T, A) bool, the difference's length is compared, otherwise its one coordinate
+    far: Tensor  # (T, A) bool, it is the length's opposite that is compared, with the threshold's
     threshold: Tensor  # (T, A) float64, metres; the atom holds below it
     flipped: Tensor  # (T, A) bool, take the atom's complement
     temperature: Tensor  # (T, A) float64, metres to one logit
-    atoms: Tensor  # (T, 2*K*S) int64
+    atoms: Tensor  # (T, J*K*S) int64
     negated: Tensor  # (T, K, S) bool, take the clause's complement
     constants: Tensor  # (T, C) float64, read as if they followed the observation
 
@@ -59,14 +60,15 @@ def _clause_atoms(clause: Clause, task: Task) -> list[_Atom]:
 
 
 def _task_atoms(task: Task, queries: Sequence[Query], steps: int, width: int) -> tuple[list[_Atom], list, list]:
-    """The atoms of one task, each once; the two of each clause (steps, width, 2); what is negated (steps, width)."""
+    """The atoms of one task, each once; those of each clause (steps, width, J); what is negated (steps, width)."""
     clauses = [[(_clause_atoms(clause, task), clause.negated) for clause in query.clauses] for query in queries]
     clauses += [[([(_ORIGIN, _ORIGIN, _NO_SHIFT, _NEVER)], False)]] * (steps - len(queries))
     always = (_ORIGIN, _ORIGIN, _NO_SHIFT, _ALWAYS)
     padded = [[*listed, *[([], False)] * (width - len(listed))] for listed in clauses]
-    atoms = list(dict.fromkeys([always, *(atom for listed in padded for found, _ in listed for atom in found)]))
-    places = [[[atoms.index(atom) for atom in (*found, always, always)[:2]] for found, _ in row] for row in padded]
-    return atoms, places, [[negated for _, negated in row] for row in padded]
+    atoms = dict.fromkeys([always, *(atom for listed in padded for found, _ in listed for atom in found)])
+    place = {atom: number for number, atom in enumerate(atoms)}
+    places = [[[place[atom] for atom in found] for found, _ in row] for row in padded]
+    return list(atoms), places, [[negated for _, negated in row] for row in padded]
 
 
 def _compile(queries: Mapping[Task, Sequence[Query]]) -> _Tables:
@@ -74,6 +76,8 @@ def _compile(queries: Mapping[Task, Sequence[Query]]) -> _Tables:
     width = max(len(query.clauses) for listed in queries.values() for query in listed)
     found = [_task_atoms(task, listed, steps, width) for task, listed in queries.items()]
     most = max(len(atoms) for atoms, _, _ in found)
+    parts = max(2, *(len(each) for _, places, _ in found for row in places for each in row))
+    filled = [[[[*each, *[0] * (parts - len(each))] for each in row] for row in places] for _, places, _ in found]
     listed = [atoms + [(_ORIGIN, _ORIGIN, _NO_SHIFT, _ALWAYS)] * (most - len(atoms)) for atoms, _, _ in found]
     constants = [0.0]
 
@@ -100,10 +104,11 @@ def _compile(queries: Mapping[Task, Sequence[Query]]) -> _Tables:
         second=table(lambda atom: index(atom, 1)).flatten(1),
         shift=table(shift, torch.float64),
         length=table(lambda atom: atom[3].length, torch.bool),
+        far=table(lambda atom: atom[3].length and atom[3].sense != "<", torch.bool),
         threshold=table(lambda atom: atom[3].threshold * (1 if atom[3].sense == "<" else -1), torch.float64),
         flipped=table(lambda atom: atom[3].sense == "<=", torch.bool),
         temperature=table(lambda atom: atom[3].temperature, torch.float64),
-        atoms=torch.tensor([places for _, places, _ in found]).permute(0, 3, 2, 1).flatten(1),
+        atoms=torch.tensor(filled).permute(0, 3, 2, 1).flatten(1),
         negated=torch.tensor([negated for _, _, negated in found]).transpose(1, 2).contiguous(),
         constants=torch.tensor([constants] * len(listed), dtype=torch.float64),
     )
@@ -153,7 +158,9 @@ class QueryProgram:
         self.num_queries = max(map(len, compiled.values()))
         index = TaskIndex(self.tasks)
         in_order = dict(sorted(compiled.items(), key=lambda item: index.row(item[0].name)))
-        self._tables = TaskTables(index, _compile(in_order))
+        tables = _compile(in_order)
+        self._any_far = bool(tables.far.any())
+        self._tables = TaskTables(index, tables)
 
     def __repr__(self) -> str:
         return f"QueryProgram({len(self.tasks)} tasks, num_queries={self.num_queries})"
@@ -176,10 +183,10 @@ class QueryProgram:
         """
         _check_batch(observation, task_id)
         tables = self._selected(observation, task_id)
-        holds = (_values(observation, tables) < tables.threshold) ^ tables.flipped
-        one, other = self._clauses(holds, tables)
-        clauses = ((one & other) ^ tables.negated).unbind(1)  # & of a few is far faster than all() over a short axis
-        return reduce(torch.logical_and, clauses).reshape(*task_id.shape, self.num_queries)
+        holds = (self._values(observation, tables) < tables.threshold) ^ tables.flipped
+        # & of a few is far faster than all() over a short axis.
+        clauses = reduce(torch.logical_and, self._parts(holds, tables)) ^ tables.negated
+        return reduce(torch.logical_and, clauses.unbind(1)).reshape(*task_id.shape, self.num_queries)
 
     def logits(self, observation: Tensor, task_id: Tensor, *, temperature: float = 1.0) -> Tensor:
         """Soft truth: how far each query is from changing its truth, differentiable in the observation.
@@ -214,26 +221,28 @@ class QueryProgram:
         near = observation if observation.dtype in (torch.float32, torch.float64) else observation.float()
         near = near.clamp(-_MOST, _MOST)  # squares of larger numbers overflow
         tables = self._selected(near, task_id)
-        margin = (tables.threshold - _values(near, tables, floor=_LEAST)) / tables.temperature / temperature
-        one, other = self._clauses(torch.where(tables.flipped, -margin, margin), tables)
-        clause = torch.minimum(one, other)
+        margin = (tables.threshold - self._values(near, tables, floor=_LEAST)) / tables.temperature / temperature
+        clause = reduce(torch.minimum, self._parts(torch.where(tables.flipped, -margin, margin), tables))
         soft = torch.where(tables.negated, -clause, clause).amin(1).float().reshape(holds.shape)
         size = torch.where(holds, soft, -soft).detach().clamp(_LEAST, _MOST)
         # On a threshold, the side that the hard truth takes; the gradient is that of soft everywhere.
         return soft - soft.detach() + torch.where(holds, size, -size)
 
-    def _clauses(self, atoms: Tensor, tables: _Tables) -> tuple[Tensor, ...]:
-        """(B, A) of the atoms to two of (B, K, S), the atoms of each clause."""
-        return atoms.gather(1, tables.atoms).unflatten(1, (2, *tables.negated.shape[1:])).unbind(1)
+    def _parts(self, atoms: Tensor, tables: _Tables) -> tuple[Tensor, ...]:
+        """(B, A) of the atoms to J of (B, K, S), the atoms of each clause."""
+        return atoms.gather(1, tables.atoms).unflatten(1, (-1, *tables.negated.shape[1:])).unbind(1)
 
-
-def _values(observation: Tensor, tables: _Tables, floor: float = 0.0) -> Tensor:
-    """What each atom compares, (B, A) metres. The length of nothing has no gradient: ``floor`` keeps away from it."""
-    numbers = torch.cat((observation.reshape(-1, OBSERVATION_SIZE), tables.constants), 1)
-    d = (numbers.gather(1, tables.first) - numbers.gather(1, tables.second)).unflatten(1, (3, -1)) + tables.shift
-    x, y, z = d.unbind(1)
-    squared = x.square() + y.square() + z.square()
-    return torch.where(tables.length, (squared.clamp(min=floor**2) if floor else squared).sqrt(), x + y + z)
+    def _values(self, observation: Tensor, tables: _Tables, floor: float = 0.0) -> Tensor:
+        """What each atom compares, (B, A) metres. The length of nothing has no gradient: ``floor`` keeps away from
+        it."""
+        numbers = torch.cat((observation.reshape(-1, OBSERVATION_SIZE), tables.constants), 1)
+        d = (numbers.gather(1, tables.first) - numbers.gather(1, tables.second)).unflatten(1, (3, -1)) + tables.shift
+        x, y, z = d.unbind(1)
+        squared = x.square() + y.square() + z.square()
+        length = (squared.clamp(min=floor**2) if floor else squared).sqrt()
+        if self._any_far:
+            length = torch.where(tables.far, -length, length)
+        return torch.where(tables.length, length, x + y + z)
 
 
 def _check_batch(observation: Tensor, task_id: Tensor) -> None:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from lw_torchrl._checks import check_choice
 from lw_torchrl.language.queries import Clause, Query, QueryError, base_clauses, parse_query
+from lw_torchrl.language.relations import PUBLISHED, RELATIONS, UNARY
 from lw_torchrl.language.tasks import Task, get_task
 
 _NEGATIONS = frozenset(("not", "no", "never", "without", "cannot"))
@@ -55,26 +56,33 @@ def _told(words: list[str]) -> str:
 
 
 @lru_cache(maxsize=256)
-def _choices(task: Task) -> tuple[tuple[Clause, ...], tuple[str, ...]]:
+def _choices(task: Task, relations: tuple[str, ...]) -> tuple[tuple[Clause, ...], tuple[str, ...]]:
     """The clauses that base queries affirm, and what each says; a negation is compared without its "not"."""
-    affirmed = tuple(clause for clause in base_clauses(task) if not clause.negated)
+    affirmed = tuple(clause for clause in base_clauses(task, relations) if not clause.negated)
     return affirmed, tuple(_told(str(clause).split()) for clause in affirmed)
 
 
 @lru_cache(maxsize=256)
-def _vectors(task: Task) -> Tensor:
+def _vectors(task: Task, relations: tuple[str, ...]) -> Tensor:
     from lw_torchrl.language.text import sentence_encoder
 
-    return sentence_encoder(tuple(map(str, _choices(task)[0])))
+    return sentence_encoder(tuple(map(str, _choices(task, relations)[0])))
 
 
-def _nearest(part: str, task: Task, by: str) -> QueryPart:
+def _parse(text: str, task: Task, relations: tuple[str, ...]) -> Query | None:
+    """The query that a text is, if it is one that has no other relations."""
     try:
-        return QueryPart(part, str(parse_query(part, task)), 1.0)
+        query = parse_query(text, task)
     except QueryError:
-        pass
+        return None
+    return query if all(clause.predicate in (*relations, *UNARY) for clause in query.clauses) else None
+
+
+def _nearest(part: str, task: Task, relations: tuple[str, ...], by: str) -> QueryPart:
+    if (query := _parse(part, task, relations)) is not None:
+        return QueryPart(part, str(query), 1.0)
     words, negated = _affirmed(part)
-    clauses, told = _choices(task)
+    clauses, told = _choices(task, relations)
     if by == "edit":
         _, similarity, at = process.extractOne(_told(words), told, scorer=fuzz.ratio)
         score = similarity / 100
@@ -82,7 +90,7 @@ def _nearest(part: str, task: Task, by: str) -> QueryPart:
         from lw_torchrl.language.text import sentence_encoder
 
         # A surrogate alone is no text that an encoder could read.
-        alike = _vectors(task) @ sentence_encoder([" ".join(words).encode("utf-8", "replace").decode()])[0]
+        alike = _vectors(task, relations) @ sentence_encoder([" ".join(words).encode("utf-8", "replace").decode()])[0]
         at, score = int(alike.argmax()), float(alike.max().clamp(0.0, 1.0))
     return QueryPart(part, str(replace(clauses[at], negated=negated)), score)
 
@@ -103,7 +111,7 @@ def nearest_query(
         text: any words.
         task: a task or its name, whose objects the query may name.
         by: "edit", closest in spelling; "embedding", closest in meaning, by the sentence encoder.
-        published_only: leave out the points that we named.
+        published_only: leave out the points that we named, and relations that were added.
 
     Raises:
         TypeError: ``text`` is no string.
@@ -124,20 +132,18 @@ def nearest_query(
         raise TypeError(f"text must be a string, got {text!r} ({type(text).__name__})")
     check_choice("by", by, ("edit", "embedding"))
     owner = get_task(task).published if published_only else get_task(task)
-    try:
-        query = parse_query(text, owner)
+    relations = PUBLISHED if published_only else tuple(RELATIONS)
+    if (query := _parse(text, owner, relations)) is not None:
         return QueryMatch(query, 1.0, tuple(QueryPart(str(clause), str(clause), 1.0) for clause in query.clauses))
-    except QueryError:
-        pass
     said = [" ".join(part.split()) for part in re.split(r"\b(?:and|but)\b", text, flags=re.IGNORECASE)]
     known: dict[tuple[str, str], QueryPart] = {}  # a text may say the same again and again
     parts: list[QueryPart] = []
     subject = ""
     for part in [part for part in said if _told(_affirmed(part)[0])] or [" ".join(text.split())]:
         if (part, subject) not in known:
-            found = _nearest(part, owner, by)
+            found = _nearest(part, owner, relations, by)
             if subject and found.score < 1.0:
-                joined = _nearest(f"the {subject} {part}", owner, by)
+                joined = _nearest(f"the {subject} {part}", owner, relations, by)
                 found = joined._replace(text=part) if joined.score > found.score else found
             known[part, subject] = found
         parts.append(known[part, subject])

@@ -1,4 +1,4 @@
-"""What the relations mean: each is one or two comparisons on d = first position - second position, in metres.
+"""What the relations mean: each is comparisons, one or more, on d = first position - second position, in metres.
 
 The unary predicates fit the same form with the origin as second position: "touching the table" compares the z
 of an object, "open" and "closed" the gripper's opening, put in place of z.
@@ -7,6 +7,8 @@ Source: paper section 'Query Answering Function'; the thresholds are the publish
 
 from __future__ import annotations
 
+import re
+from collections import ChainMap, UserDict
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Literal
@@ -14,7 +16,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from lw_torchrl._checks import check_choice
+from lw_torchrl._checks import check_choice, shown
+from lw_torchrl.language.named_objects import is_number
 
 
 @dataclass(frozen=True)
@@ -28,6 +31,10 @@ class Comparison:
         length: the Euclidean length over the axes; otherwise the signed coordinate of the one axis.
         raise_z: added to dz first, in metres.
         temperature: of the soft truth, metres (or shares of the gripper's opening) to one logit.
+
+    Raises:
+        ValueError: axes that are none of x, y, z, each once; a signed coordinate of several axes; another sense; a
+            threshold that is no finite number, or a temperature that is not above 0.
     """
 
     axes: str
@@ -36,6 +43,18 @@ class Comparison:
     length: bool = True
     raise_z: float = 0.0
     temperature: float = 0.01
+
+    def __post_init__(self) -> None:
+        if not self.axes or self.axes != "".join(axis for axis in "xyz" if axis in self.axes):
+            raise ValueError(f"axes must be some of 'xyz' in that order, got {shown(self.axes)}")
+        if not self.length and len(self.axes) != 1:
+            raise ValueError(f"axes must be one axis where length=False, got {self.axes!r}")
+        check_choice("sense", self.sense, ("<", ">", "<="))
+        for name in ("threshold", "raise_z", "temperature"):
+            if not is_number(getattr(self, name)):
+                raise ValueError(f"{name} must be a number, got {shown(getattr(self, name))}")
+        if self.temperature <= 0:
+            raise ValueError(f"temperature must be above 0, got {self.temperature}")
 
     def holds(self, d: Tensor) -> Tensor:
         """Whether the comparison holds of d: (..., 3) metres to (...) bool."""
@@ -58,7 +77,33 @@ def _less(axis: str, threshold: float) -> Comparison:
     return Comparison(axis, "<", threshold, length=False)
 
 
-RELATIONS = MappingProxyType(
+TOUCHING = "touching the table"
+UNARY = MappingProxyType(
+    {
+        TOUCHING: (Comparison("z", "<=", 0.02, length=False),),
+        "open": (Comparison("z", ">", 0.75, length=False, temperature=0.05),),
+        "closed": (Comparison("z", "<=", 0.75, length=False, temperature=0.05),),
+    }
+)
+"""The predicates of one object; "open" and "closed" are the gripper's."""
+
+
+class Relations(UserDict[str, tuple[Comparison, ...]]):
+    """Relations by name, to which others may be added; one whose name or meaning the query language cannot hold is a
+    ValueError."""
+
+    def __setitem__(self, name: str, parts: tuple[Comparison, ...]) -> None:
+        words = name.split() if isinstance(name, str) else []
+        if not words or name != " ".join(words) or not re.fullmatch(r"[a-z][a-z '-]*", name):
+            raise ValueError(f"a relation must be named by lower-case words, like 'left of', got {shown(name)}")
+        if name in UNARY or words[0] in ("is", "isn't", "not") or {"and", "the", "a", "an"} & set(words):
+            raise ValueError(f"a relation may not be named {name!r}, which has a meaning of its own in a query")
+        if isinstance(parts, Comparison) or not parts or not all(isinstance(part, Comparison) for part in parts):
+            raise ValueError(f"relation {name!r} must be a tuple of Comparison, at least one, got {shown(parts)}")
+        super().__setitem__(name, tuple(parts))
+
+
+RELATIONS = Relations(
     {
         "near": (_within("xyz", 0.04),),
         "around": (_within("xyz", 0.03, raise_z=0.02),),
@@ -75,19 +120,21 @@ RELATIONS = MappingProxyType(
         "forward aligned with": (_within("xz", 0.03),),
     }
 )
-"""The 13 relations between two objects."""
+"""The relations between two objects: the 13 published ones, and those that you add.
 
-TOUCHING = "touching the table"
-UNARY = MappingProxyType(
-    {
-        TOUCHING: (Comparison("z", "<=", 0.02, length=False),),
-        "open": (Comparison("z", ">", 0.75, length=False, temperature=0.05),),
-        "closed": (Comparison("z", "<=", 0.75, length=False, temperature=0.05),),
-    }
-)
-"""The predicates of one object; "open" and "closed" are the gripper's."""
+Example:
+    >>> RELATIONS["beside"] = (Comparison("xy", "<", 0.1), Comparison("z", "<", 0.02, length=False))
+    >>> from lw_torchrl.language.queries import parse_query
+    >>> str(parse_query("gripper beside puck", "push"))
+    "the robot's gripper is beside the puck"
+    >>> del RELATIONS["beside"]
+"""
+PUBLISHED = tuple(RELATIONS)
+"""The names of the 13."""
 
-PREDICATES = MappingProxyType({**RELATIONS, **UNARY})
+PREDICATES = ChainMap[str, tuple[Comparison, ...]](UNARY, RELATIONS)  # type: ignore[arg-type]
+"""All that a clause can say: the relations, then the predicates of one object; it sees what is added to
+:data:`RELATIONS`."""
 
 
 def relation_holds(relation: str, first: Tensor, second: Tensor) -> Tensor:

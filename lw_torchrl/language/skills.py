@@ -35,7 +35,7 @@ class ScriptedSkill:
         text: what it does, in plain English: "place the gripper above the puck".
         target: the object or point to go to; the robot's gripper makes the offset relative to the hand.
         moved: what is to arrive there: the robot's gripper, or an object that it holds or pushes.
-        offset: added to the target, metres. x points to the left as the robot sees it, y away from it, z up.
+        offset: added to the target, metres. x points to the robot's right, y away from it, z up.
         gain: per axis, action per metre; 0 leaves an axis alone.
         gripper: effort in [-1, 1]; -1 opens, 1 closes.
         variants: task name to what differs there, any of the above but the text.

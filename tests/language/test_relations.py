@@ -1,13 +1,29 @@
 """What the 13 relations mean, against the published formulas written out in plain Python."""
 
 import math
+import re
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from lw_torchrl.language.relations import PREDICATES, RELATIONS, TOUCHING, UNARY, Comparison, relation_holds
+from lw_torchrl.language.plans import ConditionalPlan
+from lw_torchrl.language.queries import QueryError, parse_query, supported_queries
+from lw_torchrl.language.query_program import QueryProgram
+from lw_torchrl.language.query_search import nearest_query
+from lw_torchrl.language.relations import (
+    PREDICATES,
+    PUBLISHED,
+    RELATIONS,
+    TOUCHING,
+    UNARY,
+    Comparison,
+    relation_holds,
+)
+from lw_torchrl.language.tasks import task_id
 
 # Every relation as (value, sense, threshold) on d = first - second in metres, from the published semantics.
 FORMULAS = {
@@ -183,3 +199,142 @@ def test_an_unknown_relation_names_the_nearest(relation, near):
     assert repr(relation) in str(caught.value)
     if near:
         assert f"did you mean {near!r}" in str(caught.value)
+
+
+def written(part, opening):
+    """A comparison as docs/queries.md writes it."""
+    value = f"‖{part.axes}‖" if part.length else "opening" if opening else part.axes
+    raised = f", z raised by {part.raise_z:g}" if part.raise_z else ""
+    return f"{value} {part.sense} {part.threshold:g}{raised}"
+
+
+def test_the_page_on_queries_says_every_threshold():
+    page = (Path(__file__).parents[2] / "docs" / "queries.md").read_text("utf-8")
+    table = page[page.index("| predicate | holds where |") :].split("\n\n")[0]
+    rows = dict(re.findall(r"^\| ([a-z ]+) \| ([^|]+) \|$", table, re.MULTILINE))
+    for name, parts in PREDICATES.items():
+        assert rows.pop(name) == " and ".join(written(part, name in ("open", "closed")) for part in parts)
+    assert rows == {"predicate": "holds where"}  # the heading
+
+
+def test_x_points_to_the_robots_right_y_away_from_it_and_z_up(metaworld_env):
+    env = metaworld_env("reach")
+    env.seed(0)
+    env.reset()
+    base, hand = env.data.body("base").xpos, env.data.body("hand").xpos
+    forward = (hand - base) * [1, 1, 0]
+    np.testing.assert_allclose(forward / np.linalg.norm(forward), [0, 1, 0], atol=0.05)
+    up = -env.model.opt.gravity / np.linalg.norm(env.model.opt.gravity)
+    np.testing.assert_array_equal(up, [0, 0, 1])
+    right = np.cross(forward / np.linalg.norm(forward), up)
+    np.testing.assert_allclose(right, [1, 0, 0], atol=0.05)
+    # Left and right are those of someone who faces the robot.
+    assert holds("left of", tuple(0.1 * right), (0.0, 0.0, 0.0))
+    assert holds("behind", (0.0, 0.1, 0.0), (0.0, 0.0, 0.0))
+
+
+OWN = {
+    "beside": (
+        Comparison("xy", "<", 0.1),
+        Comparison("z", "<", 0.02, length=False),
+        Comparison("z", ">", -0.02, length=False),
+    ),
+    "far from": (Comparison("xyz", ">", 0.2),),
+    "level with": (Comparison("z", "<=", 0.0, length=False), Comparison("yz", "<=", 0.05, raise_z=0.01)),
+    "somewhere over": (
+        *(Comparison(axis, ">", -0.05, length=False) for axis in "xyz"),
+        Comparison("xy", ">", 0.05),
+    ),
+}
+
+
+@pytest.fixture
+def own():
+    RELATIONS.update(OWN)
+    yield OWN
+    for name in OWN:
+        RELATIONS.pop(name, None)
+
+
+@pytest.mark.parametrize("name", OWN)
+def test_a_relation_of_ones_own_is_compiled_with_all_its_comparisons(own, name):
+    first = torch.randn(400, 3, generator=torch.Generator().manual_seed(0)) * 0.1
+    states = torch.zeros(400, 39)
+    states[:, 0:3] = first
+    program = QueryProgram({"push": [f"gripper {name} puck", f"gripper not {name} puck and open", "gripper near puck"]})
+    ids = torch.full((400,), task_id("push"))
+    expected = torch.stack([part.holds(first) for part in own[name]]).all(0)
+    assert 10 < expected.sum() < 390
+    for part in own[name]:  # each counts
+        others = [p.holds(first) for p in own[name] if p is not part]
+        assert len(own[name]) == 1 or not torch.equal(torch.stack(others).all(0), expected)
+    assert torch.equal(program(states, ids)[:, 0], expected)
+    assert torch.equal(program(states, ids)[:, 2], relation_holds("near", first, torch.zeros(3)))
+    assert torch.equal(program.logits(states, ids) > 0, program(states, ids))
+    assert torch.equal(relation_holds(name, first, torch.zeros(3)), expected)
+
+
+def test_whatever_is_made_of_the_relations_sees_what_is_added_and_taken_away():
+    before = supported_queries("push")
+    text = "the robot's gripper is beside the puck"
+    assert text not in before
+    with pytest.raises(QueryError):
+        parse_query(text, "push")
+    assert "beside" not in str(nearest_query("gripper besides puck", "push").query)
+    RELATIONS["beside"] = OWN["beside"]
+    try:
+        assert "beside" in PREDICATES
+        assert text in supported_queries("push")
+        assert supported_queries("push", published_only=True) == tuple(
+            query for query in before if query in supported_queries("push", published_only=True)
+        )
+        assert str(parse_query("gripper beside puck", "push")) == text
+        assert str(nearest_query("gripper besides puck", "push").query) == text
+        for asked in ("gripper besides puck", text):
+            assert "beside" not in str(nearest_query(asked, "push", published_only=True).query)
+        plan = ConditionalPlan.from_pairs("push", [("gripper beside puck", "wait")])
+        assert str(plan.steps[0].condition) == text
+        with pytest.raises(QueryError, match="'beside'"):
+            parse_query("gripper besides puck", "push")
+    finally:
+        del RELATIONS["beside"]
+    assert supported_queries("push") == before
+    assert tuple(RELATIONS) == PUBLISHED
+
+
+@pytest.mark.parametrize(
+    ("name", "parts", "says"),
+    [
+        ("Beside", OWN["beside"], "lower-case words"),
+        ("", OWN["beside"], "lower-case words"),
+        (" beside", OWN["beside"], "lower-case words"),
+        (3, OWN["beside"], "lower-case words"),
+        ("open", OWN["beside"], "meaning of its own"),
+        ("not near", OWN["beside"], "meaning of its own"),
+        ("near and dear to", OWN["beside"], "meaning of its own"),
+        ("beside", (), "at least one"),
+        ("beside", OWN["beside"][0], "tuple of Comparison"),
+        ("beside", ("xy < 0.1",), "tuple of Comparison"),
+    ],
+)
+def test_a_relation_that_no_query_could_have_is_refused(name, parts, says):
+    with pytest.raises(ValueError, match=says):
+        RELATIONS[name] = parts
+    assert tuple(RELATIONS) == PUBLISHED
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (dict(axes=""), "axes"),
+        (dict(axes="zx"), "axes"),
+        (dict(axes="w"), "axes"),
+        (dict(axes="xy", length=False), "one axis"),
+        (dict(sense=">="), "sense must be one of"),
+        (dict(threshold=math.nan), "threshold"),
+        (dict(temperature=0.0), "temperature"),
+    ],
+)
+def test_a_comparison_that_means_nothing_is_refused(options, says):
+    with pytest.raises(ValueError, match=says):
+        Comparison(**{"axes": "xyz", "sense": "<", "threshold": 0.1, **options})
