@@ -169,9 +169,10 @@ class CoLearningSampler(GroupSampler):
         """Restore what :meth:`state_dict` gave.
 
         Raises:
-            ValueError: it is the state of another target or ratio.
+            ValueError: it is no such state, or that of another target or ratio.
         """
         for name, ours in self._identity().items():
-            if (given := state_dict.get(name)) is None or not torch.equal(given.cpu(), ours.cpu()):
+            given = state_dict.get(name)
+            if not isinstance(given, Tensor) or given.dtype != ours.dtype or not torch.equal(given.cpu(), ours.cpu()):
                 raise ValueError(f"state_dict must be of the same {name}, {getattr(self, name)}, got one of another")
         super().load_state_dict(state_dict)

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from math import prod
+from pathlib import Path
+from reprlib import repr as short
 from typing import Any
 
 import torch
@@ -11,6 +14,7 @@ from torch import Tensor
 from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.storages import Storage
 
+from lw_torchrl._files import read_json
 from lw_torchrl.data.storage import JoinedStorage
 
 
@@ -48,6 +52,7 @@ class GroupSampler(Sampler):
         self._size = torch.empty(0, dtype=torch.int64)
         self._cursor = torch.empty(0, dtype=torch.int64)
         self._ran_out = False
+        self._restored = False
         self._laid_out: tuple[int, Tensor, Tensor, Tensor] | None = None  # see _layout
 
     @abstractmethod
@@ -76,6 +81,7 @@ class GroupSampler(Sampler):
         self._cursor = torch.zeros_like(self._size)
         self._length = len(storage)
         self._laid_out = None
+        self._restored = False
         for group in range(len(self._size)):
             self._shuffle(group)
 
@@ -113,7 +119,9 @@ class GroupSampler(Sampler):
         """Draw ``batch_size`` indices, group after group."""
         if not len(storage):
             raise ValueError("storage must hold at least one row, got an empty one")
-        if len(storage) != self._length:
+        if self._restored and self._length:
+            self._check_restored(storage)
+        elif len(storage) != self._length:
             self._group(storage)
         shares, group, place = self._layout(batch_size)
         at = (self._start + self._cursor)[group].add_(place).clamp_(max=len(self._order) - 1)
@@ -149,20 +157,89 @@ class GroupSampler(Sampler):
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` gave."""
-        self._length = int(state_dict["length"])
-        for name in ("order", "start", "size", "cursor"):
-            setattr(self, f"_{name}", state_dict[name].clone())
-        self._ran_out = bool(state_dict["ran_out"])
+        """Restore what :meth:`state_dict` gave.
+
+        Raises:
+            ValueError: it is no such state. Whether it is one of the storage's rows shows at the next sample, which
+                raises it then.
+        """
+        state = _checked(state_dict)
+        self._length, self._ran_out = state["length"], state["ran_out"]
+        self._order, self._start = state["order"].clone(), state["start"].clone()
+        self._size, self._cursor = state["size"].clone(), state["cursor"].clone()
         self._laid_out = None
+        self._restored = True
+
+    def _check_restored(self, storage: Storage) -> None:
+        """Raise unless a restored state is of the storage's rows, in their groups."""
+        if len(storage) != self._length:
+            raise ValueError(f"state_dict must be of the storage's {len(storage)} rows, got one of {self._length}")
+        label = self._label(storage).cpu()
+        groups = torch.repeat_interleave(self._size)
+        if len(groups) != int((label >= 0).sum()) or not torch.equal(label[self._order], groups):
+            raise ValueError("state_dict must be of the storage's rows, got one whose groups are others")
+        self._restored = False
 
     def dumps(self, path: Any) -> None:
         """Write the state to a folder, memory-mapped."""
         TensorDict(self.state_dict()).memmap(path)
 
     def loads(self, path: Any) -> None:
-        """Read the state that :meth:`dumps` wrote."""
-        self.load_state_dict(TensorDict.load_memmap(path, allow_pickle=False).to_dict())
+        """Read the state that :meth:`dumps` wrote.
+
+        Raises:
+            ValueError: it is damaged, or of something else.
+        """
+        self.load_state_dict(_read_state(Path(path)))
+
+
+def _read_state(folder: Path) -> dict[str, Any]:
+    """The tensors in a folder, if each file is as long as its description says; a shorter one would be lengthened."""
+    try:
+        for name, leaf in read_json(folder / "meta.json", "path: the description", limit=2**20).items():
+            if not isinstance(leaf, dict):
+                continue
+            if set(leaf) != {"device", "shape", "dtype", "is_nested"} or leaf["is_nested"] or "/" in name:
+                raise ValueError(f"{name} is no tensor")
+            dtype = {"torch.int64": torch.int64, "torch.bool": torch.bool}[leaf["dtype"]]
+            if not all(type(size) is int and 0 <= size < 2**48 for size in leaf["shape"]):
+                raise ValueError(f"{name} is of no shape")
+            size, file = prod(leaf["shape"]) * dtype.itemsize, folder / f"{name}.memmap"
+            if (there := file.stat().st_size if file.is_file() else 0) != size:
+                raise ValueError(f"{name}.memmap has {there} bytes, not {size}")
+        return TensorDict.load_memmap(folder, allow_pickle=False).to_dict()
+    except (OSError, RuntimeError, TypeError, KeyError, ValueError) as error:
+        raise ValueError(f"path: {str(folder)!r} holds no sampler's state ({type(error).__name__}: {error})") from error
+
+
+def _checked(state: Any) -> dict[str, Any]:
+    """A sampler's state whose parts fit one another: the groups' rows one after another, each row once."""
+
+    def require(holds: bool, name: str, wanted: str) -> None:
+        if not holds:
+            raise ValueError(f"state_dict: {name} must be {wanted}, got {short(state.get(name))}")
+
+    found: dict[str, Any] = {}
+    for name, dtype in (("length", torch.int64), ("ran_out", torch.bool)):
+        given = state.get(name)
+        require(isinstance(given, Tensor) and given.dtype == dtype and given.numel() == 1, name, f"one {dtype}")
+        found[name] = given.item()
+    require(found["length"] >= 0, "length", "at least 0")
+    for name in ("order", "start", "size", "cursor"):
+        given = state.get(name)
+        require(isinstance(given, Tensor) and given.dtype == torch.int64 and given.dim() == 1, name, "(n,) int64")
+        found[name] = given.cpu()
+    order, start, size, cursor = (found[name] for name in ("order", "start", "size", "cursor"))
+    rows = len(order)
+    require(
+        bool(((size > 0) & (size <= rows)).all()) and int(size.sum()) == rows, "size", f"of {rows} rows, none empty"
+    )
+    require(torch.equal(start, size.cumsum(0) - size), "start", "where the groups begin")
+    fits = cursor.shape == size.shape and bool(((cursor >= 0) & (cursor < size)).all())
+    require(fits, "cursor", "a place within each group")
+    inside = rows <= found["length"] and bool(((order >= 0) & (order < found["length"])).all())
+    require(inside and len(order.unique()) == rows, "order", f"rows below {found['length']}, each once")
+    return found
 
 
 class TaskBalancedSampler(GroupSampler):

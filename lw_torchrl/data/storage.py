@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
+from reprlib import repr as short
 from typing import Any, NoReturn
 
 import torch
@@ -13,7 +13,7 @@ from tensordict import NestedKey, TensorDict, TensorDictBase, is_leaf_nontensor
 from torch import Tensor
 from torchrl.data.replay_buffers.storages import Storage
 
-from lw_torchrl._files import write_json
+from lw_torchrl._files import read_json, write_json
 
 _MAX_RUNS = 4  # runs of one part in a batch, for each part, up to which they are read one after another
 
@@ -178,8 +178,8 @@ class JoinedStorage(Storage):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Check that a state is of as many rows."""
-        if state_dict.get("length") != len(self):
-            raise ValueError(f"state_dict must be of {len(self)} rows, got one of {state_dict.get('length')}")
+        if type(length := state_dict.get("length")) is not int or length != len(self):
+            raise ValueError(f"state_dict must be of {len(self)} rows, got one of {short(length)}")
 
     def dumps(self, path: Any) -> None:
         """Write the number of rows."""
@@ -187,7 +187,7 @@ class JoinedStorage(Storage):
 
     def loads(self, path: Any) -> None:
         """Check that what :meth:`dumps` wrote is of as many rows."""
-        self.load_state_dict(json.loads((Path(path) / "joined.json").read_text("utf-8")))
+        self.load_state_dict(read_json(Path(path) / "joined.json", "path: the storage's state"))
 
     def __repr__(self) -> str:
         columns = ", ".join(map(_name, self._columns))

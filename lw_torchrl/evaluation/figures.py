@@ -36,13 +36,22 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
     return max(0.0, center - half), min(1.0, center + half)
 
 
-def plot_success(result: EvaluationResult, path: str | os.PathLike[str], *, title: str = "") -> Figure:
+def plot_success(result: EvaluationResult, path: str | os.PathLike[str] | None = None, *, title: str = "") -> Figure:
     """Draw the any-step success rate of each task, best first, with 95 % intervals over the episodes.
 
     Args:
         result: of :func:`evaluate`.
-        path: an image file, .png, .svg or .pdf; it is replaced whole.
+        path: an image file, .png, .svg or .pdf; it is replaced whole. None for none.
         title: above the figure.
+
+    Returns:
+        The figure.
+
+    Example:
+        >>> import lw_torchrl as lw
+        >>> result = lw.evaluate(lw.ExpertActor("reach"), tasks="reach", episodes_per_task=2, seed=1_000)
+        >>> plot_success(result).axes[0].get_title()
+        'mean over 1 tasks: 1.000'
     """
     from matplotlib.figure import Figure
 
@@ -71,9 +80,7 @@ def plot_success(result: EvaluationResult, path: str | os.PathLike[str], *, titl
     )
     axes.set_title(f"{title}\nmean over {len(tasks)} tasks: {result.mean_success:.3f}".strip())
     axes.spines[["top", "right"]].set_visible(False)
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=140)
-    return figure
+    return _saved(figure, path)
 
 
 Rates = Mapping[str, float | Sequence[float]]
@@ -83,7 +90,7 @@ _DASHES = ((0, (5, 2)), (0, (1, 1.5)), (0, (5, 1, 1, 1)), (0, (3, 3)))
 
 def plot_sorted_tasks(
     curves: Mapping[str, Rates | Summary],
-    path: str | os.PathLike[str],
+    path: str | os.PathLike[str] | None = None,
     *,
     published: Mapping[str, Mapping[str, float]] | None = None,
     order: Literal["shared", "own"] = "shared",
@@ -97,7 +104,7 @@ def plot_sorted_tasks(
     Args:
         curves: a method's name to its :class:`Summary`, or to (task to its rates, one per seed), in [0, 1]. All have
             the same tasks.
-        path: an image file, .png, .svg or .pdf; it is replaced whole.
+        path: an image file, .png, .svg or .pdf; it is replaced whole. None for none.
         published: label to (task to rate), of the same tasks at least; :func:`published_curves` gives them.
         order: "shared" sorts the tasks by the first method, so that each place on x is one named task; "own" sorts
             every curve for itself, as the paper does: x is then a rank.
@@ -110,7 +117,7 @@ def plot_sorted_tasks(
         ValueError: no curves, methods with different tasks, or rates outside [0, 1].
 
     Example:
-        >>> figure = plot_sorted_tasks({"PCBC": {"push": [0.5, 0.7], "reach": [1.0, 0.9]}}, "few-shot.png")
+        >>> figure = plot_sorted_tasks({"PCBC": {"push": [0.5, 0.7], "reach": [1.0, 0.9]}})
         >>> [label.get_text() for label in figure.axes[0].get_xticklabels()]
         ['push', 'reach']
 
@@ -150,8 +157,13 @@ def plot_sorted_tasks(
     axes.spines[["top", "right"]].set_visible(False)
     axes.set_title(title)
     _add_legend(figure, axes, len(named))
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=140)
+    return _saved(figure, path)
+
+
+def _saved(figure: Figure, path: str | os.PathLike[str] | None) -> Figure:
+    if path is not None:
+        with replacing(path) as temporary:
+            figure.savefig(temporary, dpi=140)
     return figure
 
 

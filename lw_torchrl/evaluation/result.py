@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
 from functools import cached_property
-from pathlib import Path
+from hashlib import file_digest
+from math import isfinite
+from reprlib import repr as short
 from typing import Any
 
 from torch import Tensor
 
-from lw_torchrl._files import write_json
+from lw_torchrl._files import read_json, write_json
+from lw_torchrl._versions import package_versions
 
 FORMAT = "lw_torchrl.evaluation"
 FORMAT_VERSION = 1
@@ -48,10 +51,14 @@ class EvaluationResult:
     Attributes:
         config: tasks, episodes_per_task, seed, noise_scale, stop_at_success, max_steps.
         episodes: one record each, by task and episode.
+        origin: what it came from, once it was saved: ``date`` (UTC, ISO 8601), ``versions`` of the packages and, if
+            they were told, ``checkpoint`` (``path`` and ``sha256``) and ``plans``. Results that differ in it alone are
+            equal.
     """
 
     config: dict[str, Any]
     episodes: tuple[EpisodeResult, ...]
+    origin: dict[str, Any] = field(default_factory=dict, compare=False)
 
     def _by_task(self, value: Callable[[list[EpisodeResult]], float | None]) -> dict[str, float | None]:
         return {
@@ -84,14 +91,38 @@ class EvaluationResult:
         rates = [rate for rate in self.success_once.values() if rate is not None]
         return sum(rates) / len(rates)
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the result as JSON; a file is replaced whole or not at all."""
+    def save(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        checkpoint: str | os.PathLike[str] | None = None,
+        plans: str | None = None,
+    ) -> None:
+        """Write the result as JSON; a file is replaced whole or not at all.
+
+        Args:
+            path: the file.
+            checkpoint: the file that the actor was made of; its path and SHA-256 are noted.
+            plans: the fingerprint of the plans.
+
+        Raises:
+            FileNotFoundError: there is no such checkpoint.
+            ValueError: a number is NaN or infinite.
+        """
+        made = {"date": datetime.now(UTC).isoformat(timespec="seconds"), "versions": package_versions()}
+        origin: dict[str, Any] = dict(self.origin) or made
+        if checkpoint is not None:
+            with open(checkpoint, "rb") as file:
+                origin["checkpoint"] = {"path": str(checkpoint), "sha256": file_digest(file, "sha256").hexdigest()}
+        if plans is not None:
+            origin["plans"] = plans
         episodes = [{k: v for k, v in asdict(e).items() if k != "actions"} for e in self.episodes]
         write_json(
             path,
             {
                 "format": FORMAT,
                 "version": FORMAT_VERSION,
+                "origin": origin,
                 "config": self.config,
                 "mean_success_once": self.mean_success,
                 "success_once": self.success_once,
@@ -108,23 +139,28 @@ class EvaluationResult:
 
         Raises:
             FileNotFoundError: there is no such file.
-            ValueError: it is damaged, or no result of this format and version.
+            ValueError: it is damaged, holds what cannot be, or is no result of this format and version.
         """
         try:
-            found = json.loads(Path(path).read_text("utf-8"))
-            if (found["format"], found["version"]) != (FORMAT, FORMAT_VERSION):
-                raise ValueError(f"format {found['format']!r} version {found['version']!r}")
-            result = cls(found["config"], tuple(EpisodeResult(**episode) for episode in found["episodes"]))
-            if set(result.config["tasks"]) != {episode.task for episode in result.episodes}:
-                raise ValueError("its tasks and its episodes do not agree")
-            return result
+            found = read_json(path, "the result")
+            if (found["format"], found["version"]) != (FORMAT, FORMAT_VERSION) or type(found["version"]) is not int:
+                raise ValueError(f"format {short(found['format'])} version {short(found['version'])}")
+            config, origin = found["config"], found.get("origin", {})
+            if not isinstance(config, dict) or not isinstance(origin, dict):
+                raise ValueError("its config and its origin must be objects")
+            _check_config(config)
+            episodes = _read_episodes(found["episodes"], config)
+            if not isinstance(found["success_once"], dict) or set(found["success_once"]) != set(config["tasks"]):
+                raise ValueError("the tasks of its success_once are not those of its config")
+            return cls(config, episodes, origin)
         except FileNotFoundError:
             raise FileNotFoundError(
                 f"path: no result file {str(path)!r}; evaluate(...).save(path) writes one"
             ) from None
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(
-                f"path: {str(path)!r} is no result of {FORMAT} version {FORMAT_VERSION} ({error})"
+                f"path: {str(path)!r} is no result of {FORMAT} version {FORMAT_VERSION} "
+                f"({type(error).__name__}: {str(error)[:500]})"
             ) from error
 
     def table(self) -> str:
@@ -149,3 +185,63 @@ def _mean(values: list[Any]) -> float | None:
     if not values or any(value is None for value in values):
         return None
     return sum(values) / len(values)
+
+
+def _is_integer(value: Any, minimum: int, maximum: int = 2**63 - 1) -> bool:
+    return type(value) is int and minimum <= value <= maximum
+
+
+def _is_number(value: Any) -> bool:
+    return type(value) in (int, float) and abs(value) < 1e300 and isfinite(value)
+
+
+def _check(holds: bool, name: str, wanted: str, given: Any) -> None:
+    if not holds:
+        raise ValueError(f"{name} must be {wanted}, got {short(given)}")
+
+
+def _check_config(config: dict[str, Any]) -> None:
+    tasks = config["tasks"]
+    named = isinstance(tasks, list) and bool(tasks) and all(isinstance(task, str) for task in tasks)
+    _check(named and len(set(tasks)) == len(tasks), "config: tasks", "different names", tasks)
+    for name in ("episodes_per_task", "max_steps"):
+        _check(_is_integer(config[name], 1), f"config: {name}", "an integer of at least 1", config[name])
+    _check(_is_integer(config["seed"], -(2**63)), "config: seed", "an integer", config["seed"])
+    noise = config["noise_scale"]
+    _check(_is_number(noise) and noise >= 0, "config: noise_scale", "a number of at least 0", noise)
+    stops = config["stop_at_success"]
+    _check(isinstance(stops, bool), "config: stop_at_success", "true or false", stops)
+
+
+def _read_episodes(stated: Any, config: dict[str, Any]) -> tuple[EpisodeResult, ...]:
+    """The episodes of a file, as many of each task as its configuration says."""
+    _check(isinstance(stated, list), "episodes", "a list", stated)
+    names = {name for name in EpisodeResult.__dataclass_fields__ if name != "actions"}
+    count = dict.fromkeys(config["tasks"], 0)
+    seen: set[tuple[str, int]] = set()
+    found = []
+    for number, entry in enumerate(stated):
+        at = f"episodes[{number}]"
+        _check(isinstance(entry, dict) and set(entry) == names, at, f"an object of {', '.join(sorted(names))}", entry)
+        episode = EpisodeResult(**entry)
+        _check(isinstance(episode.task, str) and episode.task in count, f"{at}: task", "in config", episode.task)
+        _check(_is_integer(episode.episode, 0), f"{at}: episode", "an integer of at least 0", episode.episode)
+        which = episode.task, episode.episode
+        _check(which not in seen, at, "an episode of its own", which)
+        _check(isinstance(episode.success, bool), f"{at}: success", "true or false", episode.success)
+        first, end, total = episode.first_success, episode.success_at_end, episode.episode_return
+        if episode.success:
+            wanted = f"a step from 1 to {config['max_steps']}"
+            _check(_is_integer(first, 1, config["max_steps"]), f"{at}: first_success", wanted, first)
+        else:
+            _check(first is None, f"{at}: first_success", "null without success", first)
+        _check(end is None or isinstance(end, bool), f"{at}: success_at_end", "true, false or null", end)
+        _check(not end or episode.success, f"{at}: success_at_end", "false without success", end)
+        _check(total is None or _is_number(total), f"{at}: episode_return", "a number or null", total)
+        seen.add(which)
+        count[episode.task] += 1
+        found.append(episode)
+    for task, number in count.items():
+        wanted = f"{config['episodes_per_task']}, as config: episodes_per_task says"
+        _check(number == config["episodes_per_task"], f"the number of episodes of {task!r}", wanted, number)
+    return tuple(found)

@@ -128,7 +128,7 @@ def results(folder):
     found = {}
     for path in folder.rglob("results.json"):
         result = json.loads(path.read_text())
-        del result["config"]["seconds"]
+        del result["config"]["seconds"], result["origin"]["date"]
         found[path.relative_to(folder).as_posix()] = result
     found = dict(sorted(found.items()))
     return found, json.loads(next(folder.rglob("summary.json")).read_text())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -217,3 +218,15 @@ def test_wrong_curves_are_refused_before_a_file_is_written(tmp_path, curves, opt
     with pytest.raises(ValueError, match=message):
         plot_sorted_tasks(curves, tmp_path / "figure.png", **options)
     assert not list(tmp_path.iterdir())
+
+
+def test_without_a_path_the_figure_is_returned_and_nothing_is_written(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for draw, shown in ((plot_success, RESULT), (plot_sorted_tasks, {"PCBC": PCBC})):
+        saved = draw(shown, "figure.png")
+        Path("figure.png").unlink()
+        figure = draw(shown)
+        assert figure.axes[0].get_xlabel() == saved.axes[0].get_xlabel() != ""
+        assert list(tmp_path.iterdir()) == []
+        figure.savefig("mine.png")
+        Path("mine.png").unlink()

@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import json
+from datetime import UTC, datetime
+from hashlib import sha256
 
 import pytest
 import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mutations import mutated
 
+from lw_torchrl._versions import package_versions
 from lw_torchrl.evaluation import EpisodeResult, EvaluationResult
 
 CONFIG = {
@@ -95,7 +101,50 @@ def change(**entries):
     return lambda found: found.update(entries)
 
 
+def edit(number, **entries):
+    return lambda found: found["episodes"][number].update(entries)
+
+
+def configure(**entries):
+    return lambda found: found["config"].update(entries)
+
+
 DAMAGE = {
+    "a success that is 5": edit(0, success=5),
+    "a success that is 1": edit(0, success=1),
+    "an episode twice": edit(1, episode=0),
+    "an episode more than once in full": lambda found: found["episodes"].append(found["episodes"][0]),
+    "an episode that is missing": lambda found: found["episodes"].pop(),
+    "an empty list of episodes": change(episodes=[]),
+    "no tasks and no episodes": lambda found: (found["config"].update(tasks=[]), found.update(episodes=[])),
+    "an episode that is negative": edit(0, episode=-1),
+    "an episode that is true": edit(1, episode=True),
+    "an episode of another task": edit(0, task="drawer-open"),
+    "a task that is none": edit(0, task=["push"]),
+    "a first success of 0": edit(0, first_success=0),
+    "a first success past the end": edit(0, first_success=501),
+    "a first success without success": edit(2, first_success=7),
+    "a success without its first": edit(0, first_success=None),
+    "a first success that is a float": edit(0, first_success=10.0),
+    "a success at the end alone": edit(2, success_at_end=True),
+    "a success at the end that is a text": edit(0, success_at_end="yes"),
+    "a return that is a text": edit(0, episode_return="4.0"),
+    "a return of 400 digits": edit(0, episode_return=10**400),
+    "a return that is nan": edit(0, episode_return=float("nan")),
+    "a return that is infinite": edit(0, episode_return=float("inf")),
+    "a task twice in config": lambda found: found["config"]["tasks"].append("push"),
+    "tasks that are a text": configure(tasks="push"),
+    "tasks that are numbers": configure(tasks=[1, 2]),
+    "tasks of success_once that are others": lambda found: found["success_once"].pop("push"),
+    "a number of episodes that is another": configure(episodes_per_task=4),
+    "a number of episodes that is true": configure(episodes_per_task=True),
+    "a seed that is a text": configure(seed="1"),
+    "a noise that is negative": configure(noise_scale=-0.1),
+    "a number of steps that is null": configure(max_steps=None),
+    "a stop that is a number": configure(stop_at_success=0),
+    "no seed": lambda found: found["config"].pop("seed"),
+    "an origin that is a text": change(origin="mine"),
+    "a version that is a list": change(version=[[1]]),
     "another format": change(format="minari"),
     "another version": change(version=2),
     "no format": lambda found: found.pop("format"),
@@ -121,6 +170,62 @@ def test_a_wrong_file_is_refused_and_left_alone(tmp_path, name):
     with pytest.raises(ValueError, match=r"results.json' is no result of lw_torchrl.evaluation version 1"):
         EvaluationResult.load(path)
     assert path.read_bytes() == before
+
+
+@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.data())
+def test_a_file_of_another_shape_is_refused_or_holds_together(tmp_path, data):
+    path = tmp_path / "results.json"
+    stopped().save(path)
+    path.write_text(json.dumps(data.draw(mutated(json.loads(path.read_text())))))
+    try:
+        found = EvaluationResult.load(path)
+    except ValueError:
+        return
+    assert 0 <= found.mean_success <= 1
+    found.table()
+    found.save(path)
+    assert EvaluationResult.load(path) == found
+
+
+NESTED = b'{"format": ' + b"[" * 100_000 + b"]" * 100_000 + b"}"
+TWICE = b'{"format": "lw_torchrl.evaluation", "format": "lw_torchrl.evaluation"}'
+
+
+@pytest.mark.parametrize("content", [NESTED, TWICE, b"1" * 5_000], ids=["nested", "twice", "digits"])
+def test_text_that_is_no_json_is_refused(tmp_path, content):
+    (tmp_path / "results.json").write_bytes(content)
+    with pytest.raises(ValueError, match="is no result of"):
+        EvaluationResult.load(tmp_path / "results.json")
+
+
+def test_it_says_where_it_came_from(tmp_path):
+    checkpoint = tmp_path / "policy.zip"
+    checkpoint.write_bytes(b"weights")
+    before = datetime.now(UTC).replace(microsecond=0)
+    make_result().save(tmp_path / "results.json", checkpoint=checkpoint, plans="0123abcd")
+    found = EvaluationResult.load(tmp_path / "results.json")
+    assert before <= datetime.fromisoformat(found.origin["date"]) <= datetime.now(UTC)
+    assert found.origin["versions"] == package_versions()
+    assert found.origin["checkpoint"] == {"path": str(checkpoint), "sha256": sha256(b"weights").hexdigest()}
+    assert found.origin["plans"] == "0123abcd"
+    assert found == make_result(), "where it came from is no part of what was measured"
+    make_result().save(tmp_path / "plain.json")
+    assert EvaluationResult.load(tmp_path / "plain.json").origin.keys() == {"date", "versions"}
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        make_result().save(tmp_path / "other.json", checkpoint=tmp_path / "nowhere.zip")
+    assert not (tmp_path / "other.json").exists()
+
+
+def test_a_file_from_before_origins_were_kept_is_read_and_stays_of_unknown_origin_until_saved(tmp_path):
+    path = tmp_path / "results.json"
+    make_result().save(path)
+    old = json.loads(path.read_text())
+    del old["origin"]
+    path.write_text(json.dumps(old))
+    found = EvaluationResult.load(path)
+    assert found == make_result()
+    assert found.origin == {}
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"[]", b"null", b"\xff\xfe\x00", b'"words"'])
