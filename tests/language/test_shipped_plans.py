@@ -9,7 +9,7 @@ from lw_torchrl.evaluation.plan_use import expert_use
 from lw_torchrl.language import text
 from lw_torchrl.language.plans import format_plan, parse_plan
 
-EPISODES = 10
+EPISODES = 30
 
 
 def plan_text(task, folder="plans"):
