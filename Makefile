@@ -19,7 +19,7 @@ READY := $(VENV)/.ready
 demo: $(READY)
 	$(BIN)/lw-torchrl demo
 test: $(READY)
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n $(JOBS) --dist worksteal
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
 test-python:
 	$(MAKE) test VENV=.venv-$(notdir $(PYTHON)) PYTHON=$(PYTHON)
 check: $(READY)

@@ -14,7 +14,7 @@ import pytest
 import lw_torchrl
 
 ROOT = Path(__file__).parent.parent
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("**/*.md"))]
+PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("**/*.md"))]
 BLOCK = re.compile(
     r"(?P<skip><!--\s*no-run\s*-->\s*\n)?"
     r"^(?P<indent> *)```(?P<kind>python|py|pycon)[^\n]*\n(?P<code>.*?)^(?P=indent)```",

@@ -2,19 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
-
 from tensordict import unravel_key
 from tensordict.utils import NestedKey
 from torchrl.envs import Compose, EnvBase, RenameTransform, Transform, TransformedEnv
-
-
-def check_keys(argument: str, given: Any, *names: str) -> list[NestedKey]:
-    """Return ``given`` as a list of one key for each of ``names``; a key may be nested, a tuple."""
-    if isinstance(given, str) or not isinstance(given, Sequence) or len(given) != len(names):
-        raise ValueError(f"{argument} must be a list of {len(names)}, in this order: {', '.join(names)}; got {given!r}")
-    return [unravel_key(key) for key in given]
 
 
 def base_env(transform: Transform) -> EnvBase | None:

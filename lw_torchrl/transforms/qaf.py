@@ -13,9 +13,10 @@ from torchrl.envs import EnvBase, Transform
 from torchrl.envs.batched_envs import BatchedEnvBase
 
 from lw_torchrl._checks import missing_keys
+from lw_torchrl._keys import as_keys
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.query_program import QueryProgram
-from lw_torchrl.transforms.containers import base_env, check_keys, refuse_changed
+from lw_torchrl.transforms.containers import base_env, refuse_changed
 from lw_torchrl.transforms.env_state import KeepsEnvState
 
 
@@ -57,12 +58,12 @@ class QAFTransform(KeepsEnvState):
         self,
         plans: Plans | Mapping[str, ConditionalPlan],
         *,
-        in_keys: Sequence[NestedKey] = ("observation", "task_id"),
-        out_keys: Sequence[NestedKey] = ("qaf",),
+        in_keys: Sequence[NestedKey] | None = None,
+        out_keys: Sequence[NestedKey] | None = None,
     ) -> None:
         super().__init__(
-            in_keys=check_keys("in_keys", in_keys, "observation", "task_id"),
-            out_keys=check_keys("out_keys", out_keys, "qaf"),
+            in_keys=as_keys("in_keys", in_keys, ("observation", "task_id")),
+            out_keys=as_keys("out_keys", out_keys, ("qaf",)),
         )
         self.plans = as_plans(plans)
         self.program = plan_program(self.plans)

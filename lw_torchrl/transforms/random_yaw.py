@@ -11,8 +11,8 @@ from torch import Tensor
 from torchrl.envs import EnvBase, Transform
 
 from lw_torchrl._checks import check_scale, missing_keys
+from lw_torchrl._keys import as_keys
 from lw_torchrl.language.observation import FIRST, HAND, POSITIONS, SECOND, a_step_before
-from lw_torchrl.transforms.containers import check_keys
 
 _STARTS = tuple(part.start for part in (*POSITIONS, *map(a_step_before, (HAND, FIRST, SECOND))))
 _KEYS = ("observation", "action", "expert_action", "unclipped_action")
@@ -71,12 +71,12 @@ class RandomYaw(Transform):
         self,
         scale: float,
         *,
-        in_keys: Sequence[NestedKey] = _KEYS,
+        in_keys: Sequence[NestedKey] | None = None,
         out_keys: Sequence[NestedKey] | None = None,
     ) -> None:
         super().__init__(
-            in_keys=check_keys("in_keys", in_keys, *_KEYS),
-            out_keys=check_keys("out_keys", in_keys if out_keys is None else out_keys, *_KEYS),
+            in_keys=as_keys("in_keys", in_keys, _KEYS),
+            out_keys=as_keys("out_keys", in_keys if out_keys is None else out_keys, _KEYS),
         )
         self.scale = check_scale("scale", scale)
 
