@@ -11,8 +11,7 @@ def as_keys(argument: str, given: Sequence[NestedKey] | None, default: Sequence[
     """The keys ``given``, as many as the default ones and in their order; None for those.
 
     Raises:
-        ValueError: another number of keys, or the same twice.
-        TypeError: what is no key.
+        ValueError: another number of keys, the same twice, or what is no key.
 
     Example:
         >>> as_keys("in_keys", [("agent", "observation"), "task"], ("observation", "task_id"))
@@ -20,10 +19,15 @@ def as_keys(argument: str, given: Sequence[NestedKey] | None, default: Sequence[
     """
     if given is None:
         return list(default)
-    if isinstance(given, str) or not isinstance(given, Sequence):
-        raise TypeError(f"{argument} must be a list of {len(default)} keys, for {', '.join(default)}, got {given!r}")
-    # A list is a nested key too: JSON has no tuples.
-    keys = [unravel_key(tuple(key) if isinstance(key, list) else key) for key in given]
-    if len(keys) != len(default) or len(set(keys)) != len(keys):
-        raise ValueError(f"{argument} must be {len(default)} different keys, for {', '.join(default)}, got {given!r}")
+    error = ValueError(
+        f"{argument} must be a list of {len(default)}, in this order: {', '.join(default)}; got {given!r}"
+    )
+    if isinstance(given, str) or not isinstance(given, Sequence) or len(given) != len(default):
+        raise error
+    try:  # a list is a nested key too: JSON has no tuples
+        keys = [unravel_key(tuple(key) if isinstance(key, list) else key) for key in given]
+    except Exception as cause:
+        raise error from cause
+    if len(set(keys)) != len(keys):
+        raise error
     return keys

@@ -106,8 +106,8 @@ def test_a_sample_may_be_turned_elsewhere():
         (lambda: queries(in_keys="observation"), "in_keys must be a list of 2.* got 'observation'"),
         (lambda: queries(out_keys="qaf"), "out_keys must be a list of 1, in this order: qaf; got 'qaf'"),
         (lambda: queries(out_keys=[]), "out_keys must be a list of 1"),
-        (lambda: lw.RandomYaw(0.1, in_keys=["observation", "action"]), "in_keys must be a list of 3.* expert_action"),
-        (lambda: lw.RandomYaw(0.1, out_keys=["observation"]), "out_keys must be a list of 3"),
+        (lambda: lw.RandomYaw(0.1, in_keys=["observation", "action"]), "in_keys must be a list of 4.* expert_action"),
+        (lambda: lw.RandomYaw(0.1, out_keys=["observation"]), "out_keys must be a list of 4"),
     ],
 )
 def test_a_wrong_list_of_keys_is_named(make, message):
