@@ -107,7 +107,7 @@ def run_demo(out: Path, config: DemoConfig) -> EvaluationResult:
             seed=config.evaluation_seed,
             noise_scale=config.evaluation_noise,
         )
-        result.save(results)
+        result.save(results, checkpoint=out / "checkpoint.zip", plans=plans.fingerprint)
     plot_success(result, out / "success.png", title="Plan-conditioned behavioral cloning")
     print("4/4  recording a rollout")
     rollouts = rollout_tasks(actor, config.tasks, seed=config.evaluation_seed, noise_scale=config.evaluation_noise)

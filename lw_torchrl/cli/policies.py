@@ -1,0 +1,227 @@
+"""The subcommands of ``lw-torchrl`` that make policies: demonstrations, training, evaluation."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from tyro.conf import Positional
+
+from lw_torchrl.cli.outputs import check_file, check_folder
+from lw_torchrl.cli.sources import make_logger, read_encoder, read_plans, read_tasks
+from lw_torchrl.cli.threads import use_one_thread
+
+if TYPE_CHECKING:
+    from lw_torchrl.language.plans import Plans
+    from lw_torchrl.language.tasks import Task
+    from lw_torchrl.modules.policy import Policy
+
+
+def collect(
+    tasks: Positional[tuple[str, ...]],
+    /,
+    out: Path,
+    episodes: int = 10,
+    seed: int = 0,
+    noise: tuple[float, ...] = (0.0,),
+    noise_hold: int = 10,
+    redraw_failures: bool = False,
+    num_envs: int | None = None,
+) -> None:
+    """Collect demonstrations of the scripted experts. Stopped and started again it carries on.
+
+    Example: lw-torchrl collect MT10 --out demos/mt10 --noise 0 0.1 0.2 --redraw-failures
+
+    Args:
+        tasks: MT10, MT50, or names of tasks.
+        out: the dataset's folder.
+        episodes: kept for each task.
+        seed: evaluate on another one.
+        noise: standard deviations of the execution noise, gone through in turn, one an episode.
+        noise_hold: steps for which each draw of the noise is kept; longer leads further astray.
+        redraw_failures: keep successful episodes only.
+        num_envs: environments stepped together; the dataset does not depend on it.
+    """
+    check_folder("--out", out)
+    from lw_torchrl.data import collect_demonstrations
+
+    made = collect_demonstrations(
+        tasks[0] if len(tasks) == 1 else tasks,
+        episodes_per_task=episodes,
+        root=out,
+        seed=seed,
+        noise_scale=noise,
+        noise_hold=noise_hold,
+        redraw_failures=redraw_failures,
+        num_envs=num_envs,
+    )
+    print(f"{'task':28} {'success':>7} {'episodes run':>13}")
+    for task, rate in made.success_rate.items():
+        print(f"{task:28} {rate:7.2f} {made.attempts[task]:13}")
+    print(f"{made.num_steps} steps in {made.root}")
+
+
+def train(
+    data: Positional[Path],
+    /,
+    out: Path,
+    tasks: tuple[str, ...] = (),
+    plans: tuple[str, ...] = ("MT10",),
+    task_file: Path | None = None,
+    text_encoder: str | None = None,
+    method: str = "pcbc",
+    mix: Literal["latents", "actions"] = "latents",
+    features: Literal["raw", "differences", "relative", "both"] = "differences",
+    width: int = 256,
+    depth: int = 3,
+    steps: int = 8000,
+    batch_size: int = 500,
+    learning_rate: float = 1e-3,
+    after_success: int | None = 20,
+    seed: int = 0,
+    logger: Literal["csv", "tensorboard", "wandb"] | None = None,
+) -> None:
+    """Train a policy on demonstrations. Stopped and started again it carries on from its checkpoint.
+
+    Example: lw-torchrl train demos/mt10 --out runs/mt10.zip
+
+    Args:
+        data: a dataset's folder, of `lw-torchrl collect`.
+        out: the policy, one file.
+        tasks: MT10, or names of tasks: only their demonstrations; all that the dataset has if none is given.
+        plans: MT10 or MT50 for the shipped plans, .plan files, .json files of pairs, or folders; where several have a
+            plan for a task, the last one's counts.
+        task_file: tasks of yours, whose objects and points the plans may name.
+        text_encoder: a function of yours that turns texts into vectors, as my_texts:encode; evaluate wants it again.
+        method: pcbc, conditioned on the plan; or a baseline: dc, on the task's description, one-hot, on its number.
+        mix: mix the skills' latents, as in the paper, or their actions.
+        features: what the policy sees: the raw observation; differences between hand, objects and goal; relative, these
+            without the hand's height and the gripper's opening; or both the first and the second.
+        width: of the action decoder's hidden layers.
+        depth: number of them.
+        steps: minibatches.
+        batch_size: rows of a minibatch, equally many of each task.
+        learning_rate: at the start; a cosine brings it to 0.
+        after_success: leave out steps so long after an episode's first success; None keeps all.
+        seed: of the initial weights and the minibatches.
+        logger: also write loss and learning rate there, below logs/ beside the policy.
+    """
+    check_file("--out", out)
+    import torch
+
+    import lw_torchrl as lw
+    from lw_torchrl._checks import check_choice
+    from lw_torchrl.modules.policy import METHODS, make_policy, policy_class
+
+    use_one_thread()
+    known = read_tasks(task_file)
+    encoder = read_encoder(text_encoder)
+    loaded = read_plans(plans, known)
+    options: dict[str, Any] = {"features": features, "width": width, "depth": depth}
+    if policy_class(METHODS[check_choice("method", method, METHODS)].policy).plan_options:
+        options["mix"] = mix
+    config = lw.BehavioralCloningConfig(steps=steps, batch_size=batch_size, learning_rate=learning_rate, seed=seed)
+    replay = lw.LanguageWorldExperienceReplay(
+        data,
+        episodes=_all_of(data, lw.resolve_tasks(_one_or_many(tasks), tasks=known)) if tasks else None,
+        sampler=lw.TaskBalancedSampler(),
+        after_success=after_success,
+    )
+    loaded.require(replay.tasks)
+    torch.manual_seed(seed)
+    actor = make_policy(method, loaded, text_encoder=encoder, **options)
+    if (transform := actor.transform()) is not None:
+        replay.append_transform(transform)
+    writes = None if logger is None else make_logger(logger, out)
+    loss = lw.BehavioralCloningTrainer(actor, replay, config, checkpoint=out, logger=writes).train()
+    print(f"trained to step {steps}" + ("" if loss != loss else f", loss {loss:.4f}") + f": {out}")
+
+
+def _one_or_many(tasks: tuple[str, ...]) -> str | tuple[str, ...]:
+    """MT10 is a set, not a list of one name."""
+    return tasks[0] if len(tasks) == 1 else tasks
+
+
+def _all_of(data: Path, tasks: tuple[str, ...]) -> dict[str, list[int]]:
+    """Every episode of these tasks in a dataset."""
+    from lw_torchrl.data.metadata import read_metadata
+
+    found = read_metadata(data)
+    return {task: [one.episode for one in found.episodes if one.task == task] for task in tasks}
+
+
+def evaluate(
+    checkpoint: Positional[Path],
+    /,
+    tasks: tuple[str, ...] = (),
+    plans: tuple[str, ...] = (),
+    task_file: Path | None = None,
+    text_encoder: str | None = None,
+    episodes: int = 20,
+    seed: int = 1000,
+    noise: float = 0.1,
+    stop_at_success: bool = False,
+    num_envs: int | None = None,
+    out: Path | None = None,
+) -> None:
+    """Evaluate a trained policy, or the scripted experts, and write the result, a figure and a recording.
+
+    Example: lw-torchrl evaluate runs/mt10.zip --out runs/mt10
+
+    Args:
+        checkpoint: of `lw-torchrl train`, or the word expert.
+        tasks: MT10, MT50, or names of tasks; those of the policy's plans if none is given.
+        plans: carry out these instead of the policy's own: MT10, MT50, .plan or .json files, or folders; where several
+            have a plan for a task, the last one's counts.
+        task_file: tasks of yours, whose objects and points the plans may name.
+        text_encoder: the function that the policy was trained with, if it was one of yours, as my_texts:encode.
+        episodes: of each task.
+        seed: fixes initial states, goals and noise; not one that the demonstrations used.
+        noise: standard deviation of the noise on the executed action.
+        stop_at_success: end an episode at its first success; any-step success stays the same.
+        num_envs: environments stepped together; the result does not depend on it.
+        out: folder for results.json, success.png and rollout.rrd.
+    """
+    if out is not None:
+        check_folder("--out", out)
+    import lw_torchrl as lw
+    from lw_torchrl.record.rollouts import rollout_tasks, write_recording
+
+    use_one_thread()
+    given = read_plans(plans, read_tasks(task_file)) if plans else None
+    policy = None
+    if str(checkpoint) != "expert":
+        policy = _load(checkpoint, seed, given, text_encoder)
+    chosen = _one_or_many(tasks) or (policy.tasks if policy is not None else "MT10")
+    result = lw.evaluate(
+        policy or lw.ExpertActor(chosen),
+        tasks=chosen,
+        episodes_per_task=episodes,
+        seed=seed,
+        noise_scale=noise,
+        stop_at_success=stop_at_success,
+        num_envs=num_envs,
+    )
+    print(result.table())
+    if out is not None:
+        told: dict[str, Any] = {} if policy is None else {"checkpoint": checkpoint}
+        if policy is not None and policy.plans is not None:
+            told["plans"] = policy.plans.fingerprint
+        result.save(out / "results.json", **told)
+        lw.plot_success(result, out / "success.png", title=f"{checkpoint}, {episodes} episodes a task")
+        if policy is not None:
+            shown: list[str | Task] = list(result.config["tasks"][:3])
+            rollouts = rollout_tasks(policy, shown, seed=seed, noise_scale=noise)
+            write_recording(out / "rollout.rrd", policy, rollouts)
+        print(f"written to {out}")
+
+
+def _load(checkpoint: Path, seed: int, plans: Plans | None, text_encoder: str | None) -> Policy:
+    """The policy of a file, with the plans that are given; none that has seen the seed's states."""
+    import lw_torchrl as lw
+    from lw_torchrl.trainers.checkpoint import demonstration_seeds
+
+    if seed in demonstration_seeds(checkpoint):
+        raise ValueError(f"seed must differ from the demonstrations' seed, {seed}; an evaluation wants fresh states")
+    policy = lw.load_actor(checkpoint, text_encoder=read_encoder(text_encoder))
+    return policy if plans is None else policy.with_plans(plans)

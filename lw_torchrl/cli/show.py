@@ -1,0 +1,104 @@
+"""The subcommands of ``lw-torchrl`` that show something: the demo, a recording, the answers in a state."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from lw_torchrl.cli.outputs import check_file, check_folder
+from lw_torchrl.cli.sources import read_tasks
+from lw_torchrl.cli.threads import use_one_thread
+
+
+def demo(out: Path | None = None, quick: bool = False) -> None:
+    """Train a plan-conditioned policy on MT10 and show it: demonstrations, training, evaluation, a recording.
+
+    Takes some minutes on two cores. Stopped and started again it carries on.
+
+    Args:
+        out: folder for results.json, success.png, rollout.rrd, checkpoint.zip and config.json; runs/demo, or
+            runs/demo-quick with --quick.
+        quick: two tasks and little training, in under a minute; not a measure of anything.
+    """
+    folder = check_folder("--out", out or Path("runs/demo-quick" if quick else "runs/demo"))
+    from lw_torchrl.experiments.demo import QUICK, DemoConfig, run_demo
+
+    use_one_thread()
+    run_demo(folder, QUICK if quick else DemoConfig())
+
+
+def view(
+    recording: Positional[Path],
+    /,
+    screenshot: Path | None = None,
+    step: int | None = None,
+    window_size: str = "1400x900",
+) -> None:
+    """Open a recording in the rerun viewer, or take a picture of it without a screen.
+
+    Example: lw-torchrl view runs/demo/rollout.rrd --screenshot picture.png --step 80
+
+    Args:
+        recording: an .rrd file.
+        screenshot: write a .png here and open no window; wants Debian's mesa-vulkan-drivers and libvulkan1.
+        step: the step at which to take the picture; the last if none is given.
+        window_size: of the picture, WIDTHxHEIGHT.
+    """
+    if screenshot is not None:
+        check_file("--screenshot", screenshot)
+    from lw_torchrl.record import open_viewer
+
+    open_viewer(recording, screenshot, window_size, step=step)
+    if screenshot is not None:
+        print(f"written to {screenshot}")
+
+
+def query(
+    task: Positional[str],
+    text: Positional[str | None] = None,
+    /,
+    step: int = 0,
+    seed: int = 0,
+    episode: int = 0,
+    task_file: Path | None = None,
+) -> None:
+    """Answer a query on a state of a task: the state after so many steps of the scripted expert.
+
+    Example: lw-torchrl query pick-place "Is the gripper open and not above the puck?" --step 40
+
+    Args:
+        task: a task's name.
+        text: the query; without one, all supported queries that hold are listed.
+        step: how many steps the expert does first, 0 to 500.
+        seed: of the episode.
+        episode: its index.
+        task_file: tasks of yours, whose objects and points the query may name.
+    """
+    import lw_torchrl as lw
+    from lw_torchrl._checks import check_int
+    from lw_torchrl.language.tasks import check_task
+
+    name = check_task(task)
+    definition = read_tasks(task_file)[name]
+    listed = (
+        [lw.parse_query(text, definition)]
+        if text is not None
+        else [lw.parse_query(q, definition) for q in lw.supported_queries(definition)]
+    )
+    if check_int("step", step, minimum=0) > 500:
+        raise ValueError(f"step must be at most 500, got {step}")
+    env = lw.LanguageWorldEnv(name, seed=seed)
+    state = env.reset(episode=episode)
+    if step:
+        state = env.rollout(step, lw.ExpertActor(name), auto_reset=False, tensordict=state)[:, -1]["next"]
+    truths = lw.QueryProgram({definition: listed})(state["observation"], state["task_id"])[0].tolist()
+    env.close()
+    for place, position in definition.positions(state["observation"][0]).items():
+        print(f"the {place:24} at " + " ".join(f"{number:7.3f}" for number in position.tolist()) + " m")
+    print(f"the gripper's opening       {state['observation'][0, 3]:7.3f}\n")
+    for found, truth in zip(listed, truths, strict=True):
+        if text is not None:
+            print(f"{'yes' if truth else 'no'}: {found}")
+        elif truth:
+            print(found)
