@@ -253,7 +253,7 @@ def test_the_experts_can_be_evaluated(capsys):
 
 def test_the_baseline_trains_and_is_evaluated(capsys, demos, tmp_path):
     path = tmp_path / "baseline.zip"
-    run(capsys, "train", demos, "--out", path, "--policy", "descriptor", *TINY)
+    run(capsys, "train", demos, "--out", path, "--method", "dc", *TINY)
     assert isinstance(lw.load_actor(path), lw.DescriptorConditionedActor)
     printed = run(capsys, "evaluate", path, "--episodes", 1, "--stop-at-success", "--out", tmp_path / "runs")
     assert [line.split()[0] for line in printed.splitlines()[1:4]] == ["push", "reach", "mean"]
