@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import time
 
 import numpy as np
 import pytest
@@ -277,11 +276,3 @@ def test_half_made_episodes_of_other_numbers_get_todays(tmp_path, made, monkeypa
     monkeypatch.undo()
     collect(tmp_path / "demos")
     assert tree(tmp_path / "demos") == tree(made.root)
-
-
-def test_loading_reads_no_rows(made, monkeypatch):
-    """A hundred thousand rows are mapped, not read."""
-    started = time.perf_counter()
-    for _ in range(20):
-        LanguageWorldExperienceReplay(made.root)
-    assert time.perf_counter() - started < 20 * 0.2
