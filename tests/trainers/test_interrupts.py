@@ -166,11 +166,15 @@ def test_twenty_times_at_random_moments(demos, tmp_path):
     assert all(before < after for before, after in pairwise(steps)), steps
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [("collect", "reach", "push", "--out", "OUT"), ("evaluate", "expert"), ("demo", "--quick", "--out", "OUT")],
-    ids=lambda arguments: arguments[0],
+OTHERS = (
+    ("collect", "reach", "push", "--out", "OUT"),
+    ("evaluate", "expert"),
+    ("demo", "--quick", "--out", "OUT"),
+    ("reproduce", "scripted", "--seeds", 0, "--out", "OUT"),
 )
+
+
+@pytest.mark.parametrize("arguments", OTHERS, ids=lambda arguments: arguments[0])
 def test_other_work(tmp_path, arguments):
     given = [tmp_path / "out" if one == "OUT" else one for one in arguments]
     assert interrupted(given, 4, "LanguageWorldEnv", "_step") == [[130, 0]] * 4
