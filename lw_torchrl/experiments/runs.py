@@ -12,7 +12,8 @@ from filelock import FileLock
 from lw_torchrl._checks import check_choice
 from lw_torchrl.data.collect import collect_demonstrations
 from lw_torchrl.experiments.recipes import DataSetting, Execution, Member, Preset
-from lw_torchrl.language.plans import Plans, format_plan
+from lw_torchrl.language.formats.chain_py import format_plan
+from lw_torchrl.language.plans import Plans
 
 METHODS = ("pcbc", "dc", "one-hot", "scripted")
 

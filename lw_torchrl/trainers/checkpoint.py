@@ -13,7 +13,8 @@ from torch import Tensor, nn
 from torchrl.checkpoint import Checkpoint, CheckpointError
 
 from lw_torchrl._checks import check_choice
-from lw_torchrl.language.plans import Plans, format_plan, parse_plan
+from lw_torchrl.language.formats.chain_py import format_plan, parse_plan
+from lw_torchrl.language.plans import Plans
 from lw_torchrl.modules import ActorEnsemble, DescriptorConditionedActor, PlanConditionedActor
 
 ACTORS = ("ActorEnsemble", "DescriptorConditionedActor", "PlanConditionedActor")
