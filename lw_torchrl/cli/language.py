@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -149,23 +148,24 @@ def check(
         file: a .plan file, a folder of them, or a .toml file of skills or of tasks.
         task: the task that a plan must be for.
         skills: skills of yours that join ours, for the plans.
-        tasks: tasks of yours that replace ours, for the plans.
+        tasks: tasks of yours that join or replace ours, for the plans and skills.
     """
     import lw_torchrl as lw
+    from lw_torchrl._files import read_text
 
     if not file.exists():
         raise FileNotFoundError(f"file: there is no {str(file)!r}")
+    known = lw.TASKS if tasks is None else lw.load_tasks(tasks)
     if file.suffix == ".toml":
-        print(_check_table(file))
+        print(_check_table(file, known))
         return
     paths = sorted(file.glob("*.plan")) if file.is_dir() else [file]
     if not paths:
         raise ValueError(f"file: the folder {str(file)!r} holds no .plan files")
-    table = lw.load_skills(skills)
-    known = lw.TASKS if tasks is None else lw.load_tasks(tasks)
+    table = lw.load_skills(skills, tasks=known)
     wrong = 0
     for path in paths:
-        faults, steps, notes = _check_plan(path.read_text("utf-8-sig"), task, path.name, table, known)
+        faults, steps, notes = _check_plan(read_text(path, lw.PlanError), task, path.name, table, known)
         wrong += len(faults)
         print("\n".join([*faults, *notes, f"{path.name}: " + (_count(faults) if faults else f"{steps} steps, valid")]))
     if wrong:
@@ -176,21 +176,22 @@ def _count(faults: list[str]) -> str:
     return f"{len(faults)} fault" + "s" * (len(faults) > 1)
 
 
-def _check_table(file: Path) -> str:
-    import tomllib
-
+def _check_table(file: Path, known: Mapping[str, Task]) -> str:
     import lw_torchrl as lw
+    from lw_torchrl._checks import nearest
+    from lw_torchrl._files import read_toml
 
-    try:
-        rows = tomllib.loads(file.read_text("utf-8"))
-    except tomllib.TOMLDecodeError as error:
-        raise ValueError(f"{file}: {error}") from error
+    rows = read_toml(file, ValueError)
     if any(isinstance(row, dict) and ("description" in row or "objects" in row) for row in rows.values()):
         lw.load_tasks(file)
+        for name in sorted(set(rows) - set(lw.TASKS)):
+            close = nearest(name, lw.TASKS, n=1)
+            hint = f"; did you mean {close[0]!r}?" if close else ""
+            print(f"{file.name}: note: task {name!r} is none of the simulator's{hint}")
         return f"{file.name}: {len(rows)} tasks, valid"
-    table = lw.load_skills(file)
+    table = lw.load_skills(file, tasks=known)
     for text in rows:
-        if not any(table[text].suits(task) for task in lw.MT50):
+        if not any(table[text].suits(task) for task in known.values()):
             print(
                 f"{file.name}: skill {text!r} suits no task; it needs {table[text].target!r} and {table[text].moved!r}"
             )
@@ -202,29 +203,11 @@ def _check_plan(
 ) -> tuple[list[str], int, list[str]]:
     """Every fault of a plan, the steps it has if there is none, and what the scripted skills make of it."""
     import lw_torchrl as lw
-    from lw_torchrl.language.plans import parse_plan
+    from lw_torchrl.language.formats.chain_py import check_plan
 
-    faults: list[str] = []
-    lines = text.splitlines()
-    while True:
-        try:
-            plan = parse_plan("\n".join(lines), task, source, tasks)
-        except lw.PlanError as error:
-            at = re.match(rf"{re.escape(source)}, line (\d+)", str(error))
-            if at is None:  # of the plan as a whole, or what is left of it
-                return faults or [str(error)], 0, []
-            faults.append(str(error))
-            number = int(at[1]) - 1
-            if lines[number].lstrip().startswith("def"):
-                return faults, 0, []
-            # Leave the line out and go on to the next fault; a condition takes its skill with it.
-            if lines[number].lstrip().startswith("if"):
-                following = next((k for k in range(number + 1, len(lines)) if lines[k].strip()), None)
-                if following is not None:
-                    lines[following] = ""
-            lines[number] = ""
-            continue
-        break
+    plan, faults = check_plan(text, task, source, tasks)
+    if plan is None:
+        return faults, 0, []
     notes = []
     for step in plan.steps:
         if step.skill not in skills or not skills[step.skill].suits(plan.definition):
@@ -233,7 +216,7 @@ def _check_plan(
                 f"{source}: note: no scripted skill {step.skill!r} suits {plan.task}; the nearest is {found.text!r} "
                 f"({score:.2f}). A learned policy needs none"
             )
-    return faults, len(plan.steps), notes
+    return [], len(plan.steps), notes
 
 
 def scripted(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ from filelock import FileLock
 from lw_torchrl._checks import check_choice
 from lw_torchrl.data.collect import collect_demonstrations
 from lw_torchrl.experiments.recipes import DataSetting, Execution, Member, Preset
-from lw_torchrl.language.plans import Plans, format_plan
+from lw_torchrl.language.plans import Plans
 from lw_torchrl.modules.policy import METHODS, policy_class
 
 SCRIPTED = "scripted"
@@ -110,10 +109,9 @@ class Run:
 
     def describe(self, plans: Plans) -> dict[str, Any]:
         """Everything that its result hangs on, as JSON."""
-        text = "".join(map(format_plan, plans.values()))
         reads_plans = self.method == SCRIPTED or policy_class(METHODS[self.method].policy).plan_options
-        plans_used = sha256(text.encode()).hexdigest()[:16] if reads_plans else None
-        described: dict[str, Any] = {"method": self.method, "seed": self.seed, "plans": plans_used}
+        read = plans.fingerprint if reads_plans else None
+        described: dict[str, Any] = {"method": self.method, "seed": self.seed, "plans": read}
         if self.method != SCRIPTED:
             described |= {
                 "setting": self.setting.name,

@@ -10,9 +10,10 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any, Literal
 
-from lw_torchrl._checks import check_choice, nearest
-from lw_torchrl._files import write_text
-from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans, PlanStep, as_plans, format_plan, parse_plan
+from lw_torchrl._checks import check_choice, nearest, shown
+from lw_torchrl._files import read_text, write_text
+from lw_torchrl.language.formats.chain_py import format_plan, parse_plan
+from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans, PlanStep, as_plans
 from lw_torchrl.language.query_search import nearest_query
 from lw_torchrl.language.tasks import MT10, TASKS, Task
 
@@ -68,33 +69,28 @@ def load_plans(
     return _read_all(list[Traversable](listed), tasks)
 
 
-def _text(file: Traversable) -> str:
-    try:
-        return file.read_text("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise PlanError(f"{file.name}: a plan is a text file in UTF-8: {error}") from error
-
-
 def _read_all(found: list[Traversable], tasks: Mapping[str, Task]) -> Plans:
-    return Plans([parse_plan(_text(file), file.name.removesuffix(".plan"), file.name, tasks) for file in found])
+    return Plans(
+        [parse_plan(read_text(file, PlanError), file.name.removesuffix(".plan"), file.name, tasks) for file in found]
+    )
 
 
 def _read_pairs(path: Path, tasks: Mapping[str, Task]) -> Plans:
     try:
-        found = json.loads(_text(path))
+        found = json.loads(read_text(path, PlanError))
     except (ValueError, RecursionError) as error:
         raise PlanError(f"{path.name}: not JSON: {error}") from error
     if isinstance(found, dict):
         found = found.get("plans", found)
     if not isinstance(found, dict):
-        raise PlanError(f"{path.name}: expected task names with lists of (condition, skill) pairs, got {found!r:.80}")
+        raise PlanError(f"{path.name}: expected task names with lists of (condition, skill) pairs, got {shown(found)}")
     plans = []
     for name, pairs in found.items():
         if name not in tasks:
             near = nearest(name, tasks)
-            raise PlanError(f"{path.name}: {name!r} is no task" + (f"; did you mean {near[0]!r}?" if near else ""))
+            raise PlanError(f"{path.name}: {shown(name)} is no task" + (f"; did you mean {near[0]!r}?" if near else ""))
         if not isinstance(pairs, list):
-            raise PlanError(f"{path.name}, {name}: expected a list of (condition, skill) pairs, got {pairs!r:.80}")
+            raise PlanError(f"{path.name}, {name}: expected a list of (condition, skill) pairs, got {shown(pairs)}")
         steps = [_step(pair, tasks[name], f"{path.name}, {name}, step {n}") for n, pair in enumerate(pairs, 1)]
         plans.append(ConditionalPlan(name, tuple(steps), tasks[name]))
     return Plans(plans)
@@ -102,7 +98,7 @@ def _read_pairs(path: Path, tasks: Mapping[str, Task]) -> Plans:
 
 def _step(pair: Any, task: Task, where: str) -> PlanStep:
     if not (isinstance(pair, list) and len(pair) == 2 and all(isinstance(text, str) for text in pair)):
-        raise PlanError(f"{where}: expected a condition and a skill, two strings, got {pair!r:.80}")
+        raise PlanError(f"{where}: expected a condition and a skill, two strings, got {shown(pair)}")
     condition, skill = pair
     match = nearest_query(condition, task)
     return PlanStep(match.query, skill, "" if match.score == 1.0 else f"nearest to: {condition}")

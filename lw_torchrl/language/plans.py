@@ -1,31 +1,25 @@
-"""Conditional plans: (condition, skill) pairs in English, written as text in the chain_py format.
+"""Conditional plans: (condition, skill) pairs in English.
 
-    # drawer-open: Take hold of the drawer handle and pull the drawer open.
-    def drawer_open(robot):
-        # The gripper has to come from above.
-        if check("the robot's gripper is not vertically aligned with the drawer handle"):
-            robot.place("the gripper above the drawer handle")
-
-The text looks like Python and is never executed: every line is matched against the few forms above.
-Source: paper section 'Conditional Plan Generation' and its figure of a chain_py plan.
+How they are written is for :mod:`lw_torchrl.language.formats`.
+Source: paper section 'Conditional Plan Generation'.
 """
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
+from hashlib import sha256
 from types import MappingProxyType
+from typing import Any
 
-from lw_torchrl._checks import nearest
+from lw_torchrl._checks import shown
 from lw_torchrl.language.queries import Query, check_query
+from lw_torchrl.language.relations import PREDICATES
 from lw_torchrl.language.tasks import TASKS, Task, check_task, get_task
 
-_TEXT = r'"((?:[^"\\]|\\.)*)"|\'((?:[^\'\\]|\\.)*)\''
-_DEF = re.compile(r"def\s+([A-Za-z]\w*)\s*\(\s*robot\s*\)\s*:")
-_CHECK = re.compile(rf"if\s+check\s*\(\s*(?:{_TEXT})\s*\)\s*:")
-_SKILL = re.compile(rf"robot\.([A-Za-z]\w*)\s*\(\s*(?:{_TEXT})?\s*\)")
 # fmt: off
 _BEFORE_NOUN = {
     "above", "across", "against", "along", "and", "around", "at", "away", "back", "behind", "below", "beside",
@@ -33,6 +27,7 @@ _BEFORE_NOUN = {
     "past", "through", "to", "toward", "towards", "under", "up", "with",
 }
 # fmt: on
+_LONGEST_BEFORE = max(map(len, _BEFORE_NOUN))
 
 
 class PlanError(ValueError):
@@ -106,6 +101,8 @@ class ConditionalPlan:
         return cls(definition.name, steps, definition)
 
     def __str__(self) -> str:
+        from lw_torchrl.language.formats.chain_py import format_plan
+
         return format_plan(self)
 
 
@@ -154,18 +151,71 @@ class Plans(Mapping[str, ConditionalPlan]):
 
     @property
     def fingerprint(self) -> str:
-        return repr([(t, [(str(s.condition), s.skill) for s in p.steps], p.definition) for t, p in self.items()])
+        """32 hex digits of all that queries and attention hang on: each step's condition and skill, the number of
+        steps, the objects of each task with their positions and offsets, and what each relation used means now.
 
-    def to_json(self) -> dict:
-        return {task: format_plan(plan) for task, plan in self.items()}
+        Plans with the same fingerprint give the same ``qaf``. Reasons and descriptions play no part.
+        """
+        used = {clause.predicate for plan in self.values() for step in plan.steps for clause in step.condition.clauses}
+        told = {
+            "steps": self.num_steps,
+            "predicates": {name: [asdict(part) for part in PREDICATES[name]] for name in sorted(used)},
+            "plans": {
+                task: {
+                    "steps": [(str(step.condition), step.skill) for step in plan.steps],
+                    "objects": [
+                        (named.name, named.position, [float(metres) for metres in named.offset])
+                        for named in plan.definition.objects
+                    ],
+                }
+                for task, plan in self.items()
+            },
+        }
+        return sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:32]
+
+    def to_json(self) -> dict[str, Any]:
+        """Each task's plan as chain_py text, with the task where it is not the shipped one of that name.
+
+        Raises:
+            TaskError: (a ValueError) a task cannot be written, see :meth:`Task.to_json`.
+
+        Example:
+            >>> from lw_torchrl.language.plan_files import load_plans
+            >>> plans = load_plans("MT10")
+            >>> Plans.from_json(plans.to_json()).fingerprint == plans.fingerprint
+            True
+        """
+        return {
+            task: {"plan": str(plan)}
+            | ({} if plan.definition == TASKS.get(task) else {"task": plan.definition.to_json()})
+            for task, plan in self.items()
+        }
 
     @classmethod
-    def from_json(cls, found: dict) -> Plans:
-        return cls([parse_plan(text, task) for task, text in found.items()])
+    def from_json(cls, found: Any) -> Plans:
+        """The plans of :meth:`to_json`; anything else, whatever it is, is a :class:`PlanError`."""
+        from lw_torchrl.language.formats.chain_py import parse_plan
+
+        if not isinstance(found, dict):
+            raise PlanError(f"plans must be an object of task names and plans, got {shown(found)}")
+        plans = []
+        for name, entry in found.items():
+            where = f"plan of {shown(name)}"
+            if not isinstance(entry, dict) or not isinstance(entry.get("plan"), str) or set(entry) - {"plan", "task"}:
+                raise PlanError(f'{where} must be like {{"plan": text, "task": table}}, got {shown(entry)}')
+            try:
+                task = Task.from_json(name, entry["task"]) if "task" in entry else TASKS[check_task(name)]
+                plans.append(parse_plan(entry["plan"], name, where, {name: task}))
+            except PlanError:
+                raise
+            except (ValueError, TypeError) as error:
+                raise PlanError(f"{where}: {error}") from error
+        return cls(plans)
 
     def differences(self, other: Plans) -> list[str]:
-        """The tasks of both whose plans, or the tasks' definitions, differ."""
-        return [t for t in self if t in other and (self[t], self[t].definition) != (other[t], other[t].definition)]
+        """The tasks of both whose plans differ in what their fingerprint tells."""
+        shared = [task for task in self if task in other]
+        return [task for task in shared if Plans([self[task]]).fingerprint != Plans([other[task]]).fingerprint]
 
     def require(self, tasks: Iterable[str]) -> None:
         """Raise :class:`PlanError` if one of ``tasks`` has no plan here."""
@@ -185,13 +235,11 @@ def as_plans(plans: Plans | Mapping[str, ConditionalPlan]) -> Plans:
     return Plans(plans)
 
 
-def _unquote(match: re.Match[str], group: int) -> str:
-    return re.sub(r"\\(.)", r"\1", match[group] or match[group + 1] or "").strip()
-
-
 def _with_articles(details: str, task: Task) -> str:
     def article(match: re.Match[str]) -> str:
-        before = details[: match.start()].removesuffix(" ").rpartition(" ")[2]
+        end = match.start() - (details[match.start() - 1 : match.start()] == " ")
+        start = max(0, end - _LONGEST_BEFORE - 1)  # no further: a text may be all nouns
+        before = details[start:end].rpartition(" ")[2]
         return f"the {match[0]}" if not before or before in _BEFORE_NOUN else match[0]
 
     nouns = sorted({*task.object_names, "gripper"}, key=len, reverse=True)
@@ -211,82 +259,3 @@ def _skill_text(skill: str, task: Task) -> str:
         raise PlanError(f"skill must begin with a plain word like 'place', got {skill!r}")
     details = " ".join([*rest, _with_articles(details, task)]).strip()
     return f"{verb} {_with_articles(details, task)}".strip()
-
-
-def parse_plan(
-    text: str, task: str | None = None, source: str = "plan", tasks: Mapping[str, Task] = TASKS
-) -> ConditionalPlan:
-    """Read one plan in the chain_py format.
-
-    Args:
-        text: the plan.
-        task: the task it must be for; None takes the one its ``def`` line names.
-        source: what to call the text in errors, a file's name.
-        tasks: whose objects the conditions name, by task name, as from :func:`load_tasks`.
-
-    Raises:
-        PlanError: (a ValueError) with the line: a line of another form, a condition outside the query language,
-            a plan without steps, or one for another task.
-        TypeError: ``text`` is no string.
-    """
-    if not isinstance(text, str):
-        raise TypeError(f"text must be a string, got {type(text).__name__}")
-    found: str | None = None
-    condition: Query | None = None
-    steps: list[PlanStep] = []
-    reason: list[str] = []
-    for number, raw in enumerate(text.splitlines(), 1):
-        line = raw.strip()
-        where = f"{source}, line {number}"
-        if not line:
-            continue
-        if line.startswith("#"):
-            if found is not None:
-                reason.append(line.lstrip("# "))
-        elif match := _DEF.fullmatch(line):
-            if found is not None:
-                raise PlanError(f"{where}: a second plan begins; a plan file holds one")
-            found = match[1].replace("_", "-")
-            if found not in tasks:
-                near = nearest(found, tasks)
-                raise PlanError(f"{where}: {found!r} is no task" + (f"; did you mean {near[0]!r}?" if near else ""))
-            if task is not None and found != task:
-                raise PlanError(f"{where}: this is a plan for {found!r}, expected one for {task!r}")
-        elif found is None:
-            raise PlanError(f"{where}: expected 'def task_name(robot):' before {line!r}")
-        elif match := _CHECK.fullmatch(line):
-            if condition is not None:
-                raise PlanError(f'{where}: the condition above has no skill; expected robot.verb("details")')
-            try:
-                condition = check_query(_unquote(match, 1), tasks[found])
-            except ValueError as error:
-                raise PlanError(f"{where}: {error}") from error
-        elif match := _SKILL.fullmatch(line):
-            if condition is None:
-                raise PlanError(f'{where}: the skill has no condition; expected if check("condition"): above it')
-            steps.append(PlanStep(condition, f"{match[1]} {_unquote(match, 2)}", " ".join(reason)))
-            condition, reason = None, []
-        else:
-            raise PlanError(
-                f'{where}: expected a comment, if check("condition"): or robot.verb("details"), got {line!r}'
-            )
-    if found is None:
-        raise PlanError(f"{source}: no plan found; a plan begins with 'def task_name(robot):'")
-    if condition is not None:
-        raise PlanError(f"{source}: the last condition has no skill")
-    return ConditionalPlan(found, tuple(steps), tasks[found])
-
-
-def format_plan(plan: ConditionalPlan) -> str:
-    """The plan as text in the chain_py format; :func:`parse_plan` reads it back."""
-
-    def quote(text: str) -> str:
-        return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
-
-    lines = [f"# {plan.task}: {plan.definition.description}", f"def {plan.task.replace('-', '_')}(robot):"]
-    for step in plan.steps:
-        if reason := " ".join(step.reason.split()).lstrip("# "):
-            lines.append(f"    # {reason}")
-        verb, _, details = step.skill.partition(" ")
-        lines += [f"    if check({quote(str(step.condition))}):", f"        robot.{verb}({quote(details)})"]
-    return "\n".join(lines) + "\n"

@@ -128,6 +128,15 @@ def test_ones_own_skills_and_tasks(capsys, tmp_path):
     assert "1 tasks, valid" in run(capsys, "check", tasks)
     plan.write_text(PLAN.replace("puck", "disc"))
     assert "push.plan: 2 steps, valid" in run(capsys, "check", plan, "--tasks", tasks)
+    skills.write_text('["wipe it"]\ntarget = "rag"\nfor.wipe.gripper = 1.0\n')
+    tasks.write_text(
+        '[wipe]\ndescription = "Wipe."\nobjects.rag = "obs[4:7]"\n[psh]\ndescription = "Push."\nobjects.a = "obs[4:7]"'
+    )
+    out = run(capsys, "check", tasks)
+    assert "note: task 'psh' is none of the simulator's; did you mean 'push'?" in out
+    assert "2 tasks, valid" in out
+    assert run(capsys, "check", skills, "--tasks", tasks) == "skills.toml: 1 skills, valid\n"
+    assert "'wipe'" in fails(capsys, "check", skills)
     tasks.write_text('[psh]\ndescription = "Push the disc."\n')
     assert "did you mean" in fails(capsys, "check", tasks)
     assert "there is no" in fails(capsys, "check", tmp_path / "none.plan")

@@ -75,6 +75,9 @@ def test_any_condition_becomes_the_nearest_query(tmp_path_factory, condition, sk
         ({"push": [["gripper is open", "7"]]}, "skill must begin with a plain word"),
         ({"push": []}, "must have at least one step"),
         ({}, "at least one plan"),
+        ("[" * 900 + "]" * 900, "expected task names with lists"),
+        ('{"push": ' + "[" * 900 + "]" * 900 + "}", "push, step 1: expected a condition"),
+        ('{"push": [[' + "9" * 5000 + ", 3]]}", "not JSON"),
     ],
 )
 def test_what_is_no_plan_is_named(write, value, message):

@@ -2,12 +2,15 @@
 
 import os
 import re
+import time
 from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from lw_torchrl.language.formats import chain_py
+from lw_torchrl.language.formats.chain_py import check_plan, format_plan, parse_plan
 from lw_torchrl.language.plan_files import load_plans, save_plans
 from lw_torchrl.language.plans import (
     ConditionalPlan,
@@ -15,11 +18,9 @@ from lw_torchrl.language.plans import (
     Plans,
     PlanStep,
     as_plans,
-    format_plan,
-    parse_plan,
 )
-from lw_torchrl.language.queries import Clause, Query, QueryError, parse_query, supported_queries
-from lw_torchrl.language.tasks import GRIPPER, MT50, TASKS
+from lw_torchrl.language.queries import Clause, Query, QueryError, check_query, parse_query, supported_queries
+from lw_torchrl.language.tasks import GRIPPER, MT50, TASKS, Task
 
 DRAWER = """\
 # drawer-open: Take hold of the drawer handle and pull the drawer open.
@@ -571,3 +572,52 @@ def test_a_file_from_another_editor_loads(tmp_path, encode):
 def test_a_source_of_another_type_is_a_type_error(source):
     with pytest.raises(TypeError):
         load_plans(source)
+
+
+def test_all_faults_come_in_one_pass(monkeypatch):
+    asked = []
+    monkeypatch.setattr(chain_py, "check_query", lambda text, task: asked.append(text) or check_query(text, task))
+    step = "    if check('the gripper is {} the pluck'):\n        robot.wait()\n"
+    found, faults = check_plan("def push(robot):\n" + "".join(step.format("near") for _ in range(50)), source="my.plan")
+    assert found is None
+    assert [fault.split(":")[0] for fault in faults] == [f"my.plan, line {2 * k}" for k in range(1, 51)]
+    assert len(asked) == 50
+    assert check_plan(DRAWER) == (parse_plan(DRAWER), [])
+
+
+def test_every_kind_of_fault_is_told_once_and_the_sound_steps_are_read_on():
+    text = """nonsense
+def push(robot):
+    robot.place("first")
+    if check("gripper is open"):
+    if check("gripper is closed"):
+        robot.place("the puck")
+    if chek("gripper is open"):
+        robot.place("the puck")
+    import os
+    if check("gripper flies"):
+"""
+    assert [fault.split(":")[0] for fault in check_plan(text)[1]] == [f"plan, line {k}" for k in (1, 3, 5, 7, 9, 10)]
+    assert "the last condition has no skill" in check_plan("def push(robot):\n if check('gripper is open'):")[1][0]
+    for stops in ("def push(robot):\ndef push(robot):\nnonsense", "def pushh(robot):\nnonsense"):
+        assert len(check_plan(stops)[1]) == 1
+    with pytest.raises(PlanError) as caught:
+        parse_plan(text)
+    assert str(caught.value) == check_plan(text)[1][0]
+
+
+@pytest.mark.parametrize("unit", ["puck ", "puck, ", "puck,", "a-very-long-word puck ", "above the puck "])
+def test_long_texts_take_time_in_proportion(unit):
+    skill = "place " + unit * (500_000 // len(unit))
+    start = time.process_time()
+    found = ConditionalPlan.from_pairs("push", [("the gripper is open", skill)]).steps[0].skill
+    assert time.process_time() - start < 5
+    few = ConditionalPlan.from_pairs("push", [("the gripper is open", "place " + unit * 20)]).steps[0].skill
+    assert found.startswith(few.rstrip(","))
+
+
+def test_a_description_of_several_lines_writes_no_second_plan():
+    lines = Task("push", "Push.\ndef reach(robot):\u2028import os", TASKS["push"].objects)
+    written = ConditionalPlan("push", ConditionalPlan.from_pairs("push", [("gripper open", "wait")]).steps, lines)
+    assert str(written).splitlines()[0] == "# push: Push. def reach(robot): import os"
+    assert parse_plan(str(written), tasks={"push": lines}) == written

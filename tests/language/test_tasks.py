@@ -374,6 +374,11 @@ def test_a_byte_order_mark_is_no_part_of_the_first_key(tmp_path):
         (PUSH + "points.edge = 'obs[4]'", ["'edge'", "'obs[4:7]'"]),
         (PUSH + "points.disc = [0, 0, 0]", ["'push'", "different names", "'disc'"]),
         (PUSH + "points.disc = ", ["Invalid value"]),
+        (PUSH + "points.disc = " + "[" * 5000, ["mine.toml"]),
+        (PUSH + "points.disc = " + "9" * 5000, ["4300 digits"]),
+        (PUSH + "points.disc = [0, 0, " + "9" * 400 + "]", ["'disc'"]),
+        (PUSH + "points.disc = " + "[" * 60 + "]" * 60, ["'disc'"]),
+        (PUSH + f"points.disc = 'obs[{'4' * 5000}:7]'", ["'disc'"]),
     ],
 )
 def test_a_file_of_tasks_says_what_is_wrong_and_where(tmp_path, text, says):

@@ -1,0 +1,165 @@
+"""Plans as JSON with the tasks they speak of, and their fingerprint."""
+
+import json
+import random
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import lw_torchrl as lw
+from lw_torchrl.language.formats import PLAN_FORMATS
+from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans
+from lw_torchrl.language.relations import RELATIONS, Comparison
+from lw_torchrl.language.tasks import TASKS, NamedObject, Task
+from lw_torchrl.transforms.qaf import plan_program
+
+MT10_PLANS = lw.load_plans("MT10")
+PUSH = [("the gripper is near the puck", "wait"), ("the gripper is open", "place the puck")]
+
+
+def of(task=TASKS["push"], pairs=PUSH, *others):
+    return Plans([ConditionalPlan.from_pairs(task, pairs), *others])
+
+
+def moved(shift):
+    edge = NamedObject("puck edge", (4, 5, 6), (shift, 0, 0), ours=True)
+    return Task("push", "Push it.", (*TASKS["push"].objects, edge))
+
+
+def test_what_counts_and_what_does_not():
+    plans = of()
+    reasons = [replace(step, reason="why") for step in plans["push"].steps]
+    words = Task("push", "Other words.", TASKS["push"].objects)
+    same = [
+        of(),
+        Plans([ConditionalPlan("push", reasons)]),
+        of(words),
+        of(pairs=[("gripper near puck", "wait"), PUSH[1]]),
+    ]
+    assert {one.fingerprint for one in same} == {plans.fingerprint}
+    assert len(plans.fingerprint) == 32
+    int(plans.fingerprint, 16)
+    reach = ConditionalPlan.from_pairs("reach", PUSH[1:])
+    sweep = ConditionalPlan.from_pairs("reach", PUSH[1:] * 3)
+    other = [
+        of(pairs=PUSH[::-1]),
+        of(pairs=PUSH[:1]),
+        of(pairs=[PUSH[0], ("the gripper is closed", PUSH[1][1])]),
+        of(pairs=[PUSH[0], (PUSH[1][0], "wait")]),
+        of(moved(0.01)),
+        of(moved(-0.01)),
+        of(Task("push", "Push.", TASKS["push"].objects[:2])),
+        Plans({"push": plans["push"], "reach": reach}),
+        Plans({"push": plans["push"], "reach": sweep}),
+    ]
+    assert len({one.fingerprint for one in [plans, *other]}) == len(other) + 1
+
+
+def test_the_meaning_of_the_relations_used_counts():
+    before, reach = of().fingerprint, of("reach", PUSH[1:]).fingerprint
+    near = RELATIONS["near"]
+    RELATIONS["near"] = (Comparison("xyz", "<", 0.05),)
+    try:
+        assert of().fingerprint != before
+        assert of("reach", PUSH[1:]).fingerprint == reach  # does not speak of it
+    finally:
+        RELATIONS["near"] = near
+    assert of().fingerprint == before
+
+
+def test_the_fingerprint_is_the_same_in_every_process(python):
+    text = "import lw_torchrl as lw; print(lw.load_plans('MT10').fingerprint)"
+    assert python(text, PYTHONHASHSEED="3").stdout.split() == [MT10_PLANS.fingerprint]
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**31))
+def test_plans_come_back_with_their_tasks_and_answer_alike(seed):
+    rng = random.Random(seed)
+    tasks = [
+        *rng.sample(list(TASKS.values()), 3),
+        moved(rng.uniform(-0.1, 0.1)),
+        Task("own", "Own.", TASKS["hammer"].objects),
+    ]
+    listed = []
+    for task in {task.name: task for task in tasks}.values():
+        pairs = [(q, rng.choice(["wait", "place the gripper"])) for q in rng.choices(lw.supported_queries(task), k=3)]
+        listed.append(ConditionalPlan.from_pairs(task, pairs[: rng.randint(1, 3)]))
+    plans = Plans(listed)
+    told = json.loads(json.dumps(plans.to_json(), allow_nan=False))
+    found = Plans.from_json(told)
+    assert found == plans
+    assert [plan.definition for plan in found.values()] == [plan.definition for plan in plans.values()]
+    assert found.fingerprint == plans.fingerprint
+    assert ["task" in entry for entry in told.values()] == [p.definition != TASKS.get(p.task) for p in plans.values()]
+    ids = torch.tensor([lw.task_id(task) for task in plans])
+    states = torch.rand(len(ids), 39)
+    assert torch.equal(plan_program(found)(states, ids), plan_program(plans)(states, ids))
+
+
+def nested(depth):
+    found = []
+    for _ in range(depth):
+        found = [found]
+    return found
+
+
+HOSTILE = dict(
+    none=None, number=3, text="def", empty={}, deep=nested(10**5), dict={"a": nested(10**4)}, huge=10**5000, key={3: 4}
+)
+GOOD = Plans([ConditionalPlan.from_pairs(moved(0.1), PUSH)]).to_json()
+
+
+@pytest.mark.parametrize("kind", HOSTILE)
+@pytest.mark.parametrize("where", ["all", "entry", "plan", "task", "objects", "object", "more"])
+def test_hostile_json_is_a_plan_error(kind, where):
+    value = HOSTILE[kind]
+    found = json.loads(json.dumps(GOOD))
+    if where == "all":
+        found = value
+    elif where == "entry":
+        found["push"] = value
+    elif where in ("objects", "object"):
+        found["push"]["task"]["objects"] = value if where == "objects" else {"puck": value}
+    else:
+        found["push"][where] = value
+    with pytest.raises(PlanError) as caught:
+        Plans.from_json(found)
+    assert len(str(caught.value)) < 1000
+
+
+@pytest.mark.parametrize(
+    ("found", "says"),
+    [
+        ({"pusch": {"plan": "def pusch(robot):"}}, "did you mean 'push'"),
+        ({"../push": {"plan": "", "task": GOOD["push"]["task"]}}, "lower-case words"),
+        ({"push": {"plan": "def push(robot):\n  import os"}}, "line 2"),
+        ({"push": {"plan": str(MT10_PLANS["reach"])}}, "'reach' is no task"),
+        ({"push": {"plan": "def push(robot):\n  if check('\ud800'):"}}, "line 2"),
+        ({"push": {"plan": "x" * 10**6}}, "line 1"),
+        ({3: {"plan": ""}}, "plan of 3"),
+        ({("push",): {"plan": ""}}, "plan of"),
+    ],
+)
+def test_json_of_no_plan_says_what_is_wrong(found, says):
+    with pytest.raises(PlanError, match=says) as caught:
+        Plans.from_json(found)
+    assert len(str(caught.value)) < 1000
+
+
+def test_formats_by_name():
+    assert list(PLAN_FORMATS) == ["chain_py"]
+    for plan in MT10_PLANS.values():
+        text = PLAN_FORMATS["chain_py"].encode(plan)
+        assert text == str(plan)
+        assert PLAN_FORMATS["chain_py"].decode(text, plan.task) == plan
+    with pytest.raises(TypeError):
+        PLAN_FORMATS["mine"] = PLAN_FORMATS["chain_py"]
+
+
+def test_the_types_can_be_imported_first(python):
+    for module in ("plans", "formats", "formats.chain_py"):
+        assert python(f"import lw_torchrl.language.{module}").returncode == 0
