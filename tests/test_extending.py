@@ -72,7 +72,7 @@ class LearnedTaskActor(lw.Policy):
         self.in_keys, self.out_keys = ["observation", "task_id"], ["action"]
         self.index = TaskIndex(self.tasks)
         self.vectors = nn.Embedding(len(self.tasks), size)
-        self.decoder = ActionDecoder(size, "raw", 0.0, width, 1)
+        self.decoder = ActionDecoder(size, "differences", 0.0, width, 1)
 
     @classmethod
     def for_plans(cls, plans, *, text_encoder=None, **options):
@@ -136,7 +136,7 @@ def replay(plans):
 
 
 def trained(actor, replay, path):
-    config = lw.BehavioralCloningConfig(steps=150, batch_size=64, learning_rate=3e-3)
+    config = lw.BehavioralCloningConfig(steps=300, batch_size=64, learning_rate=3e-3)
     trainer = lw.BehavioralCloningTrainer(actor, replay, config, checkpoint=path, progress=False)
     assert trainer.train() < 0.5
     return actor
@@ -163,11 +163,18 @@ def test_it_is_trained_saved_loaded_evaluated_and_recorded(kind, plans, replay, 
     for (name, ours), (other, found) in zip(actor.state_dict().items(), loaded.state_dict().items(), strict=True):
         assert name == other
         assert torch.equal(ours, found)
+    definitions = [plan.definition for plan in plans.values()]
     result = lw.evaluate(
-        loaded, tasks=plans, episodes_per_task=10, seed=1_000, engine=PointEngine, max_steps=STEPS, noise_scale=0.0
+        loaded,
+        tasks=definitions,
+        episodes_per_task=10,
+        seed=1_000,
+        engine=PointEngine,
+        max_steps=STEPS,
+        noise_scale=0.0,
     )
     assert result.success_once["touch-the-block"] >= 0.8
-    rollouts = rollout_tasks(loaded, plans, seed=1_000, engine=PointEngine, max_steps=STEPS)
+    rollouts = rollout_tasks(loaded, definitions, seed=1_000, engine=PointEngine, max_steps=STEPS)
     write_recording(tmp_path / "rollout.rrd", loaded, rollouts)
     assert (tmp_path / "rollout.rrd").stat().st_size > 10_000
     if kind == "evaluator":
