@@ -106,6 +106,9 @@ class DescriptorConditionedActor(Policy):
     ) -> DescriptorConditionedActor:
         return cls([plan.definition for plan in plans.values()], text_encoder=text_encoder, **options)
 
+    def definition(self, task: str) -> Task | None:
+        return self.definitions.get(task)
+
     def prepare(self, tensordict: TensorDictBase) -> tuple[Tensor, ...]:
         """What no trained parameter touches: each task's row (B,) int64, and the observation's features (B, F)."""
         observation, task_id = self.read(tensordict)

@@ -14,6 +14,7 @@ from torchrl.envs import Transform
 
 from lw_torchrl._checks import check_choice, missing_keys
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
+from lw_torchrl.language.tasks import TASKS, Task
 from lw_torchrl.transforms.qaf import QAFTransform
 
 TextEncoding = Callable[[Sequence[str]], Tensor]
@@ -75,6 +76,10 @@ class Policy(TensorDictModuleBase):
     def for_plans(cls, plans: Plans, *, text_encoder: TextEncoding | None = None, **options: Any) -> Policy:
         """One for the tasks of ``plans``."""
         raise NotImplementedError(f"{cls.__name__} must say how it is made for plans: override for_plans")
+
+    def definition(self, task: str) -> Task | None:
+        """What the policy knows of a task: its plan's definition, or the shipped one; None if it knows none."""
+        return TASKS.get(task) if self.plans is None else self.plans[task].definition
 
     def transform(self) -> Transform | None:
         """A new transform that writes what the policy reads and the environment does not give; None for none."""

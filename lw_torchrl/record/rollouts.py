@@ -15,7 +15,7 @@ from lw_torchrl.envs.episodes import in_blocks, run_episodes
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.evaluation.protocol import make_env, tasks_of
 from lw_torchrl.language.plans import ConditionalPlan
-from lw_torchrl.language.tasks import TASKS, Task
+from lw_torchrl.language.tasks import Task
 from lw_torchrl.modules.policy import Policy, plans_of
 from lw_torchrl.record.rerun_logger import RerunLogger
 
@@ -66,12 +66,11 @@ def write_recording(
     rollouts: dict[str, TensorDictBase],
 ) -> None:
     """Write rollouts to a rerun file, each with its plan where there is one; the file is replaced whole."""
-    plans = plans_of(actor)
     with RerunLogger(path) as logger:
         for task, rollout in rollouts.items():
-            plan = None if plans is None else plans[task]
-            definition = TASKS[task] if plan is None else plan.definition
-            objects = definition.positions(rollout.get("observation"))
+            definition = actor.definition(task)
+            objects = {} if definition is None else definition.positions(rollout.get("observation"))
+            plan = None if actor.plans is None else actor.plans[task]
             logger.log_episode(rollout, task=task, objects=objects, plan=plan)
 
 
