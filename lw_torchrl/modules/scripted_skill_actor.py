@@ -20,8 +20,9 @@ from lw_torchrl.language.task_index import TaskIndex
 class ScriptedSkillActor(TensorDictModuleBase):
     """Runs the skill of a true step of the plan; where none is true, that of the last step.
 
-    Reads ``observation`` (B, 39) float32, ``task_id`` (B,) int64 and ``qaf`` (B, S) bool; writes ``action`` (B, 4)
-    float32 in [-1, 1] and ``skill_weights`` (B, S) float32, which sum to 1.
+    Reads ``observation`` (B, 39) float32, ``task_id`` (B,) int64 and ``qaf`` (B, S) bool, or float in [0, 1] for soft
+    truth; writes ``action`` (B, 4) float32 in [-1, 1] and ``skill_weights`` (B, S) float32, which sum to 1. A step of
+    soft truth is true above 0.5, whatever ``select`` is, as its hard truth would be.
 
     Args:
         plans: a plan for each task it is to act in; every step's skill is the text of a scripted one.
@@ -71,6 +72,8 @@ class ScriptedSkillActor(TensorDictModuleBase):
         return ScriptedSkillActor(plans, self.select, skills=self._skills, seed=self._generator.initial_seed())
 
     def _weights(self, qaf: Tensor, task_id: Tensor) -> Tensor:
+        if qaf.dtype != torch.bool:
+            qaf = qaf > 0.5
         rows = self.index.rows(task_id, f"tasks without a plan in {self.plans!r}")
         last = torch.nn.functional.one_hot(self._last.to(rows.device)[rows], qaf.shape[-1]).bool()
         true = torch.where(qaf.any(-1, keepdim=True), qaf, last).float()
@@ -85,7 +88,7 @@ class ScriptedSkillActor(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         observation, given, qaf = (tensordict.get(key) for key in self.in_keys)
-        weights = self._weights(qaf.bool(), given)
+        weights = self._weights(qaf, given)
         actions = self.program(observation, given)
         tensordict.set("skill_weights", weights)
         return tensordict.set("action", (weights.unsqueeze(-1) * actions).sum(-2))
