@@ -120,15 +120,7 @@ RELATIONS = Relations(
         "forward aligned with": (_within("xz", 0.03),),
     }
 )
-"""The relations between two objects: the 13 published ones, and those that you add.
-
-Example:
-    >>> RELATIONS["beside"] = (Comparison("xy", "<", 0.1), Comparison("z", "<", 0.02, length=False))
-    >>> from lw_torchrl.language.queries import parse_query
-    >>> str(parse_query("gripper beside puck", "push"))
-    "the robot's gripper is beside the puck"
-    >>> del RELATIONS["beside"]
-"""
+"""The relations between two objects: the 13 published ones, and those that you add (docs/queries.md shows how)."""
 PUBLISHED = tuple(RELATIONS)
 """The names of the 13."""
 

@@ -23,8 +23,9 @@ from lw_torchrl.transforms.qaf import QAFTransform
 class ScriptedSkillActor(Policy):
     """Runs the skill of a true step of the plan; where none is true, that of the last step.
 
-    Reads ``observation`` (B, 39) float32, ``task_id`` (B,) int64 and ``qaf`` (B, S) bool; writes ``action`` (B, 4)
-    float32 in [-1, 1] and ``skill_weights`` (B, S) float32, which sum to 1.
+    Reads ``observation`` (B, 39) float32, ``task_id`` (B,) int64 and ``qaf`` (B, S) bool, or float in [0, 1] for soft
+    truth; writes ``action`` (B, 4) float32 in [-1, 1] and ``skill_weights`` (B, S) float32, which sum to 1. A step of
+    soft truth is true above 0.5, whatever ``select`` is, as its hard truth would be.
 
     Args:
         plans: a plan for each task it is to act in; every step's skill is the text of a scripted one.
@@ -96,6 +97,8 @@ class ScriptedSkillActor(Policy):
         return cls(Plans.from_json(found["plans"]), **found["options"])
 
     def _weights(self, qaf: Tensor, task_id: Tensor) -> Tensor:
+        if qaf.dtype != torch.bool:
+            qaf = qaf > 0.5
         rows = self.index.rows(task_id, f"tasks without a plan in {self.plans!r}")
         last = torch.nn.functional.one_hot(self._last.to(rows.device)[rows], qaf.shape[-1]).bool()
         true = torch.where(qaf.any(-1, keepdim=True), qaf, last).float()
@@ -111,7 +114,7 @@ class ScriptedSkillActor(Policy):
     def prepare(self, tensordict: TensorDictBase) -> tuple[Tensor, ...]:
         """The weights (B, S), and the action of each step's skill (B, S, 4)."""
         observation, given, qaf = self.read(tensordict)
-        return self._weights(qaf.bool(), given), self.program(observation, given)
+        return self._weights(qaf, given), self.program(observation, given)
 
     def act(self, *prepared: Tensor) -> tuple[Tensor, Tensor]:
         """From what :meth:`prepare` gives: action (B, 4), and the weights."""

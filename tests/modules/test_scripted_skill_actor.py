@@ -50,6 +50,22 @@ def test_random_takes_any_true_step_equally_often_and_hangs_on_its_seed():
     assert not torch.equal(weights, acting("random", qaf, seed=4)[0])
 
 
+@pytest.mark.parametrize("select", ["first", "mix", "random"])
+def test_soft_truth_is_true_above_a_half(select):
+    soft = [[0.1, 0.9, 0.4, 0.0], [0.6, 0.9, 0.1, 0.5], [0.5, 0.4, 0.1, 0.0]]
+    weights = acting(select, soft, seed=5)[0]
+    assert torch.equal(weights, acting(select, [[truth > 0.5 for truth in row] for row in soft], seed=5)[0])
+    assert weights[0].tolist() == [0.0, 1.0, 0.0, 0.0]
+    assert weights[2].tolist() == [0.0, 0.0, 0.0, 1.0]
+
+
+def test_a_task_without_a_plan_is_named():
+    actor = lw.ScriptedSkillActor({"push": PLANS["push"]})
+    state = {"observation": torch.zeros(1, 39), "task_id": torch.tensor([0]), "qaf": torch.ones(1, 4).bool()}
+    with pytest.raises(ValueError, match=r"tasks without a plan.*: assembly"):
+        actor(TensorDict(state, [1]))
+
+
 def test_padding_gets_no_weight():
     plans = lw.load_plans("MT10")
     env_steps = plans.num_steps

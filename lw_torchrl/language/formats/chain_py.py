@@ -110,9 +110,8 @@ def check_plan(
         The plan, None if it has faults; and the faults, in the order of the lines.
 
     Example:
-        >>> plan, faults = check_plan("def reach(robot):\n  if check('gripper flies'):\n    robot.wait()\nreturn")
-        >>> [fault.split(":")[0] for fault in faults]
-        ['plan, line 2', 'plan, line 4']
+        >>> check_plan("nonsense")
+        (None, ["plan, line 1: expected 'def task_name(robot):' before 'nonsense'"])
     """
     faults, reading = [], _read(text, task, source, tasks)
     while True:
