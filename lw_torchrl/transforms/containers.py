@@ -35,6 +35,12 @@ def refuse_changed(transform: Transform, key: NestedKey) -> None:
             )
 
 
+def transforms_beside(transform: Transform) -> int:
+    """How many transforms its Compose has, 0 where it is in none: the cheap sign that one was put there."""
+    container = _container(transform)
+    return len(container.transforms) if isinstance(container, Compose) else 0
+
+
 def _before(transform: Transform) -> list[Transform]:
     found: list[Transform] = []
     inner, container = transform, _container(transform)

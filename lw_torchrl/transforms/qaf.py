@@ -16,7 +16,7 @@ from lw_torchrl._checks import missing_keys
 from lw_torchrl._keys import as_keys
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.query_program import QueryProgram
-from lw_torchrl.transforms.containers import base_env, refuse_changed
+from lw_torchrl.transforms.containers import base_env, refuse_changed, transforms_beside
 from lw_torchrl.transforms.env_state import KeepsEnvState
 
 
@@ -67,6 +67,7 @@ class QAFTransform(KeepsEnvState):
         )
         self.plans = as_plans(plans)
         self.program = plan_program(self.plans)
+        self._beside = 0
 
     def _write(self, tensordict: TensorDictBase, task_id: Tensor | None) -> None:
         observation = tensordict.get(self.in_keys[0], None)
@@ -83,12 +84,15 @@ class QAFTransform(KeepsEnvState):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``qaf``, and ``("next", "qaf")`` where there is a next observation."""
-        refuse_changed(self, self.in_keys[0])
-        task_id = tensordict.get(self.in_keys[1], None)
+        if (beside := transforms_beside(self)) != self._beside:  # something was put there later
+            refuse_changed(self, self.in_keys[0])
+            self._beside = beside
+        observation, task = self.in_keys
+        task_id = tensordict.get(task, None)
         self._write(tensordict, task_id)
         following = tensordict.get("next", None)
-        if following is not None and following.get(self.in_keys[0], None) is not None:
-            self._write(following, following.get(self.in_keys[1], task_id))
+        if following is not None and following.get(observation, None) is not None:
+            self._write(following, following.get(task, task_id))
         return tensordict
 
     def set_container(self, container: Transform | EnvBase) -> None:
