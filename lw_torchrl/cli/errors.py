@@ -16,7 +16,7 @@ OWN_NAMES = {
     "scripted": {"episodes_per_task": "episodes", "noise_scale": "noise", "tasks": "names"},
     "tasks": {"tasks": "names"},
     "plans": {"tasks": "names"},
-    "skills": {"skills": "file"},
+    "skills": {"skills": "skill_file"},
     "check": {"plans": "file"},
     "reproduce": {"episodes_per_task": "episodes", "root": "out", "checkpoint": "out"},
 }

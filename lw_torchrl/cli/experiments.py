@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, cast
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Literal, cast
 from tyro.conf import Positional
 
 from lw_torchrl.cli.outputs import check_folder
+from lw_torchrl.cli.sources import read_plans, read_tasks
 
 if TYPE_CHECKING:
     from lw_torchrl.experiments.runs import Dataset, Run
@@ -27,7 +28,8 @@ def reproduce(
     methods: tuple[Method, ...] | None = None,
     preset: Literal["strong", "paper"] = "strong",
     passes: int | None = None,
-    plans: Path | None = None,
+    plans: tuple[str, ...] = (),
+    task_file: Path | None = None,
     episodes: int = 20,
     launcher: Literal["local", "ray"] = "local",
     jobs: int = 1,
@@ -51,7 +53,9 @@ def reproduce(
             default all; with --plans, those that are trained.
         preset: ours, or the published recipe, which takes hours.
         passes: over the rows, fewer than the 500 of the preset paper.
-        plans: a folder of plans for all 50 tasks, or a .json file of pairs, instead of ours.
+        plans: of all 50 tasks, instead of ours: .plan files, .json files of pairs, folders, or MT50; where several have
+            a plan for a task, the last one's counts.
+        task_file: tasks of yours, whose objects and points the plans may name.
         episodes: evaluated for each task, on seeds that no training used, action noise 0.1.
         launcher: local, on this machine; ray, on a Ray cluster, or on all cores of this machine.
         jobs: runs run at a time by the launcher local.
@@ -76,11 +80,11 @@ def reproduce(
             raise ValueError("--passes is for --preset paper; ours counts minibatches")
         recipes = {name: replace(recipe, passes=passes) for name, recipe in recipes.items()}
     if methods is None:
-        methods = cast("tuple[Method, ...]", (*METHODS, *([SCRIPTED] if plans is None else [])))
+        methods = cast("tuple[Method, ...]", (*METHODS, *([] if plans else [SCRIPTED])))
     if experiment == SCRIPTED:
         methods = (SCRIPTED,)  # type: ignore[assignment]
     assert methods is not None
-    plans_name = "" if plans is None else plans.stem
+    plans_name = "+".join(Path(source).stem for source in plans)
     runs = [
         Run(SETTINGS[name], method, seed, recipes[name], episodes, plans_name)
         for name in (["few-shot"] if experiment == "scripted" else SETTINGS)
@@ -93,7 +97,7 @@ def reproduce(
     if list:
         print("\n".join([*datasets, *named]))
         return
-    load = _Plans(plans)
+    load = _Plans(plans, task_file)
     use_one_thread()
     if run in datasets:
         datasets[run].collect(out, progress=True)
@@ -107,7 +111,8 @@ def reproduce(
             given = [experiment, "--preset", preset, "--episodes", str(episodes), "--out", str(out)]
             given += ["--seeds", *map(str, seeds), "--methods", *methods]
             given += [] if passes is None else ["--passes", str(passes)]
-            given += [] if plans is None else ["--plans", str(plans)]
+            given += ["--plans", *plans] if plans else []
+            given += [] if task_file is None else ["--task-file", str(task_file)]
             for stage in (datasets, named):
                 _report(len(stage), _there(stage, given, launcher, jobs))
         _summarize(runs, load, out)
@@ -116,17 +121,15 @@ def reproduce(
 class _Plans:
     """The plans that a run uses, each set read once."""
 
-    def __init__(self, source: Path | None) -> None:
-        self.source = source
+    def __init__(self, sources: Sequence[str], task_file: Path | None) -> None:
+        self.sources, self.tasks = sources, read_tasks(task_file)
         self.known: dict[str, Plans] = {}
 
     def __call__(self, run: Run) -> Plans:
-        from lw_torchrl.language.plan_files import load_plans
-
         zero_shot = run.setting.name == "zero-shot" and run.method != "scripted"
         skills: Literal["MT10", "own"] = "MT10" if zero_shot else "own"
         if skills not in self.known:
-            self.known[skills] = load_plans("MT50", skills=skills) if self.source is None else load_plans(self.source)
+            self.known[skills] = read_plans(self.sources or ["MT50"], self.tasks, skills)
         return self.known[skills]
 
 

@@ -16,7 +16,9 @@ from lw_torchrl import __version__
 from lw_torchrl.cli import experiments as cli_experiments
 from lw_torchrl.cli import language as cli_language
 from lw_torchrl.cli import policies, show
+from lw_torchrl.cli.check import check
 from lw_torchrl.cli.errors import in_its_words
+from lw_torchrl.cli.scripted import scripted
 from lw_torchrl.cli.streams import check_arguments, complain, nobody_reads, sound_streams
 
 COMMANDS: dict[str, Any] = {
@@ -26,12 +28,12 @@ COMMANDS: dict[str, Any] = {
     "evaluate": policies.evaluate,
     "view": show.view,
     "query": show.query,
-    "scripted": cli_language.scripted,
+    "scripted": scripted,
     "tasks": cli_language.tasks,
     "queries": cli_language.queries,
     "skills": cli_language.skills,
     "plans": cli_language.plans,
-    "check": cli_language.check,
+    "check": check,
     "reproduce": cli_experiments.reproduce,
 }
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from tyro.conf import Positional
 
 from lw_torchrl.cli.outputs import check_file, check_folder
-from lw_torchrl.cli.sources import make_logger, read_encoder, read_plans, read_tasks
+from lw_torchrl.cli.sources import make_logger, one_or_many, read_encoder, read_plans, read_tasks
 from lw_torchrl.cli.threads import use_one_thread
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ def collect(
     from lw_torchrl.data import collect_demonstrations
 
     made = collect_demonstrations(
-        tasks[0] if len(tasks) == 1 else tasks,
+        one_or_many(tasks),
         episodes_per_task=episodes,
         root=out,
         seed=seed,
@@ -123,7 +123,7 @@ def train(
     config = lw.BehavioralCloningConfig(steps=steps, batch_size=batch_size, learning_rate=learning_rate, seed=seed)
     replay = lw.LanguageWorldExperienceReplay(
         data,
-        episodes=_all_of(data, lw.resolve_tasks(_one_or_many(tasks), tasks=known)) if tasks else None,
+        episodes=_all_of(data, lw.resolve_tasks(one_or_many(tasks), tasks=known)) if tasks else None,
         sampler=lw.TaskBalancedSampler(),
         after_success=after_success,
     )
@@ -135,11 +135,6 @@ def train(
     writes = None if logger is None else make_logger(logger, out)
     loss = lw.BehavioralCloningTrainer(actor, replay, config, checkpoint=out, logger=writes).train()
     print(f"trained to step {steps}" + ("" if loss != loss else f", loss {loss:.4f}") + f": {out}")
-
-
-def _one_or_many(tasks: tuple[str, ...]) -> str | tuple[str, ...]:
-    """MT10 is a set, not a list of one name."""
-    return tasks[0] if len(tasks) == 1 else tasks
 
 
 def _all_of(data: Path, tasks: tuple[str, ...]) -> dict[str, list[int]]:
@@ -192,7 +187,7 @@ def evaluate(
     policy = None
     if str(checkpoint) != "expert":
         policy = _load(checkpoint, seed, given, text_encoder)
-    chosen = _one_or_many(tasks) or (policy.tasks if policy is not None else "MT10")
+    chosen = one_or_many(tasks) or (policy.tasks if policy is not None else "MT10")
     result = lw.evaluate(
         policy or lw.ExpertActor(chosen),
         tasks=chosen,

@@ -16,6 +16,11 @@ if TYPE_CHECKING:
     from lw_torchrl.language.tasks import Task
 
 
+def one_or_many(names: tuple[str, ...]) -> str | tuple[str, ...]:
+    """MT10 is a set, not a list of one name."""
+    return names[0] if len(names) == 1 else names
+
+
 def read_tasks(task_file: Path | None) -> Mapping[str, Task]:
     """The 50 tasks, with those of --task-file in their place or beside them."""
     from lw_torchrl.language.tasks import TASKS, load_tasks

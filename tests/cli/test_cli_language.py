@@ -40,7 +40,7 @@ def test_skills_of_a_task_and_the_nearest(capsys):
 def test_plans_are_printed_as_they_are_written(capsys):
     assert run(capsys, "plans", "drawer-open").strip() == str(lw.load_plans("MT10")["drawer-open"]).strip()
     assert "50 plans" in run(capsys, "plans")
-    assert "robot." in run(capsys, "plans", "hammer", "--skills", "MT10")
+    assert "robot." in run(capsys, "plans", "hammer", "--skill-set", "MT10")
 
 
 def test_queries_and_the_nearest(capsys):
@@ -122,12 +122,12 @@ def test_ones_own_skills_and_tasks(capsys, tmp_path):
     assert "2 skills, valid" in out
     plan = tmp_path / "push.plan"
     plan.write_text(PLAN)
-    assert "note" not in run(capsys, "check", plan, "--skills", skills)
+    assert "note" not in run(capsys, "check", plan, "--skill-file", skills)
     tasks = tmp_path / "tasks.toml"
     tasks.write_text('[push]\ndescription = "Push the disc."\nobjects.disc = "obs[4:7]"\n')
     assert "1 tasks, valid" in run(capsys, "check", tasks)
     plan.write_text(PLAN.replace("puck", "disc"))
-    assert "push.plan: 2 steps, valid" in run(capsys, "check", plan, "--tasks", tasks)
+    assert "push.plan: 2 steps, valid" in run(capsys, "check", plan, "--task-file", tasks)
     skills.write_text('["wipe it"]\ntarget = "rag"\nfor.wipe.gripper = 1.0\n')
     tasks.write_text(
         '[wipe]\ndescription = "Wipe."\nobjects.rag = "obs[4:7]"\n[psh]\ndescription = "Push."\nobjects.a = "obs[4:7]"'
@@ -135,7 +135,7 @@ def test_ones_own_skills_and_tasks(capsys, tmp_path):
     out = run(capsys, "check", tasks)
     assert "note: task 'psh' is none of the simulator's; did you mean 'push'?" in out
     assert "2 tasks, valid" in out
-    assert run(capsys, "check", skills, "--tasks", tasks) == "skills.toml: 1 skills, valid\n"
+    assert run(capsys, "check", skills, "--task-file", tasks) == "skills.toml: 1 skills, valid\n"
     assert "'wipe'" in fails(capsys, "check", skills)
     tasks.write_text('[psh]\ndescription = "Push the disc."\n')
     assert "did you mean" in fails(capsys, "check", tasks)
