@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
 
 from lw_torchrl._checks import missing_keys
+from lw_torchrl._keys import as_keys
 from lw_torchrl.envs.engine import ACTION_SIZE, OBSERVATION_SIZE
 from lw_torchrl.envs.engines.metaworld import import_metaworld
 from lw_torchrl.language.tasks import resolve_tasks, task_id
@@ -25,6 +27,7 @@ class ExpertActor(TensorDictModuleBase):
 
     Args:
         tasks: the tasks it must know, as for :func:`resolve_tasks`.
+        in_keys, out_keys: other names for what it reads and writes, in the order above; nested ones too.
 
     Raises:
         ValueError: an unknown task, or at call time a task_id outside ``tasks``.
@@ -39,20 +42,26 @@ class ExpertActor(TensorDictModuleBase):
     Source: ``metaworld.policies``.
     """
 
-    in_keys = ["observation", "task_id"]
-    out_keys = ["action", "unclipped_action"]
     row_by_row = True  # no network: its rows need no blocks of one size
 
-    def __init__(self, tasks: str | Iterable[str]) -> None:
+    def __init__(
+        self,
+        tasks: str | Iterable[str],
+        *,
+        in_keys: Sequence[NestedKey] | None = None,
+        out_keys: Sequence[NestedKey] | None = None,
+    ) -> None:
         super().__init__()
+        self.in_keys = as_keys("in_keys", in_keys, ("observation", "task_id"))
+        self.out_keys = as_keys("out_keys", out_keys, ("action", "unclipped_action"))
         self.tasks = resolve_tasks(tasks)
         policies = import_metaworld().policies.ENV_POLICY_MAP
         self._policies = {task_id(task): policies[f"{task}-v3"]() for task in self.tasks}
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        observation, given = tensordict.get("observation", None), tensordict.get("task_id", None)
+        observation, given = (tensordict.get(key, None) for key in self.in_keys)
         if observation is None or given is None:
-            raise missing_keys(tensordict.keys(), "observation", "task_id")
+            raise missing_keys(tensordict.keys(True, True), *self.in_keys)
         if observation.shape[-1:] != (OBSERVATION_SIZE,):
             raise ValueError(f"observation must have 39 numbers, got shape {tuple(observation.shape)}")
         if given.shape != observation.shape[:-1]:
@@ -75,5 +84,5 @@ class ExpertActor(TensorDictModuleBase):
                     raise ValueError(f"task_id {task} is none of this expert's tasks: {', '.join(self.tasks)}")
                 action[row] = self._policies[task].get_action(state)
         asked = torch.from_numpy(action).to(observation.device).reshape(*observation.shape[:-1], ACTION_SIZE)
-        tensordict.set("unclipped_action", asked)
-        return tensordict.set("action", asked.clamp(-1.0, 1.0))
+        tensordict.set(self.out_keys[1], asked)
+        return tensordict.set(self.out_keys[0], asked.clamp(-1.0, 1.0))

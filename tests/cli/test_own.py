@@ -1,0 +1,118 @@
+"""Tasks, plans, skills and text encoders of one's own, by the same options in every command."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from commands import fails, run
+
+import lw_torchrl as lw
+
+TASKS = """
+[reach]
+description = "Bring the hand to the ball."
+objects.ball = "obs[36:39]"
+"""
+PLAN = """
+def reach(robot):
+    if check("the gripper is not near the ball"):
+        robot.go("to the ball")
+    if check("the gripper is near the ball"):
+        robot.wait("at the ball")
+"""
+SKILLS = """
+["go to the ball"]
+target = "ball"
+["wait at the ball"]
+target = "ball"
+gain = 0.0
+"""
+ENCODER = """
+import torch
+def encode(texts):
+    return torch.tensor([[float(text.count(letter)) for letter in "abelot"] for text in texts])
+def other(texts):
+    return encode(texts).flip(-1)
+number = 3
+"""
+TINY = ("--steps", 5, "--width", 8, "--depth", 1)
+
+
+@pytest.fixture(scope="module")
+def own(tmp_path_factory):
+    """A folder with files of one's own."""
+    folder = tmp_path_factory.mktemp("own")
+    (folder / "tasks.toml").write_text(TASKS)
+    (folder / "reach.plan").write_text(PLAN)
+    (folder / "skills.toml").write_text(SKILLS)
+    (folder / "my_texts.py").write_text(ENCODER)
+    lw.collect_demonstrations(
+        ["push", "reach"], episodes_per_task=1, root=folder / "demos", max_steps=30, progress=False
+    )
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def there(own, monkeypatch):
+    monkeypatch.chdir(own)
+
+
+def test_lists_speak_of_them(capsys):
+    assert "Bring the hand to the ball." in run(capsys, "tasks", "reach", "--task-file", "tasks.toml")
+    files = ("--task-file", "tasks.toml")
+    assert "go to the ball" in run(capsys, "skills", "reach", "--skill-file", "skills.toml", *files)
+    assert "the ball" in run(capsys, "queries", "reach", *files)
+    assert "robot.go" in run(capsys, "plans", "reach", "--plans", "reach.plan", *files)
+    assert "yes: the robot's gripper is not near the ball" in run(
+        capsys, "query", "reach", "the gripper is not near the ball", *files
+    )
+    assert "reach.plan: 2 steps, valid" in run(capsys, "check", "reach.plan", "--skill-file", "skills.toml", *files)
+    assert "reach.plan, line 3" in fails(capsys, "plans", "--plans", "reach.plan")
+
+
+def test_of_several_sources_the_later_one_counts(capsys, tmp_path):
+    (tmp_path / "push.plan").write_text(str(lw.load_plans("MT10")["push"]).replace("robot.place", "robot.bring"))
+    ours, theirs = "robot.place", "robot.bring"
+    for sources, has, lacks in ((["MT10", tmp_path], theirs, ours), ([tmp_path, "MT10"], ours, theirs)):
+        shown = run(capsys, "plans", "push", "--plans", *sources)
+        assert has in shown
+        assert lacks not in shown
+
+
+def test_scripts_carry_them_out(capsys, tmp_path):
+    files = ("--plans", "reach.plan", "--skill-file", "skills.toml", "--task-file", "tasks.toml")
+    out = run(capsys, "scripted", "reach", *files, "--episodes", 3, "--out", tmp_path / "out")
+    assert "reach: success 1.00" in out
+    found = json.loads((tmp_path / "out" / "results.json").read_text())
+    assert len(found["origin"]["plans"]) == 32
+
+
+def test_a_policy_is_trained_and_evaluated_with_them(capsys, tmp_path):
+    policy = tmp_path / "policy.zip"
+    files = ("--plans", "reach.plan", "--task-file", "tasks.toml", "--text-encoder", "my_texts:encode")
+    training = (*TINY, "--batch-size", 8, "--logger", "csv")
+    run(capsys, "train", "demos", "--out", policy, "--tasks", "reach", *files, *training)
+    assert list((tmp_path / "logs").rglob("*.csv"))
+    assert "pass that one as --text-encoder" in fails(capsys, "evaluate", policy, "--text-encoder", "my_texts:other")
+    run(
+        capsys, "evaluate", policy, "--text-encoder", "my_texts:encode", "--episodes", 1, "--out", tmp_path / "out",
+        "--stop-at-success",
+    )  # fmt: skip
+    found = json.loads((tmp_path / "out" / "results.json").read_text())
+    assert found["origin"]["checkpoint"]["path"] == str(policy)
+    assert found["origin"]["versions"]["torchrl"]
+    assert (tmp_path / "out" / "rollout.rrd").is_file()
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("my_texts", "--text-encoder must be like my_texts:encode"),
+        ("my_texts:nothing", "names no function"),
+        ("nowhere:encode", "names no function: No module named 'nowhere'"),
+        ("my_texts:number", "must name a function, it names int"),
+    ],
+)
+def test_an_encoder_that_is_none_is_refused(capsys, tmp_path, name, message):
+    assert message in fails(capsys, "train", "demos", "--out", tmp_path / "p.zip", "--text-encoder", name, *TINY)
