@@ -234,9 +234,9 @@ def wrong_states() -> dict[str, tuple[dict[str, Tensor], str]]:
         ),
         "NaN": ({"observation": nan, "task_id": reach}, "observation must hold finite numbers, got NaN"),
         "infinite": ({"observation": infinite, "task_id": reach}, "observation must hold finite numbers"),
-        "no plan": ({"observation": observation, "task_id": unknown}, r"task_id holds .*\(soccer\)"),
-        "too large": ({"observation": observation, "task_id": outside}, "task_id holds 50"),
-        "negative": ({"observation": observation, "task_id": reach - 100}, "task_id holds -"),
+        "no plan": ({"observation": observation, "task_id": unknown}, r"task_id names tasks without queries.*: soccer"),
+        "too large": ({"observation": observation, "task_id": outside}, r"task_id names tasks without queries.*: 50"),
+        "negative": ({"observation": observation, "task_id": reach - 100}, r"task_id names tasks without queries.*: -"),
         "float id": (
             {"observation": observation, "task_id": reach.float()},
             "task_id must be int64.* got torch.float32",
