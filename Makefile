@@ -6,8 +6,8 @@
 # make test-python PYTHON=python3.13   the suite under another interpreter, in an environment of its own
 #
 # On Linux pip's own torch brings gigabytes of CUDA. For the small one, or for another CUDA, name PyTorch's index when the
-# environment is first made (https://pytorch.org/get-started/locally/ has the list):
-#     make setup TORCH_INDEX=https://download.pytorch.org/whl/cpu
+# environment is first made, as https://pytorch.org/get-started/locally/ shows it for your machine:
+#     make setup TORCH_INDEX=ADDRESS
 PYTHON ?= python3
 VENV ?= .venv
 JOBS ?= 2
