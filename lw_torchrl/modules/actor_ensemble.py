@@ -88,7 +88,7 @@ class ActorEnsemble(Policy):
     @classmethod
     def from_description(cls, found: Mapping[str, Any], text_encoder: TextEncoding | None = None) -> ActorEnsemble:
         members = found["members"]
-        if not isinstance(members, list) or any(one.get("kind") == "ActorEnsemble" for one in members):
+        if not isinstance(members, list) or cls.__name__ in [one.get("kind") for one in members]:
             raise ValueError("members of an ensemble must be a list of policies that are no ensembles")
         return cls([from_description(member, text_encoder) for member in members])
 
