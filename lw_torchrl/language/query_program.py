@@ -160,13 +160,10 @@ class QueryProgram:
         in_order = dict(sorted(compiled.items(), key=lambda item: index.row(item[0].name)))
         tables = _compile(in_order)
         self._any_far = bool(tables.far.any())
-        self._tables = TaskTables(index, tables)
+        self._tables = TaskTables(index, tables, f"tasks without queries in {self!r}")
 
     def __repr__(self) -> str:
         return f"QueryProgram({len(self.tasks)} tasks, num_queries={self.num_queries})"
-
-    def _selected(self, observation: Tensor, task_id: Tensor) -> _Tables:
-        return self._tables.select(task_id.reshape(-1), observation, f"tasks without queries in {self!r}")
 
     def __call__(self, observation: Tensor, task_id: Tensor) -> Tensor:
         """Answer the queries.
@@ -182,7 +179,7 @@ class QueryProgram:
             ValueError: wrong shape or dtype, NaN or infinity in the observation, or a task without queries.
         """
         _check_batch(observation, task_id)
-        tables = self._selected(observation, task_id)
+        tables = self._tables.select(task_id.reshape(-1), observation)
         holds = (self._values(observation, tables) < tables.threshold) ^ tables.flipped
         # & of a few is far faster than all() over a short axis.
         clauses = reduce(torch.logical_and, self._parts(holds, tables)) ^ tables.negated
@@ -220,7 +217,7 @@ class QueryProgram:
         holds = self(observation.detach(), task_id)
         near = observation if observation.dtype in (torch.float32, torch.float64) else observation.float()
         near = near.clamp(-_MOST, _MOST)  # squares of larger numbers overflow
-        tables = self._selected(near, task_id)
+        tables = self._tables.select(task_id.reshape(-1), near)
         margin = (tables.threshold - self._values(near, tables, floor=_LEAST)) / tables.temperature / temperature
         clause = reduce(torch.minimum, self._parts(torch.where(tables.flipped, -margin, margin), tables))
         soft = torch.where(tables.negated, -clause, clause).amin(1).float().reshape(holds.shape)

@@ -85,7 +85,7 @@ class SkillProgram:
                 effort[t, s, 3] = skill.gripper
         fixed = torch.tensor([constants] * len(found), dtype=torch.float64)
         (target, moved), (gain, shift) = place.flatten(2).unbind(1), numbers.flatten(2).unbind(1)
-        self._tables = TaskTables(index, _Tables(target, moved, gain, shift, effort, fixed))
+        self._tables = TaskTables(index, _Tables(target, moved, gain, shift, effort, fixed), "tasks without skills")
 
     def __call__(self, observation: Tensor, task_id: Tensor) -> Tensor:
         """The action of each skill.
@@ -106,7 +106,7 @@ class SkillProgram:
                 f"observation must be of shape (..., {OBSERVATION_SIZE}) and task_id of (...), got "
                 f"{tuple(observation.shape)} and {tuple(task_id.shape)}"
             )
-        tables = self._tables.select(task_id.reshape(-1), observation, "tasks without skills")
+        tables = self._tables.select(task_id.reshape(-1), observation)
         state = torch.cat((observation.reshape(-1, OBSERVATION_SIZE), tables.constants), 1)
         way = state.gather(1, tables.target) - state.gather(1, tables.moved)
         shift = torch.addcmul(tables.shift, tables.gain, way).clamp_(-1.0, 1.0)

@@ -58,7 +58,8 @@ class Numbers(NamedTuple):
 
 
 def tables():
-    return TaskTables(TaskIndex(["push", "reach"]), Numbers(torch.tensor([[1], [2]]), torch.tensor([[0.1], [0.2]])))
+    numbers = Numbers(torch.tensor([[1], [2]]), torch.tensor([[0.1], [0.2]]))
+    return TaskTables(TaskIndex(["push", "reach"]), numbers, "tasks without numbers")
 
 
 class Reader(nn.Module):
@@ -67,7 +68,7 @@ class Reader(nn.Module):
         self.tables = tables()
 
     def forward(self, observation, task_id):
-        found = self.tables.select(task_id, observation, "tasks without numbers")
+        found = self.tables.select(task_id, observation)
         return found.whole + found.real
 
 
@@ -84,7 +85,7 @@ def test_what_is_kept_is_of_this_batch_dtype_and_mode():
         assert reader(STATES.double(), IDS).dtype == torch.float64
         with torch.inference_mode():
             reader(STATES, IDS)
-        selected = reader.tables.select(IDS, STATES, "")
+        selected = reader.tables.select(IDS, STATES)
         weight = torch.ones(3, 1, requires_grad=True)
         (weight * selected.real).sum().backward()  # refused of a table made in inference mode
     ids = IDS.clone()
