@@ -110,13 +110,15 @@ def test_no_warning_leaks_and_none_is_turned_off(states):
         np.apply_along_axis(script.get_action, -1, own)
 
 
-def test_it_reads_the_state_and_writes_the_action_alone(states):
+def test_it_reads_the_state_and_writes_the_action_clipped_and_not(states):
     expert = lw.ExpertActor("MT50")
     assert expert.in_keys == ["observation", "task_id"]
-    assert expert.out_keys == ["action"]
+    assert expert.out_keys == ["action", "unclipped_action"]
     given = states[:, 0].clone()
     out = expert(given)
-    assert set(out.keys()) == {"observation", "task_id", "action"}
+    assert set(out.keys()) == {"observation", "task_id", "action", "unclipped_action"}
+    assert torch.equal(out["action"], out["unclipped_action"].clamp(-1, 1))
+    assert out["unclipped_action"].abs().max() > 1
     assert torch.equal(out["observation"], states["observation"][:, 0])
 
 

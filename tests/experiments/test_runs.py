@@ -10,7 +10,8 @@ import lw_torchrl as lw
 from lw_torchrl.experiments import execution, training
 from lw_torchrl.experiments.execution import execute_run, load_result
 from lw_torchrl.experiments.recipes import PRESETS, SETTINGS, DataSetting, Execution, Member
-from lw_torchrl.experiments.runs import METHODS, Run
+from lw_torchrl.experiments.runs import SCRIPTED, Run
+from lw_torchrl.modules.policy import METHODS
 from lw_torchrl.trainers.checkpoint import demonstration_seeds
 
 PLANS = lw.load_plans("MT50")
@@ -48,8 +49,8 @@ def rates(path):
 
 
 RUNS = [
-    *(a_run(method) for method in METHODS),
-    *(a_run(method, setting=TINY_ONE_SHOT) for method in METHODS[:-1]),
+    *(a_run(method) for method in (*METHODS, SCRIPTED)),
+    *(a_run(method, setting=TINY_ONE_SHOT) for method in METHODS),
     *(
         a_run(method, setting=setting, preset=ENSEMBLE)
         for method in ("pcbc", "dc")

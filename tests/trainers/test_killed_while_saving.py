@@ -53,7 +53,7 @@ KILLER = """
     for k in range(moments):
         child = os.fork()
         if child == 0:
-            lines(1 + k * total // moments)
+            lines(1 + k * (total - 1) // (moments - 1))
             os._exit(0)
         status = os.waitpid(child, 0)[1]
         killed += os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL

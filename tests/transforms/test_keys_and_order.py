@@ -85,13 +85,13 @@ def test_a_sample_may_be_turned_elsewhere():
     torch.manual_seed(0)
     expected = lw.RandomYaw(0.5)(sample.clone())
     torch.manual_seed(0)
-    keys = [("robot", "state"), ("robot", "move"), ("robot", "expert")]
+    keys = [("robot", "state"), ("robot", "move"), ("robot", "expert"), ("robot", "unclipped")]
     found = lw.RandomYaw(0.5, in_keys=keys)(nested(sample))
     assert torch.equal(found["robot", "state"], expected["observation"])
     assert torch.equal(found["next", "robot", "state"], expected["next", "observation"])
     assert torch.equal(found["robot", "move"], expected["action"])
     torch.manual_seed(0)
-    beside = lw.RandomYaw(0.5, out_keys=["turned", "turned_action", "turned_expert_action"])(sample.clone())
+    beside = lw.RandomYaw(0.5, out_keys=["turned", "turned_action", "turned_expert", "turned_wish"])(sample.clone())
     assert torch.equal(beside["observation"], sample["observation"])
     assert torch.equal(beside["action"], sample["action"])
     assert torch.equal(beside["turned"], expected["observation"])

@@ -8,14 +8,13 @@ import torch
 from torchrl.envs import check_env_specs
 
 import lw_torchrl as lw
-from lw_torchrl.envs import language_world_env
 from lw_torchrl.envs.engine import EngineStep
 from lw_torchrl.envs.engines import ENGINES, make_engine
 from lw_torchrl.envs.episodes import run_episodes
-from lw_torchrl.envs.seeding import action_noise
+from lw_torchrl.envs.seeding import action_noise, episode_seed
 
-OWN_ID = 50 + 2**31 - 1
 STACK = lw.Task("stack-cups", "Stack the cups.", (*lw.TASKS["reach"].objects,))
+OWN_ID = lw.task_id("stack-cups")
 
 
 class Counting:
@@ -41,13 +40,6 @@ class Counting:
         pass
 
 
-@pytest.fixture(autouse=True)
-def own_ids(monkeypatch):
-    """Whatever the index of tasks gives, the greatest it may give."""
-    known = language_world_env.task_id
-    monkeypatch.setattr(language_world_env, "task_id", lambda name: OWN_ID if name == STACK.name else known(name))
-
-
 @pytest.mark.parametrize("tasks", [["reach", STACK], [STACK, "reach"], (t for t in (STACK, lw.TASKS["reach"]))])
 def test_a_task_of_ones_own_runs_beside_others(tasks):
     env = lw.LanguageWorldEnv(tasks, num_envs=3, seed=4, max_steps=5, engine=Counting)
@@ -58,9 +50,9 @@ def test_a_task_of_ones_own_runs_beside_others(tasks):
     env.set_seed(4)
     state = env.reset()
     assert state["task_id"].tolist() == [lw.task_id("reach"), OWN_ID, lw.task_id("reach")]
-    assert env._engine.seeds[1] == lw.episode_seed(STACK, 4, 0)
-    assert env._engine.seeds[0] == lw.episode_seed("reach", 4, 0)
-    assert lw.episode_seed(lw.TASKS["reach"], 4, 0) == lw.episode_seed("reach", 4, 0)
+    assert env._engine.seeds[1] == episode_seed(STACK, 4, 0)
+    assert env._engine.seeds[0] == episode_seed("reach", 4, 0)
+    assert episode_seed(lw.TASKS["reach"], 4, 0) == episode_seed("reach", 4, 0)
     env.load_state_dict(env.state_dict())
     assert env.reset()["episode"].tolist() == [2, 1, 3]
     env.close()
@@ -119,7 +111,7 @@ def test_mistakes_are_named(tasks, message):
 def test_a_name_alone_must_be_known():
     """A typo is no task of one's own."""
     with pytest.raises(ValueError, match=r"task must be one of .* got 'stack-cups'"):
-        lw.episode_seed("stack-cups", 0, 0)
+        episode_seed("stack-cups", 0, 0)
 
 
 def test_an_engine_by_name_or_of_ones_own():
