@@ -118,7 +118,8 @@ def train(
     encoder = read_encoder(text_encoder)
     loaded = read_plans(plans, known)
     options: dict[str, Any] = {"features": features, "width": width, "depth": depth}
-    if policy_class(METHODS[check_choice("method", method, METHODS)].policy).plan_options:
+    reads_plans = policy_class(METHODS[check_choice("method", method, METHODS)].policy).plan_options
+    if reads_plans:
         options["mix"] = mix
     config = lw.BehavioralCloningConfig(steps=steps, batch_size=batch_size, learning_rate=learning_rate, seed=seed)
     replay = lw.LanguageWorldExperienceReplay(
@@ -129,7 +130,8 @@ def train(
     )
     loaded.require(replay.tasks)
     torch.manual_seed(seed)
-    actor = make_policy(method, loaded, text_encoder=encoder, **options)
+    shown = loaded if reads_plans else {task: loaded[task] for task in replay.tasks}
+    actor = make_policy(method, shown, text_encoder=encoder, **options)
     if (transform := actor.transform()) is not None:
         replay.append_transform(transform)
     writes = None if logger is None else make_logger(logger, out)

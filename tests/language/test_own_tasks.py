@@ -5,6 +5,7 @@ import torch
 from tensordict import TensorDict
 
 import lw_torchrl as lw
+from lw_torchrl.language.skills import SkillError
 
 FILE = """
 [stack-blocks]
@@ -76,7 +77,7 @@ def test_scripted_skills_of_a_51st_task(mine, tmp_path):
     action = lw.ScriptedSkillActor(own, skills=skills)(batch)["action"]
     way = batch["observation"][0, 11:14] + torch.tensor([0.0, 0.0, 0.1]) - batch["observation"][0, 4:7]
     torch.testing.assert_close(action[0], torch.cat([(10 * way).clamp(-1, 1), torch.ones(1)]))
-    with pytest.raises(lw.SkillError, match="stack-blocks"):
+    with pytest.raises(SkillError, match="stack-blocks"):
         lw.load_skills(tmp_path / "skills.toml")
 
 

@@ -15,6 +15,7 @@ KILLER = """
     import os, signal, sys, threading
     import torch
     import lw_torchrl as lw
+    from lw_torchrl._files import sweep
 
     path, moments = sys.argv[1], int(sys.argv[2])
     plans = lw.load_plans("MT10")
@@ -51,6 +52,8 @@ KILLER = """
     lw.save_actor(first, path)
     killed = old = new = 0
     for k in range(moments):
+        left = sweep(path)  # so that each save has as many lines
+        assert len(left) <= 1
         child = os.fork()
         if child == 0:
             lines(1 + k * (total - 1) // (moments - 1))
