@@ -49,8 +49,7 @@ def tasks_of(tasks: str | Task | Iterable[str | Task], plans: Plans | None) -> d
 
 def make_env(actor: Any, plans: Plans | None, base: LanguageWorldEnv) -> EnvBase:
     """The environment with what must run before the actor, and the answers to the plans' queries beside it."""
-    answered = plans_of(actor) if plans is None else plans
-    transform = transform_of(actor, answered)
+    transform = transform_of(actor, plans)
     return base if transform is None else TransformedEnv(base, transform)
 
 

@@ -42,7 +42,7 @@ def rollout_tasks(
     """
     chosen = tasks_of(tasks, plans_of(actor))
     base = LanguageWorldEnv(list(chosen.values()), seed=seed, max_steps=max_steps, engine=engine, strict=True)
-    env = make_env(actor, None, base)
+    env = make_env(actor, plans_of(actor), base)
     written = {"qaf", *actor.out_keys} if plans_of(actor) is not None else set()
     try:
         with torch.no_grad():

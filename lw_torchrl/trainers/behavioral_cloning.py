@@ -97,10 +97,11 @@ def check_belongs(actor: Any, replay: TensorDictReplayBuffer) -> None:
     """Raise :class:`ValueError` unless the actor writes ``action``, and the buffer answers the queries of its plans."""
     if "action" not in actor.out_keys:
         raise ValueError(f"actor must write 'action', it writes {', '.join(map(str, actor.out_keys))}")
-    own = plans_of(actor)
-    for transform in replay.transform if own is not None else ():
+    if (own := plans_of(actor)) is None:
+        return
+    for transform in replay.transform:
         answered = plans_of(transform)
-        if answered is not None and own is not None and (different := answered.differences(own)):
+        if answered is not None and (different := answered.differences(own)):
             raise ValueError(
                 f"replay's QAFTransform must have the actor's plans, they differ for {', '.join(different)}; use "
                 "actor.transform()"

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import os
+import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -135,8 +136,6 @@ def _open(path: str | os.PathLike[str]) -> TensorArchive:
 
 def _is_version_1(path: Path) -> bool:
     """Whether it is an archive of TorchRL's ``Checkpoint``, told by its entries' names alone."""
-    import zipfile
-
     try:
         with zipfile.ZipFile(path) as archive:
             return any(name.startswith(("components/", "manifest", "description/")) for name in archive.namelist())
