@@ -31,3 +31,13 @@ def as_keys(argument: str, given: Sequence[NestedKey] | None, default: Sequence[
     if len(set(keys)) != len(keys):
         raise error
     return keys
+
+
+def key_beside(key: NestedKey, ending: str) -> NestedKey:
+    """The key beside ``key`` whose name has an ending more.
+
+    Example:
+        >>> key_beside(("agent", "qaf"), "_plan")
+        ('agent', 'qaf_plan')
+    """
+    return key + ending if isinstance(key, str) else (*key[:-1], key[-1] + ending)

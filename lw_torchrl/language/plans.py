@@ -7,27 +7,17 @@ Source: paper section 'Conditional Plan Generation'.
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from hashlib import sha256
-from types import MappingProxyType
 from typing import Any
 
 from lw_torchrl._checks import shown
 from lw_torchrl.language.queries import Query, check_query
 from lw_torchrl.language.relations import PREDICATES
+from lw_torchrl.language.skill_text import canonical_skill
 from lw_torchrl.language.tasks import TASKS, Task, check_task, get_task
-
-# fmt: off
-_BEFORE_NOUN = {
-    "above", "across", "against", "along", "and", "around", "at", "away", "back", "behind", "below", "beside",
-    "between", "by", "down", "from", "in", "inside", "into", "near", "of", "off", "on", "onto", "or", "out", "over",
-    "past", "through", "to", "toward", "towards", "under", "up", "with",
-}
-# fmt: on
-_LONGEST_BEFORE = max(map(len, _BEFORE_NOUN))
 
 
 class PlanError(ValueError):
@@ -85,7 +75,7 @@ class ConditionalPlan:
             if not isinstance(step, PlanStep) or not isinstance(step.skill, str):
                 raise TypeError(f"{where} must be a PlanStep with a skill in words, got {step!r}")
             try:
-                condition, skill = check_query(step.condition, definition), _skill_text(step.skill, definition)
+                condition, skill = check_query(step.condition, definition), canonical_skill(step.skill, definition)
             except ValueError as error:
                 raise PlanError(f"{where}: {error}") from error
             steps.append(replace(step, condition=condition, skill=skill))
@@ -127,7 +117,7 @@ class Plans(Mapping[str, ConditionalPlan]):
             raise PlanError("plans must hold one plan for each task")
         if not listed:
             raise PlanError("plans must hold at least one plan, got none")
-        self._plans = MappingProxyType({plan.task: plan for plan in sorted(listed, key=lambda p: p.task)})
+        self._plans = {plan.task: plan for plan in sorted(listed, key=lambda p: p.task)}
 
     def __getitem__(self, task: str) -> ConditionalPlan:
         return self._plans[task]
@@ -148,6 +138,11 @@ class Plans(Mapping[str, ConditionalPlan]):
     @cached_property
     def skills(self) -> tuple[str, ...]:
         return tuple(sorted({step.skill for plan in self.values() for step in plan.steps}))
+
+    @property
+    def numbers(self) -> dict[str, int]:
+        """A number for each task's plan, below 2**60: plans with another :attr:`fingerprint` have another number."""
+        return {task: int(Plans([plan]).fingerprint[:15], 16) for task, plan in self.items()}
 
     @property
     def fingerprint(self) -> str:
@@ -214,8 +209,8 @@ class Plans(Mapping[str, ConditionalPlan]):
 
     def differences(self, other: Plans) -> list[str]:
         """The tasks of both whose plans differ in what their fingerprint tells."""
-        shared = [task for task in self if task in other]
-        return [task for task in shared if Plans([self[task]]).fingerprint != Plans([other[task]]).fingerprint]
+        theirs = other.numbers
+        return [task for task, number in self.numbers.items() if number != theirs.get(task, number)]
 
     def require(self, tasks: Iterable[str]) -> None:
         """Raise :class:`PlanError` if one of ``tasks`` has no plan here."""
@@ -233,29 +228,3 @@ def as_plans(plans: Plans | Mapping[str, ConditionalPlan]) -> Plans:
     if isinstance(plans, ConditionalPlan) or not isinstance(plans, Mapping):
         raise TypeError(f"plans must map task names to ConditionalPlan, got {type(plans).__name__}")
     return Plans(plans)
-
-
-def _with_articles(details: str, task: Task) -> str:
-    def article(match: re.Match[str]) -> str:
-        end = match.start() - (details[match.start() - 1 : match.start()] == " ")
-        start = max(0, end - _LONGEST_BEFORE - 1)  # no further: a text may be all nouns
-        before = details[start:end].rpartition(" ")[2]
-        return f"the {match[0]}" if not before or before in _BEFORE_NOUN else match[0]
-
-    nouns = sorted({*task.object_names, "gripper"}, key=len, reverse=True)
-    pattern = "|".join(re.escape(noun) for noun in nouns)
-    return re.sub(rf"(?<![\w'-])(?:{pattern})(?![\w'-])", article, details)
-
-
-def _skill_text(skill: str, task: Task) -> str:
-    """The skill in plain English: articles go before the nouns that lack one, as in the paper.
-
-    A noun lacks one at the beginning and after a word like "above"; after any other word ("the coffee mug") it
-    is part of something longer and is left alone.
-    """
-    first, _, details = " ".join(skill.split()).partition(" ")
-    verb, *rest = first.replace("_", " ").split() or [""]
-    if not re.fullmatch(r"[A-Za-z]\w*", verb):
-        raise PlanError(f"skill must begin with a plain word like 'place', got {skill!r}")
-    details = " ".join([*rest, _with_articles(details, task)]).strip()
-    return f"{verb} {_with_articles(details, task)}".strip()

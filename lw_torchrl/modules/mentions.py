@@ -16,8 +16,8 @@ from lw_torchrl.language.observation import (
     a_step_before,
     places,
 )
+from lw_torchrl.language.plan_tables import PlanTables
 from lw_torchrl.language.plans import Plans, PlanStep
-from lw_torchrl.language.task_index import TaskIndex
 from lw_torchrl.language.tasks import Task
 
 # The numbers of each thing that an observation tells of, now and a step before: two objects, with their quaternions,
@@ -36,16 +36,16 @@ def _names(step: PlanStep, task: Task) -> set[str]:
     return names
 
 
-def mentioned(plans: Plans, index: TaskIndex) -> Tensor:
-    """(T, S, 3) bool, a row for each task of ``index``: whether a step's condition or skill mentions the first object,
-    the second, the goal, or a point beside it."""
-    table = torch.zeros(len(index.tasks), plans.num_steps, len(_PLACES), dtype=torch.bool)
+def mentioned(plans: Plans, tables: PlanTables) -> Tensor:
+    """(T, S, 3) bool, a row for each task as in ``tables``: whether a step's condition or skill mentions the
+    first object, the second, the goal, or a point beside it."""
+    table = torch.zeros(len(plans), plans.num_steps, len(_PLACES), dtype=torch.bool)
     for task, plan in plans.items():
         for number, step in enumerate(plan.steps):
             for name in _names(step, plan.definition):
                 for thing, place in enumerate(_PLACES):
                     if set(place).intersection(plan.definition.object(name).position):
-                        table[index.row(task), number, thing] = True
+                        table[tables.index.row(task), number, thing] = True
     return table
 
 

@@ -12,8 +12,9 @@ from torch import Tensor
 
 from lw_torchrl._checks import missing_keys
 from lw_torchrl._keys import as_keys
+from lw_torchrl.language.plan_tables import PlanTables
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
-from lw_torchrl.language.task_index import TaskIndex
+from lw_torchrl.transforms.qaf import plan_number_key
 
 
 def attend(logits: Tensor, steps: Tensor) -> Tensor:
@@ -32,7 +33,8 @@ class PlanAttention(TensorDictModuleBase):
         in_keys, out_keys: other names for what it reads and writes, in the order above; nested ones too.
 
     Raises:
-        ValueError: at call time, ``qaf`` of another number of steps, or a task_id without a plan.
+        ValueError: at call time, ``qaf`` of another number of steps or, where ``qaf_plan`` says so, of other plans; a
+            task_id without a plan.
 
     Example:
         >>> import torch, lw_torchrl as lw
@@ -60,21 +62,15 @@ class PlanAttention(TensorDictModuleBase):
         self.in_keys = as_keys("in_keys", in_keys, ("qaf", "task_id"))
         self.out_keys = as_keys("out_keys", out_keys, ("skill_weights",))
         self.plans = as_plans(plans)
-        self.index = TaskIndex(self.plans)
-        lengths = torch.tensor([len(self.plans[task].steps) for task in self.index.tasks])
-        self.register_buffer("mask", torch.arange(self.plans.num_steps) < lengths.unsqueeze(-1), persistent=False)
-
-    def rows(self, task_id: Tensor) -> Tensor:
-        """The row of each task in tables that have one for each plan, (...) int64; :class:`ValueError` for a task
-        without a plan."""
-        return self.index.rows(task_id, f"tasks without a plan in {self.plans!r}")
+        self.tables = PlanTables(self.plans)
+        self.register_buffer("mask", self.tables.mask, persistent=False)
 
     def weights(self, qaf: Tensor, task_id: Tensor) -> Tensor:
         """(B, S) truth and (B,) int64 to (B, S) float32 attention."""
-        return self.over_steps(qaf, self.rows(task_id))
+        return self.over_steps(qaf, self.tables.rows(task_id))
 
     def over_steps(self, qaf: Tensor, rows: Tensor) -> Tensor:
-        """:meth:`weights` from what :meth:`rows` gives."""
+        """:meth:`weights` from what :meth:`PlanTables.rows` gives."""
         if qaf.shape != (*rows.shape, self.mask.shape[-1]):
             raise ValueError(
                 f"qaf must have shape {(*rows.shape, self.mask.shape[-1])}, one column for each step of the actor's "
@@ -86,4 +82,6 @@ class PlanAttention(TensorDictModuleBase):
         qaf, task_id = (tensordict.get(key, None) for key in self.in_keys)
         if qaf is None or task_id is None:
             raise missing_keys(tensordict.keys(True, True), *self.in_keys)
-        return tensordict.set(self.out_keys[0], self.weights(qaf, task_id))
+        rows = self.tables.rows(task_id)
+        self.tables.refuse_others(tensordict.get(plan_number_key(self.in_keys[0]), None), rows)
+        return tensordict.set(self.out_keys[0], self.over_steps(qaf, rows))

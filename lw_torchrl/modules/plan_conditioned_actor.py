@@ -21,7 +21,7 @@ from lw_torchrl.modules.plan_attention import PlanAttention, attend
 from lw_torchrl.modules.plan_focus import PlanFocus
 from lw_torchrl.modules.policy import Policy, TextEncoding
 from lw_torchrl.modules.query_evaluator import QueryEvaluator, evaluator_from_description
-from lw_torchrl.transforms.qaf import QAFTransform
+from lw_torchrl.transforms.qaf import QAFTransform, plan_number_key
 
 _IN_FORCE = 0.01  # a step whose condition does not hold beside one that does has a weight of 1e-4
 
@@ -67,7 +67,8 @@ class PlanConditionedActor(Policy):
         skills: the K different skill texts, sorted.
 
     Raises:
-        ValueError: a wrong option, with the allowed ones.
+        ValueError: a wrong option, with the allowed ones; at call time, a task_id without a plan, or ``qaf`` of other
+            plans, as ``qaf_plan`` beside it tells.
         ImportError: a skill's text is not shipped, and the extra ``[text]`` is not installed.
 
     Example:
@@ -114,6 +115,7 @@ class PlanConditionedActor(Policy):
         own = as_keys("in_keys", in_keys, read)
         self.in_keys = list(dict.fromkeys([*own, *([] if evaluator is None else evaluator.in_keys)]))
         self.out_keys = as_keys("out_keys", out_keys, ("action", "skill_weights", "skill_latent"))
+        self._answered = plan_number_key(own[-1])
         self.evaluator = _check_evaluator(evaluator, self.plans, focus or swap_unmentioned)
         check_choice("mix", mix, ("latents", "actions"))
         if check_scale("swap_unmentioned", swap_unmentioned) > 1.0:
@@ -139,16 +141,12 @@ class PlanConditionedActor(Policy):
         if vectors.ndim != 2 or len(vectors) != len(self.skills):
             raise ValueError(f"text_encoder must give ({len(self.skills)}, E), got shape {tuple(vectors.shape)}")
         self.attention = PlanAttention(self.plans)
-        index = torch.zeros(len(self.plans), self.plans.num_steps, dtype=torch.int64)
-        for row, task in enumerate(self.attention.index.tasks):
-            steps = self.plans[task].steps
-            index[row, : len(steps)] = torch.tensor([self.skills.index(step.skill) for step in steps])
         # The tables come from the plans, not from training: they are not part of the state that is saved.
         self.register_buffer("text_vectors", unit_scale(vectors), persistent=False)
-        self.register_buffer("skill_index", index, persistent=False)
-        self.register_buffer("mentioned", mentioned(self.plans, self.attention.index), persistent=False)
+        self.register_buffer("skill_index", self.attention.tables.skill_index, persistent=False)
+        self.register_buffer("mentioned", mentioned(self.plans, self.attention.tables), persistent=False)
         self.encoder = text_to_latent(vectors.shape[1], latent_size, encoder_width, encoder_depth)
-        self.focus = PlanFocus(self.plans, feature_noise) if focus else None
+        self.focus = PlanFocus(self.plans, self.attention.tables, feature_noise) if focus else None
         more = 0 if self.focus is None else self.focus.width
         self.decoder = ActionDecoder(latent_size, features, feature_noise, width, depth, squash, more)
 
@@ -169,17 +167,18 @@ class PlanConditionedActor(Policy):
         observation's features (B, F). With an evaluator, in the attention's place the steps that there are (B, S) bool,
         and behind the features what the evaluator reads."""
         observation, task, *rest = self.read(tensordict)
-        rows = self.attention.rows(task)
+        rows = self.attention.tables.rows(task)
         if self.evaluator is not None:
             asked = [tensordict.get(key) for key in self.evaluator.in_keys]
             return self.attention.mask[rows], self.skill_index[rows], self.decoder.features(observation), *asked
+        self.attention.tables.refuse_others(tensordict.get(self._answered, None), rows)
         weights = self.attention.over_steps(rest[0], rows)
         if self.training and self.config["swap_unmentioned"]:
             kept = ((weights > _IN_FORCE).unsqueeze(-1) & self.mentioned[rows]).any(-2)
             observation = swap_unmentioned(observation, kept, self.config["swap_unmentioned"])
         seen = self.decoder.features(observation)
         if self.focus is not None:
-            seen = torch.cat((seen, self.focus(observation, weights, task)), -1)
+            seen = torch.cat((seen, self.focus(observation, weights, rows)), -1)
         return weights, self.skill_index[rows], seen
 
     def act(self, *prepared: Tensor) -> tuple[Tensor, Tensor, Tensor]:

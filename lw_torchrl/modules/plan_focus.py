@@ -7,8 +7,8 @@ from torch import Tensor, nn
 
 from lw_torchrl._checks import check_scale
 from lw_torchrl.language.observation import OBSERVATION_SIZE
+from lw_torchrl.language.plan_tables import PlanTables
 from lw_torchrl.language.plans import Plans, PlanStep
-from lw_torchrl.language.task_index import TaskIndex
 from lw_torchrl.language.tasks import Task, coordinate_index
 from lw_torchrl.modules.observation_features import squash
 
@@ -30,6 +30,7 @@ class PlanFocus(nn.Module):
 
     Args:
         plans: the plans.
+        tables: theirs.
         noise: standard deviation of the noise on each feature while training.
 
     Attributes:
@@ -43,18 +44,17 @@ class PlanFocus(nn.Module):
     constants: Tensor
     width = _PAIRS * 9
 
-    def __init__(self, plans: Plans, noise: float = 0.0) -> None:
+    def __init__(self, plans: Plans, tables: PlanTables, noise: float = 0.0) -> None:
         super().__init__()
         self.noise = check_scale("feature_noise", noise)
         constants = [0.0]
-        self.index = TaskIndex(plans)
         shape = (len(plans), plans.num_steps, _PAIRS, 3)
         index = torch.full((2, *shape), OBSERVATION_SIZE)  # the constant 0
         offset = torch.zeros(shape)
         for task, plan in plans.items():
             for number, step in enumerate(plan.steps):
                 for pair, names in enumerate(_pairs(step)):
-                    at = (self.index.row(task), number, pair)
+                    at = (tables.index.row(task), number, pair)
                     for side, position in enumerate(self._positions(names, plan.definition)):
                         index[(side, *at)] = torch.tensor([coordinate_index(c, constants) for c in position[0]])
                         offset[at] += torch.tensor(position[1]) * (2 * side - 1)
@@ -68,12 +68,12 @@ class PlanFocus(nn.Module):
     def _positions(names: tuple[str, str], task: Task) -> list[tuple]:
         return [(task.object(name).position, task.object(name).offset) for name in names]
 
-    def forward(self, observation: Tensor, weights: Tensor, task_id: Tensor) -> Tensor:
-        """(..., 39) float32, attention (..., S) float32 and (...) int64 to (..., 18) float32."""
+    def forward(self, observation: Tensor, weights: Tensor, rows: Tensor) -> Tensor:
+        """(..., 39) float32, attention (..., S) float32 and rows (...) int64, as from :meth:`PlanTables.rows`,
+        to (..., 18) float32."""
         known = torch.cat((observation, self.constants.expand(*observation.shape[:-1], -1)), -1)
-        rows = self.index.rows(task_id, "tasks without a plan")
         first, second = self.first[rows], self.second[rows]  # (..., S, 2, 3)
-        flat = (*first.shape[: task_id.ndim], -1)
+        flat = (*first.shape[: rows.ndim], -1)
         way = (known.gather(-1, second.reshape(flat)) - known.gather(-1, first.reshape(flat))).reshape(first.shape)
         way = (weights[..., None, None] * (way + self.offset[rows])).sum(-3).flatten(-2)
         found = torch.cat((way / _SCALE, *squash(way)), -1)

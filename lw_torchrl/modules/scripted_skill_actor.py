@@ -12,12 +12,12 @@ from torch import Tensor
 
 from lw_torchrl._checks import check_choice
 from lw_torchrl._keys import as_keys
+from lw_torchrl.language.plan_tables import PlanTables
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.skill_program import SkillProgram
 from lw_torchrl.language.skills import ScriptedSkill
-from lw_torchrl.language.task_index import TaskIndex
 from lw_torchrl.modules.policy import Policy, TextEncoding
-from lw_torchrl.transforms.qaf import QAFTransform
+from lw_torchrl.transforms.qaf import QAFTransform, plan_number_key
 
 
 class ScriptedSkillActor(Policy):
@@ -37,7 +37,7 @@ class ScriptedSkillActor(Policy):
 
     Raises:
         ValueError: a wrong option, a skill text that is no scripted skill (with the nearest), or one that speaks of
-            objects that its task lacks.
+            objects that its task lacks; at call time, ``qaf`` of other plans, as ``qaf_plan`` beside it tells.
 
     Example:
         >>> import lw_torchrl as lw
@@ -69,9 +69,8 @@ class ScriptedSkillActor(Policy):
         self.program = SkillProgram(
             {plan.definition: [step.skill for step in plan.steps] for plan in self.plans.values()}, skills
         )
-        self.index = TaskIndex(self.plans)
-        last = torch.tensor([len(self.plans[task].steps) - 1 for task in self.index.tasks])
-        self._last = last
+        self.tables = PlanTables(self.plans)
+        self._last = self.tables.mask.sum(-1) - 1
         self._generator = torch.Generator().manual_seed(seed)
 
     @classmethod
@@ -96,10 +95,9 @@ class ScriptedSkillActor(Policy):
     def from_description(cls, found: Mapping[str, Any], text_encoder: TextEncoding | None = None) -> ScriptedSkillActor:
         return cls(Plans.from_json(found["plans"]), **found["options"])
 
-    def _weights(self, qaf: Tensor, task_id: Tensor) -> Tensor:
+    def _weights(self, qaf: Tensor, rows: Tensor) -> Tensor:
         if qaf.dtype != torch.bool:
             qaf = qaf > 0.5
-        rows = self.index.rows(task_id, f"tasks without a plan in {self.plans!r}")
         last = torch.nn.functional.one_hot(self._last.to(rows.device)[rows], qaf.shape[-1]).bool()
         true = torch.where(qaf.any(-1, keepdim=True), qaf, last).float()
         if self.select == "mix":
@@ -114,7 +112,9 @@ class ScriptedSkillActor(Policy):
     def prepare(self, tensordict: TensorDictBase) -> tuple[Tensor, ...]:
         """The weights (B, S), and the action of each step's skill (B, S, 4)."""
         observation, given, qaf = self.read(tensordict)
-        return self._weights(qaf, given), self.program(observation, given)
+        rows = self.tables.rows(given)
+        self.tables.refuse_others(tensordict.get(plan_number_key(self.in_keys[2]), None), rows)
+        return self._weights(qaf, rows), self.program(observation, given)
 
     def act(self, *prepared: Tensor) -> tuple[Tensor, Tensor]:
         """From what :meth:`prepare` gives: action (B, 4), and the weights."""

@@ -3,21 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import Binary, Composite, TensorSpec
+from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase, Transform
 from torchrl.envs.batched_envs import BatchedEnvBase
 
 from lw_torchrl._checks import missing_keys
-from lw_torchrl._keys import as_keys
+from lw_torchrl._keys import as_keys, key_beside
+from lw_torchrl.language.plan_tables import PlanTables
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.query_program import QueryProgram
+from lw_torchrl.language.task_index import TaskTables
 from lw_torchrl.transforms.containers import base_env, refuse_changed, transforms_beside
 from lw_torchrl.transforms.env_state import KeepsEnvState
+
+
+class _Number(NamedTuple):
+    plan: Tensor  # (T,) int64
 
 
 def plan_program(plans: Plans) -> QueryProgram:
@@ -25,19 +32,25 @@ def plan_program(plans: Plans) -> QueryProgram:
     return QueryProgram({plan.definition: [step.condition for step in plan.steps] for plan in plans.values()})
 
 
+def plan_number_key(qaf: NestedKey) -> NestedKey:
+    """Where :class:`QAFTransform` writes the plan's number: beside ``qaf``, ``qaf_plan``."""
+    return key_beside(qaf, "_plan")
+
+
 class QAFTransform(KeepsEnvState):
     """Writes ``qaf``, in an environment and on a replay buffer.
 
     Reads ``observation`` (B, 39) float32 and ``task_id`` (B,) int64; writes ``qaf`` (B, S) bool, the truth of each
-    condition of the row's plan, in the order of its steps, false beyond its last. On a replay buffer it writes
-    ``("next", "qaf")`` too, wherever ``("next", "observation")`` is. Conditions speak of metres, so it comes before
-    whatever changes the observation: a normaliser, :class:`RandomYaw`. In an environment its ``state_dict`` holds the
-    environment's, as :class:`EnvState` does.
+    condition of the row's plan, in the order of its steps, false beyond its last, and ``qaf_plan`` (B,) int64, that
+    plan's number in :attr:`Plans.numbers`, by which an actor of other plans refuses the answers. On a replay buffer it
+    writes ``("next", "qaf")`` too, wherever ``("next", "observation")`` is. Conditions speak of metres, so it comes
+    before whatever changes the observation: a normaliser, :class:`RandomYaw`. In an environment its ``state_dict``
+    holds the environment's, as :class:`EnvState` does.
 
     Args:
         plans: a plan for each task that will be seen.
         in_keys: where observation and task_id are, in this order; a key may be nested.
-        out_keys: where the truth goes.
+        out_keys: where the truth goes; the plan's number goes beside it, under that name and ``_plan``.
 
     Raises:
         PlanError: (a ValueError) the environment has a task without a plan.
@@ -61,12 +74,15 @@ class QAFTransform(KeepsEnvState):
         in_keys: Sequence[NestedKey] | None = None,
         out_keys: Sequence[NestedKey] | None = None,
     ) -> None:
+        truth = as_keys("out_keys", out_keys, ("qaf",))
         super().__init__(
             in_keys=as_keys("in_keys", in_keys, ("observation", "task_id")),
-            out_keys=as_keys("out_keys", out_keys, ("qaf",)),
+            out_keys=[*truth, plan_number_key(truth[0])],
         )
         self.plans = as_plans(plans)
         self.program = plan_program(self.plans)
+        tables = PlanTables(self.plans)
+        self._number = TaskTables(tables.index, _Number(tables.number), f"tasks without a plan in {self.plans!r}")
         self._beside = 0
 
     def _write(self, tensordict: TensorDictBase, task_id: Tensor | None) -> None:
@@ -74,6 +90,8 @@ class QAFTransform(KeepsEnvState):
         if observation is None or task_id is None:
             raise missing_keys(tensordict.keys(True, True), *map(str, self.in_keys))
         tensordict.set(self.out_keys[0], self.program(observation, task_id))
+        number = self._number.select(task_id.reshape(-1), observation).plan
+        tensordict.set(self.out_keys[1], number.reshape(task_id.shape))
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         self._write(next_tensordict, next_tensordict.get(self.in_keys[1], None))
@@ -83,7 +101,7 @@ class QAFTransform(KeepsEnvState):
         return self._call(tensordict_reset)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``qaf``, and ``("next", "qaf")`` where there is a next observation."""
+        """Write both keys, and those of ``next`` where there is a next observation."""
         if (beside := transforms_beside(self)) != self._beside:  # something was put there later
             refuse_changed(self, self.in_keys[0])
             self._beside = beside
@@ -104,11 +122,10 @@ class QAFTransform(KeepsEnvState):
             self.plans.require(getattr(env, "tasks", ()))
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        """Add ``qaf`` to the specs."""
+        """Add ``qaf`` and ``qaf_plan`` to the specs."""
         assert isinstance(observation_spec, Composite)
         refuse_changed(self, self.in_keys[0])  # it may have been put there later
-        steps = self.program.num_queries
-        observation_spec[self.out_keys[0]] = Binary(
-            steps, shape=(*observation_spec.shape, steps), dtype=torch.bool, device=observation_spec.device
-        )
+        steps, shape, device = self.program.num_queries, observation_spec.shape, observation_spec.device
+        observation_spec[self.out_keys[0]] = Binary(steps, shape=(*shape, steps), dtype=torch.bool, device=device)
+        observation_spec[self.out_keys[1]] = Unbounded(shape, dtype=torch.int64, device=device)
         return observation_spec

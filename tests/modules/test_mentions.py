@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 
 import lw_torchrl as lw
+from lw_torchrl.language.plan_tables import PlanTables
 from lw_torchrl.language.plans import ConditionalPlan, Plans
-from lw_torchrl.language.task_index import TaskIndex
 from lw_torchrl.modules.mentions import mentioned, swap_unmentioned
 
 PLACES = {0: [*range(4, 11), *range(22, 29)], 1: [*range(11, 18), *range(29, 36)], 2: [36, 37, 38]}
@@ -16,7 +16,7 @@ PLACES = {0: [*range(4, 11), *range(22, 29)], 1: [*range(11, 18), *range(29, 36)
 
 def table(task, *pairs):
     plans = Plans([ConditionalPlan.from_pairs(task, pairs)])
-    return mentioned(plans, TaskIndex(plans))[0].int().tolist()
+    return mentioned(plans, PlanTables(plans))[0].int().tolist()
 
 
 def test_conditions_and_skills_mention_things():
@@ -33,7 +33,8 @@ def test_points_beside_an_object_are_its_mention_and_fixed_places_are_none():
     assert table("hammer", ("the gripper is above the hammer handle", "wait")) == [[1, 0, 0]]
     assert table("hammer", ("the hammer head is near the nail", "wait")) == [[1, 1, 0]]
     assert table("bin-picking", ("the gripper is above the other bin", "wait")) == [[0, 0, 0]]
-    assert mentioned(lw.load_plans("MT50"), TaskIndex(lw.MT50)).any(-1).any(-1).all()
+    plans = lw.load_plans("MT50")
+    assert mentioned(plans, PlanTables(plans)).any(-1).any(-1).all()
 
 
 rows = st.integers(1, 30)

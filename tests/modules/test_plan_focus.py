@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 
 import lw_torchrl as lw
+from lw_torchrl.language.plan_tables import PlanTables
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.modules.plan_focus import PlanFocus
 
@@ -15,13 +16,13 @@ HAND, OBJECT, SECOND, GOAL = slice(0, 3), slice(4, 7), slice(11, 14), slice(36, 
 
 def focus_of(task, *conditions):
     plans = Plans([ConditionalPlan.from_pairs(task, [(condition, "wait") for condition in conditions])])
-    return PlanFocus(plans)
+    return PlanFocus(plans, PlanTables(plans))
 
 
-def ways(focus, task, observation, weights=None):
+def ways(focus, observation, weights=None):
     """(B, 2, 3) metres: of each step's first and last clause."""
     weights = torch.ones(len(observation), 1) if weights is None else weights
-    found = focus(observation, weights, torch.full((len(observation),), lw.task_id(task)))
+    found = focus(observation, weights, torch.zeros(len(observation), dtype=torch.int64))
     assert found.shape == (len(observation), 18)
     return found[:, :6].reshape(-1, 2, 3) / 10
 
@@ -33,19 +34,19 @@ def observation():
 
 def test_the_first_and_the_last_clause_that_compares_two_things(observation):
     condition = "the gripper is above the puck and the gripper is open and the puck is near the target location"
-    found = ways(focus_of("push", condition), "push", observation)
+    found = ways(focus_of("push", condition), observation)
     torch.testing.assert_close(found[:, 0], observation[:, OBJECT] - observation[:, HAND])
     torch.testing.assert_close(found[:, 1], observation[:, GOAL] - observation[:, OBJECT])
-    found = ways(focus_of("push", "the gripper is not above the puck"), "push", observation)
+    found = ways(focus_of("push", "the gripper is not above the puck"), observation)
     assert torch.equal(found[:, 0], found[:, 1])
-    assert not ways(focus_of("push", "the gripper is open"), "push", observation).any()
+    assert not ways(focus_of("push", "the gripper is open"), observation).any()
 
 
 def test_points_have_offsets_and_fixed_places(observation):
-    found = ways(focus_of("hammer", "the hammer head is near the nail"), "hammer", observation)
+    found = ways(focus_of("hammer", "the hammer head is near the nail"), observation)
     head = observation[:, OBJECT] + torch.tensor([0.16, 0.06, 0.0])
     torch.testing.assert_close(found[:, 0], observation[:, SECOND] - head)
-    found = ways(focus_of("bin-picking", "the gripper is near the other bin"), "bin-picking", observation)
+    found = ways(focus_of("bin-picking", "the gripper is near the other bin"), observation)
     torch.testing.assert_close(found[:, 0], torch.tensor([0.12, 0.7, 0.02]) - observation[:, HAND])
 
 
@@ -56,14 +57,14 @@ def test_steps_are_mixed_by_attention(seed):
     observation = torch.randn(4, 39, generator=generator)
     weights = torch.rand(4, 2, generator=generator).softmax(-1)
     conditions = ("the gripper is above the puck", "the puck is near the target location")
-    each = [ways(focus_of("push", condition), "push", observation) for condition in conditions]
-    mixed = ways(focus_of("push", *conditions), "push", observation, weights)
+    each = [ways(focus_of("push", condition), observation) for condition in conditions]
+    mixed = ways(focus_of("push", *conditions), observation, weights)
     torch.testing.assert_close(mixed, weights[:, 0, None, None] * each[0] + weights[:, 1, None, None] * each[1])
 
 
 def test_fine_and_coarse_copies(observation):
     focus = focus_of("push", "the gripper is above the puck")
-    found = focus(observation, torch.ones(5, 1), torch.full((5,), lw.task_id("push")))
+    found = focus(observation, torch.ones(5, 1), torch.zeros(5, dtype=torch.int64))
     way = found[:, :6] / 10
     torch.testing.assert_close(found[:, 6:12], torch.tanh(way / 0.02))
     torch.testing.assert_close(found[:, 12:], torch.tanh(way / 0.1))
@@ -71,14 +72,14 @@ def test_fine_and_coarse_copies(observation):
 
 def test_any_leading_shape_and_noise_in_training_alone():
     plans = lw.load_plans("MT50")
-    focus = PlanFocus(plans, noise=0.1).eval()
-    observation, task = torch.randn(2, 3, 39), torch.randint(50, (2, 3))
+    focus = PlanFocus(plans, PlanTables(plans), noise=0.1).eval()
+    observation, rows = torch.randn(2, 3, 39), torch.randint(50, (2, 3))
     weights = torch.rand(2, 3, plans.num_steps)
-    once = focus(observation, weights, task)
+    once = focus(observation, weights, rows)
     assert once.shape == (2, 3, 18)
-    flat = focus(observation.reshape(6, 39), weights.reshape(6, -1), task.reshape(6))
+    flat = focus(observation.reshape(6, 39), weights.reshape(6, -1), rows.reshape(6))
     torch.testing.assert_close(flat.reshape(2, 3, 18), once)
-    assert not torch.equal(focus.train()(observation, weights, task), once)
+    assert not torch.equal(focus.train()(observation, weights, rows), once)
 
 
 def test_an_actor_sees_the_way_of_its_own_plans():

@@ -1,0 +1,65 @@
+"""PlanTables: the plans of many tasks as tensors, with a row for each task."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from lw_torchrl.language.plans import Plans
+from lw_torchrl.language.task_index import TaskIndex, readable
+
+
+class PlanTables:
+    """What transforms, attention and actors read of plans.
+
+    Args:
+        plans: the plans.
+
+    Attributes:
+        index: from task ids to rows, T of them.
+        mask: (T, S) bool, the steps that there are.
+        skill_index: (T, S) int64, the number of each step's skill in ``plans.skills``; 0 beyond the last step.
+        number: (T,) int64, the number of each plan, as in :attr:`Plans.numbers`.
+
+    Example:
+        >>> from lw_torchrl.language.plan_files import load_plans
+        >>> plans = load_plans("MT10")
+        >>> PlanTables(plans).mask.sum().item() == sum(len(plan.steps) for plan in plans.values())
+        True
+    """
+
+    def __init__(self, plans: Plans) -> None:
+        self.index = TaskIndex(plans)
+        self._problem = f"tasks without a plan in {plans!r}"
+        self.mask = torch.zeros(len(plans), plans.num_steps, dtype=torch.bool)
+        self.skill_index = torch.zeros(len(plans), plans.num_steps, dtype=torch.int64)
+        skill = {text: number for number, text in enumerate(plans.skills)}
+        for row, task in enumerate(self.index.tasks):
+            steps = plans[task].steps
+            self.mask[row, : len(steps)] = True
+            self.skill_index[row, : len(steps)] = torch.tensor([skill[step.skill] for step in steps])
+        numbers = plans.numbers
+        self.number = torch.tensor([numbers[task] for task in self.index.tasks])
+
+    def rows(self, task_id: Tensor) -> Tensor:
+        """The row of each task, (...) int64 to (...) int64; :class:`ValueError` for a task without a plan."""
+        return self.index.rows(task_id, self._problem)
+
+    def refuse_others(self, number: Tensor | None, rows: Tensor) -> None:
+        """Raise :class:`ValueError` where queries were answered of other plans.
+
+        Args:
+            number: (...) int64, the number of the plan whose queries were answered; None if it is not known.
+            rows: (...) int64, as from :meth:`rows`.
+        """
+        if number is None or not readable(number, rows):
+            return
+        if number.device != self.number.device:
+            self.number = self.number.to(number.device)
+        own = self.number[rows]
+        if not torch.equal(own, number):
+            tasks = ", ".join(self.index.tasks[row] for row in rows[own != number].unique().tolist()[:5])
+            raise ValueError(
+                f"qaf answers other plans than the actor's, for {tasks}: give QAFTransform the actor's plans, "
+                "QAFTransform(actor.plans), or the actor those of QAFTransform, actor.with_plans(plans)"
+            )

@@ -1,0 +1,142 @@
+"""Queries answered of other plans than the actor's, of the same number of steps, are refused where both meet."""
+
+from __future__ import annotations
+
+import pickle
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.collectors import Collector
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs import ParallelEnv, TransformedEnv
+
+import lw_torchrl as lw
+from lw_torchrl.language.relations import RELATIONS, Comparison
+from lw_torchrl.modules import PlanAttention
+
+STEPS = [
+    ("the gripper is not above the puck", "place the gripper above the puck"),
+    ("the gripper is above the puck", "lower the gripper around the puck"),
+]
+REFUSED = r"qaf answers other plans than the actor's, for push: give QAFTransform the actor's plans"
+
+
+def plans_of(pairs, *more):
+    return lw.Plans([lw.ConditionalPlan.from_pairs("push", pairs), *more])
+
+
+PLANS = plans_of(STEPS)
+OTHERS = {
+    "steps in another order": plans_of(STEPS[::-1]),
+    "another condition": plans_of([(f"{STEPS[0][0]} and the gripper is open", STEPS[0][1]), STEPS[1]]),
+    "another skill": plans_of([STEPS[0], (STEPS[1][0], "close the gripper around the puck")]),
+}
+ACTORS = {
+    "actor": lambda plans, **keys: lw.PlanConditionedActor(plans, width=8, **keys),
+    "focus": lambda plans, **keys: lw.PlanConditionedActor(plans, width=8, focus=True, swap_unmentioned=0.5, **keys),
+    "scripted": lw.ScriptedSkillActor,
+    "ensemble": lambda plans, **keys: lw.ActorEnsemble([lw.PlanConditionedActor(plans, width=8, **keys)] * 2),
+    "attention": lambda plans: PlanAttention(plans),
+}
+
+
+def state(plans, rows=3):
+    data = TensorDict(observation=torch.zeros(rows, 39), task_id=torch.full((rows,), lw.task_id("push")))
+    return lw.QAFTransform(plans)(data.auto_batch_size_())
+
+
+@pytest.mark.parametrize("other", OTHERS)
+@pytest.mark.parametrize("make", ACTORS)
+def test_in_a_loop_composed_by_hand(make, other):
+    actor = ACTORS[make](PLANS)
+    env = TransformedEnv(lw.LanguageWorldEnv("push"), lw.QAFTransform(OTHERS[other]))
+    with pytest.raises(ValueError, match=REFUSED):
+        actor(env.reset())
+    env.close()
+    env = TransformedEnv(lw.LanguageWorldEnv("push"), lw.QAFTransform(plans_of(STEPS)))  # equal, not the same
+    assert actor(env.reset())["skill_weights"].shape == (1, 2)
+    env.close()
+
+
+@pytest.mark.parametrize("make", ACTORS)
+def test_without_the_number_nothing_is_known(make):
+    ACTORS[make](PLANS)(state(OTHERS["another skill"]).exclude("qaf_plan"))
+
+
+def test_each_row_has_its_plans_number():
+    reach = lw.ConditionalPlan.from_pairs("reach", [("the gripper is open", "close the gripper")] * 2)
+    both = plans_of(STEPS, reach)
+    mixed = TensorDict(
+        observation=torch.zeros(4, 39), task_id=torch.tensor([lw.task_id(t) for t in ("push", "reach")] * 2)
+    )
+    mixed = lw.QAFTransform(both)(mixed.auto_batch_size_())
+    assert mixed["qaf_plan"].tolist() == [both.numbers["push"], both.numbers["reach"]] * 2
+    assert mixed["qaf_plan"][0] == state(PLANS)["qaf_plan"][0], "whatever stands beside it"
+    lw.PlanConditionedActor(both, width=8)(mixed)
+    other = lw.ConditionalPlan.from_pairs("reach", [("the gripper is closed", "close the gripper")] * 2)
+    with pytest.raises(ValueError, match="for reach: give"):
+        lw.PlanConditionedActor(plans_of(STEPS, other), width=8)(mixed)
+
+
+def test_a_collector_and_a_replay_buffer_refuse():
+    actor, other = lw.PlanConditionedActor(PLANS, width=8), OTHERS["another skill"]
+
+    def env():
+        return TransformedEnv(lw.LanguageWorldEnv("push"), lw.QAFTransform(other))
+
+    with pytest.raises(ValueError, match=REFUSED):
+        Collector(env, actor, frames_per_batch=4, total_frames=8)
+    replay = TensorDictReplayBuffer(storage=LazyTensorStorage(3), transform=lw.QAFTransform(other), batch_size=3)
+    replay.extend(state(PLANS).set(("next", "observation"), torch.ones(3, 39)))
+    sample = replay.sample()  # answers of its own plans replace the stored ones, and say so
+    with pytest.raises(ValueError, match=REFUSED):
+        actor(sample)
+    assert torch.equal(sample["next", "qaf_plan"], sample["qaf_plan"])
+
+
+def test_through_processes():
+    env = ParallelEnv(
+        2, lambda: TransformedEnv(lw.LanguageWorldEnv("push"), lw.QAFTransform(PLANS)), mp_start_method="fork"
+    )
+    lw.PlanConditionedActor(PLANS, width=8)(env.reset())
+    with pytest.raises(ValueError, match=REFUSED):
+        lw.PlanConditionedActor(OTHERS["another skill"], width=8)(env.reset())
+    env.close()
+
+
+@pytest.mark.parametrize("make", ["actor", "scripted"])
+def test_beside_a_qaf_of_another_name(make):
+    keys = ["observation", "task_id", ("agent", "truth")]
+    data = TensorDict(observation=torch.zeros(3, 39), task_id=torch.full((3,), lw.task_id("push"))).auto_batch_size_()
+    told = lw.QAFTransform(OTHERS["another skill"], out_keys=[("agent", "truth")])
+    assert told.out_keys == [("agent", "truth"), ("agent", "truth_plan")]
+    with pytest.raises(ValueError, match=REFUSED):
+        ACTORS[make](PLANS, in_keys=keys)(told(data))
+
+
+def test_a_relation_that_means_something_else_since(monkeypatch):
+    before = lw.PlanConditionedActor(PLANS, width=8)
+    monkeypatch.setitem(RELATIONS, "above", (Comparison("z", ">", 0.3),))
+    with pytest.raises(ValueError, match=REFUSED):
+        before(state(PLANS))
+    lw.PlanConditionedActor(PLANS, width=8)(state(PLANS))
+
+
+def test_under_vmap_over_the_rows_it_steps_aside():
+    actor, data = lw.PlanConditionedActor(PLANS, width=8), state(OTHERS["another skill"])
+    assert torch.vmap(lambda row: actor(row)["action"])(data.exclude("action")).shape == (3, 4)
+    params = TensorDict.from_module(actor).expand(2).clone()
+
+    def act(params):
+        with params.to_module(actor):
+            return actor(data.copy())["action"]
+
+    with pytest.raises(ValueError, match=REFUSED):  # over weights the numbers can be read
+        torch.vmap(act)(params)
+
+
+def test_the_number_travels_with_a_pickle():
+    actor = pickle.loads(pickle.dumps(lw.PlanConditionedActor(PLANS, width=8)))
+    with pytest.raises(ValueError, match=REFUSED):
+        actor(state(OTHERS["another skill"]))
