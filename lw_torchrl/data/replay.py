@@ -50,7 +50,7 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
     """The rows of datasets that :func:`collect_demonstrations` made; several are joined, and none is copied.
 
     Samples hold observation (B, 39) float32, action (B, 4) float32, task_id and episode (B,) int64, and what
-    ``label`` leaves; a :class:`QAFTransform` adds ``qaf``. collector/traj_ids (B,) int64 tells episodes apart, those
+    ``label`` leaves; a :class:`QAFTransform` adds ``qaf`` and ``qaf_plan``. collector/traj_ids (B,) int64 tells episodes apart, those
     of different datasets too.
 
     Args:

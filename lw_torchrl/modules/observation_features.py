@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from lw_torchrl._checks import check_choice, check_scale
 from lw_torchrl.language.observation import HAND, OBSERVATION_SIZE, OPENING, POSITIONS
+from lw_torchrl.language.task_index import readable
 
 Features = Literal["raw", "differences", "relative", "both"]
 _FINE, _COARSE = 0.02, 0.1  # metres: where the two squashed copies of each difference bend
@@ -74,7 +75,7 @@ class ObservationFeatures(nn.Module):
                 f"observation must be float32 of shape (..., 39), got {observation.dtype} of shape "
                 f"{tuple(observation.shape)}"
             )
-        if not torch.compiler.is_compiling() and not observation.isfinite().all():
+        if readable(observation) and not observation.isfinite().all():
             raise ValueError("observation must hold finite numbers, got NaN or infinity")
         if self.kind == "raw":
             return observation

@@ -83,7 +83,10 @@ def test_keys_travel_with_the_policy(tmp_path):
     loaded = lw.load_actor(tmp_path / "policy.zip")
     assert (loaded.in_keys, loaded.out_keys) == (actor.in_keys, actor.out_keys)
     queries = actor.transform()
-    assert (queries.in_keys, queries.out_keys) == (["state", ("words", "task")], [("words", "qaf")])
+    assert (queries.in_keys, queries.out_keys) == (
+        ["state", ("words", "task")],
+        [("words", "qaf"), ("words", "qaf_plan")],
+    )
 
 
 def test_a_json_list_is_a_nested_key():

@@ -86,7 +86,7 @@ def test_a_collector_and_a_replay_buffer_refuse():
         return TransformedEnv(lw.LanguageWorldEnv("push"), lw.QAFTransform(other))
 
     with pytest.raises(ValueError, match=REFUSED):
-        Collector(env, actor, frames_per_batch=4, total_frames=8)
+        next(iter(Collector(env, actor, frames_per_batch=4, total_frames=8, auto_register_policy_transforms=True)))
     replay = TensorDictReplayBuffer(storage=LazyTensorStorage(3), transform=lw.QAFTransform(other), batch_size=3)
     replay.extend(state(PLANS).set(("next", "observation"), torch.ones(3, 39)))
     sample = replay.sample()  # answers of its own plans replace the stored ones, and say so
@@ -96,9 +96,10 @@ def test_a_collector_and_a_replay_buffer_refuse():
 
 
 def test_through_processes():
-    env = ParallelEnv(
-        2, lambda: TransformedEnv(lw.LanguageWorldEnv("push"), lw.QAFTransform(PLANS)), mp_start_method="fork"
-    )
+    def make():
+        return TransformedEnv(lw.LanguageWorldEnv("push"), lw.QAFTransform(PLANS))
+
+    env = ParallelEnv(2, make, mp_start_method="fork")
     lw.PlanConditionedActor(PLANS, width=8)(env.reset())
     with pytest.raises(ValueError, match=REFUSED):
         lw.PlanConditionedActor(OTHERS["another skill"], width=8)(env.reset())
@@ -124,7 +125,7 @@ def test_a_relation_that_means_something_else_since(monkeypatch):
 
 
 def test_under_vmap_over_the_rows_it_steps_aside():
-    actor, data = lw.PlanConditionedActor(PLANS, width=8), state(OTHERS["another skill"])
+    actor, data = lw.PlanConditionedActor(PLANS, width=8).eval(), state(OTHERS["another skill"])
     assert torch.vmap(lambda row: actor(row)["action"])(data.exclude("action")).shape == (3, 4)
     params = TensorDict.from_module(actor).expand(2).clone()
 
