@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Literal, cast
 from tyro.conf import Positional
 
 from lw_torchrl.cli.outputs import check_folder
-from lw_torchrl.cli.sources import read_plans, read_tasks
+from lw_torchrl.cli.sources import read_encoder, read_plans, read_tasks
 
 if TYPE_CHECKING:
     from lw_torchrl.experiments.runs import Dataset, Run
     from lw_torchrl.language.plans import Plans
+    from lw_torchrl.modules.policy import TextEncoding
 
 Experiment = Literal["zero-shot", "few-shot", "one-shot", "scripted", "all"]
 Method = Literal["pcbc", "dc", "one-hot", "scripted"]
@@ -30,6 +31,7 @@ def reproduce(
     passes: int | None = None,
     plans: tuple[str, ...] = (),
     task_file: Path | None = None,
+    text_encoder: str | None = None,
     episodes: int = 20,
     launcher: Literal["local", "ray"] = "local",
     jobs: int = 1,
@@ -56,6 +58,7 @@ def reproduce(
         plans: of all 50 tasks, instead of ours: .plan files, .json files of pairs, folders, or MT50; where several have
             a plan for a task, the last one's counts.
         task_file: tasks of yours, whose objects and points the plans may name.
+        text_encoder: a function of yours that turns texts into vectors, as my_texts:encode.
         episodes: evaluated for each task, on seeds that no training used, action noise 0.1.
         launcher: local, on this machine; ray, on a Ray cluster, or on all cores of this machine.
         jobs: runs run at a time by the launcher local.
@@ -86,7 +89,7 @@ def reproduce(
     assert methods is not None
     plans_name = "+".join(Path(source).stem for source in plans)
     runs = [
-        Run(SETTINGS[name], method, seed, recipes[name], episodes, plans_name)
+        Run(SETTINGS[name], method, seed, recipes[name], episodes, plans_name, text_encoder or "")
         for name in (["few-shot"] if experiment == "scripted" else SETTINGS)
         if experiment in (name, "scripted", "all")
         for method in methods
@@ -97,21 +100,23 @@ def reproduce(
     if list:
         print("\n".join([*datasets, *named]))
         return
-    load = _Plans(plans, task_file)
+    load, encoder = _Plans(plans, task_file), read_encoder(text_encoder)
     use_one_thread()
     if run in datasets:
         datasets[run].collect(out, progress=True)
     elif run is not None:
-        result = execute_run(one := named[check_choice("run", run, [*datasets, *named])], load(one), out)
+        one = named[check_choice("run", run, [*datasets, *named])]
+        result = execute_run(one, load(one), out, text_encoder=encoder)
         print(f"{one.folder}: mean success {result.mean_success:.3f}, {result.config['seconds']:.0f} s")
     else:
         if launcher == "local" and jobs == 1:
-            _report(len(named), _here(named, load, out))
+            _report(len(named), _here(named, load, out, encoder))
         else:
             given = [experiment, "--preset", preset, "--episodes", str(episodes), "--out", str(out)]
             given += ["--seeds", *map(str, seeds), "--methods", *methods]
             given += [] if passes is None else ["--passes", str(passes)]
             given += ["--plans", *plans] if plans else []
+            given += [] if text_encoder is None else ["--text-encoder", text_encoder]
             given += [] if task_file is None else ["--task-file", str(task_file)]
             for stage in (datasets, named):
                 _report(len(stage), _there(stage, given, launcher, jobs))
@@ -133,11 +138,13 @@ class _Plans:
         return self.known[skills]
 
 
-def _here(named: dict[str, Run], load: Callable[[Run], Plans], out: Path) -> Iterator[str]:
+def _here(
+    named: dict[str, Run], load: Callable[[Run], Plans], out: Path, encoder: TextEncoding | None
+) -> Iterator[str]:
     from lw_torchrl.experiments.execution import execute_run
 
     for name, one in named.items():
-        result = execute_run(one, load(one), out)
+        result = execute_run(one, load(one), out, text_encoder=encoder)
         yield f"{name}: mean success {result.mean_success:.3f}, {result.config['seconds']:.0f} s"
 
 

@@ -50,8 +50,8 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
     """The rows of datasets that :func:`collect_demonstrations` made; several are joined, and none is copied.
 
     Samples hold observation (B, 39) float32, action (B, 4) float32, task_id and episode (B,) int64, and what
-    ``label`` leaves; a :class:`QAFTransform` adds ``qaf`` and ``qaf_plan``. collector/traj_ids (B,) int64 tells episodes apart, those
-    of different datasets too.
+    ``label`` leaves; a :class:`QAFTransform` adds ``qaf`` and ``qaf_plan``. collector/traj_ids (B,) int64 tells
+    episodes apart, those of different datasets too.
 
     Args:
         root: the dataset's folder, or a list of folders: the rows of the first come first.

@@ -15,13 +15,16 @@ from lw_torchrl.experiments.training import train_each, train_one
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.tasks import resolve_tasks
 from lw_torchrl.modules import ScriptedSkillActor
+from lw_torchrl.modules.policy import TextEncoding
 
 EVALUATION_SEED = 10_000
 """Training seeds count from 0; the evaluation of training seed k has seed 10000 + k."""
 RESULTS = "results.json"
 
 
-def _evaluate(run: Run, plans: Plans, out: Path, tasks: tuple[str, ...], progress: bool) -> EvaluationResult:
+def _evaluate(
+    run: Run, plans: Plans, out: Path, tasks: tuple[str, ...], progress: bool, text_encoder: TextEncoding | None
+) -> EvaluationResult:
     options: dict[str, Any] = {
         "episodes_per_task": run.episodes,
         "seed": EVALUATION_SEED + run.seed,
@@ -31,8 +34,9 @@ def _evaluate(run: Run, plans: Plans, out: Path, tasks: tuple[str, ...], progres
     if run.method == SCRIPTED:
         return evaluate(ScriptedSkillActor(plans), tasks=tasks, progress=progress, **options)
     if run.setting.targets is None:
-        return evaluate(train_one(run, plans, out, progress), tasks=tasks, progress=progress, **options)
-    actors = train_each(run, plans, out, progress)
+        policy = train_one(run, plans, out, progress, text_encoder)
+        return evaluate(policy, tasks=tasks, progress=progress, **options)
+    actors = train_each(run, plans, out, progress, text_encoder)
     found = sorted({*tasks} & {*actors})
     each = []
     with Progress("evaluating", len(found), "model", show=progress) as bar:
@@ -72,6 +76,7 @@ def execute_run(
     *,
     tasks: str | Sequence[str] = "MT50",
     progress: bool = True,
+    text_encoder: TextEncoding | None = None,
 ) -> EvaluationResult:
     """Do a run, or what is left of it; its result is written last, to ``out/run.folder/results.json``.
 
@@ -81,6 +86,7 @@ def execute_run(
         out: the experiments' folder.
         tasks: to evaluate.
         progress: show progress bars.
+        text_encoder: texts to vectors (n, E) float32, which ``run.encoder_name`` names; None for the shipped one.
 
     Returns:
         The evaluation of the last checkpoint, action noise 0.1; ``config["run"]`` says what was done, and
@@ -96,7 +102,7 @@ def execute_run(
     started = time.perf_counter()
     for dataset in run.datasets:
         dataset.collect(out, progress)
-    result = _evaluate(run, plans, out, resolve_tasks(tasks), progress)
+    result = _evaluate(run, plans, out, resolve_tasks(tasks), progress, text_encoder)
     spent = {"run": run.describe(plans), "seconds": round(time.perf_counter() - started, 1)}
     result = replace(result, config=result.config | spent)
     result.save(out / run.folder / RESULTS)

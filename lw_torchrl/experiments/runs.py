@@ -67,6 +67,7 @@ class Run:
         preset: how to train.
         episodes: evaluated for each task.
         plans_name: part of the folder's name, for other plans than ours.
+        encoder_name: that of the text encoder, for another than ours: "my_texts:encode".
     """
 
     setting: DataSetting
@@ -75,14 +76,16 @@ class Run:
     preset: Preset
     episodes: int = 20
     plans_name: str = ""
+    encoder_name: str = ""
 
     def __post_init__(self) -> None:
         check_choice("method", self.method, (*METHODS, SCRIPTED))
 
     @property
     def group(self) -> Path:
-        """The folder of the setting, the preset and the plans: what methods are compared in."""
-        return Path(self.setting.name) / "-".join(filter(None, (self.preset.name, self.plans_name)))
+        """The folder of the setting, the preset, the plans and the texts: what methods are compared in."""
+        own = self.plans_name, self.encoder_name.replace(":", ".")
+        return Path(self.setting.name) / "-".join(filter(None, (self.preset.name, *own)))
 
     @property
     def folder(self) -> Path:
@@ -123,6 +126,8 @@ class Run:
                 "after_success": self.preset.after_success,
                 "passes": self.preset.passes,
             }
+        if self.encoder_name and self.method != SCRIPTED:
+            described["text_encoder"] = self.encoder_name
         return _plain(described)
 
 

@@ -16,16 +16,16 @@ from lw_torchrl.experiments.runs import Run
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.tasks import resolve_tasks
 from lw_torchrl.modules import ActorEnsemble
-from lw_torchrl.modules.policy import Policy, make_policy
+from lw_torchrl.modules.policy import Policy, TextEncoding, make_policy
 from lw_torchrl.trainers.behavioral_cloning import BehavioralCloningConfig, BehavioralCloningTrainer
 from lw_torchrl.trainers.checkpoint import check_description, describe_data, load_actor, save_actor
 from lw_torchrl.trainers.stacked import StackedBehavioralCloning
 from lw_torchrl.transforms import RandomYaw
 
 
-def _make_actor(run: Run, member: Member, plans: Plans, seed: int) -> Policy:
+def _make_actor(run: Run, member: Member, plans: Plans, seed: int, text_encoder: TextEncoding | None) -> Policy:
     torch.manual_seed(seed)
-    return make_policy(run.method, plans, **run.actor_options(member))
+    return make_policy(run.method, plans, text_encoder=text_encoder, **run.actor_options(member))
 
 
 def _transform(actor: Policy, member: Member) -> Transform:
@@ -53,17 +53,17 @@ def _forget_checkpoints(folder: Path) -> None:
         checkpoint.unlink()
 
 
-def _kept(described: dict[str, Any], file: Path) -> Policy:
+def _kept(described: dict[str, Any], file: Path, text_encoder: TextEncoding | None) -> Policy:
     check_description(file, {"run": described})
-    return load_actor(file)
+    return load_actor(file, text_encoder=text_encoder)
 
 
-def train_one(run: Run, plans: Plans, out: Path, progress: bool) -> Policy:
+def train_one(run: Run, plans: Plans, out: Path, progress: bool, text_encoder: TextEncoding | None = None) -> Policy:
     """One policy for all tasks, kept in ``policy.zip``; until all its members are done, each has a checkpoint."""
     folder, described = out / run.folder, run.describe(plans)
     file = folder / "policy.zip"
     if file.is_file():
-        policy = _kept(described, file)
+        policy = _kept(described, file, text_encoder)
         _forget_checkpoints(folder)
         return policy
     actors = []
@@ -75,7 +75,7 @@ def train_one(run: Run, plans: Plans, out: Path, progress: bool) -> Policy:
             after_success=run.preset.after_success,
         )
         config = _config(run, len(replay), run.seed + 1_000 * number)
-        actors.append(_make_actor(run, member, plans, config.seed))
+        actors.append(_make_actor(run, member, plans, config.seed, text_encoder))
         replay.append_transform(_transform(actors[-1], member))
         checkpoint = folder / f"checkpoint-{number}.zip"
         BehavioralCloningTrainer(actors[-1], replay, config, checkpoint=checkpoint, progress=progress).train()
@@ -84,7 +84,9 @@ def train_one(run: Run, plans: Plans, out: Path, progress: bool) -> Policy:
     return policy
 
 
-def train_each(run: Run, plans: Plans, out: Path, progress: bool) -> dict[str, Policy]:
+def train_each(
+    run: Run, plans: Plans, out: Path, progress: bool, text_encoder: TextEncoding | None = None
+) -> dict[str, Policy]:
     """A policy for each target, kept in ``models/<target>.zip``; all are trained together, member by member.
 
     The i-th target's seed is the i-th from 1000 times the run's; the next member's follow.
@@ -93,7 +95,7 @@ def train_each(run: Run, plans: Plans, out: Path, progress: bool) -> dict[str, P
     targets = resolve_tasks(run.setting.targets or ())
     files = {target: folder / "models" / f"{target}.zip" for target in targets}
     if all(file.is_file() for file in files.values()):
-        policies = {target: _kept(described, file) for target, file in files.items()}
+        policies = {target: _kept(described, file, text_encoder) for target, file in files.items()}
         _forget_checkpoints(folder)
         return policies
     roots = [out / dataset.folder for dataset in run.datasets]
@@ -103,7 +105,7 @@ def train_each(run: Run, plans: Plans, out: Path, progress: bool) -> dict[str, P
     members = []
     for number, member in enumerate(run.preset.members):
         config = _config(run, rows, 1_000 * run.seed + len(targets) * number)
-        actors = [_make_actor(run, member, plans, config.seed + i) for i in range(len(targets))]
+        actors = [_make_actor(run, member, plans, config.seed + i, text_encoder) for i in range(len(targets))]
         replays = [
             LanguageWorldExperienceReplay(
                 roots,

@@ -116,3 +116,10 @@ def test_a_policy_is_trained_and_evaluated_with_them(capsys, tmp_path):
 )
 def test_an_encoder_that_is_none_is_refused(capsys, tmp_path, name, message):
     assert message in fails(capsys, "train", "demos", "--out", tmp_path / "p.zip", "--text-encoder", name, *TINY)
+
+
+def test_experiments_take_an_encoder_too(capsys, tmp_path):
+    given = ("reproduce", "few-shot", "--methods", "pcbc", "--seeds", 0, "--text-encoder")
+    listed = run(capsys, *given, "my_texts:encode", "--list")
+    assert "few-shot/strong-my_texts.encode/pcbc/seed0" in listed
+    assert "names no function" in fails(capsys, *given, "my_texts:nothing", "--out", tmp_path / "out")

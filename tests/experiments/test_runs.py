@@ -5,6 +5,7 @@ import shutil
 from dataclasses import replace
 
 import pytest
+import torch
 
 import lw_torchrl as lw
 from lw_torchrl.experiments import execution, training
@@ -31,6 +32,10 @@ ENSEMBLE = replace(PRESET, name="ensemble", members=(MEMBER, OTHER))
 
 def a_run(method="pcbc", seed=3, setting=TINY, preset=PRESET):
     return Run(setting, method, seed, preset, episodes=2)
+
+
+def lengths(texts):
+    return torch.tensor([[len(text), len(text.split()), text.count("e"), 1.0] for text in texts])
 
 
 def task_of(one):
@@ -234,3 +239,19 @@ def test_passes_count_rows(undisturbed, tmp_path, monkeypatch, setting, trainer,
         execute(a_run(setting=setting), tmp_path, replace(PRESET, passes=2))
     rows = len(lw.LanguageWorldExperienceReplay(tmp_path / a_run().datasets[0].folder, after_success=20))
     assert steps == [2 * rows // share]
+
+
+@pytest.mark.parametrize(
+    "one", [a_run(), a_run("dc"), a_run("one-hot", setting=TINY_ONE_SHOT)], ids=["pcbc", "dc", "one-hot one-shot"]
+)
+def test_a_text_encoder_of_ones_own(one, tmp_path):
+    own = replace(one, encoder_name="my_texts:lengths")
+    assert own.folder != one.folder
+    execute_run(own, PLANS, tmp_path, tasks=task_of(own), progress=False, text_encoder=lengths)
+    (tmp_path / own.folder / "results.json").unlink()
+    again = execute_run(own, PLANS, tmp_path, tasks=task_of(own), progress=False, text_encoder=lengths)
+    assert again.config["run"]["text_encoder"] == "my_texts:lengths"
+    if one.method != "one-hot":
+        (tmp_path / own.folder / "results.json").unlink()
+        with pytest.raises(ValueError, match="text"):  # a policy of other texts is no policy of these
+            execute_run(own, PLANS, tmp_path, tasks=task_of(own), progress=False)
