@@ -41,9 +41,12 @@ if TYPE_CHECKING:  # the table below, for type checkers and editors
     from lw_torchrl.modules import ActorEnsemble as ActorEnsemble
     from lw_torchrl.modules import DescriptorConditionedActor as DescriptorConditionedActor
     from lw_torchrl.modules import PlanConditionedActor as PlanConditionedActor
+    from lw_torchrl.modules import PlanConditionedQValue as PlanConditionedQValue
+    from lw_torchrl.modules import PlanConditionedValue as PlanConditionedValue
     from lw_torchrl.modules import Policy as Policy
     from lw_torchrl.modules import QueryEvaluator as QueryEvaluator
     from lw_torchrl.modules import ScriptedSkillActor as ScriptedSkillActor
+    from lw_torchrl.modules import plan_actor_value as plan_actor_value
     from lw_torchrl.record import RerunLogger as RerunLogger
     from lw_torchrl.trainers import BehavioralCloningConfig as BehavioralCloningConfig
     from lw_torchrl.trainers import BehavioralCloningTrainer as BehavioralCloningTrainer
@@ -67,8 +70,8 @@ _NAMES = {
     "lw_torchrl.language.query_search": "nearest_query",
     "lw_torchrl.language.skills": "load_skills nearest_skill",
     "lw_torchrl.language.tasks": "MT10 MT50 TASKS Task load_tasks resolve_tasks task_id",
-    "lw_torchrl.modules": "ActorEnsemble DescriptorConditionedActor PlanConditionedActor Policy QueryEvaluator "
-    "ScriptedSkillActor",
+    "lw_torchrl.modules": "ActorEnsemble DescriptorConditionedActor PlanConditionedActor PlanConditionedQValue "
+    "PlanConditionedValue Policy QueryEvaluator ScriptedSkillActor plan_actor_value",
     "lw_torchrl.record": "RerunLogger",
     "lw_torchrl.trainers": "BehavioralCloningConfig BehavioralCloningTrainer StackedBehavioralCloning "
     "load_actor save_actor",

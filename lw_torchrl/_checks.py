@@ -61,6 +61,13 @@ def check_scale(argument: str, given: Any) -> float:
     return float(given)
 
 
+def check_probability(argument: str, given: Any) -> float:
+    """Return ``given`` as a float from 0 to 1."""
+    if (value := check_scale(argument, given)) > 1.0:
+        raise ValueError(f"{argument} must be a probability, at most 1, got {given}")
+    return value
+
+
 _SHOWN = Repr()
 _SHOWN.maxlevel, _SHOWN.maxstring, _SHOWN.maxother, _SHOWN.maxlist, _SHOWN.maxtuple, _SHOWN.maxdict = 3, 80, 80, 8, 8, 8
 

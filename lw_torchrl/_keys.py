@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from tensordict import TensorDictBase
 from tensordict.utils import NestedKey, unravel_key
+from torch import Tensor
+
+from lw_torchrl._checks import missing_keys
 
 
 def as_keys(argument: str, given: Sequence[NestedKey] | None, default: Sequence[str]) -> list[NestedKey]:
@@ -41,3 +45,11 @@ def key_beside(key: NestedKey, ending: str) -> NestedKey:
         ('agent', 'qaf_plan')
     """
     return key + ending if isinstance(key, str) else (*key[:-1], key[-1] + ending)
+
+
+def read(tensordict: TensorDictBase, keys: Sequence[NestedKey]) -> list[Tensor]:
+    """The tensors of ``keys``; :class:`ValueError` names those that are missing."""
+    found = [tensordict.get(key, None) for key in keys]
+    if any(one is None for one in found):
+        raise missing_keys(tensordict.keys(True, True), *map(str, keys))
+    return found

@@ -18,8 +18,8 @@ from lw_torchrl.envs import EngineStep
 from lw_torchrl.language.relations import RELATIONS, Comparison
 from lw_torchrl.language.skills import ScriptedSkill
 from lw_torchrl.language.task_index import TaskIndex
-from lw_torchrl.modules import EVALUATORS, METHODS, POLICIES, Method, make_policy
-from lw_torchrl.modules.decoder import ActionDecoder
+from lw_torchrl.modules import EVALUATORS, METHODS, POLICIES, Method, ObservationFeatures, make_policy
+from lw_torchrl.modules.action_head import ActionHead
 from lw_torchrl.record.rollouts import rollout_tasks, write_recording
 
 STEPS = 40
@@ -72,7 +72,8 @@ class LearnedTaskActor(lw.Policy):
         self.in_keys, self.out_keys = ["observation", "task_id"], ["action"]
         self.index = TaskIndex(self.tasks)
         self.vectors = nn.Embedding(len(self.tasks), size)
-        self.decoder = ActionDecoder(size, "differences", 0.0, width, 1)
+        self.features = ObservationFeatures()
+        self.head = ActionHead(size + self.features.width, width, 1)
 
     @classmethod
     def for_plans(cls, plans, *, text_encoder=None, **options):
@@ -80,10 +81,10 @@ class LearnedTaskActor(lw.Policy):
 
     def prepare(self, tensordict):
         observation, task_id = self.read(tensordict)
-        return self.index.rows(task_id, "tasks unknown to this actor"), self.decoder.features(observation)
+        return self.index.rows(task_id, "tasks unknown to this actor"), self.features(observation)
 
     def act(self, rows, seen):
-        return (self.decoder.decode(self.vectors.weight[rows], seen),)
+        return (self.head(torch.cat((self.vectors.weight[rows], seen), -1)),)
 
     def describe(self):
         return super().describe() | {"tasks": list(self.tasks)}

@@ -16,7 +16,7 @@ from lw_torchrl.cli.sources import read_encoder, read_plans, read_tasks
 if TYPE_CHECKING:
     from lw_torchrl.experiments.runs import Dataset, Run
     from lw_torchrl.language.plans import Plans
-    from lw_torchrl.modules.policy import TextEncoding
+    from lw_torchrl.language.text import TextEncoder
 
 Experiment = Literal["zero-shot", "few-shot", "one-shot", "scripted", "all"]
 Method = Literal["pcbc", "dc", "one-hot", "scripted"]
@@ -138,9 +138,7 @@ class _Plans:
         return self.known[skills]
 
 
-def _here(
-    named: dict[str, Run], load: Callable[[Run], Plans], out: Path, encoder: TextEncoding | None
-) -> Iterator[str]:
+def _here(named: dict[str, Run], load: Callable[[Run], Plans], out: Path, encoder: TextEncoder | None) -> Iterator[str]:
     from lw_torchrl.experiments.execution import execute_run
 
     for name, one in named.items():

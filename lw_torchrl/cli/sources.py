@@ -4,16 +4,15 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from lw_torchrl.language.plans import Plans
     from lw_torchrl.language.tasks import Task
+    from lw_torchrl.language.text import TextEncoder
 
 
 def one_or_many(names: tuple[str, ...]) -> str | tuple[str, ...]:
@@ -42,7 +41,7 @@ def read_plans(sources: Sequence[str], tasks: Mapping[str, Task], skills: Litera
     return Plans(found)
 
 
-def read_encoder(name: str | None) -> Callable[[Sequence[str]], Tensor] | None:
+def read_encoder(name: str | None) -> TextEncoder | None:
     """The function that --text-encoder names, "package.module:function"; the working folder is searched first.
 
     Raises:

@@ -14,8 +14,8 @@ from lw_torchrl.experiments.runs import SCRIPTED, Run
 from lw_torchrl.experiments.training import train_each, train_one
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.tasks import resolve_tasks
+from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules import ScriptedSkillActor
-from lw_torchrl.modules.policy import TextEncoding
 
 EVALUATION_SEED = 10_000
 """Training seeds count from 0; the evaluation of training seed k has seed 10000 + k."""
@@ -23,7 +23,7 @@ RESULTS = "results.json"
 
 
 def _evaluate(
-    run: Run, plans: Plans, out: Path, tasks: tuple[str, ...], progress: bool, text_encoder: TextEncoding | None
+    run: Run, plans: Plans, out: Path, tasks: tuple[str, ...], progress: bool, text_encoder: TextEncoder | None
 ) -> EvaluationResult:
     options: dict[str, Any] = {
         "episodes_per_task": run.episodes,
@@ -76,7 +76,7 @@ def execute_run(
     *,
     tasks: str | Sequence[str] = "MT50",
     progress: bool = True,
-    text_encoder: TextEncoding | None = None,
+    text_encoder: TextEncoder | None = None,
 ) -> EvaluationResult:
     """Do a run, or what is left of it; its result is written last, to ``out/run.folder/results.json``.
 

@@ -15,15 +15,16 @@ from lw_torchrl.experiments.recipes import Member
 from lw_torchrl.experiments.runs import Run
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.tasks import resolve_tasks
+from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules import ActorEnsemble
-from lw_torchrl.modules.policy import Policy, TextEncoding, make_policy
+from lw_torchrl.modules.policy import Policy, make_policy
 from lw_torchrl.trainers.behavioral_cloning import BehavioralCloningConfig, BehavioralCloningTrainer
 from lw_torchrl.trainers.checkpoint import check_description, describe_data, load_actor, save_actor
 from lw_torchrl.trainers.stacked import StackedBehavioralCloning
 from lw_torchrl.transforms import RandomYaw
 
 
-def _make_actor(run: Run, member: Member, plans: Plans, seed: int, text_encoder: TextEncoding | None) -> Policy:
+def _make_actor(run: Run, member: Member, plans: Plans, seed: int, text_encoder: TextEncoder | None) -> Policy:
     torch.manual_seed(seed)
     return make_policy(run.method, plans, text_encoder=text_encoder, **run.actor_options(member))
 
@@ -53,12 +54,12 @@ def _forget_checkpoints(folder: Path) -> None:
         checkpoint.unlink()
 
 
-def _kept(described: dict[str, Any], file: Path, text_encoder: TextEncoding | None) -> Policy:
+def _kept(described: dict[str, Any], file: Path, text_encoder: TextEncoder | None) -> Policy:
     check_description(file, {"run": described})
     return load_actor(file, text_encoder=text_encoder)
 
 
-def train_one(run: Run, plans: Plans, out: Path, progress: bool, text_encoder: TextEncoding | None = None) -> Policy:
+def train_one(run: Run, plans: Plans, out: Path, progress: bool, text_encoder: TextEncoder | None = None) -> Policy:
     """One policy for all tasks, kept in ``policy.zip``; until all its members are done, each has a checkpoint."""
     folder, described = out / run.folder, run.describe(plans)
     file = folder / "policy.zip"
@@ -85,7 +86,7 @@ def train_one(run: Run, plans: Plans, out: Path, progress: bool, text_encoder: T
 
 
 def train_each(
-    run: Run, plans: Plans, out: Path, progress: bool, text_encoder: TextEncoding | None = None
+    run: Run, plans: Plans, out: Path, progress: bool, text_encoder: TextEncoder | None = None
 ) -> dict[str, Policy]:
     """A policy for each target, kept in ``models/<target>.zip``; all are trained together, member by member.
 

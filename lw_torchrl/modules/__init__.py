@@ -2,10 +2,14 @@
 
 import lw_torchrl._torchrl  # noqa: F401
 from lw_torchrl.modules.actor_ensemble import ActorEnsemble
+from lw_torchrl.modules.critics import PlanConditionedQValue, PlanConditionedValue, QValue, Value, plan_actor_value
 from lw_torchrl.modules.descriptor_conditioned_actor import DescriptorConditionedActor
+from lw_torchrl.modules.descriptor_encoder import DescriptorEncoder
+from lw_torchrl.modules.encoder import Encoder
 from lw_torchrl.modules.observation_features import ObservationFeatures
 from lw_torchrl.modules.plan_attention import PlanAttention
 from lw_torchrl.modules.plan_conditioned_actor import PlanConditionedActor
+from lw_torchrl.modules.plan_encoder import PlanEncoder
 from lw_torchrl.modules.plan_focus import PlanFocus
 from lw_torchrl.modules.policy import METHODS, POLICIES, Method, Policy, make_policy
 from lw_torchrl.modules.query_evaluator import EVALUATORS, QueryEvaluator
@@ -17,13 +21,21 @@ __all__ = [
     "POLICIES",
     "ActorEnsemble",
     "DescriptorConditionedActor",
+    "DescriptorEncoder",
+    "Encoder",
     "Method",
     "ObservationFeatures",
     "PlanAttention",
     "PlanConditionedActor",
+    "PlanConditionedQValue",
+    "PlanConditionedValue",
+    "PlanEncoder",
     "PlanFocus",
     "Policy",
+    "QValue",
     "QueryEvaluator",
     "ScriptedSkillActor",
+    "Value",
     "make_policy",
+    "plan_actor_value",
 ]

@@ -12,7 +12,8 @@ from torch import Tensor, nn
 from torchrl.envs import Transform
 
 from lw_torchrl.language.plans import ConditionalPlan, Plans
-from lw_torchrl.modules.policy import Policy, TextEncoding, from_description
+from lw_torchrl.language.text import TextEncoder
+from lw_torchrl.modules.policy import Policy, from_description
 
 
 class ActorEnsemble(Policy):
@@ -86,7 +87,7 @@ class ActorEnsemble(Policy):
         return {"kind": "ActorEnsemble", "options": {}, "members": [member.describe() for member in self._each]}
 
     @classmethod
-    def from_description(cls, found: Mapping[str, Any], text_encoder: TextEncoding | None = None) -> ActorEnsemble:
+    def from_description(cls, found: Mapping[str, Any], text_encoder: TextEncoder | None = None) -> ActorEnsemble:
         members = found["members"]
         if not isinstance(members, list) or cls.__name__ in [one.get("kind") for one in members]:
             raise ValueError("members of an ensemble must be a list of policies that are no ensembles")

@@ -7,6 +7,7 @@ from typing import Literal
 
 import torch
 from torch import Tensor, nn
+from torchrl.objectives import add_random_module
 
 from lw_torchrl._checks import check_choice, check_scale
 from lw_torchrl.language.observation import HAND, OBSERVATION_SIZE, OPENING, POSITIONS
@@ -110,3 +111,6 @@ class ObservationFeatures(nn.Module):
         """(..., 39) float32 to (..., F) float32, within 10 standard deviations of the mean."""
         found = ((self._select(observation) - self.mean) / self.std).clamp(-10.0, 10.0)
         return found + self.noise * torch.randn_like(found) if self.training and self.noise else found
+
+
+add_random_module(ObservationFeatures)  # losses that vmap over networks then let each draw its own noise

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
 from typing import Any, ClassVar
@@ -12,12 +12,12 @@ from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor
 from torchrl.envs import Transform
 
-from lw_torchrl._checks import check_choice, missing_keys
+from lw_torchrl._checks import check_choice
+from lw_torchrl._keys import read
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.tasks import TASKS, Task
+from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.transforms.qaf import QAFTransform
-
-TextEncoding = Callable[[Sequence[str]], Tensor]
 
 POLICIES: dict[str, str | type[Policy]] = {
     "ActorEnsemble": "lw_torchrl.modules.actor_ensemble",
@@ -73,7 +73,7 @@ class Policy(TensorDictModuleBase):
     row_by_row: ClassVar[bool] = False
 
     @classmethod
-    def for_plans(cls, plans: Plans, *, text_encoder: TextEncoding | None = None, **options: Any) -> Policy:
+    def for_plans(cls, plans: Plans, *, text_encoder: TextEncoder | None = None, **options: Any) -> Policy:
         """One for the tasks of ``plans``."""
         raise NotImplementedError(f"{cls.__name__} must say how it is made for plans: override for_plans")
 
@@ -102,10 +102,7 @@ class Policy(TensorDictModuleBase):
 
     def read(self, tensordict: TensorDictBase) -> list[Tensor]:
         """The tensors of ``in_keys``; :class:`ValueError` names those that are missing."""
-        found = [tensordict.get(key, None) for key in self.in_keys]
-        if any(one is None for one in found):
-            raise missing_keys(tensordict.keys(True, True), *self.in_keys)
-        return found
+        return read(tensordict, self.in_keys)
 
     def fit_normalization(self, observation: Tensor, weights: Tensor | None = None) -> None:
         """Take the statistics of observations (R, 39) float32, in place; ``weights`` (R,) float32, with the sum 1, tell
@@ -116,7 +113,7 @@ class Policy(TensorDictModuleBase):
         return {"kind": type(self).__name__, "options": self.config}
 
     @classmethod
-    def from_description(cls, found: Mapping[str, Any], text_encoder: TextEncoding | None = None) -> Policy:
+    def from_description(cls, found: Mapping[str, Any], text_encoder: TextEncoder | None = None) -> Policy:
         """Make what :meth:`describe` described, with fresh weights."""
         return cls(**found["options"])
 
@@ -139,7 +136,7 @@ def make_policy(
     method: str,
     plans: Plans | Mapping[str, ConditionalPlan],
     *,
-    text_encoder: TextEncoding | None = None,
+    text_encoder: TextEncoder | None = None,
     **options: Any,
 ) -> Policy:
     """A policy of a method for the tasks of some plans.
@@ -164,7 +161,7 @@ def make_policy(
     )
 
 
-def from_description(found: Any, text_encoder: TextEncoding | None = None) -> Policy:
+def from_description(found: Any, text_encoder: TextEncoder | None = None) -> Policy:
     """Make the policy that :meth:`Policy.describe` described, with fresh weights.
 
     Raises:

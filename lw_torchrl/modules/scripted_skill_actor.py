@@ -16,7 +16,8 @@ from lw_torchrl.language.plan_tables import PlanTables
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.skill_program import SkillProgram
 from lw_torchrl.language.skills import ScriptedSkill
-from lw_torchrl.modules.policy import Policy, TextEncoding
+from lw_torchrl.language.text import TextEncoder
+from lw_torchrl.modules.policy import Policy
 from lw_torchrl.transforms.qaf import QAFTransform, plan_number_key
 
 
@@ -74,7 +75,7 @@ class ScriptedSkillActor(Policy):
         self._generator = torch.Generator().manual_seed(seed)
 
     @classmethod
-    def for_plans(cls, plans: Plans, *, text_encoder: TextEncoding | None = None, **options: Any) -> ScriptedSkillActor:
+    def for_plans(cls, plans: Plans, *, text_encoder: TextEncoder | None = None, **options: Any) -> ScriptedSkillActor:
         return cls(plans, **options)
 
     def transform(self) -> QAFTransform:
@@ -92,7 +93,7 @@ class ScriptedSkillActor(Policy):
         return super().describe() | {"plans": self.plans.to_json()}
 
     @classmethod
-    def from_description(cls, found: Mapping[str, Any], text_encoder: TextEncoding | None = None) -> ScriptedSkillActor:
+    def from_description(cls, found: Mapping[str, Any], text_encoder: TextEncoder | None = None) -> ScriptedSkillActor:
         return cls(Plans.from_json(found["plans"]), **found["options"])
 
     def _weights(self, qaf: Tensor, rows: Tensor) -> Tensor:

@@ -24,7 +24,8 @@ from torch.nn.modules.module import register_module_parameter_registration_hook
 
 from lw_torchrl._state_tree import check_like, join, split
 from lw_torchrl._tensor_archive import ArchiveError, TensorArchive, write_archive
-from lw_torchrl.modules.policy import Policy, TextEncoding, from_description
+from lw_torchrl.language.text import TextEncoder
+from lw_torchrl.modules.policy import Policy, from_description
 
 FORMAT = "lw_torchrl.policy"
 FORMAT_VERSION = 2
@@ -175,7 +176,7 @@ def check_description(path: Path, ours: dict[str, Any]) -> None:
             )
 
 
-def load_actor(path: str | os.PathLike[str], *, text_encoder: TextEncoding | None = None) -> Policy:
+def load_actor(path: str | os.PathLike[str], *, text_encoder: TextEncoder | None = None) -> Policy:
     """Make the policy of a file, with its plans and weights, in eval mode.
 
     Args:

@@ -59,7 +59,7 @@ def test_with_plans_keeps_the_weights_and_the_mode():
     assert not other.training
     assert other.plans["reach"] == plan
     for before, after in zip(ensemble.members, other.members, strict=True):
-        assert after.decoder is before.decoder
+        assert after.head is before.head
     with pytest.raises(TypeError, match="with_plans is for policies with plans"):
         lw.ActorEnsemble(make_members(2, "descriptions")).with_plans({"reach": plan})
 

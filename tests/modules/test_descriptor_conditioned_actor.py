@@ -34,7 +34,7 @@ def make_state(*shape, seed=0):
 
 
 def decoded(actor, vector, observation):
-    return actor.decoder.decode(actor.encoder(vector), actor.decoder.features(observation))
+    return actor.head(torch.cat((actor.encoder.texts(vector), actor.encoder.features(observation)), -1))
 
 
 def counted(texts):
@@ -71,7 +71,7 @@ def test_the_task_makes_a_difference_and_every_known_task_works():
 def test_the_weights_do_not_depend_on_which_tasks_it_knows():
     one, other = make_actor("reach"), make_actor("MT10")
     assert one.state_dict().keys() == other.state_dict().keys()
-    assert {key.split(".")[0] for key in one.state_dict()} == {"encoder", "decoder"}
+    assert {key.split(".")[0] for key in one.state_dict()} == {"encoder", "head"}
     other.load_state_dict(one.state_dict())
     state = TensorDict({"observation": torch.rand(3, 39), "task_id": torch.full((3,), task_id("reach"))}, [3])
     assert torch.equal(one(state.clone())["action"], other(state.clone())["action"])
@@ -79,7 +79,7 @@ def test_the_weights_do_not_depend_on_which_tasks_it_knows():
 
 def test_a_text_encoder_of_ones_own():
     actor = make_actor(text_encoder=counted)
-    assert next(actor.encoder.parameters()).shape[1] == 5
+    assert next(actor.encoder.texts.parameters()).shape[1] == 5
     state = make_state(4)
     vector = counted([TASKS[MT50[state["task_id"][0]]].description])[0]
     torch.testing.assert_close(actor(state.clone())["action"][0], decoded(actor, unit(vector), state["observation"][0]))
@@ -118,7 +118,7 @@ def test_the_normalisation_is_saved_with_the_actor():
     other.load_state_dict(actor.state_dict())
     state = make_state(6)
     assert torch.equal(other(state.clone())["action"], actor(state.clone())["action"])
-    assert actor.decoder.features.mean.abs().sum() > 0
+    assert actor.encoder.features.mean.abs().sum() > 0
 
 
 def poke(index, value):

@@ -81,7 +81,7 @@ def test_a_policy_in_training_cannot_see_what_its_step_does_not_mention():
     state = TensorDict(
         observation=torch.randn(64, 39), task_id=reach, qaf=torch.ones(64, plans.num_steps, dtype=torch.bool)
     )
-    ours = actor.decoder.features(state["observation"])
+    ours = actor.encoder.features(state["observation"])
 
     def differs(seen):  # by the pair: hand-object, hand-second, hand-goal, ...
         return (seen[:, :18] != ours[:, :18]).reshape(64, 6, 3).all(-1).float().mean(0)

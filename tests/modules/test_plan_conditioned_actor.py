@@ -87,13 +87,13 @@ def test_mixing_step_by_step_by_hand(mix):
         truth = state["qaf"][row, : len(steps)].float()
         weights = torch.softmax(10 * truth - 5, 0)
         vectors = encode_texts([step.skill for step in steps])
-        latents = actor.encoder(vectors / vectors.square().mean(-1, keepdim=True).sqrt())  # numbers of size 1
+        latents = actor.encoder.texts(vectors / vectors.square().mean(-1, keepdim=True).sqrt())  # numbers of size 1
         mixed = weights @ latents
-        features = actor.decoder.features(state["observation"][row])
+        features = actor.encoder.features(state["observation"][row])
         if mix == "latents":
-            action = actor.decoder.decode(mixed, features)
+            action = actor.head(torch.cat((mixed, features), -1))
         else:
-            action = weights @ torch.stack([actor.decoder.decode(latent, features) for latent in latents])
+            action = weights @ torch.stack([actor.head(torch.cat((latent, features), -1)) for latent in latents])
         torch.testing.assert_close(out["skill_weights"][row, : len(steps)], weights)
         torch.testing.assert_close(out["skill_latent"][row], mixed)
         torch.testing.assert_close(out["action"][row], action)
@@ -144,9 +144,9 @@ def test_depth_and_width_make_the_networks():
         return [(m.in_features, m.out_features) for m in module.modules() if isinstance(m, torch.nn.Linear)]
 
     actor = make_actor(latent_size=5, width=7, depth=2, encoder_width=9, encoder_depth=3, features="raw")
-    assert linears(actor.encoder) == [(384, 9), (9, 9), (9, 9), (9, 5)]
-    assert linears(actor.decoder) == [(44, 7), (7, 7), (7, 4)]
-    assert linears(make_actor(depth=0, encoder_depth=0, features="raw").decoder) == [(45, 4)]
+    assert linears(actor.encoder.texts) == [(384, 9), (9, 9), (9, 9), (9, 5)]
+    assert linears(actor.head) == [(44, 7), (7, 7), (7, 4)]
+    assert linears(make_actor(depth=0, encoder_depth=0, features="raw").head) == [(45, 4)]
 
 
 # ---- other plans
@@ -201,18 +201,18 @@ def test_with_plans_keeps_options_normalisation_and_mode(training):
     actor.fit_normalization(make_state(50)["observation"])
     other = actor.with_plans(other_plans())
     assert other.config == actor.config
-    assert other.text_encoder is hashed
+    assert other.encoder.text_encoder is hashed
     assert other.training is training
-    assert torch.equal(other.decoder.features.mean, actor.decoder.features.mean)
+    assert torch.equal(other.encoder.features.mean, actor.encoder.features.mean)
     other.fit_normalization(make_state(50, seed=1)["observation"])
-    assert torch.equal(other.decoder.features.mean, actor.decoder.features.mean)
+    assert torch.equal(other.encoder.features.mean, actor.encoder.features.mean)
 
 
 def test_the_saved_state_holds_no_tables_of_the_plans():
     actor = make_actor(text_encoder=hashed)
     assert actor.state_dict().keys() == actor.with_plans(other_plans()).state_dict().keys()
     assert not any("skill" in key or "attention" in key for key in actor.state_dict())
-    assert {key.split(".")[0] for key in actor.state_dict()} == {"encoder", "decoder"}
+    assert {key.split(".")[0] for key in actor.state_dict()} == {"encoder", "head"}
 
 
 def test_a_text_encoder_of_ones_own():
@@ -225,8 +225,8 @@ def test_a_text_encoder_of_ones_own():
     actor = make_actor(text_encoder=encoder)
     assert seen == [PLANS.skills]
     assert actor.skills == PLANS.skills
-    assert actor.text_vectors.dtype == torch.float32
-    assert next(actor.encoder.parameters()).shape[1] == 5
+    assert actor.encoder.text_vectors.dtype == torch.float32
+    assert next(actor.encoder.texts.parameters()).shape[1] == 5
     actor(make_state(3))["action"].sum().backward()
 
 
@@ -275,7 +275,7 @@ def test_the_gradient_reaches_every_weight(mix):
 def test_only_networks_are_trained():
     actor = make_actor()
     names = {name.split(".")[0] for name, _ in actor.named_parameters()}
-    assert names == {"encoder", "decoder"}
+    assert names == {"encoder", "head"}
     assert not any("mean" in name or "std" in name for name, _ in actor.named_parameters())
 
 
@@ -285,7 +285,7 @@ def test_the_normalisation_is_saved_with_the_actor():
     other.load_state_dict(actor.state_dict())
     state = make_state(6)
     assert torch.equal(other(state.clone())["action"], actor(state.clone())["action"])
-    assert actor.decoder.features.mean.abs().sum() > 0
+    assert actor.encoder.features.mean.abs().sum() > 0
 
 
 # ---- bad input

@@ -95,5 +95,5 @@ def test_an_actor_sees_the_way_of_its_own_plans():
         )
         assert one.eval()(state)["action"].shape == (4, 4)
         assert one.prepare(state)[2].shape == (4, 56 + 18)
-    assert other.decoder is actor.decoder
-    assert other.focus is not actor.focus
+    assert other.head is actor.head
+    assert other.encoder.focus is not actor.encoder.focus

@@ -174,8 +174,8 @@ def test_the_normalisation_is_fitted_to_the_demonstrations(demos):
     trainer = make_trainer(demos)
     expected = make_actor()
     expected.fit_normalization(make_replay(demos)[:]["observation"])
-    assert torch.equal(trainer.actor.decoder.features.mean, expected.decoder.features.mean)
-    assert torch.equal(trainer.actor.decoder.features.std, expected.decoder.features.std)
+    assert torch.equal(trainer.actor.encoder.features.mean, expected.encoder.features.mean)
+    assert torch.equal(trainer.actor.encoder.features.std, expected.encoder.features.std)
 
 
 def test_the_baseline_trains_too(demos):
@@ -270,7 +270,7 @@ def test_what_a_transform_draws_hangs_on_the_seed_and_resumes_too(demos, tmp_pat
     assert_same(flat(resumed.actor.state_dict()), flat(whole.actor.state_dict()))
     unturned = make_trainer(demos)
     unturned.train()
-    assert not torch.equal(unturned.actor.decoder.network[0].weight, whole.actor.decoder.network[0].weight)
+    assert not torch.equal(unturned.actor.head.network[0].weight, whole.actor.head.network[0].weight)
 
 
 @pytest.mark.parametrize("sampler", [RandomSampler, SamplerWithoutReplacement])

@@ -52,14 +52,14 @@ def test_the_actors_get_their_weights(demos):
     actors = [make("plan", seed) for seed in range(2)]
     config = lw.BehavioralCloningConfig(steps=3, batch_size=30)
     trainer = lw.StackedBehavioralCloning(actors, [replay(demos) for _ in range(2)], config, progress=False)
-    before = [actor.decoder.network[0].weight.clone() for actor in actors]
+    before = [actor.head.network[0].weight.clone() for actor in actors]
     assert trainer.train().shape == (2,)
     for number, actor in enumerate(actors):
         assert not actor.training
-        assert not torch.equal(actor.decoder.network[0].weight, before[number])
-        stacked = trainer._parameters["actor.decoder.network.0.weight"][number]
-        assert torch.equal(actor.decoder.network[0].weight, stacked)
-    assert actors[0].decoder.features.mean.any()
+        assert not torch.equal(actor.head.network[0].weight, before[number])
+        stacked = trainer._parameters["actor.head.network.0.weight"][number]
+        assert torch.equal(actor.head.network[0].weight, stacked)
+    assert actors[0].encoder.features.mean.any()
 
 
 def test_what_it_refuses(demos):
@@ -69,7 +69,7 @@ def test_what_it_refuses(demos):
     with pytest.raises(ValueError, match="actors must be of one architecture"):
         lw.StackedBehavioralCloning([make("plan", 0), odd], [replay(demos), replay(demos)])
     broken = make("plan", 0)
-    torch.nn.init.constant_(broken.decoder.network[0].weight, float("nan"))
+    torch.nn.init.constant_(broken.head.network[0].weight, float("nan"))
     trainer = lw.StackedBehavioralCloning([make("plan", 0), broken], [replay(demos), replay(demos)], CONFIG)
     with pytest.raises(ValueError, match="the loss of actor 1 is nan at step 0"):
         trainer.step()

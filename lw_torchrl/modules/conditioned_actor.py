@@ -1,0 +1,144 @@
+"""ConditionedActor: an encoder and a head, with or without a distribution, as a policy."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Self
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import InteractionType
+from tensordict.nn.probabilistic import interaction_type
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torch.distributions import Distribution
+from torchrl.envs import Transform
+
+from lw_torchrl._keys import as_keys, key_beside
+from lw_torchrl.language.tasks import Task
+from lw_torchrl.modules.action_head import ActionHead, DistributionName
+from lw_torchrl.modules.encoder import Encoder, Encoding
+from lw_torchrl.modules.policy import Policy
+
+
+class ConditionedActor(Policy):
+    """What every actor of ours shares, whatever it is conditioned on; a subclass makes the encoder.
+
+    Reads what the encoder reads; writes ``action`` (B, 4) float32 and what the encoder tells. With a distribution it
+    writes ``loc`` and ``scale`` (B, 4) float32 and ``action_log_prob`` (B,) float32 too, and ``action`` is drawn from
+    it under ``set_exploration_type(ExplorationType.RANDOM)``, as collectors do, and its mode otherwise.
+
+    Args:
+        encoder: what it is conditioned on.
+        told: the keys of what the encoder tells beside the action, of ("skill_weights", "skill_latent").
+        width, depth, squash, distribution, init_std: as for :class:`ActionHead`.
+        out_keys: other names for what it writes, in the order above; nested ones too.
+
+    Source: ``torchrl.modules.ProbabilisticActor``, without its wrapping.
+    """
+
+    def __init__(
+        self,
+        encoder: Encoder,
+        told: Sequence[str],
+        *,
+        width: int | Sequence[int],
+        depth: int,
+        squash: bool,
+        distribution: DistributionName | None,
+        init_std: float,
+        out_keys: Sequence[NestedKey] | None,
+    ) -> None:
+        super().__init__()
+        self.encoder = encoder
+        self.head = ActionHead(encoder.width, width, depth, squash, distribution, init_std)
+        self.plans, self.tasks, self.in_keys = encoder.plans, encoder.tasks, encoder.in_keys
+        drawn = () if distribution is None else ("loc", "scale", "action_log_prob")
+        self.out_keys = as_keys("out_keys", out_keys, ("action", *told, *drawn))
+        if out_keys is not None and set(self.out_keys) & set(self.in_keys):
+            raise ValueError(f"out_keys must not be among in_keys, {self.in_keys}, got {self.out_keys}")
+        self.config = {
+            **encoder.config,
+            "width": width,
+            "depth": depth,
+            "squash": squash,
+            "distribution": distribution,
+            "init_std": init_std,
+            "out_keys": self.out_keys,
+        }
+
+    def definition(self, task: str) -> Task | None:
+        return self.encoder.definition(task)
+
+    def transform(self) -> Transform | None:
+        return self.encoder.transform()
+
+    def prepare(self, tensordict: TensorDictBase) -> tuple[Tensor, ...]:
+        """What no trained parameter touches, see the encoder's."""
+        return self.encoder.prepare(tensordict)
+
+    def told(self, encoding: Encoding) -> tuple[Tensor, ...]:
+        """What is written beside the action, of an encoding."""
+        return ()
+
+    def act(self, *prepared: Tensor) -> tuple[Tensor, ...]:
+        """From what :meth:`prepare` gives to a tensor for each of ``out_keys``."""
+        encoding = self.encoder.encode(*prepared)
+        if self.head.distribution is None:
+            return self.head(encoding.joined), *self.told(encoding)
+        loc, scale = self.head.loc_scale(encoding.joined)
+        dist = self.head.dist(loc, scale)
+        action = dist.rsample() if interaction_type() is InteractionType.RANDOM else self.head.mode(loc)
+        return action, *self.told(encoding), loc, scale, dist.log_prob(action)
+
+    def get_dist(self, tensordict: TensorDictBase) -> Distribution:
+        """The distribution of actions in these states, as losses ask for it.
+
+        Raises:
+            TypeError: the actor was made without one.
+        """
+        if self.head.distribution is None:
+            raise TypeError(
+                f"{type(self).__name__} has no distribution; make it with distribution='tanh_normal', or make a "
+                "stochastic one of a trained one by actor.stochastic()"
+            )
+        return self.head.dist(*self.head.loc_scale(self.encoder.encode(*self.prepare(tensordict)).joined))
+
+    def stochastic(self, distribution: DistributionName = "tanh_normal", init_std: float = 0.3) -> Self:
+        """An actor with a distribution, whose mode is what this one does, as it is now: a copy, to be trained by RL.
+
+        Its features have no noise, which would change its likelihoods from call to call.
+
+        Args:
+            distribution: "tanh_normal", or "normal", whose actions the environment clips.
+            init_std: the standard deviation at first, as for :class:`PlanConditionedActor`.
+
+        Raises:
+            ValueError: it has a distribution already, or a wrong option.
+
+        Example:
+            >>> import lw_torchrl as lw
+            >>> trained = lw.PlanConditionedActor(lw.load_plans("MT10"))
+            >>> trained.stochastic(init_std=0.2).out_keys
+            ['action', 'skill_weights', 'skill_latent', 'loc', 'scale', 'action_log_prob']
+        """
+        if self.head.distribution is not None:
+            raise ValueError(f"distribution: this actor has one already, {self.head.distribution!r}")
+        found = self.describe()
+        found["options"] = self.config | {
+            "distribution": distribution,
+            "init_std": init_std,
+            "feature_noise": 0.0,
+            "out_keys": [*self.out_keys, "loc", "scale", key_beside(self.out_keys[0], "_log_prob")],
+        }
+        with torch.random.fork_rng(devices=[]):
+            other = type(self).from_description(found, self.encoder.text_encoder)
+        other.encoder.load_state_dict(self.encoder.state_dict())
+        other.head.copy_from(self.head)
+        return other.train(self.training)
+
+    def describe(self) -> dict[str, Any]:
+        return super().describe() | self.encoder.describe()
+
+    def fit_normalization(self, observation: Tensor, weights: Tensor | None = None) -> None:
+        self.encoder.features.fit(observation, weights)

@@ -1,0 +1,221 @@
+"""Critics: the value of a state, or of an action in it, on the encoders that actors are built on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, dispatch
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+from torchrl.envs import Transform
+
+from lw_torchrl._checks import check_int
+from lw_torchrl._keys import as_keys, read
+from lw_torchrl.language.plans import ConditionalPlan, Plans
+from lw_torchrl.modules.action_head import ACTION_SIZE, DistributionName
+from lw_torchrl.modules.encoder import Encoder
+from lw_torchrl.modules.networks import head
+from lw_torchrl.modules.plan_conditioned_actor import PlanConditionedActor
+from lw_torchrl.modules.plan_encoder import PlanEncoder
+
+
+class Value(TensorDictModuleBase):
+    """The value of a state, on any encoder.
+
+    Reads what the encoder reads; writes ``state_value`` (B, 1) float32, the least of the ensemble's, and, with an
+    ensemble of several, ``state_values`` (B, E) float32, each of them.
+
+    Args:
+        encoder: what it is conditioned on; one that is an actor's too is trained by both.
+        ensemble: E, networks on the one encoder. TorchRL's losses copy the whole critic themselves, as often as their
+            ``num_qvalue_nets`` says, and draw the copies' weights anew.
+        width, depth: hidden layers; a tuple of widths says both.
+        layer_norm: a LayerNorm behind each hidden layer.
+        out_keys: other names for what it writes, in the order above; nested ones too.
+
+    Raises:
+        ValueError: a wrong option.
+
+    Example:
+        >>> import lw_torchrl as lw, torch
+        >>> from lw_torchrl.modules import DescriptorEncoder, Value
+        >>> Value(DescriptorEncoder("MT10"))(observation=torch.rand(5, 39), task_id=torch.full((5,), 33)).shape
+        torch.Size([5, 1])
+
+    Source: ``torchrl.modules.ValueOperator``.
+    """
+
+    _written = ("state_value", "state_values")
+    _more = 0
+
+    def __init__(
+        self,
+        encoder: Encoder,
+        *,
+        ensemble: int = 1,
+        width: int | Sequence[int] = 256,
+        depth: int = 2,
+        layer_norm: bool = True,
+        out_keys: Sequence[NestedKey] | None = None,
+    ) -> None:
+        super().__init__()
+        self.encoder = encoder
+        self.plans, self.tasks = encoder.plans, encoder.tasks
+        self.in_keys: list[NestedKey] = list(encoder.in_keys)
+        self.out_keys = as_keys("out_keys", out_keys, self._written[: 1 if ensemble == 1 else 2])
+        self.heads = nn.ModuleList(
+            head(encoder.width + self._more, 1, width, depth, layer_norm=layer_norm)
+            for _ in range(check_int("ensemble", ensemble, minimum=1))
+        )
+
+    def transform(self) -> Transform | None:
+        """A new transform that writes what it reads and the environment does not give; None for none."""
+        return self.encoder.transform()
+
+    def fit_normalization(self, observation: Tensor, weights: Tensor | None = None) -> None:
+        """As for :meth:`Policy.fit_normalization`."""
+        self.encoder.features.fit(observation, weights)
+
+    def _input(self, tensordict: TensorDictBase) -> Tensor:
+        return self.encoder.encode(*self.encoder.prepare(tensordict)).joined
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the values."""
+        seen = self._input(tensordict)
+        values = torch.cat([each(seen) for each in self.heads], -1)
+        tensordict.set(self.out_keys[0], values.amin(-1, keepdim=True))
+        if len(self.out_keys) > 1:
+            tensordict.set(self.out_keys[1], values)
+        return tensordict
+
+
+class QValue(Value):
+    """The value of an action in a state, on any encoder.
+
+    Reads what the encoder reads and ``action`` (B, 4) float32; writes ``state_action_value`` (B, 1) float32, the least
+    of the ensemble's, and, with an ensemble of several, ``state_action_values`` (B, E) float32, each of them.
+
+    Args:
+        encoder, ensemble, width, depth, layer_norm, out_keys: as for :class:`Value`.
+        action_key: where the action is; may be nested.
+
+    Raises:
+        ValueError: a wrong option.
+
+    Source: ``torchrl.modules.ValueOperator``.
+    """
+
+    _written = ("state_action_value", "state_action_values")
+    _more = ACTION_SIZE
+
+    def __init__(self, encoder: Encoder, *, action_key: NestedKey = "action", **options: Any) -> None:
+        super().__init__(encoder, **options)
+        self.action_key = action_key
+        self.in_keys = [*self.in_keys, action_key]
+
+    def _input(self, tensordict: TensorDictBase) -> Tensor:
+        (action,) = read(tensordict, [self.action_key])
+        return torch.cat((super()._input(tensordict), action), -1)
+
+
+class PlanConditionedValue(Value):
+    """:class:`Value` on a :class:`PlanEncoder`: of a state, for who carries out a plan.
+
+    Reads ``observation`` (B, 39) float32, ``task_id`` (B,) int64 and ``qaf`` (B, S) bool; writes as :class:`Value`.
+
+    Args:
+        plans: a plan for each task that will be seen.
+        ensemble, width, depth, layer_norm, out_keys: as for :class:`Value`.
+        **options: of :class:`PlanEncoder`, ``features`` say.
+
+    Example:
+        >>> import lw_torchrl as lw
+        >>> lw.PlanConditionedValue(lw.load_plans("MT10")).out_keys
+        ['state_value']
+
+    Source: ``torchrl.modules.ValueOperator``.
+    """
+
+    def __init__(
+        self,
+        plans: Plans | Mapping[str, ConditionalPlan],
+        *,
+        ensemble: int = 1,
+        width: int | tuple[int, ...] = 256,
+        depth: int = 2,
+        layer_norm: bool = True,
+        out_keys: Sequence[NestedKey] | None = None,
+        **options: Any,
+    ) -> None:
+        networks: dict[str, Any] = {"ensemble": ensemble, "width": width, "depth": depth, "layer_norm": layer_norm}
+        super().__init__(PlanEncoder(plans, **options), out_keys=out_keys, **networks)
+
+
+class PlanConditionedQValue(QValue):
+    """:class:`QValue` on a :class:`PlanEncoder`: of an action, for who carries out a plan.
+
+    Reads ``observation`` (B, 39) float32, ``task_id`` (B,) int64, ``qaf`` (B, S) bool and ``action`` (B, 4) float32;
+    writes as :class:`QValue`.
+
+    Args:
+        plans: a plan for each task that will be seen.
+        ensemble, width, depth, layer_norm, action_key, out_keys: as for :class:`QValue`.
+        **options: of :class:`PlanEncoder`, ``features`` say.
+
+    Example:
+        >>> import lw_torchrl as lw
+        >>> from torchrl.objectives import TD3BCLoss
+        >>> plans = lw.load_plans("MT10")
+        >>> loss = TD3BCLoss(lw.PlanConditionedActor(plans), lw.PlanConditionedQValue(plans), bounds=(-1.0, 1.0))
+
+    Source: ``torchrl.modules.ValueOperator``.
+    """
+
+    def __init__(
+        self,
+        plans: Plans | Mapping[str, ConditionalPlan],
+        *,
+        ensemble: int = 1,
+        width: int | tuple[int, ...] = 256,
+        depth: int = 2,
+        layer_norm: bool = True,
+        action_key: NestedKey = "action",
+        out_keys: Sequence[NestedKey] | None = None,
+        **options: Any,
+    ) -> None:
+        networks: dict[str, Any] = {"ensemble": ensemble, "width": width, "depth": depth, "layer_norm": layer_norm}
+        super().__init__(PlanEncoder(plans, **options), action_key=action_key, out_keys=out_keys, **networks)
+
+
+def plan_actor_value(
+    plans: Plans | Mapping[str, ConditionalPlan],
+    *,
+    distribution: DistributionName = "tanh_normal",
+    value_width: int | tuple[int, ...] = 256,
+    value_depth: int = 2,
+    **options: Any,
+) -> tuple[PlanConditionedActor, Value]:
+    """An actor and the value of its states on one shared encoder, as PPO and A2C take them.
+
+    Args:
+        plans: a plan for each task that will be seen.
+        distribution: the actor's.
+        value_width, value_depth: hidden layers of the value.
+        **options: of :class:`PlanConditionedActor`.
+
+    Returns:
+        The actor, and the :class:`Value` on its encoder.
+
+    Example:
+        >>> import lw_torchrl as lw
+        >>> from torchrl.objectives import ClipPPOLoss
+        >>> loss = ClipPPOLoss(*lw.plan_actor_value(lw.load_plans("MT10")))
+
+    Source: ``torchrl.modules.ActorValueOperator``.
+    """
+    actor = PlanConditionedActor(plans, distribution=distribution, **options)
+    return actor, Value(actor.encoder, width=value_width, depth=value_depth)

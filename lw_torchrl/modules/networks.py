@@ -1,0 +1,43 @@
+"""The networks that policies and critics are made of."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+from torchrl.modules import MLP
+
+from lw_torchrl._checks import check_int
+
+
+def unit_scale(vectors: Tensor) -> Tensor:
+    """Texts' vectors (n, E), rescaled so that their numbers are of size 1; encoders give vectors of length 1, whose
+    numbers are so small that a fresh network hardly tells texts apart."""
+    vectors = vectors.to(torch.float32)
+    return vectors / vectors.square().mean(-1, keepdim=True).sqrt().clamp(min=1e-6)
+
+
+def text_to_latent(text_size: int, latent_size: int, width: int, depth: int) -> MLP:
+    """An MLP from a text's vector to a skill latent, with ``depth`` hidden layers of ``width``."""
+    check_int("latent_size", latent_size, minimum=1)
+    check_int("encoder_width", width, minimum=1)
+    return MLP(
+        in_features=text_size,
+        out_features=latent_size,
+        num_cells=[width] * check_int("encoder_depth", depth, minimum=0),
+        activation_class=nn.ReLU,
+    )
+
+
+def head(size: int, out: int, width: int | Sequence[int], depth: int, *, layer_norm: bool = False) -> MLP:
+    """An MLP from an encoding (..., size) to (..., out); a tuple of widths says both width and depth."""
+    widths = [width] * check_int("depth", depth, minimum=0) if isinstance(width, int) else list(width)
+    return MLP(
+        in_features=size,
+        out_features=out,
+        num_cells=[check_int("width", cells, minimum=1) for cells in widths],
+        activation_class=nn.ReLU,
+        norm_class=nn.LayerNorm if layer_norm else None,
+        norm_kwargs=[{"normalized_shape": cells} for cells in widths] if layer_norm else None,
+    )

@@ -1,0 +1,181 @@
+"""PlanEncoder: what a conditional plan says is to be done, and where things are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+
+from lw_torchrl._checks import check_probability
+from lw_torchrl._keys import as_keys
+from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
+from lw_torchrl.language.text import TextEncoder, encode_texts
+from lw_torchrl.modules.encoder import Encoder, Encoding
+from lw_torchrl.modules.mentions import mentioned, swap_unmentioned
+from lw_torchrl.modules.networks import text_to_latent, unit_scale
+from lw_torchrl.modules.observation_features import Features, ObservationFeatures
+from lw_torchrl.modules.plan_attention import PlanAttention, attend
+from lw_torchrl.modules.plan_focus import PlanFocus
+from lw_torchrl.modules.query_evaluator import QueryEvaluator
+from lw_torchrl.transforms.qaf import QAFTransform, plan_number_key
+
+_IN_FORCE = 0.01  # a step whose condition does not hold beside one that does has a weight of 1e-4
+
+
+def _check_evaluator(evaluator: QueryEvaluator | None, plans: Plans, reads_truth: float) -> QueryEvaluator | None:
+    if evaluator is None:
+        return None
+    if reads_truth:
+        raise ValueError("focus and swap_unmentioned read the queries' exact truth, which an evaluator takes away")
+    if evaluator.plans.fingerprint != plans.fingerprint:
+        raise ValueError("evaluator must be of the actor's plans, it answers the conditions of others")
+    return evaluator
+
+
+class PlanEncoder(Encoder):
+    """Each skill's text is encoded to a latent, and the conditions' truth gives attention over the steps: the mixed
+    latent, beside the observation's features, is what a plan says is to be done now.
+
+    Reads ``observation`` (B, 39) float32, ``task_id`` (B,) int64 and ``qaf`` (B, S) bool; writes ``encoding``
+    (B, D + F) float32.
+
+    Args:
+        plans: a plan for each task that will be seen.
+        features, focus, swap_unmentioned, latent_size, encoder_width, encoder_depth, evaluator, text_encoder, in_keys:
+            as for :class:`PlanConditionedActor`.
+        feature_noise: standard deviation of the noise on the normalised features while training.
+        out_keys: another name for what it writes.
+
+    Attributes:
+        skills: the K different skill texts, sorted.
+
+    Raises:
+        ValueError: as for :class:`PlanConditionedActor`.
+
+    Example:
+        >>> import lw_torchrl as lw
+        >>> from tensordict.nn import TensorDictModule, TensorDictSequential
+        >>> from torch import nn
+        >>> trunk = PlanEncoder(lw.load_plans("MT10"))
+        >>> head = TensorDictModule(nn.Linear(trunk.width, 1), in_keys=["encoding"], out_keys=["state_value"])
+        >>> TensorDictSequential(trunk, head).in_keys
+        ['observation', 'task_id', 'qaf']
+
+    Source: paper section 'Plan Conditioning' and its figure of the architecture.
+    """
+
+    text_vectors: Tensor
+    skill_index: Tensor
+    mentioned: Tensor
+    plans: Plans
+
+    def __init__(
+        self,
+        plans: Plans | Mapping[str, ConditionalPlan],
+        *,
+        features: Features = "differences",
+        feature_noise: float = 0.0,
+        focus: bool = False,
+        swap_unmentioned: float = 0.0,
+        latent_size: int = 64,
+        encoder_width: int = 128,
+        encoder_depth: int = 1,
+        evaluator: QueryEvaluator | None = None,
+        text_encoder: TextEncoder | None = None,
+        in_keys: Sequence[NestedKey] | None = None,
+        out_keys: Sequence[NestedKey] | None = None,
+    ) -> None:
+        super().__init__()
+        self.plans = as_plans(plans)
+        self.tasks = tuple(self.plans)
+        read = ("observation", "task_id") if evaluator is not None else ("observation", "task_id", "qaf")
+        own = as_keys("in_keys", in_keys, read)
+        self.in_keys = list(dict.fromkeys([*own, *([] if evaluator is None else evaluator.in_keys)]))
+        self.out_keys = as_keys("out_keys", out_keys, ("encoding",))
+        self._answered = plan_number_key(own[-1])
+        self.evaluator = _check_evaluator(evaluator, self.plans, focus or swap_unmentioned)
+        self.config: dict[str, Any] = {
+            "features": features,
+            "feature_noise": feature_noise,
+            "focus": focus,
+            "swap_unmentioned": check_probability("swap_unmentioned", swap_unmentioned),
+            "latent_size": latent_size,
+            "encoder_width": encoder_width,
+            "encoder_depth": encoder_depth,
+            "in_keys": own,
+        }
+        self.text_encoder = text_encoder
+        self.skills = self.plans.skills
+        vectors = (encode_texts if text_encoder is None else text_encoder)(self.skills)
+        if vectors.ndim != 2 or len(vectors) != len(self.skills):
+            raise ValueError(f"text_encoder must give ({len(self.skills)}, E), got shape {tuple(vectors.shape)}")
+        self.attention = PlanAttention(self.plans)
+        # The tables come from the plans, not from training: they are not part of the state that is saved.
+        self.register_buffer("text_vectors", unit_scale(vectors), persistent=False)
+        self.register_buffer("skill_index", self.attention.tables.skill_index, persistent=False)
+        self.register_buffer("mentioned", mentioned(self.plans, self.attention.tables), persistent=False)
+        self.latent_size = latent_size
+        self.texts = text_to_latent(vectors.shape[1], latent_size, encoder_width, encoder_depth)
+        self.focus = PlanFocus(self.plans, self.attention.tables, feature_noise) if focus else None
+        self.features = ObservationFeatures(features, feature_noise)
+
+    @property
+    def width(self) -> int:
+        return super().width + (0 if self.focus is None else self.focus.width)
+
+    def transform(self) -> QAFTransform | None:
+        """Query answers, unless an evaluator gives them."""
+        if self.evaluator is not None:
+            return None
+        return QAFTransform(self.plans, in_keys=self.in_keys[:2], out_keys=self.in_keys[2:])
+
+    def prepare(self, tensordict: TensorDictBase) -> tuple[Tensor, ...]:
+        """What no trained parameter touches: attention (B, S), the index of each step's skill (B, S) int64, and the
+        observation's features (B, F). With an evaluator, in the attention's place the steps that there are (B, S) bool,
+        and behind the features what the evaluator reads."""
+        observation, task, *rest = self.read(tensordict)
+        rows = self.attention.tables.rows(task)
+        if self.evaluator is not None:
+            asked = [tensordict.get(key) for key in self.evaluator.in_keys]
+            return self.attention.mask[rows], self.skill_index[rows], self.features(observation), *asked
+        self.attention.tables.refuse_others(tensordict.get(self._answered, None), rows)
+        weights = self.attention.over_steps(rest[0], rows)
+        if self.training and self.config["swap_unmentioned"]:
+            kept = ((weights > _IN_FORCE).unsqueeze(-1) & self.mentioned[rows]).any(-2)
+            observation = swap_unmentioned(observation, kept, self.config["swap_unmentioned"])
+        seen = self.features(observation)
+        if self.focus is not None:
+            seen = torch.cat((seen, self.focus(observation, weights, rows)), -1)
+        return weights, self.skill_index[rows], seen
+
+    def weights(self, *prepared: Tensor) -> Tensor:
+        """From what :meth:`prepare` gives to the attention (B, S)."""
+        if self.evaluator is None:
+            return prepared[0]
+        steps, _, _, *asked = prepared
+        return attend(self.evaluator.logits(*asked), steps)
+
+    def encode(self, *prepared: Tensor) -> Encoding:
+        """From what :meth:`prepare` gives."""
+        weights = self.weights(*prepared)
+        # A product with (B, K) is faster than picking (B, S, D) latents, forwards and backwards.
+        over_skills = weights.new_zeros((*weights.shape[:-1], len(self.skills))).scatter_add(-1, prepared[1], weights)
+        return Encoding(over_skills @ self.latents(), prepared[2], weights)
+
+    def latents(self) -> Tensor:
+        """(K, D), the latent of each skill."""
+        return self.texts(self.text_vectors)
+
+    def describe(self) -> dict[str, Any]:
+        found = {"plans": self.plans.to_json()}
+        return found if self.evaluator is None else found | {"evaluator": self.evaluator.describe()}
+
+    def with_plans(self, plans: Plans | Mapping[str, ConditionalPlan]) -> PlanEncoder:
+        evaluator = None if self.evaluator is None else self.evaluator.with_plans(as_plans(plans))
+        other = PlanEncoder(plans, evaluator=evaluator, text_encoder=self.text_encoder, **self.config)
+        other.texts, other.features = self.texts, self.features
+        return other.train(self.training)
