@@ -12,9 +12,8 @@ from torch.distributions import Distribution
 from torchrl.modules import IndependentNormal, TanhNormal
 
 from lw_torchrl._checks import check_choice, check_scale
-from lw_torchrl.modules.networks import head
+from lw_torchrl.modules.networks import ACTION_SIZE, head
 
-ACTION_SIZE = 4
 _LEAST_STD = 1e-3
 
 DistributionName = Literal["tanh_normal", "normal"]

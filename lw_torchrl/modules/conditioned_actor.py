@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 from torchrl.envs import Transform
 
-from lw_torchrl._keys import as_keys, key_beside
+from lw_torchrl._keys import as_keys, key_beside, read
 from lw_torchrl.language.tasks import Task
 from lw_torchrl.modules.action_head import ActionHead, DistributionName
 from lw_torchrl.modules.encoder import Encoder, Encoding
@@ -97,12 +97,44 @@ class ConditionedActor(Policy):
         Raises:
             TypeError: the actor was made without one.
         """
+        return self.head.dist(*self._loc_scale(tensordict))
+
+    def get_dist_params(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """``loc`` and ``scale`` in these states, written; what :meth:`get_dist` makes its distribution of."""
+        for key, value in zip(self.dist_params_keys, self._loc_scale(tensordict), strict=True):
+            tensordict.set(key, value)
+        return tensordict
+
+    def build_dist_from_params(self, tensordict: TensorDictBase) -> Distribution:
+        """The distribution of ``loc`` and ``scale`` that were written before."""
+        return self.head.dist(*read(tensordict, self.dist_params_keys))
+
+    def _loc_scale(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         if self.head.distribution is None:
             raise TypeError(
                 f"{type(self).__name__} has no distribution; make it with distribution='tanh_normal', or make a "
                 "stochastic one of a trained one by actor.stochastic()"
             )
-        return self.head.dist(*self.head.loc_scale(self.encoder.encode(*self.prepare(tensordict)).joined))
+        return self.head.loc_scale(self.encoder.encode(*self.prepare(tensordict)).joined)
+
+    @property
+    def _drawn(self) -> list[NestedKey]:
+        return [] if self.head.distribution is None else self.out_keys[-3:]
+
+    @property
+    def dist_params_keys(self) -> list[NestedKey]:
+        """Where ``loc`` and ``scale`` are written; none without a distribution."""
+        return self._drawn[:2]
+
+    @property
+    def log_prob_keys(self) -> list[NestedKey]:
+        """Where the action's log-probability is written; none without a distribution."""
+        return self._drawn[2:]
+
+    @property
+    def dist_sample_keys(self) -> list[NestedKey]:
+        """Where the action is written, if it is drawn."""
+        return self.out_keys[:1] if self._drawn else []
 
     def stochastic(self, distribution: DistributionName = "tanh_normal", init_std: float = 0.3) -> Self:
         """An actor with a distribution, whose mode is what this one does, as it is now: a copy, to be trained by RL.

@@ -15,9 +15,9 @@ from torchrl.envs import Transform
 from lw_torchrl._checks import check_int
 from lw_torchrl._keys import as_keys, read
 from lw_torchrl.language.plans import ConditionalPlan, Plans
-from lw_torchrl.modules.action_head import ACTION_SIZE, DistributionName
+from lw_torchrl.modules.action_head import DistributionName
 from lw_torchrl.modules.encoder import Encoder
-from lw_torchrl.modules.networks import head
+from lw_torchrl.modules.networks import ACTION_SIZE, head
 from lw_torchrl.modules.plan_conditioned_actor import PlanConditionedActor
 from lw_torchrl.modules.plan_encoder import PlanEncoder
 

@@ -10,6 +10,8 @@ from torchrl.modules import MLP
 
 from lw_torchrl._checks import check_int
 
+ACTION_SIZE = 4
+
 
 def unit_scale(vectors: Tensor) -> Tensor:
     """Texts' vectors (n, E), rescaled so that their numbers are of size 1; encoders give vectors of length 1, whose

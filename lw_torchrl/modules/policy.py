@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor
+from torchrl.data import Bounded, Composite
 from torchrl.envs import Transform
 
 from lw_torchrl._checks import check_choice
@@ -17,6 +18,7 @@ from lw_torchrl._keys import read
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.tasks import TASKS, Task
 from lw_torchrl.language.text import TextEncoder
+from lw_torchrl.modules.networks import ACTION_SIZE
 from lw_torchrl.transforms.qaf import QAFTransform
 
 POLICIES: dict[str, str | type[Policy]] = {
@@ -71,6 +73,13 @@ class Policy(TensorDictModuleBase):
     tasks: tuple[str, ...]
     plan_options: ClassVar[bool] = False
     row_by_row: ClassVar[bool] = False
+
+    @property
+    def spec(self) -> Composite:
+        """Of the action, which losses ask for: (4,) float32 in [-1, 1]."""
+        spec = Composite()
+        spec[self.out_keys[0]] = Bounded(-1.0, 1.0, (ACTION_SIZE,))
+        return spec
 
     @classmethod
     def for_plans(cls, plans: Plans, *, text_encoder: TextEncoder | None = None, **options: Any) -> Policy:
