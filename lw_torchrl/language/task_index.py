@@ -86,7 +86,7 @@ class TaskIndex:
             ids = ids.to(task_id.device)
             if known:
                 self._ids = ids
-        given = task_id.long()
+        given = task_id.long().contiguous()
         rows = torch.searchsorted(ids[:-1], given)
         found = ids.index_select(0, rows.reshape(-1)).reshape(rows.shape)
         if known:

@@ -1,0 +1,229 @@
+"""Every loss of TorchRL with our actors and critics, as they are: no adapter, no patch."""
+
+from __future__ import annotations
+
+import copy
+import warnings
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs import ExplorationType, set_exploration_type
+from torchrl.objectives import (
+    A2CLoss,
+    BCLoss,
+    ClipPPOLoss,
+    CQLLoss,
+    CrossQLoss,
+    DDPGLoss,
+    DTLoss,
+    IQLLoss,
+    OnlineDTLoss,
+    REDQLoss,
+    ReinforceLoss,
+    SACLoss,
+    SoftUpdate,
+    TD3BCLoss,
+    TD3Loss,
+)
+from torchrl.objectives.value import GAE
+
+import lw_torchrl as lw
+from lw_torchrl.modules import DescriptorEncoder, PlanEncoder, QValue, Value
+
+PLANS = lw.load_plans("MT10")
+SMALL = dict(width=16, depth=1)
+BOUNDS = {"bounds": (-torch.ones(4), torch.ones(4))}
+DETERMINISTIC = {
+    "BC": lambda actor, q, v: BCLoss(actor),
+    "DDPG": lambda actor, q, v: DDPGLoss(actor, q),
+    "TD3": lambda actor, q, v: TD3Loss(actor, q, **BOUNDS),
+    "TD3+BC": lambda actor, q, v: TD3BCLoss(actor, q, **BOUNDS),
+}
+STOCHASTIC = {
+    "BC, likelihood": lambda actor, q, v: BCLoss(actor),
+    "DT": lambda actor, q, v: DTLoss(actor),
+    "online DT": lambda actor, q, v: OnlineDTLoss(actor),
+    "SAC": lambda actor, q, v: SACLoss(actor, q),
+    "REDQ": lambda actor, q, v: REDQLoss(actor, q),
+    "CrossQ": lambda actor, q, v: CrossQLoss(actor, q),
+    "IQL": lambda actor, q, v: IQLLoss(actor, q, v),
+    "CQL": lambda actor, q, v: CQLLoss(actor, q, action_spec=actor.spec["action"]),
+}
+ON_POLICY = {
+    "A2C": lambda actor, q, v: A2CLoss(actor, v),
+    "Reinforce": lambda actor, q, v: ReinforceLoss(actor, v),
+    "PPO": lambda actor, q, v: ClipPPOLoss(actor, v),
+}
+LOSSES = DETERMINISTIC | STOCHASTIC | ON_POLICY
+CONDITIONS = ("plan", "description", "one-hot")
+
+
+def make_actor(condition, distribution=None, **options):
+    options = {**SMALL, "distribution": distribution, **options}
+    if condition == "plan":
+        return lw.PlanConditionedActor(PLANS, **options)
+    return lw.DescriptorConditionedActor("MT10", condition=condition, **options)
+
+
+def make_encoder(condition, **options):
+    if condition == "plan":
+        return PlanEncoder(PLANS, **options)
+    return DescriptorEncoder("MT10", condition=condition, **options)
+
+
+def make_loss(name, condition, distribution="tanh_normal", seed=0, **noise):
+    torch.manual_seed(seed)
+    actor = make_actor(condition, None if name in DETERMINISTIC else distribution, **noise)
+    q = QValue(make_encoder(condition, **noise), **SMALL)
+    v = Value(make_encoder(condition, **noise), **SMALL)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*target_actor_network_params.*")  # BCLoss about itself
+        loss = LOSSES[name](actor, q, v)
+    if name not in ("BC", "BC, likelihood", "DT", "online DT"):
+        loss.make_value_estimator(gamma=0.9)
+    if name in ("DDPG", "TD3", "TD3+BC", "SAC", "REDQ", "IQL", "CQL"):
+        SoftUpdate(loss, eps=0.9)
+    return loss, actor, v
+
+
+def make_batch(rows=24, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    ids = torch.tensor([lw.task_id(task) for task in PLANS])[torch.randint(10, (rows,), generator=generator)]
+    flag = torch.zeros(rows, 1, dtype=torch.bool)
+
+    def state(**more):
+        return TensorDict(observation=torch.rand(rows, 39, generator=generator), task_id=ids, **more)
+
+    following = state(reward=torch.rand(rows, 1, generator=generator), done=flag, terminated=flag)
+    batch = state(action=torch.rand(rows, 4, generator=generator) * 2 - 1, next=following)
+    batch["action"][:6] = torch.tensor([1.0, -1.0, 0.5, 1.0])  # as half of what experts do
+    return lw.QAFTransform(PLANS)(batch.auto_batch_size_(1))
+
+
+def ready(name, batch, actor, value):
+    """What the loss reads beside demonstrations: what the actor did, and the advantage."""
+    if name in ON_POLICY:
+        with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+            actor(batch)
+        batch = GAE(gamma=0.9, lmbda=0.9, value_network=value)(batch.unsqueeze(0)).squeeze(0)
+    return batch
+
+
+def total(loss, batch):
+    torch.manual_seed(7)
+    return sum(value for key, value in loss(batch.copy()).items() if key.startswith("loss"))
+
+
+def trained(loss):
+    return {name: p for name, p in loss.named_parameters() if p.requires_grad}
+
+
+@pytest.mark.parametrize("mode", ["train", "eval"])
+@pytest.mark.parametrize("condition", CONDITIONS)
+@pytest.mark.parametrize("name", LOSSES)
+def test_gradients_reach_every_parameter_and_a_step_lowers_the_loss(name, condition, mode):
+    loss, actor, value = make_loss(name, condition)
+    getattr(loss, mode)()
+    getattr(actor, mode)()
+    batch = ready(name, make_batch(), actor, value)
+    before = total(loss, batch)
+    before.backward()
+    missed = [key for key, p in trained(loss).items() if p.grad is None or not p.grad.abs().sum() > 0]
+    assert not missed
+    assert all(p.grad.isfinite().all() for p in trained(loss).values())
+    with torch.no_grad():
+        norm = torch.stack([p.grad.square().sum() for p in trained(loss).values()]).sum().sqrt()
+        for p in trained(loss).values():
+            p -= 1e-3 * p.grad / norm
+    assert total(loss, batch) < before
+
+
+@pytest.mark.parametrize("distribution", ["tanh_normal", "normal"])
+@pytest.mark.parametrize("name", [*STOCHASTIC, *ON_POLICY])
+def test_with_either_distribution_the_loss_is_finite_at_the_bounds(name, distribution):
+    loss, actor, value = make_loss(name, "plan", distribution)
+    batch = ready(name, make_batch(), actor, value)
+    if name not in ON_POLICY:
+        batch["action"] = batch["action"].sign()
+    found = total(loss, batch)
+    found.backward()
+    assert found.isfinite()
+    assert all(p.grad.isfinite().all() for p in trained(loss).values())
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_its_state_goes_round(name):
+    loss, actor, value = make_loss(name, "plan")
+    other, _, _ = make_loss(name, "plan", seed=1)
+    batch = ready(name, make_batch(), actor, value)
+    if name != "online DT":  # its alpha is learned apart
+        assert total(other, batch) != total(loss, batch)
+    other.load_state_dict(loss.state_dict())
+    assert torch.equal(total(other, batch), total(loss, batch))
+
+
+@pytest.mark.parametrize("name", ["SAC", "IQL", "TD3", "CQL", "REDQ"])
+def test_noise_on_the_features_is_drawn_for_each_critic(name):
+    loss, _, _ = make_loss(name, "plan", feature_noise=0.1)
+    assert total(loss, make_batch()).isfinite()
+    assert loss.vmap_randomness == "different"
+
+
+@pytest.mark.parametrize("name", ["SAC", "IQL", "TD3", "CQL"])
+def test_with_and_without_vmap_it_is_the_same(name):
+    with_vmap, _, _ = make_loss(name, "plan")
+    without, _, _ = make_loss(name, "plan")
+    without.load_state_dict(with_vmap.state_dict())
+    without.deactivate_vmap = True
+    without._make_vmap()
+    torch.testing.assert_close(total(without, make_batch()), total(with_vmap, make_batch()))
+
+
+def test_the_ratio_is_one_before_an_update():
+    """Clipping included: the environment leaves the action as it was drawn."""
+    from torchrl.envs import TransformedEnv
+
+    for distribution in ("tanh_normal", "normal"):
+        actor, value = lw.plan_actor_value(PLANS, distribution=distribution, init_std=1.5, **SMALL)
+        env = TransformedEnv(lw.LanguageWorldEnv(["push", "reach"], num_envs=4, seed=0), actor.transform())
+        with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+            data = env.rollout(20, actor)
+        env.close()
+        if distribution == "normal":
+            assert (data["action"].abs() > 1).any()
+        data = GAE(gamma=0.9, lmbda=0.9, value_network=value)(data)
+        found = ClipPPOLoss(actor, value, normalize_advantage=False)(data.reshape(-1))
+        assert found["clip_fraction"] == 0
+        torch.testing.assert_close(found["ESS"], torch.tensor(1.0))
+        torch.testing.assert_close(found["kl_approx"], torch.tensor(0.0), atol=1e-6, rtol=0)
+
+
+def test_a_shared_encoder_is_trained_by_both():
+    actor, value = lw.plan_actor_value(PLANS, **SMALL)
+    assert value.encoder is actor.encoder
+    batch = ready("PPO", make_batch(), actor, value)
+    loss = ClipPPOLoss(actor, value, separate_losses=False)
+    found = loss(batch)
+    shared = actor.encoder.texts[0].weight
+    names = [name for name, p in loss.named_parameters() if p.shape == shared.shape and p.requires_grad]
+    assert len(names) == 1
+    found["loss_critic"].backward()
+    assert dict(loss.named_parameters())[names[0]].grad.abs().sum() > 0
+
+
+@pytest.mark.parametrize("name", ["SAC", "TD3", "IQL"])
+def test_targets_follow(name):
+    loss, _, _ = make_loss(name, "plan")
+    update = SoftUpdate(loss, eps=0.5)
+    before = loss.target_qvalue_network_params["heads", "0", "0", "weight"].clone()
+    for p in trained(loss).values():
+        p.data.add_(0.1)
+    update.step()
+    assert not torch.equal(loss.target_qvalue_network_params["heads", "0", "0", "weight"], before)
+
+
+def test_a_loss_can_be_copied():
+    loss, _, _ = make_loss("IQL", "plan")
+    other = copy.deepcopy(loss)
+    assert torch.equal(total(other, make_batch()), total(loss, make_batch()))
