@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from lw_torchrl.language.formats import chain_py
 from lw_torchrl.language.formats.chain_py import check_plan, format_plan, parse_plan
+from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.language.plan_files import load_plans, save_plans
 from lw_torchrl.language.plans import (
     ConditionalPlan,
@@ -20,7 +21,7 @@ from lw_torchrl.language.plans import (
     as_plans,
 )
 from lw_torchrl.language.queries import Clause, Query, QueryError, check_query, parse_query, supported_queries
-from lw_torchrl.language.tasks import GRIPPER, MT50, TASKS, Task
+from lw_torchrl.language.tasks import MT50, TASKS, Task
 
 DRAWER = """\
 # drawer-open: Take hold of the drawer handle and pull the drawer open.

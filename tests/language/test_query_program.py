@@ -13,9 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from states import REAL, random_states, real_states
 
+from lw_torchrl.language.named_objects import GRIPPER, NamedObject
 from lw_torchrl.language.queries import Clause, Query, parse_query, supported_queries
 from lw_torchrl.language.query_program import QueryProgram
-from lw_torchrl.language.tasks import GRIPPER, MT10, MT50, TASKS, NamedObject, Task, task_id
+from lw_torchrl.language.tasks import MT10, MT50, TASKS, Task, task_id
 
 DIRECT = 15  # of each, on which conjunctions are asked of the oracle as they are
 
