@@ -31,11 +31,11 @@ if TYPE_CHECKING:  # the table below, for type checkers and editors
     from lw_torchrl.language.query_search import nearest_query as nearest_query
     from lw_torchrl.language.skills import load_skills as load_skills
     from lw_torchrl.language.skills import nearest_skill as nearest_skill
+    from lw_torchrl.language.task_files import load_tasks as load_tasks
     from lw_torchrl.language.tasks import MT10 as MT10
     from lw_torchrl.language.tasks import MT50 as MT50
     from lw_torchrl.language.tasks import TASKS as TASKS
     from lw_torchrl.language.tasks import Task as Task
-    from lw_torchrl.language.tasks import load_tasks as load_tasks
     from lw_torchrl.language.tasks import resolve_tasks as resolve_tasks
     from lw_torchrl.language.tasks import task_id as task_id
     from lw_torchrl.modules import ActorEnsemble as ActorEnsemble
@@ -69,7 +69,8 @@ _NAMES = {
     "lw_torchrl.language.query_program": "QueryProgram",
     "lw_torchrl.language.query_search": "nearest_query",
     "lw_torchrl.language.skills": "load_skills nearest_skill",
-    "lw_torchrl.language.tasks": "MT10 MT50 TASKS Task load_tasks resolve_tasks task_id",
+    "lw_torchrl.language.task_files": "load_tasks",
+    "lw_torchrl.language.tasks": "MT10 MT50 TASKS Task resolve_tasks task_id",
     "lw_torchrl.modules": "ActorEnsemble DescriptorConditionedActor PlanConditionedActor PlanConditionedQValue "
     "PlanConditionedValue Policy QueryEvaluator ScriptedSkillActor plan_actor_value",
     "lw_torchrl.record": "RerunLogger",

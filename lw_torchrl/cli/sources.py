@@ -22,7 +22,8 @@ def one_or_many(names: tuple[str, ...]) -> str | tuple[str, ...]:
 
 def read_tasks(task_file: Path | None) -> Mapping[str, Task]:
     """The 50 tasks, with those of --task-file in their place or beside them."""
-    from lw_torchrl.language.tasks import TASKS, load_tasks
+    from lw_torchrl.language.task_files import load_tasks
+    from lw_torchrl.language.tasks import TASKS
 
     return TASKS if task_file is None else load_tasks(task_file)
 

@@ -1,13 +1,13 @@
 """Demonstrations: collecting them, reading them as a replay buffer, sampling them in exact proportions."""
 
 import lw_torchrl._torchrl  # noqa: F401
-from lw_torchrl.data.co_learning import CoLearningSampler
+from lw_torchrl.data.co_learning_sampler import CoLearningSampler
 from lw_torchrl.data.collect import collect_demonstrations
 from lw_torchrl.data.dataset import CollectConfig, DatasetError, Demonstrations
 from lw_torchrl.data.replay import LanguageWorldExperienceReplay
-from lw_torchrl.data.samplers import TaskBalancedSampler
 from lw_torchrl.data.selection import JoinedDemonstrations
 from lw_torchrl.data.storage import JoinedStorage
+from lw_torchrl.data.task_balanced_sampler import TaskBalancedSampler
 
 __all__ = [
     "CoLearningSampler",

@@ -12,15 +12,15 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from lw_torchrl._checks import check_choice, check_int
 from lw_torchrl.envs.engine import ACTION_SIZE, OBSERVATION_SIZE, Engine
 from lw_torchrl.envs.engines import make_engine
-from lw_torchrl.envs.episode_counter import EpisodeCounter, check_worker
+from lw_torchrl.envs.episode_counter import EpisodeCounter, check_worker, stated_episode
+from lw_torchrl.envs.specs import action_spec, clipped_action, done_spec, observation_spec, reward_spec, row_mask
 from lw_torchrl.envs.workers import torchrl_worker
-from lw_torchrl.language.tasks import MT50, Task, named_tasks, task_id
+from lw_torchrl.language.tasks import Task, named_tasks, task_id
 
 
 class LanguageWorldEnv(EnvBase):
@@ -123,7 +123,10 @@ class LanguageWorldEnv(EnvBase):
         self._counter = EpisodeCounter([named[t] for t in self.row_tasks], check_int("seed", seed), self.worker)
         super().__init__(device=torch.device("cpu"), batch_size=(num_envs,))
         self._task_id = torch.tensor([task_id(task) for task in self.row_tasks])
-        self._make_specs(num_envs)
+        self.observation_spec = observation_spec(self._task_id)
+        self.action_spec = action_spec(num_envs)
+        self.reward_spec = reward_spec(num_envs)
+        self.done_spec = done_spec(num_envs)
         self._episode = np.full(num_envs, -1, dtype=np.int64)
         self._steps = np.zeros(num_envs, dtype=np.int64)
         self._over = np.ones(num_envs, dtype=bool)
@@ -132,22 +135,6 @@ class LanguageWorldEnv(EnvBase):
         self._observation = np.zeros((num_envs, OBSERVATION_SIZE), dtype=np.float32)
         self._engine = make_engine(engine, self.row_tasks, reward=reward, num_threads=num_threads)
         self.is_closed = False  # EnvBase starts with True
-
-    def _make_specs(self, n: int) -> None:
-        flag = Categorical(2, shape=(n, 1), dtype=torch.bool)
-        ids = len(MT50) if int(self._task_id.max()) < len(MT50) else 2**32  # a task of one's own has a hash
-        self.observation_spec = Composite(
-            observation=Unbounded((n, OBSERVATION_SIZE)),
-            task_id=Categorical(ids, shape=(n,), dtype=torch.int64),
-            episode=Unbounded((n,), dtype=torch.int64),
-            success=flag.clone(),
-            fault=flag.clone(),
-            executed_action=Bounded(-1.0, 1.0, (n, ACTION_SIZE)),
-            shape=(n,),
-        )
-        self.action_spec = Bounded(-1.0, 1.0, (n, ACTION_SIZE))
-        self.reward_spec = Unbounded((n, 1))
-        self.done_spec = Composite(done=flag.clone(), terminated=flag.clone(), truncated=flag.clone(), shape=(n,))
 
     def _set_seed(self, seed: int | None) -> None:
         self._counter.start_again(seed)
@@ -209,12 +196,6 @@ class LanguageWorldEnv(EnvBase):
             device=self.device,
         )
 
-    def _mask(self, tensordict: TensorDictBase | None, key: str) -> np.ndarray:
-        mask = None if tensordict is None else tensordict.get(key, None)
-        if mask is None:
-            return np.ones(self.batch_size[0], dtype=bool)
-        return mask.reshape(self.batch_size).cpu().numpy()
-
     def _check_usable(self) -> None:
         if self.is_closed:
             raise RuntimeError("this environment is closed (a collector closes its own at its end): make a new one")
@@ -228,15 +209,9 @@ class LanguageWorldEnv(EnvBase):
         self, tensordict: TensorDictBase | None = None, *, episode: int | Tensor | None = None, set_state: bool = False
     ) -> TensorDict:
         self._check_usable()
-        rows = np.flatnonzero(self._mask(tensordict, "_reset"))
+        rows = np.flatnonzero(row_mask(tensordict, "_reset", self.batch_size[0]))
         if set_state:
-            if episode is not None:
-                raise ValueError("episode and set_state=True each name an episode: give one of them")
-            if tensordict is None or (episode := tensordict.get("episode", None)) is None:
-                raise ValueError(
-                    "set_state=True needs episode in the tensordict; a TransformedEnv does not hand it down: "
-                    "reset(episode=tensordict['episode'])"
-                )
+            episode = stated_episode(tensordict, episode)
         episodes = self._counter.next(rows) if episode is None else self._counter.asked(episode, rows)
         self._observation[rows] = self._engine.reset(rows.tolist(), self._counter.seeds(rows, episodes))
         self._counter.resets[rows] += 1
@@ -261,17 +236,10 @@ class LanguageWorldEnv(EnvBase):
                 "out, or repeat the episode's executed actions from its beginning"
             )
 
-    def _clipped(self, tensordict: TensorDictBase) -> Tensor:
-        action = tensordict.get("action", None)
-        if action is None or action.shape != (*self.batch_size, ACTION_SIZE) or action.dtype != torch.float32:
-            given = "none" if action is None else f"{action.dtype} of shape {tuple(action.shape)}"
-            raise ValueError(f"action must be float32 of shape {(*self.batch_size, ACTION_SIZE)}, got {given}")
-        return action.detach().clamp(-1.0, 1.0)
-
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         self._check_usable()
-        action = self._clipped(tensordict).cpu().numpy()
-        active = self._mask(tensordict, "_step")
+        action = clipped_action(tensordict, self.batch_size[0]).cpu().numpy()
+        active = row_mask(tensordict, "_step", self.batch_size[0])
         if (active & self._over).any():
             rows = np.flatnonzero(active & self._over)[:5].tolist()
             raise RuntimeError(

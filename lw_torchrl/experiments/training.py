@@ -19,8 +19,9 @@ from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules import ActorEnsemble
 from lw_torchrl.modules.policy import Policy, make_policy
 from lw_torchrl.trainers.behavioral_cloning import BehavioralCloningConfig, BehavioralCloningTrainer
-from lw_torchrl.trainers.checkpoint import check_description, describe_data, load_actor, save_actor
+from lw_torchrl.trainers.checkpoint import describe_data, load_actor, save_actor
 from lw_torchrl.trainers.stacked import StackedBehavioralCloning
+from lw_torchrl.trainers.training_state import check_description
 from lw_torchrl.transforms import RandomYaw
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -108,3 +108,33 @@ def read_point(name: str, at: Any, objects: Mapping[str, NamedObject]) -> NamedO
     if not isinstance(offset, list) or len(offset) != 3 or not all(map(is_number, offset)):
         raise ValueError(f"offset of {name!r} must be three numbers in metres, got {shown(offset)}")
     return NamedObject(name, objects[at["object"]].position, (offset[0], offset[1], offset[2]), ours=True)
+
+
+def _table(key: str, row: Mapping[str, Any]) -> Mapping[str, Any]:
+    found = row.get(key, {})
+    if not isinstance(found, Mapping) or not all(isinstance(name, str) for name in found):
+        raise ValueError(f"{key} must be a table of names and positions, got {shown(found)}")
+    return found
+
+
+def read_objects(row: Mapping[str, Any]) -> tuple[NamedObject, ...]:
+    """The gripper, then the objects and the points of a row of tasks.toml."""
+    objects = {GRIPPER: NamedObject(GRIPPER, (0, 1, 2))}
+    for named, at in _table("objects", row).items():
+        if named in objects:
+            raise ValueError(f"objects may not name {named!r}, which every task has")
+        objects[named] = NamedObject(named, read_position(named, at))
+    points = [read_point(named, at, objects) for named, at in _table("points", row).items()]
+    return (*objects.values(), *points)
+
+
+def write_objects(objects: Sequence[NamedObject]) -> dict[str, dict[str, Any]]:
+    """What :func:`read_objects` reads back, if a row can hold it."""
+    row: dict[str, dict[str, Any]] = {"objects": {}, "points": {}}
+    published = {named.position: named.name for named in reversed(objects) if not named.ours}
+    for named in objects[1:]:
+        at: Any = write_position(named.position)
+        if any(named.offset):
+            at = {"object": published.get(named.position, ""), "offset": list(named.offset)}
+        row["points" if named.ours else "objects"][named.name] = at
+    return row

@@ -35,7 +35,7 @@ def load_plans(
             folder of .plan files.
         skills: of the shipped plans, "own" for the set whose every step has a scripted skill; "MT10" for the set
             that words every step as the plans of MT10 do, for policies that have only seen MT10.
-        tasks: whose objects the conditions name, by task name, as from :func:`load_tasks`.
+        tasks: whose objects the conditions name, by task name, as from :func:`~lw_torchrl.load_tasks`.
 
     Returns:
         The plans, by task name.

@@ -15,9 +15,10 @@ from functools import lru_cache
 
 from rapidfuzz import fuzz, process
 
+from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.language.observation import FIRST, SECOND, places
 from lw_torchrl.language.relations import PREDICATES, PUBLISHED, RELATIONS, TOUCHING, UNARY
-from lw_torchrl.language.tasks import GRIPPER, Task, get_task
+from lw_torchrl.language.tasks import Task, get_task
 
 ARTICLES = ("the", "a", "an")
 _ALIASES = {"gripper": GRIPPER, "robot gripper": GRIPPER}

@@ -3,115 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import reduce
-from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from lw_torchrl.language.observation import OBSERVATION_SIZE, OPENING
-from lw_torchrl.language.queries import Clause, Query, check_query
-from lw_torchrl.language.relations import PREDICATES, Comparison
+from lw_torchrl.language.observation import OBSERVATION_SIZE
+from lw_torchrl.language.queries import Query, check_query
+from lw_torchrl.language.query_tables import QueryTables, compile_queries
 from lw_torchrl.language.task_index import TaskIndex, TaskTables, readable
-from lw_torchrl.language.tasks import Coordinate, Task, coordinate_index, get_task
+from lw_torchrl.language.tasks import Task, get_task
 
-_ORIGIN = (0.0, 0.0, 0.0)
-# Of the origin and itself, the padding of the tables: far from changing its truth at any temperature.
-_ALWAYS = Comparison("xyz", "<", 1e4, temperature=1e-6)
-_NEVER = Comparison("xyz", "<", -1e4, temperature=1e-6)
 _LEAST, _MOST = 1e-6, 1e4  # of the size of a logit, and of metres where a length has a gradient
-
-_Position = tuple[Coordinate, Coordinate, Coordinate]
-_Atom = tuple[_Position, _Position, tuple[float, float, float], Comparison]
-_NO_SHIFT = (0.0, 0.0, 0.0)
-
-
-class _Tables(NamedTuple):
-    """A task's atoms (A), each a comparison of the difference of two positions, and which J atoms make up
-    each clause (K) of each query (S). The first dimension is of tasks (T) where compiled, of rows where selected."""
-
-    first: Tensor  # (T, 3*A) int64, index of each coordinate of the first position; of 0 for an axis left out
-    second: Tensor  # (T, 3*A) int64
-    shift: Tensor  # (T, 3, A) float64, metres, added to the difference
-    length: Tensor  # (T, A) bool, the difference's length is compared, otherwise its one coordinate
-    far: Tensor  # (T, A) bool, it is the length's opposite that is compared, with the threshold's
-    threshold: Tensor  # (T, A) float64, metres; the atom holds below it
-    flipped: Tensor  # (T, A) bool, take the atom's complement
-    temperature: Tensor  # (T, A) float64, metres to one logit
-    atoms: Tensor  # (T, J*K*S) int64
-    negated: Tensor  # (T, K, S) bool, take the clause's complement
-    constants: Tensor  # (T, C) float64, read as if they followed the observation
-
-
-def _clause_atoms(clause: Clause, task: Task) -> list[_Atom]:
-    first: _Position = (0.0, 0.0, OPENING)
-    second: _Position = _ORIGIN
-    shift = _NO_SHIFT
-    if clause.predicate not in ("open", "closed"):
-        subject = task.object(clause.subject)
-        first, shift = subject.position, subject.offset
-        if clause.object is not None:
-            other = task.object(clause.object)
-            second = other.position
-            x, y, z = (a - b for a, b in zip(shift, other.offset, strict=True))
-            shift = (x, y, z)
-    return [(first, second, shift, part) for part in PREDICATES[clause.predicate]]
-
-
-def _task_atoms(task: Task, queries: Sequence[Query], steps: int, width: int) -> tuple[list[_Atom], list, list]:
-    """The atoms of one task, each once; those of each clause (steps, width, J); what is negated (steps, width)."""
-    clauses = [[(_clause_atoms(clause, task), clause.negated) for clause in query.clauses] for query in queries]
-    clauses += [[([(_ORIGIN, _ORIGIN, _NO_SHIFT, _NEVER)], False)]] * (steps - len(queries))
-    always = (_ORIGIN, _ORIGIN, _NO_SHIFT, _ALWAYS)
-    padded = [[*listed, *[([], False)] * (width - len(listed))] for listed in clauses]
-    atoms = dict.fromkeys([always, *(atom for listed in padded for found, _ in listed for atom in found)])
-    place = {atom: number for number, atom in enumerate(atoms)}
-    places = [[[place[atom] for atom in found] for found, _ in row] for row in padded]
-    return list(atoms), places, [[negated for _, negated in row] for row in padded]
-
-
-def _compile(queries: Mapping[Task, Sequence[Query]]) -> _Tables:
-    steps = max(map(len, queries.values()))
-    width = max(len(query.clauses) for listed in queries.values() for query in listed)
-    found = [_task_atoms(task, listed, steps, width) for task, listed in queries.items()]
-    most = max(len(atoms) for atoms, _, _ in found)
-    parts = max(2, *(len(each) for _, places, _ in found for row in places for each in row))
-    filled = [[[[*each, *[0] * (parts - len(each))] for each in row] for row in places] for _, places, _ in found]
-    listed = [atoms + [(_ORIGIN, _ORIGIN, _NO_SHIFT, _ALWAYS)] * (most - len(atoms)) for atoms, _, _ in found]
-    constants = [0.0]
-
-    def index(atom: _Atom, side: int) -> list[int]:
-        first, second, _, part = atom
-        position = (first, second)[side if part.sense == "<" else 1 - side]
-        return [
-            coordinate_index(c if axis in part.axes else 0.0, constants)
-            for axis, c in zip("xyz", position, strict=True)
-        ]
-
-    def shift(atom: _Atom) -> list[float]:
-        *_, found, part = atom
-        sign = 1.0 if part.sense == "<" else -1.0
-        moved = (found[0], found[1], found[2] + part.raise_z)
-        return [sign * metres if axis in part.axes else 0.0 for axis, metres in zip("xyz", moved, strict=True)]
-
-    def table(value: Callable[[_Atom], Any], dtype: torch.dtype = torch.int64) -> Tensor:
-        values = torch.tensor([[value(atom) for atom in atoms] for atoms in listed], dtype=dtype)
-        return values.movedim(1, -1).contiguous()
-
-    return _Tables(
-        first=table(lambda atom: index(atom, 0)).flatten(1),
-        second=table(lambda atom: index(atom, 1)).flatten(1),
-        shift=table(shift, torch.float64),
-        length=table(lambda atom: atom[3].length, torch.bool),
-        far=table(lambda atom: atom[3].length and atom[3].sense != "<", torch.bool),
-        threshold=table(lambda atom: atom[3].threshold * (1 if atom[3].sense == "<" else -1), torch.float64),
-        flipped=table(lambda atom: atom[3].sense == "<=", torch.bool),
-        temperature=table(lambda atom: atom[3].temperature, torch.float64),
-        atoms=torch.tensor(filled).permute(0, 3, 2, 1).flatten(1),
-        negated=torch.tensor([negated for _, _, negated in found]).transpose(1, 2).contiguous(),
-        constants=torch.tensor([constants] * len(listed), dtype=torch.float64),
-    )
 
 
 class QueryProgram:
@@ -158,7 +62,7 @@ class QueryProgram:
         self.num_queries = max(map(len, compiled.values()))
         index = TaskIndex(self.tasks)
         in_order = dict(sorted(compiled.items(), key=lambda item: index.row(item[0].name)))
-        tables = _compile(in_order)
+        tables = compile_queries(in_order)
         self._any_far = bool(tables.far.any())
         self._tables = TaskTables(index, tables, f"tasks without queries in {self!r}")
 
@@ -225,11 +129,11 @@ class QueryProgram:
         # On a threshold, the side that the hard truth takes; the gradient is that of soft everywhere.
         return soft - soft.detach() + torch.where(holds, size, -size)
 
-    def _parts(self, atoms: Tensor, tables: _Tables) -> tuple[Tensor, ...]:
+    def _parts(self, atoms: Tensor, tables: QueryTables) -> tuple[Tensor, ...]:
         """(B, A) of the atoms to J of (B, K, S), the atoms of each clause."""
         return atoms.gather(1, tables.atoms).unflatten(1, (-1, *tables.negated.shape[1:])).unbind(1)
 
-    def _values(self, observation: Tensor, tables: _Tables, floor: float = 0.0) -> Tensor:
+    def _values(self, observation: Tensor, tables: QueryTables, floor: float = 0.0) -> Tensor:
         """What each atom compares, (B, A) metres. The length of nothing has no gradient: ``floor`` keeps away from
         it."""
         numbers = torch.cat((observation.reshape(-1, OBSERVATION_SIZE), tables.constants), 1)

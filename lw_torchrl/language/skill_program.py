@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 
 from lw_torchrl._checks import unknown_name
+from lw_torchrl.language.named_objects import coordinate_index
 from lw_torchrl.language.observation import OBSERVATION_SIZE
 from lw_torchrl.language.skills import ScriptedSkill, load_skills
 from lw_torchrl.language.task_index import TaskIndex, TaskTables
-from lw_torchrl.language.tasks import Task, coordinate_index, get_task
+from lw_torchrl.language.tasks import Task, get_task
 
 
 class _Tables(NamedTuple):

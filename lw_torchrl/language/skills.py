@@ -16,8 +16,8 @@ from rapidfuzz import fuzz, process
 
 from lw_torchrl._checks import nearest, shown
 from lw_torchrl._files import read_toml
-from lw_torchrl.language.named_objects import is_number
-from lw_torchrl.language.tasks import GRIPPER, TASKS, Task, check_task, get_task
+from lw_torchrl.language.named_objects import GRIPPER, is_number
+from lw_torchrl.language.tasks import TASKS, Task, check_task, get_task
 
 Triple = tuple[float, float, float]
 
@@ -150,7 +150,7 @@ def load_skills(
     Args:
         path: a file like data/skills.toml, whose skills join ours or replace those with the same text; None for
             ours alone.
-        tasks: whose names its ``for`` tables may have, as from :func:`load_tasks`.
+        tasks: whose names its ``for`` tables may have, as from :func:`~lw_torchrl.load_tasks`.
 
     Raises:
         FileNotFoundError: there is no such file.

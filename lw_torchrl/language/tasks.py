@@ -2,49 +2,22 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from hashlib import blake2b
 from importlib.resources import files
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from lw_torchrl._checks import nearest, shown, unknown_name
+from lw_torchrl._checks import shown, unknown_name
 from lw_torchrl._files import read_toml
-from lw_torchrl.language.named_objects import (
-    GRIPPER,
-    Coordinate,
-    NamedObject,
-    coordinate_index,
-    read_point,
-    read_position,
-    write_position,
-)
-
-__all__ = [
-    "GRIPPER",
-    "MT10",
-    "MT50",
-    "TASKS",
-    "Coordinate",
-    "NamedObject",
-    "Task",
-    "TaskError",
-    "check_task",
-    "coordinate_index",
-    "get_task",
-    "load_tasks",
-    "named_tasks",
-    "resolve_tasks",
-    "task_id",
-]
+from lw_torchrl.language.named_objects import GRIPPER, NamedObject, read_objects, write_objects
+from lw_torchrl.language.named_objects import coordinate_index as coordinate_index
 
 _NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
 _OWN_IDS = 2**31 - 50  # so that an id is an int32 too
@@ -121,13 +94,7 @@ class Task:
             >>> TASKS["reach"].to_json()["objects"]
             {'reach target': 'obs[36:39]'}
         """
-        row: dict[str, Any] = {"description": self.description, "objects": {}, "points": {}}
-        published = {named.position: named.name for named in reversed(self.objects) if not named.ours}
-        for named in self.objects[1:]:
-            at: Any = write_position(named.position)
-            if any(named.offset):
-                at = {"object": published.get(named.position, ""), "offset": list(named.offset)}
-            row["points" if named.ours else "objects"][named.name] = at
+        row = {"description": self.description, **write_objects(self.objects)}
         try:
             same = Task.from_json(self.name, row) == self
         except TaskError:
@@ -156,13 +123,6 @@ def _check_name(name: object) -> str:
     return name
 
 
-def _table(key: str, row: Mapping[str, Any]) -> Mapping[str, Any]:
-    found = row.get(key, {})
-    if not isinstance(found, Mapping) or not all(isinstance(name, str) for name in found):
-        raise ValueError(f"{key} must be a table of names and positions, got {shown(found)}")
-    return found
-
-
 def _task(name: str, row: Any) -> Task:
     if not isinstance(row, Mapping):
         raise ValueError(f"must be a table, got {shown(row)}")
@@ -172,13 +132,7 @@ def _task(name: str, row: Any) -> Task:
     description = row.get("description")
     if not isinstance(description, str) or not description.strip():
         raise ValueError(f"description must be a sentence, got {shown(description)}")
-    objects = {GRIPPER: NamedObject(GRIPPER, (0, 1, 2))}
-    for named, at in _table("objects", row).items():
-        if named in objects:
-            raise ValueError(f"objects may not name {named!r}, which every task has")
-        objects[named] = NamedObject(named, read_position(named, at))
-    points = [read_point(named, at, objects) for named, at in _table("points", row).items()]
-    return Task(name, description, (*objects.values(), *points))
+    return Task(name, description, read_objects(row))
 
 
 def _load() -> tuple[Mapping[str, Task], tuple[str, ...]]:
@@ -229,7 +183,7 @@ def resolve_tasks(names: str | Iterable[str], *, tasks: Mapping[str, Task] = TAS
 
     Args:
         names: "MT10", "MT50", one task's name, or an iterable of names.
-        tasks: the tasks there are, by name, as from :func:`load_tasks`.
+        tasks: the tasks there are, by name, as from :func:`~lw_torchrl.load_tasks`.
 
     Returns:
         10, 50, 1 or n names.
@@ -264,7 +218,7 @@ def named_tasks(tasks: str | Task | Iterable[str | Task], *, known: Mapping[str,
 
     Args:
         tasks: as for :func:`resolve_tasks`; a :class:`Task` counts for itself, whatever else has its name.
-        known: the tasks that names stand for, as from :func:`load_tasks`.
+        known: the tasks that names stand for, as from :func:`~lw_torchrl.load_tasks`.
 
     Raises:
         ValueError, TypeError: as for :func:`resolve_tasks`.
@@ -285,45 +239,3 @@ def named_tasks(tasks: str | Task | Iterable[str | Task], *, known: Mapping[str,
 def get_task(task: str | Task) -> Task:
     """The :class:`Task` of a name of the 50; a Task is returned as it is."""
     return task if isinstance(task, Task) else TASKS[check_task(task)]
-
-
-def load_tasks(path: str | os.PathLike[str]) -> Mapping[str, Task]:
-    """All 50 tasks and those of a file of one's own: some of the 50 with other objects, points or words, or tasks that
-    the simulator does not have.
-
-    Args:
-        path: a file in the format of data/tasks.toml. A task with a new name must name its objects.
-
-    Returns:
-        Task name to :class:`Task`, sorted; pass one wherever a task is asked for, or all of them to
-        :func:`~lw_torchrl.load_plans` and :func:`resolve_tasks`.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        TaskError: (a ValueError) it is no TOML, or a task in it is malformed.
-
-    Example:
-        >>> import os, tempfile
-        >>> folder = tempfile.TemporaryDirectory()
-        >>> path = os.path.join(folder.name, "mine.toml")
-        >>> lines = ["[push]", "description = 'Push the disc.'", "objects.disc = 'obs[4:7]'"]
-        >>> with open(path, "w") as file:
-        ...     print(*lines, sep=os.linesep, file=file)
-        >>> load_tasks(path)["push"].object_names
-        ("robot's gripper", 'disc')
-        >>> folder.cleanup()
-    """
-    file = Path(path)
-    found = dict(TASKS)
-    for name, row in read_toml(file, TaskError).items():
-        try:
-            found[name] = Task.from_json(name, row)
-            if name not in TASKS and len(found[name].objects) == 1:
-                close = nearest(name, TASKS, n=1)
-                raise TaskError(
-                    f"task {name!r}: is none of the 50, so it must name its objects"
-                    + (f"; did you mean {close[0]!r}?" if close else "")
-                )
-        except TaskError as error:
-            raise TaskError(f"{file}, {error}") from error
-    return MappingProxyType(dict(sorted(found.items())))

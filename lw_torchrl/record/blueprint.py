@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl.record.scene import (
+from lw_torchrl.record.recorded_episode import RecordedEpisode
+from lw_torchrl.record.scene import Color
+from lw_torchrl.record.timelines import (
     EPISODE_TIMELINE,
+    METRIC_TIMELINE,
     SECONDS_TIMELINE,
-    Color,
-    RecordedEpisode,
     entity_path,
     time_columns,
 )
@@ -20,8 +21,6 @@ from lw_torchrl.record.scene import (
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
     from rerun import RecordingStream
-
-METRIC_TIMELINE = "global_step"
 
 # From behind the robot's right shoulder, over a table whose middle is at (0, 0.6, 0).
 EYE, TARGET = (0.54, 0.23, 0.46), (0.03, 0.63, 0.10)

@@ -3,35 +3,36 @@
 from __future__ import annotations
 
 import os
-import uuid
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import torch
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.record.loggers import Logger
 
-from lw_torchrl.record.blueprint import (
-    METRIC_TIMELINE,
-    episode_view,
-    log_curves,
-    log_lanes,
-    log_plan,
-    make_blueprint,
-    metric_views,
+from lw_torchrl.record.blueprint import make_blueprint, metric_views
+from lw_torchrl.record.episodes import episode_name, send_episode
+from lw_torchrl.record.metrics import (
+    check_name,
+    check_video,
+    flatten,
+    histogram,
+    send_histogram,
+    send_hparams,
+    send_scalars,
+    send_video,
 )
-from lw_torchrl.record.scene import CONTROL_PERIOD, PlanLike, RecordedEpisode, entity_path, log_scene, time_columns
+from lw_torchrl.record.recorded_episode import PlanLike, RecordedEpisode
+from lw_torchrl.record.recording_file import check_path, hidden_beside, open_stream
+from lw_torchrl.record.timelines import CONTROL_PERIOD, entity_path
 
 if TYPE_CHECKING:
     from rerun import RecordingStream
 
-RESERVED = ("metrics", "histograms", "videos", "hparams")
 BUFFERED_SCALARS = 1024
 
 
@@ -74,9 +75,9 @@ class RerunLogger(Logger):
         exp_name: str | None = None,
         application_id: str = "lw_torchrl",
     ) -> None:
-        self.path = _check_path(path)
+        self.path = check_path(path)
         self.application_id = application_id
-        self._partial = self.path.with_name(f".{self.path.stem}.{os.getpid()}-{uuid.uuid4().hex[:8]}.tmp.rrd")
+        self._partial = hidden_beside(self.path)
         self._scalars: defaultdict[str, tuple[list[int], list[float]]] = defaultdict(lambda: ([], []))
         self._counters: dict[str, int] = {}
         self._hparams: dict[str, str] = {}
@@ -86,14 +87,7 @@ class RerunLogger(Logger):
         super().__init__(exp_name=exp_name or self.path.stem, log_dir=str(self.path.parent))
 
     def _create_experiment(self) -> RecordingStream:
-        import rerun as rr
-
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        stream = rr.RecordingStream(self.application_id)
-        stream.set_log_time_enabled(False)
-        stream.set_log_tick_enabled(False)
-        stream.save(self._partial)
-        stream.send_recording_name(self.exp_name)
+        stream = open_stream(self._partial, self.application_id, self.exp_name)
         # In another process (service_backend="process") torchrl ends the experiment, not the logger.
         stream.finish = self.shutdown
         return stream
@@ -129,7 +123,7 @@ class RerunLogger(Logger):
             step: the training step; None counts the calls with this name from 0.
         """
         self._open()
-        steps, values = self._scalars[_check_name(name)]
+        steps, values = self._scalars[check_name(name)]
         try:
             number = float(value)
         except (TypeError, ValueError, RuntimeError) as error:
@@ -157,25 +151,11 @@ class RerunLogger(Logger):
                 self.log_video(f"{name}/{i}", one, step, **kwargs)
             return
         video = video[0] if video.ndim == 5 else video
-        if video.ndim != 4 or video.shape[1] not in (1, 3) or not video.numel() or video.dtype != torch.uint8:
-            raise ValueError(
-                f"video {name!r} must be uint8 of shape T×C×H×W with C = 1 or 3, "
-                f"got {str(video.dtype).removeprefix('torch.')} of shape {'×'.join(map(str, video.shape))}"
-            )
-        import rerun as rr
-
-        stream, path = self._open(), entity_path("videos", *_check_name(name).split("/"))
+        check_video(name, video)
+        stream, path = self._open(), entity_path("videos", *check_name(name).split("/"))
         if step is not None:
             path += entity_path(f"step {int(step)}")
-        frames, channels, height, width = video.shape
-        fps = float(kwargs.get("fps", 1 / CONTROL_PERIOD))
-        image_format = rr.components.ImageFormat(
-            width=width, height=height, color_model="RGB" if channels == 3 else "L", channel_datatype="U8"
-        )
-        stream.log(path, rr.Image.from_fields(format=image_format), static=True)
-        pixels = video.permute(0, 2, 3, 1).reshape(frames, -1).contiguous().numpy()
-        times = time_columns(np.arange(frames), 1 / fps)
-        stream.send_columns(path, times, rr.Image.columns(buffer=pixels))
+        send_video(stream, path, video, float(kwargs.get("fps", 1 / CONTROL_PERIOD)))
         self._videos[path] = None
 
     def log_hparams(self, cfg: Any) -> None:
@@ -184,14 +164,10 @@ class RerunLogger(Logger):
         Args:
             cfg: a mapping (a DictConfig too), nested ones are written "actor.width".
         """
-        import rerun as rr
-
         if not isinstance(cfg, Mapping):
             raise TypeError(f"cfg must be a mapping, got {type(cfg).__name__}")
-        self._hparams.update(_flatten(cfg))
-        rows = [f"| {_cell(key)} | {_cell(value)} |" for key, value in sorted(self._hparams.items())]
-        text = "\n".join(["| key | value |", "|---|---|", *rows])
-        self._open().log("hparams", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
+        self._hparams.update(flatten(cfg))
+        send_hparams(self._open(), self._hparams)
 
     def log_histogram(self, name: str, data: Sequence[float] | Tensor | NDArray[Any], **kwargs: Any) -> None:
         """Add the counts of ``data`` as a bar chart "histograms/<name>", on the timeline "global_step".
@@ -205,16 +181,9 @@ class RerunLogger(Logger):
         Raises:
             ValueError: ``data`` is empty or holds a NaN or an infinity.
         """
-        import rerun as rr
-
-        values = np.asarray(torch.as_tensor(data).detach().cpu().to(torch.float64)).ravel()
-        if not values.size or not np.isfinite(values).all():
-            raise ValueError(f"data of histogram {name!r} must be finite and not empty, got {values.tolist()[:8]}")
-        counts, edges = np.histogram(values, bins=kwargs.get("bins", 30))
-        path = entity_path("histograms", *_check_name(name).split("/"))
-        index = [rr.TimeColumn(METRIC_TIMELINE, sequence=[self._count(path, kwargs.get("step"))])]
-        chart = rr.BarChart.columns(values=[counts.astype(np.int64)], abscissa=[(edges[1:] + edges[:-1]) / 2])
-        self._open().send_columns(path, index, chart)
+        counts, edges = histogram(name, data, kwargs.get("bins", 30))
+        path = entity_path("histograms", *check_name(name).split("/"))
+        send_histogram(self._open(), path, self._count(path, kwargs.get("step")), counts, edges)
         self._histograms[path] = None
 
     def flush(self, timeout: float | None = None) -> None:
@@ -259,14 +228,9 @@ class RerunLogger(Logger):
         return now
 
     def _send_scalars(self, name: str) -> None:
-        import rerun as rr
-
         steps, values = self._scalars[name]
         if values:
-            index = [rr.TimeColumn(METRIC_TIMELINE, sequence=steps)]
-            self.experiment.send_columns(
-                entity_path("metrics", *name.split("/")), index, rr.Scalars.columns(scalars=values)
-            )
+            send_scalars(self.experiment, entity_path("metrics", *name.split("/")), steps, values)
             steps.clear()
             values.clear()
 
@@ -311,68 +275,7 @@ class RerunLogger(Logger):
             'reach'
         """
         stream = self._open()
-        name = self._episode_name(task, name)
+        name = episode_name(task, name, self._episodes)
         episode = RecordedEpisode.from_rollout(rollout, objects, plan)
-        root = entity_path(name)
-        trails = log_scene(stream, root, episode)
-        if episode.steps:
-            log_plan(stream, root, task, episode.steps)
-        log_curves(stream, root, episode)
-        lanes = log_lanes(stream, root, episode)
-        self._episodes[name] = episode_view(
-            root,
-            name,
-            trails=trails,
-            steps=len(episode.steps),
-            lanes=lanes,
-            skill_weights=episode.skill_weights is not None,
-        )
+        self._episodes[name] = send_episode(stream, name, task, episode)
         return name
-
-    def _episode_name(self, task: str, name: str | None) -> str:
-        if not isinstance(task, str) or not task.strip():
-            raise ValueError(f"task must be a task's name, got {task!r}")
-        if name is None:
-            names: Iterator[str] = (task if i == 1 else f"{task} {i}" for i in range(1, len(self._episodes) + 2))
-            return next(free for free in names if free not in self._episodes)
-        if not isinstance(name, str) or not name.strip():
-            raise ValueError(f"name must be a non-empty string, got {name!r}")
-        if name in self._episodes or name in RESERVED:
-            taken = ", ".join((*RESERVED, *self._episodes))
-            raise ValueError(f"name must be another than {taken}, got {name!r}")
-        return name
-
-
-def _check_path(path: str | os.PathLike[str]) -> Path:
-    if not isinstance(path, (str, os.PathLike)):
-        raise TypeError(f"path must be a path, got {path!r} ({type(path).__name__})")
-    target = Path(path)
-    if target.suffix != ".rrd" or not target.stem:
-        raise ValueError(f"path must end in '.rrd', got {str(target)!r}")
-    if target.is_dir():
-        raise ValueError(f"path must be a file, got the folder {str(target)!r}")
-    # The nearest parent that exists decides whether the missing ones can be made.
-    nearest = next((parent for parent in target.absolute().parents if parent.exists()), None)
-    if nearest is not None and not nearest.is_dir():
-        raise ValueError(f"path {str(target)!r} must lie in a folder, but {str(nearest)!r} is a file")
-    return target
-
-
-def _check_name(name: str) -> str:
-    if not isinstance(name, str) or not all(part.strip() for part in name.split("/")):
-        raise ValueError(f"name must be words joined by single slashes like 'loss/bc', got {name!r}")
-    return name
-
-
-def _flatten(cfg: Mapping[Any, Any], prefix: str = "") -> dict[str, str]:
-    flat: dict[str, str] = {}
-    for key, value in cfg.items():
-        if isinstance(value, Mapping) and value:
-            flat |= _flatten(value, f"{prefix}{key}.")
-        else:
-            flat[f"{prefix}{key}"] = str(value)
-    return flat
-
-
-def _cell(text: str) -> str:
-    return text.replace("|", "\\|").replace("\n", " ")

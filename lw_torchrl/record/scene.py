@@ -1,4 +1,4 @@
-"""One episode as checked arrays, and the 3-D scene that is drawn from it.
+"""The 3-D scene that is drawn from an episode.
 
 Meta-World's frame: metres, x to the robot's right, y away from the robot, z up, the table's top at z = 0.
 Static things are sent once; what moves is sent as whole columns, one call per entity.
@@ -7,23 +7,18 @@ Static things are sent once; what moves is sent as whole columns, one call per e
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from tensordict import TensorDictBase
+
+from lw_torchrl.record.recorded_episode import GRIPPER, RecordedEpisode
+from lw_torchrl.record.timelines import entity_path, time_columns
 
 if TYPE_CHECKING:
     from rerun import RecordingStream
 
 Color = tuple[int, ...]
-
-EPISODE_TIMELINE, SECONDS_TIMELINE = "step", "time"
-GRIPPER = "robot's gripper"
-CONTROL_PERIOD = 0.0125
-"""Seconds between two actions in Meta-World: 5 simulation steps of 2.5 ms, hence 80 Hz."""
 
 # Measured in Meta-World's model: obs[3] is the distance between the fingers over 0.1 m; they slide along y
 # and reach 4.5 cm below obs[0:3], the position of the hand.
@@ -38,154 +33,6 @@ TABLE_CENTER, TABLE_HALF = (0.0, 0.6, -0.010), (0.7, 0.4, 0.010)
 
 STEEL, GOLD, GREEN, TABLE, GRID = (205, 210, 220), (255, 200, 60), (90, 220, 120), (58, 64, 74), (92, 99, 112)
 OBJECT_COLORS = ((80, 170, 255), (255, 120, 90), (200, 130, 255), (90, 220, 210))
-
-
-class StepLike(Protocol):
-    """A (condition, skill) pair: ``str(condition)`` is English, ``skill`` is a string."""
-
-    @property
-    def condition(self) -> object: ...
-    @property
-    def skill(self) -> str: ...
-
-
-class PlanLike(Protocol):
-    """Anything with ``steps``, such as :class:`lw_torchrl.ConditionalPlan`."""
-
-    @property
-    def steps(self) -> Sequence[StepLike]: ...
-
-
-@dataclass(frozen=True)
-class RecordedEpisode:
-    """T rows of one episode, checked, on the CPU; S is the number of steps of its plan.
-
-    Attributes:
-        observation: T×39 float32; metres, gripper opening in [0,1] at index 3, goal at 36:39.
-        action: T×4 float32, displacement xyz and gripper effort in [-1,1].
-        objects: name -> T×3 float32 position in metres; the gripper is among them.
-        qaf: T×S bool, truth of each condition, or None.
-        skill_weights: T×S float32, attention over the steps, or None.
-        success: T bool, of the state that the row's action led to, or None.
-        reward: T float32, likewise, or None.
-        steps: the S (condition, skill) texts; empty where there is no plan.
-    """
-
-    observation: NDArray[np.float32]
-    action: NDArray[np.float32]
-    objects: dict[str, NDArray[np.float32]]
-    qaf: NDArray[np.bool_] | None
-    skill_weights: NDArray[np.float32] | None
-    success: NDArray[np.bool_] | None
-    reward: NDArray[np.float32] | None
-    steps: tuple[tuple[str, str], ...]
-
-    @property
-    def skills(self) -> list[str]:
-        """A text for each column of skill_weights: "1 grasp the handle", or "1" where there is no plan."""
-        count = 0 if self.skill_weights is None else self.skill_weights.shape[1]
-        texts = [f" {skill}" for _, skill in self.steps] or [""] * count
-        return [f"{i}{text}" for i, text in enumerate(texts, 1)]
-
-    def __len__(self) -> int:
-        return len(self.observation)
-
-    @classmethod
-    def from_rollout(
-        cls, rollout: TensorDictBase, objects: Mapping[str, Any], plan: PlanLike | None = None
-    ) -> RecordedEpisode:
-        """Check a rollout; see :meth:`lw_torchrl.RerunLogger.log_episode` for the keys and the errors."""
-        if not isinstance(rollout, TensorDictBase):
-            raise TypeError(f"rollout must be a TensorDict, got {type(rollout).__name__}")
-        if len(rollout.batch_size) != 1 or not rollout.batch_size[0]:
-            hint = "; take one episode, rollout[i]" if len(rollout.batch_size) > 1 else ""
-            raise ValueError(f"rollout must have batch size (T,) with T >= 1, got {tuple(rollout.batch_size)}{hint}")
-        steps = tuple((str(step.condition), step.skill) for step in plan.steps) if plan is not None else ()
-        length = rollout.batch_size[0]
-        return cls(
-            observation=_column(rollout, "observation", length, 39),
-            action=_column(rollout, "action", length, 4),
-            objects=_positions(objects, rollout, length),
-            qaf=_truth(rollout, "qaf", length, len(steps)),
-            skill_weights=_of_steps(rollout, "skill_weights", length, len(steps)),
-            success=_flat(_truth(rollout, ("next", "success"), length, 1)),
-            reward=_flat(_of_steps(rollout, ("next", "reward"), length, 1)),
-            steps=steps,
-        )
-
-
-def _array(value: Any, label: str, shape: tuple[int | None, ...]) -> NDArray[Any]:
-    """``value`` as an array of ``shape`` (None: any size) without NaN or infinity, or a ValueError."""
-    tensor = torch.as_tensor(value).detach().cpu()
-    allowed = "×".join("S" if size is None else str(size) for size in shape)
-    if tensor.ndim != len(shape) or any(s not in (None, n) for s, n in zip(shape, tensor.shape, strict=True)):
-        raise ValueError(f"{label} must have shape {allowed}, got {'×'.join(map(str, tensor.shape)) or 'a scalar'}")
-    if tensor.dtype == torch.bool:
-        return tensor.numpy()
-    array = tensor.to(torch.float32).numpy()
-    if not np.isfinite(array).all():
-        row = int(np.argwhere(~np.isfinite(array))[0][0])
-        raise ValueError(f"{label} must be finite, got {array[row].tolist()} in row {row}")
-    return array
-
-
-def _column(rollout: TensorDictBase, key: Any, length: int, size: int | None) -> NDArray[Any]:
-    value = rollout.get(key, None)
-    if value is None:
-        found = ", ".join(sorted(map(str, rollout.keys())))
-        raise ValueError(f"rollout must have the key {key!r} ({length}×{size}), got {found or 'no keys'}")
-    return _array(value, f"rollout[{key!r}]", (length, size))
-
-
-def _of_steps(rollout: TensorDictBase, key: Any, length: int, steps: int) -> NDArray[Any] | None:
-    """An optional column with at least ``steps`` columns; those beyond are padding and dropped."""
-    if rollout.get(key, None) is None:
-        return None
-    array = _column(rollout, key, length, None)
-    if array.shape[1] < max(steps, 1):
-        raise ValueError(f"rollout[{key!r}] must have a column for each of {steps} plan steps, got {array.shape[1]}")
-    return array[:, :steps] if steps else array
-
-
-def _truth(rollout: TensorDictBase, key: Any, length: int, steps: int) -> NDArray[np.bool_] | None:
-    array = _of_steps(rollout, key, length, steps)
-    if array is not None and array.dtype != np.bool_:
-        raise ValueError(f"rollout[{key!r}] must be bool, got {rollout.get(key).dtype}")
-    return array
-
-
-def _flat(array: NDArray[Any] | None) -> NDArray[Any] | None:
-    return None if array is None else array[:, 0]
-
-
-def _positions(objects: Any, rollout: TensorDictBase, length: int) -> dict[str, NDArray[np.float32]]:
-    if not isinstance(objects, Mapping):
-        raise TypeError(f"objects must map names to T×3 positions, got {type(objects).__name__}")
-    for name in objects:
-        if not isinstance(name, str) or not name:
-            raise TypeError(f"objects must be named by non-empty strings, got {name!r}")
-    checked = {name: _array(value, f"objects[{name!r}]", (length, 3)) for name, value in objects.items()}
-    if GRIPPER not in checked:
-        checked[GRIPPER] = _column(rollout, "observation", length, 39)[:, :3]
-    return checked
-
-
-def entity_path(*parts: str) -> str:
-    """An absolute entity path of parts that may hold any character."""
-    import rerun as rr
-
-    return "".join("/" + rr.escape_entity_path_part(part) for part in parts)
-
-
-def time_columns(steps: NDArray[np.int64], period: float = CONTROL_PERIOD) -> list[Any]:
-    """The two timelines of an episode: steps, and seconds at ``period`` each."""
-    import rerun as rr
-
-    nanoseconds = (steps * round(period * 1e9)).astype("timedelta64[ns]")
-    return [
-        rr.TimeColumn(EPISODE_TIMELINE, sequence=steps),
-        rr.TimeColumn(SECONDS_TIMELINE, duration=nanoseconds),
-    ]
 
 
 def log_scene(stream: RecordingStream, root: str, episode: RecordedEpisode) -> list[str]:

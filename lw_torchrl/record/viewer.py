@@ -18,7 +18,7 @@ from typing import IO, Any
 
 from lw_torchrl._checks import check_int
 from lw_torchrl._files import replacing
-from lw_torchrl.record.scene import EPISODE_TIMELINE
+from lw_torchrl.record.timelines import EPISODE_TIMELINE
 
 RRD_MAGIC, PNG_MAGIC = b"RRF", b"\x89PNG\r\n\x1a\n"
 START_SECONDS, PAINT_SECONDS = 60.0, 1.5

@@ -21,15 +21,9 @@ from lw_torchrl._checks import check_choice, check_int, check_scale
 from lw_torchrl._files import sweep
 from lw_torchrl._progress import Progress
 from lw_torchrl.modules.policy import Policy, plans_of
-from lw_torchrl.trainers.checkpoint import (
-    check_can_be_saved,
-    check_description,
-    describe_data,
-    load_training,
-    write,
-)
+from lw_torchrl.trainers.checkpoint import check_can_be_saved, describe_data, write
 from lw_torchrl.trainers.interrupts import interrupts_between_steps
-from lw_torchrl.trainers.training_state import TrainingState, load_state, state_of
+from lw_torchrl.trainers.training_state import TrainingState, check_description, load_state, load_training, state_of
 
 LOSSES = ("l1", "l2", "smooth_l1")
 

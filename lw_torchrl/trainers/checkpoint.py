@@ -10,7 +10,6 @@ Nothing is unpickled, and what the file says of sizes is held against what it ho
 
 from __future__ import annotations
 
-import json
 import os
 import zipfile
 from collections.abc import Iterator, Mapping
@@ -22,7 +21,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.modules.module import register_module_parameter_registration_hook
 
-from lw_torchrl._state_tree import check_like, join, split
+from lw_torchrl._state_tree import check_like, split
 from lw_torchrl._tensor_archive import ArchiveError, TensorArchive, write_archive
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.policy import Policy, from_description
@@ -93,7 +92,7 @@ def write(
         weights: the actor's, or those of many stacked.
         training: how their training stands, where they are trained.
     """
-    groups: dict[str, Mapping[str, Tensor]] = {"weights": weights, "texts": _text_vectors(actor)}
+    groups: dict[str, Mapping[str, Tensor]] = {"weights": weights, "texts": text_vectors(actor)}
     described = {"format": FORMAT, "version": FORMAT_VERSION, **described}
     if training is not None:
         tensors: dict[str, Tensor] = {}
@@ -108,11 +107,14 @@ def write(
         ) from error
 
 
-def _text_vectors(actor: nn.Module) -> dict[str, Tensor]:
+def text_vectors(actor: nn.Module) -> dict[str, Tensor]:
+    """The vectors of an actor's texts, by the name of the buffer that holds them."""
     return {name: buffer for name, buffer in actor.named_buffers() if name.rpartition(".")[2] == "text_vectors"}
 
 
-def _open(path: str | os.PathLike[str]) -> TensorArchive:
+def open_policy(path: str | os.PathLike[str]) -> TensorArchive:
+    """The archive of a policy file, whose format, version and actor it has checked; errors as of
+    :func:`read_description`."""
     if not Path(path).exists():
         raise FileNotFoundError(f"checkpoint: no file {str(path)!r}; `lw-torchrl train` writes one")
     try:
@@ -151,7 +153,7 @@ def read_description(path: str | os.PathLike[str]) -> dict[str, Any]:
         FileNotFoundError: there is no such file.
         ValueError: it is no policy file, or damaged.
     """
-    return _open(path).description
+    return open_policy(path).description
 
 
 def demonstration_seeds(path: str | os.PathLike[str]) -> set[int]:
@@ -159,21 +161,6 @@ def demonstration_seeds(path: str | os.PathLike[str]) -> set[int]:
     data = read_description(path).get("data")
     parts = data.get("parts", [data]) if isinstance(data, dict) else []
     return {part["seed"] for part in parts if isinstance(part, dict) and isinstance(part.get("seed"), int)}
-
-
-def check_description(path: Path, ours: dict[str, Any]) -> None:
-    """Raise :class:`ValueError` unless the file was saved with the description ``ours``."""
-    found, ours = read_description(path), json.loads(json.dumps(ours))  # JSON has lists alone
-    for part in ours:
-        if found.get(part) != ours[part]:
-            before, now = found.get(part) or {}, ours[part] or {}
-            both = before if isinstance(before, dict) else {}
-            different = sorted(key for key in {**both, **now} if both.get(key) != now.get(key))
-            kind = "architecture" if part == "actor" else "configuration"
-            raise ValueError(
-                f"checkpoint: {str(path)!r} is of another {kind}, its {part} differs in "
-                f"{', '.join(different)}; choose another file, or delete it to start again"
-            )
 
 
 def load_actor(path: str | os.PathLike[str], *, text_encoder: TextEncoder | None = None) -> Policy:
@@ -189,48 +176,24 @@ def load_actor(path: str | os.PathLike[str], *, text_encoder: TextEncoder | None
             another than the policy was trained with.
         ImportError: its texts are not shipped, and the extra ``[text]`` is not installed.
     """
-    archive = _open(path)
+    archive = open_policy(path)
     try:
         weights, texts = archive.tensors("weights"), archive.tensors("texts")
         numbers = sum(tensor.numel() for tensor in weights.values())
         _check_options(archive.description["actor"], numbers)
         with _at_most(numbers):
             actor = from_description(archive.description["actor"], text_encoder)
-        _check_texts(texts, _text_vectors(actor))
-        _copy(weights, actor.state_dict())
+        check_texts(texts, text_vectors(actor))
+        copy_weights(weights, actor.state_dict())
     except ImportError:
         raise
     except Exception as error:  # a file from a stranger may say anything
-        raise ValueError(f"checkpoint: the actor of {str(path)!r} cannot be made ({_first_line(error)})") from error
+        raise ValueError(f"checkpoint: the actor of {str(path)!r} cannot be made ({first_line(error)})") from error
     return actor.eval()
 
 
-def load_training(path: str | os.PathLike[str], actor: Policy, weights: Mapping[str, Tensor]) -> dict[str, Any]:
-    """Copy a file's weights into those of live actors, in place, and return the state of their training.
-
-    Raises:
-        ValueError: they do not fit, or the file has no training state.
-    """
-    archive = _open(path)
-    try:
-        state = join(archive.description.get("state"), archive.tensors("training"))
-        if not isinstance(state, dict):
-            raise ValueError("it has no training state")
-        _check_texts(archive.tensors("texts"), _text_vectors(actor))
-        _copy(archive.tensors("weights"), weights)
-    except (ValueError, RecursionError) as error:
-        raise misfit(path, error) from error
-    return state
-
-
-def misfit(path: str | os.PathLike[str], error: Exception) -> ValueError:
-    """The error for a file whose parts do not fit; the caller raises it."""
-    return ValueError(
-        f"checkpoint: {str(path)!r} does not fit, it is of another architecture or damaged ({_first_line(error)})"
-    )
-
-
-def _first_line(error: Exception) -> str:
+def first_line(error: Exception) -> str:
+    """What an error says, up to 400 characters of its first line."""
     return (str(error).splitlines() or [type(error).__name__])[0][:400]
 
 
@@ -262,13 +225,14 @@ def _at_most(numbers: int) -> Iterator[None]:
 
 
 @torch.no_grad()
-def _copy(stored: Mapping[str, Tensor], live: Mapping[str, Tensor]) -> None:
+def copy_weights(stored: Mapping[str, Tensor], live: Mapping[str, Tensor]) -> None:
+    """Copy weights in place; :class:`ValueError` where a name, shape or dtype differs."""
     check_like(stored, dict(live), "weights")
     for name, tensor in live.items():
         tensor.copy_(stored[name])
 
 
-def _check_texts(stored: Mapping[str, Tensor], ours: Mapping[str, Tensor]) -> None:
+def check_texts(stored: Mapping[str, Tensor], ours: Mapping[str, Tensor]) -> None:
     """Raise :class:`ValueError` unless the texts have the vectors that they had when the file was written."""
     for name, vectors in ours.items():
         found = stored.get(name)

@@ -23,15 +23,9 @@ from lw_torchrl.trainers.behavioral_cloning import (
     fit_normalization,
     make_optimizer,
 )
-from lw_torchrl.trainers.checkpoint import (
-    check_can_be_saved,
-    check_description,
-    describe_data,
-    load_training,
-    write,
-)
+from lw_torchrl.trainers.checkpoint import check_can_be_saved, describe_data, write
 from lw_torchrl.trainers.interrupts import interrupts_between_steps
-from lw_torchrl.trainers.training_state import TrainingState, load_state, state_of
+from lw_torchrl.trainers.training_state import TrainingState, check_description, load_state, load_training, state_of
 
 
 class _Act(nn.Module):

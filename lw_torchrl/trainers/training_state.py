@@ -1,15 +1,26 @@
-"""What training must remember beside the policy: optimizer, schedule, sampler and generators."""
+"""What training must remember beside the policy (optimizer, schedule, sampler and generators), and reading it back."""
 
 from __future__ import annotations
 
+import json
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
-from lw_torchrl._state_tree import check_like, check_optimizer_state
-from lw_torchrl.trainers.checkpoint import misfit
+from lw_torchrl._state_tree import check_like, check_optimizer_state, join
+from lw_torchrl.modules.policy import Policy
+from lw_torchrl.trainers.checkpoint import (
+    check_texts,
+    copy_weights,
+    first_line,
+    open_policy,
+    read_description,
+    text_vectors,
+)
 
 Schedule = torch.optim.lr_scheduler.LRScheduler
 
@@ -56,6 +67,39 @@ def state_of(optimizer: torch.optim.Optimizer, schedule: Schedule, states: Seque
     }
 
 
+def check_description(path: Path, ours: dict[str, Any]) -> None:
+    """Raise :class:`ValueError` unless the file was saved with the description ``ours``."""
+    found, ours = read_description(path), json.loads(json.dumps(ours))  # JSON has lists alone
+    for part in ours:
+        if found.get(part) != ours[part]:
+            before, now = found.get(part) or {}, ours[part] or {}
+            both = before if isinstance(before, dict) else {}
+            different = sorted(key for key in {**both, **now} if both.get(key) != now.get(key))
+            kind = "architecture" if part == "actor" else "configuration"
+            raise ValueError(
+                f"checkpoint: {str(path)!r} is of another {kind}, its {part} differs in "
+                f"{', '.join(different)}; choose another file, or delete it to start again"
+            )
+
+
+def load_training(path: str | os.PathLike[str], actor: Policy, weights: Mapping[str, Tensor]) -> dict[str, Any]:
+    """Copy a file's weights into those of live actors, in place, and return the state of their training.
+
+    Raises:
+        ValueError: they do not fit, or the file has no training state.
+    """
+    archive = open_policy(path)
+    try:
+        state = join(archive.description.get("state"), archive.tensors("training"))
+        if not isinstance(state, dict):
+            raise ValueError("it has no training state")
+        check_texts(archive.tensors("texts"), text_vectors(actor))
+        copy_weights(archive.tensors("weights"), weights)
+    except (ValueError, RecursionError) as error:
+        raise _misfit(path, error) from error
+    return state
+
+
 def load_state(
     path: str | os.PathLike[str],
     found: dict[str, Any],
@@ -80,4 +124,11 @@ def load_state(
         optimizer.load_state_dict(found["optimizer"])
         schedule.load_state_dict(found["schedule"])
     except (ValueError, KeyError, TypeError, RuntimeError, AttributeError) as error:
-        raise misfit(path, error) from error
+        raise _misfit(path, error) from error
+
+
+def _misfit(path: str | os.PathLike[str], error: Exception) -> ValueError:
+    """The error for a file whose parts do not fit."""
+    return ValueError(
+        f"checkpoint: {str(path)!r} does not fit, it is of another architecture or damaged ({first_line(error)})"
+    )

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import functools
+import random
 import warnings
 
 import numpy as np
 import pytest
+import torch
 
-from lw_torchrl.language.tasks import TASKS, task_id
+from lw_torchrl.language.queries import supported_queries
+from lw_torchrl.language.tasks import MT50, TASKS, task_id
 
 RANDOM, REAL = 200, 100  # states of each task
 
@@ -60,3 +63,29 @@ def real_states(task, n=REAL):
             observation = env.step(action.clip(-1, 1).astype(np.float32))[0]
     env.close()
     return np.stack(states[::2]).astype(np.float32)
+
+
+def observation(**at):
+    """A state of zeros but for what is named."""
+    state = torch.zeros(39)
+    for name, value in at.items():
+        start = {"hand": 0, "opening": 3, "one": 4, "two": 11, "goal": 36}[name]
+        value = torch.as_tensor(value).reshape(-1)
+        state[start : start + len(value)] = value
+    return state
+
+
+@functools.cache
+def all_tasks():
+    """All 50 tasks with lists of different lengths, and a mixed batch."""
+    rng = random.Random(0)
+    queries = {}
+    for rank, task in enumerate(MT50):
+        base = list(supported_queries(task))
+        queries[task] = [*rng.sample(base, 1 + rank % 9), " and ".join(rng.sample(base, 1 + rank % 4))]
+    ids = torch.randint(50, (600,), generator=torch.Generator().manual_seed(0))
+    ids[:50] = torch.arange(50)
+    states = torch.stack(
+        [torch.from_numpy(random_states(MT50[i], seed=3, n=30))[row % 30] for row, i in enumerate(ids.tolist())]
+    )
+    return queries, states, ids

@@ -1,4 +1,4 @@
-"""JSON files of pairs as language models wrote them; folders of .plan files are tested in test_plans.py."""
+"""JSON files of pairs as language models wrote them; folders of .plan files are tested in test_plan_folders.py."""
 
 import json
 

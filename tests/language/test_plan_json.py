@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 
 import lw_torchrl as lw
 from lw_torchrl.language.formats import PLAN_FORMATS
+from lw_torchrl.language.named_objects import NamedObject
 from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans
 from lw_torchrl.language.relations import RELATIONS, Comparison
-from lw_torchrl.language.tasks import TASKS, NamedObject, Task
+from lw_torchrl.language.tasks import TASKS, Task
 from lw_torchrl.transforms.qaf import plan_program
 
 MT10_PLANS = lw.load_plans("MT10")

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from lw_torchrl.language.named_objects import GRIPPER, NamedObject
 from lw_torchrl.language.queries import (
     ARTICLES,
     Clause,
@@ -18,7 +19,7 @@ from lw_torchrl.language.queries import (
     supported_queries,
 )
 from lw_torchrl.language.relations import RELATIONS, TOUCHING
-from lw_torchrl.language.tasks import GRIPPER, MT50, TASKS, NamedObject, Task, get_task
+from lw_torchrl.language.tasks import MT50, TASKS, Task, get_task
 
 tasks = st.sampled_from(MT50)
 

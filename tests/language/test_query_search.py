@@ -9,9 +9,10 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from lw_torchrl.language import query_search
+from lw_torchrl.language.named_objects import GRIPPER, NamedObject
 from lw_torchrl.language.queries import QueryError, parse_query, supported_queries
 from lw_torchrl.language.query_search import QueryMatch, nearest_query
-from lw_torchrl.language.tasks import GRIPPER, MT50, NamedObject, Task
+from lw_torchrl.language.tasks import MT50, Task
 
 tasks = st.sampled_from(MT50)
 WORDS = sorted({

@@ -5,8 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import lw_torchrl as lw
+from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.language.skills import ScriptedSkill, SkillError, load_skills, nearest_skill
-from lw_torchrl.language.tasks import GRIPPER
 
 
 def written(tmp_path, text):

@@ -1,98 +1,26 @@
-"""Behavioral cloning: it learns, and stopped anywhere it ends with the same bits."""
+"""Behavioral cloning: it learns, and says what is wrong with what it is given."""
 
 from __future__ import annotations
 
-import json
 import math
-import subprocess
-import sys
-import textwrap
 
 import pytest
 import torch
+from small_training import CONFIG, SMALL, assert_same, collect_demos, everything, make_actor, make_replay, make_trainer
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
-from torchrl.data import LazyTensorStorage, RandomSampler, SamplerWithoutReplacement, TensorDictReplayBuffer
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.record.loggers import Logger
 
-from lw_torchrl.data import LanguageWorldExperienceReplay, TaskBalancedSampler, collect_demonstrations
-from lw_torchrl.language.plan_files import load_plans
-from lw_torchrl.modules import DescriptorConditionedActor, PlanConditionedActor
+from lw_torchrl.data import TaskBalancedSampler
+from lw_torchrl.modules import DescriptorConditionedActor
 from lw_torchrl.trainers import BehavioralCloningConfig, BehavioralCloningTrainer
-from lw_torchrl.transforms import QAFTransform, RandomYaw
-
-SMALL = dict(latent_size=4, width=16, depth=1, encoder_width=8)
-CONFIG = BehavioralCloningConfig(steps=12, batch_size=8, checkpoint_every=5, learning_rate=1e-2)
-PLANS = load_plans("MT10")
 
 
 @pytest.fixture(scope="module")
 def demos(tmp_path_factory):
-    root = tmp_path_factory.mktemp("trainer") / "demos"
-    collect_demonstrations(
-        ["push", "reach"], episodes_per_task=2, root=root, max_steps=15, noise_scale=0.2, progress=False
-    )
-    return root
-
-
-def make_replay(root, sampler=None):
-    return LanguageWorldExperienceReplay(root, sampler=sampler or TaskBalancedSampler(), transform=QAFTransform(PLANS))
-
-
-def make_actor(seed=0, **options):
-    torch.manual_seed(seed)
-    return PlanConditionedActor(PLANS, **{**SMALL, **options})
-
-
-class Stopping(BehavioralCloningTrainer):
-    """Stops, as Ctrl-C does, when it gets to a step."""
-
-    stop_at: int | None = None
-
-    def step(self):
-        if self.state.step == self.stop_at:
-            raise KeyboardInterrupt
-        return super().step()
-
-
-def make_trainer(root, checkpoint=None, *, actor=None, config=CONFIG, sampler=None, stop_at=None, **options):
-    actor = make_actor() if actor is None else actor
-    trainer = Stopping(actor, make_replay(root, sampler), config, checkpoint=checkpoint, progress=False, **options)
-    trainer.stop_at = stop_at
-    return trainer
-
-
-def flat(value, path=()):
-    """Every tensor and number of a nested state."""
-    if isinstance(value, dict):
-        return {key: leaf for name in value for key, leaf in flat(value[name], (*path, str(name))).items()}
-    if isinstance(value, (list, tuple)):
-        return flat(dict(enumerate(value)), path)
-    return {path: value.detach().clone() if isinstance(value, torch.Tensor) else value}
-
-
-def everything(trainer):
-    found = flat(
-        {
-            "actor": dict(trainer.actor.state_dict()),
-            "optimizer": trainer.optimizer.state_dict(),
-            "schedule": trainer.schedule.state_dict(),
-            "state": trainer.state.state_dict(),
-        }
-    )
-    return found | {("next batch",): trainer.replay.sample(8)["observation"]}
-
-
-def assert_same(found, expected):
-    assert found.keys() == expected.keys()
-    for key, value in expected.items():
-        if isinstance(value, torch.Tensor):
-            assert torch.equal(found[key], value), key
-        elif isinstance(value, float) and isinstance(found[key], torch.Tensor):
-            assert found[key].item() == value, key
-        else:
-            assert found[key] == value, key
+    return collect_demos(tmp_path_factory.mktemp("trainer") / "demos")
 
 
 @pytest.fixture(scope="module")
@@ -100,9 +28,6 @@ def undisturbed(demos):
     trainer = make_trainer(demos)
     trainer.train()
     return everything(trainer)
-
-
-# ---- it learns
 
 
 def test_the_loss_falls(demos):
@@ -237,250 +162,6 @@ def test_a_logger_gets_loss_and_learning_rate(demos):
         ("train/learning_rate", 130),
     ]
     assert logger.scalars[2][2] == pytest.approx(final)
-
-
-# ---- stopped and started again
-
-
-@pytest.mark.parametrize("stops", [[5], [7], [11], [6, 6], [3, 8, 11]])
-def test_stopped_anywhere_and_started_again_it_ends_with_the_same_bits(demos, undisturbed, tmp_path, stops):
-    path = tmp_path / "runs" / "checkpoint.zip"
-    for stop in stops:
-        with pytest.raises(KeyboardInterrupt):
-            make_trainer(demos, path, stop_at=stop).train()
-    resumed = make_trainer(demos, path, actor=make_actor(99))
-    assert resumed.state.step == max(stops) // 5 * 5
-    resumed.train()
-    assert_same(everything(resumed), undisturbed)
-
-
-def test_what_a_transform_draws_hangs_on_the_seed_and_resumes_too(demos, tmp_path):
-    def trainer(noise, checkpoint=None, stop_at=None):
-        made = make_trainer(demos, checkpoint, stop_at=stop_at)
-        made.replay.append_transform(RandomYaw(0.5))
-        torch.manual_seed(noise)  # what else draws in this process must not matter
-        return made
-
-    whole = trainer(1)
-    whole.train()
-    with pytest.raises(KeyboardInterrupt):
-        trainer(2, tmp_path / "c.zip", stop_at=7).train()
-    resumed = trainer(3, tmp_path / "c.zip")
-    resumed.train()
-    assert_same(flat(resumed.actor.state_dict()), flat(whole.actor.state_dict()))
-    unturned = make_trainer(demos)
-    unturned.train()
-    assert not torch.equal(unturned.actor.head.network[0].weight, whole.actor.head.network[0].weight)
-
-
-@pytest.mark.parametrize("sampler", [RandomSampler, SamplerWithoutReplacement])
-def test_torchrls_samplers_resume_too(demos, tmp_path, sampler):
-    whole = make_trainer(demos, sampler=sampler())
-    whole.train()
-    path = tmp_path / "checkpoint.zip"
-    with pytest.raises(KeyboardInterrupt):
-        make_trainer(demos, path, sampler=sampler(), stop_at=8).train()
-    resumed = make_trainer(demos, path, actor=make_actor(99), sampler=sampler())
-    assert resumed.state.step == 5
-    resumed.train()
-    assert_same(everything(resumed), everything(whole))
-
-
-def test_a_finished_training_does_nothing_twice(demos, undisturbed, tmp_path):
-    path = tmp_path / "checkpoint.zip"
-    make_trainer(demos, path).train()
-    content = path.read_bytes()
-    again = make_trainer(demos, path, actor=make_actor(99), stop_at=CONFIG.steps)
-    assert math.isnan(again.train())
-    assert path.read_bytes() == content
-    assert_same(everything(again), undisturbed)
-
-
-def test_checkpoints_come_in_their_time_and_leave_one_file(demos, tmp_path, monkeypatch):
-    saved = []
-    save = BehavioralCloningTrainer.save
-    monkeypatch.setattr(BehavioralCloningTrainer, "save", lambda self: (saved.append(self.state.step), save(self)))
-    make_trainer(demos, tmp_path / "checkpoint.zip").train()
-    assert saved == [5, 10, 12]
-    assert [path.name for path in tmp_path.iterdir()] == ["checkpoint.zip"]
-
-
-def test_without_a_checkpoint_nothing_is_written(demos, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    make_trainer(demos).train()
-    assert not list(tmp_path.iterdir())
-
-
-KILLER = """
-    import os, random, signal, sys, time
-    import torch
-    import lw_torchrl as lw
-
-    root, path = sys.argv[1:]
-    plans = lw.load_plans("MT10")
-    config = lw.BehavioralCloningConfig(steps=40, batch_size=8, checkpoint_every=1)
-
-    def train(path, seed):
-        torch.manual_seed(seed)
-        actor = lw.PlanConditionedActor(plans, latent_size=4, width=16, depth=1, encoder_width=8)
-        replay = lw.LanguageWorldExperienceReplay(
-            root, sampler=lw.TaskBalancedSampler(), transform=lw.QAFTransform(plans)
-        )
-        trainer = lw.BehavioralCloningTrainer(actor, replay, config, checkpoint=path, progress=False)
-        trainer.train()
-        return {**actor.state_dict(), "batch": replay.sample(8)["observation"]}
-
-    draw, kills, seed = random.Random(0), 0, 0
-    for _ in range(12):
-        child = os.fork()
-        if child == 0:
-            try:
-                train(path, seed)
-            except BaseException as error:
-                print(repr(error), file=sys.stderr)
-                os._exit(1)
-            os._exit(0)
-        time.sleep(draw.uniform(0.02, 0.3))
-        os.kill(child, signal.SIGKILL)
-        status = os.waitpid(child, 0)[1]
-        assert not os.WIFEXITED(status) or os.WEXITSTATUS(status) == 0
-        kills += os.WIFSIGNALED(status)
-        if os.path.exists(path):
-            lw.load_actor(path)
-            seed = 99
-    resumed, whole = train(path, seed), train(None, 0)
-    assert all(torch.equal(resumed[key], whole[key]) for key in whole)
-    print(kills)
-"""
-
-
-def test_killed_at_any_moment_the_checkpoint_is_whole_and_training_the_same(demos, tmp_path):
-    path = tmp_path / "checkpoint.zip"
-    command = [sys.executable, "-W", "ignore", "-c", textwrap.dedent(KILLER), str(demos), str(path)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=240)
-    assert done.returncode == 0, done.stderr
-    assert int(done.stdout) >= 3
-
-
-@pytest.mark.parametrize("failing", ["zipfile.ZipFile.writestr", "os.replace"])
-def test_a_disk_that_fills_while_saving_leaves_the_old_checkpoint(demos, tmp_path, monkeypatch, failing):
-    path = tmp_path / "checkpoint.zip"
-    with pytest.raises(KeyboardInterrupt):
-        make_trainer(demos, path, stop_at=6).train()
-    content = path.read_bytes()
-
-    def full(*_, **__):
-        raise OSError(28, "No space left on device")
-
-    resumed = make_trainer(demos, path)
-    monkeypatch.setattr(failing, full)
-    with pytest.raises(OSError, match="No space left"):
-        resumed.save()
-    monkeypatch.undo()
-    assert path.read_bytes() == content
-    assert [found.name for found in tmp_path.iterdir()] == ["checkpoint.zip"]
-    assert make_trainer(demos, path).state.step == 5
-
-
-# ---- what does not fit
-
-
-@pytest.fixture(scope="module")
-def checkpoint(demos, tmp_path_factory):
-    path = tmp_path_factory.mktemp("checkpoint") / "checkpoint.zip"
-    make_trainer(demos, path).train()
-    return path
-
-
-def refused(path, message, make):
-    content = path.read_bytes()
-    with pytest.raises(ValueError, match=message) as caught:
-        make()
-    assert path.read_bytes() == content
-    assert str(path) in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("options", "differs"),
-    [
-        (dict(width=32), "options"),
-        (dict(depth=2), "options"),
-        (dict(latent_size=5), "options"),
-        (dict(mix="actions"), "options"),
-        (dict(features="raw"), "options"),
-    ],
-)
-def test_a_checkpoint_of_another_architecture_is_refused(demos, checkpoint, options, differs):
-    actor = make_actor(1, **options)
-    before = {name: value.clone() for name, value in actor.state_dict().items()}
-    refused(
-        checkpoint,
-        f"of another architecture, its actor differs in {differs}; choose another file, or delete it",
-        lambda: make_trainer(demos, checkpoint, actor=actor),
-    )
-    assert all(torch.equal(value, before[name]) for name, value in actor.state_dict().items())
-
-
-def test_a_checkpoint_of_other_plans_or_another_kind_is_refused(demos, checkpoint):
-    plans = {task: plan for task, plan in PLANS.items() if task in ("push", "reach")}
-    refused(
-        checkpoint,
-        "of another architecture, its actor differs in plans;",
-        lambda: make_trainer(demos, checkpoint, actor=PlanConditionedActor(plans, **SMALL)),
-    )
-    refused(
-        checkpoint,
-        "of another architecture, its actor differs in kind",
-        lambda: make_trainer(demos, checkpoint, actor=DescriptorConditionedActor("MT10", **SMALL)),
-    )
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("steps", 13),
-        ("batch_size", 6),
-        ("learning_rate", 1e-3),
-        ("loss_function", "l1"),
-        ("seed", 1),
-        ("weight_decay", 0.0),
-    ],
-)
-def test_a_checkpoint_of_another_configuration_is_refused(demos, checkpoint, name, value):
-    config = BehavioralCloningConfig(**{**vars(CONFIG), name: value})
-    refused(
-        checkpoint,
-        f"of another configuration, its training differs in {name};",
-        lambda: make_trainer(demos, checkpoint, config=config),
-    )
-
-
-def test_a_checkpoint_of_other_demonstrations_is_refused(checkpoint, tmp_path):
-    root = tmp_path / "demos"
-    collect_demonstrations(["push", "reach"], episodes_per_task=1, root=root, max_steps=15, seed=8, progress=False)
-    refused(
-        checkpoint,
-        "its data differs in episodes_per_task, noise_scale, seed;",
-        lambda: make_trainer(root, checkpoint),
-    )
-
-
-@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 not quite", b"years of work\n", json.dumps({"a": 1}).encode()])
-def test_a_foreign_file_is_refused(demos, tmp_path, content):
-    path = tmp_path / "thesis.tex"
-    path.write_bytes(content)
-    refused(path, "checkpoint: .* is damaged or none of ours", lambda: make_trainer(demos, path))
-
-
-@pytest.mark.parametrize("share", [0.1, 0.5, 0.99])
-def test_a_truncated_checkpoint_is_refused(demos, checkpoint, tmp_path, share):
-    path = tmp_path / "checkpoint.zip"
-    content = checkpoint.read_bytes()
-    path.write_bytes(content[: int(share * len(content))])
-    refused(path, "damaged or none of ours", lambda: make_trainer(demos, path))
-
-
-# ---- bad input
 
 
 def test_nan_in_the_demonstrations_is_reported(demos):

@@ -130,7 +130,7 @@ def parse_plan(
         text: the plan.
         task: the task it must be for; None takes the one its ``def`` line names.
         source: what to call the text in errors, a file's name.
-        tasks: whose objects the conditions name, by task name, as from :func:`load_tasks`.
+        tasks: whose objects the conditions name, by task name, as from :func:`~lw_torchrl.load_tasks`.
 
     Raises:
         PlanError: (a ValueError) with the line: a line of another form, a condition outside the query language,

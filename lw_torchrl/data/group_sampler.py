@@ -1,11 +1,9 @@
-"""Samplers whose counts are exact: groups of rows, each gone through in passes of its own."""
+"""GroupSampler: exact numbers from groups of rows, each group gone through in passes of its own."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from math import prod
 from pathlib import Path
-from reprlib import repr as short
 from typing import Any
 
 import torch
@@ -14,7 +12,7 @@ from torch import Tensor
 from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.storages import Storage
 
-from lw_torchrl._files import read_json
+from lw_torchrl.data.sampler_state import check_state, read_state
 from lw_torchrl.data.storage import JoinedStorage
 
 
@@ -163,7 +161,7 @@ class GroupSampler(Sampler):
             ValueError: it is no such state. Whether it is one of the storage's rows shows at the next sample, which
                 raises it then.
         """
-        state = _checked(state_dict)
+        state = check_state(state_dict)
         self._length, self._ran_out = state["length"], state["ran_out"]
         self._order, self._start = state["order"].clone(), state["start"].clone()
         self._size, self._cursor = state["size"].clone(), state["cursor"].clone()
@@ -190,96 +188,4 @@ class GroupSampler(Sampler):
         Raises:
             ValueError: it is damaged, or of something else.
         """
-        self.load_state_dict(_read_state(Path(path)))
-
-
-def _read_state(folder: Path) -> dict[str, Any]:
-    """The tensors in a folder, if each file is as long as its description says; a shorter one would be lengthened."""
-    try:
-        for name, leaf in read_json(folder / "meta.json", "path: the description", limit=2**20).items():
-            if not isinstance(leaf, dict):
-                continue
-            if set(leaf) != {"device", "shape", "dtype", "is_nested"} or leaf["is_nested"] or "/" in name:
-                raise ValueError(f"{name} is no tensor")
-            dtype = {"torch.int64": torch.int64, "torch.bool": torch.bool}[leaf["dtype"]]
-            if not all(type(size) is int and 0 <= size < 2**48 for size in leaf["shape"]):
-                raise ValueError(f"{name} is of no shape")
-            size, file = prod(leaf["shape"]) * dtype.itemsize, folder / f"{name}.memmap"
-            if (there := file.stat().st_size if file.is_file() else 0) != size:
-                raise ValueError(f"{name}.memmap has {there} bytes, not {size}")
-        return TensorDict.load_memmap(folder, allow_pickle=False).to_dict()
-    except (OSError, RuntimeError, TypeError, KeyError, ValueError) as error:
-        raise ValueError(f"path: {str(folder)!r} holds no sampler's state ({type(error).__name__}: {error})") from error
-
-
-def _checked(state: Any) -> dict[str, Any]:
-    """A sampler's state whose parts fit one another: the groups' rows one after another, each row once."""
-
-    def require(holds: bool, name: str, wanted: str) -> None:
-        if not holds:
-            raise ValueError(f"state_dict: {name} must be {wanted}, got {short(state.get(name))}")
-
-    found: dict[str, Any] = {}
-    for name, dtype in (("length", torch.int64), ("ran_out", torch.bool)):
-        given = state.get(name)
-        require(isinstance(given, Tensor) and given.dtype == dtype and given.numel() == 1, name, f"one {dtype}")
-        found[name] = given.item()
-    require(found["length"] >= 0, "length", "at least 0")
-    for name in ("order", "start", "size", "cursor"):
-        given = state.get(name)
-        require(isinstance(given, Tensor) and given.dtype == torch.int64 and given.dim() == 1, name, "(n,) int64")
-        found[name] = given.cpu()
-    order, start, size, cursor = (found[name] for name in ("order", "start", "size", "cursor"))
-    rows = len(order)
-    require(
-        bool(((size > 0) & (size <= rows)).all()) and int(size.sum()) == rows, "size", f"of {rows} rows, none empty"
-    )
-    require(torch.equal(start, size.cumsum(0) - size), "start", "where the groups begin")
-    fits = cursor.shape == size.shape and bool(((cursor >= 0) & (cursor < size)).all())
-    require(fits, "cursor", "a place within each group")
-    inside = rows <= found["length"] and bool(((order >= 0) & (order < found["length"])).all())
-    require(inside and len(order.unique()) == rows, "order", f"rows below {found['length']}, each once")
-    return found
-
-
-class TaskBalancedSampler(GroupSampler):
-    """Equal numbers from every task, exactly; within a task every row once before any comes again.
-
-    It draws from the replay buffer's generator, so ``ReplayBuffer(..., generator=...)`` fixes the batches. State is
-    saved and restored with the buffer's. An epoch is a pass over the largest task; each task has passes of its own.
-
-    Args:
-        task_key: the entry of the storage that tells the task.
-
-    Raises:
-        ValueError: at sampling, a batch size that the number of tasks does not divide (with the nearest that it
-            does), or an empty storage.
-
-    Example:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-        >>> replay = TensorDictReplayBuffer(storage=LazyTensorStorage(10), sampler=TaskBalancedSampler(), batch_size=4)
-        >>> _ = replay.extend(TensorDict({"task_id": torch.tensor([3] * 8 + [7] * 2)}, [10]))
-        >>> replay.sample()["task_id"].bincount(minlength=8).tolist()
-        [0, 0, 0, 2, 0, 0, 0, 2]
-
-    Source: paper section 'Cross-Task Co-Learning via 1:1 Data Mixing', its minibatches of equal numbers.
-    """
-
-    def __init__(self, task_key: str = "task_id") -> None:
-        self.task_key = task_key
-        super().__init__()
-
-    def _label(self, storage: Storage) -> Tensor:
-        return torch.unique(column(storage, self.task_key).reshape(-1), return_inverse=True)[1]
-
-    def _shares(self, batch_size: int) -> Tensor:
-        groups = len(self._size)
-        count, rest = divmod(batch_size, groups)
-        if rest or not count:
-            raise ValueError(
-                f"batch_size must be divisible by the number of tasks, {groups}, got {batch_size}; the nearest are "
-                + nearest_sizes(batch_size, groups)
-            )
-        return torch.full((groups,), count)
+        self.load_state_dict(read_state(Path(path)))

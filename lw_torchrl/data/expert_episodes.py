@@ -1,0 +1,94 @@
+"""Running the experts for the episodes that a dataset still lacks."""
+
+from __future__ import annotations
+
+from contextlib import closing
+
+from tensordict import TensorDictBase
+
+from lw_torchrl._progress import Progress
+from lw_torchrl.data.dataset import CollectConfig
+from lw_torchrl.data.episode_files import EpisodeFiles
+from lw_torchrl.envs.episodes import run_episodes
+from lw_torchrl.envs.experts import ExpertActor
+from lw_torchrl.envs.language_world_env import LanguageWorldEnv
+
+_RECORDED = [
+    "observation",
+    "task_id",
+    "episode",
+    "action",
+    "expert_action",
+    "unclipped_action",
+    *(("next", key) for key in ("observation", "task_id", "reward", "success", "done", "terminated", "truncated")),
+]
+_MAX_ATTEMPTS = 20  # episodes run for each one that is kept, before redrawing gives up
+
+
+def _take_stock(config: CollectConfig, files: EpisodeFiles) -> tuple[dict[str, list[int]], dict[str, list[int]]]:
+    """The kept episodes of each task, and those still to run. Candidates are taken in the order of their index, so
+    which are kept depends neither on the number of environments nor on interruptions."""
+    kept: dict[str, list[int]] = {}
+    wanted: dict[str, list[int]] = {}
+    for task in config.tasks:
+        kept[task], candidate = [], 0
+        while len(kept[task]) < config.episodes_per_task and files.has(task, candidate):
+            if files.kept(task, candidate):
+                kept[task].append(candidate)
+            candidate += 1
+        missing = config.episodes_per_task - len(kept[task])
+        if missing and candidate >= config.episodes_per_task * _MAX_ATTEMPTS:
+            raise RuntimeError(
+                f"task {task!r}: only {len(kept[task])} of {candidate} episodes succeeded; lower the noise_scale or "
+                "set redraw_failures=False"
+            )
+        ahead = range(candidate, candidate + missing)
+        wanted[task] = [episode for episode in ahead if not files.has(task, episode)]
+    return kept, wanted
+
+
+def run_expert_episodes(
+    config: CollectConfig, files: EpisodeFiles, num_envs: int | None, progress: bool
+) -> dict[str, list[int]]:
+    """Run episodes until the files are full; returns the kept ones of each task.
+
+    Raises:
+        OSError: there is no room.
+        RuntimeError: redrawing found too few successes.
+    """
+    kept, wanted = _take_stock(config, files)
+    missing = sum(map(len, wanted.values()))
+    if not missing:
+        return kept
+    rows = max(len(config.tasks), min(50, missing)) if num_envs is None else num_envs
+    env = LanguageWorldEnv(config.tasks, num_envs=rows, seed=config.seed, max_steps=config.max_steps, reward="dense")
+    policy = ExpertActor(config.tasks)
+    scales = [(s, s, s, s * config.gripper_noise_factor) for s in config.noise_scale]
+    total = config.episodes_per_task * len(config.tasks)
+    before = (total - missing) * config.max_steps
+    bar = Progress("collecting", total * config.max_steps, "step", initial=before, show=progress)
+    with bar, closing(env):
+        while missing:
+            bar.set_done((total - missing) * config.max_steps)  # steps back by the failures that are drawn again
+            episodes = run_episodes(
+                env,
+                policy,
+                wanted,
+                keys=_RECORDED,
+                noise=(lambda n: scales[n % len(scales)]) if any(config.noise_scale) else None,
+                noise_hold=config.noise_hold,
+                clean_action="expert_action",
+                on_progress=bar.update,
+            )
+            for task, episode, steps in episodes:
+                keep = not config.redraw_failures or bool(steps.get(("next", "success")).any())
+                files.put(task, episode, _as_rows(steps) if keep else None)
+            kept, wanted = _take_stock(config, files)
+            missing = sum(map(len, wanted.values()))
+    return kept
+
+
+def _as_rows(steps: TensorDictBase) -> TensorDictBase:
+    """Recorded steps with a dataset's columns, the trajectory's number aside."""
+    steps.rename_key_(("next", "reward"), ("next", "reward_dense"))
+    return steps.set(("next", "reward_sparse"), steps.get(("next", "success")).float())

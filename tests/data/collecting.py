@@ -1,0 +1,33 @@
+"""A small dataset for the tests of collecting, the bytes of a folder, and a stop in the midst of it."""
+
+from __future__ import annotations
+
+from lw_torchrl.data import collect_demonstrations
+from lw_torchrl.data.episode_files import EpisodeFiles
+
+TASKS = ("push", "reach")
+NOISE = (0.0, 0.3)
+STEPS, EPISODES, SEED = 14, 3, 5
+
+
+def collect(root, tasks=TASKS, **changed):
+    options = dict(episodes_per_task=EPISODES, seed=SEED, noise_scale=NOISE, max_steps=STEPS, progress=False)
+    return collect_demonstrations(tasks, root=root, **{**options, **changed})
+
+
+def tree(root):
+    """Every file below a folder with its bytes."""
+    return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
+
+
+def interrupt_after(monkeypatch, episodes):
+    """Stop collecting, as Ctrl-C does, after so many episodes have been put away."""
+    put, left = EpisodeFiles.put, [episodes]
+
+    def stopping(self, *args):
+        if not left[0]:
+            raise KeyboardInterrupt
+        left[0] -= 1
+        put(self, *args)
+
+    monkeypatch.setattr(EpisodeFiles, "put", stopping)

@@ -1,0 +1,160 @@
+"""Folders of .plan files: saved whole or not at all, and loaded as they were."""
+
+import os
+import re
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from plan_texts import DRAWER, HEAD, conditional_plans, plan
+
+from lw_torchrl.language.formats.chain_py import parse_plan
+from lw_torchrl.language.plan_files import load_plans, save_plans
+from lw_torchrl.language.plans import PlanError, Plans
+from lw_torchrl.language.tasks import MT50
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.sets(st.sampled_from(MT50), min_size=1, max_size=4).flatmap(
+    lambda tasks: st.tuples(*(conditional_plans(task) for task in sorted(tasks)))
+))  # fmt: skip
+def test_saved_plans_load_as_the_same_plans(tmp_path_factory, given):
+    folder = tmp_path_factory.mktemp("plans") / "new" / "folder"
+    try:
+        written = save_plans(Plans(given), folder)
+    except UnicodeEncodeError:
+        # A lone surrogate is no text of a file; nothing half-written stays.
+        assert all(load_plans(path) for path in folder.iterdir())
+        return
+    assert [path.name for path in written] == [f"{plan.task}.plan" for plan in given]
+    assert load_plans(folder) == Plans(given)
+    assert load_plans(str(folder)) == Plans(given)
+    assert load_plans(written[0]) == Plans(given[:1])
+
+
+def test_saving_replaces_the_plans_it_names_alone(tmp_path):
+    save_plans(Plans([plan(), parse_plan(DRAWER)]), tmp_path)
+    (tmp_path / "notes.txt").write_text("mine")
+    other = plan("push", ("gripper closed", "wait"))
+    save_plans({"push": other}, tmp_path)
+    assert load_plans(tmp_path) == {"push": other, "drawer-open": parse_plan(DRAWER)}
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["drawer-open.plan", "notes.txt", "push.plan"]
+
+
+def refuse(*args, **kwargs):
+    raise OSError(28, "No space left on device")
+
+
+def write_half(self, data, *args, **kwargs):
+    with open(self, "w", encoding="utf-8") as file:
+        file.write(data[: len(data) // 2])
+    refuse()
+
+
+@pytest.mark.parametrize(
+    ("owner", "name", "failing"),
+    [(os, "replace", refuse), (Path, "write_text", refuse), (Path, "write_text", write_half)],
+    ids=["replace", "write", "half"],
+)
+def test_a_failure_leaves_the_old_file_whole(tmp_path, monkeypatch, owner, name, failing):
+    save_plans(Plans([plan()]), tmp_path)
+    before = (tmp_path / "push.plan").read_bytes()
+    with monkeypatch.context() as patch:
+        patch.setattr(owner, name, failing)
+        with pytest.raises(OSError, match="No space"):
+            save_plans(Plans([plan("push", ("gripper closed", "wait"))]), tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["push.plan"], "no temporary file stays"
+    assert (tmp_path / "push.plan").read_bytes() == before
+
+
+def test_a_failure_between_two_files_leaves_each_old_or_new(tmp_path, monkeypatch):
+    old = [plan(), parse_plan(DRAWER)]
+    new = [plan("push", ("gripper closed", "wait")), plan("drawer-open", ("gripper closed", "wait"))]
+    save_plans(Plans(old), tmp_path)
+    done = []
+    replace = os.replace
+
+    def once(*args):
+        if done:
+            refuse()
+        done.append(replace(*args))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", once)
+        with pytest.raises(OSError, match="No space"):
+            save_plans(Plans(new), tmp_path)
+    assert load_plans(tmp_path) == {"drawer-open": new[1], "push": old[0]}
+    save_plans(Plans(new), tmp_path)
+    assert load_plans(tmp_path) == Plans(new)
+
+
+def test_what_a_killed_save_leaves_does_not_spoil_the_folder(tmp_path, monkeypatch):
+    save_plans(Plans([plan()]), tmp_path)
+    before = (tmp_path / "push.plan").read_bytes()
+    # A kill runs no clean-up: the half-written file stays.
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_text", write_half)
+        patch.setattr(Path, "unlink", lambda self, missing_ok=False: None)
+        with pytest.raises(OSError, match="No space"):
+            save_plans(Plans([plan("push", ("gripper closed", "wait"))]), tmp_path)
+    assert len(list(tmp_path.iterdir())) == 2
+    assert (tmp_path / "push.plan").read_bytes() == before
+    assert load_plans(tmp_path) == Plans([plan()])
+
+
+@pytest.mark.parametrize("wrong", [None, "push", [plan()], plan(), {"reach": plan()}, {}])
+def test_saving_something_else_writes_nothing(tmp_path, wrong):
+    with pytest.raises((TypeError, PlanError)):
+        save_plans(wrong, tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_missing_folder_or_file_says_what_there_is(tmp_path):
+    for missing in (tmp_path / "absent", str(tmp_path / "absent.plan"), "MT5"):
+        with pytest.raises(FileNotFoundError, match="'MT10' and 'MT50' name the shipped plans") as caught:
+            load_plans(missing)
+        assert str(missing) in str(caught.value)
+
+
+def test_a_folder_without_plans_is_an_error(tmp_path):
+    (tmp_path / "push.txt").write_text(HEAD)
+    with pytest.raises(FileNotFoundError, match=r"holds no \.plan files"):
+        load_plans(tmp_path)
+
+
+def test_a_file_named_after_another_task_is_an_error(tmp_path):
+    (tmp_path / "reach.plan").write_text(HEAD)
+    with pytest.raises(PlanError, match=r"reach\.plan, line 1: this is a plan for 'push', expected one for 'reach'"):
+        load_plans(tmp_path)
+
+
+def test_one_bad_file_names_itself_and_its_line(tmp_path):
+    save_plans(Plans([plan(), parse_plan(DRAWER)]), tmp_path)
+    (tmp_path / "reach.plan").write_text(HEAD.replace("push(robot)", "reach(robot)").replace("is open", "is opne"))
+    with pytest.raises(PlanError, match=r"^reach\.plan, line 2: .*at 'opne'"):
+        load_plans(tmp_path)
+
+
+def test_an_empty_file_is_an_error(tmp_path):
+    (tmp_path / "push.plan").touch()
+    with pytest.raises(PlanError, match=r"push\.plan: no plan found"):
+        load_plans(tmp_path)
+
+
+def test_a_file_that_is_no_utf8_text_names_itself(tmp_path):
+    (tmp_path / "push.plan").write_bytes(b"\xff\xfe" + HEAD.encode())
+    with pytest.raises(PlanError, match=re.escape("push.plan")):
+        load_plans(tmp_path)
+
+
+@pytest.mark.parametrize("encode", [lambda t: t.encode("utf-8-sig"), lambda t: t.replace("\n", "\r\n").encode()])
+def test_a_file_from_another_editor_loads(tmp_path, encode):
+    (tmp_path / "push.plan").write_bytes(encode(HEAD))
+    assert load_plans(tmp_path) == Plans([plan()])
+
+
+@pytest.mark.parametrize("source", [None, 3, ["MT10"]])
+def test_a_source_of_another_type_is_a_type_error(source):
+    with pytest.raises(TypeError):
+        load_plans(source)

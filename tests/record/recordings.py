@@ -1,0 +1,90 @@
+"""Rollouts to record, and recordings read back."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import torch
+from rerun.chunk import RrdReader
+from tensordict import TensorDict
+
+from lw_torchrl.record import RerunLogger
+from lw_torchrl.record.recorded_episode import GRIPPER
+
+STEPS = (
+    ("the robot's gripper is not near the puck", "place the gripper above the puck"),
+    ("the robot's gripper is near the puck", "close the gripper around the puck"),
+)
+PLAN = SimpleNamespace(steps=[SimpleNamespace(condition=c, skill=s) for c, s in STEPS])
+
+
+def make_rollout(length=20, columns=3, seed=0):
+    """Random numbers in the shapes of design.md; the columns beyond the plan's two steps are padding."""
+    generator = torch.Generator().manual_seed(seed)
+    qaf = torch.rand(length, columns, generator=generator) > 0.5
+    qaf[:, len(STEPS) :] = False
+    skill_weights = torch.zeros(length, columns)
+    skill_weights[:, : len(STEPS)] = torch.softmax(qaf[:, : len(STEPS)] * 10.0 - 5.0, -1)
+    return TensorDict(
+        {
+            "observation": torch.rand(length, 39, generator=generator),
+            "action": torch.rand(length, 4, generator=generator) * 2 - 1,
+            "qaf": qaf,
+            "skill_weights": skill_weights,
+            ("next", "success"): torch.arange(length)[:, None] >= length // 2,
+            ("next", "reward"): torch.rand(length, 1, generator=generator),
+        },
+        [length],
+    )
+
+
+def make_objects(rollout):
+    observation = rollout["observation"]
+    return {GRIPPER: observation[:, :3], "puck": observation[:, 4:7]}
+
+
+def record(path, *rollouts, **kwargs):
+    with RerunLogger(path) as logger:
+        for rollout in rollouts:
+            logger.log_episode(rollout, **{"task": "push", "objects": make_objects(rollout), "plan": PLAN} | kwargs)
+    return Recording(path)
+
+
+class Recording:
+    """The columns of a recording, by entity and component."""
+
+    def __init__(self, path):
+        self.reader = RrdReader(path)
+        self.columns = {}
+        for chunk in self.reader.stream():
+            batch = chunk.to_record_batch()
+            times = {name: batch.column(name).to_numpy(zero_copy_only=False) for name in chunk.timeline_names}
+            for name in batch.schema.names:
+                if ":" in name:
+                    entry = (times, batch.column(name).to_pylist())
+                    self.columns.setdefault((chunk.entity_path, name), []).append(entry)
+
+    def entities(self):
+        return {entity for entity, _ in self.columns}
+
+    def values(self, entity, component):
+        """One row for each time: a list of instances."""
+        return [row for _, rows in self.columns[entity, component] for row in rows]
+
+    def array(self, entity, component):
+        return np.array(self.values(entity, component))
+
+    def times(self, entity, component, timeline="step"):
+        return np.concatenate([times[timeline] for times, _ in self.columns[entity, component]]).tolist()
+
+    def text(self, entity):
+        return self.values(entity, "TextDocument:text")[0][0]
+
+    def lane(self, entity, length, first=0):
+        """The state at each of ``length`` steps, unrolled from its changes."""
+        steps = self.times(entity, "StateChange:state")
+        states = [row[0] for row in self.values(entity, "StateChange:state")]
+        assert (steps[-1], states[-1]) == (first + length, "")
+        at = np.searchsorted(steps, np.arange(length) + first, side="right") - 1
+        return [states[i] for i in at]

@@ -1,0 +1,191 @@
+"""Episodes in a recording: what is logged can be read back exactly, and a wrong rollout is named."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+import torch
+from recordings import PLAN, STEPS, Recording, make_objects, make_rollout, record
+
+from lw_torchrl.record import RerunLogger
+from lw_torchrl.record.blueprint import EVENLY, active_skill
+
+
+def test_an_episode_survives_exactly(tmp_path):
+    rollout = make_rollout()
+    found = record(tmp_path / "a.rrd", rollout)
+
+    for name, position in make_objects(rollout).items():
+        entity = "/push/scene/objects/" + name.replace("'", "\\'").replace(" ", "\\ ")
+        np.testing.assert_array_equal(found.array(entity, "Points3D:positions")[:, 0], position.numpy())
+    goal = found.array("/push/scene/goal", "Points3D:positions")[:, 0]
+    np.testing.assert_array_equal(goal, rollout["observation"][:, 36:39].numpy())
+    hand = found.array("/push/scene/gripper", "Transform3D:translation")[:, 0]
+    np.testing.assert_array_equal(hand, rollout["observation"][:, :3].numpy())
+    np.testing.assert_array_equal(found.array("/push/action", "Scalars:scalars"), rollout["action"].double())
+    weights = found.array("/push/skill_weights", "Scalars:scalars")
+    np.testing.assert_array_equal(weights, rollout["skill_weights"][:, :2].double())
+    reward = found.array("/push/reward", "Scalars:scalars")
+    np.testing.assert_array_equal(reward, rollout["next", "reward"].double())
+
+    for i in range(2):
+        expected = ["true" if held else "false" for held in rollout["qaf"][:, i]]
+        assert found.lane(f"/push/lanes/condition-{i + 1}", 20) == expected
+    assert found.lane("/push/lanes/success", 20, first=1) == ["false"] * 10 + ["true"] * 10
+    assert "/push/lanes/condition-3" not in found.entities()
+
+
+def test_texts_survive(tmp_path):
+    rollout = make_rollout()
+    found = record(tmp_path / "a.rrd", rollout)
+    for i, (condition, skill) in enumerate(STEPS, 1):
+        assert f"{i}. if **{condition}**:" in found.text("/push/plan")
+        assert skill in found.text("/push/plan")
+        labels = found.values(f"/push/lanes/condition-{i}", "StateConfiguration:labels")[0]
+        assert labels == [f"✓ {condition}", f"✗ {condition}"]
+    names = [f"{i} {skill}" for i, (_, skill) in enumerate(STEPS, 1)]
+    assert found.values("/push/skill_weights", "SeriesLines:names") == [names]
+    states = found.lane("/push/lanes/skill", 20)
+    for row, state in enumerate(states):
+        first, second = rollout["skill_weights"][row, :2]
+        assert state == (EVENLY if first == second else names[int(second > first)])
+
+
+def test_timelines(tmp_path):
+    found = record(tmp_path / "a.rrd", make_rollout(5))
+    assert found.times("/push/action", "Scalars:scalars") == [0, 1, 2, 3, 4]
+    assert found.times("/push/reward", "Scalars:scalars") == [1, 2, 3, 4, 5]
+    seconds = found.times("/push/action", "Scalars:scalars", "time")
+    assert [int(second) for second in seconds] == [0, 12_500_000, 25_000_000, 37_500_000, 50_000_000]
+
+
+def test_control_period_is_metaworlds():
+    from lw_torchrl.envs.engines.metaworld import make_metaworld_env
+    from lw_torchrl.record.timelines import CONTROL_PERIOD
+
+    env = make_metaworld_env("reach")
+    period = env.frame_skip * env.model.opt.timestep
+    assert period == pytest.approx(CONTROL_PERIOD)
+    env.close()
+
+
+def test_fingers_follow_the_opening(tmp_path):
+    rollout = make_rollout(2)
+    rollout["observation"][:, 3] = torch.tensor([0.0, 1.0])
+    centers = record(tmp_path / "a.rrd", rollout).array("/push/scene/gripper/fingers", "Boxes3D:centers")
+    apart = centers[:, 0, 1] - centers[:, 1, 1]
+    assert apart[1] - apart[0] == pytest.approx(0.1)
+
+
+def test_what_is_absent_is_left_out(tmp_path):
+    rollout = make_rollout(5).select("observation", "action")
+    rollout["observation"][:, 36:39] = 0.0
+    found = record(tmp_path / "a.rrd", rollout, plan=None, objects={})
+    roots = {entity.split("/")[2] for entity in found.entities() if entity.startswith("/push/")}
+    assert roots == {"scene", "action"}
+    assert not any("goal" in entity for entity in found.entities())
+    gripper = found.array("/push/scene/objects/robot\\'s\\ gripper", "Points3D:positions")[:, 0]
+    np.testing.assert_array_equal(gripper, rollout["observation"][:, :3].numpy())
+
+
+def test_without_a_plan_every_column_is_numbered(tmp_path):
+    found = record(tmp_path / "a.rrd", make_rollout(5), plan=None)
+    assert found.values("/push/skill_weights", "SeriesLines:names") == [["1", "2", "3"]]
+    assert "/push/lanes/condition-3" in found.entities()
+
+
+def test_a_goal_that_is_an_object_has_one_label(tmp_path):
+    rollout = make_rollout(5)
+    objects = {"target location": rollout["observation"][:, 36:39]}
+    found = record(tmp_path / "a.rrd", rollout, objects=objects)
+    assert "/push/scene/goal" in found.entities()
+    assert "/push/scene/goal/foot" not in found.entities()
+
+
+def test_active_skill():
+    weights = np.array([[0.9, 0.1], [0.5, 0.5], [0.2, 0.8]], np.float32)
+    assert active_skill(weights, ["a", "b"]) == ["a", EVENLY, "b"]
+    assert active_skill(np.ones((1, 1), np.float32), ["only"]) == ["only"]
+
+
+def test_several_episodes_and_their_names(tmp_path):
+    first, second = make_rollout(5, seed=1), make_rollout(7, seed=2)
+    with RerunLogger(tmp_path / "a.rrd") as logger:
+        names = [
+            logger.log_episode(rollout, task="push", objects=make_objects(rollout), name=name)
+            for rollout, name in ((first, None), (second, None), (first, "best so far"))
+        ]
+        with pytest.raises(ValueError, match="name must be another"):
+            logger.log_episode(first, task="push", objects={}, name="push 2")
+        with pytest.raises(ValueError, match="name must be another"):
+            logger.log_episode(first, task="push", objects={}, name="metrics")
+    assert names == ["push", "push 2", "best so far"]
+    found = Recording(tmp_path / "a.rrd")
+    for root, rollout in (("/push", first), ("/push\\ 2", second), ("/best\\ so\\ far", first)):
+        np.testing.assert_array_equal(found.array(f"{root}/action", "Scalars:scalars"), rollout["action"].double())
+
+
+def test_the_layout_is_in_the_file(tmp_path):
+    found = record(tmp_path / "a.rrd", make_rollout())
+    (store,) = found.reader.blueprints()
+    chunks = found.reader.stream(store=store)
+    text = " ".join(f"{chunk.entity_path} {chunk.to_record_batch()}" for chunk in chunks)
+    for expected in ("Scene", "Plan", "Skill weights", "Action", "/push/scene/trails/puck"):
+        assert expected in text
+
+
+def test_speed(tmp_path):
+    rollout = make_rollout(500, columns=8)
+    objects = make_objects(rollout)
+    with RerunLogger(tmp_path / "a.rrd") as logger:
+        logger.log_episode(rollout, task="push", objects=objects, plan=PLAN)
+        start = time.perf_counter()
+        logger.log_episode(rollout, task="push", objects=objects, plan=PLAN)
+        assert time.perf_counter() - start < 0.3
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda r: r.exclude("observation"), r"must have the key 'observation' \(20×39\), got action"),
+        (lambda r: r.exclude("action"), "must have the key 'action'"),
+        (lambda r: r[None], r"batch size \(T,\) with T >= 1, got \(1, 20\); take one episode"),
+        (lambda r: r[:0], r"got \(0,\)"),
+        (
+            lambda r: r.set("observation", torch.rand(20, 38)),
+            r"'observation'\] must have shape 20×39, got 20×38",
+        ),
+        (
+            lambda r: r.set("action", torch.full((20, 4), float("nan"))),
+            r"'action'\] must be finite, .* row 0",
+        ),
+        (lambda r: r.set("qaf", torch.rand(20, 3)), r"'qaf'\] must be bool, got torch.float32"),
+        (lambda r: r.set("qaf", torch.ones(20, 1, dtype=torch.bool)), "each of 2 plan steps, got 1"),
+        (
+            lambda r: r.set("skill_weights", torch.full((20, 3), torch.inf)),
+            "'skill_weights'.* must be finite",
+        ),
+    ],
+)
+def test_wrong_rollouts_are_named(tmp_path, change, message):
+    rollout = make_rollout()
+    with RerunLogger(tmp_path / "a.rrd") as logger, pytest.raises(ValueError, match=message):
+        logger.log_episode(change(rollout.clone()), task="push", objects=make_objects(rollout), plan=PLAN)
+
+
+def test_wrong_objects_are_named(tmp_path):
+    rollout = make_rollout()
+    with RerunLogger(tmp_path / "a.rrd") as logger:
+        with pytest.raises(ValueError, match=r"objects\['puck'\] must have shape 20×3, got 19×3"):
+            logger.log_episode(rollout, task="push", objects={"puck": torch.rand(19, 3)})
+        with pytest.raises(ValueError, match=r"objects\['puck'\] must be finite"):
+            logger.log_episode(rollout, task="push", objects={"puck": torch.full((20, 3), float("nan"))})
+        with pytest.raises(TypeError, match="objects must map names"):
+            logger.log_episode(rollout, task="push", objects=[torch.rand(20, 3)])
+        with pytest.raises(TypeError, match="rollout must be a TensorDict"):
+            logger.log_episode({"observation": torch.rand(20, 39)}, task="push", objects={})
+        with pytest.raises(ValueError, match="task must be"):
+            logger.log_episode(rollout, task="", objects={})
+    assert Recording(tmp_path / "a.rrd").entities() == {"/__properties"}

@@ -1,0 +1,156 @@
+"""Policy files whose tensors or training states are a stranger's: refused, or whole."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import struct
+
+import pytest
+import torch
+from hostile_files import make_trainer, parts, rebuild, refuses, said, train_good
+from safetensors.torch import load, save
+
+import lw_torchrl as lw
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory):
+    return train_good(tmp_path_factory.mktemp("good"))
+
+
+def changed(group, change):
+    def apply(description, groups):
+        tensors = load(groups[f"{group}.safetensors"])
+        change(tensors)
+        groups[f"{group}.safetensors"] = save(tensors)
+
+    return apply
+
+
+def replaced(group, change):
+    def apply(description, groups):
+        name = f"{group}.safetensors"
+        groups[name] = change(groups[name])
+
+    return apply
+
+
+def first(tensors):
+    return next(name for name, tensor in sorted(tensors.items()) if tensor.numel() > 1)
+
+
+def with_header(header, rest=b""):
+    text = header if isinstance(header, bytes) else json.dumps(header).encode()
+    return struct.pack("<Q", len(text)) + text + rest
+
+
+CHANGES = {
+    "shorter": lambda t: t.update({first(t): t[first(t)][:-1].clone()}),
+    "empty": lambda t: t.update({first(t): t[first(t)][:0].clone()}),
+    "scalar": lambda t: t.update({first(t): torch.tensor(0.0)}),
+    "halves": lambda t: t.update({first(t): t[first(t)].half()}),
+    "doubles": lambda t: t.update({first(t): t[first(t)].double()}),
+    "integers": lambda t: t.update({first(t): t[first(t)].to(torch.int32)}),
+    "one missing": lambda t: t.pop(first(t)),
+    "one too many": lambda t: t.update({"more": torch.zeros(3)}),
+    "another name": lambda t: t.update({"other": t.pop(first(t))}),
+    "none at all": lambda t: t.clear(),
+}
+RAW = {
+    "nothing": lambda data: b"",
+    "a pickle": lambda data: pickle.dumps([1]),
+    "cut": lambda data: data[: len(data) // 2],
+    "zeros": lambda data: bytes(len(data)),
+    "a header of 2**60 bytes": lambda data: struct.pack("<Q", 2**60) + data[8:],
+    "a tensor of 2**40 numbers": lambda data: with_header(
+        {"a": {"dtype": "F32", "shape": [2**40], "data_offsets": [0, 2**42]}}
+    ),
+    "offsets that overlap": lambda data: with_header(
+        {name: {"dtype": "F32", "shape": [1], "data_offsets": [0, 4]} for name in "ab"}, bytes(4)
+    ),
+    "a negative shape": lambda data: with_header(
+        {"a": {"dtype": "F32", "shape": [-1], "data_offsets": [0, 4]}}, bytes(4)
+    ),
+    "an unknown dtype": lambda data: with_header(
+        {"a": {"dtype": "PY", "shape": [1], "data_offsets": [0, 4]}}, bytes(4)
+    ),
+    "a header that is no JSON": lambda data: with_header(b"import os"),
+    "a nested header": lambda data: with_header(b"[" * 50_000),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
+@pytest.mark.parametrize("group", ["weights", "texts", "training"])
+def test_tensors_of_other_shapes_names_and_types_are_refused(good, tmp_path, group, change):
+    """None is loaded as zeros."""
+    description, groups = parts(good)
+    changed(group, change)(description, groups)
+    rebuild(tmp_path / "c.zip", description, groups)
+    if group == "training":  # the policy itself is whole
+        lw.load_actor(tmp_path / "c.zip")
+        if change is CHANGES["one too many"]:
+            return
+        with pytest.raises(ValueError, match=r"checkpoint: .* does not fit"):
+            make_trainer(tmp_path / "c.zip")
+    elif (group, change) == ("texts", CHANGES["one too many"]):
+        lw.load_actor(tmp_path / "c.zip")
+    else:
+        refuses(tmp_path / "c.zip")
+
+
+@pytest.mark.parametrize("change", RAW.values(), ids=RAW)
+@pytest.mark.parametrize("group", ["weights", "texts"])
+def test_tensors_that_are_no_safetensors_are_refused(good, tmp_path, group, change):
+    description, groups = parts(good)
+    replaced(group, change)(description, groups)
+    rebuild(tmp_path / "c.zip", description, groups)
+    refuses(tmp_path / "c.zip")
+
+
+STATES = {
+    "no state": None,
+    "a list": [1, 2],
+    "a missing tensor": {"tensor": "9999"},
+    "another kind": {"object": "os.system"},
+    "two kinds": {"dict": [], "list": []},
+    "no pairs": {"dict": [1, 2]},
+    "unhashable keys": {"dict": [[{"list": []}, 1]]},
+    "nested": {"dict": []},
+}
+STATES["nested"] = json.loads('{"list":[' * 400 + "1" + "]}" * 400)
+
+
+@pytest.mark.parametrize("state", STATES.values(), ids=STATES)
+def test_training_states_of_other_shapes_are_refused(good, tmp_path, state):
+    description, groups = parts(good)
+    description["state"] = state
+    rebuild(tmp_path / "c.zip", description, groups)
+    with pytest.raises(ValueError, match=r"checkpoint: .* does not fit"):
+        make_trainer(tmp_path / "c.zip")
+
+
+def leaves(tree, path=()):
+    if isinstance(tree, dict):
+        for key, value in tree.items():
+            yield from leaves(value, (*path, key))
+    elif isinstance(tree, list):
+        for number, value in enumerate(tree):
+            yield from leaves(value, (*path, number))
+    else:
+        yield path
+
+
+@pytest.mark.parametrize("value", [None, -(10**30), "step", 1e308, True])
+def test_every_value_of_a_training_state_may_be_another(good, tmp_path, value):
+    """It is refused, or it is a state that training goes on from; never another error."""
+    description, groups = parts(good)
+    places = list(leaves(description["state"]))[::7]
+    for place in places:
+        again = json.loads(json.dumps(description))
+        here = again["state"]
+        for key in place[:-1]:
+            here = here[key]
+        here[place[-1]] = value
+        rebuild(tmp_path / "c.zip", again, groups)
+        assert "checkpoint: " in (said(make_trainer, tmp_path / "c.zip") or "checkpoint: ")
