@@ -37,6 +37,12 @@ def as_keys(argument: str, given: Sequence[NestedKey] | None, default: Sequence[
     return keys
 
 
+def check_apart(in_keys: Sequence[NestedKey], out_keys: Sequence[NestedKey]) -> None:
+    """Raise :class:`ValueError` if a module would write over what it reads."""
+    if both := [key for key in out_keys if key in in_keys]:
+        raise ValueError(f"out_keys must not be among in_keys, {list(in_keys)}: {both} would be written over")
+
+
 def key_beside(key: NestedKey, ending: str) -> NestedKey:
     """The key beside ``key`` whose name has an ending more.
 

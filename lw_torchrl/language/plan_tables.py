@@ -52,7 +52,12 @@ class PlanTables:
             number: (...) int64, the number of the plan whose queries were answered; None if it is not known.
             rows: (...) int64, as from :meth:`rows`.
         """
-        if number is None or not readable(number, rows):
+        if number is None:
+            return
+        if torch.compiler.is_compiling():
+            own = self.number.to(number.device)[rows]
+            torch._assert_async((own == number).all(), "qaf answers other plans than the actor's")
+        if not readable(number, rows):
             return
         if number.device != self.number.device:
             self.number = self.number.to(number.device)

@@ -47,6 +47,8 @@ class ActionHead(nn.Module):
         init_std: float = 0.3,
     ) -> None:
         super().__init__()
+        if not isinstance(squash, bool):
+            raise TypeError(f"squash must be True or False, got {squash!r}")
         if distribution is not None:
             check_choice("distribution", distribution, DISTRIBUTIONS)
         if distribution == "tanh_normal" and not squash:

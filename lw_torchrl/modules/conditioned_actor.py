@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 from torchrl.envs import Transform
 
-from lw_torchrl._keys import as_keys, key_beside, read
+from lw_torchrl._keys import as_keys, check_apart, key_beside, read
 from lw_torchrl.language.tasks import Task
 from lw_torchrl.modules.action_head import ActionHead, DistributionName
 from lw_torchrl.modules.encoder import Encoder, Encoding
@@ -55,8 +55,7 @@ class ConditionedActor(Policy):
         self.plans, self.tasks, self.in_keys = encoder.plans, encoder.tasks, encoder.in_keys
         drawn = () if distribution is None else ("loc", "scale", "action_log_prob")
         self.out_keys = as_keys("out_keys", out_keys, ("action", *told, *drawn))
-        if out_keys is not None and set(self.out_keys) & set(self.in_keys):
-            raise ValueError(f"out_keys must not be among in_keys, {self.in_keys}, got {self.out_keys}")
+        check_apart(self.in_keys, self.out_keys)
         self.config = {
             **encoder.config,
             "width": width,

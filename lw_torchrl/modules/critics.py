@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torchrl.envs import Transform
 
 from lw_torchrl._checks import check_int
-from lw_torchrl._keys import as_keys, read
+from lw_torchrl._keys import as_keys, check_apart, read
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.modules.action_head import DistributionName
 from lw_torchrl.modules.encoder import Encoder
@@ -66,6 +66,7 @@ class Value(TensorDictModuleBase):
         self.plans, self.tasks = encoder.plans, encoder.tasks
         self.in_keys: list[NestedKey] = list(encoder.in_keys)
         self.out_keys = as_keys("out_keys", out_keys, self._written[: 1 if ensemble == 1 else 2])
+        check_apart(self.in_keys, self.out_keys)
         self.heads = nn.ModuleList(
             head(encoder.width + self._more, 1, width, depth, layer_norm=layer_norm)
             for _ in range(check_int("ensemble", ensemble, minimum=1))
@@ -116,6 +117,7 @@ class QValue(Value):
         super().__init__(encoder, **options)
         self.action_key = action_key
         self.in_keys = [*self.in_keys, action_key]
+        check_apart(self.in_keys, self.out_keys)
 
     def _input(self, tensordict: TensorDictBase) -> Tensor:
         (action,) = read(tensordict, [self.action_key])

@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from lw_torchrl._checks import check_choice
-from lw_torchrl._keys import as_keys
+from lw_torchrl._keys import as_keys, check_apart
 from lw_torchrl.language.task_index import TaskIndex
 from lw_torchrl.language.tasks import MT50, TASKS, Task, named_tasks
 from lw_torchrl.language.text import TextEncoder, encode_texts
@@ -63,6 +63,7 @@ class DescriptorEncoder(Encoder):
         self.tasks = tuple(self.definitions)
         self.in_keys = as_keys("in_keys", in_keys, ("observation", "task_id"))
         self.out_keys = as_keys("out_keys", out_keys, ("encoding",))
+        check_apart(self.in_keys, self.out_keys)
         self.config: dict[str, Any] = {
             "condition": check_choice("condition", condition, ("description", "one-hot")),
             "features": features,
@@ -99,7 +100,7 @@ class DescriptorEncoder(Encoder):
     def encode(self, *prepared: Tensor) -> Encoding:
         """From what :meth:`prepare` gives."""
         rows, seen = prepared
-        return Encoding(self.texts(self.text_vectors)[rows], seen)
+        return Encoding(self.texts(self.text_vectors)[: len(self.tasks)][rows], seen)
 
     def describe(self) -> dict[str, Any]:
         own = {name: task.to_json() for name, task in self.definitions.items() if task != TASKS.get(name)}

@@ -76,8 +76,11 @@ class ObservationFeatures(nn.Module):
                 f"observation must be float32 of shape (..., 39), got {observation.dtype} of shape "
                 f"{tuple(observation.shape)}"
             )
-        if readable(observation) and not observation.isfinite().all():
-            raise ValueError("observation must hold finite numbers, got NaN or infinity")
+        problem = "observation must hold finite numbers, got NaN or infinity"
+        if torch.compiler.is_compiling():
+            torch._assert_async(observation.isfinite().all(), problem)
+        elif readable(observation) and not observation.isfinite().all():
+            raise ValueError(problem)
         if self.kind == "raw":
             return observation
         if self.kind == "relative":

@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from lw_torchrl._checks import missing_keys
-from lw_torchrl._keys import as_keys
+from lw_torchrl._keys import as_keys, check_apart
 from lw_torchrl.language.plan_tables import PlanTables
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.transforms.qaf import plan_number_key
@@ -61,6 +61,7 @@ class PlanAttention(TensorDictModuleBase):
         super().__init__()
         self.in_keys = as_keys("in_keys", in_keys, ("qaf", "task_id"))
         self.out_keys = as_keys("out_keys", out_keys, ("skill_weights",))
+        check_apart(self.in_keys, self.out_keys)
         self.plans = as_plans(plans)
         self.tables = PlanTables(self.plans)
         self.register_buffer("mask", self.tables.mask, persistent=False)

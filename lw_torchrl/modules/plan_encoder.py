@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from lw_torchrl._checks import check_probability
-from lw_torchrl._keys import as_keys
+from lw_torchrl._keys import as_keys, check_apart
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.text import TextEncoder, encode_texts
 from lw_torchrl.modules.encoder import Encoder, Encoding
@@ -96,6 +96,7 @@ class PlanEncoder(Encoder):
         own = as_keys("in_keys", in_keys, read)
         self.in_keys = list(dict.fromkeys([*own, *([] if evaluator is None else evaluator.in_keys)]))
         self.out_keys = as_keys("out_keys", out_keys, ("encoding",))
+        check_apart(self.in_keys, self.out_keys)
         self._answered = plan_number_key(own[-1])
         self.evaluator = _check_evaluator(evaluator, self.plans, focus or swap_unmentioned)
         self.config: dict[str, Any] = {

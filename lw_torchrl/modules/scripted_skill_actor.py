@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from lw_torchrl._checks import check_choice
-from lw_torchrl._keys import as_keys
+from lw_torchrl._keys import as_keys, check_apart
 from lw_torchrl.language.plan_tables import PlanTables
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.skill_program import SkillProgram
@@ -64,6 +64,7 @@ class ScriptedSkillActor(Policy):
         self.tasks = tuple(self.plans)
         self.in_keys = as_keys("in_keys", in_keys, ("observation", "task_id", "qaf"))
         self.out_keys = as_keys("out_keys", out_keys, ("action", "skill_weights"))
+        check_apart(self.in_keys, self.out_keys)
         self.config = {"select": select, "seed": seed, "in_keys": self.in_keys, "out_keys": self.out_keys}
         self.select = check_choice("select", select, ("first", "random", "mix"))
         self._skills = skills

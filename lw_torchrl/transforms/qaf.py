@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase, Transform
 from torchrl.envs.batched_envs import BatchedEnvBase
 
 from lw_torchrl._checks import missing_keys
-from lw_torchrl._keys import as_keys, key_beside
+from lw_torchrl._keys import as_keys, check_apart, key_beside
 from lw_torchrl.language.plan_tables import PlanTables
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.query_program import QueryProgram
@@ -79,6 +79,7 @@ class QAFTransform(KeepsEnvState):
             in_keys=as_keys("in_keys", in_keys, ("observation", "task_id")),
             out_keys=[*truth, plan_number_key(truth[0])],
         )
+        check_apart(self.in_keys, self.out_keys)
         self.plans = as_plans(plans)
         self.program = plan_program(self.plans)
         tables = PlanTables(self.plans)

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase, Transform
 
 from lw_torchrl._checks import check_scale, missing_keys
-from lw_torchrl._keys import as_keys
+from lw_torchrl._keys import as_keys, check_apart
 from lw_torchrl.language.observation import FIRST, HAND, POSITIONS, SECOND, a_step_before
 
 _STARTS = tuple(part.start for part in (*POSITIONS, *map(a_step_before, (HAND, FIRST, SECOND))))
@@ -78,6 +78,9 @@ class RandomYaw(Transform):
             in_keys=as_keys("in_keys", in_keys, _KEYS),
             out_keys=as_keys("out_keys", in_keys if out_keys is None else out_keys, _KEYS),
         )
+        for own, there in zip(self.in_keys, self.out_keys, strict=True):
+            if there != own:
+                check_apart(self.in_keys, [there])
         self.scale = check_scale("scale", scale)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -91,3 +91,20 @@ def test_keys_travel_with_the_policy(tmp_path):
 
 def test_a_json_list_is_a_nested_key():
     assert as_keys("in_keys", [["a", "b"], "c"], ("x", "y")) == [("a", "b"), "c"]
+
+
+@pytest.mark.parametrize(
+    "make_one",
+    [
+        lambda: lw.PlanConditionedActor(PLANS, out_keys=["action", "observation", "latent"]),
+        lambda: lw.DescriptorConditionedActor("MT10", out_keys=["task_id"]),
+        lambda: lw.ScriptedSkillActor(PLANS, out_keys=["qaf", "weights"]),
+        lambda: lw.PlanConditionedQValue(PLANS, out_keys=["action"]),
+        lambda: lw.QAFTransform(PLANS, out_keys=["observation"]),
+        lambda: lw.QAFTransform(PLANS, in_keys=["observation", "qaf_plan"]),
+        lambda: lw.RandomYaw(0.1, out_keys=["action", "observation", "a", "b"]),
+    ],
+)
+def test_nothing_writes_over_what_it_reads(make_one):
+    with pytest.raises(ValueError, match="out_keys must not be among in_keys"):
+        make_one()

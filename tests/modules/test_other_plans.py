@@ -141,3 +141,22 @@ def test_the_number_travels_with_a_pickle():
     actor = pickle.loads(pickle.dumps(lw.PlanConditionedActor(PLANS, width=8)))
     with pytest.raises(ValueError, match=REFUSED):
         actor(state(OTHERS["another skill"]))
+
+
+def test_compiled_it_refuses_when_it_is_run():
+    actor = lw.PlanConditionedActor(PLANS, width=8).eval()
+    act = torch.compile(lambda data: actor(data)["action"], backend="eager")
+    assert act(state(PLANS)).shape == (3, 4)
+    with pytest.raises(RuntimeError, match="qaf answers other plans"):
+        act(state(OTHERS["another skill"]))
+    wrong = state(PLANS)
+    wrong["observation"][1, 2] = torch.nan
+    with pytest.raises(RuntimeError, match="finite numbers"):
+        act(wrong)
+
+
+def test_under_vmap_an_unknown_task_is_no_task_of_the_actor():
+    actor = lw.DescriptorConditionedActor(["reach", "push"], width=8).eval()
+    data = TensorDict(observation=torch.zeros(3, 39), task_id=torch.full((3,), lw.task_id("soccer")))
+    with pytest.raises(IndexError):
+        torch.vmap(lambda row: actor(row)["action"])(data.auto_batch_size_())

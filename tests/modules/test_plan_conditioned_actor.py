@@ -359,3 +359,8 @@ def test_plans_of_a_wrong_kind_are_named():
     with pytest.raises(ValueError, match="another task"):
         PlanConditionedActor({"push": PLANS["reach"]})
     assert set(PlanConditionedActor(dict(PLANS), **SMALL).plans) == set(MT10)
+
+
+def test_squash_is_a_flag():
+    with pytest.raises(TypeError, match="squash must be True or False, got 'no'"):
+        make_actor(squash="no")
