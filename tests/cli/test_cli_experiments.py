@@ -117,6 +117,7 @@ def results(folder):
     return found, json.loads(next(folder.rglob("summary.json")).read_text())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("setting", ["few-shot", "one-shot"])
 def test_killed_at_five_random_moments_it_ends_the_same(forks, tmp_path, setting):
     def start(out):
