@@ -10,8 +10,15 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
+from forks import Forks
 
 import lw_torchrl as lw
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Files with slow tests come first, so that at the end no process is left alone with one of them."""
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: item.path not in slow)
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -55,6 +62,14 @@ def mt50(request: pytest.FixtureRequest) -> Iterator[lw.LanguageWorldEnv]:
     env = lw.LanguageWorldEnv("MT50", seed=0, engine=request.param, reward="dense")
     yield env
     env.close(raise_if_closed=False)
+
+
+@pytest.fixture(scope="session")
+def forks(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Forks]:
+    """Commands in processes of their own, forks of one that is started once."""
+    forks = Forks(tmp_path_factory.mktemp("forks"))
+    yield forks
+    forks.close()
 
 
 @pytest.fixture(scope="session")

@@ -66,7 +66,7 @@ def run_episodes(
     keys: Sequence[NestedKey],
     noise: Callable[[int], Sequence[float]] | None = None,
     noise_hold: int = 1,
-    stop_at_success: bool = False,
+    after_success: int | None = None,
     clean_action: NestedKey | None = None,
     on_progress: Callable[[int], object] | None = None,
 ) -> Iterator[FinishedEpisode]:
@@ -82,7 +82,7 @@ def run_episodes(
         noise: episode index to the four standard deviations of the noise added to the action, from the same
             (task, seed, episode) as the episode itself; None for none.
         noise_hold: the steps for which each draw of the noise is kept.
-        stop_at_success: end an episode after its first successful step.
+        after_success: end an episode so many steps after its first successful one; None for never.
         clean_action: where to write the action before the noise.
         on_progress: told after each step how many more of all the steps are done with; what an early stop saves
             counts as done.
@@ -98,6 +98,7 @@ def run_episodes(
     episode = torch.zeros(rows, dtype=torch.int64)
     active = torch.zeros(rows, dtype=torch.bool)
     steps = np.zeros(rows, dtype=np.int64)
+    last = np.zeros(rows, dtype=np.int64)  # the step after which an episode ends early
     noises = np.zeros((rows, base.max_steps, 4), dtype=np.float32)
     buffers: TensorDictBase | None = None
     state: TensorDictBase = env.full_done_spec.zero()
@@ -107,7 +108,7 @@ def run_episodes(
         for row in torch.nonzero(idle).flatten().tolist():
             if queue := waiting.get(base.row_tasks[row]):
                 number = queue.popleft()
-                episode[row], starting[row], steps[row] = number, True, 0
+                episode[row], starting[row], steps[row], last[row] = number, True, 0, base.max_steps
                 if noise is not None:
                     scale = np.asarray(noise(number), dtype=np.float32)
                     drawn = action_noise(base.task_of_row[row], base.seed, number, base.max_steps, noise_hold)
@@ -138,8 +139,10 @@ def run_episodes(
         steps[live.numpy()] += 1
         following = state.get("next")
         ended = following.get("done").squeeze(-1)
-        if stop_at_success:
-            ended = ended | following.get("success").squeeze(-1)
+        if after_success is not None:
+            success = following.get("success").squeeze(-1).numpy()
+            last = np.where(success, np.minimum(last, steps + after_success), last)
+            ended = ended | torch.from_numpy(steps >= last)
         idle = ended & active
         if on_progress is not None:
             on_progress(int(active.sum()) + int((base.max_steps - steps)[idle.numpy()].sum()))

@@ -9,15 +9,17 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torchrl.envs import TransformedEnv
 
-from lw_torchrl.envs.episodes import FinishedEpisode
+from lw_torchrl.envs.episodes import FinishedEpisode, run_episodes
 from lw_torchrl.envs.experts import ExpertActor
-from lw_torchrl.evaluation.protocol import evaluate
-from lw_torchrl.evaluation.result import EvaluationResult
+from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.tasks import resolve_tasks
+from lw_torchrl.transforms import QAFTransform
 
 _AFTER = 20  # steps after the first success that still count, as in training data
+_ROWS = 250  # or so, stepped together
 _STUCK = 50  # the last steps of a failed episode, in which it got nowhere
 
 
@@ -99,8 +101,7 @@ def expert_use(
     *,
     episodes_per_task: int = 10,
     seed: int = 0,
-    progress: bool = True,
-) -> tuple[EvaluationResult, dict[str, TaskUse]]:
+) -> dict[str, TaskUse]:
     """Which conditions of the plans hold in the states that Meta-World's experts visit.
 
     Args:
@@ -108,29 +109,24 @@ def expert_use(
         tasks: some of their tasks; None for all.
         episodes_per_task: episodes of each, without action noise.
         seed: of the episodes.
-        progress: show a progress bar.
 
     Returns:
-        How the experts fared, and task name to :class:`TaskUse`.
+        Task name to :class:`TaskUse`. An episode ends 20 steps after its first success: what follows does not count.
 
     Example:
         >>> import lw_torchrl as lw
-        >>> _, use = expert_use(lw.load_plans("MT10"), "reach", episodes_per_task=1)
-        >>> use["reach"].covered
+        >>> expert_use(lw.load_plans("MT10"), "reach", episodes_per_task=1)["reach"].covered
         1.0
     """
     answered = as_plans(plans)
     names = resolve_tasks(list(answered) if tasks is None else tasks)
     use = PlanUse(answered)
-    result = evaluate(
-        ExpertActor(names),
-        tasks=names,
-        plans=answered,
-        episodes_per_task=episodes_per_task,
-        seed=seed,
-        noise_scale=0.0,
-        also_record=["qaf"],
-        on_episode=use,
-        progress=progress,
-    )
-    return result, use.tasks()
+    rows = len(names) * min(episodes_per_task, -(-_ROWS // len(names)))
+    env = TransformedEnv(LanguageWorldEnv(names, num_envs=rows, seed=seed, strict=True), QAFTransform(answered))
+    episodes = {task: range(episodes_per_task) for task in names}
+    for finished in run_episodes(
+        env, ExpertActor(names), episodes, keys=["qaf", ("next", "success")], after_success=_AFTER
+    ):
+        use(finished)
+    env.close()
+    return use.tasks()

@@ -183,7 +183,7 @@ def evaluate(
                 {task: range(episodes_per_task) for task in names},
                 keys=["action", ("next", "success"), ("next", "reward"), *also_record],
                 noise=(lambda _: (noise_scale,) * 4) if noise_scale else None,
-                stop_at_success=stop_at_success,
+                after_success=0 if stop_at_success else None,
                 on_progress=bar.update,
             ):
                 found.append(_result(*finished, stop_at_success, record_actions))

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import inspect
 import json
-import os
 import re
 import signal
-import subprocess
-import sys
 import time
 from importlib.metadata import entry_points
 
@@ -263,41 +260,30 @@ def test_the_baseline_trains_and_is_evaluated(capsys, demos, tmp_path):
 # ---- demo
 
 
-def start_demo(out):
-    command = [
-        sys.executable,
-        "-c",
-        "from lw_torchrl.cli.main import main; main()",
-        "demo",
-        "--quick",
-        "--out",
-        str(out),
-    ]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
-
-
-def kill_when(process, ready, timeout=120):
+def kill_when(forks, ready, timeout=120):
     deadline = time.monotonic() + timeout
     while not ready():
-        assert process.poll() is None, process.communicate()[1]
+        assert forks.running(0.02), forks.end()
         assert time.monotonic() < deadline
-        time.sleep(0.02)
-    os.killpg(process.pid, signal.SIGKILL)
-    process.communicate()
+    forks.send(signal.SIGKILL)
+    assert forks.end().status == -signal.SIGKILL
 
 
 @pytest.mark.slow
-def test_the_quick_demo_killed_twice_ends_and_then_does_nothing_twice(tmp_path):
+def test_the_quick_demo_killed_twice_ends_and_then_does_nothing_twice(forks, tmp_path):
     out = tmp_path / "demo"
     demonstrations = out / "demonstrations"
-    kill_when(start_demo(out), lambda: len(list(demonstrations.glob(".partial/*.npz"))) >= 2)
+    demo = ("demo", "--quick", "--out", out)
+    forks.start(*demo)
+    kill_when(forks, lambda: len(list(demonstrations.glob(".partial/*.npz"))) >= 2)
     assert not (demonstrations / "metadata.json").exists()
-    kill_when(start_demo(out), (out / "checkpoint.zip").exists)
+    forks.start(*demo)
+    kill_when(forks, (out / "checkpoint.zip").exists)
     assert not (out / "results.json").exists()
 
-    process = start_demo(out)
-    printed, errors = process.communicate(timeout=300)
-    assert process.returncode == 0, errors
+    forks.start(*demo)
+    status, printed, errors = forks.end()
+    assert status == 0, errors
     assert {path.name for path in out.iterdir() if path.name[0] != "."} == {
         "config.json",
         "demonstrations",
@@ -332,9 +318,9 @@ def test_the_quick_demo_killed_twice_ends_and_then_does_nothing_twice(tmp_path):
         "demonstrations/data/action.memmap",
     ]
     before = {name: (out / name).stat().st_mtime_ns for name in kept}
-    process = start_demo(out)
-    again, errors = process.communicate(timeout=120)
-    assert process.returncode == 0, errors
+    forks.start(*demo)
+    status, again, errors = forks.end()
+    assert status == 0, errors
     assert {name: (out / name).stat().st_mtime_ns for name in kept} == before
     assert again == printed
 

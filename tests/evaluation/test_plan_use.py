@@ -5,7 +5,7 @@ from tensordict import TensorDict
 
 import lw_torchrl as lw
 from lw_torchrl.envs.episodes import FinishedEpisode
-from lw_torchrl.evaluation.plan_use import PlanUse
+from lw_torchrl.evaluation.plan_use import PlanUse, expert_use
 
 PLANS = {"reach": lw.load_plans("MT10")["reach"]}  # three steps
 
@@ -52,3 +52,19 @@ def test_without_a_policy_that_chooses():
     assert found.chosen == []
     assert found.stuck == [0, 1, 0]
     assert found.to_json()["states"] == 3
+
+
+def test_experts_are_stopped_where_nothing_counts_any_more():
+    tasks, plans = ["drawer-open", "reach"], lw.load_plans("MT10")
+    whole = PlanUse(plans)
+    lw.evaluate(
+        lw.ExpertActor(tasks),
+        tasks=tasks,
+        plans=plans,
+        episodes_per_task=3,
+        seed=4,
+        noise_scale=0.0,
+        also_record=["qaf"],
+        on_episode=whole,
+    )
+    assert expert_use(plans, tasks, episodes_per_task=3, seed=4) == whole.tasks()

@@ -19,21 +19,23 @@ def plan_text(task, folder="plans"):
 @pytest.fixture(scope="module")
 def use():
     """How the 50 plans fare in the states that the experts visit, with a table."""
-    result, found = expert_use(lw.load_plans("MT50"), episodes_per_task=EPISODES, seed=0, progress=False)
+    found = expert_use(lw.load_plans("MT50"), episodes_per_task=EPISODES, seed=0)
     print(f"\n{EPISODES} expert episodes a task: covered before success, conditions true (median), each step's share")
     for task, seen in found.items():
         shares = " ".join(f"{100 * share:3.0f}" for share in seen.true)
         print(f"{task:28} {seen.covered:6.3f} {seen.num_true:3.0f}   {shares}")
-    assert result.mean_success > 0.95
+    assert sum(seen.failed for seen in found.values()) < 0.05 * 50 * EPISODES
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", lw.MT50)
 def test_a_condition_is_true_wherever_an_expert_goes(use, task):
     assert use[task].covered >= 0.9
     assert use[task].num_true <= 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", lw.MT50)
 def test_every_step_is_needed_and_none_is_always_on(use, task):
     assert min(use[task].true) >= 0.01, use[task].true

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
+import random
 import signal
-import subprocess
-import sys
 import threading
+import time
 from itertools import pairwise
 
 import pytest
@@ -106,60 +105,45 @@ def test_in_another_thread_nothing_is_changed(demos):
     assert trainer.state.step == CONFIG.steps
 
 
-# One process imports everything; each run is a fork of it, which gets the signal at a random moment of its work.
-FORKS = """
-import json, os, random, signal, sys, time
+# What a command does before it works: note in a file when the work begins, and at which step.
+NOTES = """
 import lw_torchrl as lw
-from lw_torchrl.cli.main import main
-from lw_torchrl.evaluation import protocol  # imported here, since it takes seconds
 
-arguments, runs, owner, method = json.loads(sys.argv[1])
-place = getattr(lw, owner)
-chance = random.Random(0)
-found = []
-for run in range(runs):
-    begun, begin = os.pipe()
-    child = os.fork()
-    if not child:
-        original = getattr(place, method)
-        def noted(self, *args):
-            setattr(place, method, original)
-            state = getattr(self, "state", None)
-            os.write(begin, str(state.step if state else 0).encode())
-            return original(self, *args)
-        setattr(place, method, noted)
-        try:
-            main(arguments)
-            os._exit(0)
-        except SystemExit as error:
-            os._exit(error.code)
-        finally:
-            os._exit(1)
-    os.close(begin)
-    step = int(os.read(begun, 20))  # at which its work began
-    os.close(begun)
-    time.sleep(chance.uniform(0, 0.15))
-    os.kill(child, signal.SIGINT)
-    status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-    found.append((status, step))
-print(json.dumps(found))
+place, method, begun = getattr(lw, {owner!r}), {method!r}, {begun!r}
+original = getattr(place, method)
+
+def noted(self, *args):
+    setattr(place, method, original)
+    state = getattr(self, "state", None)
+    with open(begun, "w") as file:
+        file.write(f"{{state.step if state else 0}}\\n")
+    return original(self, *args)
+
+setattr(place, method, noted)
 """
 
 
-def interrupted(arguments, runs, *method):
-    """(exit status, step at which it began) of each run."""
-    given = json.dumps(([str(one) for one in arguments], runs, *method))
-    done = subprocess.run([sys.executable, "-c", FORKS, given], capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr[-2000:]
-    assert "Traceback" not in done.stderr
-    return json.loads(done.stdout.splitlines()[-1])
+def interrupted(forks, tmp_path, arguments, runs, owner, method):
+    """(exit status, step at which it began) of each run; each gets the signal at a random moment of its work."""
+    begun, chance, found = tmp_path / "begun", random.Random(0), []
+    for _ in range(runs):
+        begun.write_text("")
+        forks.start(*arguments, before=NOTES.format(owner=owner, method=method, begun=str(begun)))
+        while not begun.read_text().endswith("\n"):
+            assert forks.running(0.005), forks.end()
+        time.sleep(chance.uniform(0, 0.15))
+        forks.send(signal.SIGINT)
+        ended = forks.end()
+        assert "Traceback" not in ended.err
+        found.append((ended.status, int(begun.read_text())))
+    return found
 
 
-def test_twenty_times_at_random_moments(demos, tmp_path):
+def test_twenty_times_at_random_moments(forks, demos, tmp_path):
     """Each run carries on from the one before; none loses a step that it made."""
     file = tmp_path / "policy.zip"
     arguments = ["train", demos, "--out", file, "--steps", 10**6, "--batch-size", 20, "--width", 16, "--depth", 1]
-    found = interrupted(arguments, 20, "BehavioralCloningTrainer", "step")
+    found = interrupted(forks, tmp_path, arguments, 20, "BehavioralCloningTrainer", "step")
     assert [status for status, _ in found] == [130] * 20
     steps = [step for _, step in found]
     assert steps[0] == 0
@@ -175,6 +159,6 @@ OTHERS = (
 
 
 @pytest.mark.parametrize("arguments", OTHERS, ids=lambda arguments: arguments[0])
-def test_other_work(tmp_path, arguments):
+def test_other_work(forks, tmp_path, arguments):
     given = [tmp_path / "out" if one == "OUT" else one for one in arguments]
-    assert interrupted(given, 2, "LanguageWorldEnv", "_step") == [[130, 0]] * 2
+    assert interrupted(forks, tmp_path, given, 2, "LanguageWorldEnv", "_step") == [(130, 0)] * 2
