@@ -92,7 +92,7 @@ class QAFTransform(KeepsEnvState):
             raise missing_keys(tensordict.keys(True, True), *map(str, self.in_keys))
         tensordict.set(self.out_keys[0], self.program(observation, task_id))
         number = self._number.select(task_id.reshape(-1), observation).plan
-        tensordict.set(self.out_keys[1], number.reshape(task_id.shape))
+        tensordict.set(self.out_keys[1], number.reshape(task_id.shape).clone())  # a collector zeroes what it is given
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         self._write(next_tensordict, next_tensordict.get(self.in_keys[1], None))

@@ -119,6 +119,26 @@ def test_a_resumed_collector_goes_on(name):
     assert not seen & after
 
 
+def test_a_collector_goes_on_after_a_reset_with_a_policy_of_plans():
+    """It zeroes what the environment gave it."""
+    actor = lw.PlanConditionedActor(lw.load_plans("MT10"), width=8)
+    collector = Collector(
+        make_transformed(), actor, frames_per_batch=15, total_frames=-1, auto_register_policy_transforms=False
+    )
+    for _ in range(2):
+        assert next(iter(collector))["qaf_plan"].all()
+        collector.reset()
+    collector.shutdown()
+
+
+def test_nothing_that_is_given_is_kept():
+    env = make_transformed()
+    first, second = env.reset(), env.reset()
+    for key in first.keys(True, True):
+        assert first[key].data_ptr() != second[key].data_ptr(), key
+    env.close()
+
+
 def test_a_collector_of_a_plain_environment_says_that_it_saves_nothing():
     first = Collector(make_env(), policy(), frames_per_batch=3, total_frames=-1, auto_register_policy_transforms=False)
     saved = first.state_dict()
