@@ -17,7 +17,6 @@ from torch import Tensor
 from lw_torchrl._checks import shown, unknown_name
 from lw_torchrl._files import read_toml
 from lw_torchrl.language.named_objects import GRIPPER, NamedObject, read_objects, write_objects
-from lw_torchrl.language.named_objects import coordinate_index as coordinate_index
 
 _NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
 _OWN_IDS = 2**31 - 50  # so that an id is an int32 too

@@ -85,3 +85,23 @@ def encode_texts(texts: Sequence[str]) -> Tensor:
     new = sorted({text for text in texts if text not in shipped})
     found = dict(zip(new, sentence_encoder(new), strict=True)) if new else {}
     return torch.stack([shipped[text] if text in shipped else found[text] for text in texts])
+
+
+def encoded(texts: Sequence[str], encoder: TextEncoder | None) -> Tensor:
+    """The vectors of texts by an encoder, the default one for None, checked: (n, E) float32.
+
+    Raises:
+        TypeError: ``encoder`` cannot be called, or gives no tensor.
+        ValueError: it gives another shape, or NaN or infinity.
+    """
+    if encoder is not None and not callable(encoder):
+        raise TypeError(f"text_encoder must be a function of texts, got {encoder!r:.80}")
+    found = (encoder or encode_texts)(texts)
+    if not isinstance(found, Tensor) or not found.is_floating_point():
+        raise TypeError(f"text_encoder must give a tensor of floats, got {found!r:.80}")
+    if found.ndim != 2 or len(found) != len(texts):
+        raise ValueError(f"text_encoder must give ({len(texts)}, E), got shape {tuple(found.shape)}")
+    if not found.isfinite().all():
+        wrong = texts[int((~found.isfinite()).any(-1).nonzero()[0])]
+        raise ValueError(f"text_encoder must give finite numbers, it gives NaN or infinity for {wrong!r}")
+    return found.detach().to(torch.float32)

@@ -14,7 +14,7 @@ from lw_torchrl._checks import check_choice
 from lw_torchrl._keys import as_keys, check_apart
 from lw_torchrl.language.task_index import TaskIndex
 from lw_torchrl.language.tasks import MT50, TASKS, Task, named_tasks
-from lw_torchrl.language.text import TextEncoder, encode_texts
+from lw_torchrl.language.text import TextEncoder, encoded
 from lw_torchrl.modules.encoder import Encoder, Encoding
 from lw_torchrl.modules.networks import text_to_latent, unit_scale
 from lw_torchrl.modules.observation_features import Features, ObservationFeatures
@@ -74,10 +74,8 @@ class DescriptorEncoder(Encoder):
             "in_keys": self.in_keys,
         }
         self.text_encoder = text_encoder
-        encode = text_encoder or (encode_texts if condition == "description" else _one_hot)
-        found = encode([task.description for task in self.definitions.values()])
-        if found.ndim != 2 or len(found) != len(self.tasks):
-            raise ValueError(f"text_encoder must give ({len(self.tasks)}, E), got shape {tuple(found.shape)}")
+        own = _one_hot if text_encoder is None and condition == "one-hot" else text_encoder
+        found = encoded([task.description for task in self.definitions.values()], own)
         self.index = TaskIndex(self.tasks)
         order = [self.tasks.index(task) for task in self.index.tasks]
         # A product of another number of rows rounds differently: whatever the tasks, there are 50 or more.

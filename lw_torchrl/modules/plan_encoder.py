@@ -13,7 +13,7 @@ from torch import Tensor
 from lw_torchrl._checks import check_probability
 from lw_torchrl._keys import as_keys, check_apart
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
-from lw_torchrl.language.text import TextEncoder, encode_texts
+from lw_torchrl.language.text import TextEncoder, encoded
 from lw_torchrl.modules.encoder import Encoder, Encoding
 from lw_torchrl.modules.mentions import mentioned, swap_unmentioned
 from lw_torchrl.modules.networks import text_to_latent, unit_scale
@@ -111,9 +111,7 @@ class PlanEncoder(Encoder):
         }
         self.text_encoder = text_encoder
         self.skills = self.plans.skills
-        vectors = (encode_texts if text_encoder is None else text_encoder)(self.skills)
-        if vectors.ndim != 2 or len(vectors) != len(self.skills):
-            raise ValueError(f"text_encoder must give ({len(self.skills)}, E), got shape {tuple(vectors.shape)}")
+        vectors = encoded(self.skills, text_encoder)
         self.attention = PlanAttention(self.plans)
         # The tables come from the plans, not from training: they are not part of the state that is saved.
         self.register_buffer("text_vectors", unit_scale(vectors), persistent=False)

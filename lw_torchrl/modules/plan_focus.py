@@ -6,10 +6,11 @@ import torch
 from torch import Tensor, nn
 
 from lw_torchrl._checks import check_scale
+from lw_torchrl.language.named_objects import coordinate_index
 from lw_torchrl.language.observation import OBSERVATION_SIZE
 from lw_torchrl.language.plan_tables import PlanTables
 from lw_torchrl.language.plans import Plans, PlanStep
-from lw_torchrl.language.tasks import Task, coordinate_index
+from lw_torchrl.language.tasks import Task
 from lw_torchrl.modules.observation_features import squash
 
 _PAIRS = 2  # of a step: those of its first and of its last clause that compares two things

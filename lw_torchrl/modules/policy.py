@@ -58,12 +58,41 @@ class Policy(TensorDictModuleBase):
     its order, the action first.
 
     Attributes:
-        config: the keyword arguments that make it again, as JSON.
+        config: the options that make it again, as JSON; what else it needs is for :meth:`describe` to tell and for
+            :meth:`from_description` to read, its tasks say.
         plans: what it carries out; None where it is not conditioned on plans.
         tasks: the names of the tasks that it can act in.
         plan_options: whether its class has options that speak of a plan's steps, ``focus`` say.
         row_by_row: whether a row's action is the same to the last bit whatever rows stand beside it; networks' are
             not, and are run on blocks of one size.
+
+    Example:
+        A way of conditioning of one's own, here on nothing at all. Named in ``METHODS`` as well, it is trained and
+        evaluated by the command line; ``tests/test_extending.py`` has one that learns a vector for each task.
+
+        >>> import lw_torchrl as lw, torch
+        >>> from lw_torchrl.modules import POLICIES
+        >>> class Blind(lw.Policy):
+        ...     def __init__(self, tasks, width=8):
+        ...         super().__init__()
+        ...         self.tasks, self.config = tuple(tasks), {"width": width}
+        ...         self.in_keys, self.out_keys = ["observation"], ["action"]
+        ...         self.net = torch.nn.Sequential(torch.nn.Linear(39, width), torch.nn.Linear(width, 4))
+        ...     def prepare(self, tensordict):
+        ...         return tuple(self.read(tensordict))
+        ...     def act(self, observation):
+        ...         return (self.net(observation),)
+        ...     def describe(self):
+        ...         return super().describe() | {"tasks": list(self.tasks)}
+        ...     @classmethod
+        ...     def from_description(cls, found, text_encoder=None):
+        ...         return cls(found["tasks"], **found["options"])
+        ...     @classmethod
+        ...     def for_plans(cls, plans, *, text_encoder=None, **options):
+        ...         return cls(plans, **options)
+        >>> POLICIES["Blind"] = Blind
+        >>> lw.evaluate(Blind(["reach"]), tasks="reach", episodes_per_task=1, seed=1_000, max_steps=5).mean_success
+        0.0
 
     Source: the contract that ``torchrl.objectives`` and :func:`lw_torchrl.evaluate` rely on.
     """

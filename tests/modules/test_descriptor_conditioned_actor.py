@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.objectives import BCLoss
 
+import lw_torchrl as lw
 from lw_torchrl.language.tasks import MT10, MT50, TASKS, task_id
 from lw_torchrl.language.text import encode_texts
 from lw_torchrl.modules import DescriptorConditionedActor
@@ -161,3 +162,20 @@ def test_wrong_input_is_named(key, change, message):
 def test_wrong_options_are_named(tasks, options, message):
     with pytest.raises(ValueError, match=message):
         make_actor(tasks, **options)
+
+
+@pytest.mark.parametrize(
+    ("encoder", "error", "message"),
+    [
+        (lambda texts: torch.full((len(texts), 4), torch.nan), ValueError, "it gives NaN or infinity for"),
+        (lambda texts: [[1.0] * 4 for _ in texts], TypeError, "must give a tensor of floats"),
+        ("my_texts:encode", TypeError, "text_encoder must be a function of texts, got 'my_texts:encode'"),
+    ],
+)
+def test_an_encoder_that_gives_no_vectors_is_named(encoder, error, message):
+    for make in (
+        lambda: lw.DescriptorConditionedActor("MT10", text_encoder=encoder),
+        lambda: lw.PlanConditionedActor(lw.load_plans("MT10"), text_encoder=encoder),
+    ):
+        with pytest.raises(error, match=message):
+            make()
