@@ -49,21 +49,22 @@ class PlanTables:
         """Raise :class:`ValueError` where queries were answered of other plans.
 
         Args:
-            number: (...) int64, the number of the plan whose queries were answered; None if it is not known.
+            number: (...) int64, the number of the plan whose queries were answered; 0, or None for all, where it is
+                not known.
             rows: (...) int64, as from :meth:`rows`.
         """
         if number is None:
             return
         if torch.compiler.is_compiling():
             own = self.number.to(number.device)[rows]
-            torch._assert_async((own == number).all(), "qaf answers other plans than the actor's")
+            torch._assert_async(((own == number) | (number == 0)).all(), "qaf answers other plans than the actor's")
         if not readable(number, rows):
             return
         if number.device != self.number.device:
             self.number = self.number.to(number.device)
         own = self.number[rows]
-        if not torch.equal(own, number):
-            tasks = ", ".join(self.index.tasks[row] for row in rows[own != number].unique().tolist()[:5])
+        if not torch.equal(own, number) and (wrong := (own != number) & (number != 0)).any():
+            tasks = ", ".join(self.index.tasks[row] for row in rows[wrong].unique().tolist()[:5])
             raise ValueError(
                 f"qaf answers other plans than the actor's, for {tasks}: give QAFTransform the actor's plans, "
                 "QAFTransform(actor.plans), or the actor those of QAFTransform, actor.with_plans(plans)"

@@ -42,7 +42,8 @@ class Value(TensorDictModuleBase):
     Example:
         >>> import lw_torchrl as lw, torch
         >>> from lw_torchrl.modules import DescriptorEncoder, Value
-        >>> Value(DescriptorEncoder("MT10"))(observation=torch.rand(5, 39), task_id=torch.full((5,), 33)).shape
+        >>> reach = torch.full((5,), lw.task_id("reach"))
+        >>> Value(DescriptorEncoder("MT10"))(observation=torch.rand(5, 39), task_id=reach).shape
         torch.Size([5, 1])
 
     Source: ``torchrl.modules.ValueOperator``.

@@ -3,12 +3,14 @@
 import lw_torchrl._torchrl  # noqa: F401
 from lw_torchrl.trainers.behavioral_cloning import BehavioralCloningConfig, BehavioralCloningTrainer
 from lw_torchrl.trainers.checkpoint import load_actor, save_actor
+from lw_torchrl.trainers.normalization import fit_normalization
 from lw_torchrl.trainers.stacked import StackedBehavioralCloning
 
 __all__ = [
     "BehavioralCloningConfig",
     "BehavioralCloningTrainer",
     "StackedBehavioralCloning",
+    "fit_normalization",
     "load_actor",
     "save_actor",
 ]

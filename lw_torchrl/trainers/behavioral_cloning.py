@@ -23,6 +23,7 @@ from lw_torchrl._progress import Progress
 from lw_torchrl.modules.policy import Policy, plans_of
 from lw_torchrl.trainers.checkpoint import check_can_be_saved, describe_data, write
 from lw_torchrl.trainers.interrupts import interrupts_between_steps
+from lw_torchrl.trainers.normalization import fit_normalization
 from lw_torchrl.trainers.training_state import TrainingState, check_description, load_state, load_training, state_of
 
 LOSSES = ("l1", "l2", "smooth_l1")
@@ -100,16 +101,6 @@ def check_belongs(actor: Any, replay: TensorDictReplayBuffer) -> None:
                 f"replay's QAFTransform must have the actor's plans, they differ for {', '.join(different)}; use "
                 "actor.transform()"
             )
-
-
-def fit_normalization(actor: Policy, replay: TensorDictReplayBuffer) -> None:
-    """Give the actor the statistics of the buffer's rows, each as often as :class:`CoLearningSampler` draws it.
-
-    Without the weights a target's few rows would not count, and its features lie far outside the base tasks' range.
-    """
-    weigh = getattr(replay.sampler, "row_weights", None)
-    weights = None if weigh is None else weigh(replay.storage)
-    actor.fit_normalization(replay.storage.get(slice(0, len(replay))).get("observation"), weights)
 
 
 class BehavioralCloningTrainer:

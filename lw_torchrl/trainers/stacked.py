@@ -20,11 +20,11 @@ from lw_torchrl.modules.policy import Policy
 from lw_torchrl.trainers.behavioral_cloning import (
     BehavioralCloningConfig,
     check_belongs,
-    fit_normalization,
     make_optimizer,
 )
 from lw_torchrl.trainers.checkpoint import check_can_be_saved, describe_data, write
 from lw_torchrl.trainers.interrupts import interrupts_between_steps
+from lw_torchrl.trainers.normalization import fit_normalization
 from lw_torchrl.trainers.training_state import TrainingState, check_description, load_state, load_training, state_of
 
 

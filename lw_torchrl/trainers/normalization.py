@@ -1,0 +1,84 @@
+"""Normalisation of what policies, critics and whole losses see, from the rows of a replay buffer."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torchrl.data import TensorDictReplayBuffer
+from torchrl.objectives import LossModule
+
+from lw_torchrl.modules.critics import Value
+from lw_torchrl.modules.observation_features import ObservationFeatures
+from lw_torchrl.modules.policy import Policy
+
+
+def fit_normalization(target: nn.Module, replay: TensorDictReplayBuffer) -> None:
+    """Give a policy, a critic, or all that a loss holds, the statistics of a buffer's rows.
+
+    A TorchRL loss copies the networks it is given, buffers included: statistics that the networks get later never
+    reach its critics' copies, nor its targets. Here they get them, all the same. Each row counts as often as
+    :class:`CoLearningSampler` draws it: without weights a target's few rows would not count, and its features lie far
+    outside the base tasks' range.
+
+    Args:
+        target: a :class:`Policy`, a critic, a module with :class:`ObservationFeatures` in it, or a loss of such.
+        replay: rows of ``observation`` (39,) float32.
+
+    Raises:
+        ValueError: there is nothing in it to normalise, or a row holds NaN or infinity.
+
+    Example:
+        >>> import lw_torchrl as lw, torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+        >>> from torchrl.objectives import TD3Loss
+        >>> from lw_torchrl.trainers import fit_normalization
+        >>> replay = TensorDictReplayBuffer(storage=LazyTensorStorage(64), batch_size=8)
+        >>> _ = replay.extend(TensorDict(observation=torch.rand(64, 39)).auto_batch_size_(1))
+        >>> plans = lw.load_plans("MT10")
+        >>> loss = TD3Loss(lw.PlanConditionedActor(plans), lw.PlanConditionedQValue(plans), bounds=(-1.0, 1.0))
+        >>> fit_normalization(loss, replay)
+        >>> loss.target_qvalue_network_params["encoder", "features", "mean"].shape  # of two critics
+        torch.Size([2, 56])
+
+    Source: :meth:`Policy.fit_normalization`.
+    """
+    weigh = getattr(replay.sampler, "row_weights", None)
+    weights = None if weigh is None else weigh(replay.storage)
+    observation = replay.storage.get(slice(0, len(replay))).get("observation")
+    if isinstance(target, (Policy, Value)):
+        target.fit_normalization(observation, weights)
+        return
+    known: dict[str, ObservationFeatures] = {}
+    for kind, mean, std in _statistics(target):
+        if kind not in known:
+            known[kind] = ObservationFeatures(kind).to(observation.device)  # type: ignore[arg-type]
+            known[kind].fit(observation, weights)
+        with torch.no_grad():
+            mean.copy_(known[kind].mean)
+            std.copy_(known[kind].std)
+    if not known:
+        raise ValueError(f"{type(target).__name__} holds no ObservationFeatures: there is nothing to normalise")
+
+
+def _statistics(target: nn.Module) -> Iterator[tuple[str, Tensor, Tensor]]:
+    """The kind of each :class:`ObservationFeatures`, its mean and its standard deviation; of a loss, every copy's."""
+    if not isinstance(target, LossModule):
+        for module in target.modules():
+            if isinstance(module, ObservationFeatures):
+                yield module.kind, module.mean, module.std
+        return
+    for name, network in vars(target).items():  # a loss keeps its networks there, without their parameters
+        if not isinstance(network, nn.Module):
+            continue
+        for path, module in network.named_modules():
+            if isinstance(module, ObservationFeatures):
+                for copy in (f"{name}_params", f"target_{name}_params"):
+                    params: Any = getattr(target, copy, None)
+                    if isinstance(params, TensorDictBase):
+                        mean, std = (params.get((*path.split("."), buffer)) for buffer in ("mean", "std"))
+                        yield module.kind, mean.data, std.data

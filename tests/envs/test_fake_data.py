@@ -1,0 +1,56 @@
+"""A policy acts on an environment's fake data, which TorchRL makes to find out what it writes."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torchrl.envs import ParallelEnv, SerialEnv, StepCounter, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+import lw_torchrl as lw
+
+PLANS = lw.load_plans("MT10")
+
+
+def make(tasks=("push", "reach")):
+    return TransformedEnv(lw.LanguageWorldEnv(tasks, num_envs=3), lw.QAFTransform(PLANS))
+
+
+MAKERS = {
+    "one": make,
+    "counted": lambda: make().append_transform(StepCounter()),
+    "serial": lambda: SerialEnv(2, make),
+    "serial of different tasks": lambda: SerialEnv(2, [make, lambda: make(("door-open", "drawer-close", "push"))]),
+    "parallel": lambda: ParallelEnv(2, make, mp_start_method="fork"),
+}
+
+
+@pytest.mark.parametrize("name", MAKERS)
+@pytest.mark.parametrize(
+    "policy",
+    [lw.PlanConditionedActor, lw.ScriptedSkillActor, lambda plans: lw.DescriptorConditionedActor(tuple(plans))],
+    ids=["plan", "scripted", "description"],
+)
+def test_a_policy_acts_on_fake_data(name, policy):
+    env = MAKERS[name]()
+    fake = env.fake_tensordict()
+    assert policy(PLANS)(fake)["action"].shape == (*env.batch_size, 4)
+    if name == "one":
+        assert fake["task_id"].tolist() == [lw.task_id(task) for task in ("push", "reach", "push")]
+        assert torch.equal(fake["task_id"], fake["next", "task_id"])
+    check_env_specs(env)
+    env.close()
+
+
+def test_the_ids_follow_every_change_of_shape():
+    spec = make().observation_spec["task_id"]
+    ids = spec.zero()
+    assert torch.equal(spec.clone().zero(), ids)
+    assert torch.equal(spec.expand(2, 3).zero(), ids.expand(2, 3))
+    assert torch.equal(spec.unsqueeze(0).zero(), ids.unsqueeze(0))
+    assert torch.equal(spec.unsqueeze(0).squeeze(0).zero(), ids)
+    assert torch.equal(spec[1:].zero(), ids[1:])
+    assert torch.equal(spec.reshape(3, 1).zero(), ids.reshape(3, 1))
+    assert torch.equal(spec.unflatten(0, (3, 1)).zero(), ids.reshape(3, 1))
+    assert torch.equal(spec.to("cpu").zero(), ids)
+    assert torch.equal(spec.zero((2,)), ids.expand(2, 3))
