@@ -1,0 +1,65 @@
+"""Deployment: queries and actor as one graph, compiled or exported, of any number of rows."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+
+import lw_torchrl as lw
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*Function.* should not be instantiated")  # by TorchRL's tanh
+PLANS = lw.load_plans("MT10")
+SMALL = dict(width=16, depth=1)
+ACTORS = {
+    "plan": lambda: lw.PlanConditionedActor(PLANS, **SMALL),
+    "focus": lambda: lw.PlanConditionedActor(PLANS, focus=True, **SMALL),
+    "actions": lambda: lw.PlanConditionedActor(PLANS, mix="actions", **SMALL),
+    "stochastic": lambda: lw.PlanConditionedActor(PLANS, distribution="tanh_normal", **SMALL),
+    "description": lambda: lw.DescriptorConditionedActor("MT10", **SMALL),
+    "scripted": lambda: lw.ScriptedSkillActor(PLANS),
+    "ensemble": lambda: lw.ActorEnsemble([lw.PlanConditionedActor(PLANS, **SMALL) for _ in range(2)]),
+}
+
+
+class Deployed(nn.Module):
+    """Observation and task to the action."""
+
+    def __init__(self, actor):
+        super().__init__()
+        self.actor, self.queries = actor, lw.QAFTransform(PLANS)
+
+    def forward(self, observation, task_id):
+        state = TensorDict({"observation": observation, "task_id": task_id}, [observation.shape[0]])
+        return self.actor(self.queries(state))["action"]
+
+
+def make_rows(rows):
+    generator = torch.Generator().manual_seed(rows)
+    ids = torch.tensor([lw.task_id(task) for task in PLANS])[torch.randint(10, (rows,), generator=generator)]
+    return torch.rand(rows, 39, generator=generator), ids
+
+
+@pytest.mark.parametrize("name", ACTORS)
+def test_exported_it_gives_the_same_bits_at_every_number_of_rows(name):
+    module = Deployed(ACTORS[name]().eval())
+    rows = torch.export.Dim("rows", min=1, max=4096)
+    exported = torch.export.export(
+        module, make_rows(7), dynamic_shapes={"observation": {0: rows}, "task_id": {0: rows}}
+    ).module()
+    for number in (2, 7, 64):
+        with torch.no_grad():
+            assert torch.equal(exported(*make_rows(number)), module(*make_rows(number))), number
+    observation, ids = make_rows(7)
+    with pytest.raises(RuntimeError, match="task_id names tasks"):
+        exported(observation, torch.full_like(ids, lw.task_id("soccer")))
+
+
+@pytest.mark.parametrize("name", ACTORS)
+def test_compiled_it_is_one_graph(name):
+    module = Deployed(ACTORS[name]().eval())
+    compiled = torch.compile(module, fullgraph=True, backend="eager", dynamic=True)
+    for number in (2, 7, 64):
+        with torch.no_grad():
+            assert torch.equal(compiled(*make_rows(number)), module(*make_rows(number))), number
