@@ -31,12 +31,19 @@ def _threads(found: Locals) -> tuple[int, int]:
     return 0, 1
 
 
+def _remote(found: Locals) -> tuple[int, int]:
+    """A RayCollector tells its collectors who they are; those of other collectors are counted by their process."""
+    index = found.get("worker_idx")
+    return (0, 1) if index is None or parent_process() is not None else (index, MANY)
+
+
 # Where TorchRL (0.14) calls a factory: module and function to its (rank, of), from the function's local variables.
 _WORKERS: dict[tuple[str, str], Callable[[Locals], tuple[int, int]]] = {
     ("torchrl.envs.batched_envs", "SerialEnv._start_workers"): lambda found: (found["idx"], found["_num_workers"]),
     # An environment of environments, which starts its own at its first reset.
     ("torchrl.envs.batched_envs", "SerialEnv._reset"): lambda found: (found["i"], found["self"].num_workers),
     ("torchrl.envs.async_envs", "ThreadingAsyncEnvPool._setup"): _threads,
+    ("torchrl.collectors._single", "Collector.__init__"): _remote,
 }
 _WORKER_PROCESSES: dict[tuple[str, str], Callable[[Locals], tuple[int, int]]] = {
     ("torchrl.envs.batched_envs", "_run_worker_pipe_shared_mem"): lambda found: (
