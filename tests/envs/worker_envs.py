@@ -22,3 +22,17 @@ def make_serial() -> SerialEnv:
 
 def still(tensordict):
     return tensordict.set("action", torch.zeros(*tensordict.batch_size, 4))
+
+
+def make_push_reach() -> TransformedEnv:
+    env = lw.LanguageWorldEnv(["push", "reach"], num_envs=2, max_steps=5, num_threads=1)
+    return TransformedEnv(env, lw.QAFTransform(lw.load_plans("MT10")))
+
+
+def make_single() -> TransformedEnv:
+    return TransformedEnv(make_env(num_envs=1, max_steps=5), lw.QAFTransform(lw.load_plans("MT10")))
+
+
+def make_actor() -> lw.PlanConditionedActor:
+    torch.manual_seed(0)
+    return lw.PlanConditionedActor(lw.load_plans("MT10"), width=8, depth=1, distribution="tanh_normal")
