@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import json
 import os
 import re
@@ -20,7 +21,7 @@ except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
 JSON_LIMIT = 32 * 2**20
-"""Bytes of a JSON file; read, it takes some twenty times as much memory."""
+"""Bytes of a file of JSON or text; read, JSON takes some twenty times as much memory."""
 
 
 @contextmanager
@@ -124,11 +125,27 @@ def write_json(path: str | os.PathLike[str], value: Any) -> None:
     write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
 
 
+def read_bytes(path: Path | Traversable, limit: int) -> bytes:
+    """What a file holds, be it a file and of at most ``limit`` bytes: a pipe would wait, a device give for ever.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is no file, or larger.
+    """
+    if isinstance(path, Path) and path.exists() and not path.is_file():
+        raise ValueError("it is no file")
+    with path.open("rb") as stream:
+        if stream.seek(0, os.SEEK_END) > limit:
+            raise ValueError(f"it is larger than {limit} bytes")
+        stream.seek(0)
+        return stream.read()
+
+
 def read_text(path: Path | Traversable, error: type[ValueError]) -> str:
     """A text file in UTF-8, with or without a byte order mark; ``error`` names the file that is none."""
     try:
-        return path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as fault:
+        return io.TextIOWrapper(io.BytesIO(read_bytes(path, JSON_LIMIT)), encoding="utf-8-sig").read()
+    except ValueError as fault:
         raise error(f"{path}: must be a text file in UTF-8: {fault}") from fault
 
 
@@ -156,13 +173,7 @@ def read_json(path: str | os.PathLike[str], what: str, *, limit: int = JSON_LIMI
     """
     file = Path(path)
     try:
-        if file.exists() and not file.is_file():
-            raise ValueError("it is no file")
-        with file.open("rb") as stream:
-            content = stream.read(limit + 1)
-        if len(content) > limit:
-            raise ValueError(f"it is larger than {limit} bytes")
-        return parse_json(content)
+        return parse_json(read_bytes(file, limit))
     except ValueError as error:
         raise ValueError(f"{what} {str(file)!r} cannot be read: {error}") from error
 

@@ -9,11 +9,17 @@ import signal
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 
 from lw_torchrl import _files
-from lw_torchrl._files import read_json, replacing, sweep, write_json, write_text
+from lw_torchrl._files import read_json, read_text, replacing, sweep, write_json, write_text
+
+
+class OwnError(ValueError):
+    """A room's error for a file that is none of its own."""
+
 
 LEFT = "0123456789abcdef"  # what the name of a temporary file has in its middle
 
@@ -230,6 +236,42 @@ def test_a_name_with_signs_of_patterns_is_a_name(tmp_path):
 def test_sweeping_where_there_is_no_folder_does_nothing(tmp_path):
     assert sweep(tmp_path / "nowhere" / "a.json") == []
     assert not (tmp_path / "nowhere").exists()
+
+
+# ---- reading
+
+
+@pytest.fixture
+def in_time():
+    """The test fails, rather than waits, where a pipe is read that nobody writes to."""
+
+    def late(*_):
+        raise TimeoutError("it waits for a pipe")
+
+    before = signal.signal(signal.SIGALRM, late)
+    signal.alarm(20)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
+@pytest.mark.usefixtures("in_time")
+def test_text_is_read_from_files_alone_and_up_to_the_limit(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path, tmp_path / "pipe", Path("/dev/zero")):
+        with pytest.raises(OwnError, match=f"{path}: must be a text file in UTF-8: it is no file"):
+            read_text(path, OwnError)
+    with (tmp_path / "large").open("wb") as file:
+        file.truncate(_files.JSON_LIMIT + 1)
+    with pytest.raises(OwnError, match=f"large: must be a text file in UTF-8: it is larger than {_files.JSON_LIMIT} b"):
+        read_text(tmp_path / "large", OwnError)
+
+
+def test_text_has_one_kind_of_line_end_and_no_byte_order_mark(tmp_path):
+    (tmp_path / "a.txt").write_bytes("\ufeffä\r\nb\rc\n".encode())
+    assert read_text(tmp_path / "a.txt", OwnError) == "ä\nb\nc\n"
+    with pytest.raises(FileNotFoundError):
+        read_text(tmp_path / "nowhere", OwnError)
 
 
 # ---- JSON

@@ -11,7 +11,6 @@ Nothing is unpickled, and what the file says of sizes is held against what it ho
 from __future__ import annotations
 
 import os
-import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -120,7 +119,8 @@ def open_policy(path: str | os.PathLike[str]) -> TensorArchive:
     try:
         found = TensorArchive(path)
     except (ArchiveError, OSError) as error:
-        old = _is_version_1(Path(path))
+        names = error.names if isinstance(error, ArchiveError) else []
+        old = any(name.startswith(("components/", "manifest", "description/")) for name in names)
         raise ValueError(
             f"checkpoint: {str(path)!r} is of version 1, whose files can run code when they are read; this package "
             f"reads version {FORMAT_VERSION}. Train it again"
@@ -135,15 +135,6 @@ def open_policy(path: str | os.PathLike[str]) -> TensorArchive:
     if not isinstance(found.description.get("actor"), dict):
         raise ValueError(f"checkpoint: {str(path)!r} is damaged or none of ours (it describes no actor)")
     return found
-
-
-def _is_version_1(path: Path) -> bool:
-    """Whether it is an archive of TorchRL's ``Checkpoint``, told by its entries' names alone."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return any(name.startswith(("components/", "manifest", "description/")) for name in archive.namelist())
-    except Exception:  # whatever is wrong with it, it is none
-        return False
 
 
 def read_description(path: str | os.PathLike[str]) -> dict[str, Any]:
