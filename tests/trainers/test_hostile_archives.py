@@ -131,7 +131,7 @@ def test_entries_that_begin_beyond_the_file_are_refused(good, tmp_path, offset):
     first, last, end = content.index(b"PK\1\2"), content.rindex(b"PK\1\2"), content.rindex(b"PK\5\6")
     entry = bytearray(content[last:end])
     more = struct.pack("<HHQ", 1, 8, offset)  # the offset stands in a zip64 field
-    struct.pack_into("<HHHHHLL", entry, 30, len(more), 0, 0, 0, 0, 0, 2**32 - 1)
+    struct.pack_into("<4HLL", entry, 30, len(more), 0, 0, 0, 0, 2**32 - 1)
     directory = content[first:last] + bytes(entry) + more
     ending = bytearray(content[end:])
     struct.pack_into("<LL", ending, 12, len(directory), first)
