@@ -11,23 +11,27 @@ Nothing is unpickled, and what the file says of sizes is held against what it ho
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import torch
-from torch import Tensor, nn
-from torch.nn.modules.module import register_module_parameter_registration_hook
+from torch import Tensor
 
-from lw_torchrl._state_tree import check_like, split
+from lw_torchrl._state_tree import split
 from lw_torchrl._tensor_archive import ArchiveError, TensorArchive, write_archive
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.policy import Policy, from_description
+from lw_torchrl.trainers.policy_checks import (
+    at_most,
+    check_options,
+    check_texts,
+    copy_weights,
+    first_line,
+    text_vectors,
+)
 
 FORMAT = "lw_torchrl.policy"
 FORMAT_VERSION = 2
-_TEXT_TOLERANCE = 0.01  # of numbers of size 1: more than machines differ, far less than encoders do
 
 
 def describe_data(replay: Any) -> dict[str, Any] | None:
@@ -106,11 +110,6 @@ def write(
         ) from error
 
 
-def text_vectors(actor: nn.Module) -> dict[str, Tensor]:
-    """The vectors of an actor's texts, by the name of the buffer that holds them."""
-    return {name: buffer for name, buffer in actor.named_buffers() if name.rpartition(".")[2] == "text_vectors"}
-
-
 def open_policy(path: str | os.PathLike[str]) -> TensorArchive:
     """The archive of a policy file, whose format, version and actor it has checked; errors as of
     :func:`read_description`."""
@@ -170,9 +169,8 @@ def load_actor(path: str | os.PathLike[str], *, text_encoder: TextEncoder | None
     archive = open_policy(path)
     try:
         weights, texts = archive.tensors("weights"), archive.tensors("texts")
-        numbers = sum(tensor.numel() for tensor in weights.values())
-        _check_options(archive.description["actor"], numbers)
-        with _at_most(numbers):
+        check_options(archive.description["actor"], weights)
+        with at_most(weights):
             actor = from_description(archive.description["actor"], text_encoder)
         check_texts(texts, text_vectors(actor))
         copy_weights(weights, actor.state_dict())
@@ -181,59 +179,3 @@ def load_actor(path: str | os.PathLike[str], *, text_encoder: TextEncoder | None
     except Exception as error:  # a file from a stranger may say anything
         raise ValueError(f"checkpoint: the actor of {str(path)!r} cannot be made ({first_line(error)})") from error
     return actor.eval()
-
-
-def first_line(error: Exception) -> str:
-    """What an error says, up to 400 characters of its first line."""
-    return (str(error).splitlines() or [type(error).__name__])[0][:400]
-
-
-def _check_options(found: Any, numbers: int) -> None:
-    """Refuse integers that no network of so many numbers can have, before lists of that length are made."""
-    inside = found.values() if isinstance(found, dict) else found if isinstance(found, list) else ()
-    if isinstance(found, int) and abs(found) > max(numbers, 2**16):
-        raise ValueError(f"it says {found:.3g}, but holds only {numbers} numbers")
-    for one in inside:
-        _check_options(one, numbers)
-
-
-@contextmanager
-def _at_most(numbers: int) -> Iterator[None]:
-    """Stop a module that is being made as soon as its parameters are more than ``numbers``, before they are filled."""
-    made = 0
-
-    def count(module: nn.Module, name: str, parameter: nn.Parameter | None) -> None:
-        nonlocal made
-        made += 0 if parameter is None else parameter.numel()
-        if made > numbers:
-            raise ValueError(f"it describes a network of more than the {numbers} numbers that it holds")
-
-    handle = register_module_parameter_registration_hook(count)
-    try:
-        yield
-    finally:
-        handle.remove()
-
-
-@torch.no_grad()
-def copy_weights(stored: Mapping[str, Tensor], live: Mapping[str, Tensor]) -> None:
-    """Copy weights in place; :class:`ValueError` where a name, shape or dtype differs."""
-    check_like(stored, dict(live), "weights")
-    for name, tensor in live.items():
-        tensor.copy_(stored[name])
-
-
-def check_texts(stored: Mapping[str, Tensor], ours: Mapping[str, Tensor]) -> None:
-    """Raise :class:`ValueError` unless the texts have the vectors that they had when the file was written."""
-    for name, vectors in ours.items():
-        found = stored.get(name)
-        if found is None or found.shape != vectors.shape or found.dtype != vectors.dtype:
-            said = "none" if found is None else tuple(found.shape)
-            raise ValueError(
-                f"text_encoder gives vectors of shape {tuple(vectors.shape)}, the policy was made with {said}"
-            )
-        if not torch.allclose(found, vectors.cpu(), atol=_TEXT_TOLERANCE, rtol=0.0):
-            raise ValueError(
-                "text_encoder is not the one that the policy was made with: its texts have other vectors; pass that "
-                "one as text_encoder"
-            )

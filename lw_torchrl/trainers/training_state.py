@@ -13,14 +13,8 @@ from torch import Tensor
 
 from lw_torchrl._state_tree import check_like, check_optimizer_state, join
 from lw_torchrl.modules.policy import Policy
-from lw_torchrl.trainers.checkpoint import (
-    check_texts,
-    copy_weights,
-    first_line,
-    open_policy,
-    read_description,
-    text_vectors,
-)
+from lw_torchrl.trainers.checkpoint import open_policy, read_description
+from lw_torchrl.trainers.policy_checks import check_texts, copy_weights, first_line, text_vectors
 
 Schedule = torch.optim.lr_scheduler.LRScheduler
 

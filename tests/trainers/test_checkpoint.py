@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import threading
 import zipfile
 
 import pytest
@@ -121,6 +122,22 @@ def test_another_text_encoder_is_found_out(saved, tmp_path):
         with pytest.raises(ValueError, match="text_encoder is not the one that the policy was made with"):
             load_actor(path, text_encoder=other)
     load_actor(path, text_encoder=lambda texts: counted(texts) * 3.0)  # the same after scaling
+
+
+def test_what_another_thread_makes_meanwhile_is_none_of_its_business(tmp_path):
+    """Loading bounds the modules that it makes itself; neither thread notices the other."""
+    save_actor(PlanConditionedActor(own_plans(), text_encoder=counted, **SMALL), tmp_path / "own.zip")
+    made = []
+
+    def beside(texts):
+        thread = threading.Thread(target=lambda: made.append(nn.Linear(1000, 1000)))
+        thread.start()
+        thread.join()
+        return counted(texts)
+
+    load_actor(tmp_path / "own.zip", text_encoder=beside)
+    assert made
+    nn.Linear(1000, 1000)
 
 
 def test_the_encoder_of_a_policy_on_descriptions_is_found_out_too(tmp_path):

@@ -108,6 +108,16 @@ def test_tensors_that_are_no_safetensors_are_refused(good, tmp_path, group, chan
     refuses(tmp_path / "c.zip")
 
 
+def test_more_layers_than_there_are_weights_are_refused_before_they_are_made(good, tmp_path):
+    """Their numbers are few enough, but each layer is a module of several kB."""
+    description, groups = parts(good)
+    changed("weights", lambda t: t.update({"more": torch.zeros(30_000)}))(description, groups)
+    description["actor"]["options"].update(width=1, depth=10_000)
+    rebuild(tmp_path / "c.zip", description, groups)
+    with pytest.raises(ValueError, match=r"checkpoint: .*describes a network of more weights than it holds"):
+        lw.load_actor(tmp_path / "c.zip")
+
+
 STATES = {
     "no state": None,
     "a list": [1, 2],
