@@ -19,7 +19,7 @@ def split(state: Any, tensors: dict[str, Tensor]) -> Any:
     """
     if isinstance(state, Tensor):
         name = str(len(tensors))
-        tensors[name] = state.detach().clone()
+        tensors[name] = state.detach()
         return {"tensor": name}
     if isinstance(state, Mapping):
         return {"dict": [[split(key, tensors), split(value, tensors)] for key, value in state.items()]}

@@ -48,17 +48,23 @@ def write_archive(
     Args:
         path: the file.
         description: JSON; ``sha256`` is added to it.
-        groups: name to tensors by name; they may share no memory.
+        groups: name to tensors by name.
 
     Raises:
+        ValueError: the description is no JSON that can be read again, or all is larger than what is read.
         OSError: the disk is full, say; an earlier file stays as it was.
     """
     data = {
-        f"{name}.safetensors": save({key: tensor.detach().cpu().contiguous() for key, tensor in tensors.items()})
+        f"{name}.safetensors": save(
+            {key: tensor.detach().cpu().contiguous().clone() for key, tensor in tensors.items()}
+        )
         for name, tensors in groups.items()
     }
     stated = {**description, "sha256": {name: sha256(content).hexdigest() for name, content in data.items()}}
     text = json.dumps(stated, indent=1, allow_nan=False).encode()
+    parse_json(text)
+    if len(text) > _MOST_JSON or sum(map(len, data.values())) + 2 * _MOST_JSON > _MOST_BYTES:
+        raise ValueError(f"files of over {_MOST_BYTES} bytes, or {_MOST_JSON} of JSON, are not read: none is written")
     with replacing(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
         for name, content in {_DESCRIPTION: text, **data}.items():
             archive.writestr(name, content)

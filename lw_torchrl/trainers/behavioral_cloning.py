@@ -21,8 +21,9 @@ from lw_torchrl._checks import check_choice, check_int, check_scale
 from lw_torchrl._files import sweep
 from lw_torchrl._progress import Progress
 from lw_torchrl.modules.policy import Policy, plans_of
-from lw_torchrl.trainers.checkpoint import check_can_be_saved, describe_data, write
+from lw_torchrl.trainers.checkpoint import describe_data, write
 from lw_torchrl.trainers.interrupts import interrupts_between_steps
+from lw_torchrl.trainers.policy_checks import check_can_be_saved, check_trained
 from lw_torchrl.trainers.training_state import TrainingState, check_description, load_state, load_training, state_of
 
 LOSSES = ("l1", "l2", "smooth_l1")
@@ -129,7 +130,7 @@ class BehavioralCloningTrainer:
 
     Raises:
         ValueError: the checkpoint is damaged, of another architecture, or of another configuration; the actor writes no
-            ``action``; or, in :meth:`train`, the loss is no number.
+            ``action``; or, in :meth:`train`, the loss or the weights are no numbers.
         TypeError: a checkpoint for an actor that is no :class:`Policy`.
         OSError: the checkpoint cannot be written; the earlier one stays.
 
@@ -162,9 +163,9 @@ class BehavioralCloningTrainer:
         self.config = config = config or BehavioralCloningConfig()
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
         check_belongs(actor, replay)
+        self._policy = None if self.checkpoint is None else check_can_be_saved(actor)
         if self.checkpoint is not None:
             sweep(self.checkpoint)
-            check_can_be_saved(actor)
         if replay._prefetch:
             raise ValueError("replay must not prefetch: batches drawn ahead would be lost when training is resumed")
         generator = torch.Generator().manual_seed(config.seed)
@@ -174,10 +175,9 @@ class BehavioralCloningTrainer:
             self.loss = BCLoss(actor, loss_function=config.loss_function)
         self.optimizer, self.schedule = make_optimizer(self.loss.parameters(), config)
         self.state = TrainingState(replay.sampler, generator)
-        if self.checkpoint is not None and self.checkpoint.exists():
-            policy = check_can_be_saved(actor)
-            check_description(self.checkpoint, self._describe(policy))
-            found = load_training(self.checkpoint, policy, policy.state_dict())
+        if self.checkpoint is not None and self._policy is not None and self.checkpoint.exists():
+            check_description(self.checkpoint, self._describe(self._policy))
+            found = load_training(self.checkpoint, self._policy, self._policy.state_dict(keep_vars=True))
             load_state(self.checkpoint, found, self.optimizer, self.schedule, [self.state])
         elif config.normalize and isinstance(actor, Policy):
             fit_normalization(actor, replay)
@@ -186,11 +186,15 @@ class BehavioralCloningTrainer:
         return {"actor": policy.describe(), "training": asdict(self.config), "data": describe_data(self.replay)}
 
     def save(self) -> None:
-        """Write the checkpoint; an earlier one is replaced whole."""
-        if self.checkpoint is not None:
-            policy = check_can_be_saved(self.actor)
+        """Write the checkpoint, if there is to be one; an earlier one is replaced whole.
+
+        Raises:
+            ValueError: the weights are no finite numbers.
+        """
+        check_trained(dict(self.actor.named_parameters()), self.state.step)
+        if self.checkpoint is not None and self._policy is not None:
             state = state_of(self.optimizer, self.schedule, [self.state])
-            write(self.checkpoint, self._describe(policy), policy, policy.state_dict(), state)
+            write(self.checkpoint, self._describe(self._policy), self._policy, self._policy.state_dict(), state)
 
     def step(self) -> float:
         """Train on one minibatch and return its loss."""

@@ -23,6 +23,7 @@ from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.policy import Policy, from_description
 from lw_torchrl.trainers.policy_checks import (
     at_most,
+    check_can_be_saved,
     check_options,
     check_texts,
     copy_weights,
@@ -32,28 +33,13 @@ from lw_torchrl.trainers.policy_checks import (
 
 FORMAT = "lw_torchrl.policy"
 FORMAT_VERSION = 2
+_RESERVED = {"format", "version", "actor", "state", "sha256"}
 
 
 def describe_data(replay: Any) -> dict[str, Any] | None:
     """What demonstrations a replay buffer shows, as JSON; None for a buffer that is none of ours."""
     demonstrations = getattr(replay, "demonstrations", None)
     return None if demonstrations is None else demonstrations.config.to_json()
-
-
-def check_can_be_saved(actor: Any) -> Policy:
-    """Return the actor if a policy file can hold it: what cannot be loaded again is refused before any training.
-
-    Raises:
-        TypeError: it is no :class:`Policy`.
-        ValueError: it is one that its own description does not make again.
-    """
-    if not isinstance(actor, Policy):
-        raise TypeError(
-            f"actor must be a Policy to be kept in a file, got {type(actor).__name__}: save the policy inside of it, "
-            "derive your class from lw_torchrl.Policy, or train without a checkpoint"
-        )
-    actor.describe()
-    return actor
 
 
 def save_actor(actor: Policy, path: str | os.PathLike[str], **about: Any) -> None:
@@ -66,6 +52,8 @@ def save_actor(actor: Policy, path: str | os.PathLike[str], **about: Any) -> Non
 
     Raises:
         TypeError: the actor is no :class:`Policy`.
+        ValueError: it is one that :func:`load_actor` would not make again: its weights are of other names, shapes or
+            dtypes than its description's, or are no finite numbers; or ``about`` names what a file says itself.
         OSError: it cannot be written; an earlier file stays.
 
     Example:
@@ -75,6 +63,8 @@ def save_actor(actor: Policy, path: str | os.PathLike[str], **about: Any) -> Non
         >>> lw.load_actor(path).config["width"]
         8
     """
+    if reserved := _RESERVED & set(about):
+        raise ValueError(f"about must not be named {', '.join(sorted(reserved))}, which a policy file says itself")
     checked = check_can_be_saved(actor)
     write(path, {"actor": checked.describe(), **about}, checked, checked.state_dict())
 
@@ -162,8 +152,8 @@ def load_actor(path: str | os.PathLike[str], *, text_encoder: TextEncoder | None
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it is damaged, or its weights, sizes or texts are not those that it says; or the text encoder is
-            another than the policy was trained with.
+        ValueError: it is damaged, or its weights, sizes or texts are not those that it says, or are no finite numbers;
+            or the text encoder is another than the policy was trained with.
         ImportError: its texts are not shipped, and the extra ``[text]`` is not installed.
     """
     archive = open_policy(path)
@@ -173,7 +163,7 @@ def load_actor(path: str | os.PathLike[str], *, text_encoder: TextEncoder | None
         with at_most(weights):
             actor = from_description(archive.description["actor"], text_encoder)
         check_texts(texts, text_vectors(actor))
-        copy_weights(weights, actor.state_dict())
+        copy_weights(weights, actor.state_dict(keep_vars=True))
     except ImportError:
         raise
     except Exception as error:  # a file from a stranger may say anything

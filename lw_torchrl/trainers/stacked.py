@@ -23,8 +23,9 @@ from lw_torchrl.trainers.behavioral_cloning import (
     fit_normalization,
     make_optimizer,
 )
-from lw_torchrl.trainers.checkpoint import check_can_be_saved, describe_data, write
+from lw_torchrl.trainers.checkpoint import describe_data, write
 from lw_torchrl.trainers.interrupts import interrupts_between_steps
+from lw_torchrl.trainers.policy_checks import check_can_be_saved, check_trained
 from lw_torchrl.trainers.training_state import TrainingState, check_description, load_state, load_training, state_of
 
 
@@ -54,7 +55,7 @@ class StackedBehavioralCloning:
 
     Raises:
         ValueError: not as many buffers as actors, or actors of different shapes; a checkpoint that is damaged, or of
-            other actors or another configuration; in :meth:`train`, a loss that is no number.
+            other actors or another configuration; in :meth:`train`, a loss or weights that are no numbers.
 
     Example:
         >>> import lw_torchrl as lw, tempfile
@@ -123,7 +124,12 @@ class StackedBehavioralCloning:
         }
 
     def save(self) -> None:
-        """Write the checkpoint; an earlier one is replaced whole."""
+        """Write the checkpoint, if there is to be one; an earlier one is replaced whole.
+
+        Raises:
+            ValueError: the weights are no finite numbers.
+        """
+        check_trained(self._parameters, self.steps)
         if self.checkpoint is not None:
             state = state_of(self.optimizer, self.schedule, self.states)
             write(self.checkpoint, self._describe(), self.actors[0], self._parameters, state)

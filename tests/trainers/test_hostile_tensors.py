@@ -118,6 +118,30 @@ def test_more_layers_than_there_are_weights_are_refused_before_they_are_made(goo
         lw.load_actor(tmp_path / "c.zip")
 
 
+@pytest.mark.parametrize(
+    ("ending", "value", "message"),
+    [
+        ("weight", float("nan"), "must be finite"),
+        ("bias", float("-inf"), "must be finite"),
+        ("features.mean", float("inf"), "must be finite"),
+        ("features.std", float("nan"), "must be finite"),
+        ("features.std", 0.0, "must be above 0"),
+        ("features.std", -1.0, "must be above 0"),
+    ],
+)
+def test_weights_that_are_no_numbers_are_refused(good, tmp_path, ending, value, message):
+    description, groups = parts(good)
+
+    def spoil(tensors):
+        tensors[next(name for name in tensors if name.endswith(ending))].view(-1)[-1] = value
+
+    changed("weights", spoil)(description, groups)
+    rebuild(tmp_path / "c.zip", description, groups)
+    refuses(tmp_path / "c.zip")
+    with pytest.raises(ValueError, match=rf"weights: .*{ending} {message}"):
+        lw.load_actor(tmp_path / "c.zip")
+
+
 STATES = {
     "no state": None,
     "a list": [1, 2],
