@@ -77,12 +77,11 @@ def make_optimizer(
 ) -> tuple[torch.optim.Optimizer, torch.optim.lr_scheduler.LRScheduler]:
     """The optimizer of a configuration, and its schedule."""
     optimizer: torch.optim.Optimizer
+    rate = float(config.learning_rate)  # as it is in a checkpoint
     if config.optimizer == "adamw":
-        optimizer = torch.optim.AdamW(parameters, lr=config.learning_rate, weight_decay=config.weight_decay)
+        optimizer = torch.optim.AdamW(parameters, lr=rate, weight_decay=config.weight_decay)
     else:
-        optimizer = torch.optim.SGD(
-            parameters, lr=config.learning_rate, momentum=config.momentum, weight_decay=config.weight_decay
-        )
+        optimizer = torch.optim.SGD(parameters, lr=rate, momentum=config.momentum, weight_decay=config.weight_decay)
     if config.schedule == "cosine":
         return optimizer, torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, config.steps)
     return optimizer, torch.optim.lr_scheduler.LambdaLR(optimizer, lambda _: 1.0)
@@ -178,7 +177,7 @@ class BehavioralCloningTrainer:
         if self.checkpoint is not None and self._policy is not None and self.checkpoint.exists():
             check_description(self.checkpoint, self._describe(self._policy))
             found = load_training(self.checkpoint, self._policy, self._policy.state_dict(keep_vars=True))
-            load_state(self.checkpoint, found, self.optimizer, self.schedule, [self.state])
+            load_state(self.checkpoint, found, self.optimizer, self.schedule, [self.state], config.steps)
         elif config.normalize and isinstance(actor, Policy):
             fit_normalization(actor, replay)
 

@@ -113,7 +113,7 @@ class StackedBehavioralCloning:
         if self.checkpoint is not None and self.checkpoint.exists():
             check_description(self.checkpoint, self._describe())
             found = load_training(self.checkpoint, self.actors[0], self._parameters)
-            load_state(self.checkpoint, found, self.optimizer, self.schedule, self.states)
+            load_state(self.checkpoint, found, self.optimizer, self.schedule, self.states, config.steps)
 
     def _describe(self) -> dict[str, Any]:
         data = {str(number): describe_data(replay) for number, replay in enumerate(self.replays)}

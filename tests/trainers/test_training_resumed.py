@@ -72,6 +72,14 @@ def test_torchrls_samplers_resume_too(demos, tmp_path, sampler):
     assert_same(everything(resumed), everything(whole))
 
 
+def test_a_learning_rate_that_is_an_integer_resumes_too(demos, tmp_path):
+    config = BehavioralCloningConfig(steps=12, batch_size=8, checkpoint_every=5, learning_rate=1)
+    path = tmp_path / "checkpoint.zip"
+    with pytest.raises(KeyboardInterrupt):
+        make_trainer(demos, path, config=config, stop_at=7).train()
+    assert make_trainer(demos, path, config=config).state.step == 5
+
+
 def test_a_finished_training_does_nothing_twice(demos, undisturbed, tmp_path):
     path = tmp_path / "checkpoint.zip"
     make_trainer(demos, path).train()
