@@ -21,7 +21,7 @@ from lw_torchrl._checks import check_choice, check_int, check_scale
 from lw_torchrl._files import sweep
 from lw_torchrl._progress import Progress
 from lw_torchrl.modules.policy import Policy, plans_of
-from lw_torchrl.trainers.checkpoint import describe_data, write
+from lw_torchrl.trainers.checkpoint import describe_data, describe_replay, write
 from lw_torchrl.trainers.interrupts import interrupts_between_steps
 from lw_torchrl.trainers.policy_checks import check_can_be_saved, check_trained
 from lw_torchrl.trainers.training_state import TrainingState, check_description, load_state, load_training, state_of
@@ -128,7 +128,7 @@ class BehavioralCloningTrainer:
         progress: show a progress bar.
 
     Raises:
-        ValueError: the checkpoint is damaged, of another architecture, or of another configuration; the actor writes no
+        ValueError: the checkpoint is damaged, of another architecture, configuration or data; the actor writes no
             ``action``; or, in :meth:`train`, the loss or the weights are no numbers.
         TypeError: a checkpoint for an actor that is no :class:`Policy`.
         OSError: the checkpoint cannot be written; the earlier one stays.
@@ -163,8 +163,11 @@ class BehavioralCloningTrainer:
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
         check_belongs(actor, replay)
         self._policy = None if self.checkpoint is None else check_can_be_saved(actor)
-        if self.checkpoint is not None:
+        self._described: dict[str, Any] = {}
+        if self.checkpoint is not None and self._policy is not None:
             sweep(self.checkpoint)
+            self._described = {"actor": self._policy.describe(), "training": asdict(config)}
+            self._described |= {"data": describe_data(replay), "replay": describe_replay(replay)}
         if replay._prefetch:
             raise ValueError("replay must not prefetch: batches drawn ahead would be lost when training is resumed")
         generator = torch.Generator().manual_seed(config.seed)
@@ -175,14 +178,11 @@ class BehavioralCloningTrainer:
         self.optimizer, self.schedule = make_optimizer(self.loss.parameters(), config)
         self.state = TrainingState(replay.sampler, generator)
         if self.checkpoint is not None and self._policy is not None and self.checkpoint.exists():
-            check_description(self.checkpoint, self._describe(self._policy))
+            check_description(self.checkpoint, self._described)
             found = load_training(self.checkpoint, self._policy, self._policy.state_dict(keep_vars=True))
             load_state(self.checkpoint, found, self.optimizer, self.schedule, [self.state], config.steps)
         elif config.normalize and isinstance(actor, Policy):
             fit_normalization(actor, replay)
-
-    def _describe(self, policy: Policy) -> dict[str, Any]:
-        return {"actor": policy.describe(), "training": asdict(self.config), "data": describe_data(self.replay)}
 
     def save(self) -> None:
         """Write the checkpoint, if there is to be one; an earlier one is replaced whole.
@@ -193,7 +193,7 @@ class BehavioralCloningTrainer:
         check_trained(dict(self.actor.named_parameters()), self.state.step)
         if self.checkpoint is not None and self._policy is not None:
             state = state_of(self.optimizer, self.schedule, [self.state])
-            write(self.checkpoint, self._describe(self._policy), self._policy, self._policy.state_dict(), state)
+            write(self.checkpoint, self._described, self._policy, self._policy.state_dict(), state)
 
     def step(self) -> float:
         """Train on one minibatch and return its loss."""

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from torch import Tensor
+from torchrl.envs import Compose, Transform
 
 from lw_torchrl._state_tree import split
 from lw_torchrl._tensor_archive import ArchiveError, TensorArchive, write_archive
@@ -40,6 +41,23 @@ def describe_data(replay: Any) -> dict[str, Any] | None:
     """What demonstrations a replay buffer shows, as JSON; None for a buffer that is none of ours."""
     demonstrations = getattr(replay, "demonstrations", None)
     return None if demonstrations is None else demonstrations.config.to_json()
+
+
+def describe_replay(replay: Any) -> dict[str, Any]:
+    """How a replay buffer shows its rows, as JSON: what else than :func:`describe_data` its batches hang on."""
+    parts = [part for part in replay.transform.modules() if isinstance(part, Transform)]
+    return {
+        "label": getattr(replay, "label", None),
+        "rows": None if describe_data(replay) is None else len(replay),  # after_success leaves so many
+        "sampler": type(replay.sampler).__name__,
+        "transforms": [_describe_transform(part) for part in parts if not isinstance(part, Compose)],
+    }
+
+
+def _describe_transform(transform: Transform) -> dict[str, str]:
+    options = {name: value for name, value in vars(transform).items() if name[0] != "_" and name != "training"}
+    simple = {name: repr(value) for name, value in options.items() if isinstance(value, (bool, int, float, str))}
+    return {"class": type(transform).__name__, **simple}
 
 
 def save_actor(actor: Policy, path: str | os.PathLike[str], **about: Any) -> None:

@@ -16,6 +16,9 @@ from lw_torchrl.modules.policy import Policy
 from lw_torchrl.trainers.checkpoint import open_policy, read_description
 from lw_torchrl.trainers.policy_checks import check_texts, copy_weights, first_line, text_vectors
 
+_ADDED = {"actors", "replay"}
+"""What descriptions did not say at first: a training that was begun before then goes on."""
+
 Schedule = torch.optim.lr_scheduler.LRScheduler
 
 
@@ -65,11 +68,13 @@ def check_description(path: Path, ours: dict[str, Any]) -> None:
     """Raise :class:`ValueError` unless the file was saved with the description ``ours``."""
     found, ours = read_description(path), json.loads(json.dumps(ours))  # JSON has lists alone
     for part in ours:
+        if part in _ADDED and part not in found:
+            continue
         if found.get(part) != ours[part]:
             before, now = found.get(part) or {}, ours[part] or {}
             both = before if isinstance(before, dict) else {}
             different = sorted(key for key in {**both, **now} if both.get(key) != now.get(key))
-            kind = "architecture" if part == "actor" else "configuration"
+            kind = "architecture" if part in ("actor", "actors") else "configuration"
             raise ValueError(
                 f"checkpoint: {str(path)!r} is of another {kind}, its {part} differs in "
                 f"{', '.join(different)}; choose another file, or delete it to start again"
