@@ -3,46 +3,73 @@
 from __future__ import annotations
 
 import errno
+import io
 import json
 import os
 import re
+import secrets
 import tomllib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any, NoReturn
 
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
 JSON_LIMIT = 32 * 2**20
-"""Bytes of a JSON file; read, it takes some twenty times as much memory."""
+"""Bytes of a file of JSON or text; read, JSON takes some twenty times as much memory."""
 
 
 @contextmanager
 def replacing(path: str | os.PathLike[str], *, sync: bool = True) -> Iterator[Path]:
     """A temporary path beside ``path`` to write to; it takes the name when the block ends without an error.
 
-    Whenever the process is killed or the machine stops, ``path`` is the old file or the new one, whole. What a killed
-    process left beside it goes at the next write, see :func:`sweep`. Waiting for the disk takes some 10 ms; without
-    ``sync`` it is whole after a kill, but not if the machine stops.
+    Whenever the process is killed or the machine stops, ``path`` is the old file or the new one, whole; of several
+    writers at once, the last one's. What a killed process left beside it goes at the next write, see :func:`sweep`.
+    Waiting for the disk takes some 10 ms; without ``sync`` it is whole after a kill, but not if the machine stops.
     """
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
     sweep(target)
-    # The suffix stays, since writers choose the format by it.
-    temporary = target.with_name(f".{target.stem}.{os.getpid()}.tmp{target.suffix}")
+    with _temporary(target) as temporary:
+        try:
+            yield temporary
+            if sync:
+                flush(temporary)
+            os.replace(temporary, target)
+            if sync:
+                flush(target.parent)
+        except OSError as error:
+            if error.errno is not None and error.filename is None:
+                error.filename = str(target)  # a full disk does not say which file it was
+            raise
+
+
+@contextmanager
+def _temporary(target: Path) -> Iterator[Path]:
+    """A file beside ``target`` that is the caller's alone, locked while the block lasts: by that a sweep spares it."""
+    while True:
+        # The suffix stays, since writers choose the format by it.
+        path = target.with_name(f".{target.stem}.{secrets.token_hex(8)}.tmp{target.suffix}")
+        handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
+        if fcntl is not None:
+            with suppress(OSError):  # a file system without locks, where no sweep gets one either
+                fcntl.flock(handle, fcntl.LOCK_EX)
+        if path.exists():
+            break
+        os.close(handle)  # it was swept before it was locked
+    if fcntl is None:
+        os.close(handle)  # an open file cannot be renamed there
     try:
-        yield temporary
-        if sync:
-            flush(temporary)
-        os.replace(temporary, target)
-        if sync:
-            flush(target.parent)
-    except OSError as error:
-        if error.errno is not None and error.filename is None:
-            error.filename = str(target)  # a full disk does not say which file it was
-        raise
+        yield path
     finally:
-        temporary.unlink(missing_ok=True)
+        path.unlink(missing_ok=True)
+        if fcntl is not None:
+            os.close(handle)
 
 
 def flush(path: Path) -> None:
@@ -62,30 +89,28 @@ def flush(path: Path) -> None:
 def sweep(target: str | os.PathLike[str]) -> list[Path]:
     """Remove the temporary files that killed writers of ``target`` left beside it; returns them.
 
-    A file of a process of this machine that still runs stays, unless that process is this one.
+    One that is still being written is locked, by whatever thread, process or machine, and stays.
     """
     path = Path(target)
-    pattern = re.compile(re.escape(f".{path.stem}.") + r"([1-9][0-9]{0,9})\.tmp" + re.escape(path.suffix))
-    left = []
-    for name in os.listdir(path.parent) if path.parent.is_dir() else ():
-        if (match := pattern.fullmatch(name)) and not _runs(int(match[1])):
-            path.with_name(name).unlink(missing_ok=True)
-            left.append(path.with_name(name))
-    return left
+    pattern = re.compile(re.escape(f".{path.stem}.") + r"[0-9a-f]{16}\.tmp" + re.escape(path.suffix))
+    there = os.listdir(path.parent) if path.parent.is_dir() else ()
+    return [left for left in map(path.with_name, filter(pattern.fullmatch, there)) if _remove_unlocked(left)]
 
 
-def _runs(process: int) -> bool:
-    """Whether another process of this number runs."""
-    if process == os.getpid():
+def _remove_unlocked(path: Path) -> bool:
+    if fcntl is None:
         return False
-    if os.name != "posix":
-        return True  # there, signal 0 would end it
     try:
-        os.kill(process, 0)
-    except (ProcessLookupError, OverflowError):
+        handle = os.open(path, os.O_RDWR | os.O_NOFOLLOW)
+    except OSError:
         return False
-    except PermissionError:
-        return True
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        path.unlink()
+    except OSError:
+        return False
+    finally:
+        os.close(handle)
     return True
 
 
@@ -100,11 +125,27 @@ def write_json(path: str | os.PathLike[str], value: Any) -> None:
     write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
 
 
+def read_bytes(path: Path | Traversable, limit: int) -> bytes:
+    """What a file holds, be it a file and of at most ``limit`` bytes: a pipe would wait, a device give for ever.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is no file, or larger.
+    """
+    if isinstance(path, Path) and path.exists() and not path.is_file():
+        raise ValueError("it is no file")
+    with path.open("rb") as stream:
+        if stream.seek(0, os.SEEK_END) > limit:
+            raise ValueError(f"it is larger than {limit} bytes")
+        stream.seek(0)
+        return stream.read()
+
+
 def read_text(path: Path | Traversable, error: type[ValueError]) -> str:
     """A text file in UTF-8, with or without a byte order mark; ``error`` names the file that is none."""
     try:
-        return path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as fault:
+        return io.TextIOWrapper(io.BytesIO(read_bytes(path, JSON_LIMIT)), encoding="utf-8-sig").read()
+    except ValueError as fault:
         raise error(f"{path}: must be a text file in UTF-8: {fault}") from fault
 
 
@@ -132,13 +173,7 @@ def read_json(path: str | os.PathLike[str], what: str, *, limit: int = JSON_LIMI
     """
     file = Path(path)
     try:
-        if file.exists() and not file.is_file():
-            raise ValueError("it is no file")
-        with file.open("rb") as stream:
-            content = stream.read(limit + 1)
-        if len(content) > limit:
-            raise ValueError(f"it is larger than {limit} bytes")
-        return parse_json(content)
+        return parse_json(read_bytes(file, limit))
     except ValueError as error:
         raise ValueError(f"{what} {str(file)!r} cannot be read: {error}") from error
 

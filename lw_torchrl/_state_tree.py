@@ -19,7 +19,7 @@ def split(state: Any, tensors: dict[str, Tensor]) -> Any:
     """
     if isinstance(state, Tensor):
         name = str(len(tensors))
-        tensors[name] = state.detach().clone()
+        tensors[name] = state.detach()
         return {"tensor": name}
     if isinstance(state, Mapping):
         return {"dict": [[split(key, tensors), split(value, tensors)] for key, value in state.items()]}
@@ -70,12 +70,17 @@ def check_like(found: Any, live: Any, where: str) -> None:
         raise ValueError(f"{where} must be {type(live).__name__}, got {_said(found)}")
 
 
-def check_optimizer_state(found: Any, optimizer: torch.optim.Optimizer) -> None:
-    """Raise :class:`ValueError` unless ``found`` is a state that the optimizer may come to have."""
+def check_optimizer_state(found: Any, optimizer: torch.optim.Optimizer, step: int) -> None:
+    """Raise :class:`ValueError` unless ``found`` is a state that the optimizer may have after so many steps, with a
+    learning rate from 0 to the one at the start."""
     live = optimizer.state_dict()
     if not isinstance(found, dict) or set(found) != set(live) or not isinstance(found["state"], dict):
         raise ValueError(f"optimizer must have the keys {sorted(live)}, got {_said(found)}")
     check_like(found["param_groups"], live["param_groups"], "optimizer['param_groups']")
+    for group, own in zip(found["param_groups"], live["param_groups"], strict=True):
+        check_same(group, own, "optimizer['param_groups']", {"lr"})
+        if not 0 <= group["lr"] <= own["initial_lr"]:
+            raise ValueError(f"optimizer['param_groups']: lr must be from 0 to {own['initial_lr']}, got {group['lr']}")
     parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
     names = _STATE[type(optimizer)]
     for number, state in found["state"].items():
@@ -89,6 +94,21 @@ def check_optimizer_state(found: Any, optimizer: torch.optim.Optimizer) -> None:
                 isinstance(value, Tensor) and value.dtype == torch.float32 and value.shape == shape
             ):
                 raise ValueError(f"optimizer['state'][{number}][{name!r}] does not fit, it is {_said(value)}")
+            if value is not None and not _may_be(name, value, step):
+                raise ValueError(f"optimizer['state'][{number}][{name!r}] holds what {step} steps cannot give")
+
+
+def _may_be(name: str, value: Tensor, step: int) -> bool:
+    if name == "step":
+        return 1 <= value.item() <= step
+    return bool(value.isfinite().all()) and (name != "exp_avg_sq" or bool((value >= 0).all()))
+
+
+def check_same(found: Mapping[str, Any], live: Mapping[str, Any], where: str, but: set[str]) -> None:
+    """Raise :class:`ValueError` unless two states of one structure are the same, but for some entries."""
+    for name, value in live.items():
+        if name not in but and found[name] != value:
+            raise ValueError(f"{where}: {name} must be {value!r}, got {_said(found[name])}")
 
 
 def _said(value: Any) -> str:

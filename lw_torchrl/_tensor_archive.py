@@ -11,24 +11,33 @@ import json
 import os
 import re
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor
 
-from lw_torchrl._files import parse_json, replacing
+from lw_torchrl._files import parse_json, read_bytes, replacing
 
 _DESCRIPTION = "description.json"
+_MOST_BYTES = 8 * 2**30  # of a file, which is read whole; most have 1 MB
 _MOST_JSON = 64 * 2**20  # bytes; 50 plans take 100 kB
+_MOST_ENTRIES = 8
 _GROUP = re.compile(r"([a-z_]{1,40})\.safetensors")
 
 
 class ArchiveError(ValueError):
-    """A file that is no archive of ours, or damaged."""
+    """A file that is no archive of ours, or damaged.
+
+    Attributes:
+        names: of the entries of a zip archive that is none of ours.
+    """
+
+    def __init__(self, message: str, names: Iterable[str] = ()) -> None:
+        super().__init__(message)
+        self.names = list(names)
 
 
 def write_archive(
@@ -39,17 +48,23 @@ def write_archive(
     Args:
         path: the file.
         description: JSON; ``sha256`` is added to it.
-        groups: name to tensors by name; they may share no memory.
+        groups: name to tensors by name.
 
     Raises:
+        ValueError: the description is no JSON that can be read again, or all is larger than what is read.
         OSError: the disk is full, say; an earlier file stays as it was.
     """
     data = {
-        f"{name}.safetensors": save({key: tensor.detach().cpu().contiguous() for key, tensor in tensors.items()})
+        f"{name}.safetensors": save(
+            {key: tensor.detach().cpu().contiguous().clone() for key, tensor in tensors.items()}
+        )
         for name, tensors in groups.items()
     }
     stated = {**description, "sha256": {name: sha256(content).hexdigest() for name, content in data.items()}}
     text = json.dumps(stated, indent=1, allow_nan=False).encode()
+    parse_json(text)
+    if len(text) > _MOST_JSON or sum(map(len, data.values())) + 2 * _MOST_JSON > _MOST_BYTES:
+        raise ValueError(f"files of over {_MOST_BYTES} bytes, or {_MOST_JSON} of JSON, are not read: none is written")
     with replacing(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
         for name, content in {_DESCRIPTION: text, **data}.items():
             archive.writestr(name, content)
@@ -72,11 +87,11 @@ class TensorArchive:
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         try:
-            self._data = _entries(Path(path).read_bytes())
+            self._data = _entries(read_bytes(Path(path), _MOST_BYTES))
             self.description = parse_json(self._data.pop(_DESCRIPTION))
-        except ArchiveError:
+        except (ArchiveError, OSError):
             raise
-        except (zipfile.BadZipFile, NotImplementedError, EOFError, KeyError, RuntimeError, ValueError) as error:
+        except Exception as error:  # zipfile raises many kinds of a stranger's bytes, and memory may be short
             raise ArchiveError(f"{type(error).__name__}: {error}") from error
         stated = self.description.get("sha256")
         if not isinstance(stated, dict) or set(stated) != set(self._data):
@@ -97,24 +112,27 @@ class TensorArchive:
             raise ArchiveError(f"it holds no {name}")
         try:
             return load(self._data[name])
-        except (SafetensorError, ValueError, KeyError, TypeError, RuntimeError, OverflowError) as error:
+        except Exception as error:  # as above
             raise ArchiveError(f"{name}: {error}") from error
 
 
 def _entries(content: bytes) -> dict[str, bytes]:
-    """The entries of a zip archive, none of which may be compressed: what is read is no more than the file holds."""
-    found: dict[str, bytes] = {}
+    """The entries of a zip archive, none of which may be compressed or lie over another: they are no more than it."""
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        for entry in archive.infolist():
-            if entry.filename != _DESCRIPTION and not _GROUP.fullmatch(entry.filename):
-                raise ArchiveError(f"it has an entry {entry.filename[:60]!r}, which no file of ours has")
-            if entry.filename in found:
-                raise ArchiveError(f"it has {entry.filename} twice")
+        entries = archive.infolist()
+        names = [entry.filename for entry in entries]
+        for name in names:
+            if name != _DESCRIPTION and not _GROUP.fullmatch(name):
+                raise ArchiveError(f"it has an entry {name[:60]!r}, which no file of ours has", names)
+        if len({*names}) < len(names) or len(names) > _MOST_ENTRIES:
+            raise ArchiveError(f"it must have each of at most {_MOST_ENTRIES} entries once, it has {len(names)}")
+        if _DESCRIPTION not in names:
+            raise ArchiveError(f"it has no {_DESCRIPTION}")
+        for entry in entries:
             if entry.compress_type != zipfile.ZIP_STORED or entry.file_size != entry.compress_size:
                 raise ArchiveError(f"{entry.filename} is compressed, which no file of ours is")
-            if entry.file_size > (_MOST_JSON if entry.filename == _DESCRIPTION else len(content)):
-                raise ArchiveError(f"{entry.filename} says that it has {entry.file_size} bytes")
-            found[entry.filename] = archive.read(entry)
-    if _DESCRIPTION not in found:
-        raise ArchiveError(f"it has no {_DESCRIPTION}")
-    return found
+        if (stated := sum(entry.file_size for entry in entries)) > len(content):
+            raise ArchiveError(f"its entries say that they have {stated} bytes, it has {len(content)}")
+        if (stated := archive.getinfo(_DESCRIPTION).file_size) > _MOST_JSON:
+            raise ArchiveError(f"{_DESCRIPTION} has {stated} bytes, at most {_MOST_JSON} are read")
+        return {entry.filename: archive.read(entry) for entry in entries}

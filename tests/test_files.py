@@ -4,31 +4,40 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 
 from lw_torchrl import _files
-from lw_torchrl._files import read_json, replacing, sweep, write_json, write_text
+from lw_torchrl._files import read_json, read_text, replacing, sweep, write_json, write_text
+
+
+class OwnError(ValueError):
+    """A room's error for a file that is none of its own."""
+
+
+LEFT = "0123456789abcdef"  # what the name of a temporary file has in its middle
 
 
 @pytest.fixture
-def dead():
-    """The number of a process that has ended."""
-    process = subprocess.Popen([sys.executable, "-c", ""])
-    process.wait()
-    return process.pid
+def locked():
+    """A function that lets another process write a file, as :func:`replacing` does, until the test ends."""
+    processes = []
 
+    def lock(path):
+        script = "import fcntl, sys; file = open(sys.argv[1], 'w'); fcntl.flock(file, fcntl.LOCK_EX); print(); input()"
+        command = [sys.executable, "-c", script, str(path)]
+        processes.append(subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE))
+        processes[-1].stdout.readline()
 
-@pytest.fixture
-def live():
-    """The number of another process that runs."""
-    process = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
-    yield process.pid
-    process.kill()
-    process.wait()
+    yield lock
+    for process in processes:
+        process.communicate()
 
 
 def names(folder):
@@ -54,7 +63,8 @@ def test_the_content_is_on_the_disk_before_it_takes_the_name_and_then_the_name(t
     monkeypatch.setattr(os, "replace", replace)
     target = tmp_path / "a.json"
     write_text(target, "new")
-    temporary = str(tmp_path / f".a.{os.getpid()}.tmp.json")
+    temporary = done[0][1]
+    assert re.fullmatch(re.escape(str(tmp_path)) + r"/\.a\.[0-9a-f]{16}\.tmp\.json", temporary)
     assert done == [("fsync", temporary), ("replace", str(target)), ("fsync", str(tmp_path))]
     assert target.read_text() == "new"
     done.clear()
@@ -106,6 +116,7 @@ def counting(module, name):
 
 for name in ("open", "fsync", "close", "replace", "listdir"):
     counting(os, name)
+counting(_files.fcntl, "flock")
 import pathlib
 for name in ("write_text", "unlink", "mkdir"):
     counting(pathlib.Path, name)
@@ -132,44 +143,135 @@ def test_killed_at_any_moment_the_file_is_the_old_or_the_new_and_the_next_write_
 # ---- sweeping
 
 
-def test_leftovers_of_dead_processes_and_of_this_one_go_and_those_of_live_ones_stay(tmp_path, dead, live):
+def test_leftovers_go_and_what_is_being_written_stays(tmp_path, locked):
     target = tmp_path / "results.json"
-    gone = [f".results.{dead}.tmp.json", f".results.{os.getpid()}.tmp.json", ".results.4294967295.tmp.json"]
+    gone = [f".results.{LEFT}.tmp.json", f".results.{LEFT[::-1]}.tmp.json"]
+    being_written = f".results.{'f' * 16}.tmp.json"
     stay = [
-        f".results.{live}.tmp.json",
-        ".results.1.tmp.json",  # a process of another user, as a rule
-        f".other.{dead}.tmp.json",
-        f".results.{dead}.tmp.txt",
-        f".results.more.{dead}.tmp.json",
-        f"results.{dead}.tmp.json",
+        f".other.{LEFT}.tmp.json",
+        f".results.{LEFT}.tmp.txt",
+        f".results.more.{LEFT}.tmp.json",
+        f"results.{LEFT}.tmp.json",
         ".results.x.tmp.json",
-        ".results.0.tmp.json",
+        f".results.{LEFT}0.tmp.json",
         "results.json",
     ]
     for name in gone + stay:
         (tmp_path / name).write_text(name)
+    locked(tmp_path / being_written)
     assert {path.name for path in sweep(target)} == set(gone)
-    assert names(tmp_path) == sorted(stay)
+    assert names(tmp_path) == sorted([*stay, being_written])
     assert sweep(target) == []
 
 
-def test_the_next_write_sweeps_and_leaves_a_live_writer_alone(tmp_path, dead, live):
-    for process in (dead, live):
-        (tmp_path / f".a.{process}.tmp.json").write_text("half")
+def test_links_and_folders_of_such_names_stay(tmp_path):
+    (tmp_path / "precious").write_text("years of work")
+    (tmp_path / f".a.{LEFT}.tmp.json").symlink_to("precious")
+    (tmp_path / f".a.{LEFT[::-1]}.tmp.json").mkdir()
+    before = names(tmp_path)
+    assert sweep(tmp_path / "a.json") == []
+    assert names(tmp_path) == before
+
+
+def test_the_next_write_sweeps_and_leaves_another_writer_alone(tmp_path, locked):
+    (tmp_path / f".a.{LEFT}.tmp.json").write_text("half")
+    locked(tmp_path / f".a.{LEFT[::-1]}.tmp.json")
     write_json(tmp_path / "a.json", {})
-    assert names(tmp_path) == [f".a.{live}.tmp.json", "a.json"]
+    assert names(tmp_path) == [f".a.{LEFT[::-1]}.tmp.json", "a.json"]
 
 
-def test_a_name_with_signs_of_patterns_is_a_name(tmp_path, dead):
-    (tmp_path / f".a[b]+.{dead}.tmp.json").write_text("half")
-    (tmp_path / f".ab.{dead}.tmp.json").write_text("another's")
+def test_two_writers_of_one_process_do_not_meet(tmp_path):
+    """The second began while the first was writing: each has a file of its own, and the last to end stands."""
+    target = tmp_path / "a.txt"
+    with replacing(target) as first:
+        first.write_text("first, ")
+        with replacing(target) as second:
+            second.write_text("second")
+        assert target.read_text() == "second"
+        with first.open("a") as file:
+            file.write("to its end")
+    assert target.read_text() == "first, to its end"
+    assert names(tmp_path) == ["a.txt"]
+
+
+def test_threads_that_write_one_file_leave_a_whole_one(tmp_path):
+    target = tmp_path / "a.txt"
+    texts = [letter * 100_000 for letter in "abcd"]
+    with ThreadPoolExecutor(4) as pool:
+        for future in [pool.submit(write_text, target, texts[n % 4]) for n in range(80)]:
+            future.result()
+            assert target.read_text() in texts
+    assert names(tmp_path) == ["a.txt"]
+
+
+def test_a_file_swept_before_its_writer_locked_it_is_made_anew(tmp_path, monkeypatch):
+    target, real, swept = tmp_path / "a.txt", _files.fcntl.flock, []
+
+    def flock(handle, operation):
+        if not swept:
+            swept.append(True)
+            (path,) = tmp_path.glob(".a.*")
+            path.unlink()
+        real(handle, operation)
+
+    monkeypatch.setattr(_files.fcntl, "flock", flock)
+    write_text(target, "whole")
+    assert swept
+    assert target.read_text() == "whole"
+
+
+def test_it_has_the_rights_that_any_new_file_has(tmp_path):
+    (tmp_path / "other").touch()
+    write_text(tmp_path / "a.txt", "")
+    assert (tmp_path / "a.txt").stat().st_mode == (tmp_path / "other").stat().st_mode
+
+
+def test_a_name_with_signs_of_patterns_is_a_name(tmp_path):
+    (tmp_path / f".a[b]+.{LEFT}.tmp.json").write_text("half")
+    (tmp_path / f".ab.{LEFT}.tmp.json").write_text("another's")
     write_json(tmp_path / "a[b]+.json", {})
-    assert names(tmp_path) == [f".ab.{dead}.tmp.json", "a[b]+.json"]
+    assert names(tmp_path) == [f".ab.{LEFT}.tmp.json", "a[b]+.json"]
 
 
 def test_sweeping_where_there_is_no_folder_does_nothing(tmp_path):
     assert sweep(tmp_path / "nowhere" / "a.json") == []
     assert not (tmp_path / "nowhere").exists()
+
+
+# ---- reading
+
+
+@pytest.fixture
+def in_time():
+    """The test fails, rather than waits, where a pipe is read that nobody writes to."""
+
+    def late(*_):
+        raise TimeoutError("it waits for a pipe")
+
+    before = signal.signal(signal.SIGALRM, late)
+    signal.alarm(20)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
+@pytest.mark.usefixtures("in_time")
+def test_text_is_read_from_files_alone_and_up_to_the_limit(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path, tmp_path / "pipe", Path("/dev/zero")):
+        with pytest.raises(OwnError, match=f"{path}: must be a text file in UTF-8: it is no file"):
+            read_text(path, OwnError)
+    with (tmp_path / "large").open("wb") as file:
+        file.truncate(_files.JSON_LIMIT + 1)
+    with pytest.raises(OwnError, match=f"large: must be a text file in UTF-8: it is larger than {_files.JSON_LIMIT} b"):
+        read_text(tmp_path / "large", OwnError)
+
+
+def test_text_has_one_kind_of_line_end_and_no_byte_order_mark(tmp_path):
+    (tmp_path / "a.txt").write_bytes("\ufeffä\r\nb\rc\n".encode())
+    assert read_text(tmp_path / "a.txt", OwnError) == "ä\nb\nc\n"
+    with pytest.raises(FileNotFoundError):
+        read_text(tmp_path / "nowhere", OwnError)
 
 
 # ---- JSON

@@ -21,9 +21,10 @@ from lw_torchrl._checks import check_choice, check_int, check_scale
 from lw_torchrl._files import sweep
 from lw_torchrl._progress import Progress
 from lw_torchrl.modules.policy import Policy, plans_of
-from lw_torchrl.trainers.checkpoint import check_can_be_saved, describe_data, write
+from lw_torchrl.trainers.checkpoint import describe_data, describe_replay, write
 from lw_torchrl.trainers.interrupts import interrupts_between_steps
 from lw_torchrl.trainers.normalization import fit_normalization
+from lw_torchrl.trainers.policy_checks import check_can_be_saved, check_trained
 from lw_torchrl.trainers.training_state import TrainingState, check_description, load_state, load_training, state_of
 
 LOSSES = ("l1", "l2", "smooth_l1")
@@ -77,12 +78,11 @@ def make_optimizer(
 ) -> tuple[torch.optim.Optimizer, torch.optim.lr_scheduler.LRScheduler]:
     """The optimizer of a configuration, and its schedule."""
     optimizer: torch.optim.Optimizer
+    rate = float(config.learning_rate)  # as it is in a checkpoint
     if config.optimizer == "adamw":
-        optimizer = torch.optim.AdamW(parameters, lr=config.learning_rate, weight_decay=config.weight_decay)
+        optimizer = torch.optim.AdamW(parameters, lr=rate, weight_decay=config.weight_decay)
     else:
-        optimizer = torch.optim.SGD(
-            parameters, lr=config.learning_rate, momentum=config.momentum, weight_decay=config.weight_decay
-        )
+        optimizer = torch.optim.SGD(parameters, lr=rate, momentum=config.momentum, weight_decay=config.weight_decay)
     if config.schedule == "cosine":
         return optimizer, torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, config.steps)
     return optimizer, torch.optim.lr_scheduler.LambdaLR(optimizer, lambda _: 1.0)
@@ -119,8 +119,8 @@ class BehavioralCloningTrainer:
         progress: show a progress bar.
 
     Raises:
-        ValueError: the checkpoint is damaged, of another architecture, or of another configuration; the actor writes no
-            ``action``; or, in :meth:`train`, the loss is no number.
+        ValueError: the checkpoint is damaged, of another architecture, configuration or data; the actor writes no
+            ``action``; or, in :meth:`train`, the loss or the weights are no numbers.
         TypeError: a checkpoint for an actor that is no :class:`Policy`.
         OSError: the checkpoint cannot be written; the earlier one stays.
 
@@ -153,9 +153,12 @@ class BehavioralCloningTrainer:
         self.config = config = config or BehavioralCloningConfig()
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
         check_belongs(actor, replay)
-        if self.checkpoint is not None:
+        self._policy = None if self.checkpoint is None else check_can_be_saved(actor)
+        self._described: dict[str, Any] = {}
+        if self.checkpoint is not None and self._policy is not None:
             sweep(self.checkpoint)
-            check_can_be_saved(actor)
+            self._described = {"actor": self._policy.describe(), "training": asdict(config)}
+            self._described |= {"data": describe_data(replay), "replay": describe_replay(replay)}
         if replay._prefetch:
             raise ValueError("replay must not prefetch: batches drawn ahead would be lost when training is resumed")
         generator = torch.Generator().manual_seed(config.seed)
@@ -165,23 +168,23 @@ class BehavioralCloningTrainer:
             self.loss = BCLoss(actor, loss_function=config.loss_function)
         self.optimizer, self.schedule = make_optimizer(self.loss.parameters(), config)
         self.state = TrainingState(replay.sampler, generator)
-        if self.checkpoint is not None and self.checkpoint.exists():
-            policy = check_can_be_saved(actor)
-            check_description(self.checkpoint, self._describe(policy))
-            found = load_training(self.checkpoint, policy, policy.state_dict())
-            load_state(self.checkpoint, found, self.optimizer, self.schedule, [self.state])
+        if self.checkpoint is not None and self._policy is not None and self.checkpoint.exists():
+            check_description(self.checkpoint, self._described)
+            found = load_training(self.checkpoint, self._policy, self._policy.state_dict(keep_vars=True))
+            load_state(self.checkpoint, found, self.optimizer, self.schedule, [self.state], config.steps)
         elif config.normalize and isinstance(actor, Policy):
             fit_normalization(actor, replay)
 
-    def _describe(self, policy: Policy) -> dict[str, Any]:
-        return {"actor": policy.describe(), "training": asdict(self.config), "data": describe_data(self.replay)}
-
     def save(self) -> None:
-        """Write the checkpoint; an earlier one is replaced whole."""
-        if self.checkpoint is not None:
-            policy = check_can_be_saved(self.actor)
+        """Write the checkpoint, if there is to be one; an earlier one is replaced whole.
+
+        Raises:
+            ValueError: the weights are no finite numbers.
+        """
+        check_trained(dict(self.actor.named_parameters()), self.state.step)
+        if self.checkpoint is not None and self._policy is not None:
             state = state_of(self.optimizer, self.schedule, [self.state])
-            write(self.checkpoint, self._describe(policy), policy, policy.state_dict(), state)
+            write(self.checkpoint, self._described, self._policy, self._policy.state_dict(), state)
 
     def step(self) -> float:
         """Train on one minibatch and return its loss."""

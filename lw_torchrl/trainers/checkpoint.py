@@ -11,24 +11,30 @@ Nothing is unpickled, and what the file says of sizes is held against what it ho
 from __future__ import annotations
 
 import os
-import zipfile
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import torch
-from torch import Tensor, nn
-from torch.nn.modules.module import register_module_parameter_registration_hook
+from torch import Tensor
+from torchrl.envs import Compose, Transform
 
-from lw_torchrl._state_tree import check_like, split
+from lw_torchrl._state_tree import split
 from lw_torchrl._tensor_archive import ArchiveError, TensorArchive, write_archive
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.policy import Policy, from_description
+from lw_torchrl.trainers.policy_checks import (
+    at_most,
+    check_can_be_saved,
+    check_options,
+    check_texts,
+    copy_weights,
+    first_line,
+    text_vectors,
+)
 
 FORMAT = "lw_torchrl.policy"
 FORMAT_VERSION = 2
-_TEXT_TOLERANCE = 0.01  # of numbers of size 1: more than machines differ, far less than encoders do
+_RESERVED = {"format", "version", "actor", "state", "sha256"}
 
 
 def describe_data(replay: Any) -> dict[str, Any] | None:
@@ -37,20 +43,21 @@ def describe_data(replay: Any) -> dict[str, Any] | None:
     return None if demonstrations is None else demonstrations.config.to_json()
 
 
-def check_can_be_saved(actor: Any) -> Policy:
-    """Return the actor if a policy file can hold it: what cannot be loaded again is refused before any training.
+def describe_replay(replay: Any) -> dict[str, Any]:
+    """How a replay buffer shows its rows, as JSON: what else than :func:`describe_data` its batches hang on."""
+    parts = [part for part in replay.transform.modules() if isinstance(part, Transform)]
+    return {
+        "label": getattr(replay, "label", None),
+        "rows": None if describe_data(replay) is None else len(replay),  # after_success leaves so many
+        "sampler": type(replay.sampler).__name__,
+        "transforms": [_describe_transform(part) for part in parts if not isinstance(part, Compose)],
+    }
 
-    Raises:
-        TypeError: it is no :class:`Policy`.
-        ValueError: it is one that its own description does not make again.
-    """
-    if not isinstance(actor, Policy):
-        raise TypeError(
-            f"actor must be a Policy to be kept in a file, got {type(actor).__name__}: save the policy inside of it, "
-            "derive your class from lw_torchrl.Policy, or train without a checkpoint"
-        )
-    actor.describe()
-    return actor
+
+def _describe_transform(transform: Transform) -> dict[str, str]:
+    options = {name: value for name, value in vars(transform).items() if name[0] != "_" and name != "training"}
+    simple = {name: repr(value) for name, value in options.items() if isinstance(value, (bool, int, float, str))}
+    return {"class": type(transform).__name__, **simple}
 
 
 def save_actor(actor: Policy, path: str | os.PathLike[str], **about: Any) -> None:
@@ -63,6 +70,8 @@ def save_actor(actor: Policy, path: str | os.PathLike[str], **about: Any) -> Non
 
     Raises:
         TypeError: the actor is no :class:`Policy`.
+        ValueError: it is one that :func:`load_actor` would not make again: its weights are of other names, shapes or
+            dtypes than its description's, or are no finite numbers; or ``about`` names what a file says itself.
         OSError: it cannot be written; an earlier file stays.
 
     Example:
@@ -72,6 +81,8 @@ def save_actor(actor: Policy, path: str | os.PathLike[str], **about: Any) -> Non
         >>> lw.load_actor(path).config["width"]
         8
     """
+    if reserved := _RESERVED & set(about):
+        raise ValueError(f"about must not be named {', '.join(sorted(reserved))}, which a policy file says itself")
     checked = check_can_be_saved(actor)
     write(path, {"actor": checked.describe(), **about}, checked, checked.state_dict())
 
@@ -107,11 +118,6 @@ def write(
         ) from error
 
 
-def text_vectors(actor: nn.Module) -> dict[str, Tensor]:
-    """The vectors of an actor's texts, by the name of the buffer that holds them."""
-    return {name: buffer for name, buffer in actor.named_buffers() if name.rpartition(".")[2] == "text_vectors"}
-
-
 def open_policy(path: str | os.PathLike[str]) -> TensorArchive:
     """The archive of a policy file, whose format, version and actor it has checked; errors as of
     :func:`read_description`."""
@@ -120,7 +126,8 @@ def open_policy(path: str | os.PathLike[str]) -> TensorArchive:
     try:
         found = TensorArchive(path)
     except (ArchiveError, OSError) as error:
-        old = _is_version_1(Path(path))
+        names = error.names if isinstance(error, ArchiveError) else []
+        old = any(name.startswith(("components/", "manifest", "description/")) for name in names)
         raise ValueError(
             f"checkpoint: {str(path)!r} is of version 1, whose files can run code when they are read; this package "
             f"reads version {FORMAT_VERSION}. Train it again"
@@ -135,15 +142,6 @@ def open_policy(path: str | os.PathLike[str]) -> TensorArchive:
     if not isinstance(found.description.get("actor"), dict):
         raise ValueError(f"checkpoint: {str(path)!r} is damaged or none of ours (it describes no actor)")
     return found
-
-
-def _is_version_1(path: Path) -> bool:
-    """Whether it is an archive of TorchRL's ``Checkpoint``, told by its entries' names alone."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return any(name.startswith(("components/", "manifest", "description/")) for name in archive.namelist())
-    except Exception:  # whatever is wrong with it, it is none
-        return False
 
 
 def read_description(path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -172,77 +170,20 @@ def load_actor(path: str | os.PathLike[str], *, text_encoder: TextEncoder | None
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it is damaged, or its weights, sizes or texts are not those that it says; or the text encoder is
-            another than the policy was trained with.
+        ValueError: it is damaged, or its weights, sizes or texts are not those that it says, or are no finite numbers;
+            or the text encoder is another than the policy was trained with.
         ImportError: its texts are not shipped, and the extra ``[text]`` is not installed.
     """
     archive = open_policy(path)
     try:
         weights, texts = archive.tensors("weights"), archive.tensors("texts")
-        numbers = sum(tensor.numel() for tensor in weights.values())
-        _check_options(archive.description["actor"], numbers)
-        with _at_most(numbers):
+        check_options(archive.description["actor"], weights)
+        with at_most(weights):
             actor = from_description(archive.description["actor"], text_encoder)
         check_texts(texts, text_vectors(actor))
-        copy_weights(weights, actor.state_dict())
+        copy_weights(weights, actor.state_dict(keep_vars=True))
     except ImportError:
         raise
     except Exception as error:  # a file from a stranger may say anything
         raise ValueError(f"checkpoint: the actor of {str(path)!r} cannot be made ({first_line(error)})") from error
     return actor.eval()
-
-
-def first_line(error: Exception) -> str:
-    """What an error says, up to 400 characters of its first line."""
-    return (str(error).splitlines() or [type(error).__name__])[0][:400]
-
-
-def _check_options(found: Any, numbers: int) -> None:
-    """Refuse integers that no network of so many numbers can have, before lists of that length are made."""
-    inside = found.values() if isinstance(found, dict) else found if isinstance(found, list) else ()
-    if isinstance(found, int) and abs(found) > max(numbers, 2**16):
-        raise ValueError(f"it says {found:.3g}, but holds only {numbers} numbers")
-    for one in inside:
-        _check_options(one, numbers)
-
-
-@contextmanager
-def _at_most(numbers: int) -> Iterator[None]:
-    """Stop a module that is being made as soon as its parameters are more than ``numbers``, before they are filled."""
-    made = 0
-
-    def count(module: nn.Module, name: str, parameter: nn.Parameter | None) -> None:
-        nonlocal made
-        made += 0 if parameter is None else parameter.numel()
-        if made > numbers:
-            raise ValueError(f"it describes a network of more than the {numbers} numbers that it holds")
-
-    handle = register_module_parameter_registration_hook(count)
-    try:
-        yield
-    finally:
-        handle.remove()
-
-
-@torch.no_grad()
-def copy_weights(stored: Mapping[str, Tensor], live: Mapping[str, Tensor]) -> None:
-    """Copy weights in place; :class:`ValueError` where a name, shape or dtype differs."""
-    check_like(stored, dict(live), "weights")
-    for name, tensor in live.items():
-        tensor.copy_(stored[name])
-
-
-def check_texts(stored: Mapping[str, Tensor], ours: Mapping[str, Tensor]) -> None:
-    """Raise :class:`ValueError` unless the texts have the vectors that they had when the file was written."""
-    for name, vectors in ours.items():
-        found = stored.get(name)
-        if found is None or found.shape != vectors.shape or found.dtype != vectors.dtype:
-            said = "none" if found is None else tuple(found.shape)
-            raise ValueError(
-                f"text_encoder gives vectors of shape {tuple(vectors.shape)}, the policy was made with {said}"
-            )
-        if not torch.allclose(found, vectors.cpu(), atol=_TEXT_TOLERANCE, rtol=0.0):
-            raise ValueError(
-                "text_encoder is not the one that the policy was made with: its texts have other vectors; pass that "
-                "one as text_encoder"
-            )

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Sequence
 from dataclasses import asdict
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +24,10 @@ from lw_torchrl.trainers.behavioral_cloning import (
     check_belongs,
     make_optimizer,
 )
-from lw_torchrl.trainers.checkpoint import check_can_be_saved, describe_data, write
+from lw_torchrl.trainers.checkpoint import describe_data, describe_replay, write
 from lw_torchrl.trainers.interrupts import interrupts_between_steps
 from lw_torchrl.trainers.normalization import fit_normalization
+from lw_torchrl.trainers.policy_checks import check_can_be_saved, check_trained
 from lw_torchrl.trainers.training_state import TrainingState, check_description, load_state, load_training, state_of
 
 
@@ -39,6 +42,27 @@ class _Act(nn.Module):
         return self.actor.act(*prepared)[0]
 
 
+def _fingerprint(actor: Policy) -> str:
+    """16 signs that differ for actors of other descriptions: plans, tasks, options."""
+    return sha256(json.dumps(actor.describe(), sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _architecture(actor: Policy) -> dict[str, Any]:
+    found = actor.describe()
+    return {"kind": found["kind"], "evaluator": found.get("evaluator"), **found["options"]}
+
+
+def _check_actors(actors: Sequence[Policy]) -> None:
+    """Raise :class:`ValueError` unless the actors differ in their weights, plans and tasks alone."""
+    first, *others = map(_architecture, actors)
+    for number, other in enumerate(others, 1):
+        if names := [name for name in {**first, **other} if first.get(name) != other.get(name)]:
+            raise ValueError(f"actors must be of one architecture, 0 and {number} differ in {', '.join(names)}")
+    weights = [id(parameter) for actor in actors for parameter in actor.parameters()]
+    if len({*weights}) < len(weights):
+        raise ValueError("actors must have weights of their own, some are the same or share theirs")
+
+
 class StackedBehavioralCloning:
     """Trains M actors, each on batches of its own, as :class:`BehavioralCloningTrainer` trains one.
 
@@ -46,15 +70,17 @@ class StackedBehavioralCloning:
     it would have alone, so its losses are those it would have alone, up to rounding.
 
     Args:
-        actors: M policies of one architecture; they are trained in place.
-        replays: M buffers; the i-th actor's batches come from the i-th.
+        actors: M policies, each with weights of its own, that differ in plans and tasks alone; they are trained in
+            place.
+        replays: M buffers, each with its sampler; the i-th actor's batches come from the i-th.
         config: how to train each; the i-th has the seed ``config.seed + i``.
         checkpoint: a file to write checkpoints to. If it is there already, training carries on from it.
         progress: show a progress bar.
 
     Raises:
-        ValueError: not as many buffers as actors, or actors of different shapes; a checkpoint that is damaged, or of
-            other actors or another configuration; in :meth:`train`, a loss that is no number.
+        ValueError: not as many buffers as actors, one twice, or actors of different options; a checkpoint that is
+            damaged, or of other actors, data or another configuration; in :meth:`train`, a loss or weights that are no
+            numbers.
 
     Example:
         >>> import lw_torchrl as lw, tempfile
@@ -87,9 +113,14 @@ class StackedBehavioralCloning:
             raise ValueError(f"replays must be as many as actors, at least one, got {len(replays)} and {len(actors)}")
         self.actors, self.replays, self.progress = list(actors), list(replays), progress
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
+        _check_actors(self.actors)
+        if len({*map(id, replays)}) < len(replays) or len({id(one.sampler) for one in replays}) < len(replays):
+            raise ValueError("replays must be different buffers, each with a sampler of its own")
+        self._described: dict[str, Any] = {}
         if self.checkpoint is not None:
             sweep(self.checkpoint)
             check_can_be_saved(self.actors[0])
+            self._described = self._describe()
         self.states = []
         for number, (actor, replay) in enumerate(zip(actors, replays, strict=True)):
             check_belongs(actor, replay)
@@ -110,23 +141,29 @@ class StackedBehavioralCloning:
         self._buffers = buffers
         self.optimizer, self.schedule = make_optimizer(list(self._parameters.values()), config)
         if self.checkpoint is not None and self.checkpoint.exists():
-            check_description(self.checkpoint, self._describe())
+            check_description(self.checkpoint, self._described)
             found = load_training(self.checkpoint, self.actors[0], self._parameters)
-            load_state(self.checkpoint, found, self.optimizer, self.schedule, self.states)
+            load_state(self.checkpoint, found, self.optimizer, self.schedule, self.states, config.steps)
 
     def _describe(self) -> dict[str, Any]:
-        data = {str(number): describe_data(replay) for number, replay in enumerate(self.replays)}
         return {
             "actor": self.actors[0].describe() | {"number": len(self.actors)},
+            "actors": {str(number): _fingerprint(actor) for number, actor in enumerate(self.actors)},
             "training": asdict(self.config),
-            "data": data,
+            "data": {str(number): describe_data(replay) for number, replay in enumerate(self.replays)},
+            "replay": {str(number): describe_replay(replay) for number, replay in enumerate(self.replays)},
         }
 
     def save(self) -> None:
-        """Write the checkpoint; an earlier one is replaced whole."""
+        """Write the checkpoint, if there is to be one; an earlier one is replaced whole.
+
+        Raises:
+            ValueError: the weights are no finite numbers.
+        """
+        check_trained(self._parameters, self.steps)
         if self.checkpoint is not None:
             state = state_of(self.optimizer, self.schedule, self.states)
-            write(self.checkpoint, self._describe(), self.actors[0], self._parameters, state)
+            write(self.checkpoint, self._described, self.actors[0], self._parameters, state)
 
     @property
     def steps(self) -> int:

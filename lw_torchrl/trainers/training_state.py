@@ -11,16 +11,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lw_torchrl._state_tree import check_like, check_optimizer_state, join
+from lw_torchrl._state_tree import check_like, check_optimizer_state, check_same, join
 from lw_torchrl.modules.policy import Policy
-from lw_torchrl.trainers.checkpoint import (
-    check_texts,
-    copy_weights,
-    first_line,
-    open_policy,
-    read_description,
-    text_vectors,
-)
+from lw_torchrl.trainers.checkpoint import open_policy, read_description
+from lw_torchrl.trainers.policy_checks import check_texts, copy_weights, first_line, text_vectors
+
+_ADDED = {"actors", "replay"}
+"""What descriptions did not say at first: a training that was begun before then goes on."""
 
 Schedule = torch.optim.lr_scheduler.LRScheduler
 
@@ -48,8 +45,8 @@ class TrainingState:
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         sampler = state_dict.get("sampler")
         check_like({**state_dict, "sampler": None}, {**self.state_dict(), "sampler": None}, "state")
-        if not isinstance(sampler, dict) or state_dict["step"] < 0:
-            raise ValueError("state must have a step of at least 0 and a sampler's state")
+        if not isinstance(sampler, dict) or set(sampler) != set(self.sampler.state_dict()):
+            raise ValueError(f"state must have a sampler's state, one of a {type(self.sampler).__name__}")
         self.generator.set_state(state_dict["generator"].clone())
         torch.Generator().set_state(state_dict["torch_generator"].clone())
         self.step = state_dict["step"]
@@ -71,11 +68,13 @@ def check_description(path: Path, ours: dict[str, Any]) -> None:
     """Raise :class:`ValueError` unless the file was saved with the description ``ours``."""
     found, ours = read_description(path), json.loads(json.dumps(ours))  # JSON has lists alone
     for part in ours:
+        if part in _ADDED and part not in found:
+            continue
         if found.get(part) != ours[part]:
             before, now = found.get(part) or {}, ours[part] or {}
             both = before if isinstance(before, dict) else {}
             different = sorted(key for key in {**both, **now} if both.get(key) != now.get(key))
-            kind = "architecture" if part == "actor" else "configuration"
+            kind = "architecture" if part in ("actor", "actors") else "configuration"
             raise ValueError(
                 f"checkpoint: {str(path)!r} is of another {kind}, its {part} differs in "
                 f"{', '.join(different)}; choose another file, or delete it to start again"
@@ -106,8 +105,9 @@ def load_state(
     optimizer: torch.optim.Optimizer,
     schedule: Schedule,
     states: Sequence[TrainingState],
+    steps: int,
 ) -> None:
-    """Go on from what :func:`state_of` gave, read from ``path``.
+    """Go on from what :func:`state_of` gave, read from ``path``, in a training of so many steps.
 
     Raises:
         ValueError: it does not fit.
@@ -115,16 +115,26 @@ def load_state(
     try:
         if set(found) != {"optimizer", "schedule", "states"}:
             raise ValueError(f"a training state has optimizer, schedule and states, got {', '.join(map(str, found))}")
-        check_optimizer_state(found["optimizer"], optimizer)
-        check_like(found["schedule"], schedule.state_dict(), "schedule")
         if not isinstance(found["states"], list) or len(found["states"]) != len(states):
             raise ValueError(f"states must be of {len(states)} trainings")
+        step = found["states"][0]["step"]
+        if type(step) is not int or not 0 <= step <= steps or any(one["step"] != step for one in found["states"]):
+            raise ValueError(f"states must all have one step from 0 to {steps}")
+        check_optimizer_state(found["optimizer"], optimizer, step)
+        _check_schedule(found["schedule"], schedule.state_dict(), found["optimizer"]["param_groups"], step)
         for state, one in zip(states, found["states"], strict=True):
             state.load_state_dict(one)
         optimizer.load_state_dict(found["optimizer"])
         schedule.load_state_dict(found["schedule"])
     except (ValueError, KeyError, TypeError, RuntimeError, AttributeError) as error:
         raise _misfit(path, error) from error
+
+
+def _check_schedule(found: Any, live: dict[str, Any], groups: list[dict[str, Any]], step: int) -> None:
+    """Raise :class:`ValueError` unless ``found`` is the live schedule's state after so many steps."""
+    check_like(found, live, "schedule")
+    now = {"last_epoch": step, "_step_count": step + 1, "_last_lr": [group["lr"] for group in groups]}
+    check_same(found, {**live, **now}, "schedule", set())
 
 
 def _misfit(path: str | os.PathLike[str], error: Exception) -> ValueError:

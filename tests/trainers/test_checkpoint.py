@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import threading
 import zipfile
 
 import pytest
@@ -10,6 +11,7 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
+from torch.nn.utils import prune
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from lw_torchrl.data import TaskBalancedSampler
@@ -17,7 +19,7 @@ from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.language.skills import load_skills
 from lw_torchrl.language.tasks import MT10, task_id
-from lw_torchrl.modules import DescriptorConditionedActor, PlanConditionedActor, ScriptedSkillActor
+from lw_torchrl.modules import ActorEnsemble, DescriptorConditionedActor, PlanConditionedActor, ScriptedSkillActor
 from lw_torchrl.trainers import BehavioralCloningConfig, BehavioralCloningTrainer, load_actor, save_actor
 from lw_torchrl.trainers.checkpoint import read_description
 
@@ -123,6 +125,22 @@ def test_another_text_encoder_is_found_out(saved, tmp_path):
     load_actor(path, text_encoder=lambda texts: counted(texts) * 3.0)  # the same after scaling
 
 
+def test_what_another_thread_makes_meanwhile_is_none_of_its_business(tmp_path):
+    """Loading bounds the modules that it makes itself; neither thread notices the other."""
+    save_actor(PlanConditionedActor(own_plans(), text_encoder=counted, **SMALL), tmp_path / "own.zip")
+    made = []
+
+    def beside(texts):
+        thread = threading.Thread(target=lambda: made.append(nn.Linear(1000, 1000)))
+        thread.start()
+        thread.join()
+        return counted(texts)
+
+    load_actor(tmp_path / "own.zip", text_encoder=beside)
+    assert made
+    nn.Linear(1000, 1000)
+
+
 def test_the_encoder_of_a_policy_on_descriptions_is_found_out_too(tmp_path):
     save_actor(DescriptorConditionedActor("MT10", text_encoder=counted, **SMALL), tmp_path / "own.zip")
     with pytest.raises(ValueError, match="text_encoder is not the one that the policy was made with"):
@@ -136,6 +154,68 @@ def test_what_cannot_be_loaded_is_refused_before_training(tmp_path):
     with pytest.raises(TypeError, match="actor must be a Policy"):
         save_actor(module, tmp_path / "c.zip")
     assert not list(tmp_path.iterdir())
+
+
+def pruned(actor):
+    prune.random_unstructured(actor.head.network[0], "weight", 0.5)
+    return actor
+
+
+def reconfigured(actor):
+    actor.config["width"] = 32
+    return actor
+
+
+def not_finite(actor):
+    nn.init.constant_(actor.head.network[0].bias, float("inf"))
+    return actor
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (PlanConditionedActor.double, r"must be torch.float32 of shape .*, got torch.float64"),
+        (pruned, "must have the keys"),
+        (reconfigured, r"must be torch.float32 of shape \(32, .*, got torch.float32 of shape \(16, "),
+        (not_finite, "head.network.0.bias must be finite"),
+    ],
+)
+def test_what_loading_would_refuse_is_not_saved(tmp_path, change, message):
+    actor = change(PlanConditionedActor(PLANS, **SMALL))
+    for keep in (save_actor, train):
+        with pytest.raises(ValueError, match=f"actor cannot be kept in a file, .*{message}"):
+            keep(actor, tmp_path / "c.zip")
+    assert not list(tmp_path.iterdir())
+
+
+def test_looking_whether_it_can_be_saved_draws_no_random_numbers(tmp_path):
+    actor = PlanConditionedActor(PLANS, **SMALL)
+    before = torch.get_rng_state()
+    save_actor(actor, tmp_path / "c.zip")
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+@pytest.mark.parametrize("name", ["format", "version", "state", "sha256"])
+def test_what_a_file_says_itself_cannot_be_said_about_it(tmp_path, name):
+    with pytest.raises(ValueError, match=f"about must not be named {name}, which a policy file says itself"):
+        save_actor(PlanConditionedActor(PLANS, **SMALL), tmp_path / "c.zip", **{name: 3})
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("value", [{1: "a", "1": "b"}, float("nan")])
+def test_what_cannot_be_read_again_is_not_written(tmp_path, value):
+    with pytest.raises(ValueError, match=r"names '1' more than once|JSON"):
+        save_actor(PlanConditionedActor(PLANS, **SMALL), tmp_path / "c.zip", note=value)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("other", [lambda actor: actor, lambda actor: actor.with_plans(PLANS)])
+def test_members_that_share_their_weights_are_saved_with_them(tmp_path, other):
+    actor = PlanConditionedActor(PLANS, **SMALL)
+    ensemble = ActorEnsemble([actor, other(actor)])
+    save_actor(ensemble, tmp_path / "c.zip")
+    loaded = load_actor(tmp_path / "c.zip")
+    assert all(torch.equal(value, loaded.state_dict()[name]) for name, value in ensemble.state_dict().items())
 
 
 def test_plans_with_scripted_skills_are_a_policy_file_too(tmp_path):

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import pickle
 import resource
+import signal
 import struct
 import zipfile
+import zlib
+from hashlib import sha256
 
 import pytest
 import torch
@@ -16,6 +20,7 @@ from tensordict import NonTensorData, TensorDict
 from torchrl.checkpoint import Checkpoint
 
 import lw_torchrl as lw
+from lw_torchrl import _tensor_archive
 
 
 @pytest.fixture(scope="module")
@@ -77,6 +82,99 @@ def test_entries_that_lie_about_their_size_are_refused(good, tmp_path):
         struct.pack_into("<II", content, directory + 20, size, size)
         (tmp_path / "c.zip").write_bytes(bytes(content))
         refuses(tmp_path / "c.zip")
+
+
+def overlapping(groups, size):
+    """Bytes of an archive whose groups each reach to the end of the last one's data, of so many bytes."""
+
+    def local(name, content):
+        head = struct.pack(
+            "<4s5HLLLHH", b"PK\3\4", 20, 0, 0, 0, 33, zlib.crc32(content), *[len(content)] * 2, len(name), 0
+        )
+        return head + name
+
+    ends, content = {}, bytes(size)
+    for name in reversed(groups):
+        ends[name] = content
+        content = local(name, content) + content
+    signed = {name.decode(): sha256(end).hexdigest() for name, end in ends.items()}
+    text = json.dumps({"format": "lw_torchrl.policy", "version": 2, "actor": {}, "sha256": signed}).encode()
+    first = local(b"description.json", text) + text
+    directory, offset = b"", 0
+    for name, entry in {b"description.json": text, **{name: ends[name] for name in groups}}.items():
+        sizes = zlib.crc32(entry), len(entry), len(entry), len(name)
+        directory += (
+            struct.pack("<4s6HLLLHHHHHLL", b"PK\1\2", 20, 20, 0, 0, 0, 33, *sizes, 0, 0, 0, 0, 0, offset) + name
+        )
+        offset = len(first) if name == b"description.json" else offset + 30 + len(name)
+    body = first + content
+    number = len(groups) + 1
+    return body + directory + struct.pack("<4s4H2LH", b"PK\5\6", 0, 0, number, number, len(directory), len(body), 0)
+
+
+def test_entries_that_lie_over_one_another_are_refused_unread(tmp_path):
+    """Each is as long as the file, so all together take its size times their number."""
+    path = tmp_path / "c.zip"
+    path.write_bytes(overlapping([b"weights.safetensors", b"texts.safetensors", b"training.safetensors"], 100_000))
+    with pytest.raises(ValueError, match=r"its entries say that they have 30\d{4} bytes, it has 10\d{4}"):
+        lw.load_actor(path)
+    path.write_bytes(overlapping([b"weights_%c.safetensors" % letter for letter in b"abcdefgh"], 10))
+    with pytest.raises(ValueError, match="at most 8 entries once, it has 9"):
+        lw.load_actor(path)
+
+
+@pytest.mark.parametrize("offset", [2**40, 2**63 - 1, 2**63, 2**64 - 1])
+def test_entries_that_begin_beyond_the_file_are_refused(good, tmp_path, offset):
+    description, groups = parts(good)
+    rebuild(tmp_path / "c.zip", description, groups)
+    content = (tmp_path / "c.zip").read_bytes()
+    first, last, end = content.index(b"PK\1\2"), content.rindex(b"PK\1\2"), content.rindex(b"PK\5\6")
+    entry = bytearray(content[last:end])
+    more = struct.pack("<HHQ", 1, 8, offset)  # the offset stands in a zip64 field
+    struct.pack_into("<4HLL", entry, 30, len(more), 0, 0, 0, 0, 2**32 - 1)
+    directory = content[first:last] + bytes(entry) + more
+    ending = bytearray(content[end:])
+    struct.pack_into("<LL", ending, 12, len(directory), first)
+    (tmp_path / "c.zip").write_bytes(content[:first] + directory + bytes(ending))
+    refuses(tmp_path / "c.zip")
+
+
+@pytest.fixture
+def in_time():
+    """The test fails, rather than waits, where a pipe is read that nobody writes to."""
+
+    def late(*_):
+        raise TimeoutError("it waits for a pipe")
+
+    before = signal.signal(signal.SIGALRM, late)
+    signal.alarm(30)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
+@pytest.mark.usefixtures("in_time")
+def test_what_is_no_file_is_refused_unread(tmp_path):
+    os.mkfifo(tmp_path / "c.zip")
+    (tmp_path / "d.zip").symlink_to("/dev/zero")
+    (tmp_path / "e.zip").mkdir()
+    for name in ("c.zip", "d.zip", "e.zip"):
+        refuses(tmp_path / name)
+
+
+def test_a_huge_file_is_refused_unread(tmp_path):
+    with (tmp_path / "c.zip").open("wb") as file:
+        file.truncate(200 * 2**30)  # takes no room
+    with pytest.raises(ValueError, match=r"checkpoint: .*c.zip.* larger than \d+ bytes"):
+        lw.load_actor(tmp_path / "c.zip")
+
+
+def test_too_little_memory_for_a_file_is_said_of_it(good, monkeypatch):
+    def full(*_):
+        raise MemoryError
+
+    monkeypatch.setattr(_tensor_archive, "read_bytes", full)
+    refuses(good)
 
 
 def test_an_entry_twice_is_refused(good, tmp_path):

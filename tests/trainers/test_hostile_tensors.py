@@ -108,6 +108,40 @@ def test_tensors_that_are_no_safetensors_are_refused(good, tmp_path, group, chan
     refuses(tmp_path / "c.zip")
 
 
+def test_more_layers_than_there_are_weights_are_refused_before_they_are_made(good, tmp_path):
+    """Their numbers are few enough, but each layer is a module of several kB."""
+    description, groups = parts(good)
+    changed("weights", lambda t: t.update({"more": torch.zeros(30_000)}))(description, groups)
+    description["actor"]["options"].update(width=1, depth=10_000)
+    rebuild(tmp_path / "c.zip", description, groups)
+    with pytest.raises(ValueError, match=r"checkpoint: .*describes a network of more weights than it holds"):
+        lw.load_actor(tmp_path / "c.zip")
+
+
+@pytest.mark.parametrize(
+    ("ending", "value", "message"),
+    [
+        ("weight", float("nan"), "must be finite"),
+        ("bias", float("-inf"), "must be finite"),
+        ("features.mean", float("inf"), "must be finite"),
+        ("features.std", float("nan"), "must be finite"),
+        ("features.std", 0.0, "must be above 0"),
+        ("features.std", -1.0, "must be above 0"),
+    ],
+)
+def test_weights_that_are_no_numbers_are_refused(good, tmp_path, ending, value, message):
+    description, groups = parts(good)
+
+    def spoil(tensors):
+        tensors[next(name for name in tensors if name.endswith(ending))].view(-1)[-1] = value
+
+    changed("weights", spoil)(description, groups)
+    rebuild(tmp_path / "c.zip", description, groups)
+    refuses(tmp_path / "c.zip")
+    with pytest.raises(ValueError, match=rf"weights: .*{ending} {message}"):
+        lw.load_actor(tmp_path / "c.zip")
+
+
 STATES = {
     "no state": None,
     "a list": [1, 2],
@@ -154,3 +188,53 @@ def test_every_value_of_a_training_state_may_be_another(good, tmp_path, value):
         here[place[-1]] = value
         rebuild(tmp_path / "c.zip", again, groups)
         assert "checkpoint: " in (said(make_trainer, tmp_path / "c.zip") or "checkpoint: ")
+
+
+def entries(tree, key):
+    """The pairs of that key in the JSON of a state."""
+    inside = tree.values() if isinstance(tree, dict) else tree if isinstance(tree, list) else ()
+    for one in inside:
+        if isinstance(one, list) and len(one) == 2 and one[0] == key:
+            yield one
+        yield from entries(one, key)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("T_max", 0), ("base_lrs", {"list": [1e300]}), ("last_epoch", 10**6), ("_step_count", -5),
+        ("_last_lr", {"list": [1.0]}), ("lr", -1.0), ("lr", 1e308), ("eps", -1.0), ("betas", {"tuple": [1.0, 1.0]}),
+        ("maximize", True), ("amsgrad", True), ("capturable", True), ("differentiable", True), ("weight_decay", 1e9),
+        ("step", 10**12), ("step", -1), ("step", 4),
+    ],
+)  # fmt: skip
+def test_values_that_no_such_training_has_are_refused(good, tmp_path, key, value):
+    """Each is of the right type; some trained upwards, some divided by zero, some never came to an end."""
+    description, groups = parts(good)
+    found = [pair for pair in entries(description["state"], key) if "tensor" not in str(pair[1])]
+    assert found
+    for pair in found:
+        pair[1] = value
+    rebuild(tmp_path / "c.zip", description, groups)
+    with pytest.raises(ValueError, match=r"checkpoint: .* does not fit"):
+        make_trainer(tmp_path / "c.zip")
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("step", lambda value: -value), ("step", lambda value: value + 1), ("step", lambda value: value * float("nan")),
+        ("exp_avg", lambda value: value + float("inf")), ("exp_avg_sq", lambda value: -1 - value),
+    ],
+)  # fmt: skip
+def test_an_optimizers_state_that_no_steps_give_is_refused(good, tmp_path, name, change):
+    description, groups = parts(good)
+    place = next(pair[1]["tensor"] for pair in entries(description["state"], name) if isinstance(pair[1], dict))
+
+    def spoil(tensors):
+        tensors[place] = change(tensors[place])
+
+    changed("training", spoil)(description, groups)
+    rebuild(tmp_path / "c.zip", description, groups)
+    with pytest.raises(ValueError, match=rf"does not fit.*'{name}'\] holds what 5 steps cannot give"):
+        make_trainer(tmp_path / "c.zip")

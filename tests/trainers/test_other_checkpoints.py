@@ -6,16 +6,28 @@ import json
 
 import pytest
 import torch
+from hostile_files import parts, rebuild
 from small_training import CONFIG, PLANS, SMALL, collect_demos, make_actor, make_trainer
+from torchrl.data import RandomSampler
+from torchrl.envs import Compose
 
-from lw_torchrl.data import collect_demonstrations
+from lw_torchrl.data import LanguageWorldExperienceReplay, TaskBalancedSampler, collect_demonstrations
 from lw_torchrl.modules import DescriptorConditionedActor, PlanConditionedActor
-from lw_torchrl.trainers import BehavioralCloningConfig
+from lw_torchrl.trainers import BehavioralCloningConfig, BehavioralCloningTrainer
+from lw_torchrl.transforms import QAFTransform, RandomYaw
 
 
 @pytest.fixture(scope="module")
 def demos(tmp_path_factory):
     return collect_demos(tmp_path_factory.mktemp("trainer") / "demos")
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    """Demonstrations that come to an end: steps follow the first success."""
+    root = tmp_path_factory.mktemp("whole") / "demos"
+    collect_demonstrations(["push", "reach"], episodes_per_task=1, root=root, max_steps=100, progress=False)
+    return root
 
 
 @pytest.fixture(scope="module")
@@ -96,6 +108,43 @@ def test_a_checkpoint_of_other_demonstrations_is_refused(checkpoint, tmp_path):
         "its data differs in episodes_per_task, noise_scale, seed;",
         lambda: make_trainer(root, checkpoint),
     )
+
+
+@pytest.mark.parametrize(
+    ("change", "differs"),
+    [
+        (dict(label="executed"), "label"),
+        (dict(label="unclipped"), "label"),
+        (dict(after_success=0), "rows"),
+        (dict(sampler=RandomSampler), "sampler"),
+        (dict(yaw=0.2), "transforms"),
+        (dict(yaw=None), "transforms"),
+    ],
+)
+def test_a_checkpoint_of_rows_shown_in_another_way_is_refused(root, tmp_path, change, differs):
+    path = tmp_path / "c.zip"
+
+    def trainer(label="expert", after_success=None, sampler=TaskBalancedSampler, yaw=0.1):
+        turned = Compose(QAFTransform(PLANS), *([] if yaw is None else [RandomYaw(yaw)]))
+        replay = LanguageWorldExperienceReplay(
+            root, label=label, after_success=after_success, sampler=sampler(), transform=turned
+        )
+        return BehavioralCloningTrainer(make_actor(), replay, CONFIG, checkpoint=path, progress=False)
+
+    trainer().save()
+    trainer()
+    refused(path, f"of another configuration, its replay differs in {differs};", lambda: trainer(**change))
+
+
+def test_a_checkpoint_from_before_that_was_said_goes_on(demos, tmp_path):
+    path = tmp_path / "c.zip"
+    make_trainer(demos, path).train()
+    description, groups = parts(path)
+    del description["replay"]
+    rebuild(path, description, groups)
+    assert make_trainer(demos, path).state.step == CONFIG.steps
+    with pytest.raises(ValueError, match=r"does not fit.* a sampler's state, one of a RandomSampler"):
+        make_trainer(demos, path, sampler=RandomSampler())
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 not quite", b"years of work\n", json.dumps({"a": 1}).encode()])

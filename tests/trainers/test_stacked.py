@@ -75,6 +75,47 @@ def test_what_it_refuses(demos):
         trainer.step()
 
 
+@pytest.mark.parametrize(
+    ("options", "different"), [(dict(squash=False), "squash"), (dict(mix="actions", features="both"), "features, mix")]
+)
+def test_actors_of_other_options_are_refused(demos, options, different):
+    """Of the same shapes, they would be trained as the first one is."""
+    actors = [lw.PlanConditionedActor(PLANS, width=32), lw.PlanConditionedActor(PLANS, width=32, **options)]
+    with pytest.raises(ValueError, match=f"actors must be of one architecture, 0 and 1 differ in {different}"):
+        lw.StackedBehavioralCloning(actors, [replay(demos), replay(demos)], CONFIG)
+
+
+def test_what_comes_twice_is_refused(demos):
+    actor, rows = make("plan", 0), replay(demos)
+    for other in (actor, actor.with_plans(PLANS)):
+        with pytest.raises(ValueError, match="actors must have weights of their own"):
+            lw.StackedBehavioralCloning([actor, other], [rows, replay(demos)], CONFIG)
+    sharing = lw.LanguageWorldExperienceReplay(demos, sampler=rows.sampler, transform=lw.QAFTransform(PLANS))
+    for other in (rows, sharing):
+        with pytest.raises(ValueError, match="replays must be different buffers, each with a sampler of its own"):
+            lw.StackedBehavioralCloning([actor, make("plan", 1)], [rows, other], CONFIG)
+
+
+def test_a_checkpoint_is_of_all_its_actors(demos, tmp_path):
+    """Of two trainings whose second actors differ in their plans alone, neither goes on with the other's file."""
+    pairs = [(str(step.condition), step.skill) for step in PLANS["reach"].steps]
+    others = lw.Plans([*(PLANS[t] for t in PLANS if t != "reach"), lw.ConditionalPlan.from_pairs("reach", pairs[::-1])])
+
+    def trainer(second):
+        actors = [make("plan", 0), lw.PlanConditionedActor(second, width=32)]
+        answered = lw.LanguageWorldExperienceReplay(
+            demos, sampler=lw.TaskBalancedSampler(), transform=lw.QAFTransform(second)
+        )
+        return lw.StackedBehavioralCloning(
+            actors, [replay(demos), answered], CONFIG, checkpoint=tmp_path / "c.zip", progress=False
+        )
+
+    trainer(PLANS).save()
+    trainer(PLANS)
+    with pytest.raises(ValueError, match="is of another architecture, its actors differs in 1;"):
+        trainer(others)
+
+
 def test_it_carries_on_from_its_checkpoint(demos, tmp_path):
     def trainer(config, checkpoint=None):
         actors = [make("focused plan", seed) for seed in range(2)]

@@ -9,10 +9,10 @@ import textwrap
 
 import pytest
 import torch
-from small_training import CONFIG, assert_same, collect_demos, everything, flat, make_actor, make_trainer
+from small_training import CONFIG, assert_same, collect_demos, everything, flat, make_actor, make_replay, make_trainer
 from torchrl.data import RandomSampler, SamplerWithoutReplacement
 
-from lw_torchrl.trainers import BehavioralCloningTrainer
+from lw_torchrl.trainers import BehavioralCloningConfig, BehavioralCloningTrainer, StackedBehavioralCloning
 from lw_torchrl.transforms import RandomYaw
 
 
@@ -72,6 +72,14 @@ def test_torchrls_samplers_resume_too(demos, tmp_path, sampler):
     assert_same(everything(resumed), everything(whole))
 
 
+def test_a_learning_rate_that_is_an_integer_resumes_too(demos, tmp_path):
+    config = BehavioralCloningConfig(steps=12, batch_size=8, checkpoint_every=5, learning_rate=1)
+    path = tmp_path / "checkpoint.zip"
+    with pytest.raises(KeyboardInterrupt):
+        make_trainer(demos, path, config=config, stop_at=7).train()
+    assert make_trainer(demos, path, config=config).state.step == 5
+
+
 def test_a_finished_training_does_nothing_twice(demos, undisturbed, tmp_path):
     path = tmp_path / "checkpoint.zip"
     make_trainer(demos, path).train()
@@ -94,6 +102,23 @@ def test_checkpoints_come_in_their_time_and_leave_one_file(demos, tmp_path, monk
 def test_without_a_checkpoint_nothing_is_written(demos, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     make_trainer(demos).train()
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_weights_that_the_last_step_spoils_are_not_saved(demos, tmp_path, kept):
+    """No loss is taken after it that would tell."""
+    path = tmp_path / "checkpoint.zip" if kept else None
+    config = BehavioralCloningConfig(steps=1, batch_size=8, optimizer="sgd", learning_rate=1e30, weight_decay=1e10)
+    with pytest.raises(ValueError, match=r"weights: .* must be finite, .* after step 1: the learning rate is too high"):
+        make_trainer(demos, path, config=config).train()
+    assert not list(tmp_path.iterdir())
+    actors = [make_actor(), make_actor(1)]
+    stacked = StackedBehavioralCloning(
+        actors, [make_replay(demos) for _ in actors], config, checkpoint=path, progress=False
+    )
+    with pytest.raises(ValueError, match=r"weights: .* must be finite, .* after step 1: the learning rate is too high"):
+        stacked.train()
     assert not list(tmp_path.iterdir())
 
 
