@@ -82,4 +82,6 @@ def test_a_full_disk_is_said_and_nothing_is_lost(small_disk, tmp_path):
 def test_only_a_full_disk_wants_room(tmp_path):
     assert "once there is room" in str(write_failed(tmp_path, 7, OSError(errno.ENOSPC, "No space left on device")))
     other = str(write_failed(tmp_path, 7, OSError(errno.ENOTDIR, "Not a directory")))
-    assert "writing 7 bytes" in other and "Not a directory" in other and "room" not in other
+    assert "writing 7 bytes" in other
+    assert "Not a directory" in other
+    assert "room" not in other
