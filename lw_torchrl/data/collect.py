@@ -6,14 +6,17 @@ import os
 import shutil
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import torch
+from filelock import FileLock, Timeout
 from tensordict import TensorDictBase
 
 from lw_torchrl._files import flush, write_json
 from lw_torchrl.data.dataset import (
     DATA,
+    LOCK,
     METADATA,
     PARTIAL,
     CollectConfig,
@@ -22,7 +25,7 @@ from lw_torchrl.data.dataset import (
     Demonstrations,
     EpisodeInfo,
 )
-from lw_torchrl.data.episode_files import EpisodeFiles, no_room
+from lw_torchrl.data.episode_files import EpisodeFiles, write_failed
 from lw_torchrl.data.expert_episodes import run_expert_episodes
 from lw_torchrl.data.metadata import read_config, read_metadata, write_metadata
 from lw_torchrl.data.rows import (
@@ -35,6 +38,8 @@ from lw_torchrl.data.rows import (
     write_rows,
 )
 from lw_torchrl.language.tasks import resolve_tasks, task_id
+
+_PATIENCE = 1.0  # seconds to wait for another call: it may be about to end
 
 
 def _open_episode_files(root: Path, config: CollectConfig) -> EpisodeFiles:
@@ -58,10 +63,10 @@ def _check_same(before: CollectConfig, config: CollectConfig, what: str) -> None
         )
 
 
-def _finished(root: Path, config: CollectConfig, progress: bool) -> Demonstrations | None:
-    """The dataset in a folder if all of it is as it was written. Of a damaged one, what is whole goes back among the
-    episode files, so that it is a half-made one."""
-    whole: list[EpisodeInfo] = []
+def _read_through(
+    root: Path, config: CollectConfig, progress: bool
+) -> tuple[Demonstrations | None, list[EpisodeInfo], str]:
+    """The dataset in a folder if all of it is as it was written; else its whole episodes, and what is the matter."""
     try:
         found = read_metadata(root)
     except DamagedDatasetError as error:
@@ -70,28 +75,51 @@ def _finished(root: Path, config: CollectConfig, progress: bool) -> Demonstratio
                 f"root: {str(root)!r} holds no dataset, or one damaged beyond telling ({error}); choose another "
                 "folder, or delete it to start again"
             ) from error
-        reason = str(error)
-    else:
-        _check_same(found.config, config, f"root: {str(root)!r} holds a dataset")
-        whole = whole_episodes(found, progress=progress)
-        try:
-            load_rows(found)
-            if len(whole) == len(found.episodes):
-                return found
-            reason = "rows differ from their checksums"
-        except DamagedDatasetError as error:
-            reason = str(error)
+        return None, [], str(error)
+    _check_same(found.config, config, f"root: {str(root)!r} holds a dataset")
+    whole = whole_episodes(found, progress=progress)
+    try:
+        load_rows(found)
+    except DamagedDatasetError as error:
+        return None, whole, str(error)
+    return found if len(whole) == len(found.episodes) else None, whole, "rows differ from their checksums"
+
+
+def _check_folders(root: Path) -> None:
+    """Raise unless the folders that are written anew are folders of their own, or not there."""
+    for path in (root / DATA, root / PARTIAL):
+        if path.is_symlink() or (path.exists() and not path.is_dir()):
+            raise DatasetError(
+                f"root: {str(path)!r} must be a folder for the dataset to be collected or mended, it is a "
+                f"{'link' if path.is_symlink() else 'file'}; put the folder itself there, or choose another root"
+            )
+
+
+def _take_apart(root: Path, config: CollectConfig, whole: list[EpisodeInfo], reason: str) -> None:
+    """Make a damaged dataset a half-made one: what is whole goes back among the episode files."""
     kept = f"{len(whole)} of {config.episodes_per_task * len(config.tasks)} episodes"
     warnings.warn(
         f"root: {str(root)!r} is damaged; {kept} are kept, the others are run again ({reason})",
-        stacklevel=3,
+        stacklevel=4,
     )
     files = _open_episode_files(root, config)
     for info in whole:
         if not files.has(info.task, info.episode):
             files.put(info.task, info.episode, read_rows(root / DATA, info.start, info.length))
     (root / METADATA).unlink()
-    return None
+
+
+@contextmanager
+def _alone(root: Path) -> Iterator[None]:
+    """Keep other calls out of a folder, in whatever process."""
+    root.mkdir(parents=True, exist_ok=True)
+    try:
+        with FileLock(root / LOCK, timeout=_PATIENCE):
+            yield
+    except Timeout:
+        raise DatasetError(
+            f"root: another collect_demonstrations is at work in {str(root)!r}; let it finish, or choose another folder"
+        ) from None
 
 
 def _assemble(root: Path, config: CollectConfig, files: EpisodeFiles, kept: dict[str, list[int]]) -> None:
@@ -120,7 +148,24 @@ def _assemble(root: Path, config: CollectConfig, files: EpisodeFiles, kept: dict
         write_metadata(root, config, infos, {task: max(kept[task]) + 1 for task in config.tasks})
     except OSError as error:
         shutil.rmtree(building, ignore_errors=True)
-        raise no_room(root, len(listed) * config.max_steps * ROW_BYTES, error) from error
+        raise write_failed(root, len(listed) * config.max_steps * ROW_BYTES, error) from error
+
+
+def _made(root: Path, config: CollectConfig, num_envs: int | None, progress: bool) -> Demonstrations:
+    """The dataset, finished or mended where it is not. The folder must be held: another call may have come first."""
+    found = None
+    if (root / METADATA).is_file():
+        found, whole, reason = _read_through(root, config, progress)
+        if found is None:
+            _check_folders(root)
+            _take_apart(root, config, whole, reason)
+    if found is None:
+        _check_folders(root)
+        files = _open_episode_files(root, config)
+        _assemble(root, config, files, run_expert_episodes(config, files, num_envs, progress))
+        found = read_metadata(root)
+    shutil.rmtree(root / PARTIAL, ignore_errors=True)
+    return found
 
 
 def collect_demonstrations(
@@ -174,8 +219,9 @@ def collect_demonstrations(
         UserWarning: a finished dataset was damaged.
 
     Raises:
-        ValueError: a wrong argument; DatasetError where ``root`` holds something else.
-        OSError: there is no room; nothing is lost.
+        ValueError: a wrong argument; DatasetError where ``root`` holds something else, or another call is at work
+            in it.
+        OSError: it cannot be written, since there is no room, say; nothing is lost.
         RuntimeError: redrawing found too few successes.
 
     Example:
@@ -200,13 +246,11 @@ def collect_demonstrations(
         raise ValueError(f"root must be a folder, {str(folder)!r} is a file")
     found = None
     if (folder / METADATA).is_file():
-        found = _finished(folder, config, progress)
-    elif folder.is_dir() and any(folder.iterdir()) and not (folder / PARTIAL).is_dir():
+        with suppress(OSError):  # another call may be mending it
+            found = _read_through(folder, config, progress)[0]
+    elif folder.is_dir() and {path.name for path in folder.iterdir()} - {LOCK} and not (folder / PARTIAL).is_dir():
         raise DatasetError(f"root: {str(folder)!r} is not empty and holds no dataset; choose another folder")
-    if found is None:
-        files = _open_episode_files(folder, config)
-        kept = run_expert_episodes(config, files, num_envs, progress)
-        _assemble(folder, config, files, kept)
-        found = read_metadata(folder)
-    shutil.rmtree(folder / PARTIAL, ignore_errors=True)
+    if found is None or (folder / PARTIAL).is_dir():
+        with _alone(folder):
+            found = _made(folder, config, num_envs, progress)
     return found

@@ -3,6 +3,7 @@
 root/data/            TorchRL's TED layout as a memory-mapped TensorDict, one row a step; see :mod:`.rows`
 root/metadata.json    written last: without it the dataset is not finished; see :mod:`.metadata`
 root/.partial/        the episodes so far, while collecting; see :mod:`.episode_files`
+root/.lock            held while collecting, and otherwise without a meaning
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from typing import Any
 from lw_torchrl._checks import check_int, check_scale
 from lw_torchrl.language.tasks import resolve_tasks
 
-DATA, METADATA, PARTIAL = "data", "metadata.json", ".partial"
+DATA, METADATA, PARTIAL, LOCK = "data", "metadata.json", ".partial", ".lock"
 _MOST = 2**63 - 1
 
 

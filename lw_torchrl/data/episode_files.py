@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import errno
+import stat
+import zipfile
 from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
@@ -11,10 +14,13 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 
 from lw_torchrl._files import replacing
-from lw_torchrl.data.rows import COLUMNS
+from lw_torchrl.data.dataset import DatasetError
+from lw_torchrl.data.rows import COLUMNS, ROW_BYTES
 
 _STORED = [key for key in COLUMNS if key != ("collector", "traj_ids")]
 _FAILED = b"FAILED"
+_HEADERS = 2**16  # bytes of a file beside its rows, at the most
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 class EpisodeFiles:
@@ -43,7 +49,7 @@ class EpisodeFiles:
             with replacing(self._path(task, episode), sync=False) as path:  # a damaged one is run again
                 path.write_bytes(content)
         except OSError as error:
-            raise no_room(self.folder, len(content), error) from error
+            raise write_failed(self.folder, len(content), error) from error
 
     def has(self, task: str, episode: int) -> bool:
         """Whether the episode was run."""
@@ -59,7 +65,11 @@ class EpisodeFiles:
         Raises:
             Exception: of many kinds, where the file is damaged.
         """
-        with self._path(task, episode).open("rb") as file, np.load(file, allow_pickle=False) as found:
+        content = self._content(self._path(task, episode))
+        with zipfile.ZipFile(BytesIO(content)) as archive:
+            if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):
+                raise ValueError("it is compressed")
+        with np.load(BytesIO(content), allow_pickle=False) as found:
             columns = {key: torch.from_numpy(found["/".join(key)]) for key in _STORED}
         length = len(columns["episode",])
         for key, column in columns.items():
@@ -73,22 +83,36 @@ class EpisodeFiles:
             steps.set(key, column)
         return steps
 
+    def _content(self, path: Path) -> bytes:
+        found = path.lstat()
+        if not stat.S_ISREG(found.st_mode) or found.st_size > self.max_steps * ROW_BYTES + _HEADERS:
+            raise ValueError("it is no file, or larger than an episode can be")
+        return path.read_bytes()
+
     def drop_damaged(self) -> None:
-        """Remove the files that cannot be read: those episodes are run again."""
+        """Remove what cannot be read: those episodes are run again.
+
+        Raises:
+            DatasetError: (a ValueError) a folder has the name of an episode's file.
+        """
         for path in self.folder.glob("*.npz"):
             task, _, number = path.stem.rpartition(".")
-            if task not in self.tasks or not number.isdecimal() or path.read_bytes() == _FAILED:
+            if task not in self.tasks or not number.isdecimal():
                 continue
+            if path.is_dir() and not path.is_symlink():
+                raise DatasetError(f"root: {str(path)!r} is a folder, and no episode's file; move it elsewhere")
             try:
-                self.get(task, int(number))
+                if self._content(path) != _FAILED:
+                    self.get(task, int(number))
             except Exception:  # whatever is wrong with it, the episode can be run again
                 path.unlink()
 
 
-def no_room(folder: Path, size: int, error: OSError) -> OSError:
+def write_failed(folder: Path, size: int, error: OSError) -> OSError:
     """The error for something that could not be written while collecting; the caller raises it."""
+    until = "there is room" if error.errno in _NO_ROOM else "that is mended"
     return OSError(
         error.errno,
-        f"root: writing {size} bytes to {str(folder)!r} failed: {error.strerror or error}. Nothing is lost: once there "
-        "is room, the same collect_demonstrations carries on",
+        f"root: writing {size} bytes to {str(folder)!r} failed: {error.strerror or error}. Nothing is lost: once "
+        f"{until}, the same collect_demonstrations carries on",
     )

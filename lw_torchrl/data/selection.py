@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from lw_torchrl._checks import check_int, unknown_name
-from lw_torchrl.data.dataset import CollectConfig, Demonstrations, EpisodeInfo
+from lw_torchrl.data.dataset import CollectConfig, DamagedDatasetError, Demonstrations, EpisodeInfo
 from lw_torchrl.data.rows import load_rows
 
 TRAJECTORY = ("collector", "traj_ids")
@@ -98,6 +98,9 @@ def read_part(
 
     What differs from the files is held in memory, one number a row: the ends of episodes that are cut short, and
     ``first_trajectory`` added to the trajectories' ids.
+
+    Raises:
+        DatasetError: (a ValueError) as for :func:`load_rows`; or an action is NaN or infinite.
     """
     rows = load_rows(whole)
     if label == "executed":
@@ -106,6 +109,12 @@ def read_part(
     else:
         taken, other = ("expert_action", "unclipped_action")[:: 1 if label == "expert" else -1]
         rows = rows.exclude("next", "action", other).rename_key_(taken, "action")
+    action = rows.get("action")
+    if not (action.sum().isfinite() or action.isfinite().all()):  # the sum is fast; it may overflow
+        raise DamagedDatasetError(
+            f"root: an action in {str(whole.root)!r} is no finite number, for label={label!r}; the same "
+            "collect_demonstrations keeps the episodes that are whole and collects the others again"
+        )
     if first_trajectory:
         rows.set(TRAJECTORY, rows.get(TRAJECTORY) + first_trajectory)
     if chosen.episodes == whole.episodes and after_success is None:

@@ -12,12 +12,14 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from lw_torchrl._checks import check_int
+from lw_torchrl._checks import check_int, shown
+from lw_torchrl._files import parse_json
 from lw_torchrl.envs.seeding import episode_seed
 from lw_torchrl.language.tasks import Task
 
 Rows = NDArray[np.intp]
 Episodes = NDArray[np.int64]
+_MOST_RESETS = 2**32  # of a row; with the workers and rows that there can be, its episodes fit into int64
 
 
 def check_worker(worker: Any) -> tuple[int, int]:
@@ -86,7 +88,9 @@ class EpisodeCounter:
                 f"shape {tuple(episode.shape)}"
             )
         if not isinstance(episode, Tensor):
-            episode = torch.tensor(check_int("episode", episode))
+            if check_int("episode", episode, minimum=0) >= 2**63:
+                raise ValueError(f"episode must be below 2**63, got {shown(episode)}")
+            episode = torch.tensor(episode)
         found = episode.expand(n).cpu().numpy().astype(np.int64)[rows]
         if (found < 0).any():
             raise ValueError(f"episode must be at least 0, got {found.min()}")
@@ -106,19 +110,21 @@ class EpisodeCounter:
     def load(self, dumped: Tensor) -> None:
         """Take seed and counters from :meth:`dump` of an environment with the same tasks in its rows."""
         try:
-            state = json.loads(dumped.cpu().numpy().tobytes())
-            names, seed, resets = state["tasks"], check_int("seed", state["seed"]), np.array(state["resets"], np.int64)
+            state = parse_json(dumped.cpu().numpy().tobytes())
+            names, seed, resets = list(state["tasks"]), check_int("seed", state["seed"]), list(state["resets"])
         except (AttributeError, KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"state_dict is none of a LanguageWorldEnv: {error!r}") from error
+            raise ValueError(f"state_dict is none of a LanguageWorldEnv: {error!r:.200}") from error
         if names != self.names:
             raise ValueError(
                 f"state_dict is of an environment with other rows, {len(names)}: {_few(names)}; this one has "
                 f"{len(self.names)}: {_few(self.names)}"
             )
-        if resets.shape != self.resets.shape or (resets < 0).any():
-            raise ValueError(f"state_dict must count the resets of {len(self.names)} rows, got {state['resets']}")
-        self.seed, self.resets = seed, resets
+        if len(resets) != len(names) or any(type(one) is not int or not 0 <= one < _MOST_RESETS for one in resets):
+            raise ValueError(
+                f"state_dict must count the resets of {len(names)} rows, below {_MOST_RESETS}, got {shown(resets)}"
+            )
+        self.seed, self.resets = seed, np.array(resets, dtype=np.int64)
 
 
 def _few(names: Sequence[str]) -> str:
-    return ", ".join(names[:6]) + (", ..." if len(names) > 6 else "")
+    return ", ".join(map(str, names[:6])) + (", ..." if len(names) > 6 else "")

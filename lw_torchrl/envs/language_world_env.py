@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl._utils import seed_generator
 from torchrl.envs import EnvBase
 
 from lw_torchrl._checks import check_choice, check_int
@@ -136,6 +137,11 @@ class LanguageWorldEnv(EnvBase):
         self._engine = make_engine(engine, self.row_tasks, reward=reward, num_threads=num_threads)
         self.is_closed = False  # EnvBase starts with True
 
+    def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
+        """Begin at episode 0, of another seed if one is given, any integer; returns the seed for a next environment."""
+        self._set_seed(seed)
+        return seed if seed is None or static_seed else seed_generator(abs(seed))
+
     def _set_seed(self, seed: int | None) -> None:
         self._counter.start_again(seed)
 
@@ -212,6 +218,7 @@ class LanguageWorldEnv(EnvBase):
         rows = np.flatnonzero(row_mask(tensordict, "_reset", self.batch_size[0]))
         if set_state:
             episode = stated_episode(tensordict, episode)
+            self._check_tasks(tensordict, rows)
         episodes = self._counter.next(rows) if episode is None else self._counter.asked(episode, rows)
         self._observation[rows] = self._engine.reset(rows.tolist(), self._counter.seeds(rows, episodes))
         self._counter.resets[rows] += 1
@@ -222,6 +229,14 @@ class LanguageWorldEnv(EnvBase):
         if set_state:
             self._check_beginning(tensordict, rows)
         return self._state(torch.zeros(*self.batch_size, ACTION_SIZE))
+
+    def _check_tasks(self, tensordict: TensorDictBase, rows: np.ndarray) -> None:
+        given = tensordict.get("task_id", None)
+        if given is not None and not torch.equal(given.cpu().reshape(-1)[rows], self._task_id[rows]):
+            raise ValueError(
+                "set_state=True needs the state of an environment with the same rows, and task_id names other tasks "
+                f"than those of this one, {', '.join(self.row_tasks[:6])}{', ...' * (len(self.row_tasks) > 6)}"
+            )
 
     def _check_beginning(self, tensordict: TensorDictBase, rows: np.ndarray) -> None:
         wanted = tensordict.get("observation", None)

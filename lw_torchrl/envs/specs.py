@@ -100,10 +100,16 @@ def _flag(n: int) -> Categorical:
 
 
 def row_mask(tensordict: TensorDictBase | None, key: str, n: int) -> np.ndarray:
-    """The rows that a mask such as "_reset" names, (n,) bool; all where there is none."""
+    """The rows that a mask such as "_reset" names, (n,) bool; all where there is none.
+
+    Raises:
+        ValueError: another number of rows, or dtype.
+    """
     mask = None if tensordict is None else tensordict.get(key, None)
     if mask is None:
         return np.ones(n, dtype=bool)
+    if mask.dtype != torch.bool or mask.numel() != n:
+        raise ValueError(f"{key} must be bool of shape ({n},) or ({n}, 1), got {mask.dtype} of {tuple(mask.shape)}")
     return mask.reshape(n).cpu().numpy()
 
 

@@ -61,9 +61,10 @@ class EvaluationResult:
     origin: dict[str, Any] = field(default_factory=dict, compare=False)
 
     def _by_task(self, value: Callable[[list[EpisodeResult]], float | None]) -> dict[str, float | None]:
-        return {
-            task: value([episode for episode in self.episodes if episode.task == task]) for task in self.config["tasks"]
-        }
+        found: dict[str, list[EpisodeResult]] = {}
+        for episode in self.episodes:
+            found.setdefault(episode.task, []).append(episode)
+        return {task: value(found.get(task, [])) for task in self.config["tasks"]}
 
     @cached_property
     def success_once(self) -> dict[str, float | None]:

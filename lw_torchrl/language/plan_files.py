@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping
 from importlib.resources import files
@@ -11,9 +10,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from lw_torchrl._checks import check_choice, nearest, shown
-from lw_torchrl._files import read_text, write_text
+from lw_torchrl._files import parse_json, read_text, write_text
 from lw_torchrl.language.formats.chain_py import format_plan, parse_plan
 from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans, PlanStep, as_plans
+from lw_torchrl.language.queries import QueryError
 from lw_torchrl.language.query_search import nearest_query
 from lw_torchrl.language.tasks import MT10, TASKS, Task
 
@@ -77,11 +77,10 @@ def _read_all(found: list[Traversable], tasks: Mapping[str, Task]) -> Plans:
 
 def _read_pairs(path: Path, tasks: Mapping[str, Task]) -> Plans:
     try:
-        found = json.loads(read_text(path, PlanError))
-    except (ValueError, RecursionError) as error:
-        raise PlanError(f"{path.name}: not JSON: {error}") from error
-    if isinstance(found, dict):
-        found = found.get("plans", found)
+        whole = parse_json(read_text(path, PlanError).encode())
+    except ValueError as error:
+        raise PlanError(f"{path.name}: expected JSON, task names with lists of pairs: {error}") from error
+    found = whole.get("plans", whole)
     if not isinstance(found, dict):
         raise PlanError(f"{path.name}: expected task names with lists of (condition, skill) pairs, got {shown(found)}")
     plans = []
@@ -100,7 +99,10 @@ def _step(pair: Any, task: Task, where: str) -> PlanStep:
     if not (isinstance(pair, list) and len(pair) == 2 and all(isinstance(text, str) for text in pair)):
         raise PlanError(f"{where}: expected a condition and a skill, two strings, got {shown(pair)}")
     condition, skill = pair
-    match = nearest_query(condition, task)
+    try:
+        match = nearest_query(condition, task)
+    except QueryError as error:
+        raise PlanError(f"{where}: {error}") from error
     return PlanStep(match.query, skill, "" if match.score == 1.0 else f"nearest to: {condition}")
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 from rapidfuzz import fuzz, process
@@ -22,6 +22,8 @@ from lw_torchrl.language.tasks import Task, get_task
 
 ARTICLES = ("the", "a", "an")
 _ALIASES = {"gripper": GRIPPER, "robot gripper": GRIPPER}
+_MOST_CLAUSES = 64  # the tables have room for as many in every step
+_MOST_COMPARED = 8  # of a task's objects, those whose queries an error's text is compared with
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,12 @@ class QueryError(ValueError):
     """A text that is no query of its task."""
 
 
-@lru_cache(maxsize=256)
+def check_length(text: str, parts: Sequence[str]) -> None:
+    """Raise :class:`QueryError` if a text has more clauses than a query may have."""
+    if len(parts) > _MOST_CLAUSES:
+        raise QueryError(f"query {_cut(text)!r} must have at most {_MOST_CLAUSES} clauses, got {len(parts)}")
+
+
 def base_clauses(task: Task, relations: tuple[str, ...]) -> tuple[Clause, ...]:
     """The clauses that :func:`supported_queries` lists as texts."""
     clauses = []
@@ -127,11 +134,22 @@ class _ClauseParser:
     def error(self, expected: str) -> QueryError:
         found = f"{_cut(self.words[self.at], 40)!r} (word {self.at + 1})" if self.at < len(self.words) else "its end"
         said = " ".join(self.words[max(0, self.at - 8) : self.at + 8])
-        close = process.extractOne((self.inferred + said)[:300], supported_queries(self.task), scorer=fuzz.ratio)
+        close = process.extractOne((self.inferred + said)[:300], self.comparable(), scorer=fuzz.ratio)
         return QueryError(
             f"query {_cut(self.text)!r} of task {self.task.name!r}: at {found} in {_cut(said, 60)!r}, "
             f"expected {expected}. The nearest query is {close[0]!r}; supported_queries({self.task.name!r}) lists all."
         )
+
+    def comparable(self) -> tuple[str, ...]:
+        """The queries to find the nearest of; where a task has many objects, of those that the text may mean."""
+        named = self.task.object_names
+        if len(named) > _MOST_COMPARED:
+            said = (self.inferred + " ".join(self.words))[:300]
+            found = process.extract(said, named[1:], scorer=fuzz.partial_ratio, limit=_MOST_COMPARED - 1)
+            kept = {GRIPPER, *(name for name, _, _ in found)}
+            fewer = replace(self.task, objects=tuple(one for one in self.task.objects if one.name in kept))
+            return tuple(map(str, base_clauses(fewer, tuple(RELATIONS))))
+        return supported_queries(self.task)
 
     def take(self, phrase: str) -> bool:
         words = phrase.split()
@@ -204,7 +222,7 @@ def parse_query(text: str, task: str | Task) -> Query:
 
     Raises:
         QueryError: (a ValueError) the text is no query of the task; it points at the word and names the nearest
-            query.
+            query. Or it has more than 64 clauses.
         TypeError: ``text`` is no string.
 
     Example:
@@ -216,7 +234,9 @@ def parse_query(text: str, task: str | Task) -> Query:
     owner = get_task(task)
     plain = re.sub(r"\s+", " ", text.replace("’", "'").casefold()).strip(" ?.!")
     clauses: list[Clause] = []
-    for part in re.split(r" and |^and | and$", f"{plain}"):
+    parts = re.split(r" and |^and | and$", plain)
+    check_length(text, parts)
+    for part in parts:
         parser = _ClauseParser(part.split(), owner, text)
         clauses.append(parser.parse(clauses[-1].subject if clauses else None))
     return Query(tuple(clauses))

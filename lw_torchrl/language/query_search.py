@@ -11,7 +11,7 @@ from rapidfuzz import fuzz, process
 from torch import Tensor
 
 from lw_torchrl._checks import check_choice
-from lw_torchrl.language.queries import Clause, Query, QueryError, base_clauses, parse_query
+from lw_torchrl.language.queries import Clause, Query, QueryError, base_clauses, check_length, parse_query
 from lw_torchrl.language.relations import PUBLISHED, RELATIONS, UNARY
 from lw_torchrl.language.tasks import Task, get_task
 
@@ -115,7 +115,7 @@ def nearest_query(
 
     Raises:
         TypeError: ``text`` is no string.
-        ValueError: an unknown task, or another value for ``by``.
+        ValueError: an unknown task, another value for ``by``, or a text of more than 64 parts.
         ImportError: by="embedding" without the extra ``[text]``.
 
     Example:
@@ -139,7 +139,9 @@ def nearest_query(
     known: dict[tuple[str, str], QueryPart] = {}  # a text may say the same again and again
     parts: list[QueryPart] = []
     subject = ""
-    for part in [part for part in said if _told(_affirmed(part)[0])] or [" ".join(text.split())]:
+    told = [part for part in said if _told(_affirmed(part)[0])] or [" ".join(text.split())]
+    check_length(text, told)
+    for part in told:
         if (part, subject) not in known:
             found = _nearest(part, owner, relations, by)
             if subject and found.score < 1.0:

@@ -20,6 +20,7 @@ from lw_torchrl.language.named_objects import GRIPPER, NamedObject, read_objects
 
 _NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
 _OWN_IDS = 2**31 - 50  # so that an id is an int32 too
+_MOST_OBJECTS = 64  # the base queries are of all pairs of them
 
 
 class TaskError(ValueError):
@@ -34,10 +35,10 @@ class Task:
         name: "drawer-open", Meta-World's name without its version; of a task of your own, any lower-case words joined
             by hyphens.
         description: one sentence that says what is to be done.
-        objects: the named objects, the robot's gripper first; then the points that we named.
+        objects: the named objects, the robot's gripper first; then the points that we named. At most 64.
 
     Raises:
-        ValueError: another kind of name, two objects of the same name, or the first is not the gripper.
+        ValueError: another kind of name, too many objects, two of the same name, or the first is not the gripper.
     """
 
     name: str
@@ -46,6 +47,11 @@ class Task:
 
     def __post_init__(self) -> None:
         _check_name(self.name)
+        if len(self.objects) > _MOST_OBJECTS:
+            raise ValueError(
+                f"objects of task {self.name!r} must be at most {_MOST_OBJECTS}, the gripper included, got "
+                f"{len(self.objects)}"
+            )
         names = [named.name for named in self.objects]
         if not names or names[0] != GRIPPER:
             raise ValueError(f"objects of task {self.name!r} must begin with {GRIPPER!r}, got {names}")

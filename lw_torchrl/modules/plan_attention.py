@@ -14,12 +14,24 @@ from lw_torchrl._checks import missing_keys
 from lw_torchrl._keys import as_keys, check_apart
 from lw_torchrl.language.plan_tables import PlanTables
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
+from lw_torchrl.language.task_index import readable
 from lw_torchrl.transforms.qaf import plan_number_key
 
 
 def attend(logits: Tensor, steps: Tensor) -> Tensor:
     """Softmax of logits (B, S) over the steps that there are, (B, S) bool; 0 on the others."""
     return logits.masked_fill(~steps, -torch.inf).softmax(-1)
+
+
+def check_truth(qaf: Tensor, shape: tuple[int, ...]) -> None:
+    """Raise :class:`ValueError` unless truth has one column for each step, and soft truth is of numbers from 0 to 1."""
+    if qaf.shape != shape:
+        raise ValueError(
+            f"qaf must have shape {shape}, one column for each step of the actor's plans, got {tuple(qaf.shape)}; give "
+            "QAFTransform the same plans"
+        )
+    if qaf.dtype != torch.bool and readable(qaf) and not ((qaf >= 0) & (qaf <= 1)).all():  # of bool, nothing to look at
+        raise ValueError("qaf must be bool, or numbers from 0 to 1 for soft truth, got others, or NaN")
 
 
 class PlanAttention(TensorDictModuleBase):
@@ -33,8 +45,8 @@ class PlanAttention(TensorDictModuleBase):
         in_keys, out_keys: other names for what it reads and writes, in the order above; nested ones too.
 
     Raises:
-        ValueError: at call time, ``qaf`` of another number of steps or, where ``qaf_plan`` says so, of other plans; a
-            task_id without a plan.
+        ValueError: at call time, ``qaf`` of another number of steps, outside of [0, 1] or, where ``qaf_plan`` says so,
+            of other plans; a task_id without a plan.
 
     Example:
         >>> import torch, lw_torchrl as lw
@@ -72,11 +84,7 @@ class PlanAttention(TensorDictModuleBase):
 
     def over_steps(self, qaf: Tensor, rows: Tensor) -> Tensor:
         """:meth:`weights` from what :meth:`PlanTables.rows` gives."""
-        if qaf.shape != (*rows.shape, self.mask.shape[-1]):
-            raise ValueError(
-                f"qaf must have shape {(*rows.shape, self.mask.shape[-1])}, one column for each step of the actor's "
-                f"plans, got {tuple(qaf.shape)}; give QAFTransform the same plans"
-            )
+        check_truth(qaf, (*rows.shape, self.mask.shape[-1]))
         return attend(10.0 * qaf.to(torch.float32) - 5.0, self.mask[rows])
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

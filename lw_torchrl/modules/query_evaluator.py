@@ -61,9 +61,17 @@ class QueryEvaluator(TensorDictModuleBase):
         return tensordict.set(self.out_keys[0], self.logits(*(tensordict.get(key) for key in self.in_keys)))
 
     def with_plans(self, plans: Plans) -> QueryEvaluator:
-        """The same weights for the conditions of other plans."""
+        """One with the same weights for the conditions of other plans: training either trains both.
+
+        Raises:
+            RuntimeError: the weights have other names or shapes there.
+        """
         other = type(self)(plans, **self.config)
         other.load_state_dict(self.state_dict())
+        for name, module in other.named_modules():
+            own, passing = self.get_submodule(name), module._non_persistent_buffers_set
+            module._parameters.update(own._parameters)
+            module._buffers.update({key: kept for key, kept in own._buffers.items() if key not in passing})
         return other.train(self.training)
 
     def describe(self) -> dict[str, Any]:

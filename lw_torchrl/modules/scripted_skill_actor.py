@@ -10,13 +10,14 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from lw_torchrl._checks import check_choice
+from lw_torchrl._checks import check_choice, check_int, shown
 from lw_torchrl._keys import as_keys, check_apart
 from lw_torchrl.language.plan_tables import PlanTables
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.skill_program import SkillProgram
 from lw_torchrl.language.skills import ScriptedSkill
 from lw_torchrl.language.text import TextEncoder
+from lw_torchrl.modules.plan_attention import check_truth
 from lw_torchrl.modules.policy import Policy
 from lw_torchrl.transforms.qaf import QAFTransform, plan_number_key
 
@@ -26,19 +27,21 @@ class ScriptedSkillActor(Policy):
 
     Reads ``observation`` (B, 39) float32, ``task_id`` (B,) int64 and ``qaf`` (B, S) bool, or float in [0, 1] for soft
     truth; writes ``action`` (B, 4) float32 in [-1, 1] and ``skill_weights`` (B, S) float32, which sum to 1. A step of
-    soft truth is true above 0.5, whatever ``select`` is, as its hard truth would be.
+    soft truth is true above 0.5, whatever ``select`` is, as its hard truth would be. Where an observation is NaN, so is
+    the action, which the environment does not execute.
 
     Args:
         plans: a plan for each task it is to act in; every step's skill is the text of a scripted one.
         select: of several true steps, "first" takes the first, "random" any, the paper's way, and "mix" all of
             them, in equal parts.
         skills: the scripted skills by text, as from :func:`load_skills`; None for the shipped ones.
-        seed: of the random choice.
+        seed: of the random choice, from 0 to 2**64 - 1, or down to -2**63.
         in_keys, out_keys: other names for what it reads and writes, in the order above; nested ones too.
 
     Raises:
         ValueError: a wrong option, a skill text that is no scripted skill (with the nearest), or one that speaks of
-            objects that its task lacks; at call time, ``qaf`` of other plans, as ``qaf_plan`` beside it tells.
+            objects that its task lacks; at call time, ``qaf`` of another number of steps, outside of [0, 1], or of
+            other plans, as ``qaf_plan`` beside it tells.
 
     Example:
         >>> import lw_torchrl as lw
@@ -66,6 +69,8 @@ class ScriptedSkillActor(Policy):
         self.out_keys = as_keys("out_keys", out_keys, ("action", "skill_weights"))
         check_apart(self.in_keys, self.out_keys)
         self.config = {"select": select, "seed": seed, "in_keys": self.in_keys, "out_keys": self.out_keys}
+        if not -(2**63) <= check_int("seed", seed) < 2**64:
+            raise ValueError(f"seed must be from -2**63 to 2**64 - 1, got {shown(seed)}")
         self.select = check_choice("select", select, ("first", "random", "mix"))
         self._skills = skills
         self.program = SkillProgram(
@@ -98,6 +103,7 @@ class ScriptedSkillActor(Policy):
         return cls(Plans.from_json(found["plans"]), **found["options"])
 
     def _weights(self, qaf: Tensor, rows: Tensor) -> Tensor:
+        check_truth(qaf, (*rows.shape, self.tables.mask.shape[-1]))
         if qaf.dtype != torch.bool:
             qaf = qaf > 0.5
         last = torch.nn.functional.one_hot(self._last.to(rows.device)[rows], qaf.shape[-1]).bool()

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 from tensordict import unravel_key
 from tensordict.utils import NestedKey
-from torchrl.envs import Compose, EnvBase, RenameTransform, Transform, TransformedEnv
+from torchrl.envs import Compose, EnvBase, RenameTransform, SerialEnv, Transform, TransformedEnv
 
 
 def base_env(transform: Transform) -> EnvBase | None:
@@ -19,9 +21,12 @@ def base_env(transform: Transform) -> EnvBase | None:
 
 
 def refuse_changed(transform: Transform, key: NestedKey) -> None:
-    """Raise :class:`ValueError` where a transform that runs before this one changes what it is to read."""
-    for entry in (key, unravel_key(("next", key))):
-        for earlier in reversed(_before(transform)):
+    """Raise :class:`ValueError` where a transform that runs before this one changes what it is to read.
+
+    It goes by the keys that transforms say they write, and looks into a SerialEnv once that runs, not into processes.
+    """
+    for entry, chain in product((key, unravel_key(("next", key))), _before(transform)):
+        for earlier in reversed(chain):
             written = [unravel_key(out) for out in earlier.__dict__.get("_out_keys") or ()]
             if entry not in written:
                 continue
@@ -41,7 +46,8 @@ def transforms_beside(transform: Transform) -> int:
     return len(container.transforms) if isinstance(container, Compose) else 0
 
 
-def _before(transform: Transform) -> list[Transform]:
+def _before(transform: Transform) -> list[list[Transform]]:
+    """What runs before a transform; of several workers, a list for each."""
     found: list[Transform] = []
     inner, container = transform, _container(transform)
     while isinstance(container, Compose):
@@ -50,7 +56,15 @@ def _before(transform: Transform) -> list[Transform]:
         inner, container = container, _container(container)
     while isinstance(container, TransformedEnv) and isinstance(container := container.base_env, TransformedEnv):
         found = _flat(container.transform) + found
-    return found
+    return [inner + found for inner in _inside(container)]
+
+
+def _inside(env: Compose | EnvBase | None) -> list[list[Transform]]:
+    """The transforms in an environment, a list for each worker of a SerialEnv that runs."""
+    if isinstance(env, TransformedEnv):
+        return [inner + _flat(env.transform) for inner in _inside(env.base_env)]
+    workers = env.__dict__.get("_envs", ()) if isinstance(env, SerialEnv) else ()
+    return [chain for worker in workers for chain in _inside(worker)] or [[]]
 
 
 def _container(transform: Transform) -> Compose | EnvBase | None:

@@ -22,6 +22,8 @@ from lw_torchrl.language.task_index import TaskTables
 from lw_torchrl.transforms.containers import base_env, refuse_changed, transforms_beside
 from lw_torchrl.transforms.env_state import KeepsEnvState
 
+_HALF = (torch.float16, torch.bfloat16)  # in which metres are not told apart as conditions do
+
 
 class _Number(NamedTuple):
     plan: Tensor  # (T,) int64
@@ -43,9 +45,13 @@ class QAFTransform(KeepsEnvState):
     Reads ``observation`` (B, 39) float32 and ``task_id`` (B,) int64; writes ``qaf`` (B, S) bool, the truth of each
     condition of the row's plan, in the order of its steps, false beyond its last, and ``qaf_plan`` (B,) int64, that
     plan's number in :attr:`Plans.numbers`, by which an actor of other plans refuses the answers. On a replay buffer it
-    writes ``("next", "qaf")`` too, wherever ``("next", "observation")`` is. Conditions speak of metres, so it comes
-    before whatever changes the observation: a normaliser, :class:`RandomYaw`. In an environment its ``state_dict``
-    holds the environment's, as :class:`EnvState` does.
+    writes ``("next", "qaf")`` too, wherever ``("next", "observation")`` is. In an environment its ``state_dict`` holds
+    the environment's, as :class:`EnvState` does.
+
+    Conditions speak of metres, so it comes before whatever changes the observation: a normaliser, :class:`RandomYaw`.
+    One that comes first and says so, by its ``out_keys``, is refused, also in the workers of a SerialEnv. What it
+    cannot see it answers wrongly: a transform that changes the observation without naming it among its keys, and one
+    in the processes of a ParallelEnv; put it into each worker, before them.
 
     Args:
         plans: a plan for each task that will be seen.
@@ -54,7 +60,8 @@ class QAFTransform(KeepsEnvState):
 
     Raises:
         PlanError: (a ValueError) the environment has a task without a plan.
-        ValueError: a task_id without a plan, a malformed observation, or a transform before it that changes it.
+        ValueError: a task_id without a plan, a malformed observation, one of half precision, or a transform before it
+            that changes it.
 
     Example:
         >>> from torchrl.envs import TransformedEnv
@@ -85,11 +92,17 @@ class QAFTransform(KeepsEnvState):
         tables = PlanTables(self.plans)
         self._number = TaskTables(tables.index, _Number(tables.number), f"tasks without a plan in {self.plans!r}")
         self._beside = 0
+        self._saw_workers = False
 
     def _write(self, tensordict: TensorDictBase, task_id: Tensor | None) -> None:
         observation = tensordict.get(self.in_keys[0], None)
         if observation is None or task_id is None:
             raise missing_keys(tensordict.keys(True, True), *map(str, self.in_keys))
+        if observation.dtype in _HALF:
+            raise ValueError(
+                f"observation must be float32 or float64, as the environment gave it, got {observation.dtype}: put "
+                "QAFTransform before what casts it"
+            )
         tensordict.set(self.out_keys[0], self.program(observation, task_id))
         number = self._number.select(task_id.reshape(-1), observation).plan
         tensordict.set(self.out_keys[1], number.reshape(task_id.shape).clone())  # a collector zeroes what it is given
@@ -99,6 +112,9 @@ class QAFTransform(KeepsEnvState):
         return next_tensordict
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        if not self._saw_workers:  # which a SerialEnv has since its first reset
+            refuse_changed(self, self.in_keys[0])
+            self._saw_workers = True
         return self._call(tensordict_reset)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -117,6 +133,7 @@ class QAFTransform(KeepsEnvState):
     def set_container(self, container: Transform | EnvBase) -> None:
         """Join an environment, every task of which must have a plan."""
         super().set_container(container)
+        self._saw_workers = False
         refuse_changed(self, self.in_keys[0])
         env = base_env(self)
         if not isinstance(env, BatchedEnvBase):  # whose workers may not be there yet

@@ -154,11 +154,43 @@ def replaced_zip(path):
     return zipfile.ZipFile(path, "w")
 
 
-@pytest.mark.parametrize("damage", [truncate, empty, scribble, foreign])
-def test_a_damaged_episode_is_done_again(half_made, made, damage):
+def compress(path):
+    with np.load(path) as found:
+        arrays = dict(found)
+    np.savez_compressed(path, **arrays)
+
+
+def swell(path):
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr("more", bytes(100_000))
+
+
+def link(path):
+    path.symlink_to(path.rename(path.with_suffix(".elsewhere")))
+
+
+def fifo(path):
+    path.unlink()
+    os.mkfifo(path)
+
+
+@pytest.mark.parametrize("damage", [truncate, empty, scribble, foreign, compress, swell, link, fifo])
+def test_a_damaged_episode_is_done_again(half_made, made, damage, monkeypatch):
     damage(sorted((half_made / ".partial").glob("*.npz"))[0])
+    done, put = [], EpisodeFiles.put
+    monkeypatch.setattr(EpisodeFiles, "put", lambda self, *args: (done.append(args), put(self, *args)))
     collect(half_made)
+    assert len(done) == 3
     assert tree(half_made) == tree(made.root)
+
+
+def test_a_folder_in_the_place_of_an_episode_is_named_and_left_alone(half_made):
+    (half_made / ".partial" / "reach.7.npz").mkdir()
+    (half_made / ".partial" / "reach.7.npz" / "thesis.tex").write_text("years of work")
+    before = tree(half_made)
+    with pytest.raises(DatasetError, match=r"root: .*reach\.7\.npz' is a folder"):
+        collect(half_made)
+    assert tree(half_made) == before
 
 
 def test_no_pickle_in_an_episodes_file_is_ever_executed(half_made, made, tmp_path):

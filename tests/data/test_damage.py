@@ -276,3 +276,36 @@ def test_half_made_episodes_of_other_numbers_get_todays(tmp_path, made, monkeypa
     monkeypatch.undo()
     collect(tmp_path / "demos")
     assert tree(tmp_path / "demos") == tree(made.root)
+
+
+@pytest.mark.parametrize("name", ["data", ".partial"])
+def test_a_link_in_the_place_of_a_folder_that_is_to_be_written_is_refused_before_anything_is_gone(
+    root, made, tmp_path, name
+):
+    elsewhere = tmp_path / "elsewhere"
+    if name == "data":
+        (root / name).rename(elsewhere)
+    else:
+        elsewhere.mkdir()
+    (root / name).symlink_to(elsewhere)
+    assert len(LanguageWorldExperienceReplay(root)) == made.num_steps
+    flip(root / "data" / "action.memmap", 20)
+    before = tree(root), tree(elsewhere)
+    with pytest.raises(DatasetError, match=rf"root: .*{name}' must be a folder .*, it is a link"):
+        collect(root)
+    assert (tree(root), tree(elsewhere)) == before
+
+
+@pytest.mark.parametrize(
+    ("column", "label"), [("action", "executed"), ("expert_action", "expert"), ("unclipped_action", "unclipped")]
+)
+def test_an_action_that_is_no_number_is_not_loaded(root, column, label):
+    path = root / "data" / f"{column}.memmap"
+    values = np.fromfile(path, "f4")
+    values[17] = np.nan
+    values.tofile(path)
+    with pytest.raises(DatasetError, match=f"no finite number, for label='{label}'"):
+        LanguageWorldExperienceReplay(root, label=label)
+    values[17:19] = 3e38  # whose sum overflows
+    values.tofile(path)
+    assert len(LanguageWorldExperienceReplay(root, label=label)) == len(values) // 4

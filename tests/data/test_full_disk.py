@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import subprocess
 import sys
 
 import pytest
+
+from lw_torchrl.data.episode_files import write_failed
 
 COLLECT = """
 import os, sys
@@ -74,3 +77,11 @@ def test_a_full_disk_is_said_and_nothing_is_lost(small_disk, tmp_path):
     command = [sys.executable, "-W", "ignore", "-c", COLLECT, str(small_disk), str(tmp_path / "plain")]
     done = subprocess.run(command, capture_output=True, text=True, timeout=240, env={**os.environ})
     assert (done.returncode, done.stdout) == (0, "as good as new\n"), done.stderr
+
+
+def test_only_a_full_disk_wants_room(tmp_path):
+    assert "once there is room" in str(write_failed(tmp_path, 7, OSError(errno.ENOSPC, "No space left on device")))
+    other = str(write_failed(tmp_path, 7, OSError(errno.ENOTDIR, "Not a directory")))
+    assert "writing 7 bytes" in other
+    assert "Not a directory" in other
+    assert "room" not in other

@@ -115,6 +115,7 @@ def test_an_episode_asked_for_is_the_same_trajectory(any_env):
     [
         (torch.tensor([0, 1, 2, -3, 0, 0]), ValueError, "episode must be at least 0, got -3"),
         (-1, ValueError, "episode must be at least 0, got -1"),
+        (2**63, ValueError, r"episode must be below 2\*\*63, got 9223372036854775808"),
         (torch.zeros(ROWS), ValueError, r"episode must be an integer, or int64 of shape \(6,\).*got torch.float32"),
         (torch.zeros(ROWS, 2, dtype=torch.int64), ValueError, r"episode must be .*\(6,\).* got .*\(6, 2\)"),
         (torch.zeros(5, dtype=torch.int64), ValueError, r"episode must be .*\(6,\).* got .*\(5,\)"),
@@ -161,6 +162,48 @@ def test_the_middle_of_an_episode_is_refused(env):
         env.reset(later.exclude("reward"), set_state=True)
     with pytest.raises(RuntimeError, match="have ended or were never reset"):
         advance(env, state, row_actions(state, 0))
+
+
+def test_a_state_of_other_tasks_is_refused():
+    env, other = make_env(), lw.LanguageWorldEnv(["drawer-open", "reach"], num_threads=1)
+    env.reset()
+    foreign = other.reset(episode=5).select("episode", "task_id")
+    with pytest.raises(ValueError, match=r"set_state=True .* names other tasks than those of this one, push, reach"):
+        env.reset(foreign, set_state=True)
+    one_row = foreign.clone().set("_reset", torch.tensor([False, True]))
+    assert env.reset(one_row, set_state=True)["episode"][1] == 5
+    assert env.reset()["episode"].tolist() == [1, 2], "of the rows that were not asked for, the tasks do not count"
+    env.close()
+    other.close()
+
+
+@pytest.mark.parametrize("mask", [torch.tensor([1, 0]), torch.tensor([1.0, 0.0]), torch.ones(2, 2, dtype=torch.bool)])
+def test_a_mask_is_of_bools_one_a_row(mask):
+    env = make_env()
+    state = env.reset()
+    with pytest.raises(ValueError, match="_reset must be bool of shape"):
+        env.reset(TensorDict({"_reset": mask}, [2]))
+    action = torch.zeros(2, 4)
+    with pytest.raises(ValueError, match="_step must be bool of shape"):
+        env.step(state.clone().set("action", action).set("_step", mask))
+    for _ in range(3):
+        state = env.step(state.set("action", action))["next"]
+    assert state["truncated"].all(), "the refused step did not count"
+    assert env.reset()["episode"].tolist() == [1, 1]
+    env.close()
+
+
+@pytest.mark.parametrize("seed", [-1, 2**70, 0])
+def test_the_seed_is_any_integer(seed):
+    env, made = make_env(), lw.LanguageWorldEnv(["push", "reach"], num_envs=2, seed=seed, num_threads=1)
+    following = env.set_seed(seed)
+    assert (env.seed, env.set_seed(seed, static_seed=True)) == (seed, seed)
+    assert torch.equal(env.reset()["observation"], made.reset()["observation"])
+    assert 0 <= following < 2**32
+    if seed == 0:
+        assert following == 795726461, "as TorchRL's own environments say"
+    env.close()
+    made.close()
 
 
 def test_a_state_needs_its_episode_and_no_other(env, plans):

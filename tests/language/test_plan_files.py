@@ -64,9 +64,9 @@ def test_any_condition_becomes_the_nearest_query(tmp_path_factory, condition, sk
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        ("{", "not JSON"),
-        ("[" * 100_000, "not JSON"),
-        ([], r"expected task names with lists of \(condition, skill\) pairs, got \[\]"),
+        ("{", "expected JSON"),
+        ("[" * 100_000, "nested too deeply"),
+        ([], "task names with lists of pairs: it must be an object, got list"),
         ({"plans": 3}, "expected task names with lists"),
         ({"pusch": []}, "'pusch' is no task; did you mean 'push'"),
         ({"push": {}}, "push: expected a list of"),
@@ -75,9 +75,11 @@ def test_any_condition_becomes_the_nearest_query(tmp_path_factory, condition, sk
         ({"push": [["gripper is open", "7"]]}, "skill must begin with a plain word"),
         ({"push": []}, "must have at least one step"),
         ({}, "at least one plan"),
-        ("[" * 900 + "]" * 900, "expected task names with lists"),
+        ("[" * 900 + "]" * 900, "it must be an object, got list"),
         ('{"push": ' + "[" * 900 + "]" * 900 + "}", "push, step 1: expected a condition"),
-        ('{"push": [[' + "9" * 5000 + ", 3]]}", "not JSON"),
+        ('{"push": [[' + "9" * 5000 + ", 3]]}", "expected JSON"),
+        ('{"push": [["gripper is open", "wait"]], "push": [["gripper is closed", "wait"]]}', "'push' more than once"),
+        ({"push": [["open and " * 64 + "closed", "wait"]]}, "push, step 1: query .* must have at most 64 clauses"),
     ],
 )
 def test_what_is_no_plan_is_named(write, value, message):

@@ -117,3 +117,10 @@ def test_a_plain_mapping_is_taken_for_plans():
 
 def test_the_mask_is_no_part_of_the_saved_state():
     assert PlanAttention(PLANS).state_dict() == {}
+
+
+@pytest.mark.parametrize("wrong", [math.nan, 100.0, -0.1, math.inf])
+def test_soft_truth_is_of_numbers_from_0_to_1(wrong):
+    with pytest.raises(ValueError, match="qaf must be bool, or numbers from 0 to 1"):
+        weights(torch.tensor([[0.5, wrong, 0.0, 0.0]]), [REACH])
+    assert weights(torch.tensor([[0.0, 1.0, 0.0, 0.0]]), [REACH]).sum() == 1

@@ -8,6 +8,7 @@ from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import (
     Compose,
+    DTypeCastTransform,
     ObservationNorm,
     RenameTransform,
     SerialEnv,
@@ -179,6 +180,37 @@ def test_the_right_order_answers_on_the_observation_as_it_was():
     assert torch.equal(found["observation"], expected["observation"] * 2.0)
     env.close()
     plain.close()
+
+
+def normed() -> TransformedEnv:
+    return TransformedEnv(make_env(), Compose(StepCounter(), norm()))
+
+
+@pytest.mark.parametrize("inner", [normed, lambda: TransformedEnv(SerialEnv(2, normed), StepCounter())])
+def test_what_changes_the_observation_in_a_worker_is_refused_too(inner):
+    env = TransformedEnv(SerialEnv(2, inner), queries())
+    with pytest.raises(ValueError, match="ObservationNorm changes 'observation' before QAFTransform reads it"):
+        env.reset()
+    env.close(raise_if_closed=False)
+
+
+def test_queries_in_the_workers_may_be_followed_by_a_normaliser():
+    env = TransformedEnv(SerialEnv(2, lambda: TransformedEnv(make_env(), Compose(queries(), norm()))), StepCounter())
+    assert env.reset()["qaf"].shape[:2] == (2, 2)
+    env.close()
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_an_observation_of_half_precision_is_refused(dtype):
+    replay = TensorDictReplayBuffer(storage=LazyTensorStorage(6), batch_size=6)
+    replay.append_transform(DTypeCastTransform(torch.float32, dtype))
+    replay.append_transform(queries())
+    replay.extend(rows())
+    with pytest.raises(ValueError, match=rf"observation must be float32 or float64.* got {dtype}: put QAFTransform"):
+        replay.sample()
+    precise = rows()
+    precise["observation"] = precise["observation"].double()
+    assert queries()(precise)["qaf"].dtype == torch.bool
 
 
 def test_over_workers_that_are_not_there_yet():
