@@ -80,6 +80,23 @@ def test_of_several_sources_the_later_one_counts(capsys, tmp_path):
         assert lacks not in shown
 
 
+def test_a_shipped_plan_that_a_later_source_replaces_need_not_fit(capsys):
+    files = ("--task-file", "tasks.toml")  # its reach has no "reach target", of which the shipped plan speaks
+    shown = run(capsys, "plans", "reach", "push", "--plans", "MT10", "reach.plan", *files)
+    assert "robot.go" in shown
+    assert "the puck" in shown
+    message = fails(capsys, "plans", "reach", "--plans", "reach.plan", "MT10", *files)
+    assert "--plans reach.plan MT10: the plan of 'reach' that counts is the shipped one" in message
+    assert "'the ball'" in message
+
+
+def test_a_plan_with_a_fault_is_named_by_its_path(capsys, tmp_path):
+    path = tmp_path / "mine" / "push.plan"
+    path.parent.mkdir()
+    path.write_text(PLAN)
+    assert f"--plans {path}: push.plan, line 2: " in fails(capsys, "plans", "--plans", "MT10", path)
+
+
 def test_scripts_carry_them_out(capsys, tmp_path):
     files = ("--plans", "reach.plan", "--skill-file", "skills.toml", "--task-file", "tasks.toml")
     out = run(capsys, "scripted", "reach", *files, "--episodes", 3, "--out", tmp_path / "out")
