@@ -11,6 +11,7 @@ import pytest
 import torch
 from collecting import EPISODES, NOISE, SEED, STEPS, TASKS, collect, tree
 
+import lw_torchrl as lw
 from lw_torchrl.data import CollectConfig
 from lw_torchrl.data.metadata import read_metadata
 from lw_torchrl.data.rows import load_rows
