@@ -30,6 +30,28 @@ def read_tasks(task_file: Path | None) -> Mapping[str, Task]:
     return TASKS if task_file is None else load_tasks(task_file)
 
 
+def simulated(argument: str, names: str | Sequence[str], known: Mapping[str, Task]) -> tuple[str, ...]:
+    """The tasks behind ``names``, sorted, all of which the simulator has.
+
+    Raises:
+        ValueError: one is not among ``known``, or is a task of the user's that the simulator lacks.
+    """
+    from lw_torchrl.language.tasks import TASKS, resolve_tasks
+
+    given = [names] if isinstance(names, str) else names
+    if own := [name for name in given if name not in (*SETS, *TASKS) and name in known]:
+        raise ValueError(
+            f"{argument}: the simulator has no {', '.join(own)}; tasks of your own run in an engine of yours, in "
+            "Python: docs/training.md"
+        )
+    try:
+        return resolve_tasks(names, tasks=TASKS)
+    except ValueError as error:
+        if all(name in (*SETS, *TASKS) for name in given):
+            raise
+        raise ValueError(f"{error}. The simulator has no others") from error
+
+
 def read_plans(sources: Sequence[str], tasks: Mapping[str, Task], skills: Literal["own", "MT10"] = "own") -> Plans:
     """The plans of --plans: MT10, MT50, files and folders; where two have a plan for a task, the later one's counts.
 
