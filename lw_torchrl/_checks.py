@@ -29,6 +29,16 @@ def unknown_name(argument: str, given: object, allowed: Iterable[str]) -> ValueE
     return ValueError(message)
 
 
+def counted(number: int, noun: str) -> str:
+    """A number and what it counts.
+
+    Example:
+        >>> counted(1, "task"), counted(50, "task")
+        ('1 task', '50 tasks')
+    """
+    return f"{number} {noun}" + "s" * (number != 1)
+
+
 def missing_keys(found: Iterable[Any], *needed: str) -> ValueError:
     """The error for a tensordict of the keys ``found`` that lacks one of two needed ones; the caller raises it."""
     return ValueError(f"{' and '.join(needed)} are needed, got {', '.join(map(str, found))}")

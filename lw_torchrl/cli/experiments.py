@@ -68,6 +68,8 @@ def reproduce(
     """
     if not list:
         check_folder("--out", out)
+    elif run is not None:
+        raise ValueError("--list names the runs and does none, --run does one: give one of them")
     from lw_torchrl._checks import check_choice, check_int
     from lw_torchrl.cli.threads import use_one_thread
     from lw_torchrl.experiments.execution import execute_run
@@ -101,6 +103,8 @@ def reproduce(
         print("\n".join([*datasets, *named]))
         return
     load, encoder = _Plans(plans, task_file), read_encoder(text_encoder)
+    for one in runs:  # before any work
+        load(one)
     use_one_thread()
     if run in datasets:
         datasets[run].collect(out, progress=True)
@@ -124,17 +128,26 @@ def reproduce(
 
 
 class _Plans:
-    """The plans that a run uses, each set read once."""
+    """The plans that a run uses, each set read once; :class:`ValueError` where a task of the 50 has none."""
 
     def __init__(self, sources: Sequence[str], task_file: Path | None) -> None:
         self.sources, self.tasks = sources, read_tasks(task_file)
         self.known: dict[str, Plans] = {}
 
     def __call__(self, run: Run) -> Plans:
+        from lw_torchrl.language.tasks import MT50
+
         zero_shot = run.setting.name == "zero-shot" and run.method != "scripted"
         skills: Literal["MT10", "own"] = "MT10" if zero_shot else "own"
         if skills not in self.known:
-            self.known[skills] = read_plans(self.sources or ["MT50"], self.tasks, skills)
+            found = read_plans(self.sources or ["MT50"], self.tasks, skills)
+            if missing := [task for task in MT50 if task not in found]:
+                raise ValueError(
+                    f"--plans must have a plan for each of the 50 tasks, they lack {len(missing)}: "
+                    f"{', '.join(missing[:5])}{', ...' if len(missing) > 5 else ''}; --plans MT50 "
+                    f"{' '.join(self.sources)} takes ours for these"
+                )
+            self.known[skills] = found
         return self.known[skills]
 
 

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
+from lw_torchrl._checks import counted
 from lw_torchrl.cli.outputs import check_file, check_folder
-from lw_torchrl.cli.sources import make_logger, one_or_many, read_encoder, read_plans, read_tasks
+from lw_torchrl.cli.sources import make_logger, one_or_many, read_encoder, read_plans, read_tasks, simulated
 from lw_torchrl.cli.threads import use_one_thread
 
 if TYPE_CHECKING:
@@ -44,9 +45,10 @@ def collect(
     """
     check_folder("--out", out)
     from lw_torchrl.data import collect_demonstrations
+    from lw_torchrl.language.tasks import TASKS
 
     made = collect_demonstrations(
-        one_or_many(tasks),
+        simulated("tasks", one_or_many(tasks), TASKS),
         episodes_per_task=episodes,
         root=out,
         seed=seed,
@@ -70,7 +72,7 @@ def train(
     task_file: Path | None = None,
     text_encoder: str | None = None,
     method: str = "pcbc",
-    mix: Literal["latents", "actions"] = "latents",
+    mix: Literal["latents", "actions"] | None = None,
     features: Literal["raw", "differences", "relative", "both"] = "differences",
     width: int = 256,
     depth: int = 3,
@@ -94,7 +96,7 @@ def train(
         task_file: tasks of yours, whose objects and points the plans may name.
         text_encoder: a function of yours that turns texts into vectors, as my_texts:encode; evaluate wants it again.
         method: pcbc, conditioned on the plan; or a baseline: dc, on the task's description, one-hot, on its number.
-        mix: mix the skills' latents, as in the paper, or their actions.
+        mix: mix the skills' latents, as in the paper and by default, or their actions; of a policy with plans.
         features: what the policy sees: the raw observation; differences between hand, objects and goal; relative, these
             without the hand's height and the gripper's opening; or both the first and the second.
         width: of the action decoder's hidden layers.
@@ -119,8 +121,10 @@ def train(
     loaded = read_plans(plans, known)
     options: dict[str, Any] = {"features": features, "width": width, "depth": depth}
     reads_plans = policy_class(METHODS[check_choice("method", method, METHODS)].policy).plan_options
+    if mix is not None and not reads_plans:
+        raise ValueError(f"--mix is for a method that reads plans, --method {method} does not")
     if reads_plans:
-        options["mix"] = mix
+        options["mix"] = mix or "latents"
     config = lw.BehavioralCloningConfig(steps=steps, batch_size=batch_size, learning_rate=learning_rate, seed=seed)
     replay = lw.LanguageWorldExperienceReplay(
         data,
@@ -141,9 +145,12 @@ def train(
 
 def _all_of(data: Path, tasks: tuple[str, ...]) -> dict[str, list[int]]:
     """Every episode of these tasks in a dataset."""
+    from lw_torchrl._checks import check_choice
     from lw_torchrl.data.metadata import read_metadata
 
     found = read_metadata(data)
+    for task in tasks:
+        check_choice("tasks", task, found.config.tasks)
     return {task: [one.episode for one in found.episodes if one.task == task] for task in tasks}
 
 
@@ -167,7 +174,8 @@ def evaluate(
 
     Args:
         checkpoint: of `lw-torchrl train`, or the word expert.
-        tasks: MT10, MT50, or names of tasks; those of the policy's plans if none is given.
+        tasks: MT10, MT50, or names of tasks; if none is given, those of --plans, or else those that the policy was
+            trained on.
         plans: carry out these instead of the policy's own: MT10, MT50, .plan or .json files, or folders; where several
             have a plan for a task, the last one's counts.
         task_file: tasks of yours, whose objects and points the plans may name.
@@ -185,11 +193,16 @@ def evaluate(
     from lw_torchrl.record.rollouts import rollout_tasks, write_recording
 
     use_one_thread()
-    given = read_plans(plans, read_tasks(task_file)) if plans else None
+    known = dict(read_tasks(task_file))
+    given = read_plans(plans, known) if plans else None
     policy = None
     if str(checkpoint) != "expert":
         policy = _load(checkpoint, seed, given, text_encoder)
-    chosen = one_or_many(tasks) or (policy.tasks if policy is not None else "MT10")
+        known.update({task: found for task in policy.tasks if (found := policy.definition(task)) is not None})
+    if tasks or policy is None:
+        chosen = simulated("tasks", one_or_many(tasks) or "MT10", known)
+    else:
+        chosen = _default_tasks(policy, checkpoint, trained=not plans)
     result = lw.evaluate(
         policy or lw.ExpertActor(chosen),
         tasks=chosen,
@@ -211,6 +224,28 @@ def evaluate(
             rollouts = rollout_tasks(policy, shown, seed=seed, noise_scale=noise)
             write_recording(out / "rollout.rrd", policy, rollouts)
         print(f"written to {out}")
+
+
+def _default_tasks(policy: Policy, checkpoint: Path, *, trained: bool) -> tuple[str, ...]:
+    """The policy's tasks, of these the ones that its file says it was trained on, of these the simulator's; what is
+    left out is printed."""
+    from lw_torchrl.language.tasks import TASKS
+    from lw_torchrl.trainers.checkpoint import demonstrated_tasks
+
+    shown = demonstrated_tasks(checkpoint) if trained else set()
+    chosen = [task for task in policy.tasks if task in shown] or list(policy.tasks)
+    own = [task for task in chosen if task not in TASKS]
+    if len(own) == len(chosen):
+        raise ValueError(
+            f"the simulator has none of the policy's tasks, {', '.join(own)}; name others with --tasks, or run these "
+            "in an engine of yours, in Python: docs/training.md"
+        )
+    if len(chosen) < len(policy.tasks):
+        ran = counted(len(chosen), "task")
+        print(f"on the {ran} that it was trained on, of {len(policy.tasks)} that it knows; --tasks names others")
+    if own:
+        print(f"without {', '.join(own)}, which the simulator lacks")
+    return tuple(task for task in chosen if task in TASKS)
 
 
 def _load(checkpoint: Path, seed: int, plans: Plans | None, text_encoder: str | None) -> Policy:

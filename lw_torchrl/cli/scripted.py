@@ -8,7 +8,7 @@ from typing import Literal
 from tyro.conf import Positional
 
 from lw_torchrl.cli.outputs import check_folder
-from lw_torchrl.cli.sources import one_or_many, read_plans, read_tasks
+from lw_torchrl.cli.sources import one_or_many, read_plans, read_tasks, simulated
 
 
 def scripted(
@@ -47,7 +47,7 @@ def scripted(
     from lw_torchrl.evaluation.plan_use import PlanUse
 
     known = read_tasks(task_file)
-    chosen = lw.resolve_tasks(one_or_many(names), tasks=known)
+    chosen = simulated("tasks", one_or_many(names), known)
     loaded = read_plans(plans, known)
     loaded.require(chosen)
     loaded = type(loaded)({task: loaded[task] for task in chosen})

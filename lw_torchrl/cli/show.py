@@ -7,7 +7,7 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from lw_torchrl.cli.outputs import check_file, check_folder
-from lw_torchrl.cli.sources import read_tasks
+from lw_torchrl.cli.sources import read_tasks, simulated
 from lw_torchrl.cli.threads import use_one_thread
 
 
@@ -79,8 +79,9 @@ def query(
     from lw_torchrl._checks import check_int
     from lw_torchrl.language.tasks import check_task
 
-    name = check_task(task)
-    definition = read_tasks(task_file)[name]
+    known = read_tasks(task_file)
+    (name,) = simulated("task", [check_task(task, known)], known)
+    definition = known[name]
     listed = (
         [lw.parse_query(text, definition)]
         if text is not None

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from lw_torchrl.language.tasks import Task
     from lw_torchrl.language.text import TextEncoder
 
+SETS = ("MT10", "MT50")
+
 
 def one_or_many(names: tuple[str, ...]) -> str | tuple[str, ...]:
     """MT10 is a set, not a list of one name."""
@@ -28,17 +30,56 @@ def read_tasks(task_file: Path | None) -> Mapping[str, Task]:
     return TASKS if task_file is None else load_tasks(task_file)
 
 
+def simulated(argument: str, names: str | Sequence[str], known: Mapping[str, Task]) -> tuple[str, ...]:
+    """The tasks behind ``names``, sorted, all of which the simulator has.
+
+    Raises:
+        ValueError: one is not among ``known``, or is a task of the user's that the simulator lacks.
+    """
+    from lw_torchrl.language.tasks import TASKS, resolve_tasks
+
+    given = [names] if isinstance(names, str) else names
+    if own := [name for name in given if name not in (*SETS, *TASKS) and name in known]:
+        raise ValueError(
+            f"{argument}: the simulator has no {', '.join(own)}; tasks of your own run in an engine of yours, in "
+            "Python: docs/training.md"
+        )
+    try:
+        return resolve_tasks(names, tasks=TASKS)
+    except ValueError as error:
+        if all(name in (*SETS, *TASKS) for name in given):
+            raise
+        raise ValueError(f"{error}. The simulator has no others") from error
+
+
 def read_plans(sources: Sequence[str], tasks: Mapping[str, Task], skills: Literal["own", "MT10"] = "own") -> Plans:
-    """The plans of --plans: MT10, MT50, files and folders; where two have a plan for a task, the later one's counts."""
+    """The plans of --plans: MT10, MT50, files and folders; where two have a plan for a task, the later one's counts.
+
+    A shipped plan that counts is carried over to the task of that name in ``tasks``.
+
+    Raises:
+        PlanError: (a ValueError) a source holds no valid plans, or a shipped one names what a task of the user's lacks.
+    """
     from lw_torchrl.language.plan_files import load_plans
-    from lw_torchrl.language.plans import ConditionalPlan, Plans
+    from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans
 
     found: dict[str, ConditionalPlan] = {}
     for source in sources:
-        shipped = source in ("MT10", "MT50")
-        found.update(load_plans(source, skills=skills if shipped else "own", tasks=tasks))
+        try:
+            found.update(load_plans(source, skills=skills) if source in SETS else load_plans(source, tasks=tasks))
+        except PlanError as error:
+            raise PlanError(f"--plans {source}: {error}") from error
     if not found:
         raise ValueError("--plans must name at least one source of plans: MT10, MT50, a file or a folder")
+    for task, plan in found.items():
+        if plan.definition != tasks[task]:
+            try:
+                found[task] = ConditionalPlan(task, plan.steps, tasks[task])
+            except PlanError as error:
+                raise PlanError(
+                    f"--plans {' '.join(sources)}: the plan of {task!r} that counts is the shipped one, which does not "
+                    f"fit the {task!r} of --task-file; name a plan of yours for it, last ({error})"
+                ) from error
     return Plans(found)
 
 

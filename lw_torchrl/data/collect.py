@@ -42,6 +42,16 @@ from lw_torchrl.language.tasks import resolve_tasks, task_id
 _PATIENCE = 1.0  # seconds to wait for another call: it may be about to end
 
 
+def _known_to_experts(tasks: str | Iterable[str]) -> tuple[str, ...]:
+    try:
+        return resolve_tasks(tasks)
+    except TypeError as error:
+        raise TypeError(
+            f"{error}. Meta-World's experts demonstrate its own 50 tasks; docs/training.md shows demonstrations by a "
+            "policy of one's own"
+        ) from error
+
+
 def _open_episode_files(root: Path, config: CollectConfig) -> EpisodeFiles:
     folder = root / PARTIAL
     stated = folder / "config.json"
@@ -198,7 +208,8 @@ def collect_demonstrations(
         next/success, next/done, next/terminated, next/truncated: (R, 1) bool.
 
     Args:
-        tasks: as for :func:`resolve_tasks`.
+        tasks: of the 50, as for :func:`resolve_tasks`. Meta-World's experts know no others: docs/training.md shows
+            demonstrations by a policy of one's own, in a task or an engine of one's own.
         episodes_per_task: how many episodes of each task to keep.
         root: the dataset's folder, new or left by an earlier call.
         seed: evaluate on another one.
@@ -221,6 +232,7 @@ def collect_demonstrations(
     Raises:
         ValueError: a wrong argument; DatasetError where ``root`` holds something else, or another call is at work
             in it.
+        TypeError: ``tasks`` holds a :class:`~lw_torchrl.Task`.
         OSError: it cannot be written, since there is no room, say; nothing is lost.
         RuntimeError: redrawing found too few successes.
 
@@ -232,7 +244,7 @@ def collect_demonstrations(
         (80, {'reach': 1.0})
     """
     config = CollectConfig(
-        tasks=resolve_tasks(tasks),
+        tasks=_known_to_experts(tasks),
         episodes_per_task=episodes_per_task,
         seed=seed,
         noise_scale=(noise_scale,) if isinstance(noise_scale, (int, float)) else tuple(noise_scale),

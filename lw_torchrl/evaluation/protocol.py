@@ -8,11 +8,11 @@ from typing import Any, Literal
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import NestedKey
+from tensordict.utils import NestedKey, unravel_key
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from lw_torchrl._checks import check_int, check_scale
+from lw_torchrl._checks import check_int, check_scale, unknown_name
 from lw_torchrl._progress import Progress
 from lw_torchrl.envs.engine import ACTION_SIZE
 from lw_torchrl.envs.episodes import FinishedEpisode, in_blocks, run_episodes
@@ -20,7 +20,7 @@ from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.evaluation.result import EpisodeResult, EvaluationResult
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.tasks import TASKS, Task, named_tasks
-from lw_torchrl.modules.policy import plans_of, transform_of
+from lw_torchrl.modules.policy import Policy, plans_of, transform_of
 
 _ROWS = 256  # more hardly make a step of all of them cheaper per row, and cost memory
 
@@ -67,7 +67,14 @@ def _result(task: str, episode: int, steps: TensorDictBase, stopped_early: bool,
     )
 
 
-def _checked(policy: Callable[[TensorDictBase], TensorDictBase]) -> Callable[[TensorDictBase], TensorDictBase]:
+def _checked(
+    policy: Callable[[TensorDictBase], TensorDictBase], env: EnvBase, also_record: Sequence[NestedKey]
+) -> Callable[[TensorDictBase], TensorDictBase]:
+    """``policy``, whose action is checked, and at its first call whether it and ``env`` write ``also_record``."""
+    unseen = [unravel_key(key) for key in also_record]
+    specs = env.full_observation_spec, env.full_reward_spec, env.full_done_spec
+    later = [unravel_key(("next", key)) for spec in specs for key in spec.keys(True, True)]
+
     def run(tensordict: TensorDictBase) -> TensorDictBase:
         tensordict = policy(tensordict)
         action, shape = tensordict.get("action", None), (*tensordict.batch_size, ACTION_SIZE)
@@ -78,6 +85,10 @@ def _checked(policy: Callable[[TensorDictBase], TensorDictBase]) -> Callable[[Te
                 f"the actor's action must be float32 of shape {shape}, got {action.dtype} of shape "
                 f"{tuple(action.shape)}"
             )
+        while unseen:
+            key = unseen.pop()
+            if key not in later and key not in tensordict.keys(True):
+                raise unknown_name("also_record", key, [*tensordict.exclude("_step").keys(True, True), *later])
         return tensordict
 
     return run
@@ -111,7 +122,7 @@ def evaluate(
 
     Args:
         actor: reads ``observation``, ``task_id`` and, if it has plans, ``qaf``; writes ``action`` (N, 4) float32.
-        tasks: as for :func:`resolve_tasks`.
+        tasks: as for :func:`resolve_tasks`; of a :class:`~lw_torchrl.Policy`, among its ``tasks``.
         plans: whose queries to answer; None for the actor's own.
         episodes_per_task: k.
         seed: one that no demonstration was collected with.
@@ -125,8 +136,9 @@ def evaluate(
         engine, num_threads: as for :class:`LanguageWorldEnv`.
         progress: show a progress bar when it takes longer than a second.
         also_record: more keys for ``on_episode`` to see: "qaf", "skill_weights".
-        on_episode: called with each finished episode, (task, index, steps): steps has batch (T,) and the keys
-            ``action``, ``("next", "success")``, ``("next", "reward")`` and those of ``also_record``.
+        on_episode: called with each finished episode as its one argument, a named tuple of ``task``, ``episode``, its
+            index, and ``steps``, a TensorDict of batch (T,) with the keys ``action``, ``("next", "success")``,
+            ``("next", "reward")`` and those of ``also_record``.
 
     Warns:
         UserWarning: a simulation became unstable; its episode ends there, a failure unless it had succeeded.
@@ -135,8 +147,8 @@ def evaluate(
         The result; ``.success_once`` maps each task to its success rate.
 
     Raises:
-        ValueError: a wrong argument, plans that differ from the actor's, a task without a plan, or an actor that
-            gives NaN.
+        ValueError: a wrong argument, plans that differ from the actor's, a task without a plan or not among the
+            actor's, a key in ``also_record`` that nobody writes, or an actor that gives NaN.
 
     Example:
         >>> import lw_torchrl as lw
@@ -149,14 +161,19 @@ def evaluate(
     answered = actor_plans(actor, plans)
     chosen = tasks_of(tasks, answered)
     names = tuple(chosen)
+    if answered is not None:
+        answered.require(names)
+    known = getattr(actor, "tasks", names) if isinstance(actor, Policy) else names
+    if other := [task for task in names if task not in known]:
+        raise ValueError(
+            f"tasks must be among the actor's, {', '.join(known)}; it was not made for: {', '.join(other)}"
+        )
     check_int("episodes_per_task", episodes_per_task, minimum=1)
     check_scale("noise_scale", noise_scale)
     most = len(names) * episodes_per_task  # a row more would have nothing to do
     if num_envs is None:
         num_envs = len(names) * max(1, min(episodes_per_task, _ROWS // len(names)))
     num_envs = min(check_int("num_envs", num_envs), most)
-    if answered is not None:
-        answered.require(names)
     base = LanguageWorldEnv(
         list(chosen.values()),
         num_envs=num_envs,
@@ -179,7 +196,7 @@ def evaluate(
         with bar, torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
             for finished in run_episodes(
                 env,
-                _checked(policy),
+                _checked(policy, env, also_record),
                 {task: range(episodes_per_task) for task in names},
                 keys=["action", ("next", "success"), ("next", "reward"), *also_record],
                 noise=(lambda _: (noise_scale,) * 4) if noise_scale else None,

@@ -29,6 +29,9 @@ _IN_FORCE = 0.01  # a step whose condition does not hold beside one that does ha
 def _check_evaluator(evaluator: QueryEvaluator | None, plans: Plans, reads_truth: float) -> QueryEvaluator | None:
     if evaluator is None:
         return None
+    if not isinstance(evaluator, QueryEvaluator):
+        given = f"the class {evaluator.__name__}" if isinstance(evaluator, type) else type(evaluator).__name__
+        raise TypeError(f"evaluator must be a QueryEvaluator, made for the plans: MyEvaluator(plans); got {given}")
     if reads_truth:
         raise ValueError("focus and swap_unmentioned read the queries' exact truth, which an evaluator takes away")
     if evaluator.plans.fingerprint != plans.fingerprint:
@@ -54,7 +57,8 @@ class PlanEncoder(Encoder):
         skills: the K different skill texts, sorted.
 
     Raises:
-        ValueError: as for :class:`PlanConditionedActor`.
+        ValueError: as for :class:`PlanConditionedActor`; at call time, an evaluator's logits of another shape.
+        TypeError: an evaluator that is none; at call time, one whose logits are no floats.
 
     Example:
         >>> import lw_torchrl as lw
@@ -91,6 +95,7 @@ class PlanEncoder(Encoder):
     ) -> None:
         super().__init__()
         self.plans = as_plans(plans)
+        self.evaluator = _check_evaluator(evaluator, self.plans, focus or swap_unmentioned)
         self.tasks = tuple(self.plans)
         read = ("observation", "task_id") if evaluator is not None else ("observation", "task_id", "qaf")
         own = as_keys("in_keys", in_keys, read)
@@ -98,7 +103,6 @@ class PlanEncoder(Encoder):
         self.out_keys = as_keys("out_keys", out_keys, ("encoding",))
         check_apart(self.in_keys, self.out_keys)
         self._answered = plan_number_key(own[-1])
-        self.evaluator = _check_evaluator(evaluator, self.plans, focus or swap_unmentioned)
         self.config: dict[str, Any] = {
             "features": features,
             "feature_noise": feature_noise,
@@ -156,7 +160,13 @@ class PlanEncoder(Encoder):
         if self.evaluator is None:
             return prepared[0]
         steps, _, _, *asked = prepared
-        return attend(self.evaluator.logits(*asked), steps)
+        logits = self.evaluator.answers(*asked)
+        if logits.shape != steps.shape:
+            raise ValueError(
+                f"logits of {type(self.evaluator).__name__} must be {tuple(steps.shape)}, a row for each observation, "
+                f"got shape {tuple(logits.shape)}"
+            )
+        return attend(logits, steps)
 
     def encode(self, *prepared: Tensor) -> Encoding:
         """From what :meth:`prepare` gives."""

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from importlib import import_module
 from typing import Any
 
+import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
@@ -56,9 +57,29 @@ class QueryEvaluator(TensorDictModuleBase):
         """The tensors of ``in_keys`` to (B, S) float32."""
         raise NotImplementedError(f"{type(self).__name__} must override logits")
 
+    def answers(self, *read: Tensor) -> Tensor:
+        """:meth:`logits`, as float32.
+
+        Raises:
+            TypeError: they are no floats.
+            ValueError: they have not a column for each of the plans' steps.
+        """
+        found = self.logits(*read)
+        if not isinstance(found, Tensor) or not found.is_floating_point():
+            given = found.dtype if isinstance(found, Tensor) else type(found).__name__
+            raise TypeError(
+                f"logits of {type(self).__name__} must be float32, above 0 where a condition holds, got {given}"
+            )
+        if found.shape[-1:] != (self.plans.num_steps,):
+            raise ValueError(
+                f"logits of {type(self).__name__} must be (B, {self.plans.num_steps}), a column for each step of the "
+                f"longest plan, got shape {tuple(found.shape)}"
+            )
+        return found.to(torch.float32)
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``qaf_logits``."""
-        return tensordict.set(self.out_keys[0], self.logits(*(tensordict.get(key) for key in self.in_keys)))
+        return tensordict.set(self.out_keys[0], self.answers(*(tensordict.get(key) for key in self.in_keys)))
 
     def with_plans(self, plans: Plans) -> QueryEvaluator:
         """One with the same weights for the conditions of other plans: training either trains both.

@@ -161,6 +161,15 @@ def demonstration_seeds(path: str | os.PathLike[str]) -> set[int]:
     return {part["seed"] for part in parts if isinstance(part, dict) and isinstance(part.get("seed"), int)}
 
 
+def demonstrated_tasks(path: str | os.PathLike[str]) -> set[str]:
+    """The tasks of the demonstrations that a file's policy was trained on, as far as the file says."""
+    data = read_description(path).get("data")
+    found = data if isinstance(data, dict) else {}
+    parts = found.get("episodes", [found.get("tasks")])  # of joined datasets, task name to episodes each
+    named = [part for part in parts if isinstance(part, (dict, list))] if isinstance(parts, list) else []
+    return {task for part in named for task in part if isinstance(task, str)}
+
+
 def load_actor(path: str | os.PathLike[str], *, text_encoder: TextEncoder | None = None) -> Policy:
     """Make the policy of a file, with its plans and weights, in eval mode.
 

@@ -7,6 +7,7 @@ import json
 import re
 import signal
 import time
+from functools import partial
 from importlib.metadata import entry_points
 
 import pytest
@@ -229,6 +230,27 @@ def test_evaluate_writes_result_figure_and_recording(capsys, checkpoint, tmp_pat
     actor = lw.load_actor(checkpoint)
     again = lw.evaluate(actor, tasks=["push", "reach"], episodes_per_task=1, seed=7, progress=False, num_envs=2)
     assert again.episodes == result.episodes
+
+
+def test_evaluate_runs_the_tasks_of_the_training(capsys, demos, checkpoint, tmp_path, monkeypatch):
+    monkeypatch.setattr(lw, "evaluate", partial(lw.evaluate, max_steps=5))
+    said = "that it was trained on, of 10 that it knows; --tasks names others"
+    printed = run(capsys, "evaluate", checkpoint, "--episodes", 1)
+    assert [line.split()[0] for line in printed.splitlines()[2:]] == ["push", "reach", "mean"]
+    assert printed.startswith(f"on the 2 tasks {said}\n")
+    run(capsys, "train", demos, "--out", tmp_path / "one.zip", "--tasks", "push", *TINY)
+    printed = run(capsys, "evaluate", tmp_path / "one.zip", "--episodes", 1)
+    assert [line.split()[0] for line in printed.splitlines()[2:]] == ["push", "mean"]
+    assert printed.startswith(f"on the 1 task {said}\n")
+    lw.save_actor(lw.load_actor(checkpoint), tmp_path / "plain.zip")  # which says nothing of data
+    assert run(capsys, "evaluate", tmp_path / "plain.zip", "--episodes", 1).count("\n") == 12
+    assert run(capsys, "evaluate", checkpoint, "--plans", "MT10", "--episodes", 1).count("\n") == 12
+
+
+def test_an_option_for_plans_is_refused_without_them(capsys, demos, tmp_path):
+    given = ("train", demos, "--out", tmp_path / "p.zip", "--mix", "actions", "--method")
+    for method in ("dc", "one-hot"):
+        assert f"--mix is for a method that reads plans, --method {method} does not" in fails(capsys, *given, method)
 
 
 def test_evaluating_on_the_demonstrations_seed_is_refused(capsys, checkpoint, tmp_path):

@@ -103,7 +103,19 @@ def test_what_it_refuses(capsys, tmp_path, tiny):
     assert "did you mean 'few-shot/strong/pcbc/seed0'" in message
     assert "--passes is for --preset paper" in fails(capsys, *arguments(tmp_path, "--passes", 3))
     assert "passes must be at least 1" in fails(capsys, *arguments(tmp_path, "--preset", "paper", "--passes", 0))
+    assert "--list names the runs" in fails(capsys, *arguments(tmp_path, "--list", "--run", "nope"))
     assert "jobs must be at least 1" in fails(capsys, *arguments(tmp_path, "--jobs", 0))
+
+
+@pytest.mark.parametrize("chosen", [(), ("--run", 1), ("--run", 0)])
+def test_plans_of_some_tasks_are_refused_before_any_work(capsys, tmp_path, tiny, chosen):
+    (tmp_path / "push.plan").write_text(str(lw.load_plans("MT10")["push"]))
+    own, out = ("--plans", tmp_path / "push.plan"), tmp_path / "out"
+    names = run(capsys, *arguments(out, *own, "--list")).split()
+    message = fails(capsys, *arguments(out, *own, *(names[2 * arg] if arg in (0, 1) else arg for arg in chosen)))
+    assert "--plans must have a plan for each of the 50 tasks, they lack 49: assembly, basketball, " in message
+    assert f"--plans MT50 {tmp_path / 'push.plan'} takes ours" in message
+    assert not out.exists()
 
 
 def results(folder):

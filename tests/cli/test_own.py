@@ -8,6 +8,7 @@ import pytest
 from commands import fails, run
 
 import lw_torchrl as lw
+from lw_torchrl.cli.sources import read_encoder
 
 TASKS = """
 [reach]
@@ -80,6 +81,23 @@ def test_of_several_sources_the_later_one_counts(capsys, tmp_path):
         assert lacks not in shown
 
 
+def test_a_shipped_plan_that_a_later_source_replaces_need_not_fit(capsys):
+    files = ("--task-file", "tasks.toml")  # its reach has no "reach target", of which the shipped plan speaks
+    shown = run(capsys, "plans", "reach", "push", "--plans", "MT10", "reach.plan", *files)
+    assert "robot.go" in shown
+    assert "the puck" in shown
+    message = fails(capsys, "plans", "reach", "--plans", "reach.plan", "MT10", *files)
+    assert "--plans reach.plan MT10: the plan of 'reach' that counts is the shipped one" in message
+    assert "'the ball'" in message
+
+
+def test_a_plan_with_a_fault_is_named_by_its_path(capsys, tmp_path):
+    path = tmp_path / "mine" / "push.plan"
+    path.parent.mkdir()
+    path.write_text(PLAN)
+    assert f"--plans {path}: push.plan, line 2: " in fails(capsys, "plans", "--plans", "MT10", path)
+
+
 def test_scripts_carry_them_out(capsys, tmp_path):
     files = ("--plans", "reach.plan", "--skill-file", "skills.toml", "--task-file", "tasks.toml")
     out = run(capsys, "scripted", "reach", *files, "--episodes", 3, "--out", tmp_path / "out")
@@ -103,6 +121,31 @@ def test_a_policy_is_trained_and_evaluated_with_them(capsys, tmp_path):
     assert found["origin"]["checkpoint"]["path"] == str(policy)
     assert found["origin"]["versions"]["torchrl"]
     assert (tmp_path / "out" / "rollout.rrd").is_file()
+
+
+def test_a_task_that_the_simulator_lacks_is_named(capsys, tmp_path):
+    (tmp_path / "tasks.toml").write_text('[stack-cup]\ndescription = "Stack."\nobjects.cup = "obs[4:7]"\n')
+    pairs = [["the gripper is open", "go to the cup"]]
+    (tmp_path / "plans.json").write_text(json.dumps({"stack-cup": pairs}))
+    files = ("--task-file", tmp_path / "tasks.toml")
+    tasks = lw.load_tasks(tmp_path / "tasks.toml")
+    plans = lw.load_plans(tmp_path / "plans.json", tasks=tasks)
+    both = lw.Plans({**plans, "reach": lw.load_plans("MT10")["reach"]})
+    encoder = "--text-encoder", "my_texts:encode"
+    for name, some in (("alone", plans), ("both", both)):
+        actor = lw.PlanConditionedActor(some, width=8, text_encoder=read_encoder("my_texts:encode"))
+        lw.save_actor(actor, tmp_path / f"{name}.zip")
+    lacks = "the simulator has no stack-cup; tasks of your own run in an engine of yours, in Python"
+    assert "--tasks: " + lacks in fails(capsys, "evaluate", tmp_path / "alone.zip", "--tasks", "stack-cup", *encoder)
+    assert f"task: {lacks}" in fails(capsys, "query", "stack-cup", *files)
+    scripted = ("scripted", "stack-cup", "--plans", tmp_path / "plans.json", "--out", tmp_path)
+    assert lacks in fails(capsys, *scripted, *files)
+    message = fails(capsys, "evaluate", tmp_path / "alone.zip", *encoder)
+    assert "the simulator has none of the policy's tasks, stack-cup; name others with --tasks" in message
+    printed = run(capsys, "evaluate", tmp_path / "both.zip", "--episodes", 1, *encoder)
+    assert printed.startswith("without stack-cup, which the simulator lacks\n")
+    assert "The simulator has no others" in fails(capsys, "collect", "stack-cup", "--out", tmp_path / "demos")
+    assert "did you mean 'reach'" in fails(capsys, "collect", "raech", "--out", tmp_path / "demos")
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ import pytest
 import torch
 from collecting import EPISODES, NOISE, SEED, STEPS, TASKS, collect, tree
 
+import lw_torchrl as lw
 from lw_torchrl.data import CollectConfig
 from lw_torchrl.data.metadata import read_metadata
 from lw_torchrl.data.rows import load_rows
@@ -205,4 +206,10 @@ def test_wrong_arguments_are_named(tmp_path, changed, message):
 def test_wrong_types_are_named(tmp_path, changed):
     with pytest.raises(TypeError, match=next(iter(changed))):
         collect(tmp_path / "demos", **changed)
+    assert not (tmp_path / "demos").exists()
+
+
+def test_a_task_of_ones_own_is_sent_where_it_can_be_shown(tmp_path):
+    with pytest.raises(TypeError, match=r"Task\(name='reach'.*Meta-World's experts .* docs/training.md"):
+        collect(tmp_path / "demos", [lw.TASKS["reach"]])
     assert not (tmp_path / "demos").exists()

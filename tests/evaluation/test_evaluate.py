@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from itertools import product
 
 import numpy as np
@@ -12,14 +13,14 @@ from torch import nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from lw_torchrl.data import LanguageWorldExperienceReplay, TaskBalancedSampler, collect_demonstrations
-from lw_torchrl.envs import ExpertActor
+from lw_torchrl.envs import ExpertActor, LanguageWorldEnv
 from lw_torchrl.envs.engines.metaworld import MetaWorldEngine, make_metaworld_env
 from lw_torchrl.envs.engines.vectorized.engine import VectorizedEngine
 from lw_torchrl.envs.seeding import action_noise, episode_seed
 from lw_torchrl.evaluation import evaluate
 from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.plans import ConditionalPlan, Plans
-from lw_torchrl.modules import DescriptorConditionedActor, PlanConditionedActor
+from lw_torchrl.modules import DescriptorConditionedActor, PlanConditionedActor, Policy
 from lw_torchrl.trainers import BehavioralCloningConfig, BehavioralCloningTrainer
 from lw_torchrl.transforms import QAFTransform
 
@@ -359,6 +360,38 @@ def test_an_actor_for_other_tasks_is_refused():
         run(ExpertActor("push"), "reach")
     with pytest.raises(ValueError, match="not made for: reach"):
         run(DescriptorConditionedActor("push"), "reach")
+
+
+def test_a_policys_own_list_of_tasks_is_obeyed():
+    class Still(Policy):
+        tasks = ("drawer-open", "reach")
+
+        def forward(self, tensordict):
+            return tensordict.set("action", torch.zeros(*tensordict.batch_size, 4))
+
+    assert run(Still(), "reach", max_steps=2, episodes_per_task=1).success_once == {"reach": 0.0}
+    with pytest.raises(ValueError, match=r"tasks must be among the actor's, drawer-open, reach; .* not made for: push"):
+        run(Still(), ["push", "reach"], max_steps=2)
+
+
+@pytest.mark.parametrize(
+    ("key", "said"),
+    [("skill_weight", "'skill_weight'; did you mean 'skill_weights'"), (("next", "missing"), "('next', 'missing')")],
+)
+def test_a_key_that_nobody_writes_is_refused_before_the_first_step(monkeypatch, key, said):
+    monkeypatch.setattr(LanguageWorldEnv, "_step", None)
+    with pytest.raises(ValueError, match=f"also_record must be one of .*'qaf', .*, got {re.escape(said)}"):
+        run(make_actor(), "reach", also_record=["qaf", key])
+
+
+def test_keys_of_the_environment_and_of_the_actor_are_recorded():
+    seen = []
+    keys = ["qaf", "skill_weights", ("next", "qaf"), ("next", "done"), ("next", "observation")]
+    run(make_actor(), "reach", also_record=keys, max_steps=3, episodes_per_task=1, on_episode=seen.append)
+    (finished,) = seen
+    assert (finished.task, finished.episode) == ("reach", 0)
+    assert finished.steps.batch_size == (3,)
+    assert all(key in finished.steps.keys(True) for key in keys)
 
 
 def test_the_experts_succeed_and_the_untrained_do_not():

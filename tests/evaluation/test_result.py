@@ -13,6 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mutations import mutated
 
+import lw_torchrl
 from lw_torchrl._versions import package_versions
 from lw_torchrl.evaluation import EpisodeResult, EvaluationResult
 
@@ -198,6 +199,13 @@ def test_text_that_is_no_json_is_refused(tmp_path, content):
     (tmp_path / "results.json").write_bytes(content)
     with pytest.raises(ValueError, match="is no result of"):
         EvaluationResult.load(tmp_path / "results.json")
+
+
+def test_our_version_is_that_of_the_code_that_runs(monkeypatch):
+    monkeypatch.setattr("lw_torchrl._versions.version", lambda name: "0.0.1")  # as an old editable install says
+    found = package_versions()
+    assert found["lw_torchrl"] == lw_torchrl.__version__
+    assert found["torch"] == "0.0.1"
 
 
 def test_it_says_where_it_came_from(tmp_path):
