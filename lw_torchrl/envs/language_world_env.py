@@ -58,7 +58,8 @@ class LanguageWorldEnv(EnvBase):
             writes it: a policy's numbers out of range stay as they were sampled, so that their likelihood stays true.
         executed_action: (N, 4) float32 in [-1, 1], what was done in the step that led here: the action, clipped as
             Meta-World does. Zeros after a reset, and for a row that was not stepped.
-        reward: (N, 1) float32; done, terminated, truncated: (N, 1) bool, terminated always false.
+        reward: (N, 1) float32; done, terminated, truncated: (N, 1) bool; terminated stays false unless
+            ``terminate_on_success``.
 
     A ``_step`` mask leaves rows where they are; a ``_reset`` mask resets only its rows.
 
@@ -71,9 +72,13 @@ class LanguageWorldEnv(EnvBase):
             same numbers; or a callable ``(row_tasks, *, reward, num_threads) -> Engine``.
         num_threads: of the simulation, by default the cores this process may use; never changes a result.
         reward: "sparse", the success as 0 and 1, or "dense", Meta-World's own.
-        max_steps: steps until truncation.
+        max_steps: steps of the simulation until truncation.
+        frame_skip: how many steps of the simulation an action lasts; their rewards are added up, and success is that of
+            any of them.
+        terminate_on_success: end an episode at its first success, with ``terminated``.
         strict: raise on a NaN action, instead of truncating the row with a warning as for an unstable simulation.
         worker: (w, W), which of how many environments like this one it is; None asks TorchRL.
+        batch_size: () for a single environment without the dimension of rows, as AsyncEnvPool wants it.
 
     Raises:
         ValueError: an unknown task or engine, ``num_envs`` under the number of tasks, or a wrong ``episode``.
@@ -93,6 +98,7 @@ class LanguageWorldEnv(EnvBase):
     """
 
     _supports_set_state = True
+    _has_frame_skip = True  # else TorchRL puts a transform of its own around it, which knows nothing of rows that end
 
     def __init__(
         self,
@@ -104,8 +110,11 @@ class LanguageWorldEnv(EnvBase):
         num_threads: int | None = None,
         reward: Literal["sparse", "dense"] = "sparse",
         max_steps: int = 500,
+        frame_skip: int = 1,
+        terminate_on_success: bool = False,
         strict: bool = False,
         worker: tuple[int, int] | None = None,
+        batch_size: tuple[()] | None = None,
     ) -> None:
         named = named_tasks(tasks)
         self.tasks = tuple(named)
@@ -117,22 +126,30 @@ class LanguageWorldEnv(EnvBase):
         if num_threads is not None:
             check_int("num_threads", num_threads, minimum=1)
         self.max_steps = check_int("max_steps", max_steps, minimum=1)
-        self.strict = strict
+        self.frame_skip = check_int("frame_skip", frame_skip, minimum=1)
+        self.strict, self.terminate_on_success = strict, terminate_on_success
+        if batch_size is not None and (tuple(batch_size) != () or num_envs != 1):
+            raise ValueError(
+                f"batch_size must be (), for a single environment, or None for one dimension of {num_envs} rows, got "
+                f"{batch_size!r}"
+            )
         self.row_tasks = tuple(self.tasks[i % n] for i in range(num_envs))
         self.worker = torchrl_worker() if worker is None else check_worker(worker)
         self._process = os.getpid()
         self._counter = EpisodeCounter([named[t] for t in self.row_tasks], check_int("seed", seed), self.worker)
-        super().__init__(device=torch.device("cpu"), batch_size=(num_envs,))
+        super().__init__(device=torch.device("cpu"), batch_size=(num_envs,) if batch_size is None else ())
         self._task_id = torch.tensor([task_id(task) for task in self.row_tasks])
-        self.observation_spec = observation_spec(self._task_id)
-        self.action_spec = action_spec(num_envs)
-        self.reward_spec = reward_spec(num_envs)
-        self.done_spec = done_spec(num_envs)
+        which = ... if batch_size is None else 0
+        self.observation_spec = observation_spec(self._task_id)[which]
+        self.action_spec = action_spec(num_envs)[which]
+        self.reward_spec = reward_spec(num_envs)[which]
+        self.done_spec = done_spec(num_envs)[which]
         self._episode = np.full(num_envs, -1, dtype=np.int64)
         self._steps = np.zeros(num_envs, dtype=np.int64)
         self._over = np.ones(num_envs, dtype=bool)
         self._fault = np.zeros(num_envs, dtype=bool)
         self._success = np.zeros(num_envs, dtype=bool)
+        self._terminated = np.zeros(num_envs, dtype=bool)
         self._observation = np.zeros((num_envs, OBSERVATION_SIZE), dtype=np.float32)
         self._engine = make_engine(engine, self.row_tasks, reward=reward, num_threads=num_threads)
         self.is_closed = False  # EnvBase starts with True
@@ -185,7 +202,8 @@ class LanguageWorldEnv(EnvBase):
 
     def _state(self, executed_action: Tensor, **more: Tensor) -> TensorDict:
         over = torch.from_numpy(self._over.copy()).unsqueeze(-1)
-        return TensorDict(
+        terminated = torch.from_numpy(self._terminated.copy()).unsqueeze(-1)
+        state = TensorDict(
             {
                 "observation": torch.from_numpy(self._observation.copy()),
                 "task_id": self._task_id.clone(),
@@ -194,13 +212,14 @@ class LanguageWorldEnv(EnvBase):
                 "fault": torch.from_numpy(self._fault.copy()).unsqueeze(-1),
                 "executed_action": executed_action,
                 "done": over,
-                "terminated": torch.zeros_like(over),
-                "truncated": over.clone(),
+                "terminated": terminated,
+                "truncated": over & ~terminated,
                 **more,
             },
-            batch_size=self.batch_size,
+            batch_size=(len(self.row_tasks),),
             device=self.device,
         )
+        return state if self.batch_size else state[0]
 
     def _check_usable(self) -> None:
         if self.is_closed:
@@ -215,7 +234,7 @@ class LanguageWorldEnv(EnvBase):
         self, tensordict: TensorDictBase | None = None, *, episode: int | Tensor | None = None, set_state: bool = False
     ) -> TensorDict:
         self._check_usable()
-        rows = np.flatnonzero(row_mask(tensordict, "_reset", self.batch_size[0]))
+        rows = np.flatnonzero(row_mask(tensordict, "_reset", len(self.row_tasks)))
         if set_state:
             episode = stated_episode(tensordict, episode)
             self._check_tasks(tensordict, rows)
@@ -224,11 +243,11 @@ class LanguageWorldEnv(EnvBase):
         self._counter.resets[rows] += 1
         self._episode[rows] = episodes
         self._steps[rows] = 0
-        for flag in (self._over, self._fault, self._success):
+        for flag in (self._over, self._fault, self._success, self._terminated):
             flag[rows] = False
         if set_state:
             self._check_beginning(tensordict, rows)
-        return self._state(torch.zeros(*self.batch_size, ACTION_SIZE))
+        return self._state(torch.zeros(len(self.row_tasks), ACTION_SIZE))
 
     def _check_tasks(self, tensordict: TensorDictBase, rows: np.ndarray) -> None:
         given = tensordict.get("task_id", None)
@@ -242,7 +261,7 @@ class LanguageWorldEnv(EnvBase):
         wanted = tensordict.get("observation", None)
         if wanted is None:
             return
-        later = rows[(wanted.cpu().numpy()[rows] != self._observation[rows]).any(-1)]
+        later = rows[(wanted.cpu().numpy().reshape(-1, OBSERVATION_SIZE)[rows] != self._observation[rows]).any(-1)]
         if len(later):
             self._over[later] = True
             raise ValueError(
@@ -253,8 +272,8 @@ class LanguageWorldEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         self._check_usable()
-        action = clipped_action(tensordict, self.batch_size[0]).cpu().numpy()
-        active = row_mask(tensordict, "_step", self.batch_size[0])
+        action = clipped_action(tensordict, self.batch_size).cpu().numpy().reshape(-1, ACTION_SIZE)
+        active = row_mask(tensordict, "_step", len(self.row_tasks))
         if (active & self._over).any():
             rows = np.flatnonzero(active & self._over)[:5].tolist()
             raise RuntimeError(
@@ -266,17 +285,29 @@ class LanguageWorldEnv(EnvBase):
             broken = active & np.isnan(action).any(-1)
             self._report(broken, "its action is NaN", self.strict)
             stepped = active & ~broken
-        result = self._engine.step(action, stepped)
-        if (unstable := result.fault & stepped).any():
-            self._report(unstable, "its simulation became unstable")
-        np.copyto(self._observation, result.observation, casting="same_kind", where=stepped[:, None])
-        np.copyto(self._success, result.success & stepped, where=active)
-        self._steps += active
         self._over |= self._fault
-        self._over |= self._steps >= self.max_steps
-        reward = np.where(stepped, result.reward, 0.0).astype(np.float32)
+        self._success &= ~active
+        reward = self._simulate(action, stepped)
+        for _ in range(self.frame_skip - 1):
+            if not (going := stepped & ~self._over).any():
+                break
+            reward += self._simulate(action, going)
         executed = np.where(stepped[:, None], action, np.float32(0.0))
-        return self._state(torch.from_numpy(executed), reward=torch.from_numpy(reward).unsqueeze(-1))
+        return self._state(torch.from_numpy(executed), reward=torch.from_numpy(reward.astype(np.float32)).unsqueeze(-1))
+
+    def _simulate(self, action: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """One step of the simulation of some rows, and their reward, (N,) float64."""
+        result = self._engine.step(action, rows)
+        if (unstable := result.fault & rows).any():
+            self._report(unstable, "its simulation became unstable")
+        np.copyto(self._observation, result.observation, casting="same_kind", where=rows[:, None])
+        success = result.success & rows
+        self._success |= success
+        if self.terminate_on_success:
+            self._terminated |= success
+        self._steps += rows
+        self._over |= self._fault | self._terminated | (self._steps >= self.max_steps)
+        return np.where(rows, result.reward, 0.0)
 
     def _report(self, rows: np.ndarray, what: str, fatal: bool = False) -> None:
         if not rows.any():

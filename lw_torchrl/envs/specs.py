@@ -34,14 +34,15 @@ class TaskIds(Categorical):
         """The rows' ids, in front of them the dimensions of ``shape``."""
         if self.ids is None:
             return super().zero(shape)
-        return self.ids.expand(*(shape or ()), *self.shape).clone()
+        return self.ids.expand((*(shape or ()), *self.shape)).clone()
 
     def _with(self, made: TaskIds, ids: Callable[[Tensor], Tensor]) -> TaskIds:
         made.ids = None if self.ids is None else ids(self.ids)
         return made
 
     def expand(self, *shape: Any) -> TaskIds:
-        return self._with(super().expand(*shape), lambda ids: ids.expand(*shape))
+        made = super().expand(*shape)
+        return self._with(made, lambda ids: ids.expand(made.shape))
 
     def _reshape(self, shape: Any) -> TaskIds:
         return self._with(super()._reshape(shape), lambda ids: ids.reshape(shape))
@@ -113,10 +114,10 @@ def row_mask(tensordict: TensorDictBase | None, key: str, n: int) -> np.ndarray:
     return mask.reshape(n).cpu().numpy()
 
 
-def clipped_action(tensordict: TensorDictBase, n: int) -> Tensor:
-    """The action as it is executed, (n, 4) float32 in [-1, 1]; another shape or dtype is a ValueError."""
+def clipped_action(tensordict: TensorDictBase, batch_size: torch.Size) -> Tensor:
+    """The action as it is executed, (*batch_size, 4) float32 in [-1, 1]; another shape or dtype is a ValueError."""
     action = tensordict.get("action", None)
-    if action is None or action.shape != (n, ACTION_SIZE) or action.dtype != torch.float32:
+    if action is None or action.shape != (*batch_size, ACTION_SIZE) or action.dtype != torch.float32:
         given = "none" if action is None else f"{action.dtype} of shape {tuple(action.shape)}"
-        raise ValueError(f"action must be float32 of shape {(n, ACTION_SIZE)}, got {given}")
+        raise ValueError(f"action must be float32 of shape {(*batch_size, ACTION_SIZE)}, got {given}")
     return action.detach().clamp(-1.0, 1.0)

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import io
+import os
+import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -75,8 +78,8 @@ def test_a_pool_of_processes_with_a_policy():
     with torch.no_grad():
         data = pool.rollout(4, make_actor())
     pool.close()
-    assert data["action"].shape == (2, 1, 4, 4)
-    assert data["episode"][:, 0, 0].tolist() == [0, 1]
+    assert data["action"].shape == (2, 4, 4)
+    assert data["episode"][:, 0].tolist() == [0, 1]
 
 
 @pytest.mark.slow
@@ -84,7 +87,8 @@ def test_ray():
     ray = pytest.importorskip("ray")
     from torchrl.collectors.distributed import RayCollector
 
-    ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
+    found_here = {"env_vars": {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}}
+    ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="ERROR", runtime_env=found_here)
     try:
         actor = make_actor()
         collector = RayCollector(

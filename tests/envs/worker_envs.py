@@ -30,7 +30,8 @@ def make_push_reach() -> TransformedEnv:
 
 
 def make_single() -> TransformedEnv:
-    return TransformedEnv(make_env(num_envs=1, max_steps=5), lw.QAFTransform(lw.load_plans("MT10")))
+    env = make_env(num_envs=1, max_steps=5, batch_size=())
+    return TransformedEnv(env, lw.QAFTransform(lw.load_plans("MT10")))
 
 
 def make_actor() -> lw.PlanConditionedActor:
