@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
 from reprlib import Repr
 from typing import Any
@@ -37,6 +37,26 @@ def counted(number: int, noun: str) -> str:
         ('1 task', '50 tasks')
     """
     return f"{number} {noun}" + "s" * (number != 1)
+
+
+def differences(was: Mapping[str, Any], now: Mapping[str, Any], inside: str = "") -> list[str]:
+    """The names under which two nested tables differ, with both values where they are short.
+
+    Example:
+        >>> differences({"steps": 40, "options": {"width": 8}}, {"steps": 30, "options": {"width": 8}, "seed": 1})
+        ['seed (None, now 1)', 'steps (40, now 30)']
+    """
+    found = []
+    for key in sorted({**was, **now}):
+        before, after = was.get(key), now.get(key)
+        if before == after:
+            continue
+        if isinstance(before, Mapping) and isinstance(after, Mapping):
+            found += differences(before, after, f"{inside}{key}.")
+        else:
+            values = f"{shown(before)}, now {shown(after)}"
+            found.append(f"{inside}{key}" + (f" ({values})" if len(values) <= 60 else ""))
+    return found
 
 
 def missing_keys(found: Iterable[Any], *needed: str) -> ValueError:

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from lw_torchrl._checks import differences
 from lw_torchrl._progress import Progress
 from lw_torchrl.evaluation import EvaluationResult, evaluate
 from lw_torchrl.experiments.runs import SCRIPTED, Run
@@ -58,9 +59,9 @@ def load_result(run: Run, plans: Plans, out: Path) -> EvaluationResult | None:
         return None
     result = EvaluationResult.load(path)
     found, ours = result.config.get("run") or {}, run.describe(plans)
-    different = [key for key in ours if found.get(key) != ours[key]]
-    if result.config.get("episodes_per_task") != run.episodes:
-        different.append("episodes")
+    evaluated = result.config.get("episodes_per_task")
+    found, ours = ({**one, "episodes": count} for one, count in ((found, evaluated), (ours, run.episodes)))
+    different = differences({key: found.get(key) for key in ours}, ours)
     if different:
         raise ValueError(
             f"out: {str(path)!r} is of another configuration, it differs in {', '.join(different)}; choose another "

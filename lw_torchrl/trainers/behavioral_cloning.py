@@ -103,6 +103,15 @@ def check_belongs(actor: Any, replay: TensorDictReplayBuffer) -> None:
             )
 
 
+def check_batch_size(replay: TensorDictReplayBuffer, config: BehavioralCloningConfig) -> None:
+    """Raise :class:`ValueError` if the buffer was made for minibatches of another size."""
+    if replay._batch_size not in (None, config.batch_size):
+        raise ValueError(
+            f"batch_size of the replay buffer must be None or the configuration's, {config.batch_size}, got "
+            f"{replay._batch_size}"
+        )
+
+
 class BehavioralCloningTrainer:
     """Trains an actor to give the demonstrated actions.
 
@@ -161,6 +170,7 @@ class BehavioralCloningTrainer:
             self._described |= {"data": describe_data(replay), "replay": describe_replay(replay)}
         if replay._prefetch:
             raise ValueError("replay must not prefetch: batches drawn ahead would be lost when training is resumed")
+        check_batch_size(replay, config)
         generator = torch.Generator().manual_seed(config.seed)
         replay.set_rng(generator)
         with warnings.catch_warnings():

@@ -20,7 +20,7 @@ from torchrl.envs import Compose, Transform
 
 from lw_torchrl._state_tree import split
 from lw_torchrl._tensor_archive import ArchiveError, TensorArchive, write_archive
-from lw_torchrl.language.text import TextEncoder
+from lw_torchrl.language.text import TEXT_DIMENSION, TextEncoder
 from lw_torchrl.modules.policy import Policy, from_description
 from lw_torchrl.trainers.policy_checks import (
     at_most,
@@ -123,6 +123,8 @@ def open_policy(path: str | os.PathLike[str]) -> TensorArchive:
     :func:`read_description`."""
     if not Path(path).exists():
         raise FileNotFoundError(f"checkpoint: no file {str(path)!r}; `lw-torchrl train` writes one")
+    if Path(path).is_dir():
+        raise ValueError(f"checkpoint: {str(path)!r} is a folder; a policy is one file")
     try:
         found = TensorArchive(path)
     except (ArchiveError, OSError) as error:
@@ -170,6 +172,18 @@ def demonstrated_tasks(path: str | os.PathLike[str]) -> set[str]:
     return {task for part in named for task in part if isinstance(task, str)}
 
 
+def _of_texts(archive: TensorArchive) -> str:
+    """What an error is to say beside of texts that the shipped encoder did not encode."""
+    try:
+        widths = {vectors.shape[-1] for vectors in archive.tensors("texts").values() if vectors.ndim == 2}
+    except ArchiveError:
+        return ""
+    if widths <= {TEXT_DIMENSION} or "'one-hot'" in str(archive.description["actor"].get("options")):
+        return ""
+    wanted = ", ".join(map(str, sorted(widths)))
+    return f"; its texts have {wanted} numbers each: text_encoder must be the one that gave them"
+
+
 def load_actor(path: str | os.PathLike[str], *, text_encoder: TextEncoder | None = None) -> Policy:
     """Make the policy of a file, with its plans and weights, in eval mode.
 
@@ -194,5 +208,7 @@ def load_actor(path: str | os.PathLike[str], *, text_encoder: TextEncoder | None
     except ImportError:
         raise
     except Exception as error:  # a file from a stranger may say anything
-        raise ValueError(f"checkpoint: the actor of {str(path)!r} cannot be made ({first_line(error)})") from error
+        said = first_line(error)
+        said += "" if "text_encoder" in said else _of_texts(archive)
+        raise ValueError(f"checkpoint: the actor of {str(path)!r} cannot be made ({said})") from error
     return actor.eval()

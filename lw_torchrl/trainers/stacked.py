@@ -21,6 +21,7 @@ from lw_torchrl._progress import Progress
 from lw_torchrl.modules.policy import Policy
 from lw_torchrl.trainers.behavioral_cloning import (
     BehavioralCloningConfig,
+    check_batch_size,
     check_belongs,
     make_optimizer,
 )
@@ -124,6 +125,7 @@ class StackedBehavioralCloning:
         self.states = []
         for number, (actor, replay) in enumerate(zip(actors, replays, strict=True)):
             check_belongs(actor, replay)
+            check_batch_size(replay, config)
             generator = torch.Generator().manual_seed(config.seed + number)
             replay.set_rng(generator)
             self.states.append(TrainingState(replay.sampler, generator))

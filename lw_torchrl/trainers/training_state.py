@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from lw_torchrl._checks import differences
 from lw_torchrl._state_tree import check_like, check_optimizer_state, check_same, join
 from lw_torchrl.modules.policy import Policy
 from lw_torchrl.trainers.checkpoint import open_policy, read_description
@@ -72,12 +73,12 @@ def check_description(path: Path, ours: dict[str, Any]) -> None:
             continue
         if found.get(part) != ours[part]:
             before, now = found.get(part) or {}, ours[part] or {}
-            both = before if isinstance(before, dict) else {}
-            different = sorted(key for key in {**both, **now} if both.get(key) != now.get(key))
+            different = differences(before if isinstance(before, dict) else {}, now)
             kind = "architecture" if part in ("actor", "actors") else "configuration"
             raise ValueError(
                 f"checkpoint: {str(path)!r} is of another {kind}, its {part} differs in "
-                f"{', '.join(different)}; choose another file, or delete it to start again"
+                f"{', '.join(different[:8])}{', ...' * (len(different) > 8)}; choose another file, or delete it to "
+                "start again"
             )
 
 

@@ -51,3 +51,15 @@ def test_rows_without_answers_are_named(demos):
     trainer = BehavioralCloningTrainer(PlanConditionedActor(PLANS, **SMALL), replay, CONFIG, progress=False)
     with pytest.raises(ValueError, match="observation and task_id and qaf are needed, got"):
         trainer.train()
+
+
+def test_a_buffer_for_minibatches_of_another_size_is_refused(demos):
+    replay = LanguageWorldExperienceReplay(demos, batch_size=16, transform=QAFTransform(PLANS))
+    actor = PlanConditionedActor(PLANS, **SMALL)
+    message = "batch_size of the replay buffer must be None or .* 8, got 16"
+    with pytest.raises(ValueError, match=message):
+        BehavioralCloningTrainer(actor, replay, CONFIG)
+    with pytest.raises(ValueError, match=message):
+        StackedBehavioralCloning([actor], [replay], CONFIG)
+    same = LanguageWorldExperienceReplay(demos, batch_size=8, transform=QAFTransform(PLANS))
+    BehavioralCloningTrainer(actor, same, CONFIG, progress=False).train()

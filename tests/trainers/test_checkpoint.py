@@ -110,10 +110,19 @@ def test_plans_and_text_encoder_of_ones_own(tmp_path):
     assert torch.equal(loaded(state.clone())["action"], actor(state.clone())["action"])
 
 
+def test_a_folder_is_no_policy(tmp_path):
+    with pytest.raises(ValueError, match="is a folder; a policy is one file"):
+        load_actor(tmp_path)
+
+
 def test_another_text_encoder_is_found_out(saved, tmp_path):
     """Of another dimension, and, what no shape tells, of the same one."""
     with pytest.raises(ValueError, match=r"cannot be made .text_encoder gives vectors of shape"):
         load_actor(saved[0], text_encoder=counted)
+    few = PlanConditionedActor(PLANS, text_encoder=lambda texts: torch.ones(len(texts), 3), **SMALL)
+    save_actor(few, tmp_path / "few.zip")
+    with pytest.raises(ValueError, match="its texts have 3 numbers each: text_encoder must be the one that gave them"):
+        load_actor(tmp_path / "few.zip")
     path = tmp_path / "own.zip"
     save_actor(PlanConditionedActor(own_plans(), text_encoder=counted, **SMALL), path)
     for other in (

@@ -48,11 +48,11 @@ def refused(path, message, make):
 @pytest.mark.parametrize(
     ("options", "differs"),
     [
-        (dict(width=32), "options"),
-        (dict(depth=2), "options"),
-        (dict(latent_size=5), "options"),
-        (dict(mix="actions"), "options"),
-        (dict(features="raw"), "options"),
+        (dict(width=32), r"options.width \(16, now 32\)"),
+        (dict(depth=2), r"options.depth \(1, now 2\)"),
+        (dict(latent_size=5), r"options.latent_size \(.*, now 5\)"),
+        (dict(mix="actions"), r"options.mix \('latents', now 'actions'\)"),
+        (dict(features="raw"), r"options.features \('differences', now 'raw'\)"),
     ],
 )
 def test_a_checkpoint_of_another_architecture_is_refused(demos, checkpoint, options, differs):
@@ -70,7 +70,7 @@ def test_a_checkpoint_of_other_plans_or_another_kind_is_refused(demos, checkpoin
     plans = {task: plan for task, plan in PLANS.items() if task in ("push", "reach")}
     refused(
         checkpoint,
-        "of another architecture, its actor differs in plans;",
+        r"of another architecture, its actor differs in plans.button-press-topdown, .*plans.window-open;",
         lambda: make_trainer(demos, checkpoint, actor=PlanConditionedActor(plans, **SMALL)),
     )
     refused(
@@ -95,7 +95,7 @@ def test_a_checkpoint_of_another_configuration_is_refused(demos, checkpoint, nam
     config = BehavioralCloningConfig(**{**vars(CONFIG), name: value})
     refused(
         checkpoint,
-        f"of another configuration, its training differs in {name};",
+        rf"of another configuration, its training differs in {name} \({vars(CONFIG)[name]!r}, now {value!r}\);",
         lambda: make_trainer(demos, checkpoint, config=config),
     )
 
@@ -105,7 +105,7 @@ def test_a_checkpoint_of_other_demonstrations_is_refused(checkpoint, tmp_path):
     collect_demonstrations(["push", "reach"], episodes_per_task=1, root=root, max_steps=15, seed=8, progress=False)
     refused(
         checkpoint,
-        "its data differs in episodes_per_task, noise_scale, seed;",
+        r"its data differs in episodes_per_task \(.*, now 1\), noise_scale \(.*\), seed \(0, now 8\);",
         lambda: make_trainer(root, checkpoint),
     )
 
