@@ -1,0 +1,51 @@
+"""Experience from several machines: TorchRL's RayCollector, whose workers run episodes of their own.
+
+pip install 'lw_torchrl[ray]'
+python examples/collect_on_ray.py --workers 2 --batches 4
+"""
+
+import argparse
+
+import ray
+import torch
+from torchrl.collectors.distributed import RayCollector
+from torchrl.envs import TransformedEnv
+
+import lw_torchrl as lw
+
+TASKS = ["push", "reach"]
+
+
+def make_env() -> TransformedEnv:
+    return TransformedEnv(lw.LanguageWorldEnv(TASKS, max_steps=100), lw.QAFTransform(lw.load_plans("MT10")))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--batches", type=int, default=4)
+    args = parser.parse_args()
+    ray.init(num_cpus=args.workers, include_dashboard=False, log_to_driver=False)
+    actor = lw.PlanConditionedActor(lw.load_plans("MT10"), distribution="tanh_normal")
+    frames = 100 * len(TASKS)
+    collector = RayCollector(
+        [make_env] * args.workers,
+        actor,
+        frames_per_batch=frames,
+        total_frames=frames * args.batches,
+        collector_kwargs={"auto_register_policy_transforms": False},
+        remote_configs={"num_cpus": 1, "num_gpus": 0, "memory": 2**30},
+    )
+    for number, batch in enumerate(collector):
+        episodes = batch["episode"].unique().tolist()
+        print(
+            f"batch {number}: {batch.numel()} steps, episodes {episodes}, reward {batch['next', 'reward'].mean():.3f}"
+        )
+        with torch.no_grad():  # train here; the workers get the new weights
+            collector.update_policy_weights_()
+    collector.shutdown()
+    ray.shutdown()
+
+
+if __name__ == "__main__":
+    main()
