@@ -101,7 +101,7 @@ def _count(module: nn.Module, name: str, parameter: nn.Parameter | None) -> None
     _LIMIT.parameters -= 1
     _LIMIT.numbers -= parameter.numel()
     if min(_LIMIT.parameters, _LIMIT.numbers) < 0:
-        raise ValueError("it describes a network of more weights than it holds")
+        raise ValueError("it describes a network of more weights or numbers than it holds")
 
 
 # Once and for all: one that came and went would break the threads that are just going through the hooks.

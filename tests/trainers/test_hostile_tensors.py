@@ -114,7 +114,7 @@ def test_more_layers_than_there_are_weights_are_refused_before_they_are_made(goo
     changed("weights", lambda t: t.update({"more": torch.zeros(30_000)}))(description, groups)
     description["actor"]["options"].update(width=1, depth=10_000)
     rebuild(tmp_path / "c.zip", description, groups)
-    with pytest.raises(ValueError, match=r"checkpoint: .*describes a network of more weights than it holds"):
+    with pytest.raises(ValueError, match=r"checkpoint: .*describes a network of more weights or numbers than it holds"):
         lw.load_actor(tmp_path / "c.zip")
 
 
