@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
+from lw_torchrl._checks import counted
 from lw_torchrl.cli.sources import read_tasks
 
 if TYPE_CHECKING:
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def check(
-    file: Positional[Path],
+    file: Positional[Annotated[Path, arg(metavar="FILE")]],
     /,
     task: str | None = None,
     skill_file: Path | None = None,
@@ -39,26 +40,25 @@ def check(
         raise FileNotFoundError(f"file: there is no {str(file)!r}")
     known = read_tasks(task_file)
     if file.suffix == ".toml":
-        print(_check_table(file, known))
+        print(_check_table(file, known, "" if task_file else "; tasks of yours come by --task-file"))
         return
     paths = sorted(file.glob("*.plan")) if file.is_dir() else [file]
     if not paths:
         raise ValueError(f"file: the folder {str(file)!r} holds no .plan files")
     table = lw.load_skills(skill_file, tasks=known)
-    wrong = 0
+    wrong, unknown = 0, False
     for path in paths:
         faults, steps, notes = _check_plan(read_text(path, lw.PlanError), task, path.name, table, known)
         wrong += len(faults)
-        print("\n".join([*faults, *notes, f"{path.name}: " + (_count(faults) if faults else f"{steps} steps, valid")]))
+        unknown |= any(" is no task" in fault for fault in faults)
+        found = counted(len(faults), "fault") if faults else f"{counted(steps, 'step')}, valid"
+        print("\n".join([*faults, *notes, f"{path.name}: {found}"]))
     if wrong:
-        raise ValueError(f"{wrong} fault{'s' * (wrong > 1)} in {len(paths)} file{'s' * (len(paths) > 1)}")
+        hint = "; tasks of yours come by --task-file" if unknown and task_file is None else ""
+        raise ValueError(f"{counted(wrong, 'fault')} in {counted(len(paths), 'file')}{hint}")
 
 
-def _count(faults: list[str]) -> str:
-    return f"{len(faults)} fault" + "s" * (len(faults) > 1)
-
-
-def _check_table(file: Path, known: Mapping[str, Task]) -> str:
+def _check_table(file: Path, known: Mapping[str, Task], hint: str) -> str:
     import lw_torchrl as lw
     from lw_torchrl._checks import nearest
     from lw_torchrl._files import read_toml
@@ -70,14 +70,21 @@ def _check_table(file: Path, known: Mapping[str, Task]) -> str:
             close = nearest(name, lw.TASKS, n=1)
             hint = f"; did you mean {close[0]!r}?" if close else ""
             print(f"{file.name}: note: task {name!r} is none of the simulator's{hint}")
-        return f"{file.name}: {len(rows)} tasks, valid"
+        return f"{file.name}: {counted(len(rows), 'task')}, valid"
     table = lw.load_skills(file, tasks=known)
     for text in rows:
         if not any(table[text].suits(task) for task in known.values()):
-            print(
-                f"{file.name}: skill {text!r} suits no task; it needs {table[text].target!r} and {table[text].moved!r}"
-            )
-    return f"{file.name}: {len(rows)} skills, valid"
+            needed = f"{table[text].target!r} and {table[text].moved!r}"
+            print(f"{file.name}: note: skill {text!r} suits no task; it needs {needed}{hint}")
+    return f"{file.name}: {counted(len(rows), 'skill')}, valid"
+
+
+def _foreign(task: Task) -> set[str]:
+    """The words for things of the 50 tasks that this one lacks."""
+    from lw_torchrl.language.tasks import TASKS
+
+    own = {word for name in task.object_names for word in name.split()}
+    return {name.split()[-1] for one in TASKS.values() for name in one.object_names} - own
 
 
 def _check_plan(
@@ -91,11 +98,14 @@ def _check_plan(
     if plan is None:
         return faults, 0, []
     notes = []
+    offered = {text: skill for text, skill in skills.items() if not set(text.split()) & _foreign(plan.definition)}
     for step in plan.steps:
         if step.skill not in skills or not skills[step.skill].suits(plan.definition):
-            found, score = lw.nearest_skill(step.skill, plan.definition, skills)
-            notes.append(
-                f"{source}: note: no scripted skill {step.skill!r} suits {plan.task}; the nearest is {found.text!r} "
-                f"({score:.2f}). A learned policy needs none"
-            )
+            try:
+                found, score = lw.nearest_skill(step.skill, plan.definition, offered)
+                hint = f"the nearest is {found.text!r} ({score:.2f})"
+            except ValueError:
+                hint = "nor does another; yours come by --skill-file"
+            note = f"no scripted skill {step.skill!r} suits {plan.task}; {hint}. A learned policy needs none"
+            notes.append(f"{source}: note: {note}")
     return [], len(plan.steps), notes

@@ -9,13 +9,13 @@ from inspect import Parameter, signature
 # Of each command, the names that the functions behind it use, and the command's own.
 OWN_NAMES = {
     "demo": {"root": "out", "checkpoint": "out"},
-    "collect": {"episodes_per_task": "episodes", "noise_scale": "noise", "root": "out"},
-    "train": {"root": "data", "checkpoint": "out"},
-    "evaluate": {"episodes_per_task": "episodes", "noise_scale": "noise"},
+    "collect": {"episodes_per_task": "episodes", "noise_scale": "noise", "root": "out", "task": "tasks"},
+    "train": {"root": "data", "checkpoint": "out", "task": "tasks"},
+    "evaluate": {"episodes_per_task": "episodes", "noise_scale": "noise", "task": "tasks"},
     "view": {"path": "recording"},
-    "scripted": {"episodes_per_task": "episodes", "noise_scale": "noise", "tasks": "names"},
-    "tasks": {"tasks": "names"},
-    "plans": {"tasks": "names"},
+    "scripted": {"episodes_per_task": "episodes", "noise_scale": "noise", "tasks": "names", "task": "names"},
+    "tasks": {"tasks": "names", "task": "names"},
+    "plans": {"tasks": "names", "task": "names"},
     "skills": {"skills": "skill_file"},
     "check": {"plans": "file"},
     "reproduce": {"episodes_per_task": "episodes", "root": "out", "checkpoint": "out"},
@@ -28,22 +28,26 @@ def in_its_words(command: str, function: Callable[..., object], message: str) ->
     A name at its beginning that the rest speaks of is one; elsewhere only a name that no English word is.
 
     Example:
-        >>> def collect(*, episodes: int, redraw_failures: bool): ...
+        >>> def collect(tasks: str, /, episodes: int, redraw_failures: bool): ...
         >>> in_its_words("collect", collect, "episodes_per_task must be at least 1, got 0")
         '--episodes must be at least 1, got 0'
         >>> in_its_words("collect", collect, "too few; set redraw_failures=False")
         'too few; set --no-redraw-failures'
+        >>> in_its_words("collect", collect, "tasks must be names; run the same collect_demonstrations again")
+        'TASKS must be names; run the same `lw-torchrl collect` again'
     """
     parameters = signature(function).parameters
     own = OWN_NAMES.get(command, {})
 
     def shown(match: re.Match[str]) -> str:
         given = match[1]
+        if given == "collect_demonstrations":
+            return f"`lw-torchrl {'collect' if command == 'train' else command}`"
         name = given if given in parameters and given not in own else own.get(given, "")
         if name not in parameters:
             return match[0]
         if parameters[name].kind is Parameter.POSITIONAL_ONLY:
-            return name
+            return name.upper()  # as the help has it
         option = name.replace("_", "-")
         return f"--no-{option}" if match[2] == "=False" else f"--{option}"
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
+from lw_torchrl._checks import counted
 from lw_torchrl.cli.sources import one_or_many, read_plans, read_tasks
 
 
@@ -26,11 +28,15 @@ def _print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str
         table.add_column(column, no_wrap=number == 0)
     for row in rows:
         table.add_row(*row)
-    wide = None if sys.stdout.isatty() else 160
+    wide = None if sys.stdout.isatty() or "COLUMNS" in os.environ else 160
     Printer(highlight=False, markup=False, width=wide).print(table)
 
 
-def tasks(names: Positional[tuple[str, ...]] = (), /, task_file: Path | None = None) -> None:
+def tasks(
+    names: Positional[Annotated[tuple[str, ...], arg(metavar="[NAMES ...]")]] = (),
+    /,
+    task_file: Path | None = None,
+) -> None:
     """List tasks: their descriptions, and the objects that queries can name.
 
     Example: lw-torchrl tasks MT10
@@ -47,11 +53,11 @@ def tasks(names: Positional[tuple[str, ...]] = (), /, task_file: Path | None = N
         task = known[name]
         objects = ", ".join(o.name + (" (ours)" if getattr(o, "ours", False) else "") for o in task.objects[1:])
         rows.append((name, "yes" if name in lw.MT10 else "", task.description, objects))
-    _print_table(f"{len(rows)} tasks", ("task", "MT10", "description", "objects beside the gripper"), rows)
+    _print_table(counted(len(rows), "task"), ("task", "MT10", "description", "objects beside the gripper"), rows)
 
 
 def skills(
-    task: Positional[str | None] = None,
+    task: Positional[Annotated[str | None, arg(metavar="[TASK]")]] = None,
     /,
     nearest: str | None = None,
     skill_file: Path | None = None,
@@ -87,11 +93,11 @@ def skills(
         gain = f"{shown.gain[0]:g}" if len(set(shown.gain)) == 1 else " ".join(f"{x:g}" for x in shown.gain)
         rows.append((skill.text, shown.target, moved, offset, gain, f"{shown.gripper:g}"))
     columns = ("skill", "target", "moved", "offset, m", "gain", "gripper")
-    _print_table(f"{len(rows)} scripted skills", columns, rows)
+    _print_table(counted(len(rows), "scripted skill"), columns, rows)
 
 
 def plans(
-    names: Positional[tuple[str, ...]] = (),
+    names: Positional[Annotated[tuple[str, ...], arg(metavar="[NAMES ...]")]] = (),
     /,
     plans: tuple[str, ...] = ("MT50",),
     skill_set: Literal["own", "MT10"] = "own",
@@ -121,12 +127,12 @@ def plans(
         (name, str(len(plan.steps)), "; ".join(dict.fromkeys(step.skill for step in plan.steps)))
         for name, plan in loaded.items()
     ]
-    _print_table(f"{len(rows)} plans", ("task", "steps", "skills"), rows)
+    _print_table(counted(len(rows), "plan"), ("task", "steps", "skills"), rows)
 
 
 def queries(
-    task: Positional[str],
-    text: Positional[str | None] = None,
+    task: Positional[Annotated[str, arg(metavar="TASK")]],
+    text: Positional[Annotated[str | None, arg(metavar="[TEXT]")]] = None,
     /,
     by: Literal["edit", "embedding"] = "edit",
     task_file: Path | None = None,

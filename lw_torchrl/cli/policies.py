@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from lw_torchrl._checks import counted
 from lw_torchrl.cli.outputs import check_file, check_folder
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def collect(
-    tasks: Positional[tuple[str, ...]],
+    tasks: Positional[Annotated[tuple[str, ...], arg(metavar="TASKS ...")]],
     /,
     out: Path,
     episodes: int = 10,
@@ -60,11 +60,11 @@ def collect(
     print(f"{'task':28} {'success':>7} {'episodes run':>13}")
     for task, rate in made.success_rate.items():
         print(f"{task:28} {rate:7.2f} {made.attempts[task]:13}")
-    print(f"{made.num_steps} steps in {made.root}")
+    print(f"{counted(made.num_steps, 'step')} in {made.root}")
 
 
 def train(
-    data: Positional[Path],
+    data: Positional[Annotated[Path, arg(metavar="DATA")]],
     /,
     out: Path,
     tasks: tuple[str, ...] = (),
@@ -155,7 +155,7 @@ def _all_of(data: Path, tasks: tuple[str, ...]) -> dict[str, list[int]]:
 
 
 def evaluate(
-    checkpoint: Positional[Path],
+    checkpoint: Positional[Annotated[Path, arg(metavar="CHECKPOINT")]],
     /,
     tasks: tuple[str, ...] = (),
     plans: tuple[str, ...] = (),

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from lw_torchrl.cli.outputs import check_folder
 from lw_torchrl.cli.sources import one_or_many, read_plans, read_tasks, simulated
 
 
 def scripted(
-    names: Positional[tuple[str, ...]] = ("MT10",),
+    names: Positional[Annotated[tuple[str, ...], arg(metavar="[NAMES ...]")]] = ("MT10",),
     /,
     episodes: int = 50,
     seed: int = 1000,

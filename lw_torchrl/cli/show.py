@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from lw_torchrl.cli.outputs import check_file, check_folder
 from lw_torchrl.cli.sources import read_tasks, simulated
@@ -29,7 +30,7 @@ def demo(out: Path | None = None, quick: bool = False) -> None:
 
 
 def view(
-    recording: Positional[Path],
+    recording: Positional[Annotated[Path, arg(metavar="RECORDING")]],
     /,
     screenshot: Path | None = None,
     step: int | None = None,
@@ -55,8 +56,8 @@ def view(
 
 
 def query(
-    task: Positional[str],
-    text: Positional[str | None] = None,
+    task: Positional[Annotated[str, arg(metavar="TASK")]],
+    text: Positional[Annotated[str | None, arg(metavar="[TEXT]")]] = None,
     /,
     step: int = 0,
     seed: int = 0,

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from lw_torchrl._checks import check_choice
+from lw_torchrl._checks import check_choice, counted
 from lw_torchrl._files import replacing
 from lw_torchrl.evaluation.result import EvaluationResult
 from lw_torchrl.evaluation.statistics import Array, check_rates
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+_FORMATS = (".png", ".svg", ".pdf", ".jpg", ".jpeg")
 _Z = 1.96  # of a 95 % interval
 
 
@@ -41,20 +43,24 @@ def plot_success(result: EvaluationResult, path: str | os.PathLike[str] | None =
 
     Args:
         result: of :func:`evaluate`.
-        path: an image file, .png, .svg or .pdf; it is replaced whole. None for none.
+        path: an image file, .png, .svg, .pdf or .jpg; it is replaced whole. None for none.
         title: above the figure.
 
     Returns:
         The figure.
 
+    Raises:
+        ValueError: another format.
+
     Example:
         >>> import lw_torchrl as lw
         >>> result = lw.evaluate(lw.ExpertActor("reach"), tasks="reach", episodes_per_task=2, seed=1_000)
         >>> plot_success(result).axes[0].get_title()
-        'mean over 1 tasks: 1.000'
+        'mean over 1 task: 1.000'
     """
     from matplotlib.figure import Figure
 
+    _check_image(path)
     rates = {task: rate for task, rate in result.success_once.items() if rate is not None}
     trials = result.config["episodes_per_task"]
     tasks = sorted(rates, key=lambda task: (rates[task], task))
@@ -78,7 +84,7 @@ def plot_success(result: EvaluationResult, path: str | os.PathLike[str] | None =
     axes.set_xlabel(
         f"episodes with success at any step (of {trials}; action noise {result.config['noise_scale']}; bars: 95 %)"
     )
-    axes.set_title(f"{title}\nmean over {len(tasks)} tasks: {result.mean_success:.3f}".strip())
+    axes.set_title(f"{title}\nmean over {counted(len(tasks), 'task')}: {result.mean_success:.3f}".strip())
     axes.spines[["top", "right"]].set_visible(False)
     return _saved(figure, path)
 
@@ -104,7 +110,7 @@ def plot_sorted_tasks(
     Args:
         curves: a method's name to its :class:`Summary`, or to (task to its rates, one per seed), in [0, 1]. All have
             the same tasks.
-        path: an image file, .png, .svg or .pdf; it is replaced whole. None for none.
+        path: an image file, .png, .svg, .pdf or .jpg; it is replaced whole. None for none.
         published: label to (task to rate), of the same tasks at least; :func:`published_curves` gives them.
         order: "shared" sorts the tasks by the first method, so that each place on x is one named task; "own" sorts
             every curve for itself, as the paper does: x is then a rank.
@@ -125,6 +131,7 @@ def plot_sorted_tasks(
     """
     from matplotlib.figure import Figure
 
+    _check_image(path)
     check_choice("order", order, ("shared", "own"))
     if not curves:
         raise ValueError("curves must hold at least one method, got none")
@@ -158,6 +165,12 @@ def plot_sorted_tasks(
     axes.set_title(title)
     _add_legend(figure, axes, len(named))
     return _saved(figure, path)
+
+
+def _check_image(path: str | os.PathLike[str] | None) -> None:
+    """Raise :class:`ValueError` unless the file's name tells a format."""
+    if path is not None and (given := Path(path).suffix.lower()) not in _FORMATS:
+        raise ValueError(f"path must end in {', '.join(_FORMATS)}, got {given!r} of {str(path)!r}")
 
 
 def _saved(figure: Figure, path: str | os.PathLike[str] | None) -> Figure:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import torch
 
+from lw_torchrl._checks import counted
 from lw_torchrl._files import write_json
 from lw_torchrl.data import LanguageWorldExperienceReplay, TaskBalancedSampler, collect_demonstrations
 from lw_torchrl.evaluation import EvaluationResult, evaluate, plot_success
@@ -70,7 +71,7 @@ def run_demo(out: Path, config: DemoConfig) -> EvaluationResult:
     """
     _settle(out, config)
     plans = load_plans("MT10")
-    print(f"1/4  {config.demonstrations_per_task} demonstrations of each of {len(config.tasks)} tasks")
+    print(f"1/4  {config.demonstrations_per_task} demonstrations of each of {counted(len(config.tasks), 'task')}")
     collect_demonstrations(
         config.tasks,
         episodes_per_task=config.demonstrations_per_task,

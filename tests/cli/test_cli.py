@@ -146,12 +146,14 @@ def test_without_a_text_all_queries_that_hold_are_listed(capsys):
         (["query", "reach", "--step", "-1"], "error: --step must be at least 0, got -1"),
         (["query", "reach", "--episode", "-1"], "error: --episode must be at least 0, got -1"),
         (["collect", "raech", "--out", "OUT"], "did you mean 'reach'"),
-        (["collect", "--out", "OUT"], "tasks"),
+        (["collect", "--out", "OUT"], "error: TASKS must name at least one task"),
         (["collect", "reach", "--out", "OUT", "--episodes", "0"], "error: --episodes must be at least 1, got 0"),
         (["collect", "reach", "--out", "OUT", "--noise", "-1"], "error: --noise must be finite and at least 0"),
         (["collect", "reach", "--out", "OUT", "--num-envs", "0"], "error: --num-envs must be at least 1, got 0"),
-        (["train", "NOWHERE", "--out", "OUT"], "error: data: no dataset folder"),
-        (["evaluate", "NOWHERE"], "checkpoint: no file"),
+        (["collect", "raech", "push", "--out", "OUT"], "error: TASKS must be one of"),
+        (["check", "NOWHERE"], "error: FILE: there is no 'NOWHERE'"),
+        (["train", "NOWHERE", "--out", "OUT"], "DATA: no dataset folder 'NOWHERE'; make one with `lw-torchrl collect`"),
+        (["evaluate", "NOWHERE"], "error: CHECKPOINT: no file"),
         (["evaluate", "expert", "--tasks", "raech"], "did you mean 'reach'"),
         (["evaluate", "expert", "--tasks", "reach", "--episodes", "0"], "error: --episodes must be at least 1"),
         (["view", "NOWHERE"], "NOWHERE"),
@@ -251,6 +253,11 @@ def test_an_option_for_plans_is_refused_without_them(capsys, demos, tmp_path):
     given = ("train", demos, "--out", tmp_path / "p.zip", "--mix", "actions", "--method")
     for method in ("dc", "one-hot"):
         assert f"--mix is for a method that reads plans, --method {method} does not" in fails(capsys, *given, method)
+
+
+def test_train_names_a_task_that_the_dataset_lacks(capsys, demos, tmp_path):
+    error = fails(capsys, "train", demos, "--out", tmp_path / "p.zip", "--tasks", "reach", "door-open")
+    assert "error: --tasks must be one of 'push', 'reach', got 'door-open'" in error
 
 
 def test_evaluating_on_the_demonstrations_seed_is_refused(capsys, checkpoint, tmp_path):

@@ -118,14 +118,15 @@ def test_ones_own_skills_and_tasks(capsys, tmp_path):
     skills = tmp_path / "skills.toml"
     skills.write_text('["shove the puck over there"]\ntarget = "puck"\n["juggle"]\ntarget = "balls"\n')
     out = run(capsys, "check", skills)
-    assert "skill 'juggle' suits no task; it needs 'balls'" in out
+    assert "skills.toml: note: skill 'juggle' suits no task; it needs 'balls'" in out
+    assert "tasks of yours come by --task-file" in out
     assert "2 skills, valid" in out
     plan = tmp_path / "push.plan"
     plan.write_text(PLAN)
     assert "note" not in run(capsys, "check", plan, "--skill-file", skills)
     tasks = tmp_path / "tasks.toml"
     tasks.write_text('[push]\ndescription = "Push the disc."\nobjects.disc = "obs[4:7]"\n')
-    assert "1 tasks, valid" in run(capsys, "check", tasks)
+    assert "1 task, valid" in run(capsys, "check", tasks)
     plan.write_text(PLAN.replace("puck", "disc"))
     assert "push.plan: 2 steps, valid" in run(capsys, "check", plan, "--task-file", tasks)
     skills.write_text('["wipe it"]\ntarget = "rag"\nfor.wipe.gripper = 1.0\n')
@@ -135,11 +136,31 @@ def test_ones_own_skills_and_tasks(capsys, tmp_path):
     out = run(capsys, "check", tasks)
     assert "note: task 'psh' is none of the simulator's; did you mean 'push'?" in out
     assert "2 tasks, valid" in out
-    assert run(capsys, "check", skills, "--task-file", tasks) == "skills.toml: 1 skills, valid\n"
+    assert run(capsys, "check", skills, "--task-file", tasks) == "skills.toml: 1 skill, valid\n"
     assert "'wipe'" in fails(capsys, "check", skills)
     tasks.write_text('[psh]\ndescription = "Push the disc."\n')
     assert "did you mean" in fails(capsys, "check", tasks)
     assert "there is no" in fails(capsys, "check", tmp_path / "none.plan")
+
+
+def test_a_plan_for_a_task_of_ones_own(capsys, tmp_path):
+    (tmp_path / "tasks.toml").write_text('[stack-cup]\ndescription = "Stack."\nobjects.cup = "obs[4:7]"\n')
+    plan = tmp_path / "stack-cup.plan"
+    plan.write_text('def stack_cup(robot):\n    if check("the gripper is open"):\n        robot.lift("the cup")\n')
+    with pytest.raises(SystemExit):
+        run(capsys, "check", plan)
+    assert "1 fault in 1 file; tasks of yours come by --task-file" in capsys.readouterr().err
+    out = run(capsys, "check", plan, "--task-file", tmp_path / "tasks.toml")
+    assert "no scripted skill 'lift the cup' suits stack-cup; " in out
+    assert "wrench" not in out
+    assert "stack-cup.plan: 1 step, valid" in out
+
+
+def test_tables_are_as_wide_as_they_are_asked_to_be(capsys, monkeypatch):
+    for width in ("60", "140"):
+        monkeypatch.setenv("COLUMNS", width)
+        assert max(map(len, run(capsys, "tasks").splitlines())) <= int(width)
+    assert run(capsys, "tasks", "reach").split()[:2] == ["1", "task"]
 
 
 def test_scripted_writes_what_it_found(capsys, tmp_path):

@@ -33,7 +33,7 @@ def test_a_pipe_that_nobody_reads(command):
 
 def test_a_pipe_of_which_only_the_first_line_is_read():
     status, printed, error = shell("set -o pipefail; lw-torchrl tasks reach | head -1")
-    assert (status, printed.strip(), error) == (0, "1 tasks", "")
+    assert (status, printed.strip(), error) == (0, "1 task", "")
 
 
 @pytest.mark.parametrize(("closed", "status"), [(">&-", 0), ("2>&-", 0), (">&- 2>&-", 0), ("<&-", 0)])

@@ -230,3 +230,13 @@ def test_without_a_path_the_figure_is_returned_and_nothing_is_written(tmp_path, 
         assert list(tmp_path.iterdir()) == []
         figure.savefig("mine.png")
         Path("mine.png").unlink()
+
+
+@pytest.mark.parametrize("name", ["figure.xyz", "figure", "figure.txt"])
+def test_a_format_that_is_none_is_named(tmp_path, name):
+    message = rf"path must end in .png, .svg, .pdf, .jpg, .jpeg, got '{Path(name).suffix}'"
+    with pytest.raises(ValueError, match=message):
+        plot_sorted_tasks({"PCBC": {"reach": [1.0]}}, tmp_path / name)
+    with pytest.raises(ValueError, match=message):
+        plot_success(make_result({"reach": 1.0}), tmp_path / name)
+    assert not any(tmp_path.iterdir())

@@ -101,3 +101,9 @@ def test_writing_the_table_gives_what_is_shipped(tmp_path, encoded, monkeypatch)
         assert table["texts"].tolist() == texts
         found = torch.from_numpy(table["vectors"].astype("float32"))
     torch.testing.assert_close(found, vectors, atol=1e-3, rtol=0)
+
+
+def test_loading_the_text_model_prints_nothing(capfd):
+    text._sentence_transformer.cache_clear()
+    text.sentence_encoder([NEW])
+    assert capfd.readouterr() == ("", "")
