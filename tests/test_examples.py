@@ -10,8 +10,10 @@ from pathlib import Path
 
 import pytest
 
-EXAMPLES = sorted((Path(__file__).parent.parent / "examples").glob("*.py"))
-TRAIN_BC = Path(__file__).parent.parent / "examples" / "train_bc.py"
+import lw_torchrl as lw
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+TRAIN_BC = EXAMPLES / "train_bc.py"
 
 
 def names(path):
@@ -29,7 +31,7 @@ def names(path):
     return found
 
 
-@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.name)
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.name)
 def test_an_example_is_one_page(path):
     lines = path.read_text("utf-8").splitlines()
     assert len(lines) <= 80
@@ -43,18 +45,43 @@ def test_train_bc_is_composed_by_hand():
     assert not any(name.startswith("lw_torchrl.") for name in found), "the public names are enough"
 
 
-def test_train_bc_runs(tmp_path):
-    options = ["--steps", "20", "--demonstrations", "1", "--episodes", "1"]
+def run(path, folder, *options):
     done = subprocess.run(
-        [sys.executable, str(TRAIN_BC), *options],
-        cwd=tmp_path,
-        env={**os.environ, "TMPDIR": str(tmp_path)},
+        [sys.executable, str(EXAMPLES / path), *map(str, options)],
+        cwd=folder,
+        env={**os.environ, "TMPDIR": str(folder)},
         capture_output=True,
         text=True,
         timeout=240,
     )
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stderr
+    assert "Warning" not in done.stderr
+    return done
+
+
+def test_ppo_runs(tmp_path):
+    done = run("ppo.py", tmp_path, "--updates", 2, "--rows", 4, "--horizon", 20, "--clone", 5)
+    assert "update   1  reward" in done.stdout
+    assert "window-open" in done.stdout
+
+
+def test_a_policy_is_exported(tmp_path):
+    lw.save_actor(lw.PlanConditionedActor(lw.load_plans("MT10"), width=16), tmp_path / "policy.zip")
+    done = run("export_policy.py", tmp_path, "policy.zip", "policy.pt2")
+    assert done.stdout.count("at most 0.0e+00 away") == 3
+    assert (tmp_path / "policy.pt2").is_file()
+
+
+@pytest.mark.slow
+def test_experience_comes_from_ray(tmp_path):
+    pytest.importorskip("ray")
+    done = run("collect_on_ray.py", tmp_path, "--workers", 2, "--batches", 4)
+    assert "batch 3: 200 steps" in done.stdout
+
+
+def test_train_bc_runs(tmp_path):
+    done = run("train_bc.py", tmp_path, "--steps", 20, "--demonstrations", 1, "--episodes", 1)
     assert "step     0  loss" in done.stdout
     for task in ("drawer-open", "window-open"):
         assert any(line.startswith(f"{task} ") for line in done.stdout.splitlines()), "the table"
