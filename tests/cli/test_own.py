@@ -137,7 +137,7 @@ def test_a_task_that_the_simulator_lacks_is_named(capsys, tmp_path):
         lw.save_actor(actor, tmp_path / f"{name}.zip")
     lacks = "the simulator has no stack-cup; tasks of your own run in an engine of yours, in Python"
     assert "--tasks: " + lacks in fails(capsys, "evaluate", tmp_path / "alone.zip", "--tasks", "stack-cup", *encoder)
-    assert f"task: {lacks}" in fails(capsys, "query", "stack-cup", *files)
+    assert f"TASK: {lacks}" in fails(capsys, "query", "stack-cup", *files)
     scripted = ("scripted", "stack-cup", "--plans", tmp_path / "plans.json", "--out", tmp_path)
     assert lacks in fails(capsys, *scripted, *files)
     message = fails(capsys, "evaluate", tmp_path / "alone.zip", *encoder)
