@@ -36,6 +36,7 @@ def main() -> None:
         collector_kwargs={"auto_register_policy_transforms": False},
         remote_configs={"num_cpus": 1, "num_gpus": 0, "memory": 2**30},
     )
+    collector.update_policy_weights_()  # the first weights
     for number, batch in enumerate(collector):
         episodes = batch["episode"].unique().tolist()
         print(

@@ -6,6 +6,7 @@ python examples/train_bc.py --steps 50 # only to see it run
 
 import argparse
 import tempfile
+import warnings
 
 import torch
 from torchrl.envs import TransformedEnv
@@ -42,6 +43,7 @@ def main() -> None:
         )
         actor = lw.PlanConditionedActor(plans)
         actor.fit_normalization(replay[:]["observation"])
+        warnings.filterwarnings("ignore", message=".*target_actor_network_params")  # BCLoss about itself
         loss = BCLoss(actor, loss_function="l2")
         optimizer = torch.optim.AdamW(loss.parameters(), lr=1e-3)
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, args.steps)

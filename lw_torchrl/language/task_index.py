@@ -87,8 +87,10 @@ class TaskIndex:
             if known:
                 self._ids = ids
         given = task_id.long().contiguous()
-        # Inside of vmap searchsorted warns of how the rows lie in memory.
-        rows = torch.searchsorted(ids[:-1], given) if known else (given.unsqueeze(-1) > ids[:-1]).sum(-1)
+        if known or torch.compiler.is_compiling():
+            rows = torch.searchsorted(ids[:-1], given)
+        else:  # inside of vmap searchsorted warns of how the rows lie in memory
+            rows = (given.unsqueeze(-1) > ids[:-1]).sum(-1)
         found = ids.index_select(0, rows.reshape(-1)).reshape(rows.shape)
         if known:
             if not torch.equal(found, given):

@@ -35,12 +35,13 @@ def fit_normalization(target: nn.Module, replay: TensorDictReplayBuffer) -> None
         >>> import lw_torchrl as lw, torch
         >>> from tensordict import TensorDict
         >>> from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-        >>> from torchrl.objectives import TD3Loss
+        >>> from torchrl.objectives import SoftUpdate, TD3Loss
         >>> from lw_torchrl.trainers import fit_normalization
         >>> replay = TensorDictReplayBuffer(storage=LazyTensorStorage(64), batch_size=8)
         >>> _ = replay.extend(TensorDict(observation=torch.rand(64, 39)).auto_batch_size_(1))
         >>> plans = lw.load_plans("MT10")
         >>> loss = TD3Loss(lw.PlanConditionedActor(plans), lw.PlanConditionedQValue(plans), bounds=(-1.0, 1.0))
+        >>> targets = SoftUpdate(loss, eps=0.995)
         >>> fit_normalization(loss, replay)
         >>> loss.target_qvalue_network_params["encoder", "features", "mean"].shape  # of two critics
         torch.Size([2, 56])

@@ -97,8 +97,8 @@ def test_the_metadata_say_how_it_was_made(made, tmp_path):
     found = json.loads((made.root / "metadata.json").read_text())
     assert found["config"] == CONFIG.to_json()
     assert found["config"]["seed"] == SEED
-    packages = ("lw_torchrl", "metaworld", "mujoco", "numpy", "tensordict", "torch", "torchrl")
-    assert found["versions"] == {name: version(name) for name in packages}
+    packages = ("metaworld", "mujoco", "numpy", "tensordict", "torch", "torchrl")
+    assert found["versions"] == {name: version(name) for name in packages} | {"lw_torchrl": lw.__version__}
     assert read_metadata(made.root) == made
     assert found["task_ids"] == made.task_ids == {task: MT50.index(task) for task in TASKS}
     assert not (made.root / ".partial").exists()

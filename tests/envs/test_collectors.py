@@ -99,6 +99,7 @@ def test_ray():
             collector_kwargs={"auto_register_policy_transforms": False},
             remote_configs={"num_cpus": 1, "num_gpus": 0, "memory": 2**28},
         )
+        collector.update_policy_weights_()
         found, locs = [], []
         for batch in collector:
             found.append(episodes(batch))

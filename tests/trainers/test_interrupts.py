@@ -30,12 +30,11 @@ class PressCtrlC(Transform):
 
     def __init__(self, times=1):
         super().__init__()
-        self.count, self.times = 0, times
+        self.minibatches, self.presses = iter(range(1, 100)), iter(range(times))  # no numbers: all are alike
 
     def forward(self, tensordict):
-        self.count += 1
-        if self.count == 6:
-            for _ in range(self.times):
+        if next(self.minibatches) == 6:
+            for _ in self.presses:
                 signal.raise_signal(signal.SIGINT)
         return tensordict
 
@@ -43,8 +42,7 @@ class PressCtrlC(Transform):
 def make(demos, checkpoint, stacked, *, times=0):
     def replay(press):
         found = lw.LanguageWorldExperienceReplay(demos, sampler=lw.TaskBalancedSampler())
-        if press:
-            found.append_transform(PressCtrlC(times))
+        found.append_transform(PressCtrlC(press))
         return found
 
     torch.manual_seed(0)

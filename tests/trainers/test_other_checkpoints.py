@@ -133,7 +133,7 @@ def test_a_checkpoint_of_rows_shown_in_another_way_is_refused(root, tmp_path, ch
 
     trainer().save()
     trainer()
-    refused(path, f"of another configuration, its replay differs in {differs};", lambda: trainer(**change))
+    refused(path, f"of another configuration, its replay differs in {differs}", lambda: trainer(**change))
 
 
 def test_a_checkpoint_from_before_that_was_said_goes_on(demos, tmp_path):
