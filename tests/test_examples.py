@@ -6,6 +6,7 @@ import ast
 import os
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -49,7 +50,7 @@ def run(path, folder, *options):
     done = subprocess.run(
         [sys.executable, str(EXAMPLES / path), *map(str, options)],
         cwd=folder,
-        env={**os.environ, "TMPDIR": str(folder)},
+        env={**os.environ, "TMPDIR": str(folder), "RAY_TMPDIR": tempfile.gettempdir()},  # for sockets a short one
         capture_output=True,
         text=True,
         timeout=240,
