@@ -38,6 +38,9 @@ from lw_torchrl.envs.engines.vectorized.simulation_table import simulation_table
 
 TASKS = list(simulation_table())
 
+EDGES = [0.005, 0.01, 0.015, 0.02, 0.025, 0.03, 0.035, 0.04, 0.05, 0.06, 0.065, 0.07, 0.08, 0.1, 0.12]  # metres
+"""Distances at which Meta-World's formulas change."""
+
 
 def play_both(tasks: list[str], steps: int, precisions: list[type], seed: int) -> dict[str, float]:
     """The largest difference of each task's rewards over episodes of the experts' actions, with noise and with
@@ -91,8 +94,11 @@ def invent_states(engine: VectorizedEngine, rng: np.random.Generator) -> np.ndar
         def beside(point: np.ndarray, x: float, y: float, z: float) -> np.ndarray:
             return point + np.array([x, y, z])
 
-        def near(point: np.ndarray, spread: tuple[float, ...] = (0.0, 1e-3, 0.01, 0.05)) -> np.ndarray:
-            return point + rng.choice(spread) * rng.normal(size=3)
+        def near(point: np.ndarray) -> np.ndarray:
+            if rng.random() < 0.5:
+                return point + rng.choice([0.0, 1e-3, 0.01, 0.05]) * rng.normal(size=3)
+            direction = np.eye(3)[rng.integers(3)] * rng.choice([-1, 1])
+            return point + rng.choice(EDGES) * rng.choice([0.995, 1.005]) * direction
 
         sensors = row._numbers.take(row._sensor_index)
         between = start + rng.random() * (goal - start)
@@ -105,17 +111,19 @@ def invent_states(engine: VectorizedEngine, rng: np.random.Generator) -> np.ndar
         if engine._notes.rewards[number].corners and rng.random() < 0.5:
             place = rng.uniform(corners.min(axis=0), corners.max(axis=0))
         pads = rng.choice([0.02, 0.03, 0.08]) * rng.random(2)
+        opening = rng.choice([0.0, 0.033, 0.043, 0.05, 0.055]) * rng.choice([0.995, 1.005])
+        opening = rng.choice([opening, rng.uniform(0, 0.12)])
         ideal = [[0.707, 0, 0, 0.707], [1, 0, 0, 0]][rng.integers(2)]
         invented = [
-            (OBJECT, thing),
-            (SECOND, second),
+            (OBJECT, thing - row.sources.offset),
+            (SECOND, second - row.sources.second_offset),
             (PLACE, near(place)),
             (HAND, near(beside(tips, 0, 0, 0.04))),
             (RIGHT_TIP, beside(tips, 0, -0.02, 0)),
             (LEFT_TIP, beside(tips, 0, 0.02, 0)),
             (RIGHT_PAD, beside(tips, 0, -pads[0], 0)),
             (LEFT_PAD, beside(tips, 0, pads[1], 0)),
-            (RIGHT_CLAW, beside(tips, 0, rng.uniform(0, 0.12), 0)),
+            (RIGHT_CLAW, beside(tips, 0, opening, 0)),
             (LEFT_CLAW, tips),
             (JOINT, rng.choice([0.05, 1.0]) * rng.uniform(-2, 1.6, 1)),
             (QUATERNION, ideal + rng.choice([0.0, 0.01, 0.2]) * rng.normal(size=4)),
@@ -158,7 +166,7 @@ def test_every_formula_has_metaworlds_bits_in_invented_states():
                 wrong[TASKS[number]].append((expected, got[number]))
     assert not wrong
     assert compared.min() > 75, dict(zip(TASKS, compared.tolist(), strict=True))
-    assert min(map(len, seen_rewards)) > 20
+    assert min(map(len, seen_rewards)) > 10
     never = {task for task, count in zip(TASKS, full, strict=True) if not count}
     unlimited = {"press", "press behind wall", "sum", "both", "reach"}
     assert {reward_table()[task].formula for task in never} <= unlimited, never
