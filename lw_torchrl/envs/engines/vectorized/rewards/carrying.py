@@ -11,11 +11,12 @@ from lw_torchrl.envs.engines.vectorized.observation import row_norm
 from lw_torchrl.envs.engines.vectorized.rewards.moment import Formula, Index, Moment, Weak
 from lw_torchrl.envs.engines.vectorized.rewards.parameters import GOAL, PLACED, START
 from lw_torchrl.envs.engines.vectorized.rewards.reaching import UPRIGHT, turned_like
-from lw_torchrl.envs.engines.vectorized.rewards.terms import hamacher_product, tolerance
+from lw_torchrl.envs.engines.vectorized.rewards.terms import hamacher_product, limited, tolerance
 from lw_torchrl.envs.engines.vectorized.sensors import JOINT, OBJECT, PLACE, QUATERNION, SECOND
 
 Array = NDArray[np.float64]
 
+TALL = np.array([1.0, 1.0, 3.0])
 LYING = np.array([1.0, 0.0, 0.0, 0.0])
 
 
@@ -68,7 +69,7 @@ def soccer(m: Moment, rows: Index, weak: Weak) -> Any:
     placed, line = m.placed[rows], goal[:, 1] - 0.1
     missed = (ball[:, 1] > line) & (np.abs(ball[:, 0] - goal[:, 0]) > 0.1)
     beyond = 2 * ((ball[:, 1] - line) / (1 - line))
-    placed = np.where(missed, np.clip(placed - beyond, 0.0, 1.0), placed)
+    placed = np.where(missed, limited(placed - beyond, 0.0, 1.0), placed)
     return 3 * m.grasp[rows] + 6.5 * placed
 
 
@@ -83,7 +84,7 @@ def peg(m: Moment, rows: Index, weak: Weak) -> Any:
     height = np.where(radius > rim, 0.02 * np.log(radius - rim) + 0.2, 0.0)
     error[:, 2] = height - ring[:, 2]
     lifted = (ring[:, 2] > 0.02) | (radius < rim)
-    placed = 0.1 * lifted + 0.9 * tolerance(row_norm(error * (1.0, 1.0, 3.0)), 0.0, 0.02, 0.4)
+    placed = 0.1 * lifted + 0.9 * tolerance(row_norm(error * TALL), 0.0, 0.02, 0.4)
     reward = _with_tool(m, rows, weak, placed, turned_like(facts[:, QUATERNION], UPRIGHT, 0.4))
     return np.where(on_peg, 10.0, reward)
 

@@ -13,6 +13,7 @@ from lw_torchrl.envs.engines.vectorized.rewards.caging import Caging
 from lw_torchrl.envs.engines.vectorized.rewards.carrying import CARRYING
 from lw_torchrl.envs.engines.vectorized.rewards.closeness import Closeness, Distances
 from lw_torchrl.envs.engines.vectorized.rewards.facts import gather_facts
+from lw_torchrl.envs.engines.vectorized.rewards.funnels import Funnels
 from lw_torchrl.envs.engines.vectorized.rewards.lifting import LIFTS
 from lw_torchrl.envs.engines.vectorized.rewards.moment import Moment
 from lw_torchrl.envs.engines.vectorized.rewards.parameters import (
@@ -29,6 +30,7 @@ from lw_torchrl.envs.engines.vectorized.rewards.parameters import (
 )
 from lw_torchrl.envs.engines.vectorized.rewards.reaching import REACHING
 from lw_torchrl.envs.engines.vectorized.rewards.table import FIRST_DISTANCE, TaskReward
+from lw_torchrl.envs.engines.vectorized.rewards.terms import limited
 from lw_torchrl.envs.engines.vectorized.sensors import CURRENT, GRIPPER
 
 Array = NDArray[np.float64]
@@ -87,6 +89,7 @@ class DenseReward:
         self._task = task = notes.task.of(rows)
         self._distances = Distances(task)
         self._caging = Caging(task)
+        self._funnels = Funnels(task)
         self._every_row = np.arange(len(rows))
         self._lifts = [(LIFTS[name], np.flatnonzero(task.lift == name)) for name in np.unique(task.lift) if name]
         self._formulas = [(FORMULAS[name], np.flatnonzero(task.formula == name)) for name in np.unique(task.formula)]
@@ -128,12 +131,13 @@ class DenseReward:
             near=near,
             placed=placed,
             via=via,
+            above=self._funnels(facts),
             lift=placed.copy(),
             wide=np.zeros(len(facts), dtype=bool),
             grasp=grasp,
             narrow=(narrow_grasp & ~perfect) | (narrow & task.gripper),
             closed=closed,
-            effort=(np.clip(action, -1, 1) + 1.0) / 2.0,
+            effort=(limited(action, -1, 1) + 1.0) / 2.0,
             held=held,
         )
         for lift, rows in self._lifts:

@@ -8,29 +8,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl.envs.engines.vectorized.observation import row_norm
 from lw_torchrl.envs.engines.vectorized.rewards.moment import Index, Moment
-from lw_torchrl.envs.engines.vectorized.rewards.parameters import GOAL, START, TCP
-from lw_torchrl.envs.engines.vectorized.rewards.terms import above, funnel, hamacher_product
-from lw_torchrl.envs.engines.vectorized.sensors import CORNERS, HAND, OBJECT, PLACE
+from lw_torchrl.envs.engines.vectorized.rewards.parameters import GOAL
+from lw_torchrl.envs.engines.vectorized.rewards.terms import hamacher_product, limited
+from lw_torchrl.envs.engines.vectorized.sensors import CORNERS, OBJECT, PLACE
 
 Array = NDArray[np.float64]
 
 
-def over_two_funnels(m: Moment, rows: Index) -> None:
-    """The hand is to stay above the lower of two funnels, about the object's start and about the goal."""
-    facts = m.facts[rows]
-    hand = facts[:, HAND]
-    floors = [funnel(row_norm(hand[:, :2] - facts[:, place][:, :2]), 0.03, 0.02, 0.2) for place in (START, GOAL)]
-    m.lift[rows] = hamacher_product(above(hand[:, 2], np.minimum(*floors), 0.05), m.placed[rows])
-
-
 def over_funnel(m: Moment, rows: Index) -> None:
-    """The fingertips are to stay above a funnel about the object's start."""
-    facts = m.facts[rows]
-    tips = facts[:, TCP]
-    floor = funnel(row_norm(tips[:, :2] - facts[:, START][:, :2]), 0.03, 0.015, 0.15)
-    m.lift[rows] = hamacher_product(m.placed[rows], above(tips[:, 2], floor, 0.02))
+    """The hand is to come from above, and to stay so."""
+    m.lift[rows] = hamacher_product(m.above[rows], m.placed[rows])
 
 
 def into_box(m: Moment, rows: Index) -> None:
@@ -59,13 +47,12 @@ def onto_shelf(m: Moment, rows: Index) -> None:
     edge = goal[:, 1] - 3 * 0.05
     before, under = low & (edge < y) & (y < goal[:, 1]), low & (y > goal[:, 1])
     loss = hamacher_product((y - edge) / (3 * 0.05), (0.24 - z) / 0.24)
-    lift = np.where(before, np.clip(placed - loss, 0.0, 1.0), placed)
+    lift = np.where(before, limited(placed - loss, 0.0, 1.0), placed)
     m.lift[rows] = np.where(under, 0.0, lift)
     m.wide[rows] = before
 
 
 LIFTS: dict[str, Callable[[Moment, Index], None]] = {
-    "over two funnels": over_two_funnels,
     "over funnel": over_funnel,
     "into box": into_box,
     "onto shelf": onto_shelf,

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 Truth = NDArray[np.bool_]
 
-Weak = Callable[[Array], Any]
+Weak = Callable[[Any], Any]
 """Brings numbers to the precision that a formula is computed in: single, where a number of a float32 action takes part,
 for NumPy gives way to it where a plain Python number meets it."""
 
@@ -34,6 +34,7 @@ class Moment:
         facts: (rows, FACTS).
         close: how close the pairs of points are.
         near, placed, via: (rows,) the values of these terms.
+        above: (rows,) whether the hand keeps above the floor.
         lift: (rows,) how well a held object is on its way to the goal.
         wide: (rows,) where ``lift`` is a NumPy number, not a Python one, so that single precision gives way to it.
         grasp: (rows,) how well the object is gripped.
@@ -49,10 +50,11 @@ class Moment:
     near: Array
     placed: Array
     via: Array
+    above: Array
     lift: Array
     wide: Truth
     grasp: Array
     narrow: Truth
-    closed: Array
-    effort: Array
+    closed: Numbers
+    effort: Numbers
     held: Truth

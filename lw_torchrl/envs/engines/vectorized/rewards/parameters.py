@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from lw_torchrl.envs.engines.vectorized.rewards.table import FIRST_DISTANCE, TaskReward, Term
 from lw_torchrl.envs.engines.vectorized.sensors import HAND, LEFT_PAD, OBJECT, PLACE, REWARD_WIDTH, SECOND
+from lw_torchrl.envs.engines.vectorized.simulation_table import NO_OFFSET
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -77,6 +78,14 @@ class Parameters:
     pinch: Array
     high: Truth
     medium: Truth
+    funnelled: Truth
+    funnel_over: Index
+    funnel_about: Index
+    funnel_offset: Array
+    rim: Array
+    slope: Array
+    height: Array
+    funnel_margin: Array
     held_near: Array
     held_within: Array
     opened: Array
@@ -133,6 +142,9 @@ def make_parameters(rewards: Sequence[TaskReward]) -> Parameters:
     def cage(name: str, without: Any, dtype: Any = np.float64) -> Any:
         return array(lambda reward: without if reward.cage is None else getattr(reward.cage, name), dtype)
 
+    def funnel(name: str, without: Any) -> Any:
+        return array(lambda reward: without if reward.funnel is None else getattr(reward.funnel, name))
+
     def points(reward: TaskReward) -> list[list[list[list[int]]]]:
         margins = [term.margin if isinstance(term.margin, tuple) else term.between[:1] * 2 for term in reward.terms]
         pairs = [[term.between for term in reward.terms], margins]
@@ -150,16 +162,24 @@ def make_parameters(rewards: Sequence[TaskReward]) -> Parameters:
         less=array(lambda reward: [_less(term) for term in reward.terms]),
         gaussian=array(lambda reward: [term.curve == "gaussian" for term in reward.terms], np.bool_),
         slide=cage("slide", 0.0),
-        grip_offset=cage("offset", (-0.0, -0.0, -0.0)),
+        grip_offset=cage("offset", NO_OFFSET),
         caged=array(lambda reward: reward.cage is not None, np.bool_),
         radius=cage("radius", 0.0),
         pad=cage("pad", 0.0),
         effort=cage("effort", 1.0),
-        cage_start=array(lambda reward: _cage_start(reward), np.intp),
+        cage_start=array(_cage_start, np.intp),
         signed=cage("signed", False, np.bool_),
         pinch=array(lambda reward: inf if reward.cage is None or reward.cage.pinch is None else reward.cage.pinch),
         high=array(lambda reward: reward.cage is not None and reward.cage.density == "high", np.bool_),
         medium=array(lambda reward: reward.cage is not None and reward.cage.density == "medium", np.bool_),
+        funnelled=array(lambda reward: reward.funnel is not None, np.bool_),
+        funnel_over=array(lambda reward: COLUMNS[reward.funnel.over if reward.funnel else "hand"].start + 2, np.intp),
+        funnel_about=array(_funnel_about, np.intp),
+        funnel_offset=funnel("offset", NO_OFFSET)[:, :2],
+        rim=funnel("rim", 0.0),
+        slope=funnel("slope", 0.0),
+        height=funnel("height", 0.0),
+        funnel_margin=array(lambda reward: reward.funnel.margin if reward.funnel and reward.funnel.margin else nan),
         held_near=array(lambda reward: reward.held.near),
         held_within=array(lambda reward: reward.held.within),
         opened=array(lambda reward: reward.held.opened),
@@ -184,3 +204,9 @@ def _cage_start(reward: TaskReward) -> int:
     if reward.cage is None:
         return GRIP.start + 1
     return COLUMNS["grip" if reward.cage.signed else reward.cage.start].start + 1
+
+
+def _funnel_about(reward: TaskReward) -> list[list[int]]:
+    """The columns of x and y of two points, which may be the same."""
+    about = reward.funnel.about if reward.funnel else ("object",)
+    return [[COLUMNS[point].start, COLUMNS[point].start + 1] for point in (about[0], about[-1])]

@@ -10,11 +10,13 @@ from numpy.typing import NDArray
 from lw_torchrl.envs.engines.vectorized.observation import row_norm
 from lw_torchrl.envs.engines.vectorized.rewards.moment import Formula, Index, Moment, Weak
 from lw_torchrl.envs.engines.vectorized.rewards.parameters import GOAL, TCP, VIA
-from lw_torchrl.envs.engines.vectorized.rewards.terms import above, funnel, hamacher_product, square, tolerance
+from lw_torchrl.envs.engines.vectorized.rewards.terms import hamacher_product, square, tolerance
 from lw_torchrl.envs.engines.vectorized.sensors import GRIPPER, HAND, JOINT, OBJECT, QUATERNION
 
 Array = NDArray[np.float64]
 
+TO_HANDLE = np.array([-0.05, 0.0, 0.0])
+BESIDE_HANDLE = np.array([0.05, 0.03, -0.01])
 UPRIGHT = np.array([0.707, 0.0, 0.0, 0.707])
 
 
@@ -60,26 +62,22 @@ def slide(m: Moment, rows: Index, weak: Weak) -> Array:
 def door(m: Moment, rows: Index, weak: Weak) -> Array:
     """Come to the handle from above, told to close the gripper, and turn the door."""
     facts = m.facts[rows]
-    hand, handle, angle = facts[:, HAND], facts[:, OBJECT] + (-0.05, 0.0, 0.0), -facts[:, JOINT.start]
-    floor = funnel(row_norm(hand[:, :2] - handle[:, :2]), 0.12, 0.04, 0.4)
-    near = tolerance(row_norm(hand - handle - (0.05, 0.03, -0.01)), 0.0, 0.06, 0.5)
-    ready = hamacher_product(above(hand[:, 2], floor, floor / 2.0), near)
+    handle, angle = facts[:, OBJECT], -facts[:, JOINT.start]
+    near = tolerance(row_norm(facts[:, HAND] - (handle + TO_HANDLE) - BESIDE_HANDLE), 0.0, 0.06, 0.5)
+    ready = hamacher_product(m.above[rows], near)
     turned = tolerance(np.pi / 2.0 + np.pi / 6 - angle, 0.0, 0.5, np.pi / 3.0)
     opened = 0.2 * (-angle < -np.pi / 90.0) + 0.8 * turned
     reward = 2.0 * hamacher_product(ready, m.effort[rows]) + 8.0 * opened
-    return np.where(np.abs(facts[:, OBJECT.start] - facts[:, GOAL.start]) <= 0.08, 10.0, reward)
+    return np.where(np.abs(handle[:, 0] - facts[:, GOAL.start]) <= 0.08, 10.0, reward)
 
 
 def lid(m: Moment, rows: Index, weak: Weak) -> Array:
     """Come to the lid from above, told to close the gripper, lift it and bring it over the box, all of it upright."""
-    facts = m.facts[rows]
-    hand, lid = facts[:, HAND], facts[:, OBJECT] + (0.0, 0.0, 0.02)
-    floor = funnel(row_norm(hand[:, :2] - lid[:, :2]), 0.02, 0.04, 0.4)
-    ready = hamacher_product(above(hand[:, 2], floor, floor / 2.0), m.near[rows])
-    lifted = 0.2 * (lid[:, 2] > 0.04) + 0.8 * m.placed[rows]
+    ready = hamacher_product(m.above[rows], m.near[rows])
+    lifted = 0.2 * (m.facts[rows, OBJECT.stop - 1] + 0.02 > 0.04) + 0.8 * m.placed[rows]
     reward = 2.0 * hamacher_product(m.effort[rows], ready) + 8.0 * lifted
     reward = np.where(m.close.distance[rows, VIA] < 0.08, 10.0, reward)
-    return reward * turned_like(facts[:, QUATERNION], UPRIGHT, 0.2)
+    return reward * turned_like(m.facts[rows, QUATERNION], UPRIGHT, 0.2)
 
 
 def turned_like(quaternion: Array, ideal: Array, margin: float) -> Array:

@@ -70,6 +70,25 @@ class Cage:
 
 
 @dataclass(frozen=True)
+class Funnel:
+    """Above what a point is to stay on its way."""
+
+    over: str
+    about: tuple[str, ...]
+    rim: float
+    slope: float
+    height: float
+    margin: float | None = None
+    offset: Vector = NO_OFFSET
+
+    def __post_init__(self) -> None:
+        if not 1 <= len(self.about) <= 2:
+            raise ValueError(f"funnel.about must be one or two points, got {', '.join(self.about)}")
+        for point in (self.over, *self.about):
+            check_choice("a point", point, POINTS)
+
+
+@dataclass(frozen=True)
 class Held:
     """When the object counts as held; without limits, always."""
 
@@ -93,6 +112,7 @@ class TaskReward:
     placed: Term = field(default_factory=Term)
     via: Term = field(default_factory=Term)
     cage: Cage | None = None
+    funnel: Funnel | None = None
     held: Held = field(default_factory=Held)
     done_under: float = -inf
     done_within: float = -inf
@@ -142,7 +162,7 @@ def parse_reward_table(text: str) -> dict[str, TaskReward]:
     Raises:
         ValueError: an entry that is not understood; the message names the task.
     """
-    kinds: dict[str, Any] = {"near": Term, "placed": Term, "via": Term, "cage": Cage, "held": Held}
+    kinds: dict[str, Any] = {"near": Term, "placed": Term, "via": Term, "cage": Cage, "funnel": Funnel, "held": Held}
     rewards = {}
     for name, entry in tomllib.loads(text).items():
         try:

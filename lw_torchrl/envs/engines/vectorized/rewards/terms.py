@@ -43,11 +43,6 @@ def hamacher_product(a: Numbers, b: Numbers) -> Numbers:
     return np.where(either > 0, product / either, product)
 
 
-def funnel(radius: Array, rim: float, slope: float, height: float) -> Array:
-    """How high one should be ``radius`` metres from the middle: within the rim 0, then ever higher."""
-    return np.where(radius > rim, slope * np.log(radius - rim) + height, 0.0)
-
-
-def above(z: Array, floor: Array, margin: Array | float) -> Array:
-    """1 above the floor, less below it."""
-    return np.where(z >= floor, 1.0, tolerance(floor - z, 0.0, 0.01, margin))
+def limited(x: Numbers, low: float, high: float) -> Numbers:
+    """``np.clip`` at a third of its cost for few numbers."""
+    return np.minimum(np.maximum(x, low), high)
