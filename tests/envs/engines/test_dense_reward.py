@@ -104,10 +104,12 @@ def invent_states(engine: VectorizedEngine, rng: np.random.Generator) -> np.ndar
         between = start + rng.random() * (goal - start)
         before = [beside(goal, 0, 0.05, -0.1), beside(goal, -0.16, -0.06, 0)][rng.integers(2)]
         thing = near([start, goal, between, before][rng.integers(4)])
+        if rng.random() < 0.5:
+            thing[2] = start[2] + rng.choice([0.01, 0.015, 0.02, 0.05]) * rng.choice([0.99, 1.01])
         tips = near([thing, thing, beside(thing, 0, 0, 0.03), tips_start][rng.integers(4)])
         second = near([goal, thing, start][rng.integers(3)])
         corners = sensors[CORNERS].reshape(-1, 3)
-        place = [goal, second, thing][rng.integers(3)]
+        place = [goal, second, second, thing][rng.integers(4)]
         if engine._notes.rewards[number].corners and rng.random() < 0.5:
             place = rng.uniform(corners.min(axis=0), corners.max(axis=0))
         pads = rng.choice([0.02, 0.03, 0.08]) * rng.random(2)
