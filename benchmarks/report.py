@@ -41,8 +41,8 @@ class Row:
         unit: "µs", "s", "GB", ...
         rival: what it is compared with, "" for a number that stands alone.
         theirs: the rival's number, of the same unit, measured in turns with ours.
-        ratio: the median over the rounds of ``theirs / ours``, above 1 where ours is faster; or of a part of the
-            whole, ``ours / theirs``.
+        ratio: the median over the rounds of ``theirs / ours``, above 1 where ours is faster; or, of a part of a
+            whole and of what does more than the rival, ``ours / theirs``.
         spread: the quartiles of that ratio over the rounds.
         target: what the number or the ratio is to reach, "" for none.
         met: whether it does, None without a target.
@@ -132,6 +132,21 @@ def part_of(
     if at_most is None:
         return row
     return replace(row, target=f"share ≤ {at_most:g}", met=row.ratio is not None and row.ratio <= at_most)
+
+
+def times_as_long(
+    name: str,
+    longer: Sequence[float],
+    shorter_name: str,
+    shorter: Sequence[float],
+    *,
+    unit: str,
+    scale: float,
+    at_most: float,
+) -> Row:
+    """A row whose ratio says how many times as long as ``shorter`` the ``longer`` takes, in the same rounds."""
+    row = part_of(name, longer, shorter_name, shorter, unit=unit, scale=scale, at_most=at_most)
+    return replace(row, target=f"ratio ≤ {at_most:g}")
 
 
 def _row(

@@ -16,7 +16,7 @@ import numpy as np
 from metaworld.policies import ENV_POLICY_MAP
 
 import lw_torchrl as lw
-from benchmarks.report import Row, Settings, Skipped, bars, compare, timed
+from benchmarks.report import Row, Settings, Skipped, bars, compare, timed, times_as_long
 from lw_torchrl.envs.engines.metaworld import make_metaworld_env
 from lw_torchrl.envs.engines.vectorized.engine import VectorizedEngine, available_cores
 
@@ -110,17 +110,26 @@ def steps(settings: Settings) -> list[Row]:
     for engine in engines.values():
         engine.close()
 
+    scale = 1e6 / CHUNK / n
+
     def line(ours: str, rival: str, theirs: str, at_least: float | None = None, note: str = "") -> Row:
         name = "environment step, " + ours + " reward"
-        return compare(
-            name, found[ours], rival, found[theirs], unit="µs", scale=1e6 / CHUNK / n, at_least=at_least, note=note
-        )
+        return compare(name, found[ours], rival, found[theirs], unit="µs", scale=scale, at_least=at_least, note=note)
 
     return [
         line("sparse", "mj_step ×5 alone", "bare", note="without mj_forward the states drift from Meta-World's"),
         line("sparse", "mj_step ×5, mj_forward", "floor", 0.90, note="the least that gives Meta-World's numbers"),
         line("sparse", "Meta-World's env.step", "metaworld", 2.0),
         line("dense", "Meta-World's env.step", "metaworld", 1.5),
+        times_as_long(
+            "environment step, dense reward",
+            found["dense"],
+            "with the sparse reward",
+            found["sparse"],
+            unit="µs",
+            scale=scale,
+            at_most=1.15,
+        ),
     ]
 
 

@@ -15,7 +15,7 @@ ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT))
 from benchmarks import __main__ as cli  # noqa: E402
 from benchmarks import ablations  # noqa: E402
-from benchmarks.report import Row, Skipped, compare, part_of, under  # noqa: E402
+from benchmarks.report import Row, Skipped, compare, part_of, times_as_long, under  # noqa: E402
 
 FIELDS = {"name", "ours", "unit", "rival", "theirs", "ratio", "spread", "target", "met", "note"}
 
@@ -79,6 +79,12 @@ def test_a_ratio_is_the_median_of_the_rounds(limit, met):
 def test_a_share_is_of_the_whole():
     row = part_of("x", [1.0], "y", [4.0], unit="s", scale=1.0, at_most=0.3)
     assert row == Row("x", 1.0, "s", "y", 4.0, 0.25, (0.25, 0.25), "share ≤ 0.3", True)
+
+
+@pytest.mark.parametrize(("limit", "met"), [(1.3, True), (1.2, False)])
+def test_what_does_more_may_take_so_many_times_as_long(limit, met):
+    row = times_as_long("x", [5.0], "y", [4.0], unit="s", scale=1.0, at_most=limit)
+    assert row == Row("x", 5.0, "s", "y", 4.0, 1.25, (1.25, 1.25), f"ratio ≤ {limit:g}", met)
 
 
 def test_every_benchmark_is_explained():

@@ -15,7 +15,9 @@ from lw_torchrl._checks import check_choice, check_int
 from lw_torchrl.envs.engine import ACTION_SIZE, OBSERVATION_SIZE, EngineStep
 from lw_torchrl.envs.engines.vectorized.models import SharedModel, borrow_model, check_versions, return_models
 from lw_torchrl.envs.engines.vectorized.observation import Observer
-from lw_torchrl.envs.engines.vectorized.sensors import CURRENT, WIDTH
+from lw_torchrl.envs.engines.vectorized.rewards.dense_reward import DenseReward, EpisodeNotes
+from lw_torchrl.envs.engines.vectorized.rewards.table import reward_table
+from lw_torchrl.envs.engines.vectorized.sensors import CURRENT, REWARD_WIDTH, WIDTH
 from lw_torchrl.envs.engines.vectorized.simulated_row import WARNING_KINDS, SimulatedRow, is_stable
 from lw_torchrl.envs.engines.vectorized.simulation_table import simulation_table
 from lw_torchrl.envs.engines.vectorized.success import SuccessFunction
@@ -48,8 +50,7 @@ class VectorizedEngine:
 
     Args:
         tasks: the task of each row.
-        reward: "sparse" for the success as 0 and 1, "dense" for Meta-World's own reward, which takes a third
-            longer.
+        reward: "sparse" for the success as 0 and 1, "dense" for Meta-World's own reward.
         num_threads: by default the cores this process may use.
 
     Raises:
@@ -74,7 +75,7 @@ class VectorizedEngine:
         num_threads: int | None = None,
     ) -> None:
         check_versions()
-        self._dense = check_choice("reward", reward, ("sparse", "dense")) == "dense"
+        dense = check_choice("reward", reward, ("sparse", "dense")) == "dense"
         if num_threads is None:
             num_threads = available_cores()
         num_threads = check_int("num_threads", num_threads, minimum=1)
@@ -92,9 +93,12 @@ class VectorizedEngine:
             for row in group.rows:
                 self._group_of_row[row] = number
                 builders[row] = programs[tasks[row]]
+        rewards = [reward_table()[task] if dense else None for task in tasks]
+        self._notes = EpisodeNotes([reward for reward in rewards if reward is not None]) if dense else None
+        self._width = REWARD_WIDTH if dense else WIDTH
         self._rows = [
-            SimulatedRow(table[task], models[number], builder)
-            for task, number, builder in zip(tasks, self._group_of_row, builders, strict=True)
+            SimulatedRow(table[task], models[number], builder, task_reward)
+            for task, number, builder, task_reward in zip(tasks, self._group_of_row, builders, rewards, strict=True)
         ]
         self._pool = WorkerPool(num_threads)
 
@@ -130,6 +134,8 @@ class VectorizedEngine:
             self._observation[row] = self._rows[row].reset(seed_of[row])
             self._mocap[row] = self._rows[row].mocap
             self._goal[row] = self._rows[row].goal
+            if self._notes is not None:
+                self._notes.begin(row, self._rows[row].program)
 
         self._pool.work(self._by_group(index), reset)
         self._current[index] = self._observation[index, CURRENT]
@@ -170,7 +176,7 @@ class VectorizedEngine:
         shift = np.minimum(np.maximum(action[:, :3], -1), 1) * self._action_scale
         mocap = np.minimum(np.maximum(self._mocap[rows] + shift, running.mocap_low), running.mocap_high)
         self._mocap[rows] = mocap
-        sensors = np.empty((len(rows), WIDTH))
+        sensors = np.empty((len(rows), self._width))
         warnings = np.empty((len(rows), WARNING_KINDS), dtype=np.int32)
         control = action[:, 3:] * FINGERS
 
@@ -184,24 +190,21 @@ class VectorizedEngine:
         observation = np.concatenate((current, self._current[rows], goal), axis=1)
         np.clip(observation, running.low, running.high, out=observation)
         achieved = running.success(sensors, current, goal)
+        rewards = achieved if running.reward is None else running.reward(sensors, observation, goal, action)
         stable = is_stable(observation, warnings)
         if not stable.all():
             self._faulted[rows[~stable]] = True
-            rows, current, observation, achieved = (
+            rows, current, observation, achieved, rewards = (
                 rows[stable],
                 current[stable],
                 observation[stable],
                 achieved[stable],
+                rewards[stable],
             )
-            action = action[stable]
         self._current[rows] = current
         self._observation[rows] = observation
         success[rows] = achieved
-        if self._dense:
-            for row, taken, seen in zip(rows.tolist(), action, observation, strict=True):
-                reward[row] = self._rows[row].dense_reward(taken, seen)
-        else:
-            reward[rows] = achieved
+        reward[rows] = rewards
 
     def _running_rows(self, running: Truth) -> _RunningRows:
         """What steps exactly these rows; kept for the next step, for the mask seldom changes."""
@@ -227,6 +230,7 @@ class _RunningRows:
         sources = [member.sources for member in members]
         self.observer = Observer(sources)
         self.success = SuccessFunction(sources, lambda k: members[k].program)
+        self.reward = None if engine._notes is None else DenseReward(engine._notes, rows)
         place = {row: k for k, row in enumerate(rows.tolist())}
         self.groups = [(group, [place[row] for row in items]) for group, items in engine._by_group(rows)]
         self.low, self.high = engine._low[rows], engine._high[rows]

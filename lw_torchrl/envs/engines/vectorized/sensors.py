@@ -8,6 +8,7 @@ import numpy as np
 from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
+from lw_torchrl.envs.engines.vectorized.rewards.table import TaskReward
 from lw_torchrl.envs.engines.vectorized.simulation_table import PLACES, Place, TaskSources
 
 Array = NDArray[np.float64]
@@ -29,6 +30,13 @@ LEFT_TIP = slice(36, 39)
 POINT = slice(39, 42)
 JOINT = slice(42, 43)
 WIDTH = 43
+
+# Only the dense reward looks at these.
+LEFT_PAD = slice(43, 46)
+RIGHT_PAD = slice(46, 49)
+PLACE = slice(49, 52)
+CORNERS = slice(52, 64)
+REWARD_WIDTH = 64
 
 MATRIX_OF = "matrix of "
 
@@ -94,8 +102,8 @@ def _address(array: Array) -> int:
     return array.__array_interface__["data"][0]
 
 
-def sensor_index(window: StateView, sources: TaskSources) -> NDArray[np.intp]:
-    """(WIDTH,) which numbers of the window make a task's row of sensors."""
+def sensor_index(window: StateView, sources: TaskSources, reward: TaskReward | None) -> NDArray[np.intp]:
+    """(WIDTH,) which numbers of the window make a task's row of sensors; (REWARD_WIDTH,) with a dense reward."""
     success = sources.success
     parts = [
         (HAND, window.position("body hand")),
@@ -111,14 +119,24 @@ def sensor_index(window: StateView, sources: TaskSources) -> NDArray[np.intp]:
         parts.append((SECOND, window.position(sources.second)))
         if sources.second_quaternion != "zeros":
             parts.append((SECOND_QUATERNION, window.quaternion(sources.second_quaternion)))
-    if success.point == "gripper":
+    if success.point == "gripper" or reward is not None:
         parts.append((RIGHT_TIP, window.position("site rightEndEffector")))
         parts.append((LEFT_TIP, window.position("site leftEndEffector")))
     if (point := success.stick_end or success.point) not in ("object", "second", "gripper"):
         parts.append((POINT, window.position(point)))
-    if (joint := sources.dial or success.joint) is not None:
+    joint = sources.dial or success.joint
+    if reward is not None:
+        joint = joint or reward.joint
+        parts.append((LEFT_PAD, window.position("body leftpad")))
+        parts.append((RIGHT_PAD, window.position("body rightpad")))
+        if reward.place is not None:
+            parts.append((PLACE, window.position(reward.place)))
+        for number, corner in enumerate(reward.corners):
+            start = CORNERS.start + 3 * number
+            parts.append((slice(start, start + 3), window.position(corner)))
+    if joint is not None:
         parts.append((JOINT, window.joint(joint)))
-    index = np.zeros(WIDTH, dtype=np.intp)
+    index = np.zeros(WIDTH if reward is None else REWARD_WIDTH, dtype=np.intp)
     for columns, array in parts:
         index[columns] = window.where(array) + np.arange(array.size)
     return index

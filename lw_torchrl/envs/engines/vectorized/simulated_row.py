@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lw_torchrl.envs.engines.vectorized.models import SharedModel
+from lw_torchrl.envs.engines.vectorized.rewards.table import TaskReward
 from lw_torchrl.envs.engines.vectorized.sensors import StateView, sensor_index
 from lw_torchrl.envs.engines.vectorized.simulation_table import TaskSources
 from lw_torchrl.envs.engines.vectorized.task_logic import WARNED_ALREADY
@@ -28,9 +29,10 @@ class SimulatedRow:
         sources: where the row's task finds its numbers.
         shared: the model, which no other thread may use while this row simulates or resets.
         builder: the task's program on that model, from which each episode takes a copy.
+        reward: the numbers of its dense reward, for what that looks at in the state.
     """
 
-    def __init__(self, sources: TaskSources, shared: SharedModel, builder: Any) -> None:
+    def __init__(self, sources: TaskSources, shared: SharedModel, builder: Any, reward: TaskReward | None) -> None:
         self.sources = sources
         self.shared = shared
         self.program: Any = None
@@ -44,7 +46,7 @@ class SimulatedRow:
         self._control: Array = self._data.ctrl
         window = StateView(self._model, self._data)
         self._numbers = window.numbers
-        self._sensor_index = sensor_index(window, sources)
+        self._sensor_index = sensor_index(window, sources, reward)
         self._warnings: NDArray[np.int32] = self._data.warning.number[UNSTABLE]
 
     def reset(self, seed: int) -> Array:
@@ -71,8 +73,8 @@ class SimulatedRow:
         """One step of the environment: five of physics, and one more look without moving.
 
         That look, ``mj_forward``, also leaves the accelerations from which the next step's solver starts, so
-        without it the numbers would drift apart from Meta-World's. ``sensors`` (WIDTH,) and ``warnings`` (3,)
-        are filled at once, while the state is still in the processor's cache.
+        without it the numbers would drift apart from Meta-World's. ``sensors`` (as wide as its index) and
+        ``warnings`` (3,) are filled at once, while the state is still in the processor's cache.
         """
         self._take_model()
         self._mocap[...] = mocap
@@ -81,11 +83,6 @@ class SimulatedRow:
         mujoco.mj_forward(self._model, self._data)
         self._numbers.take(self._sensor_index, out=sensors, mode="clip")
         warnings[...] = self._warnings
-
-    def dense_reward(self, action: NDArray[Any], observation: Array) -> float:
-        """Meta-World's reward of the present state."""
-        self._take_model()
-        return self.program.dense_reward(action, observation)
 
     def _take_model(self) -> None:
         if self.shared.holder is not self:

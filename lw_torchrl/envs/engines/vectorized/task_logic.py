@@ -1,4 +1,4 @@
-"""Meta-World's own reset and dense reward, run on a model and a state that this library owns."""
+"""Meta-World's own reset, run on a model and a state that this library owns."""
 
 from __future__ import annotations
 
@@ -39,7 +39,6 @@ class TaskLogic:
     tcp_center: NDArray[np.float64]
     _target_pos: NDArray[np.float64]
     reset_model: Callable[[], NDArray[np.float64]]
-    compute_reward: Callable[..., tuple[Any, ...]]
     get_body_com: Callable[[str], NDArray[np.float64]]
 
     _moves_hand = True
@@ -101,10 +100,6 @@ class TaskLogic:
     def present_goal(self) -> NDArray[np.float64]:
         """Where the goal is now."""
         return self._target_pos
-
-    def dense_reward(self, action: NDArray[Any], observation: NDArray[np.float64]) -> float:
-        """Meta-World's reward of the present state; it may keep notes until the next call."""
-        return float(self.compute_reward(action, observation)[0])
 
 
 def _task_class(task: str) -> Any:

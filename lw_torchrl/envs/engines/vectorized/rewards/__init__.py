@@ -1,0 +1,1 @@
+"""Meta-World's dense reward of many rows at once."""
