@@ -118,7 +118,7 @@ def steps(settings: Settings) -> list[Row]:
 
     return [
         line("sparse", "mj_step ×5 alone", "bare", note="without mj_forward the states drift from Meta-World's"),
-        line("sparse", "mj_step ×5, mj_forward", "floor", 0.90, note="the least that gives Meta-World's numbers"),
+        line("sparse", "mj_step ×5, mj_forward", "floor", 0.90, note="the physics that gives Meta-World's numbers"),
         line("sparse", "Meta-World's env.step", "metaworld", 2.0),
         line("dense", "Meta-World's env.step", "metaworld", 1.5),
         times_as_long(

@@ -21,6 +21,8 @@ UNSTABLE = slice(int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mj
 
 WARNING_KINDS = 3
 
+POSITIONS_DONE = int(mujoco.mjtStage.mjSTAGE_POS)
+
 
 class SimulatedRow:
     """A state, the places its last reset gave to bodies and sites, and Meta-World's program for its task.
@@ -47,11 +49,13 @@ class SimulatedRow:
         window = StateView(self._model, self._data)
         self._numbers = window.numbers
         self._sensor_index = sensor_index(window, sources, reward)
+        self._looked = False
         self._warnings: NDArray[np.int32] = self._data.warning.number[UNSTABLE]
 
     def reset(self, seed: int) -> Array:
         """Start an episode, a function of the seed alone; returns the first observation."""
         self.shared.restore()
+        self._looked = False
         self.program = self._builder.on(self._data)
         observation = self.program.start_episode(seed)
         self._body_pos[...] = self.shared.body_pos
@@ -79,10 +83,29 @@ class SimulatedRow:
         self._take_model()
         self._mocap[...] = mocap
         self._control[...] = control
-        mujoco.mj_step(self._model, self._data, self._substeps)
+        if self._looked:
+            self._substep_after_look()
+            mujoco.mj_step(self._model, self._data, self._substeps - 1)
+        else:
+            mujoco.mj_step(self._model, self._data, self._substeps)
         mujoco.mj_forward(self._model, self._data)
+        self._looked = True
         self._numbers.take(self._sensor_index, out=sensors, mode="clip")
         warnings[...] = self._warnings
+
+    def _substep_after_look(self) -> None:
+        """One ``mj_step`` where since the last ``mj_forward`` only the controls and the mocap body have moved.
+
+        That body touches nothing, and nothing hangs on it but the weld to the hand. So contacts, inertia and its
+        factors are still those of the look, which saves a twentieth of the step; the bits are the same. Numbers that
+        are not finite or too large are found by the substep after this one.
+        """
+        model, data = self._model, self._data
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_makeConstraint(model, data)
+        mujoco.mj_projectConstraint(model, data)
+        mujoco.mj_forwardSkip(model, data, POSITIONS_DONE, 1)  # 1: no sensors
+        mujoco.mj_Euler(model, data)
 
     def _take_model(self) -> None:
         if self.shared.holder is not self:
