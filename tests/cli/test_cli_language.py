@@ -17,7 +17,8 @@ def push(robot):
 """
 
 
-def test_tasks_lists_the_objects(capsys):
+def test_tasks_lists_the_objects(capsys, monkeypatch):
+    monkeypatch.delenv("COLUMNS", raising=False)
     out = run(capsys, "tasks", "MT10")
     assert "10 tasks" in out
     for task in lw.MT10:

@@ -11,7 +11,7 @@ FAILS = ["plans", "no-such-folder"]
 
 def test_a_command_says_what_it_printed_or_why_it_failed():
     assert "reach" in run_command(["tasks"])
-    with pytest.raises(RuntimeError, match=r"lw-torchrl plans no-such-folder failed:\n.*error: names must be one of"):
+    with pytest.raises(RuntimeError, match=r"lw-torchrl plans no-such-folder failed:\n.*error: NAMES must be one of"):
         run_command(FAILS)
 
 
