@@ -33,7 +33,7 @@ from lw_torchrl.trainers.policy_checks import (
 )
 
 FORMAT = "lw_torchrl.policy"
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 _RESERVED = {"format", "version", "actor", "state", "sha256"}
 
 
@@ -139,7 +139,8 @@ def open_policy(path: str | os.PathLike[str]) -> TensorArchive:
     if (found.description.get("format"), found.description.get("version")) != (FORMAT, FORMAT_VERSION):
         raise ValueError(
             f"checkpoint: {str(path)!r} is of format {found.description.get('format')!r:.60} version "
-            f"{found.description.get('version')!r:.60}; this package reads {FORMAT!r} version {FORMAT_VERSION}"
+            f"{found.description.get('version')!r:.60}; this package reads {FORMAT!r} version {FORMAT_VERSION}. "
+            "Train it again"
         )
     if not isinstance(found.description.get("actor"), dict):
         raise ValueError(f"checkpoint: {str(path)!r} is damaged or none of ours (it describes no actor)")

@@ -21,6 +21,7 @@ from torchrl.checkpoint import Checkpoint
 
 import lw_torchrl as lw
 from lw_torchrl import _tensor_archive
+from lw_torchrl.trainers.checkpoint import FORMAT_VERSION
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +43,7 @@ def test_a_file_of_version_1_is_named_and_not_unpickled(tmp_path):
             if file.is_file():
                 archive.write(file, f"components/state/evil/{file.relative_to(planted)}")
     assert any(name.endswith(".pickle") for name in zipfile.ZipFile(path).namelist())
-    with pytest.raises(ValueError, match=r"is of version 1, whose files can run code.*reads version 2"):
+    with pytest.raises(ValueError, match=r"is of version 1, whose files can run code.*reads version 3"):
         lw.load_actor(path)
     with pytest.raises(ValueError, match="is of version 1"):
         make_trainer(path)
@@ -98,7 +99,9 @@ def overlapping(groups, size):
         ends[name] = content
         content = local(name, content) + content
     signed = {name.decode(): sha256(end).hexdigest() for name, end in ends.items()}
-    text = json.dumps({"format": "lw_torchrl.policy", "version": 2, "actor": {}, "sha256": signed}).encode()
+    text = json.dumps(
+        {"format": "lw_torchrl.policy", "version": FORMAT_VERSION, "actor": {}, "sha256": signed}
+    ).encode()
     first = local(b"description.json", text) + text
     directory, offset = b"", 0
     for name, entry in {b"description.json": text, **{name: ends[name] for name in groups}}.items():
@@ -215,3 +218,13 @@ def test_a_torch_file_is_refused_and_not_unpickled(tmp_path):
     (tmp_path / "c.zip").write_bytes(buffer.getvalue())
     refuses(tmp_path / "c.zip")
     assert not trace.exists()
+
+
+def test_a_file_of_version_2_is_refused_by_name(tmp_path):
+    """Its weights have other names."""
+    path = tmp_path / "c.zip"
+    text = json.dumps({"format": "lw_torchrl.policy", "version": 2, "actor": {}, "sha256": {}}).encode()
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("description.json", text)
+    with pytest.raises(ValueError, match=r"version 2; this package reads .* version 3\. Train it again"):
+        lw.load_actor(path)
