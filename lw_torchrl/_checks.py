@@ -88,6 +88,8 @@ def check_scale(argument: str, given: Any) -> float:
         raise TypeError(f"{argument} must be a number, got {given!r} ({type(given).__name__})")
     if not 0.0 <= given <= sys.float_info.max:
         raise ValueError(f"{argument} must be finite and at least 0, got {given!r}")
+    if float(given) != given:
+        raise ValueError(f"{argument} must be a number of double precision, got {given!r}")
     return float(given)
 
 
