@@ -241,20 +241,6 @@ def test_sweeping_where_there_is_no_folder_does_nothing(tmp_path):
 # ---- reading
 
 
-@pytest.fixture
-def in_time():
-    """The test fails, rather than waits, where a pipe is read that nobody writes to."""
-
-    def late(*_):
-        raise TimeoutError("it waits for a pipe")
-
-    before = signal.signal(signal.SIGALRM, late)
-    signal.alarm(20)
-    yield
-    signal.alarm(0)
-    signal.signal(signal.SIGALRM, before)
-
-
 @pytest.mark.usefixtures("in_time")
 def test_text_is_read_from_files_alone_and_up_to_the_limit(tmp_path):
     os.mkfifo(tmp_path / "pipe")

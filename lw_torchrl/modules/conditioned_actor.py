@@ -21,6 +21,13 @@ from lw_torchrl.modules.encoder import Encoder, Encoding
 from lw_torchrl.modules.policy import Policy
 
 
+def noise_of_features(asked: float | None, distribution: str | None) -> float:
+    """The noise asked for; by default none with a distribution, whose likelihoods it would change from call to call."""
+    if asked is not None:
+        return asked
+    return 0.05 if distribution is None else 0.0
+
+
 class ConditionedActor(Policy):
     """What every actor of ours shares, whatever it is conditioned on; a subclass makes the encoder.
 

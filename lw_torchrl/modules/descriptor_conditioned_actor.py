@@ -11,7 +11,7 @@ from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.tasks import Task
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.action_head import DistributionName
-from lw_torchrl.modules.conditioned_actor import ConditionedActor
+from lw_torchrl.modules.conditioned_actor import ConditionedActor, noise_of_features
 from lw_torchrl.modules.descriptor_encoder import DescriptorEncoder
 from lw_torchrl.modules.observation_features import Features
 
@@ -67,7 +67,7 @@ class DescriptorConditionedActor(ConditionedActor):
             tasks,
             condition=condition,
             features=features,
-            feature_noise=(0.05 if distribution is None else 0.0) if feature_noise is None else feature_noise,
+            feature_noise=noise_of_features(feature_noise, distribution),
             latent_size=latent_size,
             encoder_width=encoder_width,
             encoder_depth=encoder_depth,

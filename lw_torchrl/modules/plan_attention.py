@@ -10,8 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from lw_torchrl._checks import missing_keys
-from lw_torchrl._keys import as_keys, check_apart
+from lw_torchrl._keys import as_keys, check_apart, read
 from lw_torchrl.language.plan_tables import PlanTables
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.task_index import readable
@@ -78,19 +77,13 @@ class PlanAttention(TensorDictModuleBase):
         self.tables = PlanTables(self.plans)
         self.register_buffer("mask", self.tables.mask, persistent=False)
 
-    def weights(self, qaf: Tensor, task_id: Tensor) -> Tensor:
-        """(B, S) truth and (B,) int64 to (B, S) float32 attention."""
-        return self.over_steps(qaf, self.tables.rows(task_id))
-
     def over_steps(self, qaf: Tensor, rows: Tensor) -> Tensor:
-        """:meth:`weights` from what :meth:`PlanTables.rows` gives."""
+        """(B, S) truth and rows (B,) int64, as from :meth:`PlanTables.rows`, to (B, S) float32 attention."""
         check_truth(qaf, (*rows.shape, self.mask.shape[-1]))
         return attend(10.0 * qaf.to(torch.float32) - 5.0, self.mask[rows])
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        qaf, task_id = (tensordict.get(key, None) for key in self.in_keys)
-        if qaf is None or task_id is None:
-            raise missing_keys(tensordict.keys(True, True), *self.in_keys)
+        qaf, task_id = read(tensordict, self.in_keys)
         rows = self.tables.rows(task_id)
         self.tables.refuse_others(tensordict.get(plan_number_key(self.in_keys[0]), None), rows)
         return tensordict.set(self.out_keys[0], self.over_steps(qaf, rows))

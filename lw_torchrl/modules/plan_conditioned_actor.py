@@ -12,7 +12,7 @@ from lw_torchrl._checks import check_choice
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.action_head import DistributionName
-from lw_torchrl.modules.conditioned_actor import ConditionedActor
+from lw_torchrl.modules.conditioned_actor import ConditionedActor, noise_of_features
 from lw_torchrl.modules.encoder import Encoding
 from lw_torchrl.modules.observation_features import Features
 from lw_torchrl.modules.plan_encoder import PlanEncoder
@@ -104,7 +104,7 @@ class PlanConditionedActor(ConditionedActor):
         encoder = PlanEncoder(
             plans,
             features=features,
-            feature_noise=(0.05 if distribution is None else 0.0) if feature_noise is None else feature_noise,
+            feature_noise=noise_of_features(feature_noise, distribution),
             focus=focus,
             swap_unmentioned=swap_unmentioned,
             latent_size=latent_size,

@@ -7,7 +7,6 @@ import json
 import os
 import pickle
 import resource
-import signal
 import struct
 import zipfile
 import zlib
@@ -140,20 +139,6 @@ def test_entries_that_begin_beyond_the_file_are_refused(good, tmp_path, offset):
     struct.pack_into("<LL", ending, 12, len(directory), first)
     (tmp_path / "c.zip").write_bytes(content[:first] + directory + bytes(ending))
     refuses(tmp_path / "c.zip")
-
-
-@pytest.fixture
-def in_time():
-    """The test fails, rather than waits, where a pipe is read that nobody writes to."""
-
-    def late(*_):
-        raise TimeoutError("it waits for a pipe")
-
-    before = signal.signal(signal.SIGALRM, late)
-    signal.alarm(30)
-    yield
-    signal.alarm(0)
-    signal.signal(signal.SIGALRM, before)
 
 
 @pytest.mark.usefixtures("in_time")
