@@ -3,23 +3,46 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from functools import reduce
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache, reduce
+from typing import NamedTuple
 
+import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from lw_torchrl.language.observation import OBSERVATION_SIZE
 from lw_torchrl.language.queries import Query, check_query
+from lw_torchrl.language.query_facts import compile_facts
 from lw_torchrl.language.query_tables import QueryTables, compile_queries
 from lw_torchrl.language.task_index import TaskIndex, TaskTables, readable
 from lw_torchrl.language.tasks import Task, get_task
 
 _LEAST, _MOST = 1e-6, 1e4  # of the size of a logit, and of metres where a length has a gradient
+_COMPILED = {torch.float32: np.float32, torch.float64: np.float64}
+_NOT_FINITE = "observation must hold finite numbers, got NaN or infinity"
 
 
-class QueryProgram:
+class _Row(NamedTuple):
+    row: Tensor  # (T,) int64
+
+
+@cache
+def find_kernel() -> Callable[..., bool] | None:
+    """What answers in one compiled pass, where Numba is installed and can compile."""
+    try:
+        from lw_torchrl.language.query_kernel import answer
+    except (ImportError, RuntimeError):  # the latter where it finds no folder to keep what it compiled
+        return None
+    return answer
+
+
+class QueryProgram(nn.Module):
     """Queries compiled once, answered for any batch of mixed tasks in one call.
+
+    Its tables are buffers that are not saved and keep their precision. With Numba installed (``lw_torchrl[fast]``) a
+    batch on the processor is answered by a loop that Numba compiles, with the same bits; the first call of an
+    installation waits about a second for it.
 
     Args:
         queries: task name (or :class:`Task`) to its queries, each a :class:`Query` or any accepted spelling.
@@ -57,6 +80,7 @@ class QueryProgram:
             if isinstance(listed, (str, Query)) or not listed:
                 raise ValueError(f"queries[{task.name!r}] must be a list of at least one query, got {listed!r}")
             compiled[task] = tuple(check_query(query, task) for query in listed)
+        super().__init__()
         self.queries = dict(sorted(((task.name, found) for task, found in compiled.items())))
         self.tasks = tuple(self.queries)
         self.num_queries = max(map(len, compiled.values()))
@@ -64,12 +88,16 @@ class QueryProgram:
         in_order = dict(sorted(compiled.items(), key=lambda item: index.row(item[0].name)))
         tables = compile_queries(in_order)
         self._any_far = bool(tables.far.any())
-        self._tables = TaskTables(index, tables, f"tasks without queries in {self!r}")
+        problem = f"tasks without queries in {self!r}"
+        self._tables = TaskTables(index, tables, problem)
+        self._row = TaskTables(index, _Row(torch.arange(len(in_order))), problem)
+        facts = compile_facts(in_order)
+        self._facts = {} if facts is None else {dtype: facts.of(kind) for dtype, kind in _COMPILED.items()}
 
     def __repr__(self) -> str:
         return f"QueryProgram({len(self.tasks)} tasks, num_queries={self.num_queries})"
 
-    def __call__(self, observation: Tensor, task_id: Tensor) -> Tensor:
+    def forward(self, observation: Tensor, task_id: Tensor) -> Tensor:
         """Answer the queries.
 
         Args:
@@ -83,6 +111,9 @@ class QueryProgram:
             ValueError: wrong shape or dtype, NaN or infinity in the observation, or a task without queries.
         """
         _check_batch(observation, task_id)
+        if (kernel := self._kernel(observation, task_id)) is not None:
+            return self._answer(kernel, observation, task_id)
+        _check_finite(observation)
         tables = self._tables.select(task_id.reshape(-1), observation)
         holds = (self._values(observation, tables) < tables.threshold) ^ tables.flipped
         # & of a few is far faster than all() over a short axis.
@@ -129,6 +160,20 @@ class QueryProgram:
         # On a threshold, the side that the hard truth takes; the gradient is that of soft everywhere.
         return soft - soft.detach() + torch.where(holds, size, -size)
 
+    def _kernel(self, observation: Tensor, task_id: Tensor) -> Callable[..., bool] | None:
+        """What answers this batch in one compiled pass, if anything can."""
+        if observation.dtype in self._facts and observation.device.type == "cpu" and readable(observation, task_id):
+            return find_kernel()
+        return None
+
+    def _answer(self, kernel: Callable[..., bool], observation: Tensor, task_id: Tensor) -> Tensor:
+        row = self._row.select(task_id.reshape(-1), observation).row.numpy().view(np.uint64)
+        states = observation.detach().reshape(-1, OBSERVATION_SIZE).contiguous()
+        truth = torch.empty((len(states), self.num_queries), dtype=torch.bool)
+        if not kernel(states.numpy(), row, *self._facts[observation.dtype], truth.numpy()):
+            raise ValueError(_NOT_FINITE)
+        return truth.reshape(*task_id.shape, self.num_queries)
+
     def _parts(self, atoms: Tensor, tables: QueryTables) -> tuple[Tensor, ...]:
         """(B, A) of the atoms to J of (B, K, S), the atoms of each clause."""
         return atoms.gather(1, tables.atoms).unflatten(1, (-1, *tables.negated.shape[1:])).unbind(1)
@@ -157,10 +202,12 @@ def _check_batch(observation: Tensor, task_id: Tensor) -> None:
             f"task_id must be int64 of shape {tuple(observation.shape[:-1])}, one per observation, got "
             f"{task_id.dtype} of shape {tuple(task_id.shape)}"
         )
-    problem = "observation must hold finite numbers, got NaN or infinity"
+
+
+def _check_finite(observation: Tensor) -> None:
     if torch.compiler.is_compiling():
-        torch._assert_async(observation.isfinite().all(), problem)
+        torch._assert_async(observation.isfinite().all(), _NOT_FINITE)
     elif readable(observation) and not (
         math.isfinite(observation.sum().item()) or observation.isfinite().all()  # the sum is fast; it may overflow
     ):
-        raise ValueError(problem)
+        raise ValueError(_NOT_FINITE)

@@ -20,7 +20,7 @@ _ALWAYS = Comparison("xyz", "<", 1e4, temperature=1e-6)
 _NEVER = Comparison("xyz", "<", -1e4, temperature=1e-6)
 
 _Position = tuple[Coordinate, Coordinate, Coordinate]
-_Atom = tuple[_Position, _Position, tuple[float, float, float], Comparison]
+Atom = tuple[_Position, _Position, tuple[float, float, float], Comparison]
 _NO_SHIFT = (0.0, 0.0, 0.0)
 
 
@@ -41,7 +41,7 @@ class QueryTables(NamedTuple):
     constants: Tensor  # (T, C) float64, read as if they followed the observation
 
 
-def _clause_atoms(clause: Clause, task: Task) -> list[_Atom]:
+def clause_atoms(clause: Clause, task: Task) -> list[Atom]:
     first: _Position = (0.0, 0.0, OPENING)
     second: _Position = _ORIGIN
     shift = _NO_SHIFT
@@ -56,9 +56,41 @@ def _clause_atoms(clause: Clause, task: Task) -> list[_Atom]:
     return [(first, second, shift, part) for part in PREDICATES[clause.predicate]]
 
 
-def _task_atoms(task: Task, queries: Sequence[Query], steps: int, width: int) -> tuple[list[_Atom], list, list]:
+def atom_index(atom: Atom, side: int, constants: list[float]) -> list[int]:
+    """Where the coordinates of an atom's first or second position stand; those of 0 for an axis left out."""
+    first, second, _, part = atom
+    position = (first, second)[side if part.sense == "<" else 1 - side]
+    return [
+        coordinate_index(c if axis in part.axes else 0.0, constants) for axis, c in zip("xyz", position, strict=True)
+    ]
+
+
+def atom_shift(atom: Atom) -> list[float]:
+    """What is added to the difference of an atom's positions, metres."""
+    *_, shift, part = atom
+    sign = 1.0 if part.sense == "<" else -1.0
+    moved = (shift[0], shift[1], shift[2] + part.raise_z)
+    return [sign * metres if axis in part.axes else 0.0 for axis, metres in zip("xyz", moved, strict=True)]
+
+
+def is_far(atom: Atom) -> bool:
+    """Whether the opposite of the atom's length is compared."""
+    return atom[3].length and atom[3].sense != "<"
+
+
+def atom_threshold(atom: Atom) -> float:
+    """What the atom's value is below where it holds, metres."""
+    return atom[3].threshold * (1 if atom[3].sense == "<" else -1)
+
+
+def is_flipped(atom: Atom) -> bool:
+    """Whether the atom holds where its value is not below the threshold."""
+    return atom[3].sense == "<="
+
+
+def _task_atoms(task: Task, queries: Sequence[Query], steps: int, width: int) -> tuple[list[Atom], list, list]:
     """The atoms of one task, each once; those of each clause (steps, width, J); what is negated (steps, width)."""
-    clauses = [[(_clause_atoms(clause, task), clause.negated) for clause in query.clauses] for query in queries]
+    clauses = [[(clause_atoms(clause, task), clause.negated) for clause in query.clauses] for query in queries]
     clauses += [[([(_ORIGIN, _ORIGIN, _NO_SHIFT, _NEVER)], False)]] * (steps - len(queries))
     always = (_ORIGIN, _ORIGIN, _NO_SHIFT, _ALWAYS)
     padded = [[*listed, *[([], False)] * (width - len(listed))] for listed in clauses]
@@ -79,32 +111,18 @@ def compile_queries(queries: Mapping[Task, Sequence[Query]]) -> QueryTables:
     listed = [atoms + [(_ORIGIN, _ORIGIN, _NO_SHIFT, _ALWAYS)] * (most - len(atoms)) for atoms, _, _ in found]
     constants = [0.0]
 
-    def index(atom: _Atom, side: int) -> list[int]:
-        first, second, _, part = atom
-        position = (first, second)[side if part.sense == "<" else 1 - side]
-        return [
-            coordinate_index(c if axis in part.axes else 0.0, constants)
-            for axis, c in zip("xyz", position, strict=True)
-        ]
-
-    def shift(atom: _Atom) -> list[float]:
-        *_, found, part = atom
-        sign = 1.0 if part.sense == "<" else -1.0
-        moved = (found[0], found[1], found[2] + part.raise_z)
-        return [sign * metres if axis in part.axes else 0.0 for axis, metres in zip("xyz", moved, strict=True)]
-
-    def table(value: Callable[[_Atom], Any], dtype: torch.dtype = torch.int64) -> Tensor:
+    def table(value: Callable[[Atom], Any], dtype: torch.dtype = torch.int64) -> Tensor:
         values = torch.tensor([[value(atom) for atom in atoms] for atoms in listed], dtype=dtype)
         return values.movedim(1, -1).contiguous()
 
     return QueryTables(
-        first=table(lambda atom: index(atom, 0)).flatten(1),
-        second=table(lambda atom: index(atom, 1)).flatten(1),
-        shift=table(shift, torch.float64),
+        first=table(lambda atom: atom_index(atom, 0, constants)).flatten(1),
+        second=table(lambda atom: atom_index(atom, 1, constants)).flatten(1),
+        shift=table(atom_shift, torch.float64),
         length=table(lambda atom: atom[3].length, torch.bool),
-        far=table(lambda atom: atom[3].length and atom[3].sense != "<", torch.bool),
-        threshold=table(lambda atom: atom[3].threshold * (1 if atom[3].sense == "<" else -1), torch.float64),
-        flipped=table(lambda atom: atom[3].sense == "<=", torch.bool),
+        far=table(is_far, torch.bool),
+        threshold=table(atom_threshold, torch.float64),
+        flipped=table(is_flipped, torch.bool),
         temperature=table(lambda atom: atom[3].temperature, torch.float64),
         atoms=torch.tensor(filled).permute(0, 3, 2, 1).flatten(1),
         negated=torch.tensor([negated for _, _, negated in found]).transpose(1, 2).contiguous(),

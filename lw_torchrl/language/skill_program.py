@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from lw_torchrl._checks import unknown_name
 from lw_torchrl.language.named_objects import coordinate_index
@@ -27,7 +27,7 @@ class _Tables(NamedTuple):
     constants: Tensor  # (T, C) float64, read as if they followed the observation
 
 
-class SkillProgram:
+class SkillProgram(nn.Module):
     """Lists of scripted skills compiled once; every skill of every row acts in one call.
 
     Args:
@@ -68,6 +68,7 @@ class SkillProgram:
             get_task(task): [_look_up(skill, known).for_task(task) for skill in listed]
             for task, listed in skills.items()
         }
+        super().__init__()
         self.num_skills = max(map(len, found.values()))
         index = TaskIndex(task.name for task in found)
         constants = [0.0]
@@ -88,7 +89,7 @@ class SkillProgram:
         (target, moved), (gain, shift) = place.flatten(2).unbind(1), numbers.flatten(2).unbind(1)
         self._tables = TaskTables(index, _Tables(target, moved, gain, shift, effort, fixed), "tasks without skills")
 
-    def __call__(self, observation: Tensor, task_id: Tensor) -> Tensor:
+    def forward(self, observation: Tensor, task_id: Tensor) -> Tensor:
         """The action of each skill.
 
         Args:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import Generic, TypeVar
+from collections.abc import Callable, Iterable
+from typing import Any, Generic, TypeVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch._C._functorch import is_functorch_wrapped_tensor
 from torch._subclasses.fake_tensor import FakeTensor
 
@@ -106,10 +106,11 @@ class TaskIndex:
         return ", ".join(MT50[i] if 0 <= i < len(MT50) else f"{i} (none of the 50)" for i in listed)
 
 
-class TaskTables(Generic[Tables]):
+class TaskTables(nn.Module, Generic[Tables]):
     """Tables with a row for each task, and their rows for a batch.
 
-    The rows of an environment keep their tasks, so what the last batch selected is kept for the next one.
+    The tables are buffers, which follow the module to a device and keep their precision, whatever the module is cast
+    to; none is saved. The rows of an environment keep their tasks, so what a batch selected is kept for the next.
 
     Args:
         index: which row is whose.
@@ -118,9 +119,17 @@ class TaskTables(Generic[Tables]):
     """
 
     def __init__(self, index: TaskIndex, tables: Tables, problem: str) -> None:
-        self.index, self.tables, self.problem = index, tables, problem
+        super().__init__()
+        self.index, self.problem, self._kind = index, problem, type(tables)
+        for name, table in tables._asdict().items():  # type: ignore[attr-defined]
+            self.register_buffer(name, table, persistent=False)
         self._moved: dict[_Kind, Tables] = {}
         self._last: tuple[Tensor, _Kind, Tables] | None = None
+
+    @property
+    def tables(self) -> Tables:
+        """The tables, each (T, ...)."""
+        return self._make(self.buffers(recurse=False))
 
     def select(self, task_id: Tensor, observation: Tensor) -> Tables:
         """The tables' rows for a batch.
@@ -159,4 +168,14 @@ class TaskTables(Generic[Tables]):
         return self._make(table.index_select(0, rows) for table in tables)
 
     def _make(self, tables: Iterable[Tensor]) -> Tables:
-        return type(self.tables)(*tables)
+        return self._kind(*tables)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> TaskTables[Tables]:
+        device = fn(torch.empty(0, dtype=torch.int64)).device  # which a cast of floats leaves alone
+        self._moved, self._last = {}, None
+        for name, table in self.named_buffers(recurse=False):
+            setattr(self, name, table.to(device))
+        return self
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_moved": {}, "_last": None}
