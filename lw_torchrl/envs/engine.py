@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from lw_torchrl.language.observation import ACTION_SIZE, OBSERVATION_SIZE
 
-__all__ = ["ACTION_SIZE", "OBSERVATION_SIZE", "Engine", "EngineStep"]
+__all__ = ["ACTION_SIZE", "OBSERVATION_SIZE", "Engine", "EngineStep", "Pictured"]
 
 
 class EngineStep(NamedTuple):
@@ -57,4 +57,12 @@ class Engine(Protocol):
 
     def close(self) -> None:
         """Free the simulators."""
+        ...
+
+
+class Pictured(Engine, Protocol):
+    """An engine that can also be looked at, as ``LanguageWorldEnv.render`` wants it."""
+
+    def render(self, rows: Sequence[int], *, camera: str, height: int, width: int) -> NDArray[np.uint8]:
+        """Pictures of the rows as they are now: (len(rows), height, width, 3) uint8, the first line on top."""
         ...

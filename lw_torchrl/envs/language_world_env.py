@@ -16,6 +16,7 @@ from torchrl._utils import seed_generator
 from torchrl.envs import EnvBase
 
 from lw_torchrl._checks import check_choice, check_int
+from lw_torchrl.envs.cameras import check_picture
 from lw_torchrl.envs.engine import ACTION_SIZE, OBSERVATION_SIZE, Engine
 from lw_torchrl.envs.engines import make_engine
 from lw_torchrl.envs.episode_counter import EpisodeCounter, check_worker, stated_episode
@@ -321,6 +322,42 @@ class LanguageWorldEnv(EnvBase):
             raise ValueError(f"action must hold numbers: {message}")
         self._fault |= rows
         warnings.warn(f"{message}; the row is truncated and flagged, the others go on", stacklevel=3)
+
+    def render(self, *, camera: str = "corner2", height: int = 240, width: int = 320) -> Tensor:
+        """Pictures of all rows as they are now, for TorchRL's PixelRenderTransform and VideoRecorder.
+
+        They are drawn by OpenGL, without shadows; on Linux without a display and MUJOCO_GL it is EGL. A picture changes
+        nothing in the simulation.
+
+        Args:
+            camera: "corner2", "corner", "corner3", "corner4", "topview", "behindGripper" or "gripperPOV".
+            height, width: pixels.
+
+        Returns:
+            (N, height, width, 3) uint8, (height, width, 3) with ``batch_size=()``.
+
+        Raises:
+            ValueError: an unknown camera or size.
+            RuntimeError: a row that was never reset.
+            ImportError: there is no OpenGL; it names what to install.
+            NotImplementedError: the engine is one of your own and has no ``render``.
+
+        Example:
+            >>> env = LanguageWorldEnv("reach")
+            >>> _ = env.reset()
+            >>> env.render(camera="topview", height=48, width=64).shape
+            torch.Size([1, 48, 64, 3])
+            >>> env.close()
+        """
+        self._check_usable()
+        check_picture(camera, height, width)
+        if (self._episode < 0).any():
+            raise RuntimeError("there is nothing to see before a reset: call env.reset()")
+        if not hasattr(self._engine, "render"):
+            raise NotImplementedError(f"engine {type(self._engine).__name__} has no render; see lw_torchrl.envs.engine")
+        rows = range(len(self.row_tasks))
+        pictures = torch.from_numpy(self._engine.render(rows, camera=camera, height=height, width=width))
+        return pictures if self.batch_size else pictures[0]
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Free the simulators."""

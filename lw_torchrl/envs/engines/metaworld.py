@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from lw_torchrl._checks import check_choice
 from lw_torchrl._rendering import naming_absent_renderer
+from lw_torchrl.envs.cameras import Cameras
 from lw_torchrl.envs.engine import OBSERVATION_SIZE, EngineStep
 from lw_torchrl.language.tasks import MT50
 
@@ -60,6 +61,8 @@ class MetaWorldEngine:
         self._dense = reward == "dense"
         # The environment above counts the steps; Meta-World's own limit must not come first.
         self._envs = [make_metaworld_env(task, max_steps=2**31 - 1) for task in tasks]
+        self._tasks = tuple(tasks)
+        self._cameras: Cameras | None = None
         self._last = np.zeros((len(self._envs), OBSERVATION_SIZE))
         import mujoco
 
@@ -89,7 +92,15 @@ class MetaWorldEngine:
             reward[row] = dense if self._dense else success[row]
         return EngineStep(self._last.copy(), reward, success, fault)
 
+    def render(self, rows: Sequence[int], *, camera: str, height: int, width: int) -> NDArray[np.uint8]:
+        self._cameras = self._cameras or Cameras()
+        size: Any = {"camera": camera, "height": height, "width": width}
+        envs = [(self._tasks[row], self._envs[row]) for row in rows]
+        return np.stack([self._cameras.picture(task, env.model, env.data, **size) for task, env in envs])
+
     def close(self) -> None:
+        if self._cameras is not None:
+            self._cameras.close()
         for env in self._envs:
             env.close()
         self._envs = []

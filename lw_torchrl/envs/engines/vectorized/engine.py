@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lw_torchrl._checks import check_choice, check_int
+from lw_torchrl.envs.cameras import Cameras
 from lw_torchrl.envs.engine import ACTION_SIZE, OBSERVATION_SIZE, EngineStep
 from lw_torchrl.envs.engines.vectorized.models import SharedModel, borrow_model, check_versions, return_models
 from lw_torchrl.envs.engines.vectorized.observation import Observer
@@ -101,6 +102,7 @@ class VectorizedEngine:
             for task, number, builder, task_reward in zip(tasks, self._group_of_row, builders, rewards, strict=True)
         ]
         self._pool = WorkerPool(num_threads)
+        self._cameras: Cameras | None = None
 
         n = len(tasks)
         bounds = [builder.sawyer_observation_space for builder in builders]
@@ -163,8 +165,16 @@ class VectorizedEngine:
             self._step_running(self._running_rows(running), action, reward, success)
         return EngineStep(self._observation.copy(), reward, success, active & self._faulted)
 
+    def render(self, rows: Sequence[int], *, camera: str, height: int, width: int) -> NDArray[np.uint8]:
+        """Pictures of rows, (len(rows), height, width, 3) uint8; the simulation goes on as if none had been taken."""
+        cameras = self._cameras = self._cameras or Cameras()
+        pictures = [self._rows[row].picture(cameras, camera=camera, height=height, width=width) for row in rows]
+        return np.stack(pictures)
+
     def close(self) -> None:
         """End the threads and give the models back, for the next engine of this process."""
+        if self._cameras is not None:
+            self._cameras.close()
         self._pool.close()
         self._rows = []
         self._running = None

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from lw_torchrl.envs.cameras import Cameras
 from lw_torchrl.envs.engines.vectorized.models import SharedModel
 from lw_torchrl.envs.engines.vectorized.rewards.table import TaskReward
 from lw_torchrl.envs.engines.vectorized.sensors import StateView, sensor_index
@@ -92,6 +93,11 @@ class SimulatedRow:
         self._looked = True
         self._numbers.take(self._sensor_index, out=sensors, mode="clip")
         warnings[...] = self._warnings
+
+    def picture(self, cameras: Cameras, **size: Any) -> NDArray[np.uint8]:
+        """A picture of the row as it is now."""
+        self._take_model()
+        return cameras.picture(self.shared.path, self._model, self._data, **size)
 
     def _substep_after_look(self) -> None:
         """One ``mj_step`` where since the last ``mj_forward`` only the controls and the mocap body have moved.

@@ -1,0 +1,121 @@
+"""Cameras: pictures of MuJoCo states by Meta-World's cameras, one OpenGL context for all models."""
+
+from __future__ import annotations
+
+import atexit
+import os
+import sys
+from typing import Any
+from weakref import WeakSet
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from lw_torchrl._checks import check_choice, check_int
+from lw_torchrl._rendering import RENDER_LIBRARIES
+
+CAMERAS = ("corner2", "corner", "corner3", "corner4", "topview", "behindGripper", "gripperPOV")
+_ROLLED = ("corner", "corner2", "corner3", "corner4")  # Meta-World hangs them upside down
+_LARGEST = 4096  # pixels along a side
+_MOST_GEOMS = 2000
+_LOOKS = (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION)  # a software renderer's time, fourfold
+
+
+def check_picture(camera: str, height: int, width: int) -> None:
+    """Raise :class:`ValueError` for an unknown camera or a size that no picture has."""
+    check_choice("camera", camera, CAMERAS)
+    for name, size in (("height", height), ("width", width)):
+        if check_int(name, size, minimum=1) > _LARGEST:
+            raise ValueError(f"{name} must be at most {_LARGEST} pixels, got {size}")
+
+
+def _open_gl() -> Any:
+    """A context of OpenGL without a window; without a display and MUJOCO_GL, of EGL."""
+    headless = sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    if headless and not os.environ.get("MUJOCO_GL"):
+        from mujoco.egl import GLContext
+    else:
+        from mujoco.gl_context import GLContext
+    return GLContext(64, 64)
+
+
+def _no_open_gl(error: Exception) -> ImportError:
+    backend = os.environ.get("MUJOCO_GL", "").lower().strip()
+    need = RENDER_LIBRARIES.get(backend or "egl", "OpenGL and a display")
+    return ImportError(
+        f"pictures need OpenGL, which does not open with MUJOCO_GL={backend or '(unset)'}: install {need}, or start "
+        f"Python with MUJOCO_GL=egl or MUJOCO_GL=osmesa. Simulations and recordings need none. ({error})"
+    )
+
+
+_open: WeakSet[Cameras] = WeakSet()
+
+
+def _close_all() -> None:
+    """Before the platform's own end, after which freeing a context is an error."""
+    for cameras in list(_open):
+        cameras.close()
+
+
+class Cameras:
+    """Takes pictures; a model's meshes and textures are loaded at its first. One thread's, which may be any.
+
+    Raises:
+        ImportError: there is no OpenGL, at once or with the first picture.
+    """
+
+    def __init__(self) -> None:
+        try:
+            self._gl = _open_gl()
+        except Exception as error:  # each platform has its own, an AttributeError among them
+            raise _no_open_gl(error) from error
+        if not _open:
+            atexit.unregister(_close_all)
+            atexit.register(_close_all)  # after the platform's, so that it runs first
+        _open.add(self)
+        self._loaded: dict[str, tuple[Any, Any]] = {}
+
+    def picture(self, scene: str, model: Any, data: Any, *, camera: str, height: int, width: int) -> NDArray[np.uint8]:
+        """One picture, (height, width, 3) uint8, the first line on top.
+
+        Args:
+            scene: a name that models of the same meshes and textures share.
+            model, data: the state, which stays as it is.
+            camera: one of :data:`CAMERAS`.
+            height, width: pixels.
+        """
+        self._gl.make_current()
+        if scene not in self._loaded:
+            try:
+                context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+            except mujoco.FatalError as error:
+                raise _no_open_gl(error) from error
+            self._loaded[scene] = mujoco.MjvScene(model=model, maxgeom=_MOST_GEOMS), context
+        view, context = self._loaded[scene]
+        if (context.offWidth, context.offHeight) != (width, height):
+            mujoco.mjr_resizeOffscreen(width, height, context)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, context)
+        place = mujoco.MjvCamera()
+        place.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        place.fixedcamid = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
+        everything = mujoco.mjtCatBit.mjCAT_ALL.value
+        mujoco.mjv_updateScene(model, data, mujoco.MjvOption(), None, place, everything, view)
+        for look in _LOOKS:
+            view.flags[look] = 0
+        frame = mujoco.MjrRect(0, 0, width, height)
+        pixels = np.empty((height, width, 3), dtype=np.uint8)
+        mujoco.mjr_render(frame, view, context)
+        mujoco.mjr_readPixels(pixels, None, frame, context)  # the first line at the bottom
+        return pixels[:, ::-1] if camera in _ROLLED else pixels[::-1]
+
+    def close(self) -> None:
+        """Free the context and what it holds."""
+        if self not in _open:
+            return
+        _open.remove(self)
+        self._gl.make_current()
+        for _, context in self._loaded.values():
+            context.free()
+        self._loaded = {}
+        self._gl.free()
