@@ -32,7 +32,7 @@ class _OnlySimulates(lw.LanguageWorldEnv):
         n = self.batch_size[0]
         self._engine.step(tensordict.get("action").numpy(), np.ones(n, dtype=bool))
         if not hasattr(self, "_same"):
-            self._same = self._state(torch.zeros(n, 4), reward=torch.zeros(n, 1))
+            self._same = self._rows.as_tensordict(reward=torch.zeros(n, 1))
         return self._same.copy()
 
 

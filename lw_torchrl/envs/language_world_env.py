@@ -17,12 +17,13 @@ from torchrl.envs import EnvBase
 
 from lw_torchrl._checks import check_choice, check_int
 from lw_torchrl.envs.cameras import check_picture
-from lw_torchrl.envs.engine import ACTION_SIZE, OBSERVATION_SIZE, Engine
+from lw_torchrl.envs.engine import ACTION_SIZE, Engine
 from lw_torchrl.envs.engines import make_engine
 from lw_torchrl.envs.episode_counter import EpisodeCounter, check_worker, stated_episode
+from lw_torchrl.envs.row_states import RowStates
 from lw_torchrl.envs.specs import action_spec, clipped_action, done_spec, observation_spec, reward_spec, row_mask
 from lw_torchrl.envs.workers import torchrl_worker
-from lw_torchrl.language.tasks import Task, named_tasks, task_id
+from lw_torchrl.language.tasks import Task, named_tasks
 
 
 class LanguageWorldEnv(EnvBase):
@@ -139,19 +140,12 @@ class LanguageWorldEnv(EnvBase):
         self._process = os.getpid()
         self._counter = EpisodeCounter([named[t] for t in self.row_tasks], check_int("seed", seed), self.worker)
         super().__init__(device=torch.device("cpu"), batch_size=(num_envs,) if batch_size is None else ())
-        self._task_id = torch.tensor([task_id(task) for task in self.row_tasks])
+        self._rows = RowStates(self.row_tasks)
         which = ... if batch_size is None else 0
-        self.observation_spec = observation_spec(self._task_id)[which]
+        self.observation_spec = observation_spec(self._rows.task_id)[which]
         self.action_spec = action_spec(num_envs)[which]
         self.reward_spec = reward_spec(num_envs)[which]
         self.done_spec = done_spec(num_envs)[which]
-        self._episode = np.full(num_envs, -1, dtype=np.int64)
-        self._steps = np.zeros(num_envs, dtype=np.int64)
-        self._over = np.ones(num_envs, dtype=bool)
-        self._fault = np.zeros(num_envs, dtype=bool)
-        self._success = np.zeros(num_envs, dtype=bool)
-        self._terminated = np.zeros(num_envs, dtype=bool)
-        self._observation = np.zeros((num_envs, OBSERVATION_SIZE), dtype=np.float32)
         self._engine = make_engine(engine, self.row_tasks, reward=reward, num_threads=num_threads)
         self.is_closed = False  # EnvBase starts with True
 
@@ -180,7 +174,7 @@ class LanguageWorldEnv(EnvBase):
     def set_extra_state(self, state: Tensor) -> None:
         """Take seed and counters; the episodes that ran are over."""
         self._counter.load(state)
-        self._over[:] = True
+        self._rows.over[:] = True
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
         """Take seed and episode counters from another's ``state_dict()``, and want a reset.
@@ -201,27 +195,6 @@ class LanguageWorldEnv(EnvBase):
             "makes it, lambda: LanguageWorldEnv(...)"
         )
 
-    def _state(self, executed_action: Tensor, **more: Tensor) -> TensorDict:
-        over = torch.from_numpy(self._over.copy()).unsqueeze(-1)
-        terminated = torch.from_numpy(self._terminated.copy()).unsqueeze(-1)
-        state = TensorDict(
-            {
-                "observation": torch.from_numpy(self._observation.copy()),
-                "task_id": self._task_id.clone(),
-                "episode": torch.from_numpy(self._episode.copy()),
-                "success": torch.from_numpy(self._success.copy()).unsqueeze(-1),
-                "fault": torch.from_numpy(self._fault.copy()).unsqueeze(-1),
-                "executed_action": executed_action,
-                "done": over,
-                "terminated": terminated,
-                "truncated": over & ~terminated,
-                **more,
-            },
-            batch_size=(len(self.row_tasks),),
-            device=self.device,
-        )
-        return state if self.batch_size else state[0]
-
     def _check_usable(self) -> None:
         if self.is_closed:
             raise RuntimeError("this environment is closed (a collector closes its own at its end): make a new one")
@@ -238,45 +211,23 @@ class LanguageWorldEnv(EnvBase):
         rows = np.flatnonzero(row_mask(tensordict, "_reset", len(self.row_tasks)))
         if set_state:
             episode = stated_episode(tensordict, episode)
-            self._check_tasks(tensordict, rows)
+            self._rows.refuse_other_tasks(tensordict, rows)
         episodes = self._counter.next(rows) if episode is None else self._counter.asked(episode, rows)
-        self._observation[rows] = self._engine.reset(rows.tolist(), self._counter.seeds(rows, episodes))
+        self._rows.begin(rows, episodes, self._engine.reset(rows.tolist(), self._counter.seeds(rows, episodes)))
         self._counter.resets[rows] += 1
-        self._episode[rows] = episodes
-        self._steps[rows] = 0
-        for flag in (self._over, self._fault, self._success, self._terminated):
-            flag[rows] = False
         if set_state:
-            self._check_beginning(tensordict, rows)
-        return self._state(torch.zeros(len(self.row_tasks), ACTION_SIZE))
+            self._rows.refuse_later_steps(tensordict, rows)
+        return self._shown(self._rows.as_tensordict())
 
-    def _check_tasks(self, tensordict: TensorDictBase, rows: np.ndarray) -> None:
-        given = tensordict.get("task_id", None)
-        if given is not None and not torch.equal(given.cpu().reshape(-1)[rows], self._task_id[rows]):
-            raise ValueError(
-                "set_state=True needs the state of an environment with the same rows, and task_id names other tasks "
-                f"than those of this one, {', '.join(self.row_tasks[:6])}{', ...' * (len(self.row_tasks) > 6)}"
-            )
-
-    def _check_beginning(self, tensordict: TensorDictBase, rows: np.ndarray) -> None:
-        wanted = tensordict.get("observation", None)
-        if wanted is None:
-            return
-        later = rows[(wanted.cpu().numpy().reshape(-1, OBSERVATION_SIZE)[rows] != self._observation[rows]).any(-1)]
-        if len(later):
-            self._over[later] = True
-            raise ValueError(
-                f"set_state=True goes to the beginning of an episode, and the observation of rows {later[:5].tolist()} "
-                "is of a later step, or of another seed: physics in the middle cannot be restored. Leave observation "
-                "out, or repeat the episode's executed actions from its beginning"
-            )
+    def _shown(self, rows: TensorDict) -> TensorDict:
+        return rows if self.batch_size else rows[0]
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         self._check_usable()
         action = clipped_action(tensordict, self.batch_size).cpu().numpy().reshape(-1, ACTION_SIZE)
         active = row_mask(tensordict, "_step", len(self.row_tasks))
-        if (active & self._over).any():
-            rows = np.flatnonzero(active & self._over)[:5].tolist()
+        if (active & self._rows.over).any():
+            rows = np.flatnonzero(active & self._rows.over)[:5].tolist()
             raise RuntimeError(
                 f"rows {rows} have ended or were never reset, or not since load_state_dict: reset them before the "
                 "next step (env.reset(), collector.reset())"
@@ -286,28 +237,29 @@ class LanguageWorldEnv(EnvBase):
             broken = active & np.isnan(action).any(-1)
             self._report(broken, "its action is NaN", self.strict)
             stepped = active & ~broken
-        self._over |= self._fault
-        self._success &= ~active
+        self._rows.over |= self._rows.fault
+        self._rows.success &= ~active
         reward = self._simulate(action, stepped)
         for _ in range(self.frame_skip - 1):
-            if not (going := stepped & ~self._over).any():
+            if not (going := stepped & ~self._rows.over).any():
                 break
             reward += self._simulate(action, going)
         executed = np.where(stepped[:, None], action, np.float32(0.0))
-        return self._state(torch.from_numpy(executed), reward=torch.from_numpy(reward.astype(np.float32)).unsqueeze(-1))
+        rewarded = torch.from_numpy(reward.astype(np.float32)).unsqueeze(-1)
+        return self._shown(self._rows.as_tensordict(executed, reward=rewarded))
 
     def _simulate(self, action: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """One step of the simulation of some rows, and their reward, (N,) float64."""
         result = self._engine.step(action, rows)
         if (unstable := result.fault & rows).any():
             self._report(unstable, "its simulation became unstable")
-        np.copyto(self._observation, result.observation, casting="same_kind", where=rows[:, None])
+        np.copyto(self._rows.observation, result.observation, casting="same_kind", where=rows[:, None])
         success = result.success & rows
-        self._success |= success
+        self._rows.success |= success
         if self.terminate_on_success:
-            self._terminated |= success
-        self._steps += rows
-        self._over |= self._fault | self._terminated | (self._steps >= self.max_steps)
+            self._rows.terminated |= success
+        self._rows.steps += rows
+        self._rows.over |= self._rows.fault | self._rows.terminated | (self._rows.steps >= self.max_steps)
         return np.where(rows, result.reward, 0.0)
 
     def _report(self, rows: np.ndarray, what: str, fatal: bool = False) -> None:
@@ -316,11 +268,11 @@ class LanguageWorldEnv(EnvBase):
         row = int(np.flatnonzero(rows)[0])
         message = (
             f"row {row}: {what}, in task {self.row_tasks[row]!r}, seed {self.seed}, episode "
-            f"{self._episode[row]}, step {self._steps[row]}" + (f" ({rows.sum()} rows)" if rows.sum() > 1 else "")
+            f"{self._rows.episode[row]}, step {self._rows.steps[row]}" + f" ({rows.sum()} rows)" * int(rows.sum() > 1)
         )
         if fatal:
             raise ValueError(f"action must hold numbers: {message}")
-        self._fault |= rows
+        self._rows.fault |= rows
         warnings.warn(f"{message}; the row is truncated and flagged, the others go on", stacklevel=3)
 
     def render(self, *, camera: str = "corner2", height: int = 240, width: int = 320) -> Tensor:
@@ -351,7 +303,7 @@ class LanguageWorldEnv(EnvBase):
         """
         self._check_usable()
         check_picture(camera, height, width)
-        if (self._episode < 0).any():
+        if (self._rows.episode < 0).any():
             raise RuntimeError("there is nothing to see before a reset: call env.reset()")
         if not hasattr(self._engine, "render"):
             raise NotImplementedError(f"engine {type(self._engine).__name__} has no render; see lw_torchrl.envs.engine")
