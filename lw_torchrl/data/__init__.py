@@ -4,6 +4,8 @@ import lw_torchrl._torchrl  # noqa: F401
 from lw_torchrl.data.co_learning_sampler import CoLearningSampler
 from lw_torchrl.data.collect import collect_demonstrations
 from lw_torchrl.data.dataset import CollectConfig, DatasetError, Demonstrations
+from lw_torchrl.data.growing import GrowingStorage
+from lw_torchrl.data.growing_writer import GrowingWriter
 from lw_torchrl.data.replay import LanguageWorldExperienceReplay
 from lw_torchrl.data.selection import JoinedDemonstrations
 from lw_torchrl.data.storage import JoinedStorage
@@ -14,6 +16,8 @@ __all__ = [
     "CollectConfig",
     "DatasetError",
     "Demonstrations",
+    "GrowingStorage",
+    "GrowingWriter",
     "JoinedDemonstrations",
     "JoinedStorage",
     "LanguageWorldExperienceReplay",

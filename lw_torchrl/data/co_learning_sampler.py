@@ -14,14 +14,18 @@ from torchrl.data.replay_buffers.storages import Storage
 
 from lw_torchrl._checks import unknown_name
 from lw_torchrl.data.group_sampler import GroupSampler, column, nearest_sizes
+from lw_torchrl.data.growing import GrowingStorage
 from lw_torchrl.data.storage import JoinedStorage
 from lw_torchrl.language.tasks import MT50, TASKS, task_id
+
+GROWN = "grown"
+"""The target that is what a buffer was extended with."""
 
 
 def _check_target(target: Any) -> str | Tensor:
     if isinstance(target, str):
-        if target not in TASKS:
-            raise unknown_name("target", target, TASKS)
+        if target not in TASKS and target != GROWN:
+            raise unknown_name("target", target, [GROWN, *TASKS])
         return target
     wanted = "target must be a task's name or one bool for each episode"
     try:
@@ -29,7 +33,7 @@ def _check_target(target: Any) -> str | Tensor:
     except (TypeError, ValueError, RuntimeError) as error:
         raise TypeError(f"{wanted}, got {target!r}") from error
     if mask.dtype != torch.bool or mask.dim() != 1:
-        raise TypeError(f"{wanted}, got {mask.dtype} of shape {tuple(mask.shape)}")
+        raise TypeError(f"{wanted}, got {mask.dtype} of shape {tuple(mask.shape)}; a buffer that grows has 'grown'")
     if mask.all() or not mask.any():
         raise ValueError(f"target must have true and false episodes, all {len(mask)} are {bool(mask.any())}")
     return mask.clone()
@@ -56,13 +60,17 @@ class CoLearningSampler(GroupSampler):
     true, is the pass that takes the most batches: of the largest base task, as a rule. It draws from the replay
     buffer's generator; its state, restored in the middle of an epoch, goes on with the same batches.
 
-    Where the target is itself a base task, its base demonstrations are left out. A batch holds the target's rows, then
-    those of the base tasks in the order of their ids; each row has, beside the storage's own columns:
+    With the target "grown" it is what the buffer was extended with, a collector's rows, say, that is mixed with
+    demonstrations: these as above, of all tasks; of the rows that are there now each is as likely, and independent of
+    the others, so that one may come twice.
+
+    Where a target by name is itself a base task, its base demonstrations are left out. A batch holds the target's rows,
+    then those of the base tasks in the order of their ids; each row has, beside the storage's own columns:
         is_target: (B,) bool.
 
     Args:
-        target: a task's name, or the episodes that are the target's demonstrations: one bool for each episode, in the
-            order of ``replay.demonstrations.episodes``. A name stands for all demonstrations of the task; in a storage
+        target: "grown"; a task's name; or the episodes that are the target's: one bool for each episode, in the order
+            of ``replay.demonstrations.episodes``. A name stands for all demonstrations of the task; in a storage
             that joins datasets, for those of the last dataset that has any.
         target_fraction: the target's share of a minibatch, between 0 and 1, such as 0.5, 1/3 or Fraction(2, 7).
         task_key: the entry of the storage that tells the task.
@@ -71,7 +79,8 @@ class CoLearningSampler(GroupSampler):
     Raises:
         ValueError: an unknown task, with the nearest; a fraction that is none; a mask without an episode, or without
             any other. At sampling: a batch size that cannot be exact, with the nearest that can; no row of the target
-            or of a base task; a mask of another number of episodes.
+            or of a base task; a mask of another number of episodes; a target other than "grown" where the storage
+            grows, or "grown" where it does not.
         TypeError: a target that is neither name nor mask.
 
     Example:
@@ -103,6 +112,20 @@ class CoLearningSampler(GroupSampler):
         self.episode_key = episode_key
         super().__init__()
 
+    @property
+    def _grown(self) -> bool:
+        return isinstance(self.target, str) and self.target == GROWN
+
+    def _covered(self, storage: Storage) -> int:
+        return storage.num_joined if isinstance(storage, GrowingStorage) else len(storage)
+
+    def _check_storage(self, storage: Storage) -> None:
+        if isinstance(storage, GrowingStorage) != self._grown:
+            if self._grown:
+                raise ValueError("target 'grown' needs a buffer that grows, LanguageWorldExperienceReplay(..., grow=)")
+            named = repr(self.target) if isinstance(self.target, str) else "a mask"
+            raise ValueError(f"target must be 'grown', since the buffer grows, got {named}")
+
     def _targets(self, storage: Storage, task: Tensor) -> Tensor:
         """Whether each row is the target's: (R,) bool."""
         if isinstance(self.target, str):
@@ -120,6 +143,10 @@ class CoLearningSampler(GroupSampler):
         return self.target.to(episode.device)[episode]
 
     def _label(self, storage: Storage) -> Tensor:
+        self._check_storage(storage)
+        if isinstance(storage, GrowingStorage):
+            task = storage.column(self.task_key, torch.arange(storage.num_joined)).reshape(-1)
+            return torch.unique(task, return_inverse=True)[1]
         task = column(storage, self.task_key).reshape(-1)
         mine = self._targets(storage, task)
         base = ~torch.isin(task, task[mine].unique())
@@ -129,16 +156,23 @@ class CoLearningSampler(GroupSampler):
         label[base] = 1 + torch.unique(task[base], return_inverse=True)[1]
         return label
 
+    def _keys(self, storage: Storage, rows: Tensor) -> Tensor | None:
+        by_task = isinstance(self.target, str) and not isinstance(storage, JoinedStorage)
+        return column(storage, self.task_key, rows) if by_task else None
+
     def row_weights(self, storage: Storage) -> Tensor:
         """How often each row comes in a minibatch, as a share of all: (R,) float32, 0 for a row that is left out."""
         label = self._label(storage)
+        mine = float(self.target_fraction)
+        if isinstance(storage, GrowingStorage):
+            label = torch.cat([label + 1, label.new_zeros(storage.num_grown)])
         sizes = label[label >= 0].bincount()
-        share = torch.full((len(sizes),), (1 - float(self.target_fraction)) / (len(sizes) - 1))
-        share[0] = float(self.target_fraction)
+        share = torch.full((len(sizes),), (1 - mine) / (len(sizes) - 1))
+        share[0] = mine
         return torch.where(label >= 0, (share / sizes)[label.clamp(min=0)], 0.0)
 
     def _shares(self, batch_size: int) -> Tensor:
-        base = len(self._size) - 1
+        base = len(self._passes.size) - (not self._grown)
         part, whole = self.target_fraction.numerator, self.target_fraction.denominator
         unit = whole * base // gcd(base, whole - part)
         if batch_size < 1 or batch_size % unit:
@@ -148,16 +182,35 @@ class CoLearningSampler(GroupSampler):
                 + nearest_sizes(batch_size, unit)
             )
         mine = batch_size // whole * part
-        return torch.tensor([mine] + [(batch_size - mine) // base] * base)
+        return torch.tensor([mine] * (not self._grown) + [(batch_size - mine) // base] * base)
+
+    def add(self, index: Any) -> None:
+        """Note that rows were written, over old ones perhaps; those of a growing buffer are in no group."""
+        if not self._grown:
+            super().add(index)
+
+    extend = add
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[str, Any]]:
         """Draw ``batch_size`` indices, the target's first, and tell which are the target's."""
+        self._check_storage(storage)
+        if not isinstance(storage, GrowingStorage):
+            index, info = super().sample(storage, batch_size)
+            info["is_target"] = self._layout(batch_size)[1] == 0
+            return index, info
+        if not storage.num_grown:
+            raise ValueError("target 'grown': nothing has come yet; extend the buffer before the first sample")
         index, info = super().sample(storage, batch_size)
-        info["is_target"] = self._layout(batch_size)[1] == 0
-        return index, info
+        mine = batch_size - len(index)
+        grown = torch.randint(storage.num_grown, (mine,), generator=self._rng) + storage.num_joined
+        info["is_target"] = torch.arange(batch_size) < mine
+        return torch.cat([grown, index]), info
 
     def _identity(self) -> dict[str, Tensor]:
-        target = torch.tensor(task_id(self.target)) if isinstance(self.target, str) else self.target.clone()
+        if self._grown:
+            target = torch.tensor([-1])
+        else:
+            target = torch.tensor(task_id(self.target)) if isinstance(self.target, str) else self.target.clone()
         fraction = torch.tensor([self.target_fraction.numerator, self.target_fraction.denominator])
         return {"target": target, "target_fraction": fraction}
 

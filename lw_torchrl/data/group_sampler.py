@@ -12,18 +12,19 @@ from torch import Tensor
 from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.storages import Storage
 
+from lw_torchrl.data.passes import Passes
 from lw_torchrl.data.sampler_state import check_state, read_state
 from lw_torchrl.data.storage import JoinedStorage
 
 
-def column(storage: Storage, key: NestedKey) -> Tensor:
-    """One column of all rows of a storage; a joined one would otherwise copy all columns."""
+def column(storage: Storage, key: NestedKey, index: Tensor | None = None) -> Tensor:
+    """One column of all rows of a storage, or of those at an index; a joined one would otherwise copy all columns."""
     if isinstance(storage, JoinedStorage):
-        return storage.column(key)
+        return storage.column(key, index)
     found = storage.get(slice(0, len(storage))).get(key, None)
     if found is None:
         raise KeyError(f"the storage has no column {key!r}, by which rows are to be grouped")
-    return found
+    return found if index is None else found[index.to(found.device)]
 
 
 def nearest_sizes(batch_size: int, unit: int) -> str:
@@ -38,6 +39,11 @@ class GroupSampler(Sampler):
     A subclass says which group each row is in (:meth:`_label`) and how many a batch has of each (:meth:`_shares`).
     A batch holds the groups one after another. A group's pass goes on over the end of a batch and, where a batch asks
     for more than is left, over the end of the pass: the rest comes from the next pass, in a new order.
+
+    Rows may come and be overwritten. If the subclass says by what a row's group is known (:meth:`_keys`), the groups
+    and passes are kept up: a row that comes takes a random place in what is left of its group's pass, so that it comes
+    once before any comes again, and the work is that of the rows that came. All rows are grouped again, and all passes
+    begin, where a group comes or goes, and where the subclass does not say.
     """
 
     def __init__(self) -> None:
@@ -45,10 +51,10 @@ class GroupSampler(Sampler):
 
     def _empty(self) -> None:
         self._length = 0
-        self._order = torch.empty(0, dtype=torch.int64)  # rows by group, each group shuffled
-        self._start = torch.empty(0, dtype=torch.int64)  # of each group
-        self._size = torch.empty(0, dtype=torch.int64)
-        self._cursor = torch.empty(0, dtype=torch.int64)
+        none = torch.empty(0, dtype=torch.int64)
+        self._passes = Passes(none, none)
+        self._known: Tensor | None = None  # what each group's rows are known by
+        self._written: list[Tensor] = []  # rows that were written since the last batch
         self._ran_out = False
         self._restored = False
         self._laid_out: tuple[int, Tensor, Tensor, Tensor] | None = None  # see _layout
@@ -60,6 +66,14 @@ class GroupSampler(Sampler):
     @abstractmethod
     def _shares(self, batch_size: int) -> Tensor:
         """The rows of each group in a batch: (G,) int64, at least 1; a size that cannot be exact raises ValueError."""
+
+    def _keys(self, storage: Storage, rows: Tensor) -> Tensor | None:
+        """What tells the groups of rows apart, (n,) int64; None where that takes a look at all rows."""
+        return None
+
+    def _covered(self, storage: Storage) -> int:
+        """The number of rows that are grouped: the first so many."""
+        return len(storage)
 
     @property
     def ran_out(self) -> bool:
@@ -73,43 +87,43 @@ class GroupSampler(Sampler):
     def _group(self, storage: Storage) -> None:
         label = self._label(storage).cpu()
         order = torch.argsort(label, stable=True)
-        self._order = order[int((label < 0).sum()) :]
-        self._size = label[label >= 0].bincount()
-        self._start = self._size.cumsum(0) - self._size
-        self._cursor = torch.zeros_like(self._size)
-        self._length = len(storage)
+        self._passes = Passes(order[int((label < 0).sum()) :], label[label >= 0].bincount())
+        self._length = self._covered(storage)
         self._laid_out = None
-        self._restored = False
-        for group in range(len(self._size)):
-            self._shuffle(group)
+        self._restored, self._written = False, []
+        self._know(storage)
+        for group in range(len(self._passes.size)):
+            self._passes.shuffle(group, self._rng)
 
-    def _shuffle(self, group: int) -> None:
-        start, size = int(self._start[group]), int(self._size[group])
-        rows = self._order[start : start + size]
-        self._order[start : start + size] = rows[torch.randperm(size, generator=self._rng)]
-        self._cursor[group] = 0
+    def _know(self, storage: Storage) -> None:
+        """Note what each group is known by."""
+        found = self._keys(storage, self._passes.order[self._passes.start]) if storage.ndim == 1 else None
+        self._known = None if found is None else found.reshape(-1).cpu()
 
-    def _take(self, group: int, count: int) -> tuple[Tensor, bool]:
-        """``count`` rows of a group, over the end of its pass, and whether a pass ended."""
-        taken, ended = [], False
-        start, size = int(self._start[group]), int(self._size[group])
-        while count:
-            cursor = int(self._cursor[group])
-            found = self._order[start + cursor : start + min(size, cursor + count)].clone()
-            taken.append(found)
-            self._cursor[group] += len(found)
-            count -= len(found)
-            if self._cursor[group] == size:
-                ended = True
-                self._shuffle(group)
-        return torch.cat(taken), ended
+    def _take_in(self, storage: Storage) -> bool:
+        """Move the rows that were written to their groups; whether that is all there was to do."""
+        if self._known is None or not self._written:
+            return False
+        rows = torch.cat(self._written).unique()
+        self._written = []
+        length = self._covered(storage)
+        if rows[0] < 0 or rows[-1] >= length or int((rows >= self._length).sum()) != length - self._length:
+            return False
+        keys = self._keys(storage, rows)
+        assert keys is not None
+        same = keys.reshape(-1, 1).cpu() == self._known
+        if not same.any(1).all():
+            return False
+        self._passes.exchange(rows, same.int().argmax(1), self._rng)
+        self._length = length
+        return bool((self._passes.size > 0).all())
 
     def _layout(self, batch_size: int) -> tuple[Tensor, Tensor, Tensor]:
         """The share of each group (G,), the group of each row of a batch (B,), its place within the group's (B,)."""
         if self._laid_out is None or self._laid_out[0] != batch_size:
             shares = self._shares(batch_size)
             group = torch.repeat_interleave(shares)
-            place = torch.arange(batch_size) - (shares.cumsum(0) - shares)[group]
+            place = torch.arange(len(group)) - (shares.cumsum(0) - shares)[group]
             self._laid_out = (batch_size, shares, group, place)
         return self._laid_out[1:]
 
@@ -119,38 +133,51 @@ class GroupSampler(Sampler):
             raise ValueError("storage must hold at least one row, got an empty one")
         if self._restored and self._length:
             self._check_restored(storage)
-        elif len(storage) != self._length:
+        if (self._written or self._covered(storage) != self._length) and not self._take_in(storage):
             self._group(storage)
         shares, group, place = self._layout(batch_size)
-        at = (self._start + self._cursor)[group].add_(place).clamp_(max=len(self._order) - 1)
-        index = self._order[at]
+        passes = self._passes
+        at = (passes.start + passes.cursor)[group].add_(place).clamp_(max=len(passes.order) - 1)
+        index = passes.order[at]
         self._ran_out = False
-        ending = self._cursor + shares >= self._size
-        self._cursor += torch.where(ending, 0, shares)
+        ending = passes.cursor + shares >= passes.size
+        passes.cursor += torch.where(ending, 0, shares)
         if ending.any():
-            batches = self._size / shares
+            batches = passes.size / shares
             longest = batches == batches.max()
             first = shares.cumsum(0) - shares
             for number in ending.nonzero().flatten().tolist():
-                rows, ended = self._take(number, int(shares[number]))
+                rows, ended = passes.take(number, int(shares[number]), self._rng)
                 index[first[number] : first[number] + len(rows)] = rows
                 self._ran_out |= ended and bool(longest[number])
         return index, {}
 
     def add(self, index: Any) -> None:
-        """Group the rows again at the next sample, since one was written, over an old one perhaps."""
-        self._length = 0
+        """Note that rows were written, over old ones perhaps."""
+        rows = torch.as_tensor(index, device="cpu").reshape(-1)
+        self._written.append(rows)
+        if sum(map(len, self._written)) > 2 * self._length:
+            self._length, self._written = 0, []  # as much work as to group all rows again
 
     extend = add
 
+    def mark_update(self, index: Any, *, storage: Storage | None = None) -> None:
+        """Note that rows were written, by another buffer of the same storage perhaps."""
+        self.add(index)
+
     def state_dict(self) -> dict[str, Any]:
-        """The shuffled order and how far each group's pass has come."""
+        """The shuffled order, how far each group's pass has come, and the rows written since the last batch."""
+        none = torch.empty(0, dtype=torch.int64)
+        begun = self._length > 0 and not (self._written and self._known is None)  # or else all is grouped again
+        size = self._passes.size if begun else none
         return {
-            "length": torch.tensor(self._length),
-            "order": self._order.clone(),
-            "start": self._start.clone(),
-            "size": self._size.clone(),
-            "cursor": self._cursor.clone(),
+            "length": torch.tensor(self._length if begun else 0),
+            "order": self._passes.compact() if begun else none,
+            "start": size.cumsum(0) - size,
+            "size": size.clone(),
+            "cursor": self._passes.cursor.clone() if begun else none,
+            "known": self._known.clone() if begun and self._known is not None else none,
+            "written": torch.cat(self._written) if begun and self._written else none,
             "ran_out": torch.tensor(self._ran_out),
         }
 
@@ -163,19 +190,33 @@ class GroupSampler(Sampler):
         """
         state = check_state(state_dict)
         self._length, self._ran_out = state["length"], state["ran_out"]
-        self._order, self._start = state["order"].clone(), state["start"].clone()
-        self._size, self._cursor = state["size"].clone(), state["cursor"].clone()
+        self._passes = Passes(state["order"].clone(), state["size"].clone(), state["cursor"].clone())
+        self._known = state["known"].clone() if len(state["known"]) else None
+        self._written = [state["written"].clone()] if len(state["written"]) else []
         self._laid_out = None
         self._restored = True
 
     def _check_restored(self, storage: Storage) -> None:
-        """Raise unless a restored state is of the storage's rows, in their groups."""
-        if len(storage) != self._length:
-            raise ValueError(f"state_dict must be of the storage's {len(storage)} rows, got one of {self._length}")
+        """Raise unless a restored state is of the storage's rows, in their groups.
+
+        Where rows were written since, all are grouped again if the others are not in the groups that the state says.
+        """
+        self._restored = False
+        rows, groups = self._passes.order, torch.repeat_interleave(self._passes.size)
+        length = self._covered(storage)
+        if self._written:
+            old = ~torch.isin(rows, torch.cat(self._written)) & (rows < length)
+            keys = None if self._known is None else self._keys(storage, rows[old])
+            if keys is None or not torch.equal(keys.reshape(-1).cpu(), self._known[groups[old]]):  # type: ignore[index]
+                self._length = 0
+            return
+        self._restored = True
+        if length != self._length:
+            raise ValueError(f"state_dict must be of the storage's {length} rows, got one of {self._length}")
         label = self._label(storage).cpu()
-        groups = torch.repeat_interleave(self._size)
-        if len(groups) != int((label >= 0).sum()) or not torch.equal(label[self._order], groups):
+        if len(rows) != int((label >= 0).sum()) or not torch.equal(label[rows], groups):
             raise ValueError("state_dict must be of the storage's rows, got one whose groups are others")
+        self._know(storage)
         self._restored = False
 
     def dumps(self, path: Any) -> None:

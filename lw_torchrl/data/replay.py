@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,11 +14,18 @@ from torchrl.data import ImmutableDatasetWriter, TensorStorage
 from torchrl.data.datasets.common import BaseDatasetExperienceReplay
 from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.storages import Storage
+from torchrl.data.replay_buffers.writers import Writer
 from torchrl.envs import Transform
 
 from lw_torchrl._checks import check_choice, check_int
+from lw_torchrl._state_tree import join, split
+from lw_torchrl._tensor_archive import ArchiveError, TensorArchive, write_archive
 from lw_torchrl.data.dataset import DATA, Demonstrations
+from lw_torchrl.data.growing import GrowingStorage
+from lw_torchrl.data.growing_writer import GrowingWriter
 from lw_torchrl.data.metadata import read_metadata
+from lw_torchrl.data.n_steps import check_n_steps
+from lw_torchrl.data.replay_checks import check_growing, check_reward, check_transform
 from lw_torchrl.data.selection import (
     LABELS,
     EpisodeChoice,
@@ -46,6 +54,9 @@ def _choices(episodes: Any, roots: int, joined: bool) -> list[EpisodeChoice]:
     return list(episodes)
 
 
+_NOT_COLLECTED = ("expert_action", "unclipped_action", ("next", "reward_sparse"), ("next", "reward_dense"))
+
+
 class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
     """The rows of datasets that :func:`collect_demonstrations` made; several are joined, and none is copied.
 
@@ -66,6 +77,12 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         reward: what ``("next", "reward")`` holds with label="executed": "sparse", the success as 0 and 1, or "dense",
             Meta-World's own.
         after_success: drop the steps that come more than so many after the first success; None keeps all.
+        n_steps: how many steps ``("next", ...)`` lies ahead; see :class:`JoinedStorage`. It never crosses the end of
+            an episode, that of ``after_success`` included.
+        gamma: the discount of the rewards on the way, for ``n_steps`` of 2 or more; the loss must have the same.
+        grow: rows of a part that :meth:`extend` writes to, beside the demonstrations; see :class:`GrowingStorage`. The
+            oldest are overwritten. Samples then hold the columns that a collector gives too: the expert's actions, and
+            the other reward, are left out.
         **kwargs: for :class:`torchrl.data.TensorDictReplayBuffer`: generator, prefetch, pin_memory, ...
 
     Attributes:
@@ -74,7 +91,10 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         roots: the folders.
 
     Raises:
-        ValueError: a wrong argument; a task or an episode that the dataset does not hold.
+        ValueError: a wrong argument; a task or an episode that the dataset does not hold; ``n_steps`` or ``grow``
+            without label="executed"; a ``MultiStepTransform``, in place of which there is ``n_steps``. From
+            :meth:`extend`, with ``grow``: rows that do not fit the demonstrations, or have another reward.
+        RuntimeError: :meth:`extend` without ``grow``.
         FileNotFoundError: there is no such folder.
         DatasetError: (a ValueError) the dataset is half-written, damaged, or of another format or version.
 
@@ -100,8 +120,17 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         label: Label = "expert",
         reward: Literal["sparse", "dense"] = "sparse",
         after_success: int | None = None,
+        n_steps: int = 1,
+        gamma: float | None = None,
+        grow: int | None = None,
         **kwargs: Any,
     ) -> None:
+        check_n_steps(n_steps, gamma)
+        check_transform(transform)
+        if (n_steps > 1 or grow is not None) and label != "executed":
+            raise ValueError(f"n_steps and grow need label='executed', whose actions the rewards are of, got {label!r}")
+        if grow is not None:
+            check_growing(sampler, kwargs)
         check_choice("label", label, LABELS)
         check_choice("reward", reward, ("sparse", "dense"))
         if batch_size is not None:
@@ -121,27 +150,93 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
             rows, keep = read_part(
                 whole, shown[-1], label=label, reward=reward, after_success=after_success, first_trajectory=trajectories
             )
-            parts.append(rows)
+            parts.append(rows if grow is None else rows.exclude(*_NOT_COLLECTED))
             kept.append(keep)
             trajectories += len(whole.episodes)
         storage: Storage
-        if joined or episodes is not None:
-            self.demonstrations: Demonstrations | JoinedDemonstrations = JoinedDemonstrations(tuple(shown))
-            storage = JoinedStorage(parts, kept)
-            kwargs.setdefault("collate_fn", _as_it_is)
+        several = joined or episodes is not None
+        self.demonstrations: Demonstrations | JoinedDemonstrations = (
+            JoinedDemonstrations(tuple(shown)) if several else shown[0]
+        )
+        if grow is not None:
+            storage = GrowingStorage(
+                parts, kept, grow=grow, n_steps=n_steps, gamma=gamma, check=partial(check_reward, reward)
+            )
+        elif several or n_steps > 1:
+            storage = JoinedStorage(parts, kept, n_steps=n_steps, gamma=gamma)
         else:
-            self.demonstrations = shown[0]
             storage = TensorStorage(parts[0] if kept[0] is None else parts[0][kept[0]])  # the second is in memory
+        if isinstance(storage, JoinedStorage):
+            kwargs.setdefault("collate_fn", _as_it_is)
+        writer: Writer = ImmutableDatasetWriter() if grow is None else GrowingWriter()
         self.root = self.roots[0]
         self.label, self.reward = label, reward
         super().__init__(
             storage=storage,
             sampler=sampler,
-            writer=ImmutableDatasetWriter(),
+            writer=writer,
             batch_size=batch_size,
             transform=transform,
             **kwargs,
         )
+
+    @property
+    def _grows(self) -> bool:
+        return isinstance(self._storage, GrowingStorage)
+
+    def set_sampler(self, sampler: Sampler) -> Sampler:
+        """Take another sampler; returns the one before."""
+        if self._grows:
+            check_growing(sampler, {})
+        return super().set_sampler(sampler)
+
+    def append_transform(self, transform: Transform, *, invert: bool = False) -> LanguageWorldExperienceReplay:
+        """Apply a transform to each sample, after those that are there."""
+        check_transform(transform)
+        return super().append_transform(transform, invert=invert)
+
+    def insert_transform(
+        self, index: int, transform: Transform, *, invert: bool = False
+    ) -> LanguageWorldExperienceReplay:
+        """Apply a transform to each sample, before the one at ``index``."""
+        check_transform(transform)
+        return super().insert_transform(index, transform, invert=invert)
+
+    def share(self, shared: bool = True) -> LanguageWorldExperienceReplay:
+        """Let other processes read it; a buffer that grows refuses."""
+        if shared and self._initialized and self._grows:
+            raise RuntimeError(
+                "a buffer that grows is of one process: let the collector yield its batches, and extend the buffer "
+                "with them here"
+            )
+        return super().share(shared)
+
+    def dumps(self, path: str | os.PathLike[str]) -> None:
+        """Save the state to a folder; that of a buffer that grows, as one file, which is there whole or not at all."""
+        if not self._grows:
+            return super().dumps(path)
+        tensors: dict[str, Tensor] = {}
+        tree = split(self.state_dict(), tensors)
+        write_archive(Path(path) / "buffer.zip", {"format_version": 1, "state": tree}, {"tensors": tensors})
+
+    def loads(self, path: str | os.PathLike[str]) -> None:
+        """Restore what :meth:`dumps` saved.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            ValueError: it is damaged, or the state of another buffer.
+        """
+        if not self._grows:
+            return super().loads(path)
+        file = Path(path) / "buffer.zip"
+        try:
+            archive = TensorArchive(file)
+            if archive.description.get("format_version") != 1:
+                raise ArchiveError("it is of another version")
+            state = join(archive.description.get("state"), archive.tensors("tensors"))
+        except ValueError as error:
+            raise ValueError(f"path: {str(file)!r} holds no buffer's state ({error})") from error
+        self.load_state_dict(state)
 
     @property
     def tasks(self) -> tuple[str, ...]:

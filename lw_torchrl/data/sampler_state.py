@@ -60,4 +60,9 @@ def check_state(state: Any) -> dict[str, Any]:
     require(fits, "cursor", "a place within each group")
     inside = rows <= found["length"] and bool(((order >= 0) & (order < found["length"])).all())
     require(inside and len(order.unique()) == rows, "order", f"rows below {found['length']}, each once")
+    for name, lengths in (("known", {0, len(size)}), ("written", None)):
+        given = state.get(name)
+        fits = isinstance(given, Tensor) and given.dtype == torch.int64 and given.dim() == 1
+        require(fits and (lengths is None or len(given) in lengths), name, "(n,) int64, one a group or none")
+        found[name] = given.cpu()
     return found

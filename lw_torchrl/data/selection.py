@@ -13,8 +13,8 @@ from torch import Tensor
 from lw_torchrl._checks import check_int, unknown_name
 from lw_torchrl.data.dataset import CollectConfig, DamagedDatasetError, Demonstrations, EpisodeInfo
 from lw_torchrl.data.rows import load_rows
+from lw_torchrl.data.storage import TRAJECTORY
 
-TRAJECTORY = ("collector", "traj_ids")
 Label = Literal["expert", "unclipped", "executed"]
 LABELS = get_args(Label)
 EpisodeChoice = int | Mapping[str, int | Sequence[int]] | None

@@ -14,11 +14,14 @@ from torch import Tensor
 from torchrl.data.replay_buffers.storages import Storage
 
 from lw_torchrl._files import read_json, write_json
+from lw_torchrl.data.n_steps import STEPS, check_n_steps, last_rows, sum_rewards
 
+TRAJECTORY, REWARD, DONE = ("collector", "traj_ids"), ("next", "reward"), ("next", "done")
 _MAX_RUNS = 4  # runs of one part in a batch, for each part, up to which they are read one after another
 
 
-def _name(key: NestedKey) -> str:
+def column_name(key: NestedKey) -> str:
+    """A column's name as one word."""
     return key if isinstance(key, str) else "/".join(key)
 
 
@@ -29,17 +32,19 @@ def _columns(parts: Sequence[TensorDictBase]) -> dict[NestedKey, list[Tensor]]:
         if part.batch_dims != 1:
             raise ValueError(f"parts[{number}] must have one batch dimension, got {tuple(part.batch_size)}")
         found = {key: part.get(key) for key in part.keys(True, True, is_leaf=is_leaf_nontensor)}
-        if number and (odd := sorted(map(_name, found.keys() ^ columns.keys()))):
+        if number and (odd := sorted(map(column_name, found.keys() ^ columns.keys()))):
             raise ValueError(f"parts[{number}] must have the columns of parts[0], they differ in {', '.join(odd)}")
         for key, leaf in found.items():
             if not isinstance(leaf, Tensor):
-                raise TypeError(f"parts[{number}]: column {_name(key)} must be a tensor, got {type(leaf).__name__}")
+                raise TypeError(
+                    f"parts[{number}]: column {column_name(key)} must be a tensor, got {type(leaf).__name__}"
+                )
             leaf = leaf.as_subclass(Tensor)  # the same memory; indexing a memory map's own class is slow
             before = columns.setdefault(key, [leaf])[0]
             if (leaf.shape[1:], leaf.dtype) != (before.shape[1:], before.dtype):
                 raise ValueError(
-                    f"parts[{number}]: column {_name(key)} must be {before.dtype} of shape {tuple(before.shape[1:])} "
-                    f"a row as in parts[0], got {leaf.dtype} of shape {tuple(leaf.shape[1:])}"
+                    f"parts[{number}]: column {column_name(key)} must be {before.dtype} of shape "
+                    f"{tuple(before.shape[1:])} a row as in parts[0], got {leaf.dtype} of shape {tuple(leaf.shape[1:])}"
                 )
             if number:
                 columns[key].append(leaf)
@@ -53,12 +58,21 @@ class JoinedStorage(Storage):
     its state is its length: whoever restores a buffer opens the same data again. A replay buffer over it wants
     ``collate_fn=lambda batch: batch``; :class:`LanguageWorldExperienceReplay` sees to that.
 
+    With ``n_steps``, what is under ``"next"`` is that of the row so many steps ahead, or of the trajectory's last where
+    that comes before: observation, done, terminated and truncated belong together. ``("next", "reward")`` is the
+    discounted sum on the way, and ``steps_to_next_obs``, (B,) int64, the number of steps, which TorchRL's value
+    estimators read. In memory that takes three numbers a row.
+
     Args:
         parts: P tensordicts of one batch dimension and the same columns (names, dtypes, shapes of a row).
         rows: for each part the rows to take, (n,) int64, or None for all; None for all of all.
+        n_steps: steps to ``("next", ...)``; 2 or more need the columns ("next", "reward"), (n, 1), ("next", "done") and
+            ("collector", "traj_ids").
+        gamma: the discount of the rewards on the way, in (0, 1]; the loss must have the same.
 
     Raises:
-        ValueError: no parts, columns that differ, not as many ``rows`` as parts.
+        ValueError: no parts, columns that differ, not as many ``rows`` as parts, ``n_steps`` without ``gamma`` or
+            without a column that it needs.
         IndexError: a row outside its part.
         TypeError: a column is no tensor.
         RuntimeError: at an attempt to write.
@@ -74,7 +88,15 @@ class JoinedStorage(Storage):
     Source: ``torchrl.data.StorageEnsemble``, which joins storages for samplers that name the storage with each index.
     """
 
-    def __init__(self, parts: Sequence[TensorDictBase], rows: Sequence[Tensor | None] | None = None) -> None:
+    def __init__(
+        self,
+        parts: Sequence[TensorDictBase],
+        rows: Sequence[Tensor | None] | None = None,
+        *,
+        n_steps: int = 1,
+        gamma: float | None = None,
+    ) -> None:
+        self.n_steps, self.gamma = check_n_steps(n_steps, gamma)
         if not parts:
             raise ValueError("parts must hold at least one tensordict, got none")
         chosen = [None] * len(parts) if rows is None else list(rows)
@@ -95,26 +117,57 @@ class JoinedStorage(Storage):
                 )
             taken.append(one.to(torch.int64) + start)
         self._rows = torch.cat(taken)
-        self.num_parts = len(parts)
+        self.num_joined, self.num_parts = len(self._rows), len(parts)
         self._batch_device = parts[0].device
         super().__init__(max_size=len(self._rows))
+        if self.n_steps > 1:
+            self._look_ahead()
+
+    def _look_ahead(self) -> None:
+        """Note where each row's steps end, and what they earn."""
+        if absent := [column_name(key) for key in (REWARD, DONE, TRAJECTORY) if key not in self._columns]:
+            raise ValueError(f"n_steps={self.n_steps} needs the columns {', '.join(absent)}, which parts do not have")
+        found = self._gather(self._rows, [REWARD, DONE, TRAJECTORY])
+        reward, trajectory = found[REWARD], found[TRAJECTORY].reshape(-1)
+        part = torch.bucketize(self._rows, self._ends, right=True)
+        end = found[DONE].reshape(-1).clone()
+        end[:-1] |= (trajectory[1:] != trajectory[:-1]) | (part[1:] != part[:-1]) | (self._rows.diff() != 1)
+        self._places = torch.arange(len(end))
+        self._last = last_rows(end, self.n_steps)
+        self._earned = sum_rewards(reward, self._last, self.gamma, self.n_steps)
+        self._ahead = self._last - self._places + 1
 
     def __len__(self) -> int:
-        return len(self._rows)
+        return self.num_joined
 
     def part(self) -> Tensor:
         """The number of the part that each row is from: (R,) int64, from 0."""
-        return torch.bucketize(self._rows, self._ends, right=True)
+        return torch.bucketize(self._rows[: len(self)], self._ends, right=True)
 
-    def column(self, key: NestedKey) -> Tensor:
-        """One column of all rows: (R, ...).
+    def column(self, key: NestedKey, index: Tensor | None = None) -> Tensor:
+        """One column of all rows, (R, ...), or of those at ``index``, (n,) int64.
 
         Raises:
             KeyError: there is no such column.
         """
-        if key not in self._columns:
-            raise KeyError(f"no column {_name(key)}; there are {', '.join(map(_name, self._columns))}")
-        return self._gather(self._rows, [key])[key]
+        if key not in self.keys():
+            raise KeyError(f"no column {column_name(key)}; there are {', '.join(map(column_name, self.keys()))}")
+        return self._read(torch.arange(len(self)) if index is None else index, [key])[key]
+
+    def keys(self) -> list[NestedKey]:
+        """The names of the columns."""
+        return [*self._columns, *([STEPS] if self.n_steps > 1 else [])]
+
+    def _read(self, index: Tensor, keys: Sequence[NestedKey]) -> dict[NestedKey, Tensor]:
+        """The columns of the rows at an index (n,) int64, a fresh tensor each."""
+        if self.n_steps == 1:
+            return self._gather(self._rows[index], keys)
+        ahead = [key for key in keys if key[0] == "next" and key != REWARD]
+        here = [key for key in keys if key not in (*ahead, REWARD, STEPS)]
+        found = self._gather(self._rows[index], here)
+        if ahead:
+            found |= self._gather(self._rows[self._last[index]], ahead)
+        return found | {key: own[index] for key, own in ((REWARD, self._earned), (STEPS, self._ahead)) if key in keys}
 
     def _gather(self, rows: Tensor, keys: Sequence[NestedKey]) -> dict[NestedKey, Tensor]:
         """The columns of rows counted over all parts, a fresh tensor each."""
@@ -145,8 +198,10 @@ class JoinedStorage(Storage):
 
     def get(self, index: Any) -> TensorDict:
         """The rows at an int, a slice, a list, a mask or a tensor of indices of any shape, as fresh tensors."""
-        rows = self._rows[index].contiguous()  # a slice with a step is not
-        found = self._gather(rows.reshape(-1), list(self._columns))
+        plain = self.n_steps == 1
+        rows = (self._rows if plain else self._places)[: len(self)][index].contiguous()  # a slice with a step is not
+        flat = rows.reshape(-1)
+        found = self._gather(flat, list(self._columns)) if plain else self._read(flat, self.keys())
         nested: dict[str, Any] = {}
         for key, leaf in found.items():
             *path, last = (key,) if isinstance(key, str) else key
@@ -174,12 +229,12 @@ class JoinedStorage(Storage):
 
     def state_dict(self) -> dict[str, Any]:
         """The number of rows; the rows themselves stay in their datasets."""
-        return {"length": len(self)}
+        return {"length": self.num_joined}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Check that a state is of as many rows."""
-        if type(length := state_dict.get("length")) is not int or length != len(self):
-            raise ValueError(f"state_dict must be of {len(self)} rows, got one of {short(length)}")
+        if type(length := state_dict.get("length")) is not int or length != self.num_joined:
+            raise ValueError(f"state_dict must be of {self.num_joined} rows, got one of {short(length)}")
 
     def dumps(self, path: Any) -> None:
         """Write the number of rows."""
@@ -190,5 +245,5 @@ class JoinedStorage(Storage):
         self.load_state_dict(read_json(Path(path) / "joined.json", "path: the storage's state"))
 
     def __repr__(self) -> str:
-        columns = ", ".join(map(_name, self._columns))
+        columns = ", ".join(map(column_name, self.keys()))
         return f"{type(self).__name__}({len(self)} rows of {self.num_parts} parts, columns {columns})"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from tensordict import NestedKey
 from torch import Tensor
 from torchrl.data.replay_buffers.storages import Storage
 
@@ -11,6 +12,9 @@ from lw_torchrl.data.group_sampler import GroupSampler, column, nearest_sizes
 
 class TaskBalancedSampler(GroupSampler):
     """Equal numbers from every task, exactly; within a task every row once before any comes again.
+
+    The buffer may grow: rows that come take random places in the passes under way, and what is overwritten leaves them;
+    a task that comes or goes begins all passes anew. No batch looks at more than the rows that came.
 
     It draws from the replay buffer's generator, so ``ReplayBuffer(..., generator=...)`` fixes the batches. State is
     saved and restored with the buffer's. An epoch is a pass over the largest task; each task has passes of its own.
@@ -34,15 +38,18 @@ class TaskBalancedSampler(GroupSampler):
     Source: paper section 'Cross-Task Co-Learning via 1:1 Data Mixing', its minibatches of equal numbers.
     """
 
-    def __init__(self, task_key: str = "task_id") -> None:
+    def __init__(self, task_key: NestedKey = "task_id") -> None:
         self.task_key = task_key
         super().__init__()
 
     def _label(self, storage: Storage) -> Tensor:
         return torch.unique(column(storage, self.task_key).reshape(-1), return_inverse=True)[1]
 
+    def _keys(self, storage: Storage, rows: Tensor) -> Tensor:
+        return column(storage, self.task_key, rows)
+
     def _shares(self, batch_size: int) -> Tensor:
-        groups = len(self._size)
+        groups = len(self._passes.size)
         count, rest = divmod(batch_size, groups)
         if rest or not count:
             raise ValueError(

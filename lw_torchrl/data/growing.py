@@ -1,0 +1,232 @@
+"""GrowingStorage: demonstrations as they are on disk, and behind them rows that come while learning."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from multiprocessing.context import get_spawning_popen
+from pathlib import Path
+from typing import Any, NoReturn
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+
+from lw_torchrl._checks import check_int
+from lw_torchrl._tensor_archive import TensorArchive, write_archive
+from lw_torchrl.data.collected import collected_rows
+from lw_torchrl.data.grown_state import check_grown
+from lw_torchrl.data.storage import DONE, REWARD, TRAJECTORY, JoinedStorage, column_name
+from lw_torchrl.data.trajectories import Open, follow, shared_keys
+
+Check = Callable[[Mapping[NestedKey, Tensor]], None]
+
+
+class GrowingStorage(JoinedStorage):
+    """A :class:`JoinedStorage` with a part that grows: a ring of rows, allocated once, whose oldest are overwritten.
+
+    The rows of the parts come first and stay; row i that was ever written is at ``num_joined + i % grow``. A replay
+    buffer over it wants a :class:`GrowingWriter` and ``collate_fn=lambda batch: batch``;
+    ``LanguageWorldExperienceReplay(..., grow=)`` sees to both.
+
+    Of a batch of any dimensions, the last of which is time, the columns of the parts are stored; see
+    :func:`collected_rows`. ``("collector", "traj_ids")`` is numbered anew, from one above the largest of the parts: a
+    trajectory keeps its number from batch to batch for as long as its newest row is here, and no other, of this
+    collector, another one or one after a restart, ever gets it. A row follows another if both have the collector's id,
+    the other is not done, and it is bit for bit what the other became.
+
+    Args:
+        parts, rows, n_steps, gamma: as for :class:`JoinedStorage`; ("collector", "traj_ids") and ("next", "done") are
+            needed. Rows get their n steps as those that follow them come; until then they look less far ahead.
+        grow: rows of the ring.
+        check: called with the columns of each batch before it is stored, and of a state; it raises what is wrong.
+
+    Attributes:
+        num_joined: rows of the parts.
+        grow: rows of the ring.
+        count: rows ever written.
+
+    Raises:
+        ValueError, IndexError, TypeError: as for :class:`JoinedStorage`. At writing: a batch of more rows than the
+            ring has, or what :func:`collected_rows` refuses.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import TensorDictReplayBuffer
+        >>> from lw_torchrl.data import GrowingWriter
+        >>> def rows(number, trajectory):
+        ...     time = torch.arange(number)
+        ...     after = {"time": time + 1, "done": (time == number - 1)[:, None]}
+        ...     ids = torch.full((number,), trajectory)
+        ...     found = {"time": time, "task_id": ids * 0, "collector": {"traj_ids": ids}, "next": after}
+        ...     return TensorDict(found, [number])
+        >>> replay = TensorDictReplayBuffer(
+        ...     storage=GrowingStorage([rows(6, 0)], grow=4),
+        ...     writer=GrowingWriter(),
+        ...     collate_fn=lambda batch: batch,
+        ... )
+        >>> for _ in range(2):
+        ...     _ = replay.extend(rows(3, 0))
+        >>> replay[:]["collector", "traj_ids"].tolist(), replay[6:]["time"].tolist()
+        ([0, 0, 0, 0, 0, 0, 2, 2, 1, 2], [1, 2, 2, 0])
+
+    Source: ``torchrl.data.OfflineToOnlineReplayBuffer``, which draws from two buffers.
+    """
+
+    def __init__(
+        self,
+        parts: Sequence[TensorDictBase],
+        rows: Sequence[Tensor | None] | None = None,
+        *,
+        grow: int,
+        n_steps: int = 1,
+        gamma: float | None = None,
+        check: Check | None = None,
+    ) -> None:
+        self.grow, self.count = check_int("grow", grow, minimum=1), 0
+        self._check = check
+        super().__init__(parts, rows, n_steps=n_steps, gamma=gamma)
+        if absent := [column_name(key) for key in (TRAJECTORY, DONE) if key not in self._columns]:
+            raise ValueError(f"grow={self.grow} needs the columns {', '.join(absent)}, which parts do not have")
+        if not shared_keys(self._columns):
+            raise ValueError("parts must have a column and its ('next', ...), by which it shows what follows what")
+        known = [int(leaf.max()) for leaf in self._columns[TRAJECTORY] if len(leaf)]
+        self._number, self._open = max(known, default=-1) + 1, Open.none()
+        joined = int(self._ends[-1])
+        self._ring = {
+            key: torch.empty((self.grow, *leaves[0].shape[1:]), dtype=leaves[0].dtype)
+            for key, leaves in self._columns.items()
+        }
+        for key, leaf in self._ring.items():
+            self._columns[key].append(leaf)
+        self._ends = torch.cat([self._ends, torch.tensor([joined + self.grow])])
+        self._rows = torch.cat([self._rows, torch.arange(joined, joined + self.grow)])
+        self.num_parts += 1
+        self.max_size = self.num_joined + self.grow
+        if self.n_steps > 1:
+            self._previous = torch.full((self.grow,), -1)
+            more = torch.arange(self.num_joined, self.max_size)
+            self._places, self._last = torch.arange(self.max_size), torch.cat([self._last, more])
+            self._earned = torch.cat([self._earned, self._earned.new_zeros(self.grow, 1)])
+            self._ahead = torch.cat([self._ahead, torch.ones_like(more)])
+
+    @property
+    def num_grown(self) -> int:
+        """The rows of the ring that are written."""
+        return min(self.count, self.grow)
+
+    def __len__(self) -> int:
+        return self.num_joined + self.num_grown
+
+    def extend(self, batch: TensorDictBase) -> Tensor:
+        """Write the rows of a batch; their places, int64 of the batch's shape."""
+        found = collected_rows(batch, self._ring)
+        number = len(found[DONE])
+        if not 0 < number <= self.grow:
+            raise ValueError(f"batch must have 1 to {self.grow} rows, as many as grow says, got {number}")
+        if self._check is not None:
+            self._check(found)
+        key, done = found[TRAJECTORY].reshape(-1), found[DONE].reshape(-1)
+        ring = self._ring, self._open.last % self.grow
+        previous, numbers, opened = follow(key, done, found, self._open, *ring, serial=self.count, number=self._number)
+        if (cut := len(numbers.unique()) - len(key.unique())) > number // 2:
+            warnings.warn(
+                f"batch: {cut} of {number} rows are not what the rows before them became, ('next', ...), though of the "
+                "same trajectory, which had not ended; each begins a trajectory. Are rows or steps left out?",
+                stacklevel=2,
+            )
+        found[TRAJECTORY] = numbers.view(found[TRAJECTORY].shape)
+        serial = torch.arange(self.count, self.count + number)
+        self._write(serial, found, previous)
+        here = opened.last >= self.count - self.grow
+        self._open = Open(opened.key[here], opened.number[here], opened.last[here])
+        self._number = max(self._number, int(numbers.max()) + 1)
+        return (self.num_joined + serial % self.grow).view(batch.shape)
+
+    def _read_only(self) -> NoReturn:
+        raise RuntimeError("rows of a storage that grows are written by a GrowingWriter alone, at the end of its ring")
+
+    def _write(self, serial: Tensor, found: Mapping[NestedKey, Tensor], previous: Tensor) -> None:
+        slot = serial % self.grow
+        for key, leaf in self._ring.items():
+            leaf[slot] = found[key].to(leaf.device)
+        self.count = int(serial[-1]) + 1
+        if self.n_steps > 1:
+            self._look_back(serial, found[REWARD], previous)
+        self._set_last_cursor(self.num_joined + int(slot[-1]))
+        self._bump_mutation_revision()
+
+    def _look_back(self, serial: Tensor, reward: Tensor, previous: Tensor) -> None:
+        """Let the rows before new ones look ahead to them."""
+        slot = serial % self.grow
+        place = self.num_joined + slot
+        self._previous[slot] = previous
+        self._last[place], self._earned[place], self._ahead[place] = place, reward, 1
+        behind, oldest = previous, max(0, self.count - self.grow)
+        for step in range(1, self.n_steps):
+            here = behind >= oldest
+            behind, reward, place = behind[here], reward[here], place[here]
+            earlier = self.num_joined + behind % self.grow
+            self._earned[earlier] += self.gamma**step * reward
+            self._last[earlier], self._ahead[earlier] = place, step + 1
+            behind = self._previous[behind % self.grow]
+
+    def _empty(self) -> None:  # type: ignore[override]
+        """Forget the rows of the ring; numbers of trajectories go on."""
+        self.count, self._open = 0, Open.none()
+        self._set_last_cursor(None)
+        self._bump_mutation_revision()
+
+    def state_dict(self) -> dict[str, Any]:
+        """The rows of the ring, the oldest first, and which of their trajectories may go on."""
+        slot = torch.arange(self.count - self.num_grown, self.count) % self.grow
+        return {
+            **super().state_dict(),
+            "grow": self.grow,
+            "count": self.count,
+            "number": self._number,
+            "open": {"key": self._open.key, "number": self._open.number, "last": self._open.last},
+            "rows": {column_name(key): leaf[slot] for key, leaf in self._ring.items()},
+        }
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore what :meth:`state_dict` gave.
+
+        Raises:
+            ValueError: it is none, or that of other columns, of another ``grow``, or of other demonstrations.
+        """
+        super().load_state_dict(state_dict)
+        count, number, rows, opened = check_grown(state_dict, self.grow, self._ring)
+        if self._check is not None and count:
+            self._check(rows)
+        self._empty()
+        self.count, self._number, self._open = count, max(number, self._number), opened
+        if not count:
+            return
+        serial = torch.arange(count - self.num_grown, count)
+        trajectory = rows[TRAJECTORY].reshape(-1)
+        order = trajectory.argsort(stable=True)
+        going = (trajectory[order[1:]] == trajectory[order[:-1]]).nonzero().flatten()
+        previous = torch.full_like(serial, -1)
+        previous[order[going + 1]] = serial[order[going]]
+        self._write(serial, rows, previous)
+
+    def dumps(self, path: Any) -> None:
+        """Write the state to a folder, as one file that is there whole or not at all."""
+        state = self.state_dict()
+        rows, opened = state.pop("rows"), state.pop("open")
+        Path(path).mkdir(parents=True, exist_ok=True)
+        write_archive(Path(path) / "grown.zip", state, {"rows": rows, "open": opened})
+
+    def loads(self, path: Any) -> None:
+        """Read what :meth:`dumps` wrote."""
+        archive = TensorArchive(Path(path) / "grown.zip")
+        self.load_state_dict({**archive.description, "rows": archive.tensors("rows"), "open": archive.tensors("open")})
+
+    def __getstate__(self) -> dict[str, Any]:
+        if get_spawning_popen() is not None:
+            raise RuntimeError(
+                "a buffer that grows is of one process, others would write to a copy: let the collector yield its "
+                "batches, and extend the buffer with them here"
+            )
+        return super().__getstate__()

@@ -1,0 +1,148 @@
+"""Passes over groups of rows, kept up as rows come and go."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def spans(first: Tensor, count: Tensor) -> Tensor:
+    """``count[g]`` places from ``first[g]`` on, group after group: (count.sum(),) int64."""
+    group = torch.repeat_interleave(count)
+    return torch.arange(len(group)) + (first - count.cumsum(0) + count)[group]
+
+
+def _without(some: Tensor, others: Tensor) -> Tensor:
+    return some[~torch.isin(some, others)]
+
+
+def choose(first: Tensor, size: Tensor, count: Tensor, generator: torch.Generator | None) -> Tensor:
+    """``count[g]`` different places of the ``size[g]`` from ``first[g]`` on, each choice as likely, sorted.
+
+    The work is of the order of ``count``, however large ``size`` is.
+    """
+    few = 2 * count <= size
+    wanted = torch.where(few, count, size - count)  # of the others, those that are not chosen are fewer
+    found, missing = wanted.new_empty(0), wanted
+    while missing.any():
+        group = torch.repeat_interleave(missing)
+        drawn = torch.rand(len(group), dtype=torch.float64, generator=generator) * size[group]
+        found = torch.cat([found, first[group] + drawn.long()]).unique()
+        group = torch.searchsorted(first, found, right=True) - 1
+        missing = wanted - group.bincount(minlength=len(size))
+    if few.all():
+        return found
+    whole = spans(first, torch.where(few, 0, size))
+    chosen = few[torch.searchsorted(first, found, right=True) - 1]
+    return torch.cat([found[chosen], _without(whole, found)]).sort().values
+
+
+class Passes:
+    """The rows of each group in the order of its pass: those that were drawn, then those that are to come.
+
+    The rows to come are in random order. A row that comes takes a random place among those to come, a row that goes
+    leaves no gap; neither looks at the other rows.
+
+    Args:
+        order: rows group after group.
+        size: rows of each group, (G,) int64, at least 1.
+        cursor: rows of each group that were drawn in this pass, (G,) int64; none by default.
+    """
+
+    def __init__(self, order: Tensor, size: Tensor, cursor: Tensor | None = None) -> None:
+        self.order, self.size = order, size
+        self.start = size.cumsum(0) - size
+        self.cursor = torch.zeros_like(size) if cursor is None else cursor
+        self._room = size
+        self._place: Tensor | None = None  # of each row in the order, -1 for none; made when rows come or go
+
+    def shuffle(self, group: int, generator: torch.Generator | None) -> None:
+        """Begin a pass of a group."""
+        start, size = int(self.start[group]), int(self.size[group])
+        rows = self.order[start : start + size]
+        self.order[start : start + size] = rows[torch.randperm(size, generator=generator)]
+        self.cursor[group] = 0
+        if self._place is not None:
+            self._place[self.order[start : start + size]] = torch.arange(start, start + size)
+
+    def take(self, group: int, count: int, generator: torch.Generator | None) -> tuple[Tensor, bool]:
+        """``count`` rows of a group, over the end of its pass, and whether a pass ended."""
+        taken, ended = [], False
+        start, size = int(self.start[group]), int(self.size[group])
+        while count:
+            cursor = int(self.cursor[group])
+            found = self.order[start + cursor : start + min(size, cursor + count)].clone()
+            taken.append(found)
+            self.cursor[group] += len(found)
+            count -= len(found)
+            if self.cursor[group] == size:
+                ended = True
+                self.shuffle(group, generator)
+        return torch.cat(taken), ended
+
+    def compact(self) -> Tensor:
+        """The rows group after group, without what is kept free between them."""
+        return self.order[spans(self.start, self.size)]
+
+    def exchange(self, rows: Tensor, label: Tensor, generator: torch.Generator | None) -> None:
+        """Let rows go, where they are, and come into their groups.
+
+        Args:
+            rows: (n,) int64, each once.
+            label: the group of each, (n,) int64.
+            generator: what the places are drawn from.
+        """
+        place = self._places(int(rows.max()) + 1)
+        at = place[rows]
+        place[rows] = -1
+        self._close(at[at >= 0].sort().values)
+        self._insert(rows, label, generator)
+        for group in ((self.cursor == self.size) & (self.size > 0)).nonzero().flatten().tolist():
+            self.shuffle(group, generator)
+
+    def _places(self, rows: int) -> Tensor:
+        if self._place is None or len(self._place) < rows:
+            self._place = torch.full((2 * max(rows, len(self.order)),), -1)
+            filled = spans(self.start, self.size)
+            self._place[self.order[filled]] = filled
+        return self._place
+
+    def _put(self, places: Tensor, rows: Tensor) -> None:
+        assert self._place is not None
+        self.order[places] = rows
+        self._place[rows] = places
+
+    def _close(self, holes: Tensor) -> None:
+        """Fill gaps among the rows that were drawn with others of these, then the rest with rows to come."""
+        group = torch.searchsorted(self.start, holes, right=True) - 1
+        drawn = holes < (self.start + self.cursor)[group]
+        gone = group[drawn].bincount(minlength=len(self.size))
+        self.cursor = self.cursor - gone
+        free = spans(self.start + self.cursor, gone)
+        self._put(_without(holes[drawn], free), self.order[_without(free, holes)])
+        gone = group.bincount(minlength=len(self.size))
+        self.size = self.size - gone
+        tail = spans(self.start + self.size, gone)
+        holes = torch.cat([free, holes[~drawn]]).sort().values
+        self._put(_without(holes, tail), self.order[_without(tail, holes)])
+
+    def _insert(self, rows: Tensor, label: Tensor, generator: torch.Generator | None) -> None:
+        mixed = torch.randperm(len(rows), generator=generator)
+        mixed = mixed[label[mixed].argsort(stable=True)]
+        count = label.bincount(minlength=len(self.size))
+        if (self.size + count > self._room).any():
+            self._enlarge(2 * (self.size + count))
+        end = spans(self.start + self.size, count)
+        self._put(end, rows[mixed])
+        self.size = self.size + count
+        chosen = choose(self.start + self.cursor, self.size - self.cursor, count, generator)
+        to, back = _without(chosen, end), _without(end, chosen)
+        come, go = self.order[back], self.order[to]
+        self._put(to, come)
+        self._put(back, go)
+
+    def _enlarge(self, room: Tensor) -> None:
+        rows = self.compact()
+        self._room, self.start = room, room.cumsum(0) - room
+        self.order = torch.zeros(int(room.sum()), dtype=torch.int64)
+        self._put(spans(self.start, self.size), rows)

@@ -1,0 +1,49 @@
+"""What a replay buffer of demonstrations refuses, since it would go wrong without a word."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from tensordict import NestedKey
+from torch import Tensor
+from torchrl.data.replay_buffers.samplers import SliceSampler
+from torchrl.envs import Compose, MultiStepTransform
+
+
+def check_transform(transform: Any) -> None:
+    """Raise for a transform that would do nothing to demonstrations, and say nothing."""
+    if isinstance(transform, MultiStepTransform):
+        raise ValueError(
+            "MultiStepTransform acts on rows as they are written, and demonstrations are not: leave it out and give "
+            f"n_steps={transform.n_steps}, gamma={transform.gamma}, which makes n steps of all rows"
+        )
+    for part in transform if isinstance(transform, Compose) else ():
+        check_transform(part)
+
+
+def check_growing(sampler: Any, options: Mapping[str, Any]) -> None:
+    """Raise for what a buffer that grows cannot do, or would do wrong without a word."""
+    if options.get("prefetch"):
+        raise ValueError(f"prefetch={options['prefetch']} draws batches before the newest rows come: leave it out")
+    if options.get("shared"):
+        raise ValueError("shared=True: a buffer that grows is of one process")
+    if isinstance(sampler, SliceSampler) and not sampler._fetch_traj:
+        raise ValueError(
+            "sampler: a SliceSampler by end_key joins trajectories that a collector cut without an end; take "
+            "traj_key=('collector', 'traj_ids')"
+        )
+
+
+def check_reward(reward: str, rows: Mapping[NestedKey, Tensor]) -> None:
+    """Raise where rows have another reward than the demonstrations that they are to stand beside."""
+    found, success = rows["next", "reward"], rows["next", "success"].to(torch.float32)
+    sparse = torch.equal(found, success)
+    if reward == "sparse" and not sparse:
+        raise ValueError(
+            "batch: the reward is not the success, as the demonstrations' is; give reward='dense' for a dense one, "
+            "make the environment with frame_skip=1, and scale rewards by a transform of the buffer, not its own"
+        )
+    if reward == "dense" and sparse and success.any():
+        raise ValueError("batch: the reward is the success, but the demonstrations' is dense; give reward='sparse'")
