@@ -1,4 +1,5 @@
-"""Minibatches in exact proportions: equal numbers from every task; a target's demonstration beside the base tasks."""
+"""Minibatches in exact proportions: equal numbers from every task; a target's demonstration beside the base tasks; rows
+that come beside demonstrations."""
 
 from __future__ import annotations
 
@@ -6,11 +7,19 @@ from collections.abc import Callable, Mapping
 
 import torch
 from tensordict import TensorDict
-from torchrl.data import ReplayBufferEnsemble, TensorDictReplayBuffer, TensorStorage
+from torchrl.data import (
+    LazyTensorStorage,
+    OfflineToOnlineReplayBuffer,
+    RandomSampler,
+    ReplayBuffer,
+    ReplayBufferEnsemble,
+    TensorDictReplayBuffer,
+    TensorStorage,
+)
 
 import lw_torchrl as lw
 from benchmarks.report import Row, Settings, compare, take_turns
-from lw_torchrl.data import JoinedStorage
+from lw_torchrl.data import GrowingStorage, GrowingWriter, JoinedStorage
 
 TASKS, BATCH, CALLS = 50, 200, 20
 TARGET = "coffee-push"
@@ -109,7 +118,105 @@ def _co_learning(settings: Settings, count: int) -> list[Row]:
     return _compare(name, draws, settings.pick(30, 3), rival, targets=True)
 
 
+class _Regrouping(lw.TaskBalancedSampler):
+    """The same sampler, that groups all rows again whenever one came."""
+
+    def add(self, index: object) -> None:
+        self._empty()
+
+    extend = add
+
+
+def _trajectories(count: int, task: torch.Tensor, first: int) -> TensorDict:
+    """Rows with all that a collector gives, each trajectory of 500."""
+    rows = _rows(count, task)
+    time = torch.arange(first, first + count)
+    rows["observation"] = (time % 2**20).float()[:, None].repeat(1, 39)
+    after = {"observation": rows["observation"].clone(), "task_id": task.clone()}
+    after["observation"] += 1
+    ends = (time % 500 == 499)[:, None]
+    flags = {"done": ends, "terminated": torch.zeros_like(ends), "truncated": ends.clone()}
+    rows["collector"] = TensorDict({"traj_ids": time // 500}, [count])
+    rows["next"] = TensorDict({**after, "reward": torch.rand(count, 1), **flags}, [count])
+    return rows
+
+
+def _growing(settings: Settings, count: int) -> list[Row]:
+    """100 rows come, then a batch of 200 is drawn: by task, and 1:1 with demonstrations."""
+    task = torch.arange(count) % TASKS
+    rows, come = _rows(count, task), 100
+    batch = _rows(come, torch.arange(come) % TASKS)
+
+    def balanced(sampler: object) -> Callable[[], object]:
+        replay = TensorDictReplayBuffer(
+            storage=LazyTensorStorage(count + count // 2), sampler=sampler, batch_size=BATCH
+        )
+        replay.extend(rows.clone())
+        replay.sample()
+
+        def turn() -> None:
+            replay.extend(batch.clone())
+            replay.sample()
+
+        return turn
+
+    rounds = settings.pick(15, 3)
+    regrouped = _Regrouping()
+    draws = {
+        "ours": balanced(lw.TaskBalancedSampler()),
+        "again": balanced(regrouped),
+        "random": balanced(RandomSampler()),
+    }
+    found = take_turns(draws, rounds, warm_up=3)
+    name = f"TaskBalancedSampler, {come} rows come and {BATCH} of {count:,} are drawn"
+    unit = {"unit": "µs", "scale": 1e6}
+    result = [
+        compare(name, found["ours"], "all rows grouped again", found["again"], **unit),  # type: ignore[arg-type]
+        compare(
+            name,
+            found["ours"],
+            "RandomSampler",
+            found["random"],
+            note="no exact numbers; both write the rows first",
+            **unit,  # type: ignore[arg-type]
+        ),
+    ]
+
+    grown = count
+    base = _trajectories(count // 10, torch.arange(count // 10) * 10 // (count // 10), 0)
+    first = _trajectories(grown, torch.zeros(grown, dtype=torch.int64), 10**6)
+    ring = TensorDictReplayBuffer(
+        storage=GrowingStorage([base], grow=grown),
+        writer=GrowingWriter(),
+        sampler=lw.CoLearningSampler("grown"),
+        batch_size=BATCH,
+        collate_fn=lambda batch: batch,
+    )
+    theirs = OfflineToOnlineReplayBuffer(
+        ReplayBuffer(storage=TensorStorage(base), batch_size=BATCH // 2), online_capacity=grown, batch_size=BATCH
+    )
+    for buffer in (ring, theirs):
+        buffer.extend(first.clone())
+
+    def mixed(buffer: TensorDictReplayBuffer | OfflineToOnlineReplayBuffer) -> Callable[[], object]:
+        batches = iter(first.split(come))
+
+        def turn() -> None:
+            buffer.extend(next(batches).clone())
+            buffer.sample()
+
+        return turn
+
+    found = take_turns({"ours": mixed(ring), "theirs": mixed(theirs)}, settings.pick(200, 3), warm_up=1)
+    name = f"CoLearningSampler('grown'), {come} rows come and {BATCH} of {grown + count // 10:,} are drawn"
+    note = "no equal numbers of tasks, no trajectories told apart, no saved state"
+    result.append(
+        compare(name, found["ours"], "OfflineToOnlineReplayBuffer", found["theirs"], note=note, **unit)  # type: ignore[arg-type]
+    )
+    return result
+
+
 def samplers(settings: Settings) -> list[Row]:
-    """A batch of 200 out of 500 000 rows through a replay buffer, against TorchRL's ensemble and a bare gather."""
+    """A batch of 200 out of 500 000 rows, against TorchRL's own, a bare gather, and grouping all rows again."""
     count = settings.pick(500_000, 5_000)
-    return [*_balanced(settings, count), *_co_learning(settings, count)]
+    return [*_balanced(settings, count), *_co_learning(settings, count), *_growing(settings, count)]

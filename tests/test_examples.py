@@ -67,6 +67,14 @@ def test_ppo_runs(tmp_path):
     assert "window-open" in done.stdout
 
 
+def test_co_learning_runs_on_ones_own_data(tmp_path):
+    done = run("co_learning.py", tmp_path, "--steps", 20, "--demonstrations", 1, "--episodes", 1)
+    assert "the target's rows 50" in done.stdout
+    for task in ("window-open", "drawer-open", "door-open"):
+        assert any(line.startswith(f"{task} ") for line in done.stdout.splitlines()), "the table"
+    assert not list(tmp_path.iterdir()), "it leaves nothing behind"
+
+
 def test_a_policy_is_exported(tmp_path):
     lw.save_actor(lw.PlanConditionedActor(lw.load_plans("MT10"), width=16), tmp_path / "policy.zip")
     done = run("export_policy.py", tmp_path, "policy.zip", "policy.pt2")

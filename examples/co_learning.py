@@ -1,0 +1,76 @@
+"""Co-learning on your own data: your demonstration of a target 1:1 beside demonstrations of base tasks.
+
+python examples/co_learning.py            # window-open beside two base tasks, about two minutes
+python examples/co_learning.py --steps 20 # only to see it run
+"""
+
+import argparse
+import tempfile
+import warnings
+
+import torch
+from tensordict import TensorDict
+from torchrl.data import TensorDictReplayBuffer
+from torchrl.objectives import BCLoss
+
+import lw_torchrl as lw
+from lw_torchrl.data import JoinedStorage
+
+BASE, TARGET = ["drawer-open", "door-open"], "window-open"
+
+
+def my_demonstration() -> TensorDict:
+    """Your own rows go here: what was seen and what was done, (T, 39) and (T, 4), from a robot, a person, a file."""
+    env = lw.LanguageWorldEnv(TARGET, seed=7)
+    rollout = env.rollout(100, lw.ExpertActor(TARGET))[0]
+    env.close()
+    return TensorDict(
+        {
+            "observation": rollout["observation"],
+            "action": rollout["action"].clamp(-1, 1),
+            "task_id": torch.full((len(rollout),), lw.task_id(TARGET)),
+        },
+        [len(rollout)],
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--steps", type=int, default=1000)
+    parser.add_argument("--demonstrations", type=int, default=5, help="of each base task")
+    parser.add_argument("--episodes", type=int, default=5)
+    args = parser.parse_args()
+    torch.manual_seed(0)
+    plans = lw.load_plans("MT10")
+
+    with tempfile.TemporaryDirectory() as root:
+        lw.collect_demonstrations(BASE, episodes_per_task=args.demonstrations, root=root, noise_scale=[0.0, 0.2])
+        mine = my_demonstration()
+        base = lw.LanguageWorldExperienceReplay(root, after_success=20)[:].select(*mine.keys())
+        replay = TensorDictReplayBuffer(
+            storage=JoinedStorage([base, mine]),
+            sampler=lw.CoLearningSampler(TARGET),
+            transform=lw.QAFTransform(plans),
+            batch_size=100,
+            collate_fn=lambda batch: batch,
+        )
+        actor = lw.PlanConditionedActor(plans)
+        weights = replay.sampler.row_weights(replay.storage)
+        actor.fit_normalization(replay[:]["observation"], weights)
+        warnings.filterwarnings("ignore", message=".*target_actor_network_params")  # BCLoss about itself
+        loss = BCLoss(actor, loss_function="l2")
+        optimizer = torch.optim.AdamW(loss.parameters(), lr=1e-3)
+        for step in range(args.steps):
+            batch = replay.sample()
+            value = loss(batch)["loss_bc"]
+            optimizer.zero_grad()
+            value.backward()
+            optimizer.step()
+            if step % 100 == 0:
+                print(f"step {step:5}  loss {value.item():.4f}  the target's rows {int(batch['is_target'].sum())}")
+
+    print(lw.evaluate(actor, tasks=[TARGET, *BASE], episodes_per_task=args.episodes, seed=1_000).table())
+
+
+if __name__ == "__main__":
+    main()
