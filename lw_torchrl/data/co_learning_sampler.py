@@ -13,6 +13,7 @@ from torch import Tensor
 from torchrl.data.replay_buffers.storages import Storage
 
 from lw_torchrl._checks import unknown_name
+from lw_torchrl.data.device_storage import beside
 from lw_torchrl.data.group_sampler import GroupSampler, column, nearest_sizes
 from lw_torchrl.data.growing import GrowingStorage
 from lw_torchrl.data.storage import JoinedStorage
@@ -196,7 +197,7 @@ class CoLearningSampler(GroupSampler):
         self._check_storage(storage)
         if not isinstance(storage, GrowingStorage):
             index, info = super().sample(storage, batch_size)
-            info["is_target"] = self._layout(batch_size)[1] == 0
+            info["is_target"] = beside(storage, self._layout(batch_size)[1] == 0)
             return index, info
         if not storage.num_grown:
             raise ValueError("target 'grown': nothing has come yet; extend the buffer before the first sample")

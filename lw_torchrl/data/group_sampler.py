@@ -12,19 +12,21 @@ from torch import Tensor
 from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.storages import Storage
 
+from lw_torchrl.data.device_storage import beside
 from lw_torchrl.data.passes import Passes
 from lw_torchrl.data.sampler_state import check_state, read_state
 from lw_torchrl.data.storage import JoinedStorage
 
 
 def column(storage: Storage, key: NestedKey, index: Tensor | None = None) -> Tensor:
-    """One column of all rows of a storage, or of those at an index; a joined one would otherwise copy all columns."""
+    """One column of all rows of a storage, or of those at an index, on the CPU; a joined one would otherwise copy all
+    columns."""
     if isinstance(storage, JoinedStorage):
-        return storage.column(key, index)
+        return storage.column(key, index).cpu()
     found = storage.get(slice(0, len(storage))).get(key, None)
     if found is None:
         raise KeyError(f"the storage has no column {key!r}, by which rows are to be grouped")
-    return found if index is None else found[index.to(found.device)]
+    return (found if index is None else found[index.to(found.device)]).cpu()
 
 
 def nearest_sizes(batch_size: int, unit: int) -> str:
@@ -150,7 +152,7 @@ class GroupSampler(Sampler):
                 rows, ended = passes.take(number, int(shares[number]), self._rng)
                 index[first[number] : first[number] + len(rows)] = rows
                 self._ran_out |= ended and bool(longest[number])
-        return index, {}
+        return beside(storage, index), {}
 
     def add(self, index: Any) -> None:
         """Note that rows were written, over old ones perhaps."""

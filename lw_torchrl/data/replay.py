@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
+import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import ImmutableDatasetWriter, TensorStorage
@@ -18,9 +19,11 @@ from torchrl.data.replay_buffers.writers import Writer
 from torchrl.envs import Transform
 
 from lw_torchrl._checks import check_choice, check_int
+from lw_torchrl._devices import CPU, check_device
 from lw_torchrl._state_tree import join, split
 from lw_torchrl._tensor_archive import ArchiveError, TensorArchive, write_archive
 from lw_torchrl.data.dataset import DATA, Demonstrations
+from lw_torchrl.data.device_storage import DeviceStorage
 from lw_torchrl.data.growing import GrowingStorage
 from lw_torchrl.data.growing_writer import GrowingWriter
 from lw_torchrl.data.metadata import read_metadata
@@ -83,6 +86,8 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         grow: rows of a part that :meth:`extend` writes to, beside the demonstrations; see :class:`GrowingStorage`. The
             oldest are overwritten. Samples then hold the columns that a collector gives too: the expert's actions, and
             the other reward, are left out.
+        device: where the rows are kept and transforms work: None or "cpu" for the files, memory-mapped; or "cuda",
+            "cuda:1", "mps" or "auto", into whose memory all rows are copied once. Minibatches are the same everywhere.
         **kwargs: for :class:`torchrl.data.TensorDictReplayBuffer`: generator, prefetch, pin_memory, ...
 
     Attributes:
@@ -123,6 +128,7 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         n_steps: int = 1,
         gamma: float | None = None,
         grow: int | None = None,
+        device: str | torch.device | None = None,
         **kwargs: Any,
     ) -> None:
         check_n_steps(n_steps, gamma)
@@ -137,6 +143,9 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
             check_int("batch_size", batch_size, minimum=1)
         if after_success is not None:
             check_int("after_success", after_success, minimum=0)
+        where = CPU if device is None else check_device("device", device)
+        if grow is not None and where != CPU:
+            raise ValueError("device: a buffer that grows is on the CPU; leave it out, and trainers move each minibatch")
         joined = not isinstance(root, (str, os.PathLike))
         self.roots = tuple(map(Path, root)) if joined else (Path(root),)  # type: ignore[arg-type]
         choices = _choices(episodes, len(self.roots), joined)
@@ -162,8 +171,9 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
             storage = GrowingStorage(
                 parts, kept, grow=grow, n_steps=n_steps, gamma=gamma, check=partial(check_reward, reward)
             )
-        elif several or n_steps > 1:
+        elif several or n_steps > 1 or where != CPU:
             storage = JoinedStorage(parts, kept, n_steps=n_steps, gamma=gamma)
+            storage = storage if where == CPU else DeviceStorage(storage, where)
         else:
             storage = TensorStorage(parts[0] if kept[0] is None else parts[0][kept[0]])  # the second is in memory
         if isinstance(storage, JoinedStorage):

@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 from lw_torchrl.language.plans import Plans
-from lw_torchrl.language.task_index import TaskIndex, readable
+from lw_torchrl.language.task_index import TaskIndex
+from lw_torchrl.language.value_checks import asserted, plain, readable
 
 
 class PlanTables:
@@ -55,14 +56,17 @@ class PlanTables:
         """
         if number is None:
             return
-        if torch.compiler.is_compiling():
-            own = self.number.to(number.device)[rows]
+        numbers = self.number
+        if number.device != numbers.device:
+            numbers = numbers.to(number.device)
+            if plain(number, rows):
+                self.number = numbers
+        if asserted(number, rows):
+            own = numbers[rows]
             torch._assert_async(((own == number) | (number == 0)).all(), "qaf answers other plans than the actor's")
         if not readable(number, rows):
             return
-        if number.device != self.number.device:
-            self.number = self.number.to(number.device)
-        own = self.number[rows]
+        own = numbers[rows]
         if not torch.equal(own, number) and (wrong := (own != number) & (number != 0)).any():
             tasks = ", ".join(self.index.tasks[row] for row in rows[wrong].unique().tolist()[:5])
             raise ValueError(

@@ -15,8 +15,9 @@ from lw_torchrl.language.observation import OBSERVATION_SIZE
 from lw_torchrl.language.queries import Query, check_query
 from lw_torchrl.language.query_facts import compile_facts
 from lw_torchrl.language.query_tables import QueryTables, compile_queries
-from lw_torchrl.language.task_index import TaskIndex, TaskTables, readable
+from lw_torchrl.language.task_index import TaskIndex, TaskTables
 from lw_torchrl.language.tasks import Task, get_task
+from lw_torchrl.language.value_checks import asserted, readable
 
 _LEAST, _MOST = 1e-6, 1e4  # of the size of a logit, and of metres where a length has a gradient
 _COMPILED = {torch.float32: np.float32, torch.float64: np.float64}
@@ -205,7 +206,7 @@ def _check_batch(observation: Tensor, task_id: Tensor) -> None:
 
 
 def _check_finite(observation: Tensor) -> None:
-    if torch.compiler.is_compiling():
+    if asserted(observation):
         torch._assert_async(observation.isfinite().all(), _NOT_FINITE)
     elif readable(observation) and not (
         math.isfinite(observation.sum().item()) or observation.isfinite().all()  # the sum is fast; it may overflow

@@ -7,25 +7,13 @@ from typing import Any, Generic, TypeVar
 
 import torch
 from torch import Tensor, nn
-from torch._C._functorch import is_functorch_wrapped_tensor
-from torch._subclasses.fake_tensor import FakeTensor
 
 from lw_torchrl.language.tasks import MT50, task_id
+from lw_torchrl.language.value_checks import asserted, plain, readable
 
 _Kind = tuple[torch.device, torch.dtype, bool]
 _KEPT_ROWS = 4096  # of the last batch, the most to keep the tables of
 Tables = TypeVar("Tables", bound=tuple[Tensor, ...])
-
-
-def readable(*tensors: Tensor) -> bool:
-    """Whether Python may look at the tensors' numbers, and keep them: not while something is compiled or exported, nor
-    inside a transform of ``torch.func``."""
-    if torch.compiler.is_compiling():
-        return False
-    for tensor in tensors:  # noqa: SIM110 - in every call, and a generator takes twice as long
-        if is_functorch_wrapped_tensor(tensor) or isinstance(tensor, FakeTensor):
-            return False
-    return True
 
 
 class TaskIndex:
@@ -76,27 +64,27 @@ class TaskIndex:
             (...) int64. Where an unknown id cannot be told, inside ``torch.vmap``, it gets a row beyond the last.
 
         Raises:
-            ValueError: another dtype, or an id that has no row; compiled, a RuntimeError when it is run.
+            ValueError: another dtype, or an id that has no row; compiled, or on a GPU, a RuntimeError when it is run.
         """
         if task_id.dtype not in (torch.int64, torch.int32):
             raise ValueError(f"task_id must be int64, got {task_id.dtype}")
-        known = readable(task_id)
+        kept = plain(task_id)
         ids = self._ids
         if ids.device != task_id.device:
             ids = ids.to(task_id.device)
-            if known:
+            if kept:
                 self._ids = ids
         given = task_id.long().contiguous()
-        if known or torch.compiler.is_compiling():
+        if kept or torch.compiler.is_compiling():
             rows = torch.searchsorted(ids[:-1], given)
         else:  # inside of vmap searchsorted warns of how the rows lie in memory
             rows = (given.unsqueeze(-1) > ids[:-1]).sum(-1)
         found = ids.index_select(0, rows.reshape(-1)).reshape(rows.shape)
-        if known:
+        if readable(task_id):
             if not torch.equal(found, given):
                 raise ValueError(f"task_id names {problem}: {self._name(given[found != given])}")
             return rows
-        if torch.compiler.is_compiling():
+        if asserted(task_id):
             torch._assert_async((found == given).all(), f"task_id names {problem}")
         return torch.where(found == given, rows, len(self.tasks))
 
@@ -145,18 +133,19 @@ class TaskTables(nn.Module, Generic[Tables]):
             ValueError: as for :meth:`TaskIndex.rows`.
         """
         device, dtype = observation.device, observation.dtype
-        if not readable(observation, task_id):
+        if not plain(observation, task_id):
             return self._pick(self._to(device, dtype), task_id)
         # Autograd refuses what was made in inference mode.
         kind = device, dtype, torch.is_inference_mode_enabled()
-        if self._last is not None:
+        looked_at = readable(task_id)
+        if self._last is not None and looked_at:
             ids, of, selected = self._last
             if of == kind and ids.device == task_id.device and torch.equal(ids, task_id):
                 return selected
         if kind not in self._moved:
             self._moved[kind] = self._to(device, dtype)
         selected = self._pick(self._moved[kind], task_id)
-        if len(task_id) <= _KEPT_ROWS:
+        if looked_at and len(task_id) <= _KEPT_ROWS:
             self._last = (task_id.clone(), kind, selected)
         return selected
 

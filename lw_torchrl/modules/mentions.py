@@ -23,7 +23,8 @@ from lw_torchrl.language.tasks import Task
 # The numbers of each thing that an observation tells of, now and a step before: two objects, with their quaternions,
 # and the goal, which has no past.
 _THINGS = (slice(FIRST.start, FIRST_QUATERNION.stop), slice(SECOND.start, SECOND_QUATERNION.stop))
-_PLACES = (*((*places(thing), *places(a_step_before(thing))) for thing in _THINGS), places(GOAL))
+_PARTS = (*((thing, a_step_before(thing)) for thing in _THINGS), (GOAL,))
+_PLACES = tuple({number for part in parts for number in places(part)} for parts in _PARTS)
 
 
 def _names(step: PlanStep, task: Task) -> set[str]:
@@ -44,7 +45,7 @@ def mentioned(plans: Plans, tables: PlanTables) -> Tensor:
         for number, step in enumerate(plan.steps):
             for name in _names(step, plan.definition):
                 for thing, place in enumerate(_PLACES):
-                    if set(place).intersection(plan.definition.object(name).position):
+                    if place.intersection(plan.definition.object(name).position):
                         table[tables.index.row(task), number, thing] = True
     return table
 
@@ -65,9 +66,9 @@ def swap_unmentioned(observation: Tensor, kept: Tensor, probability: float) -> T
     """
     rows, kept = observation.reshape(-1, observation.shape[-1]), kept.reshape(-1, len(_PLACES))
     swapped, number, device = rows.clone(), len(rows), observation.device
-    for thing, place in enumerate(_PLACES):
+    for thing, parts in enumerate(_PARTS):
         away = ~kept[:, thing] & (torch.rand(number, device=device) < probability)
-        other = torch.randint(number, (number,), device=device)
-        columns = torch.tensor(place, device=device)
-        swapped[:, columns] = torch.where(away.unsqueeze(-1), rows[other][:, columns], rows[:, columns])
+        others = rows[torch.randint(number, (number,), device=device)]
+        for part in parts:
+            swapped[:, part] = torch.where(away.unsqueeze(-1), others[:, part], rows[:, part])
     return swapped.reshape(observation.shape)

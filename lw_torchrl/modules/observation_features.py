@@ -11,7 +11,7 @@ from torchrl.objectives import add_random_module
 
 from lw_torchrl._checks import check_choice, check_scale
 from lw_torchrl.language.observation import HAND, OBSERVATION_SIZE, OPENING, POSITIONS
-from lw_torchrl.language.task_index import readable
+from lw_torchrl.language.value_checks import check_values
 
 Features = Literal["raw", "differences", "relative", "both"]
 _FINE, _COARSE = 0.02, 0.1  # metres: where the two squashed copies of each difference bend
@@ -77,10 +77,7 @@ class ObservationFeatures(nn.Module):
                 f"{tuple(observation.shape)}"
             )
         problem = "observation must hold finite numbers, got NaN or infinity"
-        if torch.compiler.is_compiling():
-            torch._assert_async(observation.isfinite().all(), problem)
-        elif readable(observation) and not observation.isfinite().all():
-            raise ValueError(problem)
+        check_values(lambda values: values.isfinite().all(), observation, problem)
         if self.kind == "raw":
             return observation
         if self.kind == "relative":

@@ -13,7 +13,7 @@ from torch import Tensor
 from lw_torchrl._keys import as_keys, check_apart, read
 from lw_torchrl.language.plan_tables import PlanTables
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
-from lw_torchrl.language.task_index import readable
+from lw_torchrl.language.value_checks import check_values
 from lw_torchrl.transforms.qaf import plan_number_key
 
 
@@ -29,8 +29,9 @@ def check_truth(qaf: Tensor, shape: tuple[int, ...]) -> None:
             f"qaf must have shape {shape}, one column for each step of the actor's plans, got {tuple(qaf.shape)}; give "
             "QAFTransform the same plans"
         )
-    if qaf.dtype != torch.bool and readable(qaf) and not ((qaf >= 0) & (qaf <= 1)).all():  # of bool, nothing to look at
-        raise ValueError("qaf must be bool, or numbers from 0 to 1 for soft truth, got others, or NaN")
+    if qaf.dtype != torch.bool:  # of bool, there is nothing to look at
+        problem = "qaf must be bool, or numbers from 0 to 1 for soft truth, got others, or NaN"
+        check_values(lambda truth: ((truth >= 0) & (truth <= 1)).all(), qaf, problem)
 
 
 class PlanAttention(TensorDictModuleBase):

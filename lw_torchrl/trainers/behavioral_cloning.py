@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torch.nn.utils import clip_grad_norm_
@@ -18,6 +19,7 @@ from torchrl.objectives import BCLoss
 from torchrl.record.loggers import Logger
 
 from lw_torchrl._checks import check_choice, check_int, check_scale
+from lw_torchrl._devices import CPU, drawn_on, place
 from lw_torchrl._files import sweep
 from lw_torchrl._progress import Progress
 from lw_torchrl.modules.policy import Policy, plans_of
@@ -25,7 +27,16 @@ from lw_torchrl.trainers.checkpoint import describe_data, describe_replay, write
 from lw_torchrl.trainers.interrupts import interrupts_between_steps
 from lw_torchrl.trainers.normalization import fit_normalization
 from lw_torchrl.trainers.policy_checks import check_can_be_saved, check_trained
-from lw_torchrl.trainers.training_state import TrainingState, check_description, load_state, load_training, state_of
+from lw_torchrl.trainers.recent_losses import READ_EVERY, RecentLosses
+from lw_torchrl.trainers.training_state import (
+    TrainingState,
+    check_description,
+    load_state,
+    load_training,
+    state_of,
+    warn_of_another_device,
+    where,
+)
 
 LOSSES = ("l1", "l2", "smooth_l1")
 
@@ -112,6 +123,12 @@ def check_batch_size(replay: TensorDictReplayBuffer, config: BehavioralCloningCo
         )
 
 
+def draw_batch(replay: TensorDictReplayBuffer, size: int, device: torch.device) -> TensorDictBase:
+    """A minibatch on the device; of a buffer whose rows are elsewhere, it goes over."""
+    batch = replay.sample(size)
+    return batch if device == CPU else batch.to(device, non_blocking=True)
+
+
 class BehavioralCloningTrainer:
     """Trains an actor to give the demonstrated actions.
 
@@ -126,6 +143,13 @@ class BehavioralCloningTrainer:
         checkpoint: a file to write checkpoints to. If it is there already, training carries on from it.
         logger: a TorchRL logger for the loss and the learning rate.
         progress: show a progress bar.
+        device: where to train: "cpu", "cuda", "cuda:1", "mps", or "auto" for the fastest that there is. The actor is
+            moved there, and stays; None for where it is. On a GPU no step waits for another: losses are read every 100
+            steps. Make the buffer with the same ``device``, or each minibatch has to go over.
+
+    Warns:
+        UserWarning: the checkpoint is of training on another kind of device: it goes on with the same minibatches, but
+            not bit for bit.
 
     Raises:
         ValueError: the checkpoint is damaged, of another architecture, configuration or data; the actor writes no
@@ -157,8 +181,10 @@ class BehavioralCloningTrainer:
         checkpoint: str | os.PathLike[str] | None = None,
         logger: Logger | None = None,
         progress: bool = True,
+        device: str | torch.device | None = None,
     ) -> None:
         self.actor, self.replay, self.logger, self.progress = actor, replay, logger, progress
+        self.device = place(actor, device)
         self.config = config = config or BehavioralCloningConfig()
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
         check_belongs(actor, replay)
@@ -177,9 +203,11 @@ class BehavioralCloningTrainer:
             warnings.filterwarnings("ignore", message=".*target_actor_network_params.*")
             self.loss = BCLoss(actor, loss_function=config.loss_function)
         self.optimizer, self.schedule = make_optimizer(self.loss.parameters(), config)
+        self._losses = RecentLosses(("the loss",), config.learning_rate)
         self.state = TrainingState(replay.sampler, generator)
         if self.checkpoint is not None and self._policy is not None and self.checkpoint.exists():
             check_description(self.checkpoint, self._described)
+            warn_of_another_device(self.checkpoint, self.device)
             found = load_training(self.checkpoint, self._policy, self._policy.state_dict(keep_vars=True))
             load_state(self.checkpoint, found, self.optimizer, self.schedule, [self.state], config.steps)
         elif config.normalize and isinstance(actor, Policy):
@@ -194,27 +222,25 @@ class BehavioralCloningTrainer:
         check_trained(dict(self.actor.named_parameters()), self.state.step)
         if self.checkpoint is not None and self._policy is not None:
             state = state_of(self.optimizer, self.schedule, [self.state])
-            write(self.checkpoint, self._described, self._policy, self._policy.state_dict(), state)
+            described = self._described | where(self.device)
+            write(self.checkpoint, described, self._policy, self._policy.state_dict(), state)
 
-    def step(self) -> float:
-        """Train on one minibatch and return its loss."""
-        with torch.random.fork_rng(devices=[]):  # what transforms and the actor draw hangs on the configuration's seed
-            torch.set_rng_state(self.state.torch_generator)
-            batch = self.replay.sample(self.config.batch_size)
+    def step(self) -> Tensor:
+        """Train on one minibatch and return its loss, () float32, on the device: nobody has waited for it."""
+        # What transforms and the actor draw hangs on the configuration's seed.
+        with drawn_on(self.device, self.state.torch_generator):
+            batch = draw_batch(self.replay, self.config.batch_size, self.device)
             loss = self.loss(batch)["loss_bc"]
             self.state.torch_generator = torch.get_rng_state()
-        if not loss.isfinite():
-            raise ValueError(
-                f"the loss is {loss.item()} at step {self.state.step}: the demonstrations hold NaN, or the learning "
-                f"rate {self.config.learning_rate} is too high"
-            )
+        if self.device == CPU:
+            self._losses.check(loss, self.state.step)
         self.optimizer.zero_grad()
         loss.backward()
         clip_grad_norm_(self.loss.parameters(), self.config.max_grad_norm)
         self.optimizer.step()
         self.schedule.step()
         self.state.step += 1
-        return loss.item()
+        return loss.detach()
 
     def train(self) -> float:
         """Train to the last step, from wherever training stands.
@@ -224,25 +250,31 @@ class BehavioralCloningTrainer:
         Returns:
             The mean loss over the last 100 steps made; NaN if there were none left to make.
         """
-        losses: list[float] = []
+        losses = self._losses
+        losses.clear()
         self.actor.train()
         every, total = self.config.checkpoint_every, self.config.steps
         bar = Progress("training", total, "step", initial=self.state.step, show=self.progress)
         with bar, interrupts_between_steps() as interrupt:
             while self.state.step < total and not interrupt.asked:
-                losses.append(self.step())
+                losses.add(self.step())
                 step = self.state.step
                 bar.update()
-                if step % 100 == 0 or step == total:
-                    mean = sum(losses[-100:]) / len(losses[-100:])
+                if step % READ_EVERY == 0 or step == total:
+                    mean = _mean(losses.read(step))
                     bar.note(loss=f"{mean:.4f}")
                     if self.logger is not None:
                         self.logger.log_scalar("train/loss", mean, step=step)
                         self.logger.log_scalar("train/learning_rate", self.schedule.get_last_lr()[0], step=step)
                 if step % every == 0 or step == total:
+                    losses.read(step)  # before anything is written of it
                     self.save()
             if interrupt.asked:
+                losses.read(self.state.step)
                 self.save()
         self.actor.eval()
-        recent = losses[-100:]
-        return sum(recent) / len(recent) if recent else float("nan")
+        return _mean(losses.read(self.state.step))
+
+
+def _mean(losses: Tensor) -> float:
+    return sum(losses.tolist()) / len(losses) if len(losses) else float("nan")

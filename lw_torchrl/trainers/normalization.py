@@ -50,7 +50,7 @@ def fit_normalization(target: nn.Module, replay: TensorDictReplayBuffer) -> None
     """
     weigh = getattr(replay.sampler, "row_weights", None)
     weights = None if weigh is None else weigh(replay.storage)
-    observation = replay.storage.get(slice(0, len(replay))).get("observation")
+    observation = replay.storage.get(slice(0, len(replay))).get("observation").cpu()  # the same sums on every device
     if isinstance(target, (Policy, Value)):
         target.fit_normalization(observation, weights)
         return

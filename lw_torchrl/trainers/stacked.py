@@ -16,6 +16,7 @@ from torch.func import functional_call, stack_module_state, vmap
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.objectives.utils import distance_loss
 
+from lw_torchrl._devices import CPU, drawn_on, place
 from lw_torchrl._files import sweep
 from lw_torchrl._progress import Progress
 from lw_torchrl.modules.policy import Policy
@@ -23,13 +24,23 @@ from lw_torchrl.trainers.behavioral_cloning import (
     BehavioralCloningConfig,
     check_batch_size,
     check_belongs,
+    draw_batch,
     make_optimizer,
 )
 from lw_torchrl.trainers.checkpoint import describe_data, describe_replay, write
 from lw_torchrl.trainers.interrupts import interrupts_between_steps
 from lw_torchrl.trainers.normalization import fit_normalization
 from lw_torchrl.trainers.policy_checks import check_can_be_saved, check_trained
-from lw_torchrl.trainers.training_state import TrainingState, check_description, load_state, load_training, state_of
+from lw_torchrl.trainers.recent_losses import READ_EVERY, RecentLosses
+from lw_torchrl.trainers.training_state import (
+    TrainingState,
+    check_description,
+    load_state,
+    load_training,
+    state_of,
+    warn_of_another_device,
+    where,
+)
 
 
 class _Act(nn.Module):
@@ -77,6 +88,7 @@ class StackedBehavioralCloning:
         config: how to train each; the i-th has the seed ``config.seed + i``.
         checkpoint: a file to write checkpoints to. If it is there already, training carries on from it.
         progress: show a progress bar.
+        device: where to train, as for :class:`BehavioralCloningTrainer`; None for where the first actor is.
 
     Raises:
         ValueError: not as many buffers as actors, one twice, or actors of different options; a checkpoint that is
@@ -108,6 +120,7 @@ class StackedBehavioralCloning:
         *,
         checkpoint: str | os.PathLike[str] | None = None,
         progress: bool = True,
+        device: str | torch.device | None = None,
     ) -> None:
         self.config = config = config or BehavioralCloningConfig()
         if not actors or len(replays) != len(actors):
@@ -117,6 +130,11 @@ class StackedBehavioralCloning:
         _check_actors(self.actors)
         if len({*map(id, replays)}) < len(replays) or len({id(one.sampler) for one in replays}) < len(replays):
             raise ValueError("replays must be different buffers, each with a sampler of its own")
+        self.device = place(self.actors[0], device)
+        for actor in self.actors[1:]:
+            actor.to(self.device)
+        of = [f"the loss of actor {number}" for number in range(len(self.actors))]
+        self._losses = RecentLosses(tuple(of), config.learning_rate)
         self._described: dict[str, Any] = {}
         if self.checkpoint is not None:
             sweep(self.checkpoint)
@@ -144,6 +162,7 @@ class StackedBehavioralCloning:
         self.optimizer, self.schedule = make_optimizer(list(self._parameters.values()), config)
         if self.checkpoint is not None and self.checkpoint.exists():
             check_description(self.checkpoint, self._described)
+            warn_of_another_device(self.checkpoint, self.device)
             found = load_training(self.checkpoint, self.actors[0], self._parameters)
             load_state(self.checkpoint, found, self.optimizer, self.schedule, self.states, config.steps)
 
@@ -165,7 +184,7 @@ class StackedBehavioralCloning:
         check_trained(self._parameters, self.steps)
         if self.checkpoint is not None:
             state = state_of(self.optimizer, self.schedule, self.states)
-            write(self.checkpoint, self._described, self.actors[0], self._parameters, state)
+            write(self.checkpoint, self._described | where(self.device), self.actors[0], self._parameters, state)
 
     @property
     def steps(self) -> int:
@@ -173,21 +192,19 @@ class StackedBehavioralCloning:
         return self.states[0].step
 
     def step(self) -> Tensor:
-        """Train every actor on one minibatch and return their losses, (M,) float32."""
+        """Train every actor on one minibatch and return their losses, (M,) float32, on the device."""
         prepared, targets = [], []
         for actor, replay, state in zip(self.actors, self.replays, self.states, strict=True):
-            with torch.random.fork_rng(devices=[]):
-                torch.set_rng_state(state.torch_generator)
-                batch = replay.sample(self.config.batch_size)
+            with drawn_on(self.device, state.torch_generator):
+                batch = draw_batch(replay, self.config.batch_size, self.device)
                 prepared.append(actor.prepare(batch))
                 state.torch_generator = torch.get_rng_state()
             targets.append(batch.get("action"))
         inputs = tuple(torch.stack(column) for column in zip(*prepared, strict=True))
         actions = self._act(self._parameters, self._buffers, inputs)
         losses = distance_loss(actions, torch.stack(targets), self.config.loss_function).flatten(1).mean(1)
-        if not losses.isfinite().all():
-            first = int((~losses.isfinite()).nonzero()[0])
-            raise ValueError(f"the loss of actor {first} is {losses[first].item()} at step {self.steps}")
+        if self.device == CPU:
+            self._losses.check(losses, self.steps)
         self.optimizer.zero_grad()
         losses.sum().backward()
         self._clip()
@@ -210,19 +227,25 @@ class StackedBehavioralCloning:
         Returns:
             (M,) float32, each actor's mean loss over the last 100 steps made; NaN if there were none left to make.
         """
-        recent = [torch.full((len(self.actors),), torch.nan)] * (self.steps == self.config.steps)
+        losses = self._losses
+        losses.clear()
         what = f"training {len(self.actors)} models"
         bar = Progress(what, self.config.steps, "step", initial=self.steps, show=self.progress)
         with bar, interrupts_between_steps() as interrupt:
             while self.steps < self.config.steps and not interrupt.asked:
-                recent = [*recent[-99:], self.step()]
+                losses.add(self.step())
                 bar.update()
-                if self.steps % self.config.checkpoint_every == 0 or self.steps == self.config.steps:
+                saves = self.steps % self.config.checkpoint_every == 0 or self.steps == self.config.steps
+                if saves or self.steps % READ_EVERY == 0:
+                    losses.read(self.steps)
+                if saves:
                     self.save()
             if interrupt.asked:
+                losses.read(self.steps)
                 self.save()
         self.write_back()
-        return torch.stack(recent).mean(0)
+        found = losses.read(self.steps)
+        return found.mean(0) if len(found) else torch.full((len(self.actors),), torch.nan)
 
     @torch.no_grad()
     def write_back(self) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lw_torchrl._checks import differences
+from lw_torchrl._checks import differences, shown
 from lw_torchrl._state_tree import check_like, check_optimizer_state, check_same, join
 from lw_torchrl.modules.policy import Policy
 from lw_torchrl.trainers.checkpoint import open_policy, read_description
@@ -80,6 +81,21 @@ def check_description(path: Path, ours: dict[str, Any]) -> None:
                 f"{', '.join(different[:8])}{', ...' * (len(different) > 8)}; choose another file, or delete it to "
                 "start again"
             )
+
+
+def where(device: torch.device) -> dict[str, str]:
+    """What a checkpoint says of the device that it was trained on; of the CPU, nothing."""
+    return {} if device.type == "cpu" else {"device": device.type}
+
+
+def warn_of_another_device(path: Path, device: torch.device) -> None:
+    """Warn that a training which was begun on another kind of device will not go on bit for bit."""
+    if (before := read_description(path).get("device", "cpu")) != device.type:
+        warnings.warn(
+            f"checkpoint: {str(path)!r} was trained on {shown(before)} and goes on on {device.type!r}: with the same "
+            "minibatches, but sums are rounded, and noise is drawn, in another way",
+            stacklevel=3,
+        )
 
 
 def load_training(path: str | os.PathLike[str], actor: Policy, weights: Mapping[str, Tensor]) -> dict[str, Any]:

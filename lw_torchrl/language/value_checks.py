@@ -1,0 +1,48 @@
+"""Checks of tensors' values: at once where Python may look at the numbers, by the device itself where it may not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+from torch._C._functorch import is_functorch_wrapped_tensor
+from torch._subclasses.fake_tensor import FakeTensor
+
+
+def plain(*tensors: Tensor) -> bool:
+    """Whether the tensors are numbers that can be kept: not while something is compiled or exported, nor inside a
+    transform of ``torch.func``."""
+    if torch.compiler.is_compiling():
+        return False
+    for tensor in tensors:  # noqa: SIM110 - in every call, and a generator takes twice as long
+        if is_functorch_wrapped_tensor(tensor) or isinstance(tensor, FakeTensor):
+            return False
+    return True
+
+
+def _waits(*tensors: Tensor) -> bool:
+    for tensor in tensors:  # noqa: SIM110 - as above
+        if tensor.is_cuda:
+            return True
+    return False
+
+
+def readable(*tensors: Tensor) -> bool:
+    """Whether Python may look at the tensors' numbers: :func:`plain` ones, and none on a GPU, for which it would have
+    to wait."""
+    return plain(*tensors) and not _waits(*tensors)
+
+
+def asserted(*tensors: Tensor) -> bool:
+    """Whether what must hold of the tensors is left to ``torch._assert_async``: compiled, and on a GPU, where it stops
+    the program later, and nobody waits."""
+    return torch.compiler.is_compiling() or (_waits(*tensors) and plain(*tensors))
+
+
+def check_values(holds: Callable[[Tensor], Tensor], tensor: Tensor, problem: str) -> None:
+    """Raise :class:`ValueError` unless ``holds(tensor)``, () bool; compiled or on a GPU, a RuntimeError later."""
+    if asserted(tensor):
+        torch._assert_async(holds(tensor), problem)
+    elif readable(tensor) and not holds(tensor):
+        raise ValueError(problem)
