@@ -19,11 +19,11 @@ def check_device(argument: str, given: Any) -> torch.device:
 
     Args:
         argument: its name, for errors.
-        given: "cpu", "cuda", "cuda:1", "mps", or "auto" for the first that there is of "cuda", "mps" and "cpu"; or a
-            :class:`torch.device`.
+        given: "cpu", "cuda", "cuda:1", "mps" or another kind that PyTorch knows, "auto" for the accelerator of this
+            machine, or the CPU where it has none; or a :class:`torch.device`.
 
     Raises:
-        ValueError: it is none of these, or not in this machine.
+        ValueError: it is no device, or not in this machine.
         TypeError: it is neither a name nor a device.
 
     Example:
@@ -32,33 +32,31 @@ def check_device(argument: str, given: Any) -> torch.device:
     """
     if not isinstance(given, (str, torch.device)):
         raise TypeError(f"{argument} must be a device's name, got {shown(given)}")
-    there = ["cpu", *_of_cuda(), *(["mps"] if torch.backends.mps.is_available() else [])]
-    if str(given) == "auto":
-        return check_device(argument, next((name for name in ("cuda", "mps") if name in there), "cpu"))
+    there = _there()
+    if given == "auto":
+        given = there[1] if len(there) > 1 else "cpu"
     try:
         device = torch.device(given)
     except RuntimeError:
         raise unknown_name(argument, given, _NAMES) from None
-    if device.type not in ("cpu", "cuda", "mps"):
-        raise unknown_name(argument, str(device), _NAMES)
     if device.type == "cpu":
         return CPU
-    if str(device) not in (*there, "mps:0" if "mps" in there else ""):
-        lack = {
-            "cuda": "this build of PyTorch has no CUDA" if torch.version.cuda is None else "this machine has no CUDA",
-            "mps": "this machine has no MPS",
-        }[device.type]
+    if str(device) not in there:
+        of = device.type.upper()
+        lack = "" if device.type in there else f": this machine, or this build of PyTorch, has no {of}"
         raise ValueError(
-            f"{argument} must be one of {', '.join(map(repr, [*there, 'auto']))} here, got {str(device)!r}"
-            + ("" if device.type in there else f": {lack}")
+            f"{argument} must be one of {', '.join(map(repr, [*there, 'auto']))} here, got {str(device)!r}{lack}"
         )
     return torch.empty(0, device=device).device
 
 
-def _of_cuda() -> list[str]:
-    if not torch.cuda.is_available():
-        return []
-    return ["cuda", *(f"cuda:{number}" for number in range(torch.cuda.device_count()))]
+def _there() -> list[str]:
+    """The names of this machine's devices."""
+    accelerator = torch.accelerator.current_accelerator(check_available=True)
+    if accelerator is None:
+        return ["cpu"]
+    kind = accelerator.type
+    return ["cpu", kind, *(f"{kind}:{number}" for number in range(torch.accelerator.device_count()))]
 
 
 def device_of(module: Any) -> torch.device:
@@ -76,12 +74,13 @@ def device_of(module: Any) -> torch.device:
     return CPU
 
 
-def place(module: torch.nn.Module, device: str | torch.device | None) -> torch.device:
-    """Move a module to a device; with None it stays. Returns where it is."""
+def place(module: Any, device: str | torch.device | None) -> torch.device:
+    """Move a module to a device, where it stays; with None it stays where it is. Returns where that is."""
     if device is None:
         return device_of(module)
     found = check_device("device", device)
-    module.to(found)
+    if isinstance(module, torch.nn.Module):
+        module.to(found)
     return found
 
 
@@ -99,8 +98,7 @@ def drawn_on(device: torch.device, state: torch.Tensor) -> Iterator[None]:
     with torch.random.fork_rng(devices=[device], device_type=device.type):
         torch.set_rng_state(state)
         seed = int(torch.randint(2**62, ()))
-        if device.type == "cuda":
-            torch.cuda.default_generators[device.index].manual_seed(seed)
-        else:
-            torch.get_device_module(device.type).manual_seed(seed)
+        module = torch.get_device_module(device.type)
+        generators = getattr(module, "default_generators", None)  # one for each; manual_seed is of the current one
+        (module if generators is None else generators[device.index]).manual_seed(seed)
         yield

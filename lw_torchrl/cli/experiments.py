@@ -35,6 +35,7 @@ def reproduce(
     episodes: int = 20,
     launcher: Literal["local", "ray"] = "local",
     jobs: int = 1,
+    device: str = "cpu",
     run: str | None = None,
     list: bool = False,
     out: Path = Path("runs/reproduce"),
@@ -62,6 +63,9 @@ def reproduce(
         episodes: evaluated for each task, on seeds that no training used, action noise 0.1.
         launcher: local, on this machine; ray, on a Ray cluster, or on all cores of this machine.
         jobs: runs run at a time by the launcher local.
+        device: where the networks work: cpu; cuda, or cuda:1 for the second of several; mps, a Mac's; or auto, the GPU
+            where there is one. It is no part of what a run is: one that was begun elsewhere is
+            finished here.
         run: run this one alone, such as few-shot/strong/pcbc/seed0.
         list: print the names of the runs and do nothing.
         out: where everything goes; on a cluster, a folder that all its machines share.
@@ -71,6 +75,7 @@ def reproduce(
     elif run is not None:
         raise ValueError("--list names the runs and does none, --run does one: give one of them")
     from lw_torchrl._checks import check_choice, check_int
+    from lw_torchrl._devices import check_device
     from lw_torchrl.cli.threads import use_one_thread
     from lw_torchrl.experiments.execution import execute_run
     from lw_torchrl.experiments.recipes import PRESETS, SETTINGS
@@ -78,6 +83,8 @@ def reproduce(
     from lw_torchrl.modules.policy import METHODS
 
     check_int("jobs", jobs, minimum=1)
+    if launcher == "ray" and device != "cpu":
+        raise ValueError(f"--device {device} is for the launcher local: the tasks of ray have a CPU core each")
     recipes = PRESETS[preset]
     if passes is not None:
         check_int("passes", passes, minimum=1)
@@ -102,6 +109,7 @@ def reproduce(
     if list:
         print("\n".join([*datasets, *named]))
         return
+    there = check_device("device", device)
     load, encoder = _Plans(plans, task_file), read_encoder(text_encoder)
     for one in runs:  # before any work
         load(one)
@@ -110,14 +118,15 @@ def reproduce(
         datasets[run].collect(out, progress=True)
     elif run is not None:
         one = named[check_choice("run", run, [*datasets, *named])]
-        result = execute_run(one, load(one), out, text_encoder=encoder)
+        result = execute_run(one, load(one), out, text_encoder=encoder, device=there)
         print(f"{one.folder}: mean success {result.mean_success:.3f}, {result.config['seconds']:.0f} s")
     else:
         if launcher == "local" and jobs == 1:
-            _report(len(named), _here(named, load, out, encoder))
+            _report(len(named), _here(named, load, out, encoder, device))
         else:
             given = [experiment, "--preset", preset, "--episodes", str(episodes), "--out", str(out)]
             given += ["--seeds", *map(str, seeds), "--methods", *methods]
+            given += ["--device", device] if device != "cpu" else []
             given += [] if passes is None else ["--passes", str(passes)]
             given += ["--plans", *plans] if plans else []
             given += [] if text_encoder is None else ["--text-encoder", text_encoder]
@@ -151,11 +160,13 @@ class _Plans:
         return self.known[skills]
 
 
-def _here(named: dict[str, Run], load: Callable[[Run], Plans], out: Path, encoder: TextEncoder | None) -> Iterator[str]:
+def _here(
+    named: dict[str, Run], load: Callable[[Run], Plans], out: Path, encoder: TextEncoder | None, device: str
+) -> Iterator[str]:
     from lw_torchrl.experiments.execution import execute_run
 
     for name, one in named.items():
-        result = execute_run(one, load(one), out, text_encoder=encoder)
+        result = execute_run(one, load(one), out, text_encoder=encoder, device=device)
         yield f"{name}: mean success {result.mean_success:.3f}, {result.config['seconds']:.0f} s"
 
 

@@ -82,6 +82,7 @@ def train(
     after_success: int | None = 20,
     seed: int = 0,
     logger: Literal["csv", "tensorboard", "wandb"] | None = None,
+    device: str = "cpu",
 ) -> None:
     """Train a policy on demonstrations. Stopped and started again it carries on from its checkpoint.
 
@@ -107,15 +108,20 @@ def train(
         after_success: leave out steps so long after an episode's first success; None keeps all.
         seed: of the initial weights and the minibatches.
         logger: also write loss and learning rate there, below logs/ beside the policy.
+        device: where the networks work: cpu; cuda, or cuda:1 for the second of several; mps, a Mac's; or auto, the GPU
+            where there is one. Minibatches are the same everywhere, and the policy can be loaded
+            anywhere.
     """
     check_file("--out", out)
     import torch
 
     import lw_torchrl as lw
     from lw_torchrl._checks import check_choice
+    from lw_torchrl._devices import check_device
     from lw_torchrl.modules.policy import METHODS, make_policy, policy_class
 
     use_one_thread()
+    there = check_device("device", device)
     known = read_tasks(task_file)
     encoder = read_encoder(text_encoder)
     loaded = read_plans(plans, known)
@@ -131,6 +137,7 @@ def train(
         episodes=_all_of(data, lw.resolve_tasks(one_or_many(tasks), tasks=known)) if tasks else None,
         sampler=lw.TaskBalancedSampler(),
         after_success=after_success,
+        device=there,
     )
     loaded.require(replay.tasks)
     torch.manual_seed(seed)
@@ -139,7 +146,7 @@ def train(
     if (transform := actor.transform()) is not None:
         replay.append_transform(transform)
     writes = None if logger is None else make_logger(logger, out)
-    loss = lw.BehavioralCloningTrainer(actor, replay, config, checkpoint=out, logger=writes).train()
+    loss = lw.BehavioralCloningTrainer(actor, replay, config, checkpoint=out, logger=writes, device=there).train()
     print(f"trained to step {steps}" + ("" if loss != loss else f", loss {loss:.4f}") + f": {out}")
 
 
@@ -167,6 +174,7 @@ def evaluate(
     stop_at_success: bool = False,
     num_envs: int | None = None,
     out: Path | None = None,
+    device: str = "cpu",
 ) -> None:
     """Evaluate a trained policy, or the scripted experts, and write the result, a figure and a recording.
 
@@ -186,13 +194,17 @@ def evaluate(
         stop_at_success: end an episode at its first success; any-step success stays the same.
         num_envs: environments stepped together; the result does not depend on it.
         out: folder for results.json, success.png and rollout.rrd.
+        device: where the networks work: cpu; cuda, or cuda:1 for the second of several; mps, a Mac's; or auto, the GPU
+            where there is one. The simulation is always on the CPU.
     """
     if out is not None:
         check_folder("--out", out)
     import lw_torchrl as lw
+    from lw_torchrl._devices import check_device
     from lw_torchrl.record.rollouts import rollout_tasks, write_recording
 
     use_one_thread()
+    there = check_device("device", device)
     known = dict(read_tasks(task_file))
     given = read_plans(plans, known) if plans else None
     policy = None
@@ -203,6 +215,8 @@ def evaluate(
         chosen = simulated("tasks", one_or_many(tasks) or "MT10", known)
     else:
         chosen = _default_tasks(policy, checkpoint, trained=not plans)
+    if policy is None and there.type != "cpu":
+        raise ValueError("--device is for a policy; the scripted experts work on the CPU")
     result = lw.evaluate(
         policy or lw.ExpertActor(chosen),
         tasks=chosen,
@@ -211,6 +225,7 @@ def evaluate(
         noise_scale=noise,
         stop_at_success=stop_at_success,
         num_envs=num_envs,
+        device=there,
     )
     print(result.table())
     if out is not None:

@@ -7,15 +7,20 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data.replay_buffers.storages import Storage
 
+from lw_torchrl._devices import CPU
 from lw_torchrl.data.storage import JoinedStorage
+
+
+def device_of_rows(storage: Storage) -> torch.device:
+    """Where a storage's rows are; the CPU for one that does not say."""
+    said = getattr(storage, "device", None)
+    return CPU if said in (None, "auto") else torch.device(said)
 
 
 def beside(storage: Storage, index: Tensor) -> Tensor:
     """``index``, drawn on the CPU, where the rows are: a copy that nobody waits for."""
-    device = getattr(storage, "device", None)
-    if device is None or device == "auto" or torch.device(device).type == "cpu":
-        return index
-    return index.to(device, non_blocking=True)
+    device = device_of_rows(storage)
+    return index if device.type == "cpu" else index.to(device, non_blocking=True)
 
 
 class DeviceStorage(JoinedStorage):

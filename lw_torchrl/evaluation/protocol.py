@@ -13,6 +13,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from lw_torchrl._checks import check_int, check_scale, unknown_name
+from lw_torchrl._devices import CPU, place
 from lw_torchrl._progress import Progress
 from lw_torchrl.envs.engine import ACTION_SIZE
 from lw_torchrl.envs.episodes import FinishedEpisode, in_blocks, run_episodes
@@ -51,6 +52,18 @@ def make_env(actor: Any, plans: Plans | None, base: LanguageWorldEnv) -> EnvBase
     """The environment with what must run before the actor, and the answers to the plans' queries beside it."""
     transform = transform_of(actor, plans)
     return base if transform is None else TransformedEnv(base, transform)
+
+
+def policy_of(actor: Any, device: str | torch.device | None = None) -> Callable[[TensorDictBase], TensorDictBase]:
+    """The actor as episodes are run with it, on a device, or where it is; what it reads goes there and comes back.
+
+    Networks are run on blocks of rows, so that rows do not feel one another.
+    """
+    there = place(actor, device)
+    policy = actor if getattr(actor, "row_by_row", False) else in_blocks(actor)
+    if there == CPU:
+        return policy
+    return lambda tensordict: tensordict.update(policy(tensordict.to(there)).to(CPU))
 
 
 def _result(task: str, episode: int, steps: TensorDictBase, stopped_early: bool, keep_actions: bool) -> EpisodeResult:
@@ -112,6 +125,7 @@ def evaluate(
     progress: bool = True,
     also_record: Sequence[NestedKey] = (),
     on_episode: Callable[[FinishedEpisode], object] | None = None,
+    device: str | torch.device | None = None,
 ) -> EvaluationResult:
     """Run episodes 0 to k - 1 of each task and report how they went.
 
@@ -139,6 +153,8 @@ def evaluate(
         on_episode: called with each finished episode as its one argument, a named tuple of ``task``, ``episode``, its
             index, and ``steps``, a TensorDict of batch (T,) with the keys ``action``, ``("next", "success")``,
             ``("next", "reward")`` and those of ``also_record``.
+        device: where the actor works: "cpu", "cuda", "cuda:1", "mps", or "auto"; it is moved there, and stays. None for
+            where it is. The environment and its queries are always on the CPU.
 
     Warns:
         UserWarning: a simulation became unstable; its episode ends there, a failure unless it had succeeded.
@@ -185,8 +201,7 @@ def evaluate(
         strict=True,
     )
     env = make_env(actor, answered, base)
-    # Networks are run on blocks, so that rows do not feel one another.
-    policy = actor if getattr(actor, "row_by_row", False) else in_blocks(actor)
+    policy = policy_of(actor, device)
     training = getattr(actor, "training", False)
     if isinstance(actor, torch.nn.Module):
         actor.eval()

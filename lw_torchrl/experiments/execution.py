@@ -8,7 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from lw_torchrl._checks import differences
+from lw_torchrl._devices import check_device
 from lw_torchrl._progress import Progress
 from lw_torchrl.evaluation import EvaluationResult, evaluate
 from lw_torchrl.experiments.runs import SCRIPTED, Run
@@ -24,7 +27,13 @@ RESULTS = "results.json"
 
 
 def _evaluate(
-    run: Run, plans: Plans, out: Path, tasks: tuple[str, ...], progress: bool, text_encoder: TextEncoder | None
+    run: Run,
+    plans: Plans,
+    out: Path,
+    tasks: tuple[str, ...],
+    progress: bool,
+    text_encoder: TextEncoder | None,
+    device: torch.device,
 ) -> EvaluationResult:
     options: dict[str, Any] = {
         "episodes_per_task": run.episodes,
@@ -34,10 +43,11 @@ def _evaluate(
     }
     if run.method == SCRIPTED:
         return evaluate(ScriptedSkillActor(plans), tasks=tasks, progress=progress, **options)
+    options["device"] = device
     if run.setting.targets is None:
-        policy = train_one(run, plans, out, progress, text_encoder)
+        policy = train_one(run, plans, out, progress, text_encoder, device)
         return evaluate(policy, tasks=tasks, progress=progress, **options)
-    actors = train_each(run, plans, out, progress, text_encoder)
+    actors = train_each(run, plans, out, progress, text_encoder, device)
     found = sorted({*tasks} & {*actors})
     each = []
     with Progress("evaluating", len(found), "model", show=progress) as bar:
@@ -78,6 +88,7 @@ def execute_run(
     tasks: str | Sequence[str] = "MT50",
     progress: bool = True,
     text_encoder: TextEncoder | None = None,
+    device: str | torch.device = "cpu",
 ) -> EvaluationResult:
     """Do a run, or what is left of it; its result is written last, to ``out/run.folder/results.json``.
 
@@ -88,6 +99,8 @@ def execute_run(
         tasks: to evaluate.
         progress: show progress bars.
         text_encoder: texts to vectors (n, E) float32, which ``run.encoder_name`` names; None for the shipped one.
+        device: where networks are trained and evaluated; it is no part of what the run is, so one that was begun
+            elsewhere is finished here.
 
     Returns:
         The evaluation of the last checkpoint, action noise 0.1; ``config["run"]`` says what was done, and
@@ -100,10 +113,11 @@ def execute_run(
     """
     if (done := load_result(run, plans, out)) is not None:
         return done
+    there = check_device("device", device)
     started = time.perf_counter()
     for dataset in run.datasets:
         dataset.collect(out, progress)
-    result = _evaluate(run, plans, out, resolve_tasks(tasks), progress, text_encoder)
+    result = _evaluate(run, plans, out, resolve_tasks(tasks), progress, text_encoder, there)
     spent = {"run": run.describe(plans), "seconds": round(time.perf_counter() - started, 1)}
     result = replace(result, config=result.config | spent)
     result.save(out / run.folder / RESULTS)

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torchrl.envs import Compose, Transform
 
+from lw_torchrl._devices import CPU
 from lw_torchrl.data import CoLearningSampler, LanguageWorldExperienceReplay, TaskBalancedSampler
 from lw_torchrl.experiments.recipes import Member
 from lw_torchrl.experiments.runs import Run
@@ -18,8 +19,9 @@ from lw_torchrl.language.tasks import resolve_tasks
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules import ActorEnsemble
 from lw_torchrl.modules.policy import Policy, make_policy
-from lw_torchrl.trainers.behavioral_cloning import BehavioralCloningConfig, BehavioralCloningTrainer
+from lw_torchrl.trainers.behavioral_cloning import BehavioralCloningTrainer
 from lw_torchrl.trainers.checkpoint import describe_data, load_actor, save_actor
+from lw_torchrl.trainers.config import BehavioralCloningConfig
 from lw_torchrl.trainers.stacked import StackedBehavioralCloning
 from lw_torchrl.trainers.training_state import check_description
 from lw_torchrl.transforms import RandomYaw
@@ -60,7 +62,14 @@ def _kept(described: dict[str, Any], file: Path, text_encoder: TextEncoder | Non
     return load_actor(file, text_encoder=text_encoder)
 
 
-def train_one(run: Run, plans: Plans, out: Path, progress: bool, text_encoder: TextEncoder | None = None) -> Policy:
+def train_one(
+    run: Run,
+    plans: Plans,
+    out: Path,
+    progress: bool,
+    text_encoder: TextEncoder | None = None,
+    device: torch.device = CPU,
+) -> Policy:
     """One policy for all tasks, kept in ``policy.zip``; until all its members are done, each has a checkpoint."""
     folder, described = out / run.folder, run.describe(plans)
     file = folder / "policy.zip"
@@ -75,19 +84,26 @@ def train_one(run: Run, plans: Plans, out: Path, progress: bool, text_encoder: T
             sampler=TaskBalancedSampler(),
             label=run.preset.label,
             after_success=run.preset.after_success,
+            device=device,
         )
         config = _config(run, len(replay), run.seed + 1_000 * number)
         actors.append(_make_actor(run, member, plans, config.seed, text_encoder))
         replay.append_transform(_transform(actors[-1], member))
         checkpoint = folder / f"checkpoint-{number}.zip"
-        BehavioralCloningTrainer(actors[-1], replay, config, checkpoint=checkpoint, progress=progress).train()
+        options: dict[str, Any] = {"checkpoint": checkpoint, "progress": progress, "device": device}
+        BehavioralCloningTrainer(actors[-1], replay, config, **options).train()
     policy = _keep(described, actors, file, replay)
     _forget_checkpoints(folder)
     return policy
 
 
 def train_each(
-    run: Run, plans: Plans, out: Path, progress: bool, text_encoder: TextEncoder | None = None
+    run: Run,
+    plans: Plans,
+    out: Path,
+    progress: bool,
+    text_encoder: TextEncoder | None = None,
+    device: torch.device = CPU,
 ) -> dict[str, Policy]:
     """A policy for each target, kept in ``models/<target>.zip``; all are trained together, member by member.
 
@@ -116,12 +132,14 @@ def train_each(
                 transform=_transform(actor, member),
                 label=run.preset.label,
                 after_success=run.preset.after_success,
+                device=device,
             )
             for target, actor in zip(targets, actors, strict=True)
         ]
         members.append(actors)
         checkpoint = folder / f"checkpoint-{number}.zip"
-        StackedBehavioralCloning(members[-1], replays, config, checkpoint=checkpoint, progress=progress).train()
+        options: dict[str, Any] = {"checkpoint": checkpoint, "progress": progress, "device": device}
+        StackedBehavioralCloning(members[-1], replays, config, **options).train()
     policies = {
         target: _keep(described, each, files[target], replay)
         for target, replay, *each in zip(targets, replays, *members, strict=True)

@@ -9,6 +9,8 @@ from torch import Tensor
 from torch._C._functorch import is_functorch_wrapped_tensor
 from torch._subclasses.fake_tensor import FakeTensor
 
+_ASSERTING = {"cuda"}  # where torch._assert_async waits for nobody
+
 
 def plain(*tensors: Tensor) -> bool:
     """Whether the tensors are numbers that can be kept: not while something is compiled or exported, nor inside a
@@ -23,20 +25,20 @@ def plain(*tensors: Tensor) -> bool:
 
 def _waits(*tensors: Tensor) -> bool:
     for tensor in tensors:  # noqa: SIM110 - as above
-        if tensor.is_cuda:
+        if tensor.device.type in _ASSERTING:
             return True
     return False
 
 
 def readable(*tensors: Tensor) -> bool:
-    """Whether Python may look at the tensors' numbers: :func:`plain` ones, and none on a GPU, for which it would have
-    to wait."""
+    """Whether Python may look at the tensors' numbers: :func:`plain` ones, and none on a CUDA device, for which it
+    would have to wait."""
     return plain(*tensors) and not _waits(*tensors)
 
 
 def asserted(*tensors: Tensor) -> bool:
-    """Whether what must hold of the tensors is left to ``torch._assert_async``: compiled, and on a GPU, where it stops
-    the program later, and nobody waits."""
+    """Whether what must hold of the tensors is left to ``torch._assert_async``: compiled, and on a CUDA device, where
+    it stops the program later, and nobody waits."""
     return torch.compiler.is_compiling() or (_waits(*tensors) and plain(*tensors))
 
 

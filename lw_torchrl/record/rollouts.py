@@ -11,9 +11,9 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 
-from lw_torchrl.envs.episodes import in_blocks, run_episodes
+from lw_torchrl.envs.episodes import run_episodes
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
-from lw_torchrl.evaluation.protocol import make_env, tasks_of
+from lw_torchrl.evaluation.protocol import make_env, policy_of, tasks_of
 from lw_torchrl.language.plans import ConditionalPlan
 from lw_torchrl.language.tasks import Task
 from lw_torchrl.modules.policy import Policy, plans_of
@@ -50,7 +50,7 @@ def rollout_tasks(
                 found.task: found.steps
                 for found in run_episodes(
                     env,
-                    in_blocks(actor.eval()),
+                    policy_of(actor.eval()),
                     {task: [episode] for task in chosen},
                     keys=[*_KEYS, *sorted(_PLAN_KEYS & written)],
                     noise=(lambda _: (noise_scale,) * 4) if noise_scale else None,

@@ -1,8 +1,9 @@
 """Training: behavioral cloning of one actor or of many at once, and the checkpoints that it leaves."""
 
 import lw_torchrl._torchrl  # noqa: F401
-from lw_torchrl.trainers.behavioral_cloning import BehavioralCloningConfig, BehavioralCloningTrainer
+from lw_torchrl.trainers.behavioral_cloning import BehavioralCloningTrainer
 from lw_torchrl.trainers.checkpoint import load_actor, save_actor
+from lw_torchrl.trainers.config import BehavioralCloningConfig
 from lw_torchrl.trainers.normalization import fit_normalization
 from lw_torchrl.trainers.stacked import StackedBehavioralCloning
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -15,15 +14,18 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torch.nn.utils import clip_grad_norm_
 from torchrl.data import TensorDictReplayBuffer
+from torchrl.data.replay_buffers.samplers import RandomSampler
 from torchrl.objectives import BCLoss
 from torchrl.record.loggers import Logger
 
-from lw_torchrl._checks import check_choice, check_int, check_scale
 from lw_torchrl._devices import CPU, drawn_on, place
 from lw_torchrl._files import sweep
 from lw_torchrl._progress import Progress
+from lw_torchrl.data.device_storage import DeviceStorage, device_of_rows
+from lw_torchrl.data.group_sampler import GroupSampler
 from lw_torchrl.modules.policy import Policy, plans_of
 from lw_torchrl.trainers.checkpoint import describe_data, describe_replay, write
+from lw_torchrl.trainers.config import BehavioralCloningConfig, make_optimizer
 from lw_torchrl.trainers.interrupts import interrupts_between_steps
 from lw_torchrl.trainers.normalization import fit_normalization
 from lw_torchrl.trainers.policy_checks import check_can_be_saved, check_trained
@@ -37,66 +39,6 @@ from lw_torchrl.trainers.training_state import (
     warn_of_another_device,
     where,
 )
-
-LOSSES = ("l1", "l2", "smooth_l1")
-
-
-@dataclass(frozen=True)
-class BehavioralCloningConfig:
-    """How an actor is trained.
-
-    Attributes:
-        steps: minibatches.
-        batch_size: rows of a minibatch; the number of tasks must divide it.
-        learning_rate: at the start.
-        optimizer: "adamw" or "sgd".
-        weight_decay: the optimizer's.
-        momentum: of "sgd".
-        schedule: of the learning rate, "cosine" to 0 or "constant".
-        normalize: first take the statistics of the observation's features from the demonstrations.
-        loss_function: between the actor's and the demonstrated action: "l1", "l2" or "smooth_l1".
-        max_grad_norm: gradients are clipped to it.
-        seed: of the minibatches, and of what the buffer's transforms and the actor draw while training.
-        checkpoint_every: steps between checkpoints; the last step always makes one.
-    """
-
-    steps: int = 8000
-    batch_size: int = 500
-    learning_rate: float = 1e-3
-    optimizer: str = "adamw"
-    weight_decay: float = 1e-4
-    momentum: float = 0.9
-    schedule: str = "cosine"
-    normalize: bool = True
-    loss_function: str = "l2"
-    max_grad_norm: float = 1.0
-    seed: int = 0
-    checkpoint_every: int = 500
-
-    def __post_init__(self) -> None:
-        for name in ("steps", "batch_size", "checkpoint_every"):
-            check_int(name, getattr(self, name), minimum=1)
-        for name in ("learning_rate", "weight_decay", "momentum", "max_grad_norm"):
-            check_scale(name, getattr(self, name))
-        check_int("seed", self.seed)
-        check_choice("loss_function", self.loss_function, LOSSES)
-        check_choice("optimizer", self.optimizer, ("adamw", "sgd"))
-        check_choice("schedule", self.schedule, ("cosine", "constant"))
-
-
-def make_optimizer(
-    parameters: Iterable[Tensor], config: BehavioralCloningConfig
-) -> tuple[torch.optim.Optimizer, torch.optim.lr_scheduler.LRScheduler]:
-    """The optimizer of a configuration, and its schedule."""
-    optimizer: torch.optim.Optimizer
-    rate = float(config.learning_rate)  # as it is in a checkpoint
-    if config.optimizer == "adamw":
-        optimizer = torch.optim.AdamW(parameters, lr=rate, weight_decay=config.weight_decay)
-    else:
-        optimizer = torch.optim.SGD(parameters, lr=rate, momentum=config.momentum, weight_decay=config.weight_decay)
-    if config.schedule == "cosine":
-        return optimizer, torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, config.steps)
-    return optimizer, torch.optim.lr_scheduler.LambdaLR(optimizer, lambda _: 1.0)
 
 
 def check_belongs(actor: Any, replay: TensorDictReplayBuffer) -> None:
@@ -120,6 +62,17 @@ def check_batch_size(replay: TensorDictReplayBuffer, config: BehavioralCloningCo
         raise ValueError(
             f"batch_size of the replay buffer must be None or the configuration's, {config.batch_size}, got "
             f"{replay._batch_size}"
+        )
+
+
+def check_draws(replay: TensorDictReplayBuffer) -> None:
+    """Raise :class:`ValueError` if the sampler would draw on a device, where the trainers' generators are not."""
+    rows, sampler = replay.storage, replay.sampler
+    ours = isinstance(sampler, GroupSampler) or (isinstance(rows, DeviceStorage) and type(sampler) is RandomSampler)
+    if not ours and (device := device_of_rows(rows)).type != "cpu":
+        raise ValueError(
+            f"replay: a {type(sampler).__name__} draws on {device}, where its rows are, with a generator of its own; "
+            "take a TaskBalancedSampler or a CoLearningSampler, or leave the rows on the CPU: minibatches then go over"
         )
 
 
@@ -197,6 +150,7 @@ class BehavioralCloningTrainer:
         if replay._prefetch:
             raise ValueError("replay must not prefetch: batches drawn ahead would be lost when training is resumed")
         check_batch_size(replay, config)
+        check_draws(replay)
         generator = torch.Generator().manual_seed(config.seed)
         replay.set_rng(generator)
         with warnings.catch_warnings():
@@ -260,14 +214,15 @@ class BehavioralCloningTrainer:
                 losses.add(self.step())
                 step = self.state.step
                 bar.update()
-                if step % READ_EVERY == 0 or step == total:
+                saves = step % every == 0 or step == total
+                if saves or step % READ_EVERY == 0:
                     mean = _mean(losses.read(step))
+                if step % READ_EVERY == 0 or step == total:
                     bar.note(loss=f"{mean:.4f}")
                     if self.logger is not None:
                         self.logger.log_scalar("train/loss", mean, step=step)
                         self.logger.log_scalar("train/learning_rate", self.schedule.get_last_lr()[0], step=step)
-                if step % every == 0 or step == total:
-                    losses.read(step)  # before anything is written of it
+                if saves:
                     self.save()
             if interrupt.asked:
                 losses.read(self.state.step)

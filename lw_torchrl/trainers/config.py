@@ -1,0 +1,71 @@
+"""How an actor is trained: the options, and the optimizer and schedule that they say."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from lw_torchrl._checks import check_choice, check_int, check_scale
+
+LOSSES = ("l1", "l2", "smooth_l1")
+
+
+@dataclass(frozen=True)
+class BehavioralCloningConfig:
+    """How an actor is trained.
+
+    Attributes:
+        steps: minibatches.
+        batch_size: rows of a minibatch; the number of tasks must divide it.
+        learning_rate: at the start.
+        optimizer: "adamw" or "sgd".
+        weight_decay: the optimizer's.
+        momentum: of "sgd".
+        schedule: of the learning rate, "cosine" to 0 or "constant".
+        normalize: first take the statistics of the observation's features from the demonstrations.
+        loss_function: between the actor's and the demonstrated action: "l1", "l2" or "smooth_l1".
+        max_grad_norm: gradients are clipped to it.
+        seed: of the minibatches, and of what the buffer's transforms and the actor draw while training.
+        checkpoint_every: steps between checkpoints; the last step always makes one.
+    """
+
+    steps: int = 8000
+    batch_size: int = 500
+    learning_rate: float = 1e-3
+    optimizer: str = "adamw"
+    weight_decay: float = 1e-4
+    momentum: float = 0.9
+    schedule: str = "cosine"
+    normalize: bool = True
+    loss_function: str = "l2"
+    max_grad_norm: float = 1.0
+    seed: int = 0
+    checkpoint_every: int = 500
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "batch_size", "checkpoint_every"):
+            check_int(name, getattr(self, name), minimum=1)
+        for name in ("learning_rate", "weight_decay", "momentum", "max_grad_norm"):
+            check_scale(name, getattr(self, name))
+        check_int("seed", self.seed)
+        check_choice("loss_function", self.loss_function, LOSSES)
+        check_choice("optimizer", self.optimizer, ("adamw", "sgd"))
+        check_choice("schedule", self.schedule, ("cosine", "constant"))
+
+
+def make_optimizer(
+    parameters: Iterable[Tensor], config: BehavioralCloningConfig
+) -> tuple[torch.optim.Optimizer, torch.optim.lr_scheduler.LRScheduler]:
+    """The optimizer of a configuration, and its schedule."""
+    optimizer: torch.optim.Optimizer
+    rate = float(config.learning_rate)  # as it is in a checkpoint
+    if config.optimizer == "adamw":
+        optimizer = torch.optim.AdamW(parameters, lr=rate, weight_decay=config.weight_decay)
+    else:
+        optimizer = torch.optim.SGD(parameters, lr=rate, momentum=config.momentum, weight_decay=config.weight_decay)
+    if config.schedule == "cosine":
+        return optimizer, torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, config.steps)
+    return optimizer, torch.optim.lr_scheduler.LambdaLR(optimizer, lambda _: 1.0)

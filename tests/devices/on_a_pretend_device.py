@@ -1,0 +1,344 @@
+"""What test_devices.py runs in a process of its own: training and evaluation on a device that notes every wait."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+
+import pytest
+import torch
+from pretend_device import COPIES, MODULE, PRETEND, WAITS
+from small_training import CONFIG, PLANS, SMALL, assert_same, collect_demos, flat, make_actor
+from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs import Compose
+
+import lw_torchrl as lw
+
+ACTORS = {
+    "plan": lambda: make_actor(feature_noise=0.0),
+    "noisy plan": lambda: make_actor(feature_noise=0.1, focus=True, swap_unmentioned=0.5),
+    "mixed actions": lambda: make_actor(feature_noise=0.0, mix="actions"),
+    "description": lambda: seeded(lw.DescriptorConditionedActor, "MT10", feature_noise=0.0, **SMALL),
+    "one-hot": lambda: seeded(lw.DescriptorConditionedActor, "MT10", condition="one-hot", feature_noise=0.0, **SMALL),
+    "stochastic": lambda: make_actor(feature_noise=0.0, distribution="normal"),
+}
+SAMPLERS = {
+    "balanced": lambda: (lw.TaskBalancedSampler(), None),
+    "co-learning": lambda: (lw.CoLearningSampler("push"), None),
+    "chosen episodes": lambda: (lw.TaskBalancedSampler(), {"push": 1, "reach": 2}),
+    "uniform": lambda: (None, None),
+}
+
+
+def seeded(make, *args, **options):
+    torch.manual_seed(0)
+    return make(*args, **options)
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory):
+    return collect_demos(tmp_path_factory.mktemp("demos") / "d")
+
+
+def make_replay(demos, device, sampler="balanced", turned=False):
+    drawn, episodes = SAMPLERS[sampler]()
+    transform = Compose(lw.QAFTransform(PLANS), *([lw.RandomYaw(0.3)] if turned else []))
+    return lw.LanguageWorldExperienceReplay(demos, sampler=drawn, episodes=episodes, transform=transform, device=device)
+
+
+def make_trainer(demos, device, actor="plan", sampler="balanced", turned=False, checkpoint=None, **config):
+    return lw.BehavioralCloningTrainer(
+        ACTORS[actor](),
+        make_replay(demos, device, sampler, turned),
+        dataclasses.replace(CONFIG, **config),
+        progress=False,
+        checkpoint=checkpoint,
+        device=device,
+    )
+
+
+def quiet_steps(trainer, number=3):
+    """The losses of the first steps, none of which but the first has waited."""
+    losses = [trainer.step()]
+    WAITS.clear()
+    COPIES.clear()
+    losses += [trainer.step() for _ in range(number)]
+    assert WAITS == []
+    return losses
+
+
+def weights(trainer):
+    return {name: value.detach().cpu() for name, value in trainer.actor.named_parameters()}
+
+
+def test_what_one_waits_for_is_noted():
+    here = torch.arange(6.0)
+    WAITS.clear()
+    there = here.to(PRETEND)
+    assert len(WAITS) == 1
+    here.to(PRETEND, non_blocking=True)
+    assert len(WAITS) == 1
+    assert COPIES[-1] == (6,)
+    for wait in (
+        there.sum().item,
+        there.cpu,
+        lambda: bool(there.any()),
+        lambda: there[there > 2],
+        lambda: torch.equal(there, there),
+        lambda: there[torch.tensor([1, 2])],
+        lambda: torch.tensor([1.0], device=PRETEND),
+        there.nonzero,
+    ):
+        WAITS.clear()
+        wait()
+        assert WAITS
+    with pytest.raises(RuntimeError, match="same device"):
+        there + here
+
+
+@pytest.mark.parametrize(
+    ("actor", "sampler", "turned"),
+    [(a, "balanced", False) for a in ACTORS] + [("plan", s, s == "uniform") for s in SAMPLERS if s != "balanced"],
+)
+def test_a_step_waits_for_nothing_and_is_the_cpus(demos, actor, sampler, turned):
+    trainer = make_trainer(demos, "pretend", actor, sampler, turned)
+    assert trainer.device == PRETEND
+    assert {p.device for p in trainer.actor.parameters()} == {PRETEND}
+    losses = quiet_steps(trainer)
+    indices = 2 if sampler == "co-learning" else 1  # beside them, which rows are the target's
+    assert len(COPIES) == 3 * indices, "one copy a batch"
+    if turned or actor == "noisy plan":
+        return  # of other draws
+    cpu = make_trainer(demos, "cpu", actor, sampler)
+    assert [loss.item() for loss in losses] == [cpu.step().item() for _ in losses]
+    assert_same(weights(trainer), weights(cpu))
+
+
+def test_a_batch_is_wholly_on_the_device(demos):
+    ours, cpu = make_replay(demos, "pretend", "co-learning"), make_replay(demos, None, "co-learning")
+    for replay in (ours, cpu):
+        replay.set_rng(torch.Generator().manual_seed(3))
+    batch, expected = ours.sample(8), cpu.sample(8)
+    assert batch.device == PRETEND
+    assert {value.device for value in batch.values(True, True)} == {PRETEND}
+    assert batch["is_target"].sum().item() == 4
+    assert (batch.cpu() == expected).all()
+
+
+def test_rows_on_the_cpu_go_over(demos):
+    rows = make_replay(demos, None)[:].select("observation", "task_id", "qaf", "qaf_plan", "action")
+    mine = TensorDictReplayBuffer(storage=LazyTensorStorage(len(rows)))
+    mine.extend(rows)
+    trainer = lw.BehavioralCloningTrainer(ACTORS["plan"](), mine, CONFIG, progress=False, device="pretend")
+    losses = quiet_steps(trainer)
+    cpu = lw.BehavioralCloningTrainer(ACTORS["plan"](), mine, CONFIG, progress=False)
+    assert [loss.item() for loss in losses] == [cpu.step().item() for _ in losses]
+
+
+def test_rows_that_are_there_want_a_sampler_of_ours(demos):
+    rows = make_replay(demos, None)[:].select("observation", "task_id", "qaf", "qaf_plan", "action")
+    mine = TensorDictReplayBuffer(storage=LazyTensorStorage(len(rows), device=PRETEND))
+    mine.extend(rows)
+    with pytest.raises(ValueError, match="replay: a RandomSampler draws on pretend:0, where its rows are"):
+        lw.BehavioralCloningTrainer(ACTORS["plan"](), mine, CONFIG, progress=False, device="pretend")
+    mine = TensorDictReplayBuffer(storage=mine.storage, sampler=lw.TaskBalancedSampler())
+    quiet_steps(lw.BehavioralCloningTrainer(ACTORS["plan"](), mine, CONFIG, progress=False, device="pretend"))
+
+
+def make_stack(demos, device, checkpoint=None, actor="plan", **config):
+    replays = [make_replay(demos, device) for _ in range(3)]
+    options = {"checkpoint": checkpoint, "progress": False, "device": device}
+    actors = [ACTORS[actor]() for _ in replays]
+    return lw.StackedBehavioralCloning(actors, replays, dataclasses.replace(CONFIG, **config), **options)
+
+
+def test_many_at_once_wait_for_nothing(demos):
+    stack = make_stack(demos, "pretend")
+    losses = quiet_steps(stack)
+    assert len(COPIES) == 3 * 3
+    cpu = make_stack(demos, "cpu")
+    for loss in losses:
+        assert torch.equal(loss.cpu(), cpu.step())
+    stack.train()
+    assert all(p.device == PRETEND for actor in stack.actors for p in actor.parameters())
+
+
+def test_losses_are_read_every_100_steps(demos, tmp_path):
+    trainer = make_trainer(demos, "pretend", steps=250, checkpoint_every=10_000)
+    trainer.step()
+    WAITS.clear()
+    mean = trainer.train()
+    assert len([wait for wait in WAITS if "recent_losses" in wait]) == 4  # at 100, 200, 250, and at the end
+    WAITS[:] = [wait for wait in WAITS if "recent_losses" not in wait]
+    assert all("policy_checks" in wait for wait in WAITS), WAITS  # of the weights, at the end
+    cpu = make_trainer(demos, "cpu", steps=250, checkpoint_every=10_000)
+    cpu.step()
+    assert cpu.train() == mean
+
+
+@pytest.mark.parametrize("many", [False, True])
+def test_nan_is_found_with_its_step_and_not_written(demos, tmp_path, many):
+    path = tmp_path / "c.zip"
+    make = make_stack if many else make_trainer
+    trainer = make(demos, "pretend", checkpoint=path, steps=250, checkpoint_every=50)
+    step, count = trainer.step, [0]
+
+    def breaks():
+        count[0] += 1
+        if count[0] == 73:
+            with torch.no_grad():
+                actors = trainer._parameters if many else dict(trainer.actor.named_parameters())
+                name = next(key for key in actors if key.endswith("network.0.weight"))
+                actors[name][(1, 0) if many else 0].fill_(float("nan"))
+        return step()
+
+    trainer.step = breaks
+    which = "the loss of actor 1" if many else "the loss"
+    with pytest.raises(ValueError, match=f"{which} is nan at step 72: the demonstrations hold NaN, or"):
+        trainer.train()
+    assert count[0] == 100
+    kept = make(demos, "pretend", checkpoint=path, steps=250, checkpoint_every=50)
+    assert (kept.steps if many else kept.state.step) == 50
+
+
+@pytest.mark.parametrize("many", [False, True])
+def test_it_carries_on_bit_for_bit_where_it_was_begun(demos, tmp_path, many):
+    make = make_stack if many else make_trainer
+    options = {"actor": "noisy plan", "steps": 12, "checkpoint_every": 5}
+
+    def everything(trainer):
+        states = trainer.states if many else [trainer.state]
+        own = trainer._parameters if many else weights(trainer)
+        found = flat({"weights": own, "states": [s.state_dict() for s in states]})
+        found |= flat({"optimizer": trainer.optimizer.state_dict()})
+        return {key: value.cpu() if isinstance(value, torch.Tensor) else value for key, value in found.items()}
+
+    whole = make(demos, "pretend", **options)
+    for _ in range(12):
+        whole.step()
+    path = tmp_path / "c.zip"
+    first = make(demos, "pretend", checkpoint=path, **options)
+    for _ in range(7):
+        first.step()
+    first.save()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        second = make(demos, "pretend", checkpoint=path, **options)
+    for _ in range(5):
+        second.step()
+    assert_same(everything(second), everything(whole))
+
+
+@pytest.mark.parametrize(("begun", "ended"), [("pretend", "cpu"), ("cpu", "pretend")])
+def test_elsewhere_it_carries_on_and_says_so(demos, tmp_path, begun, ended):
+    path = tmp_path / "c.zip"
+    first = make_trainer(demos, begun, checkpoint=path)
+    for _ in range(7):
+        first.step()
+    first.save()
+    with pytest.warns(UserWarning, match=f"was trained on '{begun}' and goes on on '{ended}': with the same"):
+        second = make_trainer(demos, ended, checkpoint=path)
+    assert second.state.step == 7
+    assert_same(weights(second), weights(first))
+    assert [second.step().item() for _ in range(3)] == [first.step().item() for _ in range(3)]
+
+
+def test_a_file_from_there_is_loaded_here(demos, tmp_path):
+    trainer = make_trainer(demos, "pretend", checkpoint=tmp_path / "c.zip")
+    trainer.train()
+    lw.save_actor(trainer.actor, tmp_path / "p.zip")
+    for name in ("c.zip", "p.zip"):
+        loaded = lw.load_actor(tmp_path / name)
+        assert {tensor.device.type for tensor in loaded.state_dict().values()} == {"cpu"}
+        assert_same(dict(loaded.named_parameters()), weights(trainer))
+
+
+@pytest.mark.parametrize("kind", ["plan", "description", "scripted", "ensemble", "evaluator"])
+def test_an_evaluation_there_is_the_cpus(kind):
+    class Guess(lw.QueryEvaluator):
+        def logits(self, observation, task_id):
+            return observation[..., :1].expand(*task_id.shape, self.plans.num_steps)
+
+    made = {
+        "scripted": lambda: lw.ScriptedSkillActor(PLANS),
+        "ensemble": lambda: lw.ActorEnsemble([ACTORS["plan"](), ACTORS["mixed actions"]()]),
+        "evaluator": lambda: seeded(lw.PlanConditionedActor, PLANS, evaluator=Guess(PLANS), **SMALL),
+    }
+    actor = made.get(kind, ACTORS.get(kind))()
+    options = {"tasks": ["push", "reach"], "episodes_per_task": 2, "seed": 1000, "max_steps": 8, "progress": False}
+    options |= {"record_actions": True}
+    expected = lw.evaluate(actor, **options)
+    WAITS.clear()
+    found = lw.evaluate(actor, device="pretend", **options)
+    assert [wait for wait in WAITS if "protocol" in wait], "it was there"
+    assert {p.device for p in actor.parameters()} <= {PRETEND}, "and stays"
+    again = lw.evaluate(actor, **options)  # where it is
+    for result in (found, again):
+        assert result.success_once == expected.success_once
+        for one, other in zip(result.episodes, expected.episodes, strict=True):
+            assert torch.equal(one.actions, other.actions)
+
+
+def make_state(rows=3):
+    ids = torch.full((rows,), lw.task_id("push"))
+    state = TensorDict({"observation": torch.rand(rows, 39), "task_id": ids}, [rows])
+    return lw.QAFTransform(PLANS)(state).to(PRETEND)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "problem"),
+    [
+        ("observation", float("nan"), "observation must hold finite numbers"),
+        ("task_id", -1, "task_id names tasks without a plan"),
+        ("qaf_plan", 5, "qaf answers other plans"),
+        ("qaf", 2.0, "qaf must be bool, or numbers from 0 to 1"),
+    ],
+)
+def test_what_is_wrong_is_refused_without_waiting(key, value, problem):
+    actor = ACTORS["plan"]().to(PRETEND)
+    actor(make_state())
+    state = make_state()
+    if key == "qaf":
+        state["qaf"] = state["qaf"].float()
+    state[key].fill_(value)
+    WAITS.clear()
+    with pytest.raises(RuntimeError, match=problem):
+        actor(state)
+    assert WAITS == []
+    if key in ("observation", "task_id"):
+        queries = lw.QAFTransform(PLANS)
+        queries(make_state())
+        WAITS.clear()
+        with pytest.raises(RuntimeError, match=problem.rsplit(" ", 2)[0]):
+            queries(state)
+        assert WAITS == []
+
+
+def test_draws_are_the_trainers_alone(demos):
+    def drawn():
+        there = MODULE.state
+        return torch.get_rng_state(), there
+
+    trainer = make_trainer(demos, "pretend", "noisy plan", turned=True)
+    before = drawn()
+    losses = [trainer.step().item() for _ in range(3)]
+    for one, other in zip(drawn(), before, strict=True):
+        assert torch.equal(one, other)
+    torch.manual_seed(99)
+    MODULE.manual_seed(99)
+    again = make_trainer(demos, "pretend", "noisy plan", turned=True)
+    torch.manual_seed(1)
+    MODULE.manual_seed(1)
+    assert [again.step().item() for _ in range(3)] == losses
+
+
+def test_names_of_devices(demos):
+    from lw_torchrl._devices import check_device
+
+    for name in ("auto", "pretend", "pretend:0", PRETEND):
+        assert check_device("device", name) == PRETEND
+    with pytest.raises(ValueError, match="device must be one of 'cpu', 'pretend', 'pretend:0', 'auto' here, got 'pret"):
+        check_device("device", "pretend:1")
+    with pytest.raises(ValueError, match="got 'cuda': this machine, or this build of PyTorch, has no CUDA"):
+        make_trainer(demos, "cuda")

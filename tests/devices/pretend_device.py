@@ -1,0 +1,145 @@
+"""A second device, of kind "pretend": its tensors compute on the CPU, and it notes whatever one would wait for.
+
+To be used in a process of its own: PyTorch knows one such device, for good.
+"""
+
+from __future__ import annotations
+
+import traceback
+from pathlib import Path
+
+import torch
+from torch.utils import _pytree as pytree
+from torch.utils.backend_registration import _DummyBackendModule, _setup_privateuseone_for_python_backend
+
+from lw_torchrl.language import value_checks
+
+aten = torch.ops.aten
+READS = {aten._local_scalar_dense, aten.equal, aten.nonzero, aten.masked_select, aten._unique2, aten.bincount}
+PACKAGE = str(Path(value_checks.__file__).parents[1])
+
+
+class Module(_DummyBackendModule):
+    """``torch.pretend``, with a generator of its own."""
+
+    state = torch.Generator().get_state()
+
+    def synchronize(self, device=None) -> None:
+        WAITS.append("synchronize")
+
+    def get_rng_state(self, device=None):
+        return self.state
+
+    def set_rng_state(self, state, device=None) -> None:
+        self.state = state
+
+    def manual_seed(self, seed) -> None:
+        self.state = torch.Generator().manual_seed(seed).get_state()
+
+
+MODULE = Module()
+_setup_privateuseone_for_python_backend("pretend", MODULE)
+value_checks._ASSERTING.add("pretend")
+PRETEND = torch.device("pretend:0")
+WAITS: list[str] = []  # what made somebody wait, and where
+COPIES: list[torch.Size] = []  # what went over without waiting
+
+
+class PretendTensor(torch.Tensor):
+    """A tensor that says it is on the device, around one on the CPU."""
+
+    @staticmethod
+    def __new__(cls, raw):
+        return torch.Tensor._make_wrapper_subclass(
+            cls, raw.shape, strides=raw.stride(), dtype=raw.dtype, device=PRETEND, storage_offset=raw.storage_offset()
+        )
+
+    def __init__(self, raw):
+        self.raw = raw
+
+    def __repr__(self):
+        return f"PretendTensor({self.raw})"
+
+    __torch_function__ = torch._C._disabled_torch_function_impl
+
+    @classmethod
+    def __torch_dispatch__(cls, func, types, args=(), kwargs=None):
+        return _run(func, args, kwargs or {})
+
+
+def _here() -> str:
+    ours = [frame for frame in traceback.extract_stack() if frame.filename.startswith(PACKAGE)]
+    return f"{ours[-1].filename}:{ours[-1].lineno}" if ours else "elsewhere"
+
+
+def _note(func, flat, kwargs, there) -> None:
+    """Note what a GPU would make one wait for; raise where one would refuse."""
+    packet = func.overloadpacket
+    on = [one for one in flat if isinstance(one, PretendTensor)]
+    off = [one for one in flat if isinstance(one, torch.Tensor) and not isinstance(one, PretendTensor) and one.dim()]
+    if packet in (aten._to_copy, aten.copy_):
+        source = flat[1] if packet is aten.copy_ else flat[0]
+        over = isinstance(source, PretendTensor) != there if packet is aten._to_copy else bool(off and on)
+        waited = kwargs.get("non_blocking") or (packet is aten.copy_ and len(flat) > 2 and flat[2] is True)
+        if over and there and waited:
+            COPIES.append(source.shape)
+        elif over:
+            WAITS.append(f"{func} at {_here()}")
+        return
+    masks = packet in (aten.index, aten.index_put, aten.index_put_) and any(one.dtype == torch.bool for one in on[1:])
+    if on and (packet in READS or masks):
+        WAITS.append(f"{func} at {_here()}")
+    if on and off:
+        if packet not in (aten.index, aten.index_put, aten.index_put_):
+            raise RuntimeError(f"{func}: expected all tensors to be on the same device, at {_here()}")
+        WAITS.append(f"{func} of the CPU's indices at {_here()}")
+    if there and kwargs.get("generator") is not None:
+        raise RuntimeError("expected a 'pretend' device type for generator but found 'cpu'")
+
+
+def _run(func, args, kwargs):
+    flat = pytree.tree_leaves((args, kwargs))
+    device = kwargs.get("device")
+    on = any(isinstance(one, PretendTensor) for one in flat)
+    there = on if device is None else torch.device(device).type == "pretend"
+    if not on and not there:
+        return func(*args, **kwargs)
+    _note(func, flat, kwargs, there)
+    own = lambda one: one.raw if isinstance(one, PretendTensor) else one  # noqa: E731
+    raw_args, raw_kwargs = pytree.tree_map(own, (args, kwargs))
+    if device is not None:
+        raw_kwargs["device"] = torch.device("cpu")
+    draws = there and torch.Tag.nondeterministic_seeded in func.tags
+    before = torch.get_rng_state()
+    if draws:
+        torch.set_rng_state(MODULE.state)
+    found = func(*raw_args, **raw_kwargs)
+    if draws:
+        MODULE.state = torch.get_rng_state()
+        torch.set_rng_state(before)
+    if not there or func.overloadpacket is aten._local_scalar_dense:
+        return found
+    if func.overloadpacket is aten._to_copy and not on and found is raw_args[0]:
+        found = found.clone()
+    same = {id(one.raw): one for one in flat if isinstance(one, PretendTensor)} if func._schema.is_mutable else {}
+    wrap = lambda one: same.get(id(one), PretendTensor(one)) if isinstance(one, torch.Tensor) else one  # noqa: E731
+    return pytree.tree_map(wrap, found)
+
+
+def _empty(size, *, dtype=None, layout=None, device=None, pin_memory=None, memory_format=None):
+    return PretendTensor(torch.empty(size, dtype=dtype))
+
+
+def _empty_strided(size, stride, *, dtype=None, layout=None, device=None, pin_memory=None):
+    return PretendTensor(torch.empty_strided(size, stride, dtype=dtype))
+
+
+def _copy_from(source, here, non_blocking=False):
+    """What ``torch.tensor(..., device="pretend")`` calls."""
+    return _run(aten.copy_.default, (here, source, non_blocking), {})
+
+
+_LIBRARY = torch.library.Library("aten", "IMPL")
+_LIBRARY.impl("empty.memory_format", _empty, "PrivateUse1")
+_LIBRARY.impl("empty_strided", _empty_strided, "PrivateUse1")
+_LIBRARY.impl("_copy_from", _copy_from, "PrivateUse1")
