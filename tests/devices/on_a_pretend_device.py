@@ -165,14 +165,14 @@ def test_many_at_once_wait_for_nothing(demos):
 
 
 def test_losses_are_read_every_100_steps(demos, tmp_path):
-    trainer = make_trainer(demos, "pretend", steps=250, checkpoint_every=10_000)
+    trainer = make_trainer(demos, "pretend", steps=120, checkpoint_every=10_000)
     trainer.step()
     WAITS.clear()
     mean = trainer.train()
-    assert len([wait for wait in WAITS if "recent_losses" in wait]) == 4  # at 100, 200, 250, and at the end
+    assert len([wait for wait in WAITS if "recent_losses" in wait]) == 3  # at 100, at 120, and at the end
     WAITS[:] = [wait for wait in WAITS if "recent_losses" not in wait]
     assert all("policy_checks" in wait for wait in WAITS), WAITS  # of the weights, at the end
-    cpu = make_trainer(demos, "cpu", steps=250, checkpoint_every=10_000)
+    cpu = make_trainer(demos, "cpu", steps=120, checkpoint_every=10_000)
     cpu.step()
     assert cpu.train() == mean
 
@@ -181,12 +181,12 @@ def test_losses_are_read_every_100_steps(demos, tmp_path):
 def test_nan_is_found_with_its_step_and_not_written(demos, tmp_path, many):
     path = tmp_path / "c.zip"
     make = make_stack if many else make_trainer
-    trainer = make(demos, "pretend", checkpoint=path, steps=250, checkpoint_every=50)
+    trainer = make(demos, "pretend", checkpoint=path, steps=30, checkpoint_every=10)
     step, count = trainer.step, [0]
 
     def breaks():
         count[0] += 1
-        if count[0] == 73:
+        if count[0] == 13:
             with torch.no_grad():
                 actors = trainer._parameters if many else dict(trainer.actor.named_parameters())
                 name = next(key for key in actors if key.endswith("network.0.weight"))
@@ -195,11 +195,11 @@ def test_nan_is_found_with_its_step_and_not_written(demos, tmp_path, many):
 
     trainer.step = breaks
     which = "the loss of actor 1" if many else "the loss"
-    with pytest.raises(ValueError, match=f"{which} is nan at step 72: the demonstrations hold NaN, or"):
+    with pytest.raises(ValueError, match=f"{which} is nan at step 12: the demonstrations hold NaN, or"):
         trainer.train()
-    assert count[0] == 100
-    kept = make(demos, "pretend", checkpoint=path, steps=250, checkpoint_every=50)
-    assert (kept.steps if many else kept.state.step) == 50
+    assert count[0] == 20
+    kept = make(demos, "pretend", checkpoint=path, steps=30, checkpoint_every=10)
+    assert (kept.steps if many else kept.state.step) == 10
 
 
 @pytest.mark.parametrize("many", [False, True])

@@ -1,4 +1,4 @@
-"""Devices: names, and on one that notes every wait, in a process of its own, all that on_a_pretend_device.py says."""
+"""Devices: their names, a GPU where there is one, and one that notes every wait, in a process of its own."""
 
 from __future__ import annotations
 
@@ -7,11 +7,21 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+import torch
+
+import lw_torchrl as lw
+from lw_torchrl._devices import CPU, check_device, device_of
+from lw_torchrl.cli.main import main
+
 HERE = Path(__file__).parent
+PLANS = lw.load_plans("MT10")
+needs_a_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+needs_no_gpu = pytest.mark.skipif(torch.accelerator.is_available(), reason="needs a machine without a GPU")
 
 
 def test_on_a_pretend_device_nobody_waits():
-    paths = [str(HERE), str(HERE.parent / "trainers"), str(HERE.parent / "objectives"), *sys.path]
+    paths = [str(HERE), *(str(HERE.parent / room) for room in ("trainers", "objectives")), *sys.path]
     done = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(HERE / "on_a_pretend_device.py")],
         cwd=HERE.parent.parent,
@@ -22,3 +32,111 @@ def test_on_a_pretend_device_nobody_waits():
     )
     assert done.returncode == 0, done.stdout[-8000:] + done.stderr[-2000:]
     assert " passed" in done.stdout
+
+
+def test_the_cpu_is_there():
+    assert check_device("device", "cpu") == check_device("device", torch.device("cpu")) == CPU
+    assert device_of(torch.nn.Module()) == CPU
+
+
+@pytest.mark.parametrize(
+    ("given", "error", "said"),
+    [
+        ("cdua", ValueError, "device must be one of 'cpu', 'cuda', 'cuda:0', 'mps', 'auto', got 'cdua'; did you mean "),
+        ("cuda:x", ValueError, "device must be one of .*, got 'cuda:x'; did you mean 'cuda:0'"),
+        ("", ValueError, "device must be one of .*, got ''"),
+        (0, TypeError, "device must be a device's name, got 0"),
+    ],
+)
+def test_what_is_no_device_is_refused(given, error, said):
+    with pytest.raises(error, match=said):
+        check_device("device", given)
+
+
+@needs_no_gpu
+def test_without_a_gpu_there_is_the_cpu(demos, tmp_path):
+    assert check_device("device", "auto") == CPU
+    actor, replay = lw.PlanConditionedActor(PLANS, width=8), make_replay(demos)
+    for refused in (
+        lambda: make_replay(demos, "cuda"),
+        lambda: lw.BehavioralCloningTrainer(actor, replay, device="cuda"),
+        lambda: lw.StackedBehavioralCloning([actor], [replay], device="cuda"),
+        lambda: lw.evaluate(actor, tasks="reach", seed=0, device="cuda"),
+    ):
+        with pytest.raises(
+            ValueError, match="device must be one of 'cpu', 'auto' here, got 'cuda': this machine, or this build"
+        ):
+            refused()
+
+
+@needs_no_gpu
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        (
+            ["train", "DEMOS", "--out", "p.zip", "--device", "cuda"],
+            "--device must be one of 'cpu', 'auto' here",
+        ),
+        (
+            ["evaluate", "p.zip", "--device", "gpu"],
+            "--device must be one of 'cpu', 'cuda', 'cuda:0', 'mps', 'auto'",
+        ),
+        (
+            ["reproduce", "few-shot", "--out", "r", "--device", "mps"],
+            "got 'mps': this machine, or this build",
+        ),
+        (["reproduce", "few-shot", "--out", "r", "--device", "auto", "--launcher", "ray"], "for the launcher local"),
+    ],
+)
+def test_the_command_line_says_so(demos, tmp_path, monkeypatch, capsys, command, said):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as caught:
+        main([str(demos) if one == "DEMOS" else one for one in command])
+    assert caught.value.code == 2
+    assert said in capsys.readouterr().err
+    assert not list(tmp_path.iterdir()), "before any work"
+
+
+def test_the_command_line_trains_and_evaluates_there(demos, tmp_path, capsys):
+    out = tmp_path / "p.zip"
+    main(["train", str(demos), "--out", str(out), "--steps", "3", "--batch-size", "10", "--device", "auto"])
+    main(["evaluate", str(out), "--episodes", "1", "--stop-at-success", "--device", "auto"])
+    assert "reach" in capsys.readouterr().out
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory):
+    root = tmp_path_factory.mktemp("demos") / "d"
+    lw.collect_demonstrations("reach", episodes_per_task=1, root=root, max_steps=30, progress=False)
+    return root
+
+
+def make_replay(demos, device=None):
+    transform = lw.QAFTransform(PLANS)
+    return lw.LanguageWorldExperienceReplay(demos, sampler=lw.TaskBalancedSampler(), transform=transform, device=device)
+
+
+@needs_a_gpu
+def test_on_a_gpu_nobody_waits(demos, tmp_path):
+    """As on the pretend device, by CUDA's own word; what is drawn is the same, what is summed nearly so."""
+    config = lw.BehavioralCloningConfig(steps=8, batch_size=10)
+    losses = {}
+    for device in ("cpu", "cuda"):
+        torch.manual_seed(0)
+        actor = lw.PlanConditionedActor(PLANS, width=16, feature_noise=0.0)
+        options = {"checkpoint": tmp_path / f"{device}.zip", "progress": False, "device": device}
+        trainer = lw.BehavioralCloningTrainer(actor, make_replay(demos, device), config, **options)
+        losses[device] = [trainer.step().item() for _ in range(4)]
+        torch.cuda.set_sync_debug_mode("error" if device == "cuda" else "default")
+        try:
+            for _ in range(3):
+                trainer.step()
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
+        trainer.train()
+    assert losses["cuda"] == pytest.approx(losses["cpu"], rel=1e-3)
+    options = {"tasks": "reach", "episodes_per_task": 2, "seed": 1000, "max_steps": 20, "progress": False}
+    there = lw.evaluate(actor, record_actions=True, **options)
+    here = lw.evaluate(lw.load_actor(tmp_path / "cuda.zip"), record_actions=True, **options)
+    for one, other in zip(there.episodes, here.episodes, strict=True):
+        assert (one.actions - other.actions).abs().max() < 1e-2
