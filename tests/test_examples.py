@@ -82,6 +82,16 @@ def test_a_policy_is_exported(tmp_path):
     assert (tmp_path / "policy.pt2").is_file()
 
 
+def test_a_trainer_of_torchrls_runs(tmp_path):
+    done = run("torchrl_trainer.py", tmp_path, "--updates", 3, "--rows", 4, "--horizon", 25)
+    assert len(done.stdout.split("update:")[1].splitlines()[0].split()) == 3
+    logged = tmp_path / "runs" / "torchrl_trainer" / "ppo" / "scalars"
+    for name in ("reward", "success", "loss_objective"):
+        lines = (logged / f"{name}.csv").read_text("utf-8").splitlines()
+        assert [line.split(",")[0] for line in lines] == ["100", "200", "300"]
+    assert lw.load_actor(tmp_path / "runs" / "torchrl_trainer" / "policy.zip").head.distribution == "normal"
+
+
 @pytest.mark.slow
 def test_experience_comes_from_ray(tmp_path):
     pytest.importorskip("ray")

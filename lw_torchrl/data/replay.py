@@ -18,7 +18,7 @@ from torchrl.data.replay_buffers.storages import Storage
 from torchrl.data.replay_buffers.writers import Writer
 from torchrl.envs import Transform
 
-from lw_torchrl._checks import check_choice, check_int
+from lw_torchrl._checks import check_choice, check_int, shown
 from lw_torchrl._devices import CPU, check_device
 from lw_torchrl._state_tree import join, split
 from lw_torchrl._tensor_archive import ArchiveError, TensorArchive, write_archive
@@ -88,7 +88,8 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
             the other reward, are left out.
         device: where the rows are kept and transforms work: None or "cpu" for the files, memory-mapped; or "cuda",
             "cuda:1", "mps" or "auto", into whose memory all rows are copied once. Minibatches are the same everywhere.
-        **kwargs: for :class:`torchrl.data.TensorDictReplayBuffer`: generator, prefetch, pin_memory, ...
+        **kwargs: for :class:`torchrl.data.TensorDictReplayBuffer`: generator, pin_memory, ...; prefetch, at most 1:
+            several threads would draw in an order that differs from run to run.
 
     Attributes:
         demonstrations: the dataset's description; a :class:`JoinedDemonstrations` where folders are joined or
@@ -143,6 +144,11 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
             check_int("batch_size", batch_size, minimum=1)
         if after_success is not None:
             check_int("after_success", after_success, minimum=0)
+        if (ahead := kwargs.get("prefetch") or 0) > 1:
+            raise ValueError(
+                f"prefetch must be None, 0 or 1, got {shown(ahead)}: several threads draw the batches in an order that "
+                "differs from run to run"
+            )
         where = CPU if device is None else check_device("device", device)
         if grow is not None and where != CPU:
             raise ValueError("device: a buffer that grows is on the CPU; leave it out, and trainers move each minibatch")
