@@ -18,7 +18,7 @@ from torchrl.data.replay_buffers.storages import Storage
 from torchrl.data.replay_buffers.writers import Writer
 from torchrl.envs import Transform
 
-from lw_torchrl._checks import check_choice, check_int, shown
+from lw_torchrl._checks import check_choice, check_int
 from lw_torchrl._devices import CPU, check_device
 from lw_torchrl._state_tree import join, split
 from lw_torchrl._tensor_archive import ArchiveError, TensorArchive, write_archive
@@ -146,7 +146,7 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
             check_int("after_success", after_success, minimum=0)
         if (ahead := kwargs.get("prefetch") or 0) > 1:
             raise ValueError(
-                f"prefetch must be None, 0 or 1, got {shown(ahead)}: several threads draw the batches in an order that "
+                f"prefetch must be None, 0 or 1, got {ahead!r:.40}: several threads draw the batches in an order that "
                 "differs from run to run"
             )
         where = CPU if device is None else check_device("device", device)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-import io
 import os
+import signal
+import subprocess
 import sys
+import time
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 import pytest
@@ -24,7 +27,32 @@ KINDS = {
 }
 
 
+@contextmanager
+def ray_started():
+    import ray
+
+    found_here = {"env_vars": {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}}
+    ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="ERROR", runtime_env=found_here)
+    try:
+        yield
+    finally:
+        ray.shutdown()
+
+
 def make_collector(kind, actor):
+    if kind == "ray":
+        from torchrl.collectors.distributed import RayCollector
+
+        collector = RayCollector(
+            [make_push_reach] * 2,
+            actor,
+            frames_per_batch=2 * ROWS * STEPS,
+            total_frames=10_000 * ROWS * STEPS,
+            collector_kwargs={"auto_register_policy_transforms": False},
+            remote_configs={"num_cpus": 1, "num_gpus": 0, "memory": 2**28},
+        )
+        collector.update_policy_weights_()  # the first ones
+        return collector
     cls, makers, options = KINDS[kind]
     workers = len(makers) if isinstance(makers, list) else 1
     return cls(makers, actor, frames_per_batch=2 * ROWS * STEPS * workers, total_frames=-1, **options)
@@ -54,23 +82,58 @@ def test_workers_get_new_weights_and_differ(kind):
     collector.shutdown()
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_one_that_is_resumed_goes_on_with_the_next_episodes(kind):
-    first = make_collector(kind, make_actor())
-    batches = iter(first)
-    seen = set().union(*(episodes(next(batches)) for _ in range(2)))
-    file = io.BytesIO()
-    torch.save(first.state_dict(), file)
-    first.shutdown()
-    file.seek(0)
-    second = make_collector(kind, make_actor())
-    second.load_state_dict(torch.load(file, weights_only=True))
-    second.reset()
-    batches = iter(second)
-    after = set().union(*(episodes(next(batches)) for _ in range(2)))
-    second.shutdown()
-    assert after
+def collect_until_killed(kind, file):
+    """Never ends; after each batch, ``file`` holds the collector's state and the episodes so far, whole."""
+    with ray_started() if kind == "ray" else nullcontext():
+        collector = make_collector(kind, make_actor())
+        seen = set()
+        for number, batch in enumerate(collector, 1):
+            seen |= episodes(batch)
+            torch.save({"state": collector.state_dict(), "seen": sorted(seen), "batches": number}, f"{file}.new")
+            os.replace(f"{file}.new", file)
+
+
+def kill_after_two_batches(kind, file):
+    """What it left behind: a state of a collector, and the episodes that it had given by then."""
+    program = f"import test_collectors; test_collectors.collect_until_killed({kind!r}, {str(file)!r})"
+    paths = {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path]), "OMP_NUM_THREADS": "1"}
+    process = subprocess.Popen(
+        [sys.executable, "-W", "ignore", "-c", program], env={**os.environ, **paths}, start_new_session=True
+    )
+    try:
+        until = time.monotonic() + 120
+        while not (file.is_file() and torch.load(file, weights_only=True)["batches"] >= 2):
+            assert process.poll() is None
+            assert time.monotonic() < until
+            time.sleep(0.05)
+    finally:
+        os.killpg(process.pid, signal.SIGKILL)  # its workers, too
+        process.wait()
+    left = torch.load(file, weights_only=True)
+    return left["state"], set(left["seen"])
+
+
+@pytest.mark.parametrize("kind", ["one", *(pytest.param(k, marks=pytest.mark.slow) for k in ("sync", "async", "ray"))])
+def test_one_that_was_killed_goes_on_with_the_next_episodes(kind, tmp_path):
+    if kind == "ray":
+        pytest.importorskip("ray")
+    state, seen = kill_after_two_batches(kind, tmp_path / "state.pt")
+    with ray_started() if kind == "ray" else nullcontext():
+        collector = make_collector(kind, make_actor())
+        collector.load_state_dict(state)
+        if kind == "ray":  # which has no reset of its own
+            import ray
+
+            ray.get([remote.reset.remote() for remote in collector.remote_collectors])
+        else:
+            collector.reset()
+        batches = iter(collector)
+        after = set().union(*(episodes(next(batches)) for _ in range(2)))
+        collector.shutdown()
+    assert len(after) >= ROWS * 2
     assert not seen & after
+    if kind == "one":  # the one that had just begun is lost
+        assert min(number for _, number in after) == max(number for _, number in seen) + 2
 
 
 def test_a_pool_of_processes_with_a_policy():
@@ -84,26 +147,16 @@ def test_a_pool_of_processes_with_a_policy():
 
 @pytest.mark.slow
 def test_ray():
-    ray = pytest.importorskip("ray")
-    from torchrl.collectors.distributed import RayCollector
-
-    found_here = {"env_vars": {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}}
-    ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="ERROR", runtime_env=found_here)
-    try:
+    pytest.importorskip("ray")
+    with ray_started():
         actor = make_actor()
-        collector = RayCollector(
-            [make_push_reach] * 2,
-            actor,
-            frames_per_batch=2 * ROWS * STEPS,
-            total_frames=4 * 2 * ROWS * STEPS,
-            collector_kwargs={"auto_register_policy_transforms": False},
-            remote_configs={"num_cpus": 1, "num_gpus": 0, "memory": 2**28},
-        )
-        collector.update_policy_weights_()
+        collector = make_collector("ray", actor)
         found, locs = [], []
         for batch in collector:
             found.append(episodes(batch))
             locs.append(batch["loc"].abs().sum().item())
+            if len(found) == 4:
+                break
             with torch.no_grad():
                 for p in actor.head.parameters():
                     p.zero_()
@@ -112,5 +165,3 @@ def test_ray():
         assert locs[0] > 0
         assert locs[-1] == 0
         collector.shutdown()
-    finally:
-        ray.shutdown()
