@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -35,6 +37,11 @@ class Deployed(nn.Module):
         return self.actor(self.queries(state))["action"]
 
 
+def exported(module):
+    rows = torch.export.Dim("rows", min=1, max=4096)
+    return torch.export.export(module, make_rows(7), dynamic_shapes={"observation": {0: rows}, "task_id": {0: rows}})
+
+
 def make_rows(rows):
     generator = torch.Generator().manual_seed(rows)
     ids = torch.tensor([lw.task_id(task) for task in PLANS])[torch.randint(10, (rows,), generator=generator)]
@@ -44,16 +51,13 @@ def make_rows(rows):
 @pytest.mark.parametrize("name", ACTORS)
 def test_exported_it_gives_the_same_bits_at_every_number_of_rows(name):
     module = Deployed(ACTORS[name]().eval())
-    rows = torch.export.Dim("rows", min=1, max=4096)
-    exported = torch.export.export(
-        module, make_rows(7), dynamic_shapes={"observation": {0: rows}, "task_id": {0: rows}}
-    ).module()
+    run = exported(module).module()
     for number in (2, 7, 64):
         with torch.no_grad():
-            assert torch.equal(exported(*make_rows(number)), module(*make_rows(number))), number
+            assert torch.equal(run(*make_rows(number)), module(*make_rows(number))), number
     observation, ids = make_rows(7)
     with pytest.raises(RuntimeError, match="task_id names tasks"):
-        exported(observation, torch.full_like(ids, lw.task_id("soccer")))
+        run(observation, torch.full_like(ids, lw.task_id("soccer")))
 
 
 @pytest.mark.parametrize("name", ACTORS)
@@ -63,3 +67,24 @@ def test_compiled_it_is_one_graph(name):
     for number in (2, 7, 64):
         with torch.no_grad():
             assert torch.equal(compiled(*make_rows(number)), module(*make_rows(number))), number
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not (shutil.which("c++") or shutil.which("g++")), reason="needs a C++ compiler")
+@pytest.mark.filterwarnings("ignore:.*LeafSpec:FutureWarning", "ignore:.*torch.jit:DeprecationWarning")  # PyTorch's own
+@pytest.mark.parametrize("name", ["plan", "description"])
+def test_compiled_ahead_of_time_it_gives_the_same_but_for_rounding(name, tmp_path):
+    """Compiled kernels are fused, so sums are made in another order: the last bits differ."""
+    module = Deployed(ACTORS[name]().eval())
+    with torch.no_grad():
+        path = torch._inductor.aoti_compile_and_package(exported(module), package_path=str(tmp_path / "policy.pt2"))
+        run = torch._inductor.aoti_load_package(path)
+        for number in (1, 7, 64, 500):
+            assert (run(*make_rows(number)) - module(*make_rows(number))).abs().max() <= 1e-6, number
+    observation, ids = make_rows(7)
+    for wrong in ("soccer", "basketball", "assembly"):
+        with pytest.raises(RuntimeError):
+            run(observation, torch.full_like(ids, lw.task_id(wrong)))
+    observation[3, 5] = torch.nan
+    with pytest.raises(RuntimeError):
+        run(observation, ids)
