@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import torch
 from torch import Tensor
-from torch._C._functorch import is_functorch_wrapped_tensor
+from torch._C._functorch import is_batchedtensor, is_functorch_wrapped_tensor
 from torch._subclasses.fake_tensor import FakeTensor
 
 _ASSERTING = {"cuda"}  # where torch._assert_async waits for nobody
@@ -38,8 +38,13 @@ def readable(*tensors: Tensor) -> bool:
 
 def asserted(*tensors: Tensor) -> bool:
     """Whether what must hold of the tensors is left to ``torch._assert_async``: compiled, and on a CUDA device, where
-    it stops the program later, and nobody waits."""
-    return torch.compiler.is_compiling() or (_waits(*tensors) and plain(*tensors))
+    it stops the program later, and nobody waits. Inside ``vmap`` there is no such thing."""
+    if not torch.compiler.is_compiling():
+        return _waits(*tensors) and plain(*tensors)
+    for tensor in tensors:  # noqa: SIM110 - as above
+        if is_batchedtensor(tensor):
+            return False
+    return True
 
 
 def check_values(holds: Callable[[Tensor], Tensor], tensor: Tensor, problem: str) -> None:

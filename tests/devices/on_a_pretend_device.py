@@ -10,6 +10,7 @@ import torch
 from pretend_device import COPIES, MODULE, PRETEND, WAITS
 from small_training import CONFIG, PLANS, SMALL, assert_same, collect_demos, flat, make_actor
 from tensordict import TensorDict
+from test_losses import CONDITIONS, LOSSES, make_batch, make_loss, ready, total, trained
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import Compose
 
@@ -342,3 +343,25 @@ def test_names_of_devices(demos):
         check_device("device", "pretend:1")
     with pytest.raises(ValueError, match="got 'cuda': this machine, or this build of PyTorch, has no CUDA"):
         make_trainer(demos, "cuda")
+
+
+@pytest.mark.parametrize("condition", CONDITIONS)
+@pytest.mark.parametrize("name", LOSSES)
+def test_a_loss_that_is_made_there_is_the_cpus(name, condition):
+    """With all its networks, their copies, targets and tables; its state comes back."""
+    here, actor, value = make_loss(name, condition)
+    batch = ready(name, make_batch(), actor, value)
+    there, _, _ = make_loss(name, condition, device=PRETEND)
+    there.load_state_dict(here.state_dict())
+    tensors = [one for one in (*there.parameters(), *there.buffers()) if one.dim()]  # all but gamma and its like
+    assert {tensor.device for tensor in tensors} == {PRETEND}
+    found = total(there, batch.to(PRETEND))
+    found.backward()
+    assert found.device == PRETEND
+    assert {p.grad.device for p in trained(there).values()} == {PRETEND}
+    expected = total(here, batch)
+    if name != "REDQ":  # which draws on both
+        torch.testing.assert_close(found.cpu(), expected)
+    other, _, _ = make_loss(name, condition, seed=1)
+    other.load_state_dict(there.state_dict())
+    assert torch.equal(total(other, batch), expected)

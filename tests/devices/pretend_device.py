@@ -36,6 +36,8 @@ class Module(_DummyBackendModule):
     def manual_seed(self, seed) -> None:
         self.state = torch.Generator().manual_seed(seed).get_state()
 
+    manual_seed_all = manual_seed
+
 
 MODULE = Module()
 _setup_privateuseone_for_python_backend("pretend", MODULE)

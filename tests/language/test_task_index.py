@@ -125,6 +125,14 @@ def test_inside_vmap_an_unknown_id_gets_nobodys_numbers():
         each(STATES, IDS + 1)
 
 
+def test_compiled_and_inside_vmap_nothing_is_asserted():
+    """There is no such thing; as for critics in a compiled loss."""
+    index = TaskIndex(["push", "reach"])
+    rows = torch.compile(torch.vmap(lambda ids: index.rows(ids, "wrong")), fullgraph=True, backend="eager")
+    assert torch.equal(rows(IDS.unsqueeze(-1)), torch.tensor([[1], [0], [1]]))
+    assert torch.equal(rows(IDS.unsqueeze(-1) + 1), torch.full((3, 1), 2)), "a row beyond the last"
+
+
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 def test_it_follows_the_ids_to_their_device():
     reader = Reader()

@@ -72,11 +72,13 @@ def make_encoder(condition, **options):
     return DescriptorEncoder("MT10", condition=condition, **options)
 
 
-def make_loss(name, condition, distribution="tanh_normal", seed=0, **noise):
+def make_loss(name, condition, distribution="tanh_normal", seed=0, device="cpu", **noise):
     torch.manual_seed(seed)
     actor = make_actor(condition, None if name in DETERMINISTIC else distribution, **noise)
     q = QValue(make_encoder(condition, **noise), **SMALL)
     v = Value(make_encoder(condition, **noise), **SMALL)
+    for network in (actor, q, v):
+        network.to(device)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*target_actor_network_params.*")  # BCLoss about itself
         loss = LOSSES[name](actor, q, v)
@@ -161,6 +163,49 @@ def test_its_state_goes_round(name):
         assert total(other, batch) != total(loss, batch)
     other.load_state_dict(loss.state_dict())
     assert torch.equal(total(other, batch), total(loss, batch))
+
+
+QUICK = ("BC", "DT")  # to compile; the others take about ten seconds each
+
+
+@pytest.mark.parametrize("name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in LOSSES])
+def test_compiled_it_is_one_graph_with_the_same_gradients(name):
+    loss, actor, value = make_loss(name, "plan")
+    batch = ready(name, make_batch(), actor, value)
+    gradients = []
+    for run in (loss, torch.compile(loss, fullgraph=True, backend="eager")):
+        loss.zero_grad()
+        found = total(run, batch)
+        found.backward()
+        gradients.append([found.detach(), *(p.grad.clone() for p in trained(loss).values())])
+    assert all(torch.equal(one, other) for one, other in zip(*gradients, strict=True))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("condition", CONDITIONS)
+def test_compiled_to_kernels_it_is_the_same_but_for_rounding(condition):
+    loss, _, _ = make_loss("BC", condition)
+    expected = total(loss, make_batch())
+    torch.testing.assert_close(total(torch.compile(loss, fullgraph=True), make_batch()), expected)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.parametrize("condition", CONDITIONS)
+@pytest.mark.parametrize("name", LOSSES)
+def test_it_goes_to_a_gpu_and_comes_back(name, condition):
+    loss, actor, value = make_loss(name, condition)
+    batch = ready(name, make_batch(), actor, value)
+    expected = total(loss, batch)
+    before = copy.deepcopy(loss.state_dict())
+    loss.to("cuda")
+    assert {tensor.device.type for tensor in (*loss.parameters(), *loss.buffers())} == {"cuda"}
+    there = total(loss, batch.to("cuda"))
+    there.backward()
+    assert there.is_cuda
+    assert there.isfinite()
+    loss.to("cpu")
+    loss.load_state_dict(before)
+    assert torch.equal(total(loss, batch), expected)
 
 
 @pytest.mark.parametrize("name", ["SAC", "IQL", "TD3", "CQL", "REDQ"])
