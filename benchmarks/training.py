@@ -1,4 +1,4 @@
-"""A step of behavioral cloning, eager and compiled."""
+"""A step of behavioral cloning, eager on each device that there is, and compiled."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ def _batch() -> TensorDict:
 class _Learner:
     """An actor, its loss and its optimizer, as BehavioralCloningTrainer has them."""
 
-    def __init__(self, batch: TensorDict, *, compiled: bool) -> None:
+    def __init__(self, batch: TensorDict, *, compiled: bool = False, device: str = "cpu") -> None:
         torch.manual_seed(0)
-        actor = lw.PlanConditionedActor(lw.load_plans("MT50"))
+        actor = lw.PlanConditionedActor(lw.load_plans("MT50")).to(device)
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message=".*target_actor_network_params.*")
             self._module = BCLoss(actor, loss_function="l2")
         self._loss = torch.compile(self._module) if compiled else self._module
         self._optimizer = torch.optim.AdamW(self._module.parameters(), lr=1e-3)
-        self._batch = batch
+        self._batch = batch.to(device)
 
     def __call__(self) -> None:
         loss = self._loss(self._batch)["loss_bc"]
@@ -45,21 +45,41 @@ class _Learner:
         self._optimizer.step()
 
 
+def _devices() -> dict[str, str]:
+    """Each device that there is, and what to call it."""
+    gpus = {f"cuda:{number}": torch.cuda.get_device_name(number) for number in range(torch.cuda.device_count())}
+    return {"cpu": "CPU", **gpus, **({"mps": "MPS"} if torch.backends.mps.is_available() else {})}
+
+
+def _on(batch: TensorDict, device: str, steps: int) -> float:
+    """Seconds of a step: the mean, since a GPU is waited for at the end alone."""
+    step = _Learner(batch, device=device)
+    for _ in range(3):
+        step()
+    wait = (lambda: None) if device == "cpu" else lambda: torch.accelerator.synchronize(torch.device(device))
+    wait()
+    start = perf_counter()
+    for _ in range(steps):
+        step()
+    wait()
+    return (perf_counter() - start) / steps
+
+
 def train_step(settings: Settings) -> list[Row]:
     """PlanConditionedActor with BCLoss on batches of 500 of all 50 tasks."""
     batch = _batch()
-    eager = _Learner(batch, compiled=False)
     name = f"training step, batch {BATCH}"
+    steps = settings.pick(100, 2)
+    rows = [under(f"{name}, {called}", 1e3 * _on(batch, there, steps), "ms") for there, called in _devices().items()]
     if not settings.compiled or settings.quick:
-        found = take_turns({"eager": eager}, settings.pick(50, 2), warm_up=3)
-        middle = sorted(found["eager"])[len(found["eager"]) // 2]
-        return [under(f"{name}, eager", 1e3 * middle, "ms", note="--compile measures torch.compile too")]
-    compiled = _Learner(batch, compiled=True)
+        return rows
+    eager, compiled = _Learner(batch), _Learner(batch, compiled=True)
     start = perf_counter()
     compiled()
     waited = perf_counter() - start
     found = take_turns({"compiled": compiled, "eager": eager}, 50, warm_up=5)
     return [
+        *rows,
         compare(
             f"{name}, torch.compile",
             found["compiled"],
@@ -68,5 +88,5 @@ def train_step(settings: Settings) -> list[Row]:
             unit="ms",
             scale=1e3,
             note=f"after {waited:.0f} s of compiling",
-        )
+        ),
     ]

@@ -10,7 +10,7 @@ import torch
 from pretend_device import COPIES, MODULE, PRETEND, WAITS
 from small_training import CONFIG, PLANS, SMALL, assert_same, collect_demos, flat, make_actor
 from tensordict import TensorDict
-from test_losses import CONDITIONS, LOSSES, make_batch, make_loss, ready, total, trained
+from test_losses import LOSSES, make_batch, make_loss, ready, total, trained
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import Compose
 
@@ -345,8 +345,9 @@ def test_names_of_devices(demos):
         make_trainer(demos, "cuda")
 
 
-@pytest.mark.parametrize("condition", CONDITIONS)
-@pytest.mark.parametrize("name", LOSSES)
+@pytest.mark.parametrize(
+    ("name", "condition"), [*((name, "plan") for name in LOSSES), ("SAC", "description"), ("IQL", "one-hot")]
+)
 def test_a_loss_that_is_made_there_is_the_cpus(name, condition):
     """With all its networks, their copies, targets and tables; its state comes back."""
     here, actor, value = make_loss(name, condition)
@@ -363,5 +364,6 @@ def test_a_loss_that_is_made_there_is_the_cpus(name, condition):
     if name != "REDQ":  # which draws on both
         torch.testing.assert_close(found.cpu(), expected)
     other, _, _ = make_loss(name, condition, seed=1)
+    total(other, batch)  # REDQ's state grows at its first call
     other.load_state_dict(there.state_dict())
     assert torch.equal(total(other, batch), expected)
