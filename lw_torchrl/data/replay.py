@@ -28,7 +28,7 @@ from lw_torchrl.data.growing import GrowingStorage
 from lw_torchrl.data.growing_writer import GrowingWriter
 from lw_torchrl.data.metadata import read_metadata
 from lw_torchrl.data.n_steps import check_n_steps
-from lw_torchrl.data.replay_checks import check_growing, check_reward, check_transform
+from lw_torchrl.data.replay_checks import check_growing, check_prefetch, check_reward, check_transform
 from lw_torchrl.data.selection import (
     LABELS,
     EpisodeChoice,
@@ -134,6 +134,7 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
     ) -> None:
         check_n_steps(n_steps, gamma)
         check_transform(transform)
+        check_prefetch(kwargs.get("prefetch"))
         if (n_steps > 1 or grow is not None) and label != "executed":
             raise ValueError(f"n_steps and grow need label='executed', whose actions the rewards are of, got {label!r}")
         if grow is not None:
@@ -144,14 +145,9 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
             check_int("batch_size", batch_size, minimum=1)
         if after_success is not None:
             check_int("after_success", after_success, minimum=0)
-        if (ahead := kwargs.get("prefetch") or 0) > 1:
-            raise ValueError(
-                f"prefetch must be None, 0 or 1, got {ahead!r:.40}: several threads draw the batches in an order that "
-                "differs from run to run"
-            )
         where = CPU if device is None else check_device("device", device)
         if grow is not None and where != CPU:
-            raise ValueError("device: a buffer that grows is on the CPU; leave it out, and trainers move each minibatch")
+            raise ValueError("device: a buffer that grows is on the CPU; leave it out, trainers move each minibatch")
         joined = not isinstance(root, (str, os.PathLike))
         self.roots = tuple(map(Path, root)) if joined else (Path(root),)  # type: ignore[arg-type]
         choices = _choices(episodes, len(self.roots), joined)

@@ -23,6 +23,15 @@ def check_transform(transform: Any) -> None:
         check_transform(part)
 
 
+def check_prefetch(batches: int | None) -> None:
+    """Raise where several threads would draw batches in an order that differs from run to run."""
+    if (batches or 0) > 1:
+        raise ValueError(
+            f"prefetch must be None, 0 or 1, got {batches}: several threads draw the batches in an order that differs "
+            "from run to run"
+        )
+
+
 def check_growing(sampler: Any, options: Mapping[str, Any]) -> None:
     """Raise for what a buffer that grows cannot do, or would do wrong without a word."""
     if options.get("prefetch"):
