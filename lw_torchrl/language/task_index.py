@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from lw_torchrl.language.tasks import MT50, task_id
-from lw_torchrl.language.value_checks import asserted, plain, readable
+from lw_torchrl.language.value_checks import asserted, plain, waits
 
 _Kind = tuple[torch.device, torch.dtype, bool]
 _KEPT_ROWS = 4096  # of the last batch, the most to keep the tables of
@@ -80,7 +80,7 @@ class TaskIndex:
         else:  # inside of vmap searchsorted warns of how the rows lie in memory
             rows = (given.unsqueeze(-1) > ids[:-1]).sum(-1)
         found = ids.index_select(0, rows.reshape(-1)).reshape(rows.shape)
-        if readable(task_id):
+        if kept and not waits(task_id):
             if not torch.equal(found, given):
                 raise ValueError(f"task_id names {problem}: {self._name(given[found != given])}")
             return rows
@@ -137,7 +137,7 @@ class TaskTables(nn.Module, Generic[Tables]):
             return self._pick(self._to(device, dtype), task_id)
         # Autograd refuses what was made in inference mode.
         kind = device, dtype, torch.is_inference_mode_enabled()
-        looked_at = readable(task_id)
+        looked_at = not waits(task_id)
         if self._last is not None and looked_at:
             ids, of, selected = self._last
             if of == kind and ids.device == task_id.device and torch.equal(ids, task_id):

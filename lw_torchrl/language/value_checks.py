@@ -23,9 +23,10 @@ def plain(*tensors: Tensor) -> bool:
     return True
 
 
-def _waits(*tensors: Tensor) -> bool:
+def waits(*tensors: Tensor) -> bool:
+    """Whether whoever looks at the tensors' numbers waits for a device that can check them itself."""
     for tensor in tensors:  # noqa: SIM110 - as above
-        if tensor.device.type in _ASSERTING:
+        if not tensor.is_cpu and tensor.device.type in _ASSERTING:
             return True
     return False
 
@@ -33,14 +34,14 @@ def _waits(*tensors: Tensor) -> bool:
 def readable(*tensors: Tensor) -> bool:
     """Whether Python may look at the tensors' numbers: :func:`plain` ones, and none on a CUDA device, for which it
     would have to wait."""
-    return plain(*tensors) and not _waits(*tensors)
+    return plain(*tensors) and not waits(*tensors)
 
 
 def asserted(*tensors: Tensor) -> bool:
     """Whether what must hold of the tensors is left to ``torch._assert_async``: compiled, and on a CUDA device, where
     it stops the program later, and nobody waits. Inside ``vmap`` there is no such thing."""
     if not torch.compiler.is_compiling():
-        return _waits(*tensors) and plain(*tensors)
+        return waits(*tensors) and plain(*tensors)
     for tensor in tensors:  # noqa: SIM110 - as above
         if is_batchedtensor(tensor):
             return False
