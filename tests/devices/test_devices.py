@@ -20,10 +20,21 @@ needs_a_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a 
 needs_no_gpu = pytest.mark.skipif(torch.accelerator.is_available(), reason="needs a machine without a GPU")
 
 
-def test_on_a_pretend_device_nobody_waits():
-    paths = [str(HERE), *(str(HERE.parent / room) for room in ("trainers", "objectives")), *sys.path]
+@pytest.mark.parametrize("which", ["not slow", pytest.param("slow", marks=pytest.mark.slow)])
+def test_on_a_pretend_device_nobody_waits(which):
+    paths = [str(HERE), *(str(HERE.parent / room) for room in ("trainers", "objectives", "experiments")), *sys.path]
     done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(HERE / "on_a_pretend_device.py")],
+        [
+            sys.executable,
+            "-m",
+            "pytest",
+            "-q",
+            "-p",
+            "no:cacheprovider",
+            "-m",
+            which,
+            str(HERE / "on_a_pretend_device.py"),
+        ],
         cwd=HERE.parent.parent,
         env={**os.environ, "PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"},
         capture_output=True,
