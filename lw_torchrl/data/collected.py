@@ -11,6 +11,7 @@ from lw_torchrl.data.n_steps import STEPS
 from lw_torchrl.data.storage import column_name
 
 EXECUTED = ("next", "executed_action")
+MASK = ("collector", "mask")
 
 
 def collected_rows(batch: TensorDictBase, columns: Mapping[NestedKey, Tensor]) -> dict[NestedKey, Tensor]:
@@ -25,13 +26,18 @@ def collected_rows(batch: TensorDictBase, columns: Mapping[NestedKey, Tensor]) -
 
     Raises:
         ValueError: a column is missing, or of another dtype or shape; a number is NaN or infinite; an action lies
-            outside [-1, 1]; the rows are of n steps already.
+            outside [-1, 1]; the rows are of n steps already, or no steps, by ``("collector", "mask")``.
     """
     names = set(batch.keys(True, True))
     if STEPS in names:
         raise ValueError(
             f"batch holds {STEPS}, so MultiStep or MultiStepTransform was here: leave it out and give the buffer "
             "n_steps= and gamma=, which makes n steps of the demonstrations and of these rows alike"
+        )
+    if MASK in names and not batch.get(MASK).all():
+        raise ValueError(
+            "batch holds rows that are no steps: split_trajs=True fills trajectories up to one length; leave it out, "
+            "or give batch[batch['collector', 'mask']]"
         )
     sources = {key: EXECUTED if key == "action" and EXECUTED in names else key for key in columns}
     if absent := [column_name(key) for key, source in sources.items() if source not in names]:

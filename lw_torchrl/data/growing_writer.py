@@ -24,7 +24,7 @@ class GrowingWriter(Writer):
         """Write the rows of a batch; their places, int64 of the batch's shape."""
         index = self._storage.extend(data)
         for entity in self._storage._attached_entities_iter():
-            entity.mark_update(index)
+            entity.mark_update(index.reshape(-1))
         return index
 
     def add(self, data: TensorDictBase) -> Tensor:

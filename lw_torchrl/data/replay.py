@@ -183,6 +183,7 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         writer: Writer = ImmutableDatasetWriter() if grow is None else GrowingWriter()
         self.root = self.roots[0]
         self.label, self.reward = label, reward
+        self._grows = grow is not None
         super().__init__(
             storage=storage,
             sampler=sampler,
@@ -191,10 +192,6 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
             transform=transform,
             **kwargs,
         )
-
-    @property
-    def _grows(self) -> bool:
-        return isinstance(self._storage, GrowingStorage)
 
     def set_sampler(self, sampler: Sampler) -> Sampler:
         """Take another sampler; returns the one before."""
@@ -216,7 +213,7 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
 
     def share(self, shared: bool = True) -> LanguageWorldExperienceReplay:
         """Let other processes read it; a buffer that grows refuses."""
-        if shared and self._initialized and self._grows:
+        if shared and self._grows:
             raise RuntimeError(
                 "a buffer that grows is of one process: let the collector yield its batches, and extend the buffer "
                 "with them here"

@@ -49,7 +49,16 @@ def _no_open_gl(error: Exception) -> ImportError:
     )
 
 
+def _let_go(context: Any) -> None:
+    """Let another thread take the context, where EGL draws."""
+    if type(context).__module__ == "mujoco.egl":
+        from OpenGL import EGL  # type: ignore[import-untyped]
+
+        EGL.eglReleaseThread()
+
+
 _open: WeakSet[Cameras] = WeakSet()
+_processes: set[int] = set()  # that opened OpenGL, this one and those it was forked from
 
 
 def _close_all() -> None:
@@ -59,13 +68,19 @@ def _close_all() -> None:
 
 
 class Cameras:
-    """Takes pictures; a model's meshes and textures are loaded at its first. One thread's, which may be any.
+    """Takes pictures; a model's meshes and textures are loaded at its first. One thread at a time, which may be any.
 
     Raises:
         ImportError: there is no OpenGL, at once or with the first picture.
+        RuntimeError: this process was forked from one that took pictures.
     """
 
     def __init__(self) -> None:
+        if _processes - {os.getpid()}:
+            raise RuntimeError(
+                "this process was forked from one that took pictures, and OpenGL's threads stayed there: start it with "
+                "mp_start_method='spawn', or take no picture before the fork"
+            )
         try:
             self._gl = _open_gl()
         except Exception as error:  # each platform has its own, an AttributeError among them
@@ -74,6 +89,7 @@ class Cameras:
             atexit.unregister(_close_all)
             atexit.register(_close_all)  # after the platform's, so that it runs first
         _open.add(self)
+        _processes.add(os.getpid())
         self._loaded: dict[str, tuple[Any, Any]] = {}
 
     def picture(self, scene: str, model: Any, data: Any, *, camera: str, height: int, width: int) -> NDArray[np.uint8]:
@@ -86,6 +102,12 @@ class Cameras:
             height, width: pixels.
         """
         self._gl.make_current()
+        try:
+            return self._picture(scene, model, data, camera, height, width)
+        finally:
+            _let_go(self._gl)
+
+    def _picture(self, scene: str, model: Any, data: Any, camera: str, height: int, width: int) -> NDArray[np.uint8]:
         if scene not in self._loaded:
             try:
                 context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
@@ -111,7 +133,7 @@ class Cameras:
 
     def close(self) -> None:
         """Free the context and what it holds."""
-        if self not in _open:
+        if self not in _open or os.getpid() not in _processes:
             return
         _open.remove(self)
         self._gl.make_current()

@@ -279,7 +279,8 @@ class LanguageWorldEnv(EnvBase):
         """Pictures of all rows as they are now, for TorchRL's PixelRenderTransform and VideoRecorder.
 
         They are drawn by OpenGL, without shadows; on Linux without a display and MUJOCO_GL it is EGL. A picture changes
-        nothing in the simulation.
+        nothing in the simulation. A PixelRenderTransform does: ask for its environment's ``observation_spec`` before
+        the first reset, or the first step resets it.
 
         Args:
             camera: "corner2", "corner", "corner3", "corner4", "topview", "behindGripper" or "gripperPOV".
@@ -290,7 +291,7 @@ class LanguageWorldEnv(EnvBase):
 
         Raises:
             ValueError: an unknown camera or size.
-            RuntimeError: a row that was never reset.
+            RuntimeError: a row that was never reset; or the process was forked from one that took pictures.
             ImportError: there is no OpenGL; it names what to install.
             NotImplementedError: the engine is one of your own and has no ``render``.
 

@@ -163,9 +163,8 @@ class QueryProgram(nn.Module):
 
     def _kernel(self, observation: Tensor, task_id: Tensor) -> Callable[..., bool] | None:
         """What answers this batch in one compiled pass, if anything can."""
-        if observation.dtype in self._facts and observation.device.type == "cpu" and readable(observation, task_id):
-            return find_kernel()
-        return None
+        known = observation.dtype in self._facts and observation.device.type == "cpu"
+        return find_kernel() if known and self._row.plain(observation, task_id) else None
 
     def _answer(self, kernel: Callable[..., bool], observation: Tensor, task_id: Tensor) -> Tensor:
         row = self._row.select(task_id.reshape(-1), observation).row.numpy().view(np.uint64)

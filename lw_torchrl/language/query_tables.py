@@ -14,14 +14,21 @@ from lw_torchrl.language.queries import Clause, Query
 from lw_torchrl.language.relations import PREDICATES, Comparison
 from lw_torchrl.language.tasks import Task
 
-_ORIGIN = (0.0, 0.0, 0.0)
 # Of the origin and itself, the padding of the tables: far from changing its truth at any temperature.
 _ALWAYS = Comparison("xyz", "<", 1e4, temperature=1e-6)
 _NEVER = Comparison("xyz", "<", -1e4, temperature=1e-6)
 
-_Position = tuple[Coordinate, Coordinate, Coordinate]
+_Position = tuple[tuple[type, Coordinate], ...]
 Atom = tuple[_Position, _Position, tuple[float, float, float], Comparison]
 _NO_SHIFT = (0.0, 0.0, 0.0)
+
+
+def _typed(position: Sequence[Coordinate]) -> _Position:
+    """Coordinates with their types: index 1 and metre 1.0 are equal numbers, but other places."""
+    return tuple((type(coordinate), coordinate) for coordinate in position)
+
+
+_ORIGIN = _typed((0.0, 0.0, 0.0))
 
 
 class QueryTables(NamedTuple):
@@ -42,15 +49,14 @@ class QueryTables(NamedTuple):
 
 
 def clause_atoms(clause: Clause, task: Task) -> list[Atom]:
-    first: _Position = (0.0, 0.0, OPENING)
-    second: _Position = _ORIGIN
+    first, second = _typed((0.0, 0.0, OPENING)), _ORIGIN
     shift = _NO_SHIFT
     if clause.predicate not in ("open", "closed"):
         subject = task.object(clause.subject)
-        first, shift = subject.position, subject.offset
+        first, shift = _typed(subject.position), subject.offset
         if clause.object is not None:
             other = task.object(clause.object)
-            second = other.position
+            second = _typed(other.position)
             x, y, z = (a - b for a, b in zip(shift, other.offset, strict=True))
             shift = (x, y, z)
     return [(first, second, shift, part) for part in PREDICATES[clause.predicate]]
@@ -60,9 +66,8 @@ def atom_index(atom: Atom, side: int, constants: list[float]) -> list[int]:
     """Where the coordinates of an atom's first or second position stand; those of 0 for an axis left out."""
     first, second, _, part = atom
     position = (first, second)[side if part.sense == "<" else 1 - side]
-    return [
-        coordinate_index(c if axis in part.axes else 0.0, constants) for axis, c in zip("xyz", position, strict=True)
-    ]
+    used = [c if axis in part.axes else 0.0 for axis, (_, c) in zip("xyz", position, strict=True)]
+    return [coordinate_index(c, constants) for c in used]
 
 
 def atom_shift(atom: Atom) -> list[float]:

@@ -119,6 +119,10 @@ class TaskTables(nn.Module, Generic[Tables]):
         """The tables, each (T, ...)."""
         return self._make(self.buffers(recurse=False))
 
+    def plain(self, *tensors: Tensor) -> bool:
+        """Whether the tensors are, and the tables: a loss may give each member of an ensemble tables of its own."""
+        return plain(*tensors, next(iter(self._buffers.values())))  # type: ignore[arg-type]
+
     def select(self, task_id: Tensor, observation: Tensor) -> Tables:
         """The tables' rows for a batch.
 
@@ -133,7 +137,7 @@ class TaskTables(nn.Module, Generic[Tables]):
             ValueError: as for :meth:`TaskIndex.rows`.
         """
         device, dtype = observation.device, observation.dtype
-        if not plain(observation, task_id):
+        if not self.plain(observation, task_id):
             return self._pick(self._to(device, dtype), task_id)
         # Autograd refuses what was made in inference mode.
         kind = device, dtype, torch.is_inference_mode_enabled()

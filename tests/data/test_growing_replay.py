@@ -221,6 +221,12 @@ def test_refused_later_too(root):
         still.extend(replay[:])
 
 
+def test_a_buffer_that_is_built_at_its_first_use(root):
+    replay = open_replay(root, delayed_init=True)
+    replay.set_sampler(RandomSampler())
+    assert len(replay) == 120
+
+
 def test_what_is_shown_is_what_a_collector_gives_too(root):
     replay = open_replay(root)
     later = ("observation", "task_id", "success", "done", "terminated", "truncated", "reward")

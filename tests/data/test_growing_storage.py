@@ -222,6 +222,7 @@ BAD = [
     (changed(("next", "reward"), torch.full((2, 3, 1), torch.nan)), "column next/reward holds NaN"),
     (changed("action", torch.full((2, 3, 2), 1.5)), r"action must be what was done, in \[-1, 1\], got one of 1.5"),
     (changed("steps_to_next_obs", torch.ones(2, 3)), "so MultiStep or MultiStepTransform was here: leave it out"),
+    (changed(("collector", "mask"), torch.ones(2, 3).tril().bool()), "rows that are no steps: split_trajs=True"),
     (Stream(0, 2, 0).batch(16), "batch must have 1 to 30 rows, as many as grow says, got 32"),
 ]
 
@@ -235,6 +236,26 @@ def test_rows_that_do_not_fit_are_refused_and_nothing_is_written(batch, message)
         replay.extend(batch)
     assert len(replay) == 12 + 6
     assert all(torch.equal(before["rows"][key], leaf) for key, leaf in replay.storage.state_dict()["rows"].items())
+
+
+def test_trajectories_that_were_split_are_stored_without_what_fills_them_up():
+    replay = buffer()
+    batch = changed(("collector", "mask"), torch.ones(2, 3).tril().bool())
+    replay.extend(batch[batch["collector", "mask"]])
+    assert torch.equal(replay[12:]["observation"], batch["observation"][batch["collector", "mask"]])
+
+
+def test_a_sampler_that_keeps_something_of_each_row_is_told_of_rows_one_by_one():
+    class Marked(RandomSampler):
+        marks = ()
+
+        def mark_update(self, index, *, storage=None):
+            self.marks += (index,)
+
+    replay = buffer(sampler=(sampler := Marked()))
+    for shape in ((2, 3), (6,)):
+        replay.extend(Stream(0, 2, 0).batch(3).reshape(shape))
+    assert [mark.tolist() for mark in sampler.marks] == [list(range(12, 18)), list(range(18, 24))]
 
 
 def test_what_was_done_is_the_action_and_other_columns_are_left_out():

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -180,6 +181,55 @@ except ImportError as error:
     print("ImportError:", error)
 env.close()
 """
+
+
+def test_one_thread_takes_pictures_and_then_another():
+    env = opened()
+    with ThreadPoolExecutor(2) as pool:
+        here = env.render(height=24, width=32)
+        there = pool.submit(env.render, height=24, width=32).result()
+        pool.submit(env.close).result()
+    assert torch.equal(here, there)
+
+
+_FORK = """
+import multiprocessing as mp
+import lw_torchrl as lw
+
+def show():
+    mine = lw.LanguageWorldEnv("reach")
+    mine.reset()
+    try:
+        mine.render(height=24, width=32)
+    except RuntimeError as error:
+        print(error, flush=True)
+    env.close()
+    print("closed", flush=True)
+
+if __name__ == "__main__":
+    env = lw.LanguageWorldEnv("reach")
+    env.reset()
+    env.render(height=24, width=32)
+    child = mp.get_context("fork").Process(target=show)
+    child.start()
+    child.join(60)
+    child.kill()
+"""
+
+
+def test_a_process_forked_after_a_picture_is_told_and_does_not_hang():
+    done = subprocess.run([sys.executable, "-c", _FORK], capture_output=True, text=True, check=True)
+    assert "forked from one that took pictures" in done.stdout
+    assert done.stdout.endswith("closed\n")
+
+
+def test_pixels_are_of_one_episode_once_the_specs_are_known():
+    pixels = PixelRenderTransform(height=24, width=32)
+    env = TransformedEnv(lw.LanguageWorldEnv(["reach", "push"], num_threads=1), pixels)
+    assert env.observation_spec["pixels"].shape == (2, 24, 32, 3)
+    rollout = env.rollout(3)
+    assert torch.equal(rollout["episode"], rollout["next", "episode"])
+    env.close()
 
 
 def test_an_environment_left_open_ends_in_silence():

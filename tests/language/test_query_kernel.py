@@ -12,10 +12,11 @@ from hypothesis import strategies as st
 from states import all_tasks, random_states
 
 from lw_torchrl.language import query_program
+from lw_torchrl.language.named_objects import GRIPPER, NamedObject
 from lw_torchrl.language.queries import supported_queries
 from lw_torchrl.language.query_facts import MOST_FACTS
 from lw_torchrl.language.query_program import QueryProgram, find_kernel
-from lw_torchrl.language.tasks import MT50, task_id
+from lw_torchrl.language.tasks import MT50, Task, task_id
 
 
 @pytest.fixture
@@ -68,6 +69,17 @@ def test_on_all_tasks_and_lists_of_different_lengths():
         compiled, by_tables = both(program, given_states, ids)
         assert torch.equal(compiled, by_tables)
         assert 0 < compiled.sum() < compiled.numel()
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_a_place_in_metres_is_no_place_in_the_observation(compiled, monkeypatch):
+    if not compiled:
+        monkeypatch.setattr(query_program, "find_kernel", lambda: None)
+    objects = (NamedObject(GRIPPER, (0, 1, 2)), NamedObject("puck", (4, 5, 6)), NamedObject("wall", (0.0, 1, 2)))
+    program = QueryProgram({Task("slide", "", objects): ["gripper near puck", "wall near puck", "gripper near wall"]})
+    states = torch.zeros(2, 39)
+    states[0, [0, 4]] = 0.5
+    assert program(states, torch.full((2,), task_id("slide"))).tolist() == [[True, False, False], [True] * 3]
 
 
 def test_what_contradicts_itself_never_holds():

@@ -4,9 +4,11 @@ import shutil
 
 import pytest
 import torch
-from states import all_tasks
+from states import all_tasks, random_states
+from tensordict import TensorDict
 
 from lw_torchrl.language.query_program import QueryProgram
+from lw_torchrl.language.tasks import task_id
 
 
 class Asked(torch.nn.Module):
@@ -57,6 +59,22 @@ def test_inductor_answers_on_the_thresholds_too():
     states[::3, 4:7] = states[::3, 0:3]
     states[::3, 4] -= 0.04
     agrees_with_eager(torch.compile(Asked(program), fullgraph=True), program, states, ids)
+
+
+@pytest.mark.parametrize("soft", [False, True])
+def test_an_ensemble_may_have_tables_for_each_member(soft):
+    program = QueryProgram({"push": ["gripper near puck", "gripper open"]})
+    states = torch.from_numpy(random_states("push", n=20))
+    ids = torch.full((20,), task_id("push"))
+    members = TensorDict.from_modules(program, QueryProgram(program.queries), as_module=True)
+
+    def ask(member):
+        with member.to_module(program):
+            return program.logits(states, ids) if soft else program(states, ids)
+
+    answers = torch.vmap(ask)(members)
+    expected = program.logits(states, ids) if soft else program(states, ids)
+    assert torch.equal(answers, expected.expand(2, 20, 2))
 
 
 def test_each_state_by_vmap_answers_as_the_batch():
