@@ -34,7 +34,11 @@ def _open_gl() -> Any:
     """A context of OpenGL without a window; without a display and MUJOCO_GL, of EGL."""
     headless = sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
     if headless and not os.environ.get("MUJOCO_GL"):
-        from mujoco.egl import GLContext
+        before = os.environ.get("PYOPENGL_PLATFORM")
+        from mujoco.egl import GLContext  # which says "egl" to processes started from here, too
+
+        if before is None:
+            os.environ.pop("PYOPENGL_PLATFORM", None)
     else:
         from mujoco.gl_context import GLContext
     return GLContext(64, 64)
