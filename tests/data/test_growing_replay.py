@@ -196,7 +196,7 @@ def test_the_other_reward_is_refused_by_name(root, tmp_path):
     [
         (dict(label="expert"), ValueError, "n_steps and grow need label='executed'.* got 'expert'"),
         (dict(grow=0), ValueError, "grow must be at least 1, got 0"),
-        (dict(prefetch=2), ValueError, "prefetch=2 draws batches before the newest rows come"),
+        (dict(prefetch=1), ValueError, "prefetch=1 draws batches before the newest rows come"),
         (dict(shared=True), ValueError, "shared=True: a buffer that grows is of one process"),
         (
             dict(sampler=SliceSampler(slice_len=4, end_key=("next", "done"))),
