@@ -13,6 +13,7 @@ from lw_torchrl.language.observation import OBSERVATION_SIZE
 GRIPPER = "robot's gripper"
 Coordinate = int | float
 """An int is an index into the observation, a float a fixed number of metres."""
+TypedPosition = tuple[tuple[bool, Coordinate], ...]
 
 _SLICE = re.compile(r"obs\[([0-9]{1,4}):([0-9]{1,4})\]")
 _INDEX = re.compile(r"obs\[([0-9]{1,4})\]")
@@ -22,6 +23,11 @@ def is_number(value: object) -> bool:
     """Whether ``value`` is a number that is plausible in metres, gains or efforts: neither bool nor NaN, and not
     huge."""
     return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e9
+
+
+def typed(position: Sequence[Coordinate]) -> TypedPosition:
+    """A position that equals no other: index 1 and metre 1.0 are equal numbers."""
+    return tuple((isinstance(coordinate, int), coordinate) for coordinate in position)
 
 
 def coordinate_index(coordinate: Coordinate, constants: list[float]) -> int:
@@ -131,10 +137,10 @@ def read_objects(row: Mapping[str, Any]) -> tuple[NamedObject, ...]:
 def write_objects(objects: Sequence[NamedObject]) -> dict[str, dict[str, Any]]:
     """What :func:`read_objects` reads back, if a row can hold it."""
     row: dict[str, dict[str, Any]] = {"objects": {}, "points": {}}
-    published = {named.position: named.name for named in reversed(objects) if not named.ours}
+    published = {typed(named.position): named.name for named in reversed(objects) if not named.ours}
     for named in objects[1:]:
         at: Any = write_position(named.position)
         if any(named.offset):
-            at = {"object": published.get(named.position, ""), "offset": list(named.offset)}
+            at = {"object": published.get(typed(named.position), ""), "offset": list(named.offset)}
         row["points" if named.ours else "objects"][named.name] = at
     return row

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from lw_torchrl.language.named_objects import Coordinate, coordinate_index
+from lw_torchrl.language.named_objects import TypedPosition, coordinate_index, typed
 from lw_torchrl.language.observation import OPENING
 from lw_torchrl.language.queries import Clause, Query
 from lw_torchrl.language.relations import PREDICATES, Comparison
@@ -18,17 +18,11 @@ from lw_torchrl.language.tasks import Task
 _ALWAYS = Comparison("xyz", "<", 1e4, temperature=1e-6)
 _NEVER = Comparison("xyz", "<", -1e4, temperature=1e-6)
 
-_Position = tuple[tuple[type, Coordinate], ...]
-Atom = tuple[_Position, _Position, tuple[float, float, float], Comparison]
+Atom = tuple[TypedPosition, TypedPosition, tuple[float, float, float], Comparison]
 _NO_SHIFT = (0.0, 0.0, 0.0)
 
 
-def _typed(position: Sequence[Coordinate]) -> _Position:
-    """Coordinates with their types: index 1 and metre 1.0 are equal numbers, but other places."""
-    return tuple((type(coordinate), coordinate) for coordinate in position)
-
-
-_ORIGIN = _typed((0.0, 0.0, 0.0))
+_ORIGIN = typed((0.0, 0.0, 0.0))
 
 
 class QueryTables(NamedTuple):
@@ -49,14 +43,14 @@ class QueryTables(NamedTuple):
 
 
 def clause_atoms(clause: Clause, task: Task) -> list[Atom]:
-    first, second = _typed((0.0, 0.0, OPENING)), _ORIGIN
+    first, second = typed((0.0, 0.0, OPENING)), _ORIGIN
     shift = _NO_SHIFT
     if clause.predicate not in ("open", "closed"):
         subject = task.object(clause.subject)
-        first, shift = _typed(subject.position), subject.offset
+        first, shift = typed(subject.position), subject.offset
         if clause.object is not None:
             other = task.object(clause.object)
-            second = _typed(other.position)
+            second = typed(other.position)
             x, y, z = (a - b for a, b in zip(shift, other.offset, strict=True))
             shift = (x, y, z)
     return [(first, second, shift, part) for part in PREDICATES[clause.predicate]]

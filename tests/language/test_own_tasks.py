@@ -5,6 +5,7 @@ import torch
 from tensordict import TensorDict
 
 import lw_torchrl as lw
+from lw_torchrl.language.named_objects import GRIPPER, NamedObject, read_objects, write_objects
 from lw_torchrl.language.skills import SkillError
 
 FILE = """
@@ -88,3 +89,12 @@ def test_a_plan_without_a_definition_is_of_one_of_the_50():
     stranger = lw.Task("pushh", "Push.", lw.TASKS["push"].objects)
     assert lw.ConditionalPlan("pushh", steps, stranger).definition is stranger
     assert lw.Plans([lw.ConditionalPlan("pushh", steps, stranger)]).num_steps == len(steps)
+
+
+def test_a_point_beside_a_place_in_metres_is_written_as_one_beside_that():
+    """Index 1 and metre 1.0 are equal numbers, and other places."""
+    puck, wall = NamedObject("puck", (0, 1, 2)), NamedObject("wall", (0.0, 1, 2))
+    beside = NamedObject("wall side", (0.0, 1, 2), offset=(0.1, 0.0, 0.0), ours=True)
+    written = write_objects((NamedObject(GRIPPER, (0, 1, 2)), puck, wall, beside))
+    assert written["points"]["wall side"]["object"] == "wall"
+    assert read_objects(written)[1:] == (puck, wall, beside)
