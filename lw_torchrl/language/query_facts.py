@@ -18,7 +18,7 @@ from lw_torchrl.language.query_tables import (
     is_far,
     is_flipped,
 )
-from lw_torchrl.language.tasks import Task
+from lw_torchrl.language.tasks import MT50, Task, task_id
 
 MOST_FACTS = 63  # of a task; the last bit of 64 is never true
 _NEVER = 1 << MOST_FACTS
@@ -30,6 +30,8 @@ class QueryFacts(NamedTuple):
     """The facts (F) of all tasks, one after another: a task's comparisons of lengths, then those of one coordinate;
     then its conjunctions (D). A query holds where the bits of its task's facts that it cares for are those it wants."""
 
+    ids: NDArray[np.int64]  # (T,), of the tasks, ascending
+    row_of: NDArray[np.int64]  # (50,), the row of each of the 50 tasks, -1 for one without
     ends: Bits  # (T, 5): a task's lengths begin and end, its coordinates end, its conjunctions begin and end
     places: Bits  # (F, 6), of x, y and z of both positions in turn; of a coordinate's, the first two alone
     metres: NDArray[np.floating[Any]]  # (F, 5): the shift along x, y and z, the length's sign, the threshold
@@ -81,7 +83,12 @@ class _TaskFacts:
 
 
 def compile_facts(queries: Mapping[Task, Sequence[Query]]) -> QueryFacts | None:
-    """The facts of the queries of tasks, rows in the mapping's order; None where a task has too many for 64 bits."""
+    """The facts of the queries of tasks, in the order of their ids; None where a task has too many for 64 bits."""
+    ids = [task_id(task.name) for task in queries]
+    row_of = np.full(len(MT50), -1)
+    for row, number in enumerate(ids):
+        if number < len(MT50):
+            row_of[number] = row
     tasks = [_TaskFacts(task, listed) for task, listed in queries.items()]
     if max(task.count for task in tasks) > MOST_FACTS:
         return None
@@ -108,6 +115,8 @@ def compile_facts(queries: Mapping[Task, Sequence[Query]]) -> QueryFacts | None:
     literals = [task.queries + [(_NEVER, _NEVER)] * (steps - len(task.queries)) for task in tasks]
     care, want = np.moveaxis(np.array(literals, np.uint64), 2, 0)
     return QueryFacts(
+        ids=np.array(ids),
+        row_of=row_of,
         ends=np.array(ends, np.uint64),
         places=np.array(places, np.uint64),
         metres=np.array(metres),

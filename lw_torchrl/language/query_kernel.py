@@ -12,7 +12,9 @@ from numba import njit
 @njit(cache=True, nogil=True, error_model="numpy")
 def answer(
     observation: Any,
-    row: Any,
+    task_id: Any,
+    ids: Any,
+    row_of: Any,
     ends: Any,
     places: Any,
     metres: Any,
@@ -28,11 +30,12 @@ def answer(
 
     Args:
         observation: (B, 39) float32 or float64, metres.
-        row: (B,) uint64, of the tables that follow, those of :class:`QueryFacts` in its order.
+        task_id: (B,) int64.
+        ids and what follows: the tables of :class:`QueryFacts`, in its order.
         truth: (B, S) bool, written.
 
     Returns:
-        Whether the observation holds finite numbers.
+        False for a task without queries, or an observation that holds NaN or infinity.
     """
     size = observation.shape[1]
     numbers = np.empty(size + constants.shape[0], observation.dtype)
@@ -44,7 +47,16 @@ def answer(
             number = observation[b, i]
             numbers[i] = number
             finite &= number - number == 0
-        t = row[b]
+        task, row = task_id[b], -1
+        if 0 <= task < len(row_of):
+            row = row_of[task]
+        else:
+            found = np.searchsorted(ids, task)
+            if found < len(ids) and ids[found] == task:
+                row = found
+        if row < 0:
+            return False
+        t = np.uint64(row)
         facts = np.uint64(0)
         for a in range(ends[t, 0], ends[t, 1]):
             x = numbers[places[a, 0]] - numbers[places[a, 1]] + metres[a, 0]

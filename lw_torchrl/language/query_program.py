@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache, reduce
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -22,10 +21,6 @@ from lw_torchrl.language.value_checks import asserted, readable
 _LEAST, _MOST = 1e-6, 1e4  # of the size of a logit, and of metres where a length has a gradient
 _COMPILED = {torch.float32: np.float32, torch.float64: np.float64}
 _NOT_FINITE = "observation must hold finite numbers, got NaN or infinity"
-
-
-class _Row(NamedTuple):
-    row: Tensor  # (T,) int64
 
 
 @cache
@@ -91,7 +86,6 @@ class QueryProgram(nn.Module):
         self._any_far = bool(tables.far.any())
         problem = f"tasks without queries in {self!r}"
         self._tables = TaskTables(index, tables, problem)
-        self._row = TaskTables(index, _Row(torch.arange(len(in_order))), problem)
         facts = compile_facts(in_order)
         self._facts = {} if facts is None else {dtype: facts.of(kind) for dtype, kind in _COMPILED.items()}
 
@@ -163,16 +157,19 @@ class QueryProgram(nn.Module):
 
     def _kernel(self, observation: Tensor, task_id: Tensor) -> Callable[..., bool] | None:
         """What answers this batch in one compiled pass, if anything can."""
-        known = observation.dtype in self._facts and observation.device.type == "cpu"
-        return find_kernel() if known and self._row.plain(observation, task_id) else None
+        known = observation.dtype in self._facts and observation.is_cpu and task_id.is_cpu and not observation.is_neg()
+        return find_kernel() if known and self._tables.plain(observation, task_id) else None
 
     def _answer(self, kernel: Callable[..., bool], observation: Tensor, task_id: Tensor) -> Tensor:
-        row = self._row.select(task_id.reshape(-1), observation).row.numpy().view(np.uint64)
-        states = observation.detach().reshape(-1, OBSERVATION_SIZE).contiguous()
-        truth = torch.empty((len(states), self.num_queries), dtype=torch.bool)
-        if not kernel(states.numpy(), row, *self._facts[observation.dtype], truth.numpy()):
-            raise ValueError(_NOT_FINITE)
-        return truth.reshape(*task_id.shape, self.num_queries)
+        """Few operations of PyTorch: after the physics, which empties the processor's caches, each is slow."""
+        states = observation.numpy(force=observation.requires_grad).reshape(-1, OBSERVATION_SIZE)
+        ids = task_id.numpy().reshape(-1)
+        truth = np.empty((len(ids), self.num_queries), dtype=bool)
+        given = np.ascontiguousarray(states), np.ascontiguousarray(ids, dtype=np.int64)
+        if not kernel(*given, *self._facts[observation.dtype], truth):
+            _check_finite(observation)
+            self._tables.select(task_id.reshape(-1), observation)  # one of the two raises
+        return torch.from_numpy(truth.reshape(*task_id.shape, self.num_queries))
 
     def _parts(self, atoms: Tensor, tables: QueryTables) -> tuple[Tensor, ...]:
         """(B, A) of the atoms to J of (B, K, S), the atoms of each clause."""
