@@ -157,8 +157,10 @@ class QueryProgram(nn.Module):
 
     def _kernel(self, observation: Tensor, task_id: Tensor) -> Callable[..., bool] | None:
         """What answers this batch in one compiled pass, if anything can."""
-        known = observation.dtype in self._facts and observation.is_cpu and task_id.is_cpu and not observation.is_neg()
-        return find_kernel() if known and self._tables.plain(observation, task_id) else None
+        here = observation.dtype in self._facts and observation.is_cpu and task_id.is_cpu
+        if here and self._tables.plain(observation, task_id) and not observation.is_neg():
+            return find_kernel()
+        return None
 
     def _answer(self, kernel: Callable[..., bool], observation: Tensor, task_id: Tensor) -> Tensor:
         """Few operations of PyTorch: after the physics, which empties the processor's caches, each is slow."""

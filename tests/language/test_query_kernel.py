@@ -82,6 +82,12 @@ def test_a_place_in_metres_is_no_place_in_the_observation(compiled, monkeypatch)
     assert program(states, torch.full((2,), task_id("slide"))).tolist() == [[True, False, False], [True] * 3]
 
 
+def test_a_view_whose_sign_is_noted_and_not_yet_changed():
+    queries, states, ids = all_tasks()
+    program = QueryProgram(queries)
+    assert torch.equal(program(torch._neg_view(-states), ids), program(states, ids))
+
+
 def test_what_contradicts_itself_never_holds():
     program = QueryProgram({"push": ["the gripper is near the puck and the gripper is not near the puck"]})
     states = torch.from_numpy(random_states("push"))
