@@ -173,7 +173,7 @@ ABOUT_ITSELF = pytest.mark.filterwarnings(  # what PyTorch warns of when it comp
     "ignore:.*torch.jit:DeprecationWarning",
 )
 QUICK = ("BC", "DT")  # to compile; the others take about ten seconds each
-TYPICAL = (*QUICK, "TD3", "SAC", "IQL", "ClipPPO")
+TYPICAL = (*QUICK, "TD3", "SAC", "IQL", "PPO")
 ALL = "LW_TORCHRL_COMPILE_ALL" in os.environ  # the 45, about eight minutes
 
 
