@@ -28,7 +28,7 @@ from lw_torchrl.data.growing import GrowingStorage
 from lw_torchrl.data.growing_writer import GrowingWriter
 from lw_torchrl.data.metadata import read_metadata
 from lw_torchrl.data.n_steps import check_n_steps
-from lw_torchrl.data.replay_checks import check_growing, check_prefetch, check_reward, check_transform
+from lw_torchrl.data.replay_checks import check_growing, check_prefetch, check_rows, check_transform
 from lw_torchrl.data.selection import (
     LABELS,
     EpisodeChoice,
@@ -80,6 +80,8 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         reward: what ``("next", "reward")`` holds with label="executed": "sparse", the success as 0 and 1, or "dense",
             Meta-World's own.
         after_success: drop the steps that come more than so many after the first success; None keeps all.
+        terminate_on_success: end each episode at its first success, with ``("next", "terminated")``, as
+            ``LanguageWorldEnv(terminate_on_success=True)`` does; with label="executed".
         n_steps: how many steps ``("next", ...)`` lies ahead; see :class:`JoinedStorage`. It never crosses the end of
             an episode, that of ``after_success`` included.
         gamma: the discount of the rewards on the way, for ``n_steps`` of 2 or more; the loss must have the same.
@@ -126,6 +128,7 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         label: Label = "expert",
         reward: Literal["sparse", "dense"] = "sparse",
         after_success: int | None = None,
+        terminate_on_success: bool = False,
         n_steps: int = 1,
         gamma: float | None = None,
         grow: int | None = None,
@@ -145,6 +148,11 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
             check_int("batch_size", batch_size, minimum=1)
         if after_success is not None:
             check_int("after_success", after_success, minimum=0)
+        if terminate_on_success and (label != "executed" or after_success is not None):
+            raise ValueError(
+                "terminate_on_success ends an episode at its first success and needs label='executed' and no "
+                f"after_success, got label={label!r}, after_success={after_success!r}"
+            )
         where = CPU if device is None else check_device("device", device)
         if grow is not None and where != CPU:
             raise ValueError("device: a buffer that grows is on the CPU; leave it out, trainers move each minibatch")
@@ -159,7 +167,13 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
             whole = read_metadata(folder)
             shown.append(choose_episodes(whole, choice, f"episodes[{number}]" if joined else "episodes"))
             rows, keep = read_part(
-                whole, shown[-1], label=label, reward=reward, after_success=after_success, first_trajectory=trajectories
+                whole,
+                shown[-1],
+                label=label,
+                reward=reward,
+                after_success=after_success,
+                terminate_on_success=terminate_on_success,
+                first_trajectory=trajectories,
             )
             parts.append(rows if grow is None else rows.exclude(*_NOT_COLLECTED))
             kept.append(keep)
@@ -171,7 +185,12 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         )
         if grow is not None:
             storage = GrowingStorage(
-                parts, kept, grow=grow, n_steps=n_steps, gamma=gamma, check=partial(check_reward, reward)
+                parts,
+                kept,
+                grow=grow,
+                n_steps=n_steps,
+                gamma=gamma,
+                check=partial(check_rows, reward, terminate_on_success),
             )
         elif several or n_steps > 1 or where != CPU:
             storage = JoinedStorage(parts, kept, n_steps=n_steps, gamma=gamma)

@@ -45,10 +45,10 @@ def check_growing(sampler: Any, options: Mapping[str, Any]) -> None:
         )
 
 
-def check_reward(reward: str, rows: Mapping[NestedKey, Tensor]) -> None:
-    """Raise where rows have another reward than the demonstrations that they are to stand beside."""
-    found, success = rows["next", "reward"], rows["next", "success"].to(torch.float32)
-    sparse = torch.equal(found, success)
+def check_rows(reward: str, terminate_on_success: bool, rows: Mapping[NestedKey, Tensor]) -> None:
+    """Raise where rows have another reward, or other ends, than the demonstrations that they are to stand beside."""
+    found, success = rows["next", "reward"], rows["next", "success"]
+    sparse = torch.equal(found, success.to(torch.float32))
     if reward == "sparse" and not sparse:
         raise ValueError(
             "batch: the reward is not the success, as the demonstrations' is; give reward='dense' for a dense one, "
@@ -56,3 +56,9 @@ def check_reward(reward: str, rows: Mapping[NestedKey, Tensor]) -> None:
         )
     if reward == "dense" and sparse and success.any():
         raise ValueError("batch: the reward is the success, but the demonstrations' is dense; give reward='sparse'")
+    if not torch.equal(rows["next", "terminated"], success & terminate_on_success):
+        at = "terminated at success" if terminate_on_success else "never terminated"
+        raise ValueError(
+            f"batch: rows must be {at}, as the demonstrations are; give the environment and the buffer the same "
+            f"terminate_on_success, here {terminate_on_success}"
+        )

@@ -92,12 +92,13 @@ def read_part(
     label: Label,
     reward: Literal["sparse", "dense"],
     after_success: int | None,
+    terminate_on_success: bool = False,
     first_trajectory: int = 0,
 ) -> tuple[TensorDictBase, Tensor | None]:
     """All rows of a dataset, memory-mapped, and which of them to show: (n,) int64, None for all.
 
-    What differs from the files is held in memory, one number a row: the ends of episodes that are cut short, and
-    ``first_trajectory`` added to the trajectories' ids.
+    What differs from the files is held in memory, one number a row: the ends of episodes that are cut short, which are
+    ``terminated`` where ``terminate_on_success`` asks for it, and ``first_trajectory`` added to the trajectories' ids.
 
     Raises:
         DatasetError: (a ValueError) as for :func:`load_rows`; or an action is NaN or infinite.
@@ -117,13 +118,18 @@ def read_part(
         )
     if first_trajectory:
         rows.set(TRAJECTORY, rows.get(TRAJECTORY) + first_trajectory)
-    if chosen.episodes == whole.episodes and after_success is None:
+    after = 0 if terminate_on_success else after_success
+    if chosen.episodes == whole.episodes and after is None:
         return rows, None
-    kept, last = _kept(chosen.episodes, after_success)
-    if label == "executed" and after_success is not None:
-        for key in ("done", "truncated"):
+    kept, last = _kept(chosen.episodes, after)
+    if label == "executed" and after is not None:
+        ends = {"done": last, "truncated": last}
+        if terminate_on_success:
+            succeeds = rows.get(("next", "success"))[last].reshape(-1)
+            ends |= {"truncated": last[~succeeds], "terminated": last[succeeds]}
+        for key, where in ends.items():
             flag = rows.get(("next", key)).clone()
-            flag[last] = True
+            flag[last], flag[where] = False, True
             rows.set(("next", key), flag)
     return rows, kept
 
