@@ -104,12 +104,12 @@ class SimulatedRow:
 
         That body touches nothing, and nothing hangs on it but the weld to the hand. So contacts, inertia and its
         factors, velocities and what they cause are still those of the look, which saves a tenth of the step; the bits
-        are the same. Numbers that are not finite or too large are found by the substep after this one.
+        are the same. Meta-World's solver, Newton's, wants no projection of constraints. Numbers that are not finite or
+        too large are found by the substep after this one.
         """
         model, data = self._model, self._data
         mujoco.mj_kinematics(model, data)
         mujoco.mj_makeConstraint(model, data)
-        mujoco.mj_projectConstraint(model, data)
         mujoco.mj_referenceConstraint(model, data)
         mujoco.mj_forwardSkip(model, data, VELOCITIES_DONE, 1)  # 1: no sensors
         mujoco.mj_Euler(model, data)
