@@ -61,7 +61,12 @@ def differences(was: Mapping[str, Any], now: Mapping[str, Any], inside: str = ""
 
 def missing_keys(found: Iterable[Any], *needed: str) -> ValueError:
     """The error for a tensordict of the keys ``found`` that lacks one of two needed ones; the caller raises it."""
-    return ValueError(f"{' and '.join(needed)} are needed, got {', '.join(map(str, found))}")
+    names = [str(key) for key in found]
+    absent = [key for key in needed if key not in names]
+    hint = ": QAFTransform(plans) in the environment, and in the buffer, writes it" if "qaf" in absent else ""
+    return ValueError(
+        f"{' and '.join(needed)} are needed, got {', '.join(names)}; without {' and '.join(absent)}{hint}"
+    )
 
 
 def check_choice(argument: str, given: Any, allowed: Iterable[str]) -> Any:
@@ -96,7 +101,7 @@ def check_scale(argument: str, given: Any) -> float:
 def check_probability(argument: str, given: Any) -> float:
     """Return ``given`` as a float from 0 to 1."""
     if (value := check_scale(argument, given)) > 1.0:
-        raise ValueError(f"{argument} must be a probability, at most 1, got {given}")
+        raise ValueError(f"{argument} must be from 0 to 1, got {given}")
     return value
 
 

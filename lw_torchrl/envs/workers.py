@@ -25,8 +25,8 @@ def _by_process(level: int) -> tuple[int, int]:
 def _threads(found: Locals) -> tuple[int, int]:
     if found["self"].num_envs > 1:
         raise RuntimeError(
-            "a ThreadingAsyncEnvPool does not say which of its environments this is: say it yourself, "
-            "worker=(rank, of), or they would all run the same episodes"
+            "a ThreadingAsyncEnvPool does not say which of its environments this is, so they would all run the same "
+            "episodes: take backend='multiprocessing'"
         )
     return 0, 1
 

@@ -108,7 +108,10 @@ class Plans(Mapping[str, ConditionalPlan]):
         listed = list(plans.values() if isinstance(plans, Mapping) else plans)
         for plan in listed:
             if not isinstance(plan, ConditionalPlan):
-                raise TypeError(f"plans must hold ConditionalPlan, got {plan!r} ({type(plan).__name__})")
+                raise TypeError(
+                    f"plans must hold ConditionalPlan, got {plan!r} ({type(plan).__name__}); "
+                    "ConditionalPlan.from_pairs makes one of conditions and skills, QueryProgram takes queries alone"
+                )
         if isinstance(plans, Mapping):
             for name, plan in plans.items():
                 if name != plan.task:

@@ -191,6 +191,11 @@ class QueryProgram(nn.Module):
 
 
 def _check_batch(observation: Tensor, task_id: Tensor) -> None:
+    for name, given in (("observation", observation), ("task_id", task_id)):
+        if not isinstance(given, Tensor):
+            raise TypeError(
+                f"{name} must be a tensor, got {type(given).__name__}; torch.as_tensor makes one of an array"
+            )
     if observation.shape[-1:] != (OBSERVATION_SIZE,) or not observation.is_floating_point():
         raise ValueError(
             f"observation must be float of shape (..., {OBSERVATION_SIZE}), got {observation.dtype} of shape "

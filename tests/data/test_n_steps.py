@@ -152,7 +152,7 @@ def test_torchrls_transform_is_refused_where_it_would_do_nothing(root):
         (dict(n_steps=3), ValueError, "n_steps=3 needs gamma"),
         (dict(gamma=0.9), ValueError, "gamma belongs to n_steps of 2 or more"),
         (dict(n_steps=0, gamma=0.9), ValueError, "n_steps must be at least 1, got 0"),
-        (dict(n_steps=2, gamma=1.5), ValueError, "gamma must be a probability, at most 1, got 1.5"),
+        (dict(n_steps=2, gamma=1.5), ValueError, "gamma must be from 0 to 1, got 1.5"),
         (dict(n_steps=2, gamma=0.0), ValueError, "gamma must be above 0, got 0"),
         (dict(n_steps=2.0, gamma=0.9), TypeError, "n_steps must be an integer"),
         (dict(n_steps=2, gamma=0.9, label="expert"), ValueError, "need label='executed'.*got 'expert'"),

@@ -62,7 +62,7 @@ def test_what_is_missing_is_named(kind):
     module = make(kind)
     rows = state()
     for key in module.in_keys:
-        with pytest.raises(ValueError, match=rf"{module.in_keys[0]} and .* are needed, got "):
+        with pytest.raises(ValueError, match=rf"{module.in_keys[0]} and .* are needed, got .*; without {key}"):
             module(rows.exclude(key))
 
 

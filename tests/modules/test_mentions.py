@@ -96,7 +96,7 @@ def test_a_policy_in_training_cannot_see_what_its_step_does_not_mention():
 
 def test_what_it_refuses():
     plans = lw.load_plans("MT10")
-    with pytest.raises(ValueError, match=r"swap_unmentioned must be a probability, at most 1, got 1\.5"):
+    with pytest.raises(ValueError, match=r"swap_unmentioned must be from 0 to 1, got 1\.5"):
         lw.PlanConditionedActor(plans, swap_unmentioned=1.5)
     with pytest.raises(ValueError, match="swap_unmentioned must be finite and at least 0"):
         lw.PlanConditionedActor(plans, swap_unmentioned=-0.1)
