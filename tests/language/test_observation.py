@@ -41,4 +41,4 @@ def test_whoever_needs_the_layout_reads_it_here():
     assert engine.ACTION_SIZE is layout.ACTION_SIZE
     # As they were written out before there was one layout.
     assert _STARTS == (0, 4, 11, 36, 18, 22, 29)
-    assert ((*range(4, 11), *range(22, 29)), (*range(11, 18), *range(29, 36)), (36, 37, 38)) == _PLACES
+    assert ({*range(4, 11), *range(22, 29)}, {*range(11, 18), *range(29, 36)}, {36, 37, 38}) == _PLACES
