@@ -136,7 +136,8 @@ class LanguageWorldEnv(EnvBase):
                 f"{batch_size!r}"
             )
         self.row_tasks = tuple(self.tasks[i % n] for i in range(num_envs))
-        self.worker = torchrl_worker() if worker is None else check_worker(worker)
+        found = torchrl_worker()  # which refuses some pools
+        self.worker = found if worker is None else check_worker(worker)
         self._process = os.getpid()
         self._counter = EpisodeCounter([named[t] for t in self.row_tasks], check_int("seed", seed), self.worker)
         super().__init__(device=torch.device("cpu"), batch_size=(num_envs,) if batch_size is None else ())

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Mapping
 from multiprocessing import current_process, parent_process
 from types import FrameType
-from typing import Any
+from typing import Any, NoReturn
 
 MANY = 2**16
 """Stands for the number of workers where TorchRL does not tell it: more than there are."""
@@ -22,13 +22,11 @@ def _by_process(level: int) -> tuple[int, int]:
     return current_process()._identity[level] - 1, MANY
 
 
-def _threads(found: Locals) -> tuple[int, int]:
-    if found["self"].num_envs > 1:
-        raise RuntimeError(
-            "a ThreadingAsyncEnvPool does not say which of its environments this is, so they would all run the same "
-            "episodes: take backend='multiprocessing'"
-        )
-    return 0, 1
+def _threads(found: Locals) -> NoReturn:
+    raise RuntimeError(
+        "a ThreadingAsyncEnvPool steps an environment now from one thread and now from another, which MuJoCo may not "
+        "survive, and does not say which of its environments this is: take backend='multiprocessing'"
+    )
 
 
 def _remote(found: Locals) -> tuple[int, int]:
@@ -64,7 +62,7 @@ def torchrl_worker() -> tuple[int, int]:
     by the order in which the parent started them.
 
     Raises:
-        RuntimeError: in a ThreadingAsyncEnvPool of several environments, which cannot be told apart.
+        RuntimeError: in a ThreadingAsyncEnvPool.
     """
     rank, of, processes = 0, 1, 0
     frame: FrameType | None = sys._getframe(1)

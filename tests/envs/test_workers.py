@@ -123,8 +123,9 @@ def test_a_pool_of_processes_and_one_of_threads():
     pool = AsyncEnvPool([partial(make_env, num_envs=1)] * 2, backend="multiprocessing", exchange="queue")
     assert pool.reset()["episode"].flatten().tolist() == [0, 1]
     pool.close()
-    with pytest.raises(RuntimeError, match=r"does not say which .*: take backend='multiprocessing'"):
-        AsyncEnvPool([make_env] * 2, backend="threading")
+    for factories in ([make_env] * 2, [partial(make_env, worker=(w, 2)) for w in range(2)], [make_env]):
+        with pytest.raises(RuntimeError, match=r"does not say which .*: take backend='multiprocessing'"):
+            AsyncEnvPool(factories, backend="threading")
 
 
 def test_a_worker_may_be_told_who_it_is():
