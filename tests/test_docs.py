@@ -10,9 +10,9 @@ import warnings
 from pathlib import Path
 
 import pytest
+from pictures import why_no_pictures
 
 import lw_torchrl
-from lw_torchrl.envs.cameras import Cameras
 
 ROOT = Path(__file__).parent.parent
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("**/*.md"))]
@@ -31,15 +31,6 @@ def blocks(page):
         if not match["skip"]:
             lines = [line.removeprefix(match["indent"]) for line in match["code"].splitlines(keepends=True)]
             yield text[: match.start("code")].count("\n"), match["kind"], "".join(lines)
-
-
-def open_gl():
-    """Whether pictures can be taken here; the blocks and examples that do are left out otherwise."""
-    try:
-        Cameras().close()
-    except ImportError:
-        return False
-    return True
 
 
 def examples(name):
@@ -61,7 +52,7 @@ def test_the_examples_of_the_docstrings_run(name):
     runner = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS)
     report = []
     for test in examples(name):
-        if not test.name.endswith(".render") or open_gl():
+        if not test.name.endswith(".render") or not why_no_pictures():
             runner.run(test, out=report.append)
     assert runner.summarize(verbose=False).failed == 0, "".join(report)
 
@@ -83,7 +74,7 @@ def test_every_public_class_says_what_it_is(name):
 def test_the_blocks_of_a_page_run_one_after_another(page):
     namespace = {"__name__": "__main__"}
     for line, kind, code in blocks(page):
-        if "PixelRenderTransform" in code and not open_gl():
+        if "PixelRenderTransform" in code and why_no_pictures():
             continue
         if kind == "pycon":
             test = doctest.DocTestParser().get_doctest(code, namespace, page.name, str(page), line)

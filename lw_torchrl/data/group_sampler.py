@@ -203,7 +203,6 @@ class GroupSampler(Sampler):
 
         Where rows were written since, all are grouped again if the others are not in the groups that the state says.
         """
-        self._restored = False
         rows, groups = self._passes.order, torch.repeat_interleave(self._passes.size)
         length = self._covered(storage)
         if self._written:
@@ -211,8 +210,8 @@ class GroupSampler(Sampler):
             keys = None if self._known is None else self._keys(storage, rows[old])
             if keys is None or not torch.equal(keys.reshape(-1).cpu(), self._known[groups[old]]):  # type: ignore[index]
                 self._length = 0
+            self._restored = False
             return
-        self._restored = True
         if length != self._length:
             raise ValueError(f"state_dict must be of the storage's {length} rows, got one of {self._length}")
         label = self._label(storage).cpu()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache, reduce
 
@@ -16,11 +15,10 @@ from lw_torchrl.language.query_facts import compile_facts
 from lw_torchrl.language.query_tables import QueryTables, compile_queries
 from lw_torchrl.language.task_index import TaskIndex, TaskTables
 from lw_torchrl.language.tasks import Task, get_task
-from lw_torchrl.language.value_checks import asserted, readable
+from lw_torchrl.language.value_checks import check_finite
 
 _LEAST, _MOST = 1e-6, 1e4  # of the size of a logit, and of metres where a length has a gradient
 _COMPILED = {torch.float32: np.float32, torch.float64: np.float64}
-_NOT_FINITE = "observation must hold finite numbers, got NaN or infinity"
 
 
 @cache
@@ -108,7 +106,7 @@ class QueryProgram(nn.Module):
         _check_batch(observation, task_id)
         if (kernel := self._kernel(observation, task_id)) is not None:
             return self._answer(kernel, observation, task_id)
-        _check_finite(observation)
+        check_finite("observation", observation)
         tables = self._tables.select(task_id.reshape(-1), observation)
         holds = (self._values(observation, tables) < tables.threshold) ^ tables.flipped
         # & of a few is far faster than all() over a short axis.
@@ -169,7 +167,7 @@ class QueryProgram(nn.Module):
         truth = np.empty((len(ids), self.num_queries), dtype=bool)
         given = np.ascontiguousarray(states), np.ascontiguousarray(ids, dtype=np.int64)
         if not kernel(*given, *self._facts[observation.dtype], truth):
-            _check_finite(observation)
+            check_finite("observation", observation)
             self._tables.select(task_id.reshape(-1), observation)  # one of the two raises
         return torch.from_numpy(truth.reshape(*task_id.shape, self.num_queries))
 
@@ -206,12 +204,3 @@ def _check_batch(observation: Tensor, task_id: Tensor) -> None:
             f"task_id must be int64 of shape {tuple(observation.shape[:-1])}, one per observation, got "
             f"{task_id.dtype} of shape {tuple(task_id.shape)}"
         )
-
-
-def _check_finite(observation: Tensor) -> None:
-    if asserted(observation):
-        torch._assert_async(observation.isfinite().all(), _NOT_FINITE)
-    elif readable(observation) and not (
-        math.isfinite(observation.sum().item()) or observation.isfinite().all()  # the sum is fast; it may overflow
-    ):
-        raise ValueError(_NOT_FINITE)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import torch
@@ -54,3 +55,15 @@ def check_values(holds: Callable[[Tensor], Tensor], tensor: Tensor, problem: str
         torch._assert_async(holds(tensor), problem)
     elif readable(tensor) and not holds(tensor):
         raise ValueError(problem)
+
+
+def finite(tensor: Tensor) -> bool:
+    """Whether all numbers are; the sum is fast, but may overflow."""
+    return math.isfinite(tensor.sum().item()) or bool(tensor.isfinite().all())
+
+
+def check_finite(argument: str, tensor: Tensor) -> None:
+    """:func:`check_values` of a tensor whose numbers must be finite."""
+    if not (readable(tensor) and finite(tensor)):
+        problem = f"{argument} must hold finite numbers, got NaN or infinity"
+        check_values(lambda values: values.isfinite().all(), tensor, problem)

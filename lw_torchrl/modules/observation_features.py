@@ -11,7 +11,7 @@ from torchrl.objectives import add_random_module
 
 from lw_torchrl._checks import check_choice, check_scale
 from lw_torchrl.language.observation import HAND, OBSERVATION_SIZE, OPENING, POSITIONS
-from lw_torchrl.language.value_checks import check_values
+from lw_torchrl.language.value_checks import check_finite
 
 Features = Literal["raw", "differences", "relative", "both"]
 _FINE, _COARSE = 0.02, 0.1  # metres: where the two squashed copies of each difference bend
@@ -76,8 +76,7 @@ class ObservationFeatures(nn.Module):
                 f"observation must be float32 of shape (..., 39), got {observation.dtype} of shape "
                 f"{tuple(observation.shape)}"
             )
-        problem = "observation must hold finite numbers, got NaN or infinity"
-        check_values(lambda values: values.isfinite().all(), observation, problem)
+        check_finite("observation", observation)
         if self.kind == "raw":
             return observation
         if self.kind == "relative":

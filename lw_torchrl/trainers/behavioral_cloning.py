@@ -9,24 +9,21 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torch.nn.utils import clip_grad_norm_
 from torchrl.data import TensorDictReplayBuffer
-from torchrl.data.replay_buffers.samplers import RandomSampler
 from torchrl.objectives import BCLoss
 from torchrl.record.loggers import Logger
 
 from lw_torchrl._devices import CPU, drawn_on, place
 from lw_torchrl._files import sweep
 from lw_torchrl._progress import Progress
-from lw_torchrl.data.device_storage import DeviceStorage, device_of_rows
-from lw_torchrl.data.group_sampler import GroupSampler
-from lw_torchrl.modules.policy import Policy, plans_of
+from lw_torchrl.modules.policy import Policy
 from lw_torchrl.trainers.checkpoint import describe_data, describe_replay, write
 from lw_torchrl.trainers.config import BehavioralCloningConfig, make_optimizer
 from lw_torchrl.trainers.interrupts import interrupts_between_steps
+from lw_torchrl.trainers.minibatches import check_replay, draw_batch
 from lw_torchrl.trainers.normalization import fit_normalization
 from lw_torchrl.trainers.policy_checks import check_can_be_saved, check_trained
 from lw_torchrl.trainers.recent_losses import READ_EVERY, RecentLosses
@@ -39,47 +36,6 @@ from lw_torchrl.trainers.training_state import (
     warn_of_another_device,
     where,
 )
-
-
-def check_belongs(actor: Any, replay: TensorDictReplayBuffer) -> None:
-    """Raise :class:`ValueError` unless the actor writes ``action``, and the buffer answers the queries of its plans."""
-    if "action" not in actor.out_keys:
-        raise ValueError(f"actor must write 'action', it writes {', '.join(map(str, actor.out_keys))}")
-    if (own := plans_of(actor)) is None:
-        return
-    for transform in replay.transform:
-        answered = plans_of(transform)
-        if answered is not None and (different := answered.differences(own)):
-            raise ValueError(
-                f"replay's QAFTransform must have the actor's plans, they differ for {', '.join(different)}; use "
-                "actor.transform()"
-            )
-
-
-def check_batch_size(replay: TensorDictReplayBuffer, config: BehavioralCloningConfig) -> None:
-    """Raise :class:`ValueError` if the buffer was made for minibatches of another size."""
-    if replay._batch_size not in (None, config.batch_size):
-        raise ValueError(
-            f"batch_size of the replay buffer must be None or the configuration's, {config.batch_size}, got "
-            f"{replay._batch_size}"
-        )
-
-
-def check_draws(replay: TensorDictReplayBuffer) -> None:
-    """Raise :class:`ValueError` if the sampler would draw on a device, where the trainers' generators are not."""
-    rows, sampler = replay.storage, replay.sampler
-    ours = isinstance(sampler, GroupSampler) or (isinstance(rows, DeviceStorage) and type(sampler) is RandomSampler)
-    if not ours and (device := device_of_rows(rows)).type != "cpu":
-        raise ValueError(
-            f"replay: a {type(sampler).__name__} draws on {device}, where its rows are, with a generator of its own; "
-            "take a TaskBalancedSampler or a CoLearningSampler, or leave the rows on the CPU: minibatches then go over"
-        )
-
-
-def draw_batch(replay: TensorDictReplayBuffer, size: int, device: torch.device) -> TensorDictBase:
-    """A minibatch on the device; of a buffer whose rows are elsewhere, it goes over."""
-    batch = replay.sample(size)
-    return batch if device == CPU else batch.to(device, non_blocking=True)
 
 
 class BehavioralCloningTrainer:
@@ -140,25 +96,19 @@ class BehavioralCloningTrainer:
         self.device = place(actor, device)
         self.config = config = config or BehavioralCloningConfig()
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
-        check_belongs(actor, replay)
+        check_replay(actor, replay, config)
         self._policy = None if self.checkpoint is None else check_can_be_saved(actor)
         self._described: dict[str, Any] = {}
         if self.checkpoint is not None and self._policy is not None:
             sweep(self.checkpoint)
             self._described = {"actor": self._policy.describe(), "training": asdict(config)}
             self._described |= {"data": describe_data(replay), "replay": describe_replay(replay)}
-        if replay._prefetch:
-            raise ValueError("replay must not prefetch: batches drawn ahead would be lost when training is resumed")
-        check_batch_size(replay, config)
-        check_draws(replay)
-        generator = torch.Generator().manual_seed(config.seed)
-        replay.set_rng(generator)
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message=".*target_actor_network_params.*")
             self.loss = BCLoss(actor, loss_function=config.loss_function)
         self.optimizer, self.schedule = make_optimizer(self.loss.parameters(), config)
         self._losses = RecentLosses(("the loss",), config.learning_rate)
-        self.state = TrainingState(replay.sampler, generator)
+        self.state = TrainingState(replay, config.seed)
         if self.checkpoint is not None and self._policy is not None and self.checkpoint.exists():
             check_description(self.checkpoint, self._described)
             warn_of_another_device(self.checkpoint, self.device)

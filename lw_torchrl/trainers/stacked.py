@@ -20,10 +20,10 @@ from lw_torchrl._devices import CPU, drawn_on, place
 from lw_torchrl._files import sweep
 from lw_torchrl._progress import Progress
 from lw_torchrl.modules.policy import Policy
-from lw_torchrl.trainers.behavioral_cloning import check_batch_size, check_belongs, check_draws, draw_batch
 from lw_torchrl.trainers.checkpoint import describe_data, describe_replay, write
 from lw_torchrl.trainers.config import BehavioralCloningConfig, make_optimizer
 from lw_torchrl.trainers.interrupts import interrupts_between_steps
+from lw_torchrl.trainers.minibatches import check_replay, draw_batch
 from lw_torchrl.trainers.normalization import fit_normalization
 from lw_torchrl.trainers.policy_checks import check_can_be_saved, check_trained
 from lw_torchrl.trainers.recent_losses import READ_EVERY, RecentLosses
@@ -137,12 +137,8 @@ class StackedBehavioralCloning:
             self._described = self._describe()
         self.states = []
         for number, (actor, replay) in enumerate(zip(actors, replays, strict=True)):
-            check_belongs(actor, replay)
-            check_batch_size(replay, config)
-            check_draws(replay)
-            generator = torch.Generator().manual_seed(config.seed + number)
-            replay.set_rng(generator)
-            self.states.append(TrainingState(replay.sampler, generator))
+            check_replay(actor, replay, config)
+            self.states.append(TrainingState(replay, config.seed + number))
             if config.normalize:
                 fit_normalization(actor, replay)
             actor.train()

@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torchrl.data import TensorDictReplayBuffer
 
 from lw_torchrl._checks import differences, shown
 from lw_torchrl._state_tree import check_like, check_optimizer_state, check_same, join
@@ -25,16 +26,17 @@ Schedule = torch.optim.lr_scheduler.LRScheduler
 
 
 class TrainingState:
-    """What a trainer must remember beside actor, optimizer and schedule.
+    """What a trainer must remember beside actor, optimizer and schedule; from its seed on the buffer draws.
 
     Attributes:
         step: the minibatches done.
         torch_generator: the state of what transforms and the actor draw from in training.
     """
 
-    def __init__(self, sampler: Any, generator: torch.Generator) -> None:
-        self.sampler, self.generator, self.step = sampler, generator, 0
-        self.torch_generator = generator.get_state()
+    def __init__(self, replay: TensorDictReplayBuffer, seed: int) -> None:
+        self.sampler, self.generator, self.step = replay.sampler, torch.Generator().manual_seed(seed), 0
+        replay.set_rng(self.generator)
+        self.torch_generator = self.generator.get_state()
 
     def state_dict(self) -> dict[str, Any]:
         return {

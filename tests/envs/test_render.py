@@ -8,21 +8,19 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch
+from pictures import why_no_pictures
 from torchrl.envs import Compose, StepCounter, TransformedEnv, check_env_specs
 from torchrl.record import PixelRenderTransform, VideoRecorder
 from torchrl.record.loggers import CSVLogger
 
 import lw_torchrl as lw
-from lw_torchrl.envs import cameras
 from lw_torchrl.envs.cameras import CAMERAS
 
 
 @pytest.fixture(scope="module", autouse=True)
 def _needs_open_gl():
-    try:
-        cameras.Cameras().close()
-    except ImportError as error:
-        pytest.skip(str(error))
+    if missing := why_no_pictures():
+        pytest.skip(missing)
 
 
 def opened(engine="vectorized", tasks=("reach", "drawer-open"), **options):

@@ -65,6 +65,9 @@ def test_the_actors_get_their_weights(demos):
 def test_what_it_refuses(demos):
     with pytest.raises(ValueError, match="replays must be as many as actors, at least one, got 1 and 2"):
         lw.StackedBehavioralCloning([make("plan", 0), make("plan", 1)], [replay(demos)])
+    ahead = lw.LanguageWorldExperienceReplay(demos, prefetch=1, batch_size=10)
+    with pytest.raises(ValueError, match="replay must not prefetch"):
+        lw.StackedBehavioralCloning([make("one-hot", 0)], [ahead], CONFIG)
     odd = lw.PlanConditionedActor(PLANS, width=16)
     with pytest.raises(ValueError, match="actors must be of one architecture"):
         lw.StackedBehavioralCloning([make("plan", 0), odd], [replay(demos), replay(demos)])
