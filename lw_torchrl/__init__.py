@@ -9,7 +9,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # the table below, for type checkers and editors
+    from lw_torchrl.data import Behaviour as Behaviour
     from lw_torchrl.data import CoLearningSampler as CoLearningSampler
+    from lw_torchrl.data import EpisodeFilter as EpisodeFilter
     from lw_torchrl.data import LanguageWorldExperienceReplay as LanguageWorldExperienceReplay
     from lw_torchrl.data import TaskBalancedSampler as TaskBalancedSampler
     from lw_torchrl.data import collect_demonstrations as collect_demonstrations
@@ -60,7 +62,8 @@ if TYPE_CHECKING:  # the table below, for type checkers and editors
 __version__ = "0.2.0"
 
 _NAMES = {
-    "lw_torchrl.data": "CoLearningSampler LanguageWorldExperienceReplay TaskBalancedSampler collect_demonstrations",
+    "lw_torchrl.data": "Behaviour CoLearningSampler EpisodeFilter LanguageWorldExperienceReplay TaskBalancedSampler "
+    "collect_demonstrations",
     "lw_torchrl.envs": "ExpertActor LanguageWorldEnv",
     "lw_torchrl.evaluation": "EvaluationResult evaluate plot_success",
     "lw_torchrl.language.plan_files": "load_plans save_plans",
