@@ -49,6 +49,9 @@ if TYPE_CHECKING:  # the table below, for type checkers and editors
     from lw_torchrl.modules import QueryEvaluator as QueryEvaluator
     from lw_torchrl.modules import ScriptedSkillActor as ScriptedSkillActor
     from lw_torchrl.modules import plan_actor_value as plan_actor_value
+    from lw_torchrl.objectives import AdvantageWeightedLoss as AdvantageWeightedLoss
+    from lw_torchrl.objectives import ExpectileValueLoss as ExpectileValueLoss
+    from lw_torchrl.objectives import standardize_by_task as standardize_by_task
     from lw_torchrl.record import RerunLogger as RerunLogger
     from lw_torchrl.trainers import BehavioralCloningConfig as BehavioralCloningConfig
     from lw_torchrl.trainers import BehavioralCloningTrainer as BehavioralCloningTrainer
@@ -76,13 +79,25 @@ _NAMES = {
     "lw_torchrl.language.tasks": "MT10 MT50 TASKS Task resolve_tasks task_id",
     "lw_torchrl.modules": "ActorEnsemble DescriptorConditionedActor PlanConditionedActor PlanConditionedQValue "
     "PlanConditionedValue Policy QueryEvaluator ScriptedSkillActor plan_actor_value",
+    "lw_torchrl.objectives": "AdvantageWeightedLoss ExpectileValueLoss standardize_by_task",
     "lw_torchrl.record": "RerunLogger",
     "lw_torchrl.trainers": "BehavioralCloningConfig BehavioralCloningTrainer StackedBehavioralCloning "
     "load_actor save_actor",
     "lw_torchrl.transforms": "EnvState QAFTransform RandomYaw",
 }
 _ROOM = {name: room for room, names in _NAMES.items() for name in names.split()}
-_PACKAGES = ("data", "envs", "evaluation", "experiments", "language", "modules", "record", "trainers", "transforms")
+_PACKAGES = (
+    "data",
+    "envs",
+    "evaluation",
+    "experiments",
+    "language",
+    "modules",
+    "objectives",
+    "record",
+    "trainers",
+    "transforms",
+)
 
 __all__ = sorted(_ROOM)
 
