@@ -60,7 +60,7 @@ def plot_success(result: EvaluationResult, path: str | os.PathLike[str] | None =
     """
     from matplotlib.figure import Figure
 
-    _check_image(path)
+    check_image(path)
     rates = {task: rate for task, rate in result.success_once.items() if rate is not None}
     trials = result.config["episodes_per_task"]
     tasks = sorted(rates, key=lambda task: (rates[task], task))
@@ -86,7 +86,7 @@ def plot_success(result: EvaluationResult, path: str | os.PathLike[str] | None =
     )
     axes.set_title(f"{title}\nmean over {counted(len(tasks), 'task')}: {result.mean_success:.3f}".strip())
     axes.spines[["top", "right"]].set_visible(False)
-    return _saved(figure, path)
+    return saved(figure, path)
 
 
 Rates = Mapping[str, float | Sequence[float]]
@@ -131,7 +131,7 @@ def plot_sorted_tasks(
     """
     from matplotlib.figure import Figure
 
-    _check_image(path)
+    check_image(path)
     check_choice("order", order, ("shared", "own"))
     if not curves:
         raise ValueError("curves must hold at least one method, got none")
@@ -164,16 +164,16 @@ def plot_sorted_tasks(
     axes.spines[["top", "right"]].set_visible(False)
     axes.set_title(title)
     _add_legend(figure, axes, len(named))
-    return _saved(figure, path)
+    return saved(figure, path)
 
 
-def _check_image(path: str | os.PathLike[str] | None) -> None:
+def check_image(path: str | os.PathLike[str] | None) -> None:
     """Raise :class:`ValueError` unless the file's name tells a format."""
     if path is not None and (given := Path(path).suffix.lower()) not in _FORMATS:
         raise ValueError(f"path must end in {', '.join(_FORMATS)}, got {given!r} of {str(path)!r}")
 
 
-def _saved(figure: Figure, path: str | os.PathLike[str] | None) -> Figure:
+def saved(figure: Figure, path: str | os.PathLike[str] | None) -> Figure:
     if path is not None:
         with replacing(path) as temporary:
             figure.savefig(temporary, dpi=140)

@@ -1,0 +1,26 @@
+"""What the commands share that do runs of work, one after another, or each in a process of its own."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Literal
+
+
+def report(total: int, lines: Iterable[str]) -> None:
+    """Print what each run says as it ends, and how long the others will take."""
+    started = time.perf_counter()
+    for number, line in enumerate(lines, 1):
+        left = (time.perf_counter() - started) / number * (total - number)
+        print(f"[{number}/{total}] {line}; about {left / 60:.0f} min left", flush=True)
+
+
+def elsewhere(
+    names: Iterable[str], command: Sequence[str], launcher: Literal["local", "ray"], jobs: int
+) -> Iterator[str]:
+    """Do runs by ``lw-torchrl COMMAND --run NAME``, several at a time; yields what each printed, as it ends."""
+    from lw_torchrl.experiments.launchers import run_commands
+
+    listed = [*names]
+    for index, printed in run_commands([[*command, "--run", name] for name in listed], launcher, jobs):
+        yield printed.strip() or listed[index]
