@@ -51,6 +51,7 @@ if TYPE_CHECKING:  # the table below, for type checkers and editors
     from lw_torchrl.modules import plan_actor_value as plan_actor_value
     from lw_torchrl.objectives import AdvantageWeightedLoss as AdvantageWeightedLoss
     from lw_torchrl.objectives import ExpectileValueLoss as ExpectileValueLoss
+    from lw_torchrl.objectives import SkillLatentLoss as SkillLatentLoss
     from lw_torchrl.objectives import standardize_by_task as standardize_by_task
     from lw_torchrl.record import RerunLogger as RerunLogger
     from lw_torchrl.trainers import BehavioralCloningConfig as BehavioralCloningConfig
@@ -81,7 +82,7 @@ _NAMES = {
     "lw_torchrl.language.tasks": "MT10 MT50 TASKS Task resolve_tasks task_id",
     "lw_torchrl.modules": "ActorEnsemble DescriptorConditionedActor PlanConditionedActor PlanConditionedQValue "
     "PlanConditionedValue Policy QueryEvaluator ScriptedSkillActor plan_actor_value",
-    "lw_torchrl.objectives": "AdvantageWeightedLoss ExpectileValueLoss standardize_by_task",
+    "lw_torchrl.objectives": "AdvantageWeightedLoss ExpectileValueLoss SkillLatentLoss standardize_by_task",
     "lw_torchrl.record": "RerunLogger",
     "lw_torchrl.trainers": "BehavioralCloningConfig BehavioralCloningTrainer OfflineConfig OfflineTrainer "
     "StackedBehavioralCloning load_actor save_actor",

@@ -57,7 +57,7 @@ OFFLINE_TABLES: Mapping[str, OfflineTable] = MappingProxyType(
         "quick": OfflineTable("two", {"W": _SHORT[:2]}),
     }
 )
-"""By name: seven methods on plans; what actors and critics are conditioned on; all of MT10; two tasks, to see it run."""
+"""By name: seven methods on plans; what actors and critics are conditioned on; all of MT10; two tasks, for a look."""
 
 
 def advantages_of(runs: Iterable[OfflineRun]) -> dict[str, Advantages]:
