@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 from tyro.conf import Positional
 
 from lw_torchrl.cli.outputs import check_folder
-from lw_torchrl.cli.sources import read_plans
+from lw_torchrl.cli.sources import read_plans, read_tasks
 from lw_torchrl.cli.units import elsewhere, report
 
 if TYPE_CHECKING:
@@ -103,7 +103,7 @@ def offline(
     if list:
         print("\n".join([*datasets, *advantages, *runs]))
         return
-    known = read_plans(plans, {})
+    known = read_plans(plans, read_tasks(None))
     for one in runs.values():
         known.require(TASK_SETS[one.tasks])
     use_one_thread()
