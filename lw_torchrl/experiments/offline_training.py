@@ -14,7 +14,7 @@ from filelock import FileLock
 from torch import Tensor
 from torchrl.objectives import BCLoss, CQLLoss, IQLLoss, LossModule, TD3BCLoss
 
-from lw_torchrl._tensor_archive import TensorArchive, write_archive
+from lw_torchrl._tensor_archive import ArchiveError, TensorArchive, write_archive
 from lw_torchrl.data import LanguageWorldExperienceReplay, TaskBalancedSampler
 from lw_torchrl.evaluation import EvaluationResult, evaluate
 from lw_torchrl.experiments.execution import EVALUATION_SEED, RESULTS, load_result
@@ -138,9 +138,13 @@ def make_advantages(one: Advantages, plans: Plans, out: Path, progress: bool) ->
             )
             write_archive(file, described, {"advantages": {"advantage": found}})
             checkpoint.unlink()
-    archive = TensorArchive(file)
+    try:
+        archive = TensorArchive(file)
+        found = archive.tensors("advantages")
+    except ArchiveError as error:
+        raise ValueError(f"out: {str(file)!r} is damaged ({error}); delete it, and they are learned again") from error
     check_same_description(file, archive.description, described)
-    return archive.tensors("advantages")
+    return found
 
 
 def _config(one: Learned, steps: int) -> OfflineConfig:
