@@ -140,11 +140,11 @@ def make_advantages(one: Advantages, plans: Plans, out: Path, progress: bool) ->
             checkpoint.unlink()
     try:
         archive = TensorArchive(file)
-        found = archive.tensors("advantages")
+        advantages = archive.tensors("advantages")
     except ArchiveError as error:
         raise ValueError(f"out: {str(file)!r} is damaged ({error}); delete it, and they are learned again") from error
     check_same_description(file, archive.description, described)
-    return found
+    return advantages
 
 
 def _config(one: Learned, steps: int) -> OfflineConfig:

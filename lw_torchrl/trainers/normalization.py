@@ -73,13 +73,14 @@ def _statistics(target: nn.Module) -> Iterator[tuple[str, Tensor, Tensor]]:
             if isinstance(module, ObservationFeatures):
                 yield module.kind, module.mean, module.std
         return
+    held = dict(target.named_children())  # asked for by name, targets warn where nothing moves them yet
     for name, network in vars(target).items():  # a loss keeps its networks there, without their parameters
         if not isinstance(network, nn.Module):
             continue
         for path, module in network.named_modules():
             if isinstance(module, ObservationFeatures):
                 for copy in (f"{name}_params", f"target_{name}_params"):
-                    params: Any = getattr(target, copy, None)
+                    params: Any = held.get(copy)
                     if isinstance(params, TensorDictBase):
                         mean, std = (params.get((*path.split("."), buffer)) for buffer in ("mean", "std"))
                         yield module.kind, mean.data, std.data

@@ -142,9 +142,8 @@ class OfflineTrainer:
         actor, others = trained_parameters(loss)
         rates = (actor, config.learning_rate), (others, config.critic_learning_rate)
         self.groups = [group for group, _ in rates if group]
-        self.optimizer = torch.optim.AdamW(
-            [{"params": group, "lr": float(rate)} for group, rate in rates if group], weight_decay=config.weight_decay
-        )
+        options = [{"params": group, "lr": float(rate)} for group, rate in rates if group]
+        self.optimizer = torch.optim.AdamW(options, weight_decay=config.weight_decay, fused=True)
         self.schedule: torch.optim.lr_scheduler.LRScheduler = (
             torch.optim.lr_scheduler.CosineAnnealingLR(self.optimizer, config.steps)
             if config.schedule == "cosine"

@@ -131,7 +131,9 @@ def test_a_step_is_the_one_written_by_hand(demos):
     groups = [[p for n, p in named.items() if n.startswith("actor") is first] for first in (True, False)]
     rates = CONFIG.learning_rate, 3e-3
     optimizer = torch.optim.AdamW(
-        [{"params": group, "lr": rate} for group, rate in zip(groups, rates, strict=True)], weight_decay=1e-4
+        [{"params": group, "lr": rate} for group, rate in zip(groups, rates, strict=True)],
+        weight_decay=1e-4,
+        fused=True,
     )
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, CONFIG.steps)
     with torch.random.fork_rng():
