@@ -313,7 +313,8 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         check_column(name, values, len(self), self.storage.get(slice(0, 1)).keys(), self.transform)
         own = values.detach().clone()
         if isinstance(self.storage, TensorStorage):
-            self.storage._storage.set(name, own)
+            rows = self.storage._storage.clone(recurse=False)  # replay[:] is the one before, not a copy
+            self.storage._storage = rows.set(name, own)
         else:
             self.storage.add_column(name, own)
 
