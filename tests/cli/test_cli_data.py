@@ -97,9 +97,7 @@ def test_it_says_how_a_dataset_was_made(capsys, made):
     assert f"lw_torchrl {lw.__version__}" in good
     assert "torchrl" in good
     fingerprint = made[1].config.policy.fingerprint[:16]
-    said = (
-        f"spoilt-30: plans (fingerprint {fingerprint}) with scripted skills in 0.3 of pieces of 8 to 24 steps, else any"
-    )
+    said = f"plans (fingerprint {fingerprint}) with scripted skills in 0.3 of pieces of 8 to 24 steps, else any"
     assert said in " ".join(spoilt.split())
     assert "noise      none" in spoilt
     assert "seed 5" in spoilt
@@ -110,8 +108,10 @@ def test_it_says_how_a_dataset_was_made(capsys, made):
 def test_failures_that_were_drawn_again_are_counted(capsys, tmp_path):
     options = dict(tasks="reach", policy="wrong", episodes_per_task=2, seed=5, max_steps=31, redraw_failures=True)
     made = collect(tmp_path / "demos", **options)
-    assert made.attempts["reach"] > 2
-    assert f"seed 5; {made.attempts['reach'] - 2} failures drawn again" in run(capsys, "data", "show", made.root)
+    again = made.attempts["reach"] - 2
+    assert again > 0, "the test wants failures"
+    said = f"seed 5; {again} failure{'s' * (again != 1)} drawn again"
+    assert said in run(capsys, "data", "show", made.root)
 
 
 def test_check_reads_every_row(capsys, made, tmp_path):
