@@ -9,7 +9,15 @@ from inspect import Parameter, signature
 # Of each command, the names that the functions behind it use, and the command's own.
 OWN_NAMES = {
     "demo": {"root": "out", "checkpoint": "out"},
-    "collect": {"episodes_per_task": "episodes", "noise_scale": "noise", "root": "out", "task": "tasks"},
+    "collect": {
+        "episodes_per_task": "episodes",
+        "noise_scale": "noise",
+        "gripper_noise_factor": "gripper_noise",
+        "root": "out",
+        "task": "tasks",
+        "checkpoint": "policy",
+    },
+    "data": {"root": "folders"},
     "train": {"root": "data", "checkpoint": "out", "task": "tasks"},
     "evaluate": {"episodes_per_task": "episodes", "noise_scale": "noise", "task": "tasks"},
     "view": {"path": "recording"},
@@ -42,7 +50,7 @@ def in_its_words(command: str, function: Callable[..., object], message: str) ->
     def shown(match: re.Match[str]) -> str:
         given = match[1]
         if given == "collect_demonstrations":
-            return f"`lw-torchrl {'collect' if command == 'train' else command}`"
+            return f"`lw-torchrl {'collect' if command in ('train', 'data') else command}`"
         name = given if given in parameters and given not in own else own.get(given, "")
         if name not in parameters:
             return match[0]

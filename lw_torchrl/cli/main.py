@@ -17,6 +17,7 @@ from lw_torchrl.cli import experiments as cli_experiments
 from lw_torchrl.cli import language as cli_language
 from lw_torchrl.cli import policies, show
 from lw_torchrl.cli.check import check
+from lw_torchrl.cli.data import data
 from lw_torchrl.cli.errors import in_its_words
 from lw_torchrl.cli.offline import offline
 from lw_torchrl.cli.scripted import scripted
@@ -25,6 +26,7 @@ from lw_torchrl.cli.streams import check_arguments, complain, nobody_reads, soun
 COMMANDS: dict[str, Any] = {
     "demo": show.demo,
     "collect": policies.collect,
+    "data": data,
     "train": policies.train,
     "evaluate": policies.evaluate,
     "view": show.view,

@@ -26,10 +26,13 @@ def collect(
     seed: int = 0,
     noise: tuple[float, ...] = (0.0,),
     noise_hold: int = 10,
+    gripper_noise: float = 0.2,
     redraw_failures: bool = False,
+    policy: str = "expert",
+    behaviour: str | None = None,
     num_envs: int | None = None,
 ) -> None:
-    """Collect demonstrations of the scripted experts. Stopped and started again it carries on.
+    """Collect demonstrations of the scripted experts, or of others. Stopped and started again it carries on.
 
     Example: lw-torchrl collect MT10 --out demos/mt10 --noise 0 0.1 0.2 --redraw-failures
 
@@ -40,13 +43,24 @@ def collect(
         seed: evaluate on another one.
         noise: standard deviations of the execution noise, gone through in turn, one an episode.
         noise_hold: steps for which each draw of the noise is kept; longer leads further astray.
+        gripper_noise: what the noise on the gripper is multiplied by; noise there makes grasps fail.
         redraw_failures: keep successful episodes only.
+        policy: who acts: expert, Meta-World's scripts; scripted, plans with scripted skills; spoilt-60 or spoilt-30,
+            the same in so many of 100 pieces of an episode; wrong, any skill of the plan; random; or a policy's file,
+            of `lw-torchrl train`.
+        behaviour: the label of its episodes; by default the name of who acts, of a policy its file's.
         num_envs: environments stepped together; the dataset does not depend on it.
     """
     check_folder("--out", out)
-    from lw_torchrl.data import collect_demonstrations
+    from lw_torchrl.data import BEHAVIOURS, collect_demonstrations
     from lw_torchrl.language.tasks import TASKS
 
+    acts: str | Policy = policy
+    if policy not in BEHAVIOURS and (policy.endswith(".zip") or Path(policy).exists()):
+        from lw_torchrl.trainers.checkpoint import load_actor
+
+        use_one_thread()
+        acts, behaviour = load_actor(policy), behaviour or Path(policy).stem
     made = collect_demonstrations(
         simulated("tasks", one_or_many(tasks), TASKS),
         episodes_per_task=episodes,
@@ -54,7 +68,10 @@ def collect(
         seed=seed,
         noise_scale=noise,
         noise_hold=noise_hold,
+        gripper_noise_factor=gripper_noise,
         redraw_failures=redraw_failures,
+        policy=acts,
+        behaviour=behaviour,
         num_envs=num_envs,
     )
     print(f"{'task':28} {'success':>7} {'episodes run':>13}")

@@ -9,12 +9,15 @@ from hashlib import sha256
 from types import MappingProxyType
 from typing import Any, Literal
 
+import torch
+
 from lw_torchrl._checks import check_choice, check_int, check_probability, shown, unknown_name
 from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.modules.policy import Policy
 
 _MOST_STEPS = 100_000
+_OF_SEGMENTS = ("right", "otherwise", "shortest", "longest")
 
 
 @dataclass(frozen=True)
@@ -49,12 +52,8 @@ class Behaviour:
     fingerprint: str | None = None
 
     def __post_init__(self) -> None:
-        if (
-            not isinstance(self.name, str)
-            or not self.name.strip()
-            or len(self.name) > 100
-            or not self.name.isprintable()
-        ):
+        label = self.name if isinstance(self.name, str) else ""
+        if not 0 < len(label) <= 100 or not label.isprintable() or label != label.strip():
             raise ValueError(f"behaviour: name must be a label of 1 to 100 characters, got {shown(self.name)}")
         check_choice("behaviour: kind", self.kind, ("expert", "segments", "policy"))
         check_choice("behaviour: otherwise", self.otherwise, ("skill", "action"))
@@ -68,6 +67,13 @@ class Behaviour:
             )
         if self.fingerprint is not None and not isinstance(self.fingerprint, str):
             raise TypeError(f"behaviour: fingerprint must be a text or None, got {shown(self.fingerprint)}")
+        if self.kind != "segments" and (odd := [name for name in _OF_SEGMENTS if getattr(self, name) != _usual(name)]):
+            raise ValueError(f"behaviour: {', '.join(odd)} is of kind 'segments', got kind {self.kind!r}")
+
+    @property
+    def acts(self) -> Behaviour:
+        """Of two that have the same one, neither does what the other would not, given the same plans."""
+        return replace(self, fingerprint=None) if self.kind == "segments" else self
 
     def to_json(self) -> dict[str, Any]:
         return asdict(self)
@@ -81,7 +87,13 @@ class Behaviour:
         return cls(**stated)
 
 
+def _usual(name: str) -> Any:
+    return Behaviour.__dataclass_fields__[name].default
+
+
 EXPERT = Behaviour("expert", "expert")
+NOISY = "noisy"
+"""The label of the expert's episodes where they are executed with noise."""
 BEHAVIOURS: Mapping[str, Behaviour] = MappingProxyType(
     {
         behaviour.name: behaviour
@@ -97,6 +109,14 @@ BEHAVIOURS: Mapping[str, Behaviour] = MappingProxyType(
 )
 """By name: Meta-World's expert; plans with scripted skills; the same in 60 or 30 of 100 pieces, and any skill of the
 plan in the others; any skill of the plan throughout; one action in [-1, 1] after another."""
+
+
+def check_own_label(behaviour: Behaviour) -> None:
+    """Raise :class:`ValueError` for a label that is another behaviour's."""
+    if behaviour.name == NOISY or behaviour.acts != BEHAVIOURS.get(behaviour.name, behaviour.acts):
+        raise ValueError(
+            f"behaviour must be a label of its own, {behaviour.name!r} is another's: {', '.join((*BEHAVIOURS, NOISY))}"
+        )
 
 
 def segment_plans(tasks: Iterable[str]) -> Plans:
@@ -115,9 +135,10 @@ def behaviour_of(policy: Any, tasks: Iterable[str], name: str | None = None) -> 
     if isinstance(policy, Policy):
         if name is None:
             raise ValueError("behaviour must name the policy in the dataset, behaviour='my-policy' say, got None")
-        if name in BEHAVIOURS:
+        if policy.draws:
             raise ValueError(
-                f"behaviour must be a name of the policy's own, {name!r} is one of {', '.join(BEHAVIOURS)}"
+                f"policy: this {type(policy).__name__} draws in the order in which it is called, so that its episodes "
+                "would hang on num_envs and on interruptions"
             )
         return Behaviour(name, "policy", fingerprint=policy_fingerprint(policy))
     if isinstance(policy, str):
@@ -136,9 +157,12 @@ def behaviour_of(policy: Any, tasks: Iterable[str], name: str | None = None) -> 
 
 
 def policy_fingerprint(policy: Policy) -> str:
-    """A digest of a policy's description and weights."""
+    """A digest of a policy's description, weights and, by which another text encoder is known, its texts' vectors."""
     digest = sha256(json.dumps(policy.describe(), sort_keys=True).encode())
-    for key, value in sorted(policy.state_dict().items()):
-        digest.update(key.encode())
-        digest.update(value.detach().cpu().contiguous().numpy().tobytes())
+    # Their signs, since the scale that they are brought to may round otherwise elsewhere.
+    named = policy.named_buffers(remove_duplicate=False)
+    texts = {name: vectors.sign() for name, vectors in named if name.rpartition(".")[2] == "text_vectors"}
+    for key, value in sorted({**policy.state_dict(), **texts}.items()):
+        digest.update(f"{key} {value.dtype} {tuple(value.shape)}".encode())
+        digest.update(value.detach().cpu().reshape(-1).view(torch.uint8).numpy().tobytes())
     return digest.hexdigest()[:16]

@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 import torch
 from filelock import FileLock, Timeout
@@ -66,9 +67,14 @@ def _open_episode_files(root: Path, config: CollectConfig) -> EpisodeFiles:
     return files
 
 
+def _flat(config: CollectConfig) -> dict[str, Any]:
+    policy = {f"policy.{key}": value for key, value in config.policy.to_json().items()}
+    return {key: value for key, value in config.to_json().items() if key != "policy"} | policy
+
+
 def _check_same(before: CollectConfig, config: CollectConfig, what: str) -> None:
     if before != config:
-        was, now = before.to_json(), config.to_json()
+        was, now = _flat(before), _flat(config)
         differ = ", ".join(f"{key} {was[key]!r}, now {now[key]!r}" for key in now if was[key] != now[key])
         raise DatasetError(
             f"{what} of another configuration ({differ}); choose another folder, or delete it to start again"
@@ -119,6 +125,18 @@ def _take_apart(root: Path, config: CollectConfig, whole: list[EpisodeInfo], rea
         if not files.has(info.task, info.episode):
             files.put(info.task, info.episode, read_rows(root / DATA, info.start, info.length))
     (root / METADATA).unlink()
+
+
+@contextmanager
+def _in_eval_mode(policy: Policy | None) -> Iterator[None]:
+    training = policy is not None and policy.training
+    if policy is not None:
+        policy.eval()
+    try:
+        yield
+    finally:
+        if policy is not None:
+            policy.train(training)
 
 
 @contextmanager
@@ -221,7 +239,8 @@ def collect_demonstrations(
         policy: who acts: "expert", Meta-World's script; "scripted", the shipped plans with scripted skills; "spoilt-60"
             or "spoilt-30", the same in so many of 100 pieces of 8 to 24 steps, and any skill of the plan in the others;
             "wrong", any skill of the plan throughout; "random", one action after another; a :class:`Behaviour` of
-            yours; or a trained :class:`Policy`, in eval mode. Mixtures are lists of datasets.
+            yours; or a trained :class:`Policy`, in eval mode and without exploration, as :func:`evaluate` runs it.
+            One acts in all of a dataset; mixtures are lists of datasets.
         behaviour: the label of its episodes, for :class:`EpisodeFilter`; None for its name. A Policy wants one.
         seed: evaluate on another one.
         noise_scale: standard deviation of the noise on the executed action; a sequence is gone through in turn, one
@@ -269,8 +288,6 @@ def collect_demonstrations(
         max_steps=max_steps,
         policy=behaviour_of(policy, names, behaviour),
     )
-    if actor is not None:
-        actor.eval()
     folder = Path(root)
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"root must be a folder, {str(folder)!r} is a file")
@@ -281,6 +298,6 @@ def collect_demonstrations(
     elif folder.is_dir() and {path.name for path in folder.iterdir()} - {LOCK} and not (folder / PARTIAL).is_dir():
         raise DatasetError(f"root: {str(folder)!r} is not empty and holds no dataset; choose another folder")
     if found is None or (folder / PARTIAL).is_dir():
-        with _alone(folder):
+        with _alone(folder), _in_eval_mode(actor):
             found = _made(folder, config, actor, num_envs, progress)
     return found

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from lw_torchrl._checks import check_int, check_scale
-from lw_torchrl.data.behaviours import EXPERT, Behaviour
+from lw_torchrl.data.behaviours import EXPERT, NOISY, Behaviour, check_own_label
 from lw_torchrl.language.tasks import resolve_tasks
 
 DATA, METADATA, PARTIAL, LOCK = "data", "metadata.json", ".partial", ".lock"
@@ -66,6 +66,7 @@ class CollectConfig:
     def __post_init__(self) -> None:
         if not isinstance(self.policy, Behaviour):
             raise TypeError(f"policy must be a Behaviour, got {self.policy!r}")
+        check_own_label(self.policy)
         if not isinstance(self.redraw_failures, bool):
             raise TypeError(f"redraw_failures must be True or False, got {self.redraw_failures!r}")
         if not self.noise_scale:
@@ -90,7 +91,7 @@ class CollectConfig:
     @property
     def behaviour(self) -> str:
         """The label of its episodes: who acts; "noisy" for an expert executed with noise."""
-        return "noisy" if self.policy == EXPERT and any(self.noise_scale) else self.policy.name
+        return NOISY if self.policy == EXPERT and any(self.noise_scale) else self.policy.name
 
 
 @dataclass(frozen=True)

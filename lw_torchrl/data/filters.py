@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -41,16 +41,20 @@ class EpisodeFilter:
     behaviours: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
-        if self.success not in (None, True, False):
+        if self.success is not None and not isinstance(self.success, bool):
             raise TypeError(f"keep: success must be True, False or None, got {self.success!r}")
         if self.best is not None and not check_probability("keep: best", self.best):
             raise ValueError("keep: best must be above 0, got 0")
-        if self.least_return is not None and self.least_return != self.least_return:
-            raise ValueError("keep: least_return must be a number, got nan")
-        if isinstance(self.behaviours, str):
+        least = self.least_return
+        if least is not None and (isinstance(least, bool) or not isinstance(least, (int, float)) or least != least):
+            raise ValueError(f"keep: least_return must be a number, got {least!r}")
+        if self.behaviours is None:
+            return
+        if isinstance(self.behaviours, str) or not isinstance(self.behaviours, Iterable):
             raise TypeError(f"keep: behaviours must be a tuple of labels, got {self.behaviours!r}")
-        if self.behaviours is not None:
-            object.__setattr__(self, "behaviours", tuple(self.behaviours))
+        object.__setattr__(self, "behaviours", tuple(self.behaviours))
+        if not self.behaviours:
+            raise ValueError("keep: behaviours must hold at least one label, got none")
 
     def choose(self, parts: Sequence[Demonstrations], returns: Sequence[Tensor]) -> list[Demonstrations]:
         """The parts with the episodes that are kept.
@@ -89,9 +93,7 @@ class EpisodeFilter:
             and (self.behaviours is None or behaviour in self.behaviours)
         )
 
-    def _best(
-        self, listed: list[tuple[int, int, str, float, int]], task: str
-    ) -> list[tuple[int, int, str, float, int]]:
+    def _best(self, listed: list[_Listed], task: str) -> list[_Listed]:
         assert self.best is not None
         ours = sorted((row for row in listed if row[2] == task), key=lambda row: (-row[3], row[4], row[0], row[1]))
         return ours[: max(1, round(self.best * len(ours)))]
@@ -104,7 +106,7 @@ def episode_returns(reward: Tensor, lengths: Sequence[int]) -> Tensor:
         reward: (R, 1) float32.
         lengths: of each episode.
     """
-    rows = torch.tensor(lengths)
+    rows = torch.tensor(lengths, dtype=torch.int64)
     total = torch.zeros(len(rows), dtype=torch.float64)
     total.index_add_(0, torch.repeat_interleave(rows), reward.reshape(-1).double())
     return torch.stack((total, rows.double()), -1)

@@ -15,7 +15,7 @@ from lw_torchrl.data.behaviours import segment_plans
 from lw_torchrl.data.dataset import CollectConfig
 from lw_torchrl.data.episode_files import EpisodeFiles
 from lw_torchrl.data.segment_actor import SegmentActor
-from lw_torchrl.envs.episodes import in_blocks, run_episodes
+from lw_torchrl.envs.episodes import policy_of, read_action, run_episodes
 from lw_torchrl.envs.experts import ExpertActor
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.modules.policy import Policy
@@ -49,8 +49,8 @@ def _take_stock(config: CollectConfig, files: EpisodeFiles) -> tuple[dict[str, l
         missing = config.episodes_per_task - len(kept[task])
         if missing and candidate >= config.episodes_per_task * _MAX_ATTEMPTS:
             raise RuntimeError(
-                f"task {task!r}: only {len(kept[task])} of {candidate} episodes succeeded; lower the noise_scale or "
-                "set redraw_failures=False"
+                f"task {task!r}: only {len(kept[task])} of {candidate} episodes of {config.behaviour!r} succeeded; "
+                "lower the noise_scale or set redraw_failures=False"
             )
         ahead = range(candidate, candidate + missing)
         wanted[task] = [episode for episode in ahead if not files.has(task, episode)]
@@ -61,7 +61,8 @@ def _clipped(policy: _Acts) -> _Acts:
     """``policy`` with what it asked for beside what can be done, as :class:`ExpertActor` gives them."""
 
     def run(tensordict: TensorDictBase) -> TensorDictBase:
-        asked = policy(tensordict).get("action")
+        tensordict = policy(tensordict)
+        asked = read_action(tensordict)
         return tensordict.set("unclipped_action", asked).set("action", asked.clamp(-1.0, 1.0))
 
     return run
@@ -76,8 +77,7 @@ def _cast(config: CollectConfig, policy: Policy | None, env: LanguageWorldEnv) -
         actor = SegmentActor(config.policy, plans, config.seed, config.max_steps)
         return TransformedEnv(env, QAFTransform(plans)), _clipped(actor)
     transform = policy.transform()
-    acts = policy if policy.row_by_row else in_blocks(policy)
-    return env if transform is None else TransformedEnv(env, transform), _clipped(acts)
+    return env if transform is None else TransformedEnv(env, transform), _clipped(policy_of(policy))
 
 
 def run_missing_episodes(

@@ -31,6 +31,8 @@ from lw_torchrl.data.metadata import read_metadata
 from lw_torchrl.data.n_steps import check_n_steps
 from lw_torchrl.data.replay_checks import (
     admit_rows,
+    check_behaviours,
+    check_column,
     check_growing,
     check_label,
     check_prefetch,
@@ -159,6 +161,8 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
             check_growing(sampler, kwargs)
         check_choice("label", label, LABELS)
         check_choice("reward", reward, REWARDS)
+        if keep is not None and not isinstance(keep, EpisodeFilter):
+            raise TypeError(f"keep must be an EpisodeFilter, got {keep!r}")
         if batch_size is not None:
             check_int("batch_size", batch_size, minimum=1)
         if after_success is not None:
@@ -176,6 +180,7 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         choices = _choices(episodes, len(self.roots), joined)
         whole = [read_metadata(folder) for folder in self.roots]
         check_label(label, whole)
+        check_behaviours(whole)
         shown = [
             choose_episodes(found, choice, f"episodes[{number}]" if joined else "episodes")
             for number, (found, choice) in enumerate(zip(whole, choices, strict=True))
@@ -296,22 +301,22 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
 
         Args:
             name: of the column, a new one.
-            values: (R, ...), for each row in the order of ``replay[:]``.
+            values: (R, ...), for each row in the order of ``replay[:]``; a copy is kept where the rows are.
 
         Raises:
-            ValueError: another number of rows, a name that rows have, or a buffer that grows, whose later rows would
+            ValueError: another number of rows, a name that samples have, or a buffer that grows, whose later rows would
                 have none.
+            TypeError: ``name`` is no text, or ``values`` is no tensor.
         """
         if self._grows:
             raise ValueError(f"add_column: {name!r} would be of no row that comes later, and this buffer grows")
-        if name in self.storage.get(slice(0, 1)).keys():
-            raise ValueError(f"name must be new, the rows have a column {name!r}")
-        if len(values) != len(self):
-            raise ValueError(f"values must be of {len(self)} rows, got {len(values)}")
+        check_column(name, values, len(self), self.storage.get(slice(0, 1)).keys(), self.transform)
+        own = values.detach().clone()
         if isinstance(self.storage, TensorStorage):
-            self.storage._storage.set(name, values)
+            rows = self.storage._storage.clone(recurse=False)  # replay[:] is the one before, not a copy
+            self.storage._storage = rows.set(name, own)
         else:
-            self.storage.add_column(name, values)
+            self.storage.add_column(name, own)
 
     @property
     def tasks(self) -> tuple[str, ...]:

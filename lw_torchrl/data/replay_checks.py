@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import torch
 from tensordict import NestedKey
 from torch import Tensor
 from torchrl.data.replay_buffers.samplers import SliceSampler
-from torchrl.envs import Compose, MultiStepTransform
+from torchrl.envs import Compose, MultiStepTransform, Transform
 
-from lw_torchrl.data.behaviours import EXPERT
 from lw_torchrl.data.dataset import Demonstrations
 from lw_torchrl.data.rewards import REWARDS, RewardName, check_reward
+
+_OF_SAMPLERS = ("index", "is_target")  # what samples have beside rows
 
 
 def check_transform(transform: Any) -> None:
@@ -38,11 +39,24 @@ def check_prefetch(batches: int | None) -> None:
 
 def check_label(label: str, parts: Sequence[Demonstrations]) -> None:
     """Raise :class:`ValueError` where an expert's actions are asked for, and another one acted."""
-    others = sorted({part.config.behaviour for part in parts if part.config.policy != EXPERT})
+    others = sorted({part.config.behaviour for part in parts if part.config.policy.kind != "expert"})
     if others and label != "executed":
         raise ValueError(
             f"label={label!r} is what the expert wanted, and {', '.join(others)} acted here: take label='executed'"
         )
+
+
+def check_behaviours(parts: Sequence[Demonstrations]) -> None:
+    """Raise :class:`ValueError` where one label stands for two behaviours."""
+    first: dict[str, Demonstrations] = {}
+    for part in parts:
+        label, policy = part.config.behaviour, part.config.policy
+        before = first.setdefault(label, part)
+        if before.config.policy.acts != policy.acts:
+            raise ValueError(
+                f"root: {label!r} stands for two behaviours, {before.config.policy} in {str(before.root)!r} and "
+                f"{policy} in {str(part.root)!r}; give one another name, in its metadata.json under config, policy"
+            )
 
 
 def check_growing(sampler: Any, options: Mapping[str, Any]) -> None:
@@ -77,3 +91,14 @@ def admit_rows(
     made = REWARDS[reward]
     check_rows(made.source, terminate_on_success, rows)
     return {**rows, ("next", "reward"): made.of(rows["next", "reward"], rows["next", "success"])}
+
+
+def check_column(name: Any, values: Any, rows: int, there: Iterable[str], transform: Transform) -> None:
+    """Raise unless ``values`` can be a new column of so many rows, beside those that are there or come to samples."""
+    if not isinstance(name, str) or not isinstance(values, Tensor):
+        raise TypeError(f"add_column takes a name and a tensor, got {type(name).__name__} and {type(values).__name__}")
+    written = {key for part in transform.modules() if isinstance(part, Transform) for key in part.out_keys or ()}
+    if name in {*there, *_OF_SAMPLERS, *written}:
+        raise ValueError(f"name must be new, samples have {name!r} already")
+    if values.dim() == 0 or len(values) != rows:
+        raise ValueError(f"values must be of {rows} rows, got a tensor of shape {tuple(values.shape)}")

@@ -171,8 +171,9 @@ class JoinedStorage(Storage):
 
     def add_column(self, key: NestedKey, values: Tensor) -> None:
         """Give each row a value, (R, ...) in the order of the rows, held in memory."""
+        values = values.to(self._rows.device)
         whole = values.new_zeros((int(self._ends[-1]), *values.shape[1:]))
-        whole[self._rows.to(values.device)] = values
+        whole[self._rows] = values
         starts = [0, *self._ends.tolist()]
         self._columns[key] = [whole[start:end] for start, end in pairwise(starts)]
 

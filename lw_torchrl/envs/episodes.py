@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
+from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv, step_mdp
 
+from lw_torchrl._devices import CPU, place
+from lw_torchrl.envs.engine import ACTION_SIZE
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.envs.seeding import action_noise
 
@@ -51,6 +54,30 @@ def in_blocks(
     return run
 
 
+def policy_of(actor: Any, device: str | torch.device | None = None) -> Callable[[TensorDictBase], TensorDictBase]:
+    """The actor as episodes are run with it, on a device, or where it is; what it reads goes there and comes back.
+
+    Networks are run on blocks of rows, so that rows do not feel one another.
+    """
+    there = place(actor, device)
+    policy = actor if getattr(actor, "row_by_row", False) else in_blocks(actor)
+    if there == CPU:
+        return policy
+    return lambda tensordict: tensordict.update(policy(tensordict.to(there)).to(CPU))
+
+
+def read_action(tensordict: TensorDictBase) -> Tensor:
+    """The ``action`` that an actor wrote, (N, 4) float32; :class:`ValueError` if it is none."""
+    action, shape = tensordict.get("action", None), (*tensordict.batch_size, ACTION_SIZE)
+    if action is None:
+        raise ValueError(f"the actor must write 'action', got {', '.join(map(str, tensordict.keys()))}")
+    if action.shape != shape or action.dtype != torch.float32:
+        raise ValueError(
+            f"the actor's action must be float32 of shape {shape}, got {action.dtype} of shape {tuple(action.shape)}"
+        )
+    return action
+
+
 def _base(env: EnvBase) -> LanguageWorldEnv:
     base = env.base_env if isinstance(env, TransformedEnv) else env
     if not isinstance(base, LanguageWorldEnv):
@@ -72,7 +99,7 @@ def run_episodes(
 ) -> Iterator[FinishedEpisode]:
     """Run each task's listed episodes once and yield them as they finish.
 
-    A row that finishes takes the next episode of its task; one without work costs nothing.
+    A row that finishes takes the next episode of its task; one without work costs a reset.
 
     Args:
         env: a LanguageWorldEnv, with transforms or without.
@@ -103,6 +130,7 @@ def run_episodes(
     buffers: TensorDictBase | None = None
     state: TensorDictBase = env.full_done_spec.zero()
     idle = torch.ones(rows, dtype=torch.bool)
+    fresh = True  # no row was reset yet; policies look at the task of a row without work too
     while True:
         starting = torch.zeros(rows, dtype=torch.bool)
         for row in torch.nonzero(idle).flatten().tolist():
@@ -117,7 +145,8 @@ def run_episodes(
         if not active.any():
             return
         if starting.any():
-            state = env.reset(state.set("_reset", starting), episode=episode).exclude("_reset")
+            anew = torch.ones_like(starting) if fresh else starting
+            state, fresh = env.reset(state.set("_reset", anew), episode=episode).exclude("_reset"), False
         state.set("_step", active)
         state = policy(state)
         action = state.get("action")

@@ -13,10 +13,8 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from lw_torchrl._checks import check_int, check_scale, unknown_name
-from lw_torchrl._devices import CPU, place
 from lw_torchrl._progress import Progress
-from lw_torchrl.envs.engine import ACTION_SIZE
-from lw_torchrl.envs.episodes import FinishedEpisode, in_blocks, run_episodes
+from lw_torchrl.envs.episodes import FinishedEpisode, policy_of, read_action, run_episodes
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.evaluation.result import EpisodeResult, EvaluationResult
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
@@ -54,18 +52,6 @@ def make_env(actor: Any, plans: Plans | None, base: LanguageWorldEnv) -> EnvBase
     return base if transform is None else TransformedEnv(base, transform)
 
 
-def policy_of(actor: Any, device: str | torch.device | None = None) -> Callable[[TensorDictBase], TensorDictBase]:
-    """The actor as episodes are run with it, on a device, or where it is; what it reads goes there and comes back.
-
-    Networks are run on blocks of rows, so that rows do not feel one another.
-    """
-    there = place(actor, device)
-    policy = actor if getattr(actor, "row_by_row", False) else in_blocks(actor)
-    if there == CPU:
-        return policy
-    return lambda tensordict: tensordict.update(policy(tensordict.to(there)).to(CPU))
-
-
 def _result(task: str, episode: int, steps: TensorDictBase, stopped_early: bool, keep_actions: bool) -> EpisodeResult:
     success = steps.get(("next", "success")).flatten()
     hits = success.nonzero().flatten()
@@ -90,14 +76,7 @@ def _checked(
 
     def run(tensordict: TensorDictBase) -> TensorDictBase:
         tensordict = policy(tensordict)
-        action, shape = tensordict.get("action", None), (*tensordict.batch_size, ACTION_SIZE)
-        if action is None:
-            raise ValueError(f"the actor must write 'action', got {', '.join(map(str, tensordict.keys()))}")
-        if action.shape != shape or action.dtype != torch.float32:
-            raise ValueError(
-                f"the actor's action must be float32 of shape {shape}, got {action.dtype} of shape "
-                f"{tuple(action.shape)}"
-            )
+        read_action(tensordict)
         while unseen:
             key = unseen.pop()
             if key not in later and key not in tensordict.keys(True):

@@ -58,6 +58,7 @@ class ActorEnsemble(Policy):
         self.plans, self.tasks = first.plans, first.tasks
         self.in_keys = first.in_keys
         self.out_keys = first.out_keys[: 1 if first.plans is None else 2]
+        self.draws = any(member.draws for member in members)
         self._own_evaluators = any(getattr(member, "evaluator", None) is not None for member in members)
 
     def transform(self) -> Transform | None:

@@ -65,6 +65,7 @@ class Policy(TensorDictModuleBase):
         plan_options: whether its class has options that speak of a plan's steps, ``focus`` say.
         row_by_row: whether a row's action is the same to the last bit whatever rows stand beside it; networks' are
             not, and are run on blocks of one size.
+        draws: whether its actions, without exploration, hang on numbers that it drew before, for other episodes too.
 
     Example:
         A way of conditioning of one's own, here on nothing at all. Named in ``METHODS`` as well, it is trained and
@@ -102,6 +103,7 @@ class Policy(TensorDictModuleBase):
     tasks: tuple[str, ...]
     plan_options: ClassVar[bool] = False
     row_by_row: ClassVar[bool] = False
+    draws: bool = False
 
     @property
     def spec(self) -> Composite:

@@ -72,6 +72,7 @@ class ScriptedSkillActor(Policy):
         if not -(2**63) <= check_int("seed", seed) < 2**64:
             raise ValueError(f"seed must be from -2**63 to 2**64 - 1, got {shown(seed)}")
         self.select = check_choice("select", select, ("first", "random", "mix"))
+        self.draws = self.select == "random"
         self._skills = skills
         self.program = SkillProgram(
             {plan.definition: [step.skill for step in plan.steps] for plan in self.plans.values()}, skills

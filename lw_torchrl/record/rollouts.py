@@ -11,9 +11,9 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 
-from lw_torchrl.envs.episodes import run_episodes
+from lw_torchrl.envs.episodes import policy_of, run_episodes
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
-from lw_torchrl.evaluation.protocol import make_env, policy_of, tasks_of
+from lw_torchrl.evaluation.protocol import make_env, tasks_of
 from lw_torchrl.language.plans import ConditionalPlan
 from lw_torchrl.language.tasks import Task
 from lw_torchrl.modules.policy import Policy, plans_of

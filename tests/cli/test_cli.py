@@ -21,6 +21,7 @@ from lw_torchrl.experiments.demo import QUICK
 COMMANDS = (
     "demo",
     "collect",
+    "data",
     "train",
     "evaluate",
     "view",

@@ -14,6 +14,7 @@ from lw_torchrl.language.query_program import QueryProgram
 from lw_torchrl.transforms import QAFTransform
 
 STEPS = 50
+WITHOUT_NEXT = {"observation", "task_id", "episode", "behaviour", "action", ("collector", "traj_ids")}
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +42,7 @@ def test_the_label_is_what_the_expert_wanted(made, rows):
     replay = LanguageWorldExperienceReplay(made.root)
     found = replay[:]
     assert torch.equal(found["action"], rows["expert_action"])
-    assert set(found.keys(True, True)) == {"observation", "task_id", "episode", "action", ("collector", "traj_ids")}
+    assert set(found.keys(True, True)) == WITHOUT_NEXT
     assert torch.equal(found["observation"], rows["observation"])
 
 
@@ -49,7 +50,7 @@ def test_or_what_its_script_asked_for(made, rows):
     found = LanguageWorldExperienceReplay(made.root, label="unclipped")[:]
     assert torch.equal(found["action"], rows["unclipped_action"])
     assert found["action"].abs().max() > 1
-    assert set(found.keys(True, True)) == {"observation", "task_id", "episode", "action", ("collector", "traj_ids")}
+    assert set(found.keys(True, True)) == WITHOUT_NEXT
 
 
 @pytest.mark.parametrize("reward", ["sparse", "dense"])
@@ -57,8 +58,8 @@ def test_or_what_was_executed_with_its_consequences(made, rows, reward):
     replay = LanguageWorldExperienceReplay(made.root, label="executed", reward=reward)
     found = replay[:]
     assert not torch.equal(rows["action"], rows["expert_action"])
-    assert set(found.keys(True, True)) == {*rows.keys(True, True), ("next", "reward")}
-    assert (found.exclude(("next", "reward")) == rows).all()
+    assert set(found.keys(True, True)) == {*rows.keys(True, True), "behaviour", ("next", "reward")}
+    assert (found.exclude("behaviour", ("next", "reward")) == rows).all()
     assert torch.equal(found["next", "reward"], rows["next", f"reward_{reward}"])
     assert not torch.equal(rows["next", "reward_sparse"], rows["next", "reward_dense"])
     assert (replay.label, replay.reward) == ("executed", reward)

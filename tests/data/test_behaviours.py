@@ -1,0 +1,524 @@
+"""Who acts in a dataset: plans with scripted skills, sound and spoilt, chance, trained policies; what is refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import warnings
+
+import pytest
+import torch
+from collecting import SEED, STEPS, collect, interrupt_after, tree
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mutations import mutated
+from tensordict import TensorDict
+
+import lw_torchrl as lw
+from lw_torchrl.data import BEHAVIOURS, Behaviour, CollectConfig, DatasetError, missing_episodes
+from lw_torchrl.data.behaviours import behaviour_of, policy_fingerprint, segment_plans
+from lw_torchrl.data.metadata import parse_config, read_metadata
+from lw_torchrl.data.rows import load_rows
+from lw_torchrl.data.segment_actor import SegmentActor
+from lw_torchrl.envs.episodes import run_episodes
+from lw_torchrl.envs.seeding import episode_generator
+from lw_torchrl.language.tasks import task_id
+from lw_torchrl.trainers import BehavioralCloningConfig, BehavioralCloningTrainer
+from lw_torchrl.trainers.checkpoint import demonstrated_tasks, demonstration_seeds
+
+PLANS = lw.load_plans("MT10")
+OTHERS = [name for name in BEHAVIOURS if name != "expert"]
+
+
+def trained(kind="plan", seed=0, **options):
+    """A tiny policy; of other weights for another seed."""
+    torch.manual_seed(seed)
+    if kind == "plan":
+        return lw.PlanConditionedActor(PLANS, width=8, depth=1, **options)
+    return lw.DescriptorConditionedActor(("push", "reach"), width=8, depth=1, **options)
+
+
+def same_rows(one, other):
+    return (load_rows(one) == load_rows(other)).all()
+
+
+# ---- who acts by pieces
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A dataset of each behaviour."""
+    root = tmp_path_factory.mktemp("behaviours")
+    return {name: collect(root / name, policy=name) for name in OTHERS}
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_a_dataset_depends_on_neither_the_number_of_environments_nor_the_tasks_beside(made, name, tmp_path):
+    assert same_rows(made[name], collect(tmp_path / "narrow", policy=name, num_envs=2))
+    alone = collect(tmp_path / "alone", policy=name, tasks="reach", num_envs=1)
+    rows = load_rows(made[name])
+    beside = rows[rows["task_id"] == task_id("reach")].exclude("collector")
+    assert (beside == load_rows(alone).exclude("collector")).all()
+
+
+@pytest.mark.parametrize("name", ["spoilt-30", "random"])
+def test_nor_on_interruptions(made, name, tmp_path, monkeypatch):
+    root = tmp_path / "stopped"
+    for episodes in (1, 2):
+        with monkeypatch.context() as patch:
+            interrupt_after(patch, episodes)
+            with pytest.raises(KeyboardInterrupt):
+                collect(root, policy=name, num_envs=2)
+    assert tree(collect(root, policy=name, num_envs=3).root) == tree(made[name].root)
+
+
+def test_behaviours_differ_in_what_they_do_and_not_in_where_they_begin(made):
+    first = [load_rows(one)[:1] for one in made.values()]
+    assert all(torch.equal(rows["observation"], first[0]["observation"]) for rows in first)
+    actions = [load_rows(one)["expert_action"] for one in made.values()]
+    assert not any(torch.equal(one, other) for n, one in enumerate(actions) for other in actions[:n])
+
+
+def test_the_metadata_say_who_acted(made):
+    for name, one in made.items():
+        found = read_metadata(one.root).config
+        assert found.behaviour == name
+        assert found.policy.acts == BEHAVIOURS[name]
+        assert found.policy.fingerprint == segment_plans(("push", "reach")).fingerprint
+        assert parse_config(json.loads(json.dumps(found.to_json()))) == found
+
+
+def test_the_experts_metadata_say_what_they_said_before_there_were_others(tmp_path):
+    one = collect(tmp_path / "demos")
+    text = (one.root / "metadata.json").read_text()
+    assert list(json.loads(text)["config"]) == [
+        "tasks",
+        "episodes_per_task",
+        "seed",
+        "noise_scale",
+        "noise_hold",
+        "gripper_noise_factor",
+        "redraw_failures",
+        "max_steps",
+    ]
+    assert one.config.policy == BEHAVIOURS["expert"]
+    assert collect(one.root, policy="expert") == one
+    assert (one.root / "metadata.json").read_text() == text
+    assert one.config.behaviour == "noisy"
+    assert CollectConfig(("reach",), 1, 0).behaviour == "expert"
+
+
+def pieces(flags):
+    """The lengths of the runs of equal rows of (T, ...)."""
+    changes = (flags[1:] != flags[:-1]).reshape(len(flags) - 1, -1).any(-1).nonzero().flatten() + 1
+    return torch.diff(torch.cat([torch.tensor([0]), changes, torch.tensor([len(flags)])])).tolist()
+
+
+def acting(behaviour, tasks=("reach",), max_steps=500):
+    return SegmentActor(behaviour, segment_plans(tasks), SEED, max_steps)
+
+
+@given(
+    right=st.floats(0.0, 1.0),
+    otherwise=st.sampled_from(["skill", "action"]),
+    shortest=st.integers(1, 30),
+    more=st.integers(0, 30),
+    episode=st.integers(0, 2**40),
+)
+@settings(max_examples=60, deadline=None)
+def test_pieces_are_as_long_and_as_often_right_as_said(right, otherwise, shortest, more, episode):
+    how = Behaviour("any", right=right, otherwise=otherwise, shortest=shortest, longest=shortest + more)
+    actor = acting(how)
+    actor._begin(1)
+    actor._draw(0, task_id("reach"), episode)
+    held = pieces(actor._held[0])
+    assert sum(held) == 500
+    assert all(shortest <= length <= shortest + more for length in held[:-1])
+    assert held[-1] <= shortest + more
+    assert actor._held.abs().max() <= 1
+    starts = torch.tensor([0, *held[:-1]]).cumsum(0)
+    for start, length in zip(starts.tolist(), held, strict=True):
+        for drawn in (actor._right, actor._skill):
+            assert len(drawn[0, start : start + length].unique()) == 1
+    draws = episode_generator("segments", "reach", SEED, episode)  # the order of the draws is part of the data
+    assert held[0] == draws.integers(shortest, shortest + more + 1, -(-500 // shortest))[0]
+
+
+@pytest.mark.parametrize(("name", "right"), [("spoilt-60", 0.6), ("spoilt-30", 0.3), ("wrong", 0.0), ("scripted", 1.0)])
+def test_the_share_of_right_pieces(name, right):
+    actor = acting(BEHAVIOURS[name])
+    actor._begin(1)
+    shares = []
+    for episode in range(300):
+        actor._draw(0, task_id("reach"), episode)
+        shares.append(actor._right[0].double().mean())
+    mean = torch.stack(shares).mean()
+    assert abs(mean - right) < 0.02
+    assert (mean == right) or 0 < right < 1
+
+
+def recorded(actor, tasks, policy=None, steps=40, episodes=2):
+    """The actions of a plain run of episodes."""
+    env = lw.LanguageWorldEnv(tasks, num_envs=4, seed=SEED, max_steps=steps)
+    from torchrl.envs import TransformedEnv
+
+    wrapped = TransformedEnv(env, lw.QAFTransform(segment_plans(tasks)))
+    keys = ["action", "observation"]
+    found = run_episodes(wrapped, actor, {task: range(episodes) for task in tasks}, keys=keys)
+    done = {(one.task, one.episode): one.steps for one in found}
+    wrapped.close()
+    return done
+
+
+def test_all_right_is_the_scripted_skill_actor(tmp_path):
+    tasks = ("button-press-topdown", "reach")
+    ours = recorded(lw.ScriptedSkillActor(segment_plans(tasks)), tasks)
+    made = collect(tmp_path / "demos", tasks=tasks, policy="scripted", noise_scale=0.0, max_steps=40)
+    rows = load_rows(made)
+    for info in made.episodes:
+        if info.episode < 2:
+            span = slice(info.start, info.start + info.length)
+            assert torch.equal(rows["action"][span], ours[info.task, info.episode]["action"])
+            assert torch.equal(rows["observation"][span], ours[info.task, info.episode]["observation"])
+
+
+def test_random_holds_one_action_a_piece(tmp_path):
+    made = collect(tmp_path / "demos", policy="random", noise_scale=0.0, max_steps=120, episodes_per_task=2)
+    rows = load_rows(made)
+    for info in made.episodes:
+        held = pieces(rows["action"][info.start : info.start + info.length])
+        assert all(8 <= length <= 24 for length in held[:-1])
+        assert len(held) >= 5
+    assert torch.equal(rows["action"], rows["expert_action"])
+    assert torch.equal(rows["action"], rows["unclipped_action"])
+
+
+def test_wrong_does_what_skills_of_the_plan_do(tmp_path):
+    """Each action is one of the plan's skills', in the state that it was taken in."""
+    from lw_torchrl.language.skill_program import SkillProgram
+
+    made = collect(tmp_path / "demos", tasks="push", policy="wrong", noise_scale=0.0, max_steps=60)
+    rows, plan = load_rows(made), segment_plans(["push"])["push"]
+    offered = SkillProgram({plan.definition: [step.skill for step in plan.steps]})(
+        rows["observation"].clone(), rows["task_id"].clone()
+    )
+    assert (offered == rows["unclipped_action"].unsqueeze(1)).all(-1).any(-1).all()
+
+
+def test_noise_is_drawn_beside_who_acts(made):
+    rows = load_rows(made["random"])
+    noisy = rows["episode"] % 2 == 1  # NOISE is (0.0, 0.3)
+    assert not torch.equal(rows["action"][noisy], rows["expert_action"][noisy])
+    assert torch.equal(rows["action"][~noisy], rows["expert_action"][~noisy])
+
+
+# ---- trained policies
+
+
+@pytest.mark.parametrize("kind", ["plan", "description"])
+def test_a_policy_acts_as_in_an_evaluation(tmp_path, kind):
+    actor = trained(kind).train()
+    options = dict(noise_scale=0.1, gripper_noise_factor=1.0, noise_hold=1)
+    made = collect(tmp_path / "demos", policy=actor, behaviour="tiny", num_envs=3, **options)
+    assert actor.training, "it is left as it was"
+    result = lw.evaluate(
+        actor,
+        tasks=("push", "reach"),
+        episodes_per_task=3,
+        seed=SEED,
+        noise_scale=0.1,
+        max_steps=STEPS,
+        record_actions=True,
+        progress=False,
+    )
+    rows = load_rows(made)
+    for info, episode in zip(made.episodes, result.episodes, strict=True):
+        assert (info.task, info.episode) == (episode.task, episode.episode)
+        assert torch.equal(rows["action"][info.start : info.start + info.length], episode.actions)
+    assert made.config.behaviour == "tiny"
+
+
+def test_a_policy_with_a_distribution_acts_without_exploring(tmp_path):
+    actor = trained(distribution="tanh_normal").train()
+    one = collect(tmp_path / "one", policy=actor, behaviour="tiny")
+    torch.manual_seed(99)
+    assert tree(collect(tmp_path / "other", policy=actor, behaviour="tiny", num_envs=2).root) == tree(one.root)
+    still = collect(tmp_path / "still", policy=actor, behaviour="tiny", noise_scale=0.0)
+    state = TensorDict({"observation": load_rows(still)["observation"][:64].clone()}, [64])
+    state["task_id"] = load_rows(still)["task_id"][:64].clone()
+    with torch.no_grad(), lw_deterministic():
+        actor.eval()(lw.QAFTransform(PLANS)(state))
+    assert torch.allclose(state["action"], load_rows(still)["action"][:64], atol=1e-5)
+
+
+def lw_deterministic():
+    from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+    return set_exploration_type(ExplorationType.DETERMINISTIC)
+
+
+def test_an_interrupted_collection_of_a_policy_goes_on_with_the_same_alone(tmp_path, monkeypatch):
+    root, actor = tmp_path / "demos", trained()
+    whole = collect(tmp_path / "whole", policy=actor, behaviour="tiny")
+    with monkeypatch.context() as patch:
+        interrupt_after(patch, 2)
+        with pytest.raises(KeyboardInterrupt):
+            collect(root, policy=actor, behaviour="tiny", num_envs=2)
+    before = tree(root)
+    for other in (trained(seed=1), trained(mix="actions")):
+        with pytest.raises(DatasetError, match=r"half-made dataset.*\(policy.fingerprint '\w+', now '\w+'\)"):
+            collect(root, policy=other, behaviour="tiny")
+    with torch.no_grad():
+        next(actor.parameters()).add_(1e-3)
+    with pytest.raises(DatasetError, match=r"policy.fingerprint"):
+        collect(root, policy=actor, behaviour="tiny")
+    with torch.no_grad():
+        next(actor.parameters()).copy_(next(trained().parameters()))
+    with pytest.raises(DatasetError, match=r"policy.name 'tiny', now 'other'"):
+        collect(root, policy=actor, behaviour="other")
+    assert tree(root) == before
+    assert tree(collect(root, policy=actor, behaviour="tiny").root) == tree(whole.root)
+
+
+@pytest.mark.parametrize(
+    ("was", "now", "message"),
+    [
+        ("expert", "scripted", r"policy.name 'expert', now 'scripted', policy.kind 'expert', now 'segments'"),
+        ("scripted", "expert", r"policy.name 'scripted', now 'expert'"),
+        ("spoilt-30", "spoilt-60", r"\(policy.name 'spoilt-30', now 'spoilt-60', policy.right 0.3, now 0.6\)"),
+    ],
+)
+def test_a_dataset_of_another_behaviour_is_refused_with_what_differs(tmp_path, was, now, message):
+    made = collect(tmp_path / "demos", tasks="reach", episodes_per_task=1, policy=was)
+    before = tree(made.root)
+    with pytest.raises(DatasetError, match=message):
+        collect(made.root, tasks="reach", episodes_per_task=1, policy=now)
+    assert tree(made.root) == before
+
+
+def test_a_damaged_dataset_of_a_policy_is_mended_by_the_same_policy(tmp_path):
+    actor = trained()
+    made = collect(tmp_path / "demos", policy=actor, behaviour="tiny")
+    before = tree(made.root)
+    path = made.root / "data" / "observation.memmap"
+    content = bytearray(path.read_bytes())
+    content[5] ^= 255
+    path.write_bytes(content)
+    damaged = tree(made.root)
+    with pytest.raises(DatasetError, match=r"policy\.fingerprint"):
+        collect(made.root, policy=trained(seed=1), behaviour="tiny")
+    assert tree(made.root) == damaged
+    with pytest.warns(UserWarning, match="5 of 6 episodes are kept"):
+        collect(made.root, policy=actor, behaviour="tiny")
+    assert tree(made.root) == before
+
+
+def test_redrawing_with_others_than_the_expert(tmp_path, monkeypatch):
+    options = dict(tasks="reach", policy="wrong", redraw_failures=True, episodes_per_task=2, max_steps=31)
+    made = collect(tmp_path / "a", noise_scale=0.0, **options)
+    assert all(one.success for one in made.episodes)
+    assert made.attempts["reach"] > 2, "the test wants failures"
+    assert tree(collect(tmp_path / "b", noise_scale=0.0, num_envs=1, **options).root) == tree(made.root)
+    monkeypatch.setattr(missing_episodes, "_MAX_ATTEMPTS", 3)
+    with pytest.raises(RuntimeError, match=r"only 0 of 3 episodes of 'random' succeeded.*redraw_failures=False"):
+        collect(tmp_path / "c", tasks="push", policy="random", redraw_failures=True, episodes_per_task=1)
+
+
+def nan(policy):
+    with torch.no_grad():
+        for parameter in policy.parameters():
+            parameter.fill_(torch.nan)
+    return policy
+
+
+class Odd(lw.Policy):
+    """Writes another action than it should."""
+
+    def __init__(self, wrong):
+        super().__init__()
+        self.tasks, self.config, self.wrong = ("push", "reach"), {}, wrong
+        self.in_keys, self.out_keys = ["observation"], ["deed" if wrong == "key" else "action"]
+
+    def prepare(self, tensordict):
+        return tuple(self.read(tensordict))
+
+    def act(self, observation):
+        dtype = torch.float64 if self.wrong == "dtype" else torch.float32
+        return (observation[..., : 3 if self.wrong == "shape" else 4].to(dtype),)
+
+
+@pytest.mark.parametrize(
+    ("policy", "options", "error", "message"),
+    [
+        (trained(), dict(behaviour=None), ValueError, "behaviour must name the policy in the dataset"),
+        (
+            trained(),
+            dict(behaviour="random"),
+            ValueError,
+            "behaviour must be a label of its own, 'random' is another's",
+        ),
+        (trained(), dict(behaviour="noisy"), ValueError, "behaviour must be a label of its own, 'noisy' is another's"),
+        (trained(), dict(behaviour=" x"), ValueError, "name must be a label"),
+        (trained(), dict(behaviour=7), ValueError, "name must be a label of 1 to 100 characters, got 7"),
+        (trained(), dict(behaviour="a\nb"), ValueError, "name must be a label"),
+        ("random", dict(behaviour="expert"), ValueError, "label of its own, 'expert' is another's"),
+        ("expert", dict(behaviour="spoilt-30"), ValueError, "label of its own"),
+        (Behaviour("wrong", right=0.9), dict(behaviour=None), ValueError, "label of its own"),
+        (Behaviour("mine", "policy"), {}, ValueError, "give the policy itself"),
+        ("raondm", {}, ValueError, "policy must be one of 'expert'.*did you mean 'random'"),
+        (None, {}, TypeError, "policy must be a name, a Behaviour or a Policy, got NoneType"),
+        (lambda state: state, {}, TypeError, "policy must be a name"),
+        (trained("description"), dict(tasks=("push", "drawer-open")), ValueError, "not made for drawer-open"),
+        (nan(trained()), {}, ValueError, "NaN"),
+        (Odd("key"), {}, ValueError, "must write 'action'"),
+        (Odd("dtype"), {}, ValueError, "must be float32"),
+        (Odd("shape"), {}, ValueError, r"must be float32 of shape \(2, 4\), got torch.float32 of shape \(2, 3\)"),
+        (lw.ScriptedSkillActor(PLANS, "random"), {}, ValueError, "would hang on num_envs and on interruptions"),
+        (lw.ActorEnsemble([lw.ScriptedSkillActor(PLANS, "random")]), {}, ValueError, "draws in the order"),
+        (lw.ScriptedSkillActor(PLANS, skills=lw.load_skills()), {}, TypeError, "skills of your own"),
+    ],
+)
+def test_what_is_refused(tmp_path, policy, options, error, message):
+    with pytest.raises(error, match=message):
+        collect(tmp_path / "demos", policy=policy, num_envs=2, **{"behaviour": "mine", **options})
+    assert not (tmp_path / "demos" / "metadata.json").exists()
+
+
+def test_an_expert_of_another_name_is_one(tmp_path):
+    made = collect(tmp_path / "demos", behaviour="night shift")
+    assert made.config.behaviour == "night shift"
+    replay = lw.LanguageWorldExperienceReplay(made.root, label="expert")
+    assert replay.behaviours == ("night shift",)
+    assert torch.equal(replay[:]["action"], load_rows(made)["expert_action"])
+
+
+@pytest.mark.parametrize("label", ["expert", "unclipped"])
+def test_the_experts_label_is_refused_where_another_acted(made, label):
+    with pytest.raises(ValueError, match=f"label='{label}' is what the expert wanted, and random acted here"):
+        lw.LanguageWorldExperienceReplay(made["random"].root, label=label)
+
+
+def test_rows_say_who_acted(made):
+    names = ("wrong", "scripted", "random")
+    replay = lw.LanguageWorldExperienceReplay([made[name].root for name in names], label="executed")
+    assert replay.behaviours == ("random", "scripted", "wrong")
+    size = made["wrong"].num_steps
+    assert replay[:]["behaviour"].tolist() == [2] * size + [1] * size + [0] * size
+
+
+def test_one_label_of_two_behaviours_is_refused(tmp_path, made):
+    one = collect(tmp_path / "one", policy=trained(), behaviour="tiny")
+    other = collect(tmp_path / "other", policy=trained(seed=1), behaviour="tiny")
+    with pytest.raises(ValueError, match=r"'tiny' stands for two behaviours.*metadata\.json"):
+        lw.LanguageWorldExperienceReplay([one.root, other.root], label="executed")
+    stated = json.loads((other.root / "metadata.json").read_text())
+    stated["config"]["policy"]["name"] = "second"
+    (other.root / "metadata.json").write_text(json.dumps(stated))
+    both = lw.LanguageWorldExperienceReplay([one.root, other.root], label="executed")
+    assert both.behaviours == ("second", "tiny")
+    alone = collect(tmp_path / "reach", tasks="reach", policy="scripted")  # other plans, the same behaviour
+    lw.LanguageWorldExperienceReplay([made["scripted"].root, alone.root], label="executed")
+
+
+def test_a_policy_trained_on_such_data_says_which_seeds_it_saw(tmp_path, made, capsys):
+    from commands import fails
+
+    tiny = collect(tmp_path / "tiny", tasks="reach", policy=trained(), behaviour="tiny", seed=77)
+    roots = [made["spoilt-60"].root, tiny.root]
+    for number, (root, seeds, tasks) in enumerate(
+        [(roots, {SEED, 77}, {"push", "reach"}), (roots[0], {SEED}, {"push", "reach"}), (roots[1], {77}, {"reach"})]
+    ):
+        replay = lw.LanguageWorldExperienceReplay(
+            root, label="executed", sampler=lw.TaskBalancedSampler(), transform=lw.QAFTransform(PLANS)
+        )
+        path = tmp_path / f"{number}.zip"
+        config = BehavioralCloningConfig(steps=1, batch_size=8)
+        BehavioralCloningTrainer(trained(), replay, config, checkpoint=path, progress=False).train()
+        assert demonstration_seeds(path) == seeds
+        assert demonstrated_tasks(path) == tasks
+        for seed in seeds:
+            assert "--seed must differ from the demonstrations' seed" in fails(capsys, "evaluate", path, "--seed", seed)
+
+
+# ---- fingerprints
+
+
+def test_a_fingerprint_is_of_all_that_a_policy_does():
+    base = policy_fingerprint(trained())
+    assert policy_fingerprint(trained()) == base
+    others = [trained(seed=1), trained(mix="actions"), trained(features="raw"), trained("description")]
+    others.append(trained().with_plans({**PLANS, "reach": PLANS["reach"].__class__("reach", PLANS["reach"].steps[:1])}))
+    others.append(trained(text_encoder=lambda texts: torch.randn(len(texts), 384, generator=torch.Generator())))
+    found = [base, *map(policy_fingerprint, others)]
+    assert len(set(found)) == len(found)
+    assert policy_fingerprint(trained().bfloat16()) != base
+
+
+# ---- JSON
+
+
+@given(st.data())
+@settings(max_examples=300, deadline=None)
+def test_json_of_any_shape_is_refused_by_name_or_a_behaviour(data):
+    stated = CollectConfig(("reach",), 1, 0, policy=behaviour_of("spoilt-30", ["reach"])).to_json()
+    stated["policy"] = data.draw(mutated(stated["policy"]))
+    said = None
+    try:
+        found = parse_config(stated)
+    except (ValueError, TypeError, OverflowError) as error:
+        said = str(error)
+    if said is not None:
+        assert "policy" in said or "behaviour" in said
+        return
+    assert isinstance(found.policy, Behaviour)
+    assert parse_config(json.loads(json.dumps(found.to_json()))) == found
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (dict(kind="evil"), "behaviour: kind must be one of"),
+        (dict(kind="expert"), "right is of kind 'segments'"),
+        (dict(name="expert"), "label of its own, 'expert' is another's"),
+        (dict(longest=10**30), "behaviour: longest must be from shortest, 8, to 100000"),
+        (dict(longest=7), "behaviour: longest must be from shortest, 8"),
+        (dict(shortest=0), "behaviour: shortest must be at least 1"),
+        (dict(right=float("nan")), "it holds NaN, which is no JSON"),
+        (dict(right=1.5), "behaviour: right must be from 0 to 1"),
+        (dict(right=True), "behaviour: right must be a number"),
+        (dict(right="0.3"), "behaviour: right must be a number"),
+        (dict(otherwise="sleep"), "behaviour: otherwise must be one of"),
+        (dict(fingerprint=3), "behaviour: fingerprint must be a text"),
+        (dict(more=1), "policy must be an object of name, kind"),
+        (dict(name="x" * 101), "name must be a label"),
+    ],
+)
+def test_hostile_metadata_are_refused_by_name(made, tmp_path, change, message):
+    root = shutil.copytree(made["spoilt-30"].root, tmp_path / "demos")
+    stated = json.loads((root / "metadata.json").read_text())
+    stated["config"]["policy"].update(change)
+    (root / "metadata.json").write_text(json.dumps(stated))
+    with pytest.raises(DatasetError, match=message):
+        lw.LanguageWorldExperienceReplay(root, label="executed")
+
+
+@given(
+    right=st.floats(0.0, 1.0),
+    otherwise=st.sampled_from(["skill", "action"]),
+    shortest=st.integers(1, 100_000),
+    data=st.data(),
+)
+@settings(max_examples=100, deadline=None)
+def test_a_behaviour_comes_back_from_its_json(right, otherwise, shortest, data):
+    longest = data.draw(st.integers(shortest, 100_000))
+    one = Behaviour("mine", right=right, otherwise=otherwise, shortest=shortest, longest=longest)
+    assert Behaviour.from_json(json.loads(json.dumps(one.to_json()))) == one
+
+
+def test_a_behaviour_of_ones_own(tmp_path):
+    mine = Behaviour("mine", right=0.5, otherwise="action", shortest=2, longest=3)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        made = collect(tmp_path / "demos", policy=mine)
+    assert made.config.policy.acts == mine
+    assert collect(made.root, policy=mine) == made

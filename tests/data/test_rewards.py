@@ -1,0 +1,110 @@
+"""Rewards by name, each written anew by hand, and what is found out of rows that have another."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from collecting import collect
+
+import lw_torchrl as lw
+from lw_torchrl.data.rewards import REWARDS, check_reward
+from lw_torchrl.data.rows import load_rows
+
+
+def by_hand(name, dense, success):
+    if name == "sparse":
+        return 1.0 if success else 0.0
+    if name == "dense":
+        return dense
+    if success:
+        return 0.0
+    return -0.01 if name == "cost" else (dense - 10.0) / 100.0
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Successes and failures of reach, by plans with scripted skills, dense rewards of 0 to 10."""
+    made = collect(
+        tmp_path_factory.mktemp("rewards") / "demos",
+        tasks="reach",
+        policy="scripted",
+        noise_scale=0.0,
+        max_steps=34,
+        episodes_per_task=5,
+    )
+    assert {e.success for e in made.episodes} == {True, False}
+    return made
+
+
+@pytest.mark.parametrize("name", list(REWARDS))
+@pytest.mark.parametrize("ends", [dict(), dict(after_success=2), dict(terminate_on_success=True)])
+def test_each_row_has_the_reward_named(made, name, ends):
+    rows = load_rows(made)
+    replay = lw.LanguageWorldExperienceReplay(made.root, label="executed", reward=name, **ends)
+    found = replay[:]
+    kept = [
+        info.start + step
+        for info in made.episodes
+        for step in range(info.length)
+        if not ends or not info.success or step < info.first_success + ends.get("after_success", 0)
+    ]
+    assert len(found) == len(kept)
+    for row, source in enumerate(kept):
+        dense, success = float(rows["next", "reward_dense"][source]), bool(rows["next", "success"][source])
+        assert float(found["next", "reward"][row]) == pytest.approx(by_hand(name, dense, success), abs=1e-6)
+    assert found["next", "reward"].dtype == torch.float32
+    assert found["next", "reward"].shape == (len(kept), 1)
+
+
+@pytest.mark.parametrize(("name", "least", "most"), [("cost", -0.01, 0.0), ("dense_cost", -0.1001, 0.0)])
+def test_costs_end_at_nought_where_episodes_end_at_success(made, name, least, most):
+    replay = lw.LanguageWorldExperienceReplay(made.root, label="executed", reward=name, terminate_on_success=True)
+    rows = replay[:]
+    reward, terminated = rows["next", "reward"], rows["next", "terminated"]
+    assert terminated.any()
+    assert (reward[terminated] == 0).all()
+    assert (reward[~terminated] < 0).all()
+    assert reward.min() >= least
+    assert reward.max() <= most
+
+
+@pytest.mark.parametrize("name", list(REWARDS))
+def test_n_steps_are_summed_of_the_reward_named(made, name):
+    options = dict(label="executed", reward=name, terminate_on_success=True)
+    one = lw.LanguageWorldExperienceReplay(made.root, **options)[:]
+    three = lw.LanguageWorldExperienceReplay(made.root, n_steps=3, gamma=0.5, **options)[:]
+    reward, traj = one["next", "reward"].flatten().tolist(), one["collector", "traj_ids"].tolist()
+    for row in range(len(reward)):
+        ahead = [n for n in range(row, min(row + 3, len(reward))) if traj[n] == traj[row]]
+        expected = sum(reward[n] * 0.5 ** (n - row) for n in ahead)
+        assert float(three["next", "reward"][row]) == pytest.approx(expected, abs=1e-5)
+
+
+SUCCESS = torch.tensor([[False], [True], [False]])
+DENSE = torch.tensor([[2.0], [10.0], [0.0]])
+
+
+@pytest.mark.parametrize("name", list(REWARDS))
+def test_made_rewards_pass_their_check(name):
+    made = REWARDS[name]
+    source = SUCCESS.float() if made.source == "sparse" else DENSE
+    before = source.clone()
+    check_reward(name, made.of(source, SUCCESS), SUCCESS)
+    assert torch.equal(source, before)
+    check_reward(name, torch.empty(0, 1), torch.empty(0, 1, dtype=torch.bool))
+
+
+@pytest.mark.parametrize(
+    ("name", "reward", "message"),
+    [
+        ("sparse", DENSE, "the reward is not the success"),
+        ("cost", SUCCESS.float(), "the reward is not the success, of which 'cost' is made"),
+        ("dense", SUCCESS.float(), "the reward is the success, but"),
+        ("dense", DENSE * 2, "a reward of 20 is more than 'dense' gives in a step, 10; .*frame_skip=1"),
+        ("dense_cost", DENSE, "a reward of 10 is more than 'dense_cost' gives in a step"),
+        ("dense_cost", torch.full((3, 1), -0.05), "the reward of a success must be 0.0 for 'dense_cost'"),
+    ],
+)
+def test_rows_that_plainly_have_another_reward_are_found_out(name, reward, message):
+    with pytest.raises(ValueError, match=message):
+        check_reward(name, reward, SUCCESS)
