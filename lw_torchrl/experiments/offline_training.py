@@ -20,7 +20,7 @@ from lw_torchrl.evaluation import EvaluationResult, evaluate
 from lw_torchrl.experiments.execution import EVALUATION_SEED, RESULTS, load_result
 from lw_torchrl.experiments.mixtures import TASK_SETS
 from lw_torchrl.experiments.offline_recipes import OfflineRecipe
-from lw_torchrl.experiments.offline_runs import Advantages, Learned, OfflineRun
+from lw_torchrl.experiments.offline_runs import SEEN_BY, Advantages, Learned, OfflineRun
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.modules import DescriptorEncoder, PlanEncoder, QValue, Value
 from lw_torchrl.modules.encoder import Encoder
@@ -128,7 +128,7 @@ def make_advantages(one: Advantages, plans: Plans, out: Path, progress: bool) ->
             replay = _replay(one, own, out, **_ahead(one.recipe))
             config = _config(one, one.recipe.value_steps)
             checkpoint = file.with_name("checkpoint.zip")
-            title = f"{one.critic} value of {one.mixture}"
+            title = f"value by {SEEN_BY[one.critic]}, {one.mixture}"
             OfflineTrainer(loss, replay, config, checkpoint=checkpoint, progress=progress, title=title).train()
             starts = range(0, len(replay), _CHUNK)
             chunks = [replay[start : min(start + _CHUNK, len(replay))] for start in starts]

@@ -32,7 +32,7 @@ from lw_torchrl.trainers.loss_state import (
     trained_parameters,
     write_training,
 )
-from lw_torchrl.trainers.minibatches import check_minibatches
+from lw_torchrl.trainers.minibatches import check_minibatches, draw_batch
 from lw_torchrl.trainers.normalization import fit_normalization
 from lw_torchrl.trainers.policy_checks import check_trained
 from lw_torchrl.trainers.recent_losses import READ_EVERY, RecentLosses
@@ -88,7 +88,7 @@ class OfflineTrainer:
 
     Args:
         loss: of ``torchrl.objectives`` or ``lw_torchrl.objectives``, with its value estimator; networks are trained in
-            place, in train mode, and are in eval mode afterwards.
+            place, on the device where they are, in train mode, and are in eval mode afterwards.
         replay: samples with what the loss reads. Its generator is set to the configuration's seed.
         config: how to train.
         checkpoint: a file to write checkpoints to. If it is there already, training carries on from it.
@@ -136,6 +136,7 @@ class OfflineTrainer:
         self.config = config = config or OfflineConfig()
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
         self.networks = networks_of(loss)
+        self.device = next(loss.parameters()).device
         check_minibatches(self.networks, replay, config.batch_size)
         self.state = TrainingState(replay, config.seed)
         self.targets = targets_of(loss, config.target_eps)
@@ -179,11 +180,13 @@ class OfflineTrainer:
 
     def step(self) -> TensorDictBase:
         """Train on one minibatch and return what the loss gives, detached."""
-        with drawn_on(CPU, self.state.torch_generator):
-            found = self.loss(self.replay.sample(self.config.batch_size))
+        with drawn_on(self.device, self.state.torch_generator):
+            found = self.loss(draw_batch(self.replay, self.config.batch_size, self.device))
             self.state.torch_generator = torch.get_rng_state()
         total = sum_of_losses(found)
-        self._recent.check(total, self.state.step)
+        if self.device == CPU:
+            self._recent.check(total, self.state.step)
+        self._recent.add(total.detach())
         self.optimizer.zero_grad()
         total.backward()
         for group in self.groups:
@@ -218,6 +221,7 @@ class OfflineTrainer:
             network.eval()
 
     def _tell(self, given: list[Mapping[str, Tensor]]) -> None:
+        self._recent.read(self.state.step)
         names = [name for name, value in given[0].items() if value.numel() == 1]
         self.last = {name: float(torch.stack([one[name].reshape(()) for one in given]).mean()) for name in names}
         if self.logger is not None:

@@ -6,6 +6,7 @@ import warnings
 from dataclasses import replace
 
 import pytest
+import test_offline as offline
 import torch
 from pretend_device import COPIES, MODULE, PRETEND, WAITS
 from small_training import CONFIG, PLANS, SMALL, assert_same, collect_demos, flat, make_actor
@@ -398,3 +399,22 @@ def test_a_run_is_the_same_wherever_it_is_done(tmp_path, setting):
     assert WAITS == []
     assert again.success_once == found.success_once
     assert {path.relative_to(tmp_path) for path in tmp_path.rglob("*") if path.is_file()} == there
+
+
+@pytest.mark.parametrize("name", ["bc", "advantage", "value"])  # copies of critics are drawn where they are
+def test_any_loss_over_a_buffer_waits_for_nothing_and_is_the_cpus(demos, name):
+    def trainer(device):
+        loss = offline.make_loss(name, noise=0.0, device=device)
+        return lw.OfflineTrainer(loss, offline.make_replay(demos, device=device), offline.CONFIG, progress=False)
+
+    there, cpu = trainer("pretend"), trainer("cpu")
+    assert there.device == PRETEND
+    given = [there.step()]
+    WAITS.clear()
+    given += [there.step() for _ in range(2)]
+    assert WAITS == []
+    for one in given:
+        expected = cpu.step()
+        for key in expected.keys():
+            if expected[key].numel() == 1:
+                assert one[key].item() == pytest.approx(expected[key].item(), rel=1e-5), key

@@ -41,33 +41,41 @@ def make_replay(demos, plans=PLANS, sampler=None, **options):
     return replay
 
 
-def actor(**options):
-    return lw.PlanConditionedActor(PLANS, **{**SMALL, "feature_noise": 0.05, **options})
+class Networks:
+    """Makes networks with a noise on their features, on a device."""
+
+    def __init__(self, noise, device):
+        self.noise, self.device = noise, device
+
+    def actor(self, **options):
+        return lw.PlanConditionedActor(PLANS, **{**SMALL, "feature_noise": self.noise, **options}).to(self.device)
+
+    def value(self, ensemble=1):
+        return lw.PlanConditionedValue(PLANS, ensemble=ensemble, feature_noise=self.noise, **CRITIC).to(self.device)
+
+    def qvalue(self):
+        return lw.PlanConditionedQValue(PLANS, **CRITIC).to(self.device)
 
 
-def qvalue():
-    return lw.PlanConditionedQValue(PLANS, **CRITIC)
-
-
-def bc():
+def bc(made):
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*target_actor_network_params.*")
-        return BCLoss(actor(), loss_function="l2")
+        return BCLoss(made.actor(), loss_function="l2")
 
 
 LOSSES = {
     "bc": bc,
-    "value": lambda: lw.ExpectileValueLoss(lw.PlanConditionedValue(PLANS, ensemble=2, feature_noise=0.02, **CRITIC)),
-    "advantage": lambda: lw.AdvantageWeightedLoss(actor()),
-    "iql": lambda: IQLLoss(actor(distribution="normal"), qvalue(), lw.PlanConditionedValue(PLANS, **CRITIC)),
-    "td3-bc": lambda: TD3BCLoss(actor(), qvalue(), bounds=(-1.0, 1.0), delay_actor=True),
-    "cql": lambda: CQLLoss(actor(distribution="tanh_normal"), qvalue(), num_random=2),
+    "value": lambda made: lw.ExpectileValueLoss(made.value(ensemble=2)),
+    "advantage": lambda made: lw.AdvantageWeightedLoss(made.actor()),
+    "iql": lambda made: IQLLoss(made.actor(distribution="normal"), made.qvalue(), made.value()),
+    "td3-bc": lambda made: TD3BCLoss(made.actor(), made.qvalue(), bounds=(-1.0, 1.0), delay_actor=True),
+    "cql": lambda made: CQLLoss(made.actor(distribution="tanh_normal"), made.qvalue(), num_random=2),
 }
 
 
-def make_loss(name, seed=0):
+def make_loss(name, seed=0, noise=0.05, device="cpu"):
     torch.manual_seed(seed)
-    loss = LOSSES[name]()
+    loss = LOSSES[name](Networks(noise, device))
     if name not in ("bc", "advantage"):
         loss.make_value_estimator(gamma=GAMMA)
     return loss
@@ -227,7 +235,7 @@ def test_a_checkpoint_of_another_training_is_refused(demos, checkpoint, change, 
     loss = make_loss(change.get("name", "value"))
     if {"expectile", "gamma", "width"} & set(change):
         value = lw.PlanConditionedValue(
-            PLANS, ensemble=2, feature_noise=0.02, **{**CRITIC, "width": change.get("width", 16)}
+            PLANS, ensemble=2, feature_noise=0.05, **{**CRITIC, "width": change.get("width", 16)}
         )
         loss = lw.ExpectileValueLoss(value, expectile=change.get("expectile", 0.7))
         loss.make_value_estimator(gamma=change.get("gamma", GAMMA))
@@ -250,7 +258,7 @@ def test_a_checkpoint_of_other_plans_is_refused(demos, checkpoint):
 def test_a_file_that_is_no_checkpoint_is_refused(demos, checkpoint, tmp_path, content):
     path = tmp_path / "checkpoint.zip"
     if content is None:
-        lw.save_actor(actor(), path)
+        lw.save_actor(Networks(0.0, "cpu").actor(), path)
     else:
         path.write_bytes(content)
     with pytest.raises(ValueError, match="is damaged or none of a loss's training"):
