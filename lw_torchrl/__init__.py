@@ -45,8 +45,11 @@ if TYPE_CHECKING:  # the table below, for type checkers and editors
     from lw_torchrl.modules import PlanConditionedValue as PlanConditionedValue
     from lw_torchrl.modules import Policy as Policy
     from lw_torchrl.modules import QueryEvaluator as QueryEvaluator
+    from lw_torchrl.modules import ResidualActor as ResidualActor
     from lw_torchrl.modules import ScriptedSkillActor as ScriptedSkillActor
     from lw_torchrl.modules import plan_actor_value as plan_actor_value
+    from lw_torchrl.objectives import DemonstratedSACLoss as DemonstratedSACLoss
+    from lw_torchrl.objectives import DemonstratedTD3Loss as DemonstratedTD3Loss
     from lw_torchrl.record import RerunLogger as RerunLogger
     from lw_torchrl.trainers import BehavioralCloningConfig as BehavioralCloningConfig
     from lw_torchrl.trainers import BehavioralCloningTrainer as BehavioralCloningTrainer
@@ -72,14 +75,26 @@ _NAMES = {
     "lw_torchrl.language.task_files": "load_tasks",
     "lw_torchrl.language.tasks": "MT10 MT50 TASKS Task resolve_tasks task_id",
     "lw_torchrl.modules": "ActorEnsemble DescriptorConditionedActor PlanConditionedActor PlanConditionedQValue "
-    "PlanConditionedValue Policy QueryEvaluator ScriptedSkillActor plan_actor_value",
+    "PlanConditionedValue Policy QueryEvaluator ResidualActor ScriptedSkillActor plan_actor_value",
+    "lw_torchrl.objectives": "DemonstratedSACLoss DemonstratedTD3Loss",
     "lw_torchrl.record": "RerunLogger",
     "lw_torchrl.trainers": "BehavioralCloningConfig BehavioralCloningTrainer StackedBehavioralCloning "
     "load_actor save_actor",
     "lw_torchrl.transforms": "EnvState QAFTransform RandomYaw",
 }
 _ROOM = {name: room for room, names in _NAMES.items() for name in names.split()}
-_PACKAGES = ("data", "envs", "evaluation", "experiments", "language", "modules", "record", "trainers", "transforms")
+_PACKAGES = (
+    "data",
+    "envs",
+    "evaluation",
+    "experiments",
+    "language",
+    "modules",
+    "objectives",
+    "record",
+    "trainers",
+    "transforms",
+)
 
 __all__ = sorted(_ROOM)
 
