@@ -19,7 +19,7 @@ from lw_torchrl.data.grown_state import check_grown
 from lw_torchrl.data.storage import DONE, REWARD, TRAJECTORY, JoinedStorage, column_name
 from lw_torchrl.data.trajectories import Open, follow, shared_keys
 
-Check = Callable[[Mapping[NestedKey, Tensor]], None]
+Columns = Mapping[NestedKey, Tensor]
 
 
 class GrowingStorage(JoinedStorage):
@@ -39,7 +39,8 @@ class GrowingStorage(JoinedStorage):
         parts, rows, n_steps, gamma: as for :class:`JoinedStorage`; ("collector", "traj_ids") and ("next", "done") are
             needed. Rows get their n steps as those that follow them come; until then they look less far ahead.
         grow: rows of the ring.
-        check: called with the columns of each batch before it is stored, and of a state; it raises what is wrong.
+        admit: from the columns of each batch to those that are stored; it raises what is wrong.
+        check: called with the columns of a state, as they were stored; it raises what is wrong.
 
     Attributes:
         num_joined: rows of the parts.
@@ -81,10 +82,11 @@ class GrowingStorage(JoinedStorage):
         grow: int,
         n_steps: int = 1,
         gamma: float | None = None,
-        check: Check | None = None,
+        admit: Callable[[Columns], Columns] | None = None,
+        check: Callable[[Columns], None] | None = None,
     ) -> None:
         self.grow, self.count = check_int("grow", grow, minimum=1), 0
-        self._check = check
+        self._admit, self._check = admit, check
         super().__init__(parts, rows, n_steps=n_steps, gamma=gamma)
         if absent := [column_name(key) for key in (TRAJECTORY, DONE) if key not in self._columns]:
             raise ValueError(f"grow={self.grow} needs the columns {', '.join(absent)}, which parts do not have")
@@ -120,12 +122,12 @@ class GrowingStorage(JoinedStorage):
 
     def extend(self, batch: TensorDictBase) -> Tensor:
         """Write the rows of a batch; their places, int64 of the batch's shape."""
-        found = collected_rows(batch, self._ring)
+        found: Columns = collected_rows(batch, self._ring)
         number = len(found[DONE])
         if not 0 < number <= self.grow:
             raise ValueError(f"batch must have 1 to {self.grow} rows, as many as grow says, got {number}")
-        if self._check is not None:
-            self._check(found)
+        if self._admit is not None:
+            found = self._admit(found)
         key, done = found[TRAJECTORY].reshape(-1), found[DONE].reshape(-1)
         ring = self._ring, self._open.last % self.grow
         previous, numbers, opened = follow(key, done, found, self._open, *ring, serial=self.count, number=self._number)
@@ -135,7 +137,7 @@ class GrowingStorage(JoinedStorage):
                 "same trajectory, which had not ended; each begins a trajectory. Are rows or steps left out?",
                 stacklevel=2,
             )
-        found[TRAJECTORY] = numbers.view(found[TRAJECTORY].shape)
+        found = {**found, TRAJECTORY: numbers.view(found[TRAJECTORY].shape)}
         serial = torch.arange(self.count, self.count + number)
         self._write(serial, found, previous)
         here = opened.last >= self.count - self.grow
@@ -146,7 +148,7 @@ class GrowingStorage(JoinedStorage):
     def _read_only(self) -> NoReturn:
         raise RuntimeError("rows of a storage that grows are written by a GrowingWriter alone, at the end of its ring")
 
-    def _write(self, serial: Tensor, found: Mapping[NestedKey, Tensor], previous: Tensor) -> None:
+    def _write(self, serial: Tensor, found: Columns, previous: Tensor) -> None:
         slot = serial % self.grow
         for key, leaf in self._ring.items():
             leaf[slot] = found[key].to(leaf.device)

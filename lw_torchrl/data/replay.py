@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -28,7 +28,8 @@ from lw_torchrl.data.growing import GrowingStorage
 from lw_torchrl.data.growing_writer import GrowingWriter
 from lw_torchrl.data.metadata import read_metadata
 from lw_torchrl.data.n_steps import check_n_steps
-from lw_torchrl.data.replay_checks import check_growing, check_prefetch, check_rows, check_transform
+from lw_torchrl.data.replay_checks import admit_rows, check_growing, check_prefetch, check_rows, check_transform
+from lw_torchrl.data.rewards import REWARDS, RewardName
 from lw_torchrl.data.selection import (
     LABELS,
     EpisodeChoice,
@@ -77,8 +78,9 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         label: what ``action`` holds. "expert": what the expert wanted, in [-1, 1]; "unclipped": what its script asked
             for, up to 25; of both, reward and next are left out, since they belong to the executed action. "executed":
             what was executed, with reward and next.
-        reward: what ``("next", "reward")`` holds with label="executed": "sparse", the success as 0 and 1, or "dense",
-            Meta-World's own.
+        reward: what ``("next", "reward")`` holds with label="executed": "sparse", the success as 0 and 1; "dense",
+            Meta-World's own, at most 10; "cost", -0.01 a step and 0 at success; or "dense_cost", what the dense reward
+            lacks of 10, through -100, and 0 at success. Rows that come later are given the same reward as they come.
         after_success: drop the steps that come more than so many after the first success; None keeps all.
         terminate_on_success: end each episode at its first success, with ``("next", "terminated")``, as
             ``LanguageWorldEnv(terminate_on_success=True)`` does; with label="executed".
@@ -126,7 +128,7 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         sampler: Sampler | None = None,
         transform: Transform | None = None,
         label: Label = "expert",
-        reward: Literal["sparse", "dense"] = "sparse",
+        reward: RewardName = "sparse",
         after_success: int | None = None,
         terminate_on_success: bool = False,
         n_steps: int = 1,
@@ -143,7 +145,7 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         if grow is not None:
             check_growing(sampler, kwargs)
         check_choice("label", label, LABELS)
-        check_choice("reward", reward, ("sparse", "dense"))
+        check_choice("reward", reward, REWARDS)
         if batch_size is not None:
             check_int("batch_size", batch_size, minimum=1)
         if after_success is not None:
@@ -190,6 +192,7 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
                 grow=grow,
                 n_steps=n_steps,
                 gamma=gamma,
+                admit=partial(admit_rows, reward, terminate_on_success),
                 check=partial(check_rows, reward, terminate_on_success),
             )
         elif several or n_steps > 1 or where != CPU:

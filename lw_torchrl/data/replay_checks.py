@@ -11,6 +11,8 @@ from torch import Tensor
 from torchrl.data.replay_buffers.samplers import SliceSampler
 from torchrl.envs import Compose, MultiStepTransform
 
+from lw_torchrl.data.rewards import REWARDS, RewardName, check_reward
+
 
 def check_transform(transform: Any) -> None:
     """Raise for a transform that would do nothing to demonstrations, and say nothing."""
@@ -45,20 +47,22 @@ def check_growing(sampler: Any, options: Mapping[str, Any]) -> None:
         )
 
 
-def check_rows(reward: str, terminate_on_success: bool, rows: Mapping[NestedKey, Tensor]) -> None:
+def check_rows(reward: RewardName, terminate_on_success: bool, rows: Mapping[NestedKey, Tensor]) -> None:
     """Raise where rows have another reward, or other ends, than the demonstrations that they are to stand beside."""
-    found, success = rows["next", "reward"], rows["next", "success"]
-    sparse = torch.equal(found, success.to(torch.float32))
-    if reward == "sparse" and not sparse:
-        raise ValueError(
-            "batch: the reward is not the success, as the demonstrations' is; give reward='dense' for a dense one, "
-            "make the environment with frame_skip=1, and scale rewards by a transform of the buffer, not its own"
-        )
-    if reward == "dense" and sparse and success.any():
-        raise ValueError("batch: the reward is the success, but the demonstrations' is dense; give reward='sparse'")
+    success = rows["next", "success"]
+    check_reward(reward, rows["next", "reward"], success)
     if not torch.equal(rows["next", "terminated"], success & terminate_on_success):
         at = "terminated at success" if terminate_on_success else "never terminated"
         raise ValueError(
             f"batch: rows must be {at}, as the demonstrations are; give the environment and the buffer the same "
             f"terminate_on_success, here {terminate_on_success}"
         )
+
+
+def admit_rows(
+    reward: RewardName, terminate_on_success: bool, rows: Mapping[NestedKey, Tensor]
+) -> dict[NestedKey, Tensor]:
+    """A collector's rows with the demonstrations' reward; raises as :func:`check_rows`."""
+    made = REWARDS[reward]
+    check_rows(made.source, terminate_on_success, rows)
+    return {**rows, ("next", "reward"): made.of(rows["next", "reward"], rows["next", "success"])}

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from lw_torchrl._checks import check_int, unknown_name
 from lw_torchrl.data.dataset import CollectConfig, DamagedDatasetError, Demonstrations, EpisodeInfo
+from lw_torchrl.data.rewards import REWARDS, RewardName
 from lw_torchrl.data.rows import load_rows
 from lw_torchrl.data.storage import TRAJECTORY
 from lw_torchrl.language.value_checks import finite
@@ -91,7 +92,7 @@ def read_part(
     chosen: Demonstrations,
     *,
     label: Label,
-    reward: Literal["sparse", "dense"],
+    reward: RewardName,
     after_success: int | None,
     terminate_on_success: bool = False,
     first_trajectory: int = 0,
@@ -107,7 +108,9 @@ def read_part(
     rows = load_rows(whole)
     if label == "executed":
         rows = rows.clone(recurse=False)
-        rows.set(("next", "reward"), rows.get(("next", f"reward_{reward}")))
+        made = REWARDS[reward]
+        source, success = rows.get(("next", f"reward_{made.source}")), rows.get(("next", "success"))
+        rows.set(("next", "reward"), made.of(source, success))
     else:
         taken, other = ("expert_action", "unclipped_action")[:: 1 if label == "expert" else -1]
         rows = rows.exclude("next", "action", other).rename_key_(taken, "action")

@@ -191,6 +191,36 @@ def test_the_other_reward_is_refused_by_name(root, tmp_path):
         open_replay(root, reward="sparse").loads(tmp_path)
 
 
+@pytest.mark.parametrize(("reward", "source"), [("cost", "sparse"), ("dense_cost", "dense")])
+def test_rows_get_the_demonstrations_reward_before_n_steps_are_summed(root, tmp_path, reward, source):
+    (rows,) = collect(batches=1, reward=source)
+    replay = open_replay(root, reward=reward, n_steps=3, gamma=0.9)
+    begun = len(replay)
+    replay.extend(rows)
+    flat = rows.reshape(-1)
+    source_reward, success = flat["next", "reward"], flat["next", "success"]
+    each = -0.01 * (1 - source_reward) if reward == "cost" else torch.where(success, 0.0, (source_reward - 10) / 100)
+    expected = each[0] + 0.9 * each[1] + 0.81 * each[2]
+    assert torch.allclose(replay[begun]["next", "reward"], expected, atol=1e-6)
+    replay.dumps(tmp_path)
+    again = open_replay(root, reward=reward, n_steps=3, gamma=0.9)
+    again.loads(tmp_path)
+    assert torch.equal(again[begun:]["next", "reward"], replay[begun:]["next", "reward"])
+    other = "sparse" if source == "dense" else "dense"
+    (wrong,) = collect(batches=1, reward=other)
+    if other == "sparse":
+        wrong["next", "success"][0, 0], wrong["next", "reward"][0, 0] = True, 1.0
+    with pytest.raises(ValueError, match="the reward is"):
+        replay.extend(wrong)
+
+
+def test_a_dense_reward_of_several_steps_is_found_out(root):
+    (rows,) = collect(batches=1)
+    rows["next", "reward"][0, 0] = 17.0
+    with pytest.raises(ValueError, match=r"a reward of 17 is more than 'dense' gives in a step, 10.*frame_skip=1"):
+        open_replay(root).extend(rows)
+
+
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [

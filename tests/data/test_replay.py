@@ -152,7 +152,10 @@ def test_it_knows_its_tasks_and_where_it_lies(made):
             dict(label="experts"),
             "label must be one of 'expert', 'unclipped', 'executed', got 'experts'; did you mean 'expert'",
         ),
-        (dict(reward="spars"), "reward must be one of 'sparse', 'dense', got 'spars'; did you mean 'sparse'"),
+        (
+            dict(reward="spars"),
+            "reward must be one of 'sparse', 'dense', 'cost', 'dense_cost', got 'spars'; did you mean 'sparse'",
+        ),
         (dict(batch_size=0), "batch_size must be at least 1, got 0"),
         (dict(after_success=-1), "after_success must be at least 0, got -1"),
     ],

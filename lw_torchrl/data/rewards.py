@@ -1,0 +1,83 @@
+"""The rewards that stored and collected rows are shown with: made of the simulator's, before n steps are summed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+RewardName = Literal["sparse", "dense", "cost", "dense_cost"]
+
+_MOST = 10.0  # Meta-World's dense reward, which it gives at success
+
+
+@dataclass(frozen=True)
+class Reward:
+    """A reward of a step: ``(source + shift) * scale``.
+
+    Attributes:
+        source: what the environment must give, "sparse" or "dense".
+        shift, scale: of the source.
+        at_success: the reward of a step that succeeds; None for the source's own.
+    """
+
+    source: Literal["sparse", "dense"]
+    shift: float = 0.0
+    scale: float = 1.0
+    at_success: float | None = None
+
+    @property
+    def is_source(self) -> bool:
+        """Whether it is what the environment gives."""
+        return (self.shift, self.scale, self.at_success) == (0.0, 1.0, None)
+
+    def of(self, source: Tensor, success: Tensor) -> Tensor:
+        """The reward, (R, 1) float32, of the source's and of success (R, 1) bool."""
+        if self.is_source:
+            return source
+        made = (source + self.shift) * self.scale
+        return made if self.at_success is None else torch.where(success, self.at_success, made)
+
+
+REWARDS: Mapping[RewardName, Reward] = MappingProxyType(
+    {
+        "sparse": Reward("sparse"),
+        "dense": Reward("dense"),
+        "cost": Reward("sparse", shift=-1.0, scale=0.01),
+        "dense_cost": Reward("dense", shift=-_MOST, scale=0.01, at_success=0.0),
+    }
+)
+"""By name: the success as 0 and 1; Meta-World's own, at most 10; a cost of 0.01 a step, none at success; what the dense
+reward lacks of 10, as a cost of at most about 0.1 a step, none at success. Costs want episodes that end at success
+(``terminate_on_success``): a return of 0 is then the best there is, and "stay short of the goal" earns nothing."""
+
+
+def check_reward(name: RewardName, reward: Tensor, success: Tensor) -> None:
+    """Raise :class:`ValueError` where rows (R, 1) plainly have another reward than the one named.
+
+    A dense reward of several steps, from ``frame_skip``, shows where it is over 10.
+    """
+    stated = REWARDS[name]
+    sparse = success.to(torch.float32)
+    if stated.source == "sparse":
+        if not torch.equal(reward, stated.of(sparse, success)):
+            raise ValueError(
+                f"batch: the reward is not the success, of which {name!r} is made; give reward='dense' or 'dense_cost' "
+                "for a dense one, make the environment with frame_skip=1, and scale rewards by a transform of the "
+                "buffer, not its own"
+            )
+        return
+    if stated.is_source and torch.equal(reward, sparse) and success.any():
+        raise ValueError("batch: the reward is the success, but the demonstrations' is dense; give reward='sparse'")
+    most = stated.of(reward.new_tensor([[_MOST]]), success.new_zeros(1, 1))
+    if len(reward) and float(reward.max()) > float(most) + 1e-3:
+        raise ValueError(
+            f"batch: a reward of {float(reward.max()):.4g} is more than {name!r} gives in a step, {float(most):.4g}; "
+            "make the environment with frame_skip=1"
+        )
+    if stated.at_success is not None and (reward[success] != stated.at_success).any():
+        raise ValueError(f"batch: the reward of a success must be {stated.at_success} for {name!r}")
