@@ -53,6 +53,8 @@ if TYPE_CHECKING:  # the table below, for type checkers and editors
     from lw_torchrl.record import RerunLogger as RerunLogger
     from lw_torchrl.trainers import BehavioralCloningConfig as BehavioralCloningConfig
     from lw_torchrl.trainers import BehavioralCloningTrainer as BehavioralCloningTrainer
+    from lw_torchrl.trainers import OnlineConfig as OnlineConfig
+    from lw_torchrl.trainers import OnlineTrainer as OnlineTrainer
     from lw_torchrl.trainers import StackedBehavioralCloning as StackedBehavioralCloning
     from lw_torchrl.trainers import load_actor as load_actor
     from lw_torchrl.trainers import save_actor as save_actor
@@ -78,8 +80,8 @@ _NAMES = {
     "PlanConditionedValue Policy QueryEvaluator ResidualActor ScriptedSkillActor plan_actor_value",
     "lw_torchrl.objectives": "DemonstratedSACLoss DemonstratedTD3Loss",
     "lw_torchrl.record": "RerunLogger",
-    "lw_torchrl.trainers": "BehavioralCloningConfig BehavioralCloningTrainer StackedBehavioralCloning "
-    "load_actor save_actor",
+    "lw_torchrl.trainers": "BehavioralCloningConfig BehavioralCloningTrainer OnlineConfig OnlineTrainer "
+    "StackedBehavioralCloning load_actor save_actor",
     "lw_torchrl.transforms": "EnvState QAFTransform RandomYaw",
 }
 _ROOM = {name: room for room, names in _NAMES.items() for name in names.split()}

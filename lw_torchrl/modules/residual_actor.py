@@ -50,9 +50,7 @@ class ResidualActor(Policy):
     Source: Johannink et al., 'Residual Reinforcement Learning for Robot Control'.
     """
 
-    def __init__(
-        self, base: Policy, *, scale: float = 0.3, width: int | Sequence[int] = 256, depth: int = 2
-    ) -> None:
+    def __init__(self, base: Policy, *, scale: float = 0.3, width: int | Sequence[int] = 256, depth: int = 2) -> None:
         super().__init__()
         if not isinstance(base, ConditionedActor):
             raise TypeError(

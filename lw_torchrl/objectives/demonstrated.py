@@ -1,11 +1,10 @@
-"""Actor-critic losses with a term of imitation on those rows of a minibatch that are demonstrations, and on no others."""
+"""Actor-critic losses with imitation, of those rows of a minibatch alone that are demonstrations."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Any
 
-import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
@@ -97,7 +96,7 @@ class DemonstratedTD3Loss(TD3BCLoss):
 
     def _set_in_keys(self) -> None:
         super()._set_in_keys()
-        self._in_keys = list({*self._in_keys, self.tensor_keys.is_target})
+        self._in_keys: list[NestedKey] = list({*self._in_keys, self.tensor_keys.is_target})
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict]:
         """The actor's loss, () float32, and ``bc_loss``, ``lmbd`` and ``state_action_value_actor``, detached."""
@@ -176,7 +175,7 @@ class DemonstratedSACLoss(SACLoss):
 
     def _set_in_keys(self) -> None:
         super()._set_in_keys()
-        self._in_keys = list({*self._in_keys, self.tensor_keys.is_target})
+        self._in_keys: list[NestedKey] = list({*self._in_keys, self.tensor_keys.is_target})
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """The actor's loss, () float32, and ``log_prob`` and ``bc_loss``, detached."""

@@ -5,11 +5,16 @@ from lw_torchrl.trainers.behavioral_cloning import BehavioralCloningTrainer
 from lw_torchrl.trainers.checkpoint import load_actor, save_actor
 from lw_torchrl.trainers.config import BehavioralCloningConfig
 from lw_torchrl.trainers.normalization import fit_normalization
+from lw_torchrl.trainers.online import LEARNERS, OnlineTrainer
+from lw_torchrl.trainers.online_config import OnlineConfig
 from lw_torchrl.trainers.stacked import StackedBehavioralCloning
 
 __all__ = [
+    "LEARNERS",
     "BehavioralCloningConfig",
     "BehavioralCloningTrainer",
+    "OnlineConfig",
+    "OnlineTrainer",
     "StackedBehavioralCloning",
     "fit_normalization",
     "load_actor",

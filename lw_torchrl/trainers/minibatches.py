@@ -16,7 +16,7 @@ from lw_torchrl.modules.policy import plans_of
 from lw_torchrl.trainers.config import BehavioralCloningConfig
 
 
-def _check_belongs(actor: Any, replay: TensorDictReplayBuffer) -> None:
+def check_belongs(actor: Any, replay: TensorDictReplayBuffer) -> None:
     """Raise :class:`ValueError` unless the actor writes ``action``, and the buffer answers the queries of its plans."""
     if "action" not in actor.out_keys:
         raise ValueError(f"actor must write 'action', it writes {', '.join(map(str, actor.out_keys))}")
@@ -59,7 +59,7 @@ def draw_batch(replay: TensorDictReplayBuffer, size: int, device: torch.device) 
 
 def check_replay(actor: Any, replay: TensorDictReplayBuffer, config: BehavioralCloningConfig) -> None:
     """Raise :class:`ValueError` unless an actor can be trained on a buffer's minibatches, and training be resumed."""
-    _check_belongs(actor, replay)
+    check_belongs(actor, replay)
     if replay._prefetch:
         raise ValueError("replay must not prefetch: batches drawn ahead would be lost when training is resumed")
     _check_batch_size(replay, config)

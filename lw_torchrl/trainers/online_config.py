@@ -21,6 +21,7 @@ class OnlineConfig:
         first_frames: steps of the environment before the first gradient step.
         warm_up: gradient steps in which the critics alone are trained.
         actor_learning_rate, critic_learning_rate: of AdamW.
+        cloning_learning_rate: of AdamW, of "expert-iteration".
         gamma: the discount; that of the buffer.
         target_eps: how much of the target networks stays, in each gradient step.
         policy_delay: gradient steps of the critics for one of the actor, of "td3" and "residual".
@@ -46,6 +47,7 @@ class OnlineConfig:
     warm_up: int = 400
     actor_learning_rate: float = 1e-4
     critic_learning_rate: float = 5e-4
+    cloning_learning_rate: float = 3e-4
     gamma: float = 0.99
     target_eps: float = 0.995
     policy_delay: int = 2
@@ -81,6 +83,7 @@ class OnlineConfig:
             "utd",
             "actor_learning_rate",
             "critic_learning_rate",
+            "cloning_learning_rate",
             "policy_noise",
             "noise_clip",
             "bc_weight",
