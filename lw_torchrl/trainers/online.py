@@ -135,9 +135,9 @@ class OnlineTrainer:
         self.tasks = replay.tasks if tasks is None else tasks
         self.num_threads = num_threads
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
-        self.generator = torch.Generator().manual_seed(config.seed)
-        replay.set_rng(self.generator)
-        self._drawn = self.generator.get_state()
+        generator = torch.Generator().manual_seed(config.seed)
+        replay.set_rng(generator)
+        self._drawn = generator.get_state()
         start = _fingerprint(actor)
         with drawn_on(CPU, self._drawn):
             self.learner = LEARNERS[method](actor, replay, config, critic)
@@ -150,8 +150,8 @@ class OnlineTrainer:
             sweep(self.checkpoint)
             self._described = {
                 "actor": self.policy.describe(),
-                "start": start,
-                "critic": None if critic is None else _fingerprint(critic),
+                "start": {"weights": start},
+                "critic": {} if critic is None else {"weights": _fingerprint(critic)},
                 "online": {"method": method, "tasks": list(named_tasks(self.tasks)), **asdict(config)},
                 "data": describe_data(replay),
                 "replay": describe_replay(replay) | _describe_growing(replay),
@@ -178,7 +178,6 @@ class OnlineTrainer:
         return {
             "round": self.round,
             "drawn": self._drawn.clone(),
-            "generator": self.generator.get_state(),
             "episodes": self._episodes,
             "history": self.history,
             "learner": self.learner.state_dict(),
@@ -194,7 +193,6 @@ class OnlineTrainer:
             torch.Generator().set_state(found["drawn"].clone())
             self.learner.load_state_dict(found["learner"])
             self.replay.load_state_dict(found["replay"])
-            self.generator.set_state(found["generator"].clone())
             self._episodes, self._drawn = found["episodes"].clone(), found["drawn"].clone()
             self.history = [{str(name): float(value) for name, value in one.items()} for one in found["history"]]
             self.round = found["round"]
@@ -344,6 +342,8 @@ def _check_replay(actor: Policy, replay: Any, config: OnlineConfig) -> None:
         raise ValueError(
             "replay's sampler must be CoLearningSampler('grown'), which says which rows are demonstrations"
         )
+    if not replay.terminate_on_success:
+        raise ValueError("replay must end at success, as the environment does: give it terminate_on_success=True")
     if replay._batch_size not in (None, config.batch_size):
         raise ValueError(
             f"batch_size of the replay buffer must be None or the configuration's, {config.batch_size}, got "
