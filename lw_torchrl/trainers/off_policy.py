@@ -82,7 +82,7 @@ class SACLearner(Learner):
         critic = QValue(encoder_like(self.policy)) if critic is None else critic
         options: dict[str, Any] = {"bc_weight": config.bc_weight, "loss_function": "l2", "alpha_init": config.entropy}
         self.loss = loss = DemonstratedSACLoss(self.policy, critic.eval(), **options)
-        loss.target_entropy  # noqa: B018: a buffer, made when it is first asked for
+        self.target_entropy = loss.target_entropy  # which makes a buffer of the loss
         loss.make_value_estimator(gamma=config.gamma)
         self.targets = SoftUpdate(loss, eps=config.target_eps)
         actor, critics = loss.actor_network_params, loss.qvalue_network_params

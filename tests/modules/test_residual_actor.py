@@ -106,7 +106,7 @@ def test_other_plans_have_the_same_weights():
 
 
 def test_a_base_that_cannot_be_is_refused():
-    with pytest.raises(TypeError, match="base must be a PlanConditionedActor or .* got ScriptedSkillActor"):
+    with pytest.raises(TypeError, match=r"base must be a PlanConditionedActor or .* got ScriptedSkillActor"):
         lw.ResidualActor(lw.ScriptedSkillActor(PLANS))
     with pytest.raises(TypeError, match="got ResidualActor"):
         lw.ResidualActor(lw.ResidualActor(make_base(), **SMALL))

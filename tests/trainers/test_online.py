@@ -248,7 +248,7 @@ def test_a_critic_may_be_given(demos):
     trainer.train()
     assert trainer.learner.loss.qvalue_network.heads[0][0].weight.shape[0] == 8
     for method in ("ppo", "expert-iteration"):
-        with pytest.raises(ValueError, match="critic: .* leave it out"):
+        with pytest.raises(ValueError, match=r"critic: .* leave it out"):
             make_online(demos, method, critic=critic)
 
 
@@ -268,16 +268,16 @@ def test_a_loss_that_is_no_number_is_told(demos):
 
 def test_what_cannot_be_trained_on_is_refused(demos):
     actor = make_actor()
-    with pytest.raises(ValueError, match="method must be one of 'td3', .* did you mean 'td3'"):
+    with pytest.raises(ValueError, match=r"method must be one of 'td3', .* did you mean 'td3'"):
         make_online(demos, "td4")
     plain = lw.LanguageWorldExperienceReplay(demos, transform=actor.transform())
-    with pytest.raises(ValueError, match="replay must be .* that grows: give it grow="):
+    with pytest.raises(ValueError, match=r"replay must be .* that grows: give it grow="):
         make_online(demos, replay=plain)
     with pytest.raises(ValueError, match="sampler must be CoLearningSampler"):
         make_online(demos, replay=make_replay(demos, actor, sampler=lw.TaskBalancedSampler()))
     with pytest.raises(ValueError, match=r"gamma must be the replay buffer's, 0.9, got 0.99"):
         make_online(demos, replay=make_replay(demos, actor, gamma=0.9))
-    with pytest.raises(ValueError, match="batch_size of the replay buffer must be None or .* 8, got 10"):
+    with pytest.raises(ValueError, match=r"batch_size of the replay buffer must be None or .* 8, got 10"):
         make_online(demos, replay=make_replay(demos, actor, batch_size=10))
     with pytest.raises(ValueError, match="replay must end at success"):
         make_online(demos, replay=make_replay(demos, actor, terminate_on_success=False))
