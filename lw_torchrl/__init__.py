@@ -9,7 +9,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # the table below, for type checkers and editors
+    from lw_torchrl.data import Behaviour as Behaviour
     from lw_torchrl.data import CoLearningSampler as CoLearningSampler
+    from lw_torchrl.data import EpisodeFilter as EpisodeFilter
     from lw_torchrl.data import LanguageWorldExperienceReplay as LanguageWorldExperienceReplay
     from lw_torchrl.data import TaskBalancedSampler as TaskBalancedSampler
     from lw_torchrl.data import collect_demonstrations as collect_demonstrations
@@ -48,8 +50,11 @@ if TYPE_CHECKING:  # the table below, for type checkers and editors
     from lw_torchrl.modules import ResidualActor as ResidualActor
     from lw_torchrl.modules import ScriptedSkillActor as ScriptedSkillActor
     from lw_torchrl.modules import plan_actor_value as plan_actor_value
+    from lw_torchrl.objectives import AdvantageWeightedLoss as AdvantageWeightedLoss
     from lw_torchrl.objectives import DemonstratedSACLoss as DemonstratedSACLoss
     from lw_torchrl.objectives import DemonstratedTD3Loss as DemonstratedTD3Loss
+    from lw_torchrl.objectives import ExpectileValueLoss as ExpectileValueLoss
+    from lw_torchrl.objectives import standardize_by_task as standardize_by_task
     from lw_torchrl.record import RerunLogger as RerunLogger
     from lw_torchrl.trainers import BehavioralCloningConfig as BehavioralCloningConfig
     from lw_torchrl.trainers import BehavioralCloningTrainer as BehavioralCloningTrainer
@@ -65,7 +70,8 @@ if TYPE_CHECKING:  # the table below, for type checkers and editors
 __version__ = "0.2.0"
 
 _NAMES = {
-    "lw_torchrl.data": "CoLearningSampler LanguageWorldExperienceReplay TaskBalancedSampler collect_demonstrations",
+    "lw_torchrl.data": "Behaviour CoLearningSampler EpisodeFilter LanguageWorldExperienceReplay TaskBalancedSampler "
+    "collect_demonstrations",
     "lw_torchrl.envs": "ExpertActor LanguageWorldEnv",
     "lw_torchrl.evaluation": "EvaluationResult evaluate plot_success",
     "lw_torchrl.language.plan_files": "load_plans save_plans",
@@ -78,7 +84,8 @@ _NAMES = {
     "lw_torchrl.language.tasks": "MT10 MT50 TASKS Task resolve_tasks task_id",
     "lw_torchrl.modules": "ActorEnsemble DescriptorConditionedActor PlanConditionedActor PlanConditionedQValue "
     "PlanConditionedValue Policy QueryEvaluator ResidualActor ScriptedSkillActor plan_actor_value",
-    "lw_torchrl.objectives": "DemonstratedSACLoss DemonstratedTD3Loss",
+    "lw_torchrl.objectives": "AdvantageWeightedLoss DemonstratedSACLoss DemonstratedTD3Loss ExpectileValueLoss "
+    "standardize_by_task",
     "lw_torchrl.record": "RerunLogger",
     "lw_torchrl.trainers": "BehavioralCloningConfig BehavioralCloningTrainer OnlineConfig OnlineTrainer "
     "StackedBehavioralCloning load_actor save_actor",

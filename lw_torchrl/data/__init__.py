@@ -1,9 +1,11 @@
 """Demonstrations: collecting them, reading them as a replay buffer, sampling them in exact proportions."""
 
 import lw_torchrl._torchrl  # noqa: F401
+from lw_torchrl.data.behaviours import BEHAVIOURS, Behaviour
 from lw_torchrl.data.co_learning_sampler import CoLearningSampler
 from lw_torchrl.data.collect import collect_demonstrations
 from lw_torchrl.data.dataset import CollectConfig, DatasetError, Demonstrations
+from lw_torchrl.data.filters import EpisodeFilter
 from lw_torchrl.data.growing import GrowingStorage
 from lw_torchrl.data.growing_writer import GrowingWriter
 from lw_torchrl.data.replay import LanguageWorldExperienceReplay
@@ -12,10 +14,13 @@ from lw_torchrl.data.storage import JoinedStorage
 from lw_torchrl.data.task_balanced_sampler import TaskBalancedSampler
 
 __all__ = [
+    "BEHAVIOURS",
+    "Behaviour",
     "CoLearningSampler",
     "CollectConfig",
     "DatasetError",
     "Demonstrations",
+    "EpisodeFilter",
     "GrowingStorage",
     "GrowingWriter",
     "JoinedDemonstrations",

@@ -14,6 +14,7 @@ from filelock import FileLock, Timeout
 from tensordict import TensorDictBase
 
 from lw_torchrl._files import flush, write_json
+from lw_torchrl.data.behaviours import Behaviour, behaviour_of
 from lw_torchrl.data.dataset import (
     DATA,
     LOCK,
@@ -26,8 +27,8 @@ from lw_torchrl.data.dataset import (
     EpisodeInfo,
 )
 from lw_torchrl.data.episode_files import EpisodeFiles, write_failed
-from lw_torchrl.data.expert_episodes import run_expert_episodes
 from lw_torchrl.data.metadata import read_config, read_metadata, write_metadata
+from lw_torchrl.data.missing_episodes import run_missing_episodes
 from lw_torchrl.data.rows import (
     ROW_BYTES,
     describe_episode,
@@ -38,6 +39,7 @@ from lw_torchrl.data.rows import (
     write_rows,
 )
 from lw_torchrl.language.tasks import resolve_tasks, task_id
+from lw_torchrl.modules.policy import Policy
 
 _PATIENCE = 1.0  # seconds to wait for another call: it may be about to end
 
@@ -161,7 +163,9 @@ def _assemble(root: Path, config: CollectConfig, files: EpisodeFiles, kept: dict
         raise write_failed(root, len(listed) * config.max_steps * ROW_BYTES, error) from error
 
 
-def _made(root: Path, config: CollectConfig, num_envs: int | None, progress: bool) -> Demonstrations:
+def _made(
+    root: Path, config: CollectConfig, policy: Policy | None, num_envs: int | None, progress: bool
+) -> Demonstrations:
     """The dataset, finished or mended where it is not. The folder must be held: another call may have come first."""
     found = None
     if (root / METADATA).is_file():
@@ -172,7 +176,7 @@ def _made(root: Path, config: CollectConfig, num_envs: int | None, progress: boo
     if found is None:
         _check_folders(root)
         files = _open_episode_files(root, config)
-        _assemble(root, config, files, run_expert_episodes(config, files, num_envs, progress))
+        _assemble(root, config, files, run_missing_episodes(config, policy, files, num_envs, progress))
         found = read_metadata(root)
     shutil.rmtree(root / PARTIAL, ignore_errors=True)
     return found
@@ -183,6 +187,8 @@ def collect_demonstrations(
     *,
     episodes_per_task: int,
     root: str | os.PathLike[str],
+    policy: str | Behaviour | Policy = "expert",
+    behaviour: str | None = None,
     seed: int = 0,
     noise_scale: float | Sequence[float] = 0.0,
     noise_hold: int = 1,
@@ -192,7 +198,7 @@ def collect_demonstrations(
     num_envs: int | None = None,
     progress: bool = True,
 ) -> Demonstrations:
-    """Run Meta-World's scripted experts and write their episodes to a dataset.
+    """Run Meta-World's scripted experts, or others, and write their episodes to a dataset.
 
     Killed, or out of disk, and called again it carries on. Called on a finished dataset of the same configuration it
     reads that through: if all is as it was written it returns, else it keeps the whole episodes and runs the others
@@ -202,8 +208,8 @@ def collect_demonstrations(
         observation: (R, 39) float32, metres; next/observation likewise.
         task_id, episode: (R,) int64; next/task_id likewise. collector/traj_ids: (R,) int64, unique per episode.
         action: (R, 4) float32 in [-1, 1], as executed, noise included.
-        expert_action: (R, 4) float32 in [-1, 1], what the expert wanted in the same state; unclipped_action: (R, 4)
-            float32, what its script asked for.
+        expert_action: (R, 4) float32 in [-1, 1], what the expert, or who acted, wanted in the same state;
+            unclipped_action: (R, 4) float32, what its script asked for.
         next/reward_sparse, next/reward_dense: (R, 1) float32, the success as 0 and 1, and Meta-World's reward.
         next/success, next/done, next/terminated, next/truncated: (R, 1) bool.
 
@@ -212,6 +218,11 @@ def collect_demonstrations(
             demonstrations by a policy of one's own, in a task or an engine of one's own.
         episodes_per_task: how many episodes of each task to keep.
         root: the dataset's folder, new or left by an earlier call.
+        policy: who acts: "expert", Meta-World's script; "scripted", the shipped plans with scripted skills; "spoilt-60"
+            or "spoilt-30", the same in so many of 100 pieces of 8 to 24 steps, and any skill of the plan in the others;
+            "wrong", any skill of the plan throughout; "random", one action after another; a :class:`Behaviour` of
+            yours; or a trained :class:`Policy`, in eval mode. Mixtures are lists of datasets.
+        behaviour: the label of its episodes, for :class:`EpisodeFilter`; None for its name. A Policy wants one.
         seed: evaluate on another one.
         noise_scale: standard deviation of the noise on the executed action; a sequence is gone through in turn, one
             an episode.
@@ -243,8 +254,12 @@ def collect_demonstrations(
         >>> demos.num_steps, demos.success_rate
         (80, {'reach': 1.0})
     """
+    names = _known_to_experts(tasks)
+    actor = policy if isinstance(policy, Policy) else None
+    if actor is not None and (unknown := [task for task in names if task not in actor.tasks]):
+        raise ValueError(f"tasks must be among the policy's, it was not made for {', '.join(unknown)}")
     config = CollectConfig(
-        tasks=_known_to_experts(tasks),
+        tasks=names,
         episodes_per_task=episodes_per_task,
         seed=seed,
         noise_scale=(noise_scale,) if isinstance(noise_scale, (int, float)) else tuple(noise_scale),
@@ -252,7 +267,10 @@ def collect_demonstrations(
         gripper_noise_factor=gripper_noise_factor,
         redraw_failures=bool(redraw_failures),
         max_steps=max_steps,
+        policy=behaviour_of(policy, names, behaviour),
     )
+    if actor is not None:
+        actor.eval()
     folder = Path(root)
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"root must be a folder, {str(folder)!r} is a file")
@@ -264,5 +282,5 @@ def collect_demonstrations(
         raise DatasetError(f"root: {str(folder)!r} is not empty and holds no dataset; choose another folder")
     if found is None or (folder / PARTIAL).is_dir():
         with _alone(folder):
-            found = _made(folder, config, num_envs, progress)
+            found = _made(folder, config, actor, num_envs, progress)
     return found

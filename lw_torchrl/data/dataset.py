@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from lw_torchrl._checks import check_int, check_scale
+from lw_torchrl.data.behaviours import EXPERT, Behaviour
 from lw_torchrl.language.tasks import resolve_tasks
 
 DATA, METADATA, PARTIAL, LOCK = "data", "metadata.json", ".partial", ".lock"
@@ -46,6 +47,7 @@ class CollectConfig:
         gripper_noise_factor: what the gripper's noise is multiplied by; noise there makes grasps fail.
         redraw_failures: keep successful episodes only, and draw another for each failure.
         max_steps: steps of an episode.
+        policy: who acts.
 
     Raises:
         ValueError, TypeError: a wrong value, by its name.
@@ -59,8 +61,11 @@ class CollectConfig:
     gripper_noise_factor: float = 0.2
     redraw_failures: bool = False
     max_steps: int = 500
+    policy: Behaviour = EXPERT
 
     def __post_init__(self) -> None:
+        if not isinstance(self.policy, Behaviour):
+            raise TypeError(f"policy must be a Behaviour, got {self.policy!r}")
         if not isinstance(self.redraw_failures, bool):
             raise TypeError(f"redraw_failures must be True or False, got {self.redraw_failures!r}")
         if not self.noise_scale:
@@ -78,7 +83,14 @@ class CollectConfig:
             object.__setattr__(self, name, value)
 
     def to_json(self) -> dict[str, Any]:
-        return {key: list(v) if isinstance(v, tuple) else v for key, v in asdict(self).items()}
+        """As JSON; who acts is left out where it is the expert, as in datasets that know no others."""
+        found = {key: list(v) if isinstance(v, tuple) else v for key, v in asdict(self).items()}
+        return {key: v for key, v in found.items() if key != "policy" or self.policy != EXPERT}
+
+    @property
+    def behaviour(self) -> str:
+        """The label of its episodes: who acts; "noisy" for an expert executed with noise."""
+        return "noisy" if self.policy == EXPERT and any(self.noise_scale) else self.policy.name
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from typing import Any
 
 from lw_torchrl._files import read_json, write_json
 from lw_torchrl._versions import package_versions
+from lw_torchrl.data.behaviours import Behaviour
 from lw_torchrl.data.dataset import (
     METADATA,
     PARTIAL,
@@ -110,15 +111,22 @@ def parse_config(stated: Any) -> CollectConfig:
     Raises:
         ValueError, TypeError, OverflowError: it is none.
     """
-    found = _object("config", stated, CollectConfig.__dataclass_fields__)
+    names = [name for name in CollectConfig.__dataclass_fields__ if name != "policy" or name in _mapping(stated)]
+    found = _object("config", stated, names)
     for name, longest in (("tasks", len(MT50)), ("noise_scale", None)):
         if not isinstance(found[name], list) or (longest and len(found[name]) > longest):
             raise ValueError(f"{name} must be a list, of at most {longest or 'any'} entries, got {short(found[name])}")
     options: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in found.items()}
+    if "policy" in options:
+        options["policy"] = Behaviour.from_json(options["policy"])
     config = CollectConfig(**options)
     if list(config.tasks) != found["tasks"]:
         raise ValueError(f"tasks must be sorted, got {short(found['tasks'])}")
     return config
+
+
+def _mapping(stated: Any) -> Mapping[str, Any]:
+    return stated if isinstance(stated, Mapping) else {}
 
 
 def _object(name: str, stated: Any, keys: Any) -> dict[str, Any]:

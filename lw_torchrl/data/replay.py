@@ -24,11 +24,19 @@ from lw_torchrl._state_tree import join, split
 from lw_torchrl._tensor_archive import ArchiveError, TensorArchive, write_archive
 from lw_torchrl.data.dataset import DATA, Demonstrations
 from lw_torchrl.data.device_storage import DeviceStorage
+from lw_torchrl.data.filters import EpisodeFilter
 from lw_torchrl.data.growing import GrowingStorage
 from lw_torchrl.data.growing_writer import GrowingWriter
 from lw_torchrl.data.metadata import read_metadata
 from lw_torchrl.data.n_steps import check_n_steps
-from lw_torchrl.data.replay_checks import admit_rows, check_growing, check_prefetch, check_rows, check_transform
+from lw_torchrl.data.replay_checks import (
+    admit_rows,
+    check_growing,
+    check_label,
+    check_prefetch,
+    check_rows,
+    check_transform,
+)
 from lw_torchrl.data.rewards import REWARDS, RewardName
 from lw_torchrl.data.selection import (
     LABELS,
@@ -37,6 +45,7 @@ from lw_torchrl.data.selection import (
     Label,
     choose_episodes,
     read_part,
+    returns_of,
 )
 from lw_torchrl.data.storage import JoinedStorage
 
@@ -58,7 +67,7 @@ def _choices(episodes: Any, roots: int, joined: bool) -> list[EpisodeChoice]:
     return list(episodes)
 
 
-_NOT_COLLECTED = ("expert_action", "unclipped_action", ("next", "reward_sparse"), ("next", "reward_dense"))
+_NOT_COLLECTED = ("behaviour", "expert_action", "unclipped_action", ("next", "reward_sparse"), ("next", "reward_dense"))
 
 
 class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
@@ -66,18 +75,20 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
 
     Samples hold observation (B, 39) float32, action (B, 4) float32, task_id and episode (B,) int64, and what
     ``label`` leaves; a :class:`QAFTransform` adds ``qaf`` and ``qaf_plan``. collector/traj_ids (B,) int64 tells
-    episodes apart, those of different datasets too.
+    episodes apart, those of different datasets too; behaviour (B,) int64 says who acted, an index of ``behaviours``.
 
     Args:
         root: the dataset's folder, or a list of folders: the rows of the first come first.
         episodes: which episodes to show. None: all; a number: the first so many of each task; a mapping: for each task
             to show, the first so many, or a list of indices of episodes. Of a list of folders, a list of such choices.
+        keep: of these, the ones that went so: the successes, the best tenth, those of one behaviour; see
+            :class:`EpisodeFilter`.
         batch_size: rows of a sample.
         sampler: a TorchRL sampler, :class:`TaskBalancedSampler` say; None for uniform.
         transform: applied to each sample.
         label: what ``action`` holds. "expert": what the expert wanted, in [-1, 1]; "unclipped": what its script asked
             for, up to 25; of both, reward and next are left out, since they belong to the executed action. "executed":
-            what was executed, with reward and next.
+            what was executed, with reward and next. Datasets that others than the expert acted in have that alone.
         reward: what ``("next", "reward")`` holds with label="executed": "sparse", the success as 0 and 1; "dense",
             Meta-World's own, at most 10; "cost", -0.01 a step and 0 at success; or "dense_cost", what the dense reward
             lacks of 10, through -100, and 0 at success. Rows that come later are given the same reward as they come.
@@ -99,6 +110,7 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         demonstrations: the dataset's description; a :class:`JoinedDemonstrations` where folders are joined or
             episodes chosen.
         roots: the folders.
+        behaviours: the labels of who acted, sorted.
 
     Raises:
         ValueError: a wrong argument; a task or an episode that the dataset does not hold; ``n_steps`` or ``grow``
@@ -124,6 +136,7 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         root: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
         *,
         episodes: EpisodeChoice | Sequence[EpisodeChoice] = None,
+        keep: EpisodeFilter | None = None,
         batch_size: int | None = None,
         sampler: Sampler | None = None,
         transform: Transform | None = None,
@@ -161,27 +174,36 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         joined = not isinstance(root, (str, os.PathLike))
         self.roots = tuple(map(Path, root)) if joined else (Path(root),)  # type: ignore[arg-type]
         choices = _choices(episodes, len(self.roots), joined)
-        shown: list[Demonstrations] = []
+        whole = [read_metadata(folder) for folder in self.roots]
+        check_label(label, whole)
+        shown = [
+            choose_episodes(found, choice, f"episodes[{number}]" if joined else "episodes")
+            for number, (found, choice) in enumerate(zip(whole, choices, strict=True))
+        ]
+        if keep is not None:
+            after = 0 if terminate_on_success else after_success
+            pairs = zip(whole, shown, strict=True)
+            shown = keep.choose(shown, [returns_of(found, chosen, reward, after) for found, chosen in pairs])
+        self.behaviours = tuple(sorted({found.config.behaviour for found in whole}))
         parts: list[TensorDictBase] = []
         kept: list[Tensor | None] = []
         trajectories = 0
-        for number, (folder, choice) in enumerate(zip(self.roots, choices, strict=True)):
-            whole = read_metadata(folder)
-            shown.append(choose_episodes(whole, choice, f"episodes[{number}]" if joined else "episodes"))
-            rows, keep = read_part(
-                whole,
-                shown[-1],
+        for found, chosen in zip(whole, shown, strict=True):
+            rows, taken = read_part(
+                found,
+                chosen,
                 label=label,
                 reward=reward,
                 after_success=after_success,
                 terminate_on_success=terminate_on_success,
                 first_trajectory=trajectories,
+                behaviour=self.behaviours.index(found.config.behaviour),
             )
             parts.append(rows if grow is None else rows.exclude(*_NOT_COLLECTED))
-            kept.append(keep)
-            trajectories += len(whole.episodes)
+            kept.append(taken)
+            trajectories += len(found.episodes)
         storage: Storage
-        several = joined or episodes is not None
+        several = joined or episodes is not None or keep is not None
         self.demonstrations: Demonstrations | JoinedDemonstrations = (
             JoinedDemonstrations(tuple(shown)) if several else shown[0]
         )
@@ -268,6 +290,28 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         except ValueError as error:
             raise ValueError(f"path: {str(file)!r} holds no buffer's state ({error})") from error
         self.load_state_dict(state)
+
+    def add_column(self, name: str, values: Tensor) -> None:
+        """Give each row a number of its own, held in memory, that samples then have: its advantage, say.
+
+        Args:
+            name: of the column, a new one.
+            values: (R, ...), for each row in the order of ``replay[:]``.
+
+        Raises:
+            ValueError: another number of rows, a name that rows have, or a buffer that grows, whose later rows would
+                have none.
+        """
+        if self._grows:
+            raise ValueError(f"add_column: {name!r} would be of no row that comes later, and this buffer grows")
+        if name in self.storage.get(slice(0, 1)).keys():
+            raise ValueError(f"name must be new, the rows have a column {name!r}")
+        if len(values) != len(self):
+            raise ValueError(f"values must be of {len(self)} rows, got {len(values)}")
+        if isinstance(self.storage, TensorStorage):
+            self.storage._storage.set(name, values)
+        else:
+            self.storage.add_column(name, values)
 
     @property
     def tasks(self) -> tuple[str, ...]:

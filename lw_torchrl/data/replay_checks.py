@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -11,6 +11,8 @@ from torch import Tensor
 from torchrl.data.replay_buffers.samplers import SliceSampler
 from torchrl.envs import Compose, MultiStepTransform
 
+from lw_torchrl.data.behaviours import EXPERT
+from lw_torchrl.data.dataset import Demonstrations
 from lw_torchrl.data.rewards import REWARDS, RewardName, check_reward
 
 
@@ -31,6 +33,15 @@ def check_prefetch(batches: int | None) -> None:
         raise ValueError(
             f"prefetch must be None, 0 or 1, got {batches}: several threads draw the batches in an order that differs "
             "from run to run"
+        )
+
+
+def check_label(label: str, parts: Sequence[Demonstrations]) -> None:
+    """Raise :class:`ValueError` where an expert's actions are asked for, and another one acted."""
+    others = sorted({part.config.behaviour for part in parts if part.config.policy != EXPERT})
+    if others and label != "executed":
+        raise ValueError(
+            f"label={label!r} is what the expert wanted, and {', '.join(others)} acted here: take label='executed'"
         )
 
 

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from lw_torchrl._checks import check_int, unknown_name
 from lw_torchrl.data.dataset import CollectConfig, DamagedDatasetError, Demonstrations, EpisodeInfo
+from lw_torchrl.data.filters import episode_returns
 from lw_torchrl.data.rewards import REWARDS, RewardName
 from lw_torchrl.data.rows import load_rows
 from lw_torchrl.data.storage import TRAJECTORY
@@ -73,18 +74,30 @@ def _listed(numbers: list[int]) -> str:
     return ", ".join(map(str, numbers[:20])) + (", ..." if len(numbers) > 20 else "")
 
 
+def _lengths(episodes: Sequence[EpisodeInfo], after: int | None) -> list[int]:
+    """The rows of each episode up to ``after`` steps past its first success."""
+    return [
+        e.length if after is None or e.first_success is None else min(e.length, e.first_success + after)
+        for e in episodes
+    ]
+
+
 def _kept(episodes: Sequence[EpisodeInfo], after: int | None) -> tuple[Tensor, Tensor]:
     """The rows up to ``after`` steps past each episode's first success, and the last of them of each episode."""
-    starts = torch.tensor([episode.start for episode in episodes])
-    lengths = torch.tensor(
-        [
-            e.length if after is None or e.first_success is None else min(e.length, e.first_success + after)
-            for e in episodes
-        ]
-    )
+    starts = torch.tensor([episode.start for episode in episodes], dtype=torch.int64)
+    lengths = torch.tensor(_lengths(episodes, after), dtype=torch.int64)
     before = lengths.cumsum(0) - lengths
     rows = torch.repeat_interleave(starts - before, lengths) + torch.arange(int(lengths.sum()))
     return rows, starts + lengths - 1
+
+
+def returns_of(whole: Demonstrations, chosen: Demonstrations, reward: RewardName, after: int | None) -> Tensor:
+    """The return and the number of rows of each chosen episode, up to ``after`` steps past its first success: (E, 2)
+    float64."""
+    rows, (kept, _) = load_rows(whole), _kept(chosen.episodes, after)
+    made = REWARDS[reward]
+    source, success = (rows.get(("next", key))[kept] for key in (f"reward_{made.source}", "success"))
+    return episode_returns(made.of(source, success), _lengths(chosen.episodes, after))
 
 
 def read_part(
@@ -96,11 +109,13 @@ def read_part(
     after_success: int | None,
     terminate_on_success: bool = False,
     first_trajectory: int = 0,
+    behaviour: int = 0,
 ) -> tuple[TensorDictBase, Tensor | None]:
     """All rows of a dataset, memory-mapped, and which of them to show: (n,) int64, None for all.
 
     What differs from the files is held in memory, one number a row: the ends of episodes that are cut short, which are
-    ``terminated`` where ``terminate_on_success`` asks for it, and ``first_trajectory`` added to the trajectories' ids.
+    ``terminated`` where ``terminate_on_success`` asks for it, a reward that is not on disk, ``first_trajectory`` added
+    to the trajectories' ids, and the number ``behaviour``.
 
     Raises:
         DatasetError: (a ValueError) as for :func:`load_rows`; or an action is NaN or infinite.
@@ -121,6 +136,7 @@ def read_part(
         )
     if first_trajectory:
         rows.set(TRAJECTORY, rows.get(TRAJECTORY) + first_trajectory)
+    rows.set("behaviour", torch.full(rows.batch_size, behaviour))
     after = 0 if terminate_on_success else after_success
     if chosen.episodes == whole.episodes and after is None:
         return rows, None

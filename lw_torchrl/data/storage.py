@@ -169,6 +169,13 @@ class JoinedStorage(Storage):
             found |= self._gather(self._rows[self._last[index]], ahead)
         return found | {key: own[index] for key, own in ((REWARD, self._earned), (STEPS, self._ahead)) if key in keys}
 
+    def add_column(self, key: NestedKey, values: Tensor) -> None:
+        """Give each row a value, (R, ...) in the order of the rows, held in memory."""
+        whole = values.new_zeros((int(self._ends[-1]), *values.shape[1:]))
+        whole[self._rows.to(values.device)] = values
+        starts = [0, *self._ends.tolist()]
+        self._columns[key] = [whole[start:end] for start, end in pairwise(starts)]
+
     def _gather(self, rows: Tensor, keys: Sequence[NestedKey]) -> dict[NestedKey, Tensor]:
         """The columns of rows counted over all parts, a fresh tensor each."""
         if self.num_parts == 1:

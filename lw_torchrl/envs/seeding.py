@@ -40,9 +40,13 @@ def episode_seed(task: str | Task, seed: int, episode: int) -> int:
     return _hash("episode", task, seed, episode)
 
 
+def episode_generator(purpose: str, task: str | Task, seed: int, episode: int) -> np.random.Generator:
+    """A generator of an episode's own for a purpose, at its beginning; other purposes draw from others."""
+    return np.random.Generator(np.random.Philox(_hash(purpose, task, seed, episode)))
+
+
 def action_noise(task: str | Task, seed: int, episode: int, steps: int, hold: int = 1) -> NDArray[np.float32]:
     """Standard normal noise for the actions of one episode, (steps, 4) float32, the same wherever it is drawn; each
     draw is kept for ``hold`` steps."""
-    generator = np.random.Generator(np.random.Philox(_hash("noise", task, seed, episode)))
-    draws = generator.standard_normal((-(-steps // hold), 4), dtype=np.float32)
+    draws = episode_generator("noise", task, seed, episode).standard_normal((-(-steps // hold), 4), dtype=np.float32)
     return draws.repeat(hold, axis=0)[:steps]

@@ -6,7 +6,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 
@@ -58,7 +58,19 @@ def _evaluate(
     return EvaluationResult(each[0].config | {"tasks": shown}, tuple(e for one in each for e in one.episodes))
 
 
-def load_result(run: Run, plans: Plans, out: Path) -> EvaluationResult | None:
+class Evaluated(Protocol):
+    """A run whose result is an evaluation: where it goes, and what it hangs on."""
+
+    @property
+    def folder(self) -> Path: ...
+
+    @property
+    def episodes(self) -> int: ...
+
+    def describe(self, plans: Plans) -> dict[str, Any]: ...
+
+
+def load_result(run: Evaluated, plans: Plans, out: Path) -> EvaluationResult | None:
     """The result of a run, if it is there.
 
     Raises:

@@ -128,11 +128,11 @@ class Run:
             }
         if self.encoder_name and self.method != SCRIPTED:
             described["text_encoder"] = self.encoder_name
-        return _plain(described)
+        return plain(described)
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """As JSON gives it back: lists for tuples."""
     if isinstance(value, dict):
-        return {key: _plain(one) for key, one in value.items()}
-    return [_plain(one) for one in value] if isinstance(value, (list, tuple)) else value
+        return {key: plain(one) for key, one in value.items()}
+    return [plain(one) for one in value] if isinstance(value, (list, tuple)) else value

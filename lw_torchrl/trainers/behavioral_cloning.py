@@ -96,7 +96,7 @@ class BehavioralCloningTrainer:
         self.device = place(actor, device)
         self.config = config = config or BehavioralCloningConfig()
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
-        check_replay(actor, replay, config)
+        check_replay(actor, replay, config.batch_size)
         self._policy = None if self.checkpoint is None else check_can_be_saved(actor)
         self._described: dict[str, Any] = {}
         if self.checkpoint is not None and self._policy is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import torch
@@ -12,31 +13,32 @@ from torchrl.data.replay_buffers.samplers import RandomSampler
 from lw_torchrl._devices import CPU
 from lw_torchrl.data.device_storage import DeviceStorage, device_of_rows
 from lw_torchrl.data.group_sampler import GroupSampler
+from lw_torchrl.modules.critics import Value
 from lw_torchrl.modules.policy import plans_of
-from lw_torchrl.trainers.config import BehavioralCloningConfig
 
 
-def check_belongs(actor: Any, replay: TensorDictReplayBuffer) -> None:
-    """Raise :class:`ValueError` unless the actor writes ``action``, and the buffer answers the queries of its plans."""
-    if "action" not in actor.out_keys:
-        raise ValueError(f"actor must write 'action', it writes {', '.join(map(str, actor.out_keys))}")
-    if (own := plans_of(actor)) is None:
+def _check_plans(network: Any, replay: TensorDictReplayBuffer) -> None:
+    """Raise :class:`ValueError` unless the buffer answers the queries of a network's plans, where it has plans."""
+    if (own := plans_of(network)) is None:
         return
     for transform in replay.transform:
         answered = plans_of(transform)
         if answered is not None and (different := answered.differences(own)):
             raise ValueError(
-                f"replay's QAFTransform must have the actor's plans, they differ for {', '.join(different)}; use "
-                "actor.transform()"
+                f"replay's QAFTransform must have the {_called(network)}'s plans, they differ for "
+                f"{', '.join(different)}; use {_called(network)}.transform()"
             )
 
 
-def _check_batch_size(replay: TensorDictReplayBuffer, config: BehavioralCloningConfig) -> None:
+def _called(network: Any) -> str:
+    return "critic" if isinstance(network, Value) else "actor"
+
+
+def _check_batch_size(replay: TensorDictReplayBuffer, size: int) -> None:
     """Raise :class:`ValueError` if the buffer was made for minibatches of another size."""
-    if replay._batch_size not in (None, config.batch_size):
+    if replay._batch_size not in (None, size):
         raise ValueError(
-            f"batch_size of the replay buffer must be None or the configuration's, {config.batch_size}, got "
-            f"{replay._batch_size}"
+            f"batch_size of the replay buffer must be None or the configuration's, {size}, got {replay._batch_size}"
         )
 
 
@@ -57,10 +59,18 @@ def draw_batch(replay: TensorDictReplayBuffer, size: int, device: torch.device) 
     return batch if device == CPU else batch.to(device, non_blocking=True)
 
 
-def check_replay(actor: Any, replay: TensorDictReplayBuffer, config: BehavioralCloningConfig) -> None:
-    """Raise :class:`ValueError` unless an actor can be trained on a buffer's minibatches, and training be resumed."""
-    check_belongs(actor, replay)
+def check_minibatches(networks: Iterable[Any], replay: TensorDictReplayBuffer, size: int) -> None:
+    """Raise :class:`ValueError` unless networks can be trained on a buffer's minibatches, and training be resumed."""
+    for network in networks:
+        _check_plans(network, replay)
     if replay._prefetch:
         raise ValueError("replay must not prefetch: batches drawn ahead would be lost when training is resumed")
-    _check_batch_size(replay, config)
+    _check_batch_size(replay, size)
     _check_draws(replay)
+
+
+def check_replay(actor: Any, replay: TensorDictReplayBuffer, size: int) -> None:
+    """As :func:`check_minibatches`, of what writes ``action``."""
+    if "action" not in actor.out_keys:
+        raise ValueError(f"actor must write 'action', it writes {', '.join(map(str, actor.out_keys))}")
+    check_minibatches([actor], replay, size)

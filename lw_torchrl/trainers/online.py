@@ -33,7 +33,7 @@ from lw_torchrl.trainers.checkpoint import describe_data, describe_replay, write
 from lw_torchrl.trainers.expert_iteration import ExpertIterationLearner
 from lw_torchrl.trainers.interrupts import Interrupt, interrupts_between_steps
 from lw_torchrl.trainers.learner import Learner
-from lw_torchrl.trainers.minibatches import check_belongs
+from lw_torchrl.trainers.minibatches import check_replay
 from lw_torchrl.trainers.off_policy import ResidualLearner, SACLearner, TD3Learner
 from lw_torchrl.trainers.on_policy import PPOLearner
 from lw_torchrl.trainers.online_config import OnlineConfig
@@ -344,11 +344,6 @@ def _check_replay(actor: Policy, replay: Any, config: OnlineConfig) -> None:
         )
     if not replay.terminate_on_success:
         raise ValueError("replay must end at success, as the environment does: give it terminate_on_success=True")
-    if replay._batch_size not in (None, config.batch_size):
-        raise ValueError(
-            f"batch_size of the replay buffer must be None or the configuration's, {config.batch_size}, got "
-            f"{replay._batch_size}"
-        )
     if replay.storage.n_steps > 1 and replay.storage.gamma != config.gamma:
         raise ValueError(f"gamma must be the replay buffer's, {replay.storage.gamma}, got {config.gamma}")
-    check_belongs(actor, replay)
+    check_replay(actor, replay, config.batch_size)

@@ -137,7 +137,7 @@ class StackedBehavioralCloning:
             self._described = self._describe()
         self.states = []
         for number, (actor, replay) in enumerate(zip(actors, replays, strict=True)):
-            check_replay(actor, replay, config)
+            check_replay(actor, replay, config.batch_size)
             self.states.append(TrainingState(replay, config.seed + number))
             if config.normalize:
                 fit_normalization(actor, replay)

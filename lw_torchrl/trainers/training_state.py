@@ -69,15 +69,20 @@ def state_of(optimizer: torch.optim.Optimizer, schedule: Schedule, states: Seque
 
 
 def check_description(path: Path, ours: dict[str, Any]) -> None:
-    """Raise :class:`ValueError` unless the file was saved with the description ``ours``."""
-    found, ours = read_description(path), json.loads(json.dumps(ours))  # JSON has lists alone
+    """Raise :class:`ValueError` unless the policy file was saved with the description ``ours``."""
+    check_same_description(path, read_description(path), ours)
+
+
+def check_same_description(path: Path, found: dict[str, Any], ours: dict[str, Any]) -> None:
+    """Raise :class:`ValueError` unless a file's description ``found`` is ``ours``."""
+    ours = json.loads(json.dumps(ours))  # JSON has lists alone
     for part in ours:
         if part in _ADDED and part not in found:
             continue
         if found.get(part) != ours[part]:
             before, now = found.get(part) or {}, ours[part] or {}
             different = differences(before if isinstance(before, dict) else {}, now)
-            kind = "architecture" if part in ("actor", "actors") else "configuration"
+            kind = "architecture" if part in ("actor", "actors", "loss") else "configuration"
             raise ValueError(
                 f"checkpoint: {str(path)!r} is of another {kind}, its {part} differs in "
                 f"{', '.join(different[:8])}{', ...' * (len(different) > 8)}; choose another file, or delete it to "

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from collecting import collect, interrupt_after, tree
 
-from lw_torchrl.data import DatasetError, expert_episodes
+from lw_torchrl.data import DatasetError, missing_episodes
 
 
 @pytest.fixture(scope="module")
@@ -18,7 +18,7 @@ def test_a_finished_dataset_is_returned_at_once(made, monkeypatch):
         raise AssertionError("nothing is to be simulated")
 
     before = tree(made.root)
-    monkeypatch.setattr(expert_episodes, "LanguageWorldEnv", refuse)
+    monkeypatch.setattr(missing_episodes, "LanguageWorldEnv", refuse)
     assert collect(made.root) == made
     assert tree(made.root) == before
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from lw_torchrl.data import DatasetError, LanguageWorldExperienceReplay, collect_demonstrations, expert_episodes
+from lw_torchrl.data import DatasetError, LanguageWorldExperienceReplay, collect_demonstrations, missing_episodes
 from lw_torchrl.data import collect as collect_module
 from lw_torchrl.data.metadata import read_metadata
 from lw_torchrl.data.rows import COLUMNS, load_rows, whole_episodes
@@ -42,13 +42,13 @@ def root(made, tmp_path):
 @pytest.fixture
 def run_again(monkeypatch):
     """The episodes that are simulated."""
-    ran, real = [], expert_episodes.run_episodes
+    ran, real = [], missing_episodes.run_episodes
 
     def run(env, policy, episodes, **options):
         ran.extend((task, number) for task, numbers in episodes.items() for number in numbers)
         return real(env, policy, episodes, **options)
 
-    monkeypatch.setattr(expert_episodes, "run_episodes", run)
+    monkeypatch.setattr(missing_episodes, "run_episodes", run)
     return ran
 
 

@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mutations import mutated
 
-from lw_torchrl.data import CollectConfig, DatasetError, collect_demonstrations, expert_episodes
+from lw_torchrl.data import CollectConfig, DatasetError, collect_demonstrations, missing_episodes
 from lw_torchrl.data.metadata import read_config, read_metadata
 from lw_torchrl.data.rows import load_rows
 
@@ -181,7 +181,7 @@ def test_text_that_is_no_json_is_refused_wherever_it_is_read(root, tmp_path, nam
 
 
 def test_a_half_made_dataset_of_a_strange_configuration_runs_nothing(tmp_path, made, monkeypatch):
-    monkeypatch.setattr(expert_episodes, "LanguageWorldEnv", None)
+    monkeypatch.setattr(missing_episodes, "LanguageWorldEnv", None)
     (tmp_path / ".partial").mkdir()
     for change in (dict(tasks="reach"), dict(max_steps=10**400), dict(seed=None), dict(noise_scale=[[0.1]])):
         (tmp_path / ".partial" / "config.json").write_text(json.dumps(made.config.to_json() | change))

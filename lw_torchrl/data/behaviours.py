@@ -1,0 +1,144 @@
+"""Who acts in a dataset's episodes: Meta-World's experts, plans with scripted skills, sound or spoilt, chance."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from hashlib import sha256
+from types import MappingProxyType
+from typing import Any, Literal
+
+from lw_torchrl._checks import check_choice, check_int, check_probability, shown, unknown_name
+from lw_torchrl.language.plan_files import load_plans
+from lw_torchrl.language.plans import Plans
+from lw_torchrl.modules.policy import Policy
+
+_MOST_STEPS = 100_000
+
+
+@dataclass(frozen=True)
+class Behaviour:
+    """Who acts in an episode, as a dataset's metadata say it; equal ones act alike.
+
+    "segments" is an actor by pieces of an episode: in each, with the probability ``right``, it carries out the plan by
+    scripted skills, and otherwise does something else throughout. All it draws hangs on (task, seed, episode).
+
+    Attributes:
+        name: the label of its episodes.
+        kind: "expert", Meta-World's script; "segments"; or "policy", a trained one.
+        right: of "segments", the probability that a piece follows the plan.
+        otherwise: of "segments", what it does elsewhere: "skill", any one of the plan's, or "action", one in [-1, 1].
+        shortest, longest: of "segments", steps of a piece.
+        fingerprint: of the plans of "segments"; of the description and weights of "policy"; None until it is known.
+
+    Raises:
+        ValueError, TypeError: a wrong value, by its name.
+
+    Example:
+        >>> Behaviour("half-right", right=0.5).otherwise
+        'skill'
+    """
+
+    name: str
+    kind: Literal["expert", "segments", "policy"] = "segments"
+    right: float = 1.0
+    otherwise: Literal["skill", "action"] = "skill"
+    shortest: int = 8
+    longest: int = 24
+    fingerprint: str | None = None
+
+    def __post_init__(self) -> None:
+        if (
+            not isinstance(self.name, str)
+            or not self.name.strip()
+            or len(self.name) > 100
+            or not self.name.isprintable()
+        ):
+            raise ValueError(f"behaviour: name must be a label of 1 to 100 characters, got {shown(self.name)}")
+        check_choice("behaviour: kind", self.kind, ("expert", "segments", "policy"))
+        check_choice("behaviour: otherwise", self.otherwise, ("skill", "action"))
+        object.__setattr__(self, "right", check_probability("behaviour: right", self.right))
+        for field in ("shortest", "longest"):
+            object.__setattr__(self, field, check_int(f"behaviour: {field}", getattr(self, field), minimum=1))
+        if not self.shortest <= self.longest <= _MOST_STEPS:
+            raise ValueError(
+                f"behaviour: longest must be from shortest, {shown(self.shortest)}, to {_MOST_STEPS}, got "
+                f"{shown(self.longest)}"
+            )
+        if self.fingerprint is not None and not isinstance(self.fingerprint, str):
+            raise TypeError(f"behaviour: fingerprint must be a text or None, got {shown(self.fingerprint)}")
+
+    def to_json(self) -> dict[str, Any]:
+        return asdict(self)
+
+    @classmethod
+    def from_json(cls, stated: Any) -> Behaviour:
+        """The behaviour that :meth:`to_json` gave; :class:`ValueError` or :class:`TypeError` if it is none."""
+        names = [field.name for field in fields(cls)]
+        if not isinstance(stated, Mapping) or set(stated) != set(names):
+            raise ValueError(f"policy must be an object of {', '.join(names)}, got {shown(stated)}")
+        return cls(**stated)
+
+
+EXPERT = Behaviour("expert", "expert")
+BEHAVIOURS: Mapping[str, Behaviour] = MappingProxyType(
+    {
+        behaviour.name: behaviour
+        for behaviour in (
+            EXPERT,
+            Behaviour("scripted"),
+            Behaviour("spoilt-60", right=0.6),
+            Behaviour("spoilt-30", right=0.3),
+            Behaviour("wrong", right=0.0),
+            Behaviour("random", right=0.0, otherwise="action"),
+        )
+    }
+)
+"""By name: Meta-World's expert; plans with scripted skills; the same in 60 or 30 of 100 pieces, and any skill of the
+plan in the others; any skill of the plan throughout; one action in [-1, 1] after another."""
+
+
+def segment_plans(tasks: Iterable[str]) -> Plans:
+    """The plans that behaviours of kind "segments" carry out, or spoil: the shipped ones."""
+    known = load_plans("MT50")
+    return Plans([known[task] for task in tasks])
+
+
+def behaviour_of(policy: Any, tasks: Iterable[str], name: str | None = None) -> Behaviour:
+    """The behaviour in these tasks that an argument ``policy`` stands for, under another name if one is given.
+
+    Raises:
+        ValueError: an unknown name (with the nearest); a trained policy without a name.
+        TypeError: it is none.
+    """
+    if isinstance(policy, Policy):
+        if name is None:
+            raise ValueError("behaviour must name the policy in the dataset, behaviour='my-policy' say, got None")
+        if name in BEHAVIOURS:
+            raise ValueError(
+                f"behaviour must be a name of the policy's own, {name!r} is one of {', '.join(BEHAVIOURS)}"
+            )
+        return Behaviour(name, "policy", fingerprint=policy_fingerprint(policy))
+    if isinstance(policy, str):
+        if policy not in BEHAVIOURS:
+            raise unknown_name("policy", policy, BEHAVIOURS)
+        found = BEHAVIOURS[policy]
+    elif isinstance(policy, Behaviour):
+        found = policy
+    else:
+        raise TypeError(f"policy must be a name, a Behaviour or a Policy, got {type(policy).__name__}")
+    if found.kind == "policy":
+        raise ValueError(f"policy: the Behaviour {found.name!r} is of a trained policy; give the policy itself")
+    if found.kind == "segments":
+        found = replace(found, fingerprint=segment_plans(tasks).fingerprint)
+    return found if name is None else replace(found, name=name)
+
+
+def policy_fingerprint(policy: Policy) -> str:
+    """A digest of a policy's description and weights."""
+    digest = sha256(json.dumps(policy.describe(), sort_keys=True).encode())
+    for key, value in sorted(policy.state_dict().items()):
+        digest.update(key.encode())
+        digest.update(value.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()[:16]

@@ -1,0 +1,342 @@
+"""Imitation by advantage: against sums written out by hand, and TorchRL's own."""
+
+from __future__ import annotations
+
+import copy
+import math
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.objectives import BCLoss
+
+import lw_torchrl as lw
+from lw_torchrl.trainers import fit_normalization
+
+PLANS = lw.load_plans("MT10")
+SMALL = dict(width=16, depth=1)
+DISTANCES = ("l2", "l1", "smooth_l1")
+FLOATS = st.floats(-100, 100, width=32)
+
+
+def make_actor(kind="plan", distribution=None, **options):
+    options = {**SMALL, "distribution": distribution, "feature_noise": 0.0, **options}
+    torch.manual_seed(0)
+    if kind == "plan":
+        return lw.PlanConditionedActor(PLANS, **options)
+    return lw.DescriptorConditionedActor("MT10", **options)
+
+
+def make_batch(rows=12, seed=0, spread=2.0):
+    generator = torch.Generator().manual_seed(seed)
+    ids = torch.tensor([lw.task_id(task) for task in PLANS])[torch.randint(10, (rows,), generator=generator)]
+    batch = TensorDict(
+        observation=torch.rand(rows, 39, generator=generator),
+        task_id=ids,
+        action=torch.rand(rows, 4, generator=generator) * 2 - 1,
+        advantage=torch.randn(rows, 1, generator=generator) * spread,
+    )
+    return lw.QAFTransform(PLANS)(batch.auto_batch_size_(1))
+
+
+def bc(actor, **options):
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*target_actor_network_params.*")  # BCLoss about itself
+        return BCLoss(actor, **options)
+
+
+def distance(given, wanted, name):
+    off = abs(given - wanted)
+    if name == "l2":
+        return off**2
+    return off if name == "l1" else (off**2 / 2 if off < 1 else off - 0.5)
+
+
+@pytest.mark.parametrize("distribution", [None, "normal", "tanh_normal"])
+@pytest.mark.parametrize("name", DISTANCES)
+@pytest.mark.parametrize("kind", ["plan", "description"])
+def test_it_is_what_is_written_by_hand(kind, name, distribution):
+    actor, batch = make_actor(kind, distribution), make_batch()
+    loss = lw.AdvantageWeightedLoss(actor, beta=1.5, max_weight=5.0, loss_function=name)
+    actions = actor(batch.copy())["action"].double().tolist()
+    total, weights, clipped = 0.0, [], 0
+    for row in range(len(batch)):
+        exponential = math.exp(1.5 * batch["advantage"][row].item())
+        clipped += exponential > 5.0
+        weights.append(min(exponential, 5.0))
+        off = [distance(a, b, name) for a, b in zip(actions[row], batch["action"][row].tolist(), strict=True)]
+        total += weights[-1] * sum(off) / 4
+    found = loss(batch)
+    np.testing.assert_allclose(found["loss_actor"].item(), total / sum(weights), rtol=1e-5)
+    np.testing.assert_allclose(found["weight_clipped"].item(), clipped / 12, rtol=1e-6)
+    np.testing.assert_allclose(found["ESS"].item(), sum(weights) ** 2 / sum(w**2 for w in weights) / 12, rtol=1e-5)
+    assert 0 < clipped < 12
+    assert not any(found[key].requires_grad for key in ("ESS", "weight_clipped"))
+
+
+@pytest.mark.parametrize("name", [*DISTANCES, "log_prob"])
+def test_without_a_difference_it_is_torchrls_bc(name):
+    actor = make_actor(distribution="normal" if name == "log_prob" else None)
+    batch = make_batch()
+    wanted = bc(actor, loss_function=None if name == "log_prob" else name)(batch.copy())["loss_bc"]
+    weigh = lw.AdvantageWeightedLoss(actor, beta=2.0, loss_function=name)
+    alike = batch.clone().set("advantage", torch.zeros(12, 1))
+    torch.testing.assert_close(weigh(alike)["loss_actor"], wanted)
+    assert weigh(alike)["ESS"] == 1
+    assert not torch.isclose(weigh(batch)["loss_actor"], wanted)
+    never = lw.AdvantageWeightedLoss(actor, beta=0.0, loss_function=name)
+    torch.testing.assert_close(never(batch)["loss_actor"], wanted)
+    assert never(batch)["weight_clipped"] == 0
+
+
+def test_by_likelihood_it_is_the_weighted_mean():
+    actor, batch = make_actor(distribution="normal"), make_batch()
+    likelihood = actor.get_dist(batch.copy()).log_prob(batch["action"])
+    weights = batch["advantage"].squeeze(-1).exp().clamp(max=20.0)
+    wanted = -(weights * likelihood).sum() / weights.sum()
+    found = lw.AdvantageWeightedLoss(actor, loss_function="log_prob")(batch)["loss_actor"]
+    torch.testing.assert_close(found, wanted)
+
+
+@pytest.mark.parametrize("name", ["l2", "log_prob"])
+def test_gradients_reach_every_parameter_and_no_advantage(name):
+    actor, batch = make_actor(distribution="tanh_normal" if name == "log_prob" else None), make_batch()
+    loss = lw.AdvantageWeightedLoss(actor, loss_function=name)
+    batch["advantage"].requires_grad_()
+    loss(batch)["loss_actor"].backward()
+    assert all(p.grad.abs().sum() > 0 for p in loss.parameters())
+    assert batch["advantage"].grad is None
+
+
+def test_a_row_counts_as_its_weight_says():
+    """By the gradient of each row's action: the larger the advantage, the more, until the largest weight."""
+    batch = make_batch(5)
+    batch["advantage"] = torch.tensor([[-3.0], [0.0], [1.0], [4.0], [9.0]])
+    actor = make_actor()
+    loss = lw.AdvantageWeightedLoss(actor, max_weight=20.0, loss_function="l1")
+    shares = []
+    for row in range(5):
+        moved = batch.clone()
+        moved["action"][row] += 10.0 * (moved["action"][row] - actor(batch.copy())["action"][row].detach()).sign()
+        shares.append((loss(moved)["loss_actor"] - loss(batch)["loss_actor"]).item() / 10.0)
+    exponentials = np.minimum(np.exp([-3.0, 0.0, 1.0, 4.0, 9.0]), 20.0)
+    np.testing.assert_allclose(shares, exponentials / exponentials.sum(), atol=1e-5)
+
+
+@settings(max_examples=30, deadline=None)
+@given(advantages=st.lists(FLOATS, min_size=4, max_size=4), beta=st.floats(0, 5, width=32))
+def test_weights_are_monotone_and_the_loss_is_within_the_rows(advantages, beta):
+    """Of any advantages, however large: never 0 / 0."""
+    batch = make_batch(4).set("advantage", torch.tensor(advantages).unsqueeze(-1))
+    loss = lw.AdvantageWeightedLoss(ACTOR, beta=beta)
+    found = loss(batch)
+    rows = [lw.AdvantageWeightedLoss(ACTOR)(batch[i : i + 1])["loss_actor"].item() for i in range(4)]
+    assert min(rows) - 1e-5 <= found["loss_actor"] <= max(rows) + 1e-5
+    assert 0.25 - 1e-5 <= found["ESS"] <= 1 + 1e-5
+    order = np.argsort(rows)
+    best = batch.clone()  # the advantages in the order of the rows' own losses: no other order gives more
+    best["advantage"][torch.from_numpy(order)] = batch["advantage"].sort(0).values
+    assert loss(best)["loss_actor"] >= found["loss_actor"] - 1e-5
+
+
+@settings(max_examples=20, deadline=None)
+@given(order=st.permutations(range(12)))
+def test_the_order_of_rows_changes_nothing(order):
+    batch, loss = make_batch(), lw.AdvantageWeightedLoss(ACTOR)
+    torch.testing.assert_close(loss(batch[list(order)])["loss_actor"], loss(batch)["loss_actor"])
+
+
+@settings(max_examples=20, deadline=None)
+@given(shift=st.floats(-1000, 1000, width=32))
+def test_without_a_largest_weight_a_shift_of_all_changes_nothing(shift):
+    batch, loss = make_batch(spread=0.5), lw.AdvantageWeightedLoss(ACTOR, max_weight=1e300, beta=0.5)
+    moved = batch.clone().set("advantage", batch["advantage"] + shift)
+    torch.testing.assert_close(loss(moved)["loss_actor"], loss(batch)["loss_actor"], rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.filterwarnings(  # what PyTorch warns of when it compiles
+    "ignore:torch._dynamo.config.inline_inbuilt_nn_modules:FutureWarning",
+    "ignore:.*LeafSpec:FutureWarning",
+    "ignore:.*torch.jit:DeprecationWarning",
+)
+@pytest.mark.parametrize(("name", "distribution"), [("l2", None), ("smooth_l1", "normal"), ("log_prob", "normal")])
+def test_compiled_it_is_one_graph_with_the_same_gradients(name, distribution):
+    torch._dynamo.reset()
+    loss = lw.AdvantageWeightedLoss(make_actor(distribution=distribution), loss_function=name)
+    found = []
+    for run in (loss, torch.compile(loss, fullgraph=True, backend="eager")):
+        loss.zero_grad()
+        value = run(make_batch())["loss_actor"]
+        value.backward()
+        found.append([value.detach(), *(p.grad.clone() for p in loss.parameters() if p.grad is not None)])
+    assert len(found[0]) > 5
+    assert all(torch.equal(one, other) for one, other in zip(*found, strict=True))
+
+
+def test_its_state_goes_round_and_statistics_reach_it():
+    batch = make_batch()
+    loss, other = (lw.AdvantageWeightedLoss(make_actor(encoder_width=w)) for w in (128, 128))
+    for p in other.parameters():
+        p.data += 0.1
+    assert loss(batch)["loss_actor"] != other(batch)["loss_actor"]
+    replay = TensorDictReplayBuffer(storage=LazyTensorStorage(12), batch_size=4)
+    replay.extend(batch)
+    before = loss(batch)["loss_actor"]
+    fit_normalization(loss, replay)
+    assert loss(batch)["loss_actor"] != before
+    other.load_state_dict(loss.state_dict())
+    assert torch.equal(loss(batch)["loss_actor"], other(batch)["loss_actor"])
+    assert torch.equal(copy.deepcopy(loss)(batch)["loss_actor"], loss(batch)["loss_actor"])
+
+
+def test_keys_by_other_names_nested_ones_too():
+    batch = make_batch()
+    keys = [("agent", "observation"), ("agent", "task_id")]
+    out = [("agent", "action")]
+    plain = lw.AdvantageWeightedLoss(make_actor("description"))
+    other = lw.AdvantageWeightedLoss(make_actor("description", in_keys=keys, out_keys=out))
+    other.set_keys(action=("agent", "action"), advantage=("agent", "better"))
+    renamed = batch.select("observation", "task_id", "action").set("better", batch["advantage"])
+    renamed = TensorDict(agent=renamed, batch_size=[12])
+    assert torch.equal(other(renamed)["loss_actor"], plain(batch)["loss_actor"])
+    assert set(other.in_keys) == {*keys, ("agent", "action"), ("agent", "better")}
+    with pytest.raises(ValueError, match="is not an accepted tensordict key"):
+        other.set_keys(reward="reward")
+
+
+def test_its_keys_are_enough_and_what_it_is_given_stays():
+    loss, batch = lw.AdvantageWeightedLoss(make_actor("description")), make_batch()
+    before = batch.clone()
+    wanted = loss(batch)
+    assert set(batch.keys(True, True)) == set(before.keys(True, True))
+    assert (batch == before).all()
+    value, clipped, ess = loss(**{key: batch[key] for key in loss.in_keys})
+    assert torch.equal(value, wanted["loss_actor"])
+    assert torch.equal(clipped, wanted["weight_clipped"])
+    assert torch.equal(ess, wanted["ESS"])
+
+
+def test_answers_to_other_plans_are_refused():
+    other = lw.ConditionalPlan.from_pairs("reach", [(lw.supported_queries("reach")[0], "go there")])
+    loss = lw.AdvantageWeightedLoss(lw.PlanConditionedActor({**PLANS, "reach": other}, **SMALL))
+    with pytest.raises(ValueError, match="other plans"):
+        loss(make_batch())
+
+
+@pytest.mark.parametrize("shape", [(12,), (12, 2), (1, 1), (1, 12)])
+def test_shapes_that_would_broadcast_are_refused(shape):
+    batch = make_batch().exclude("advantage").auto_batch_size_(1)
+    wrong = TensorDict(dict(batch.items()) | {"advantage": torch.zeros(shape)}, batch_size=[])
+    wrong.batch_size = [12] if shape[0] == 12 else []
+    with pytest.raises(ValueError, match="advantage must be"):
+        lw.AdvantageWeightedLoss(make_actor())(wrong)
+
+
+def test_what_is_refused():
+    actor, batch = make_actor(), make_batch()
+    for wrong in (dict(beta=-1.0), dict(beta=math.inf), dict(max_weight=0.0), dict(max_weight=math.nan)):
+        with pytest.raises(ValueError, match=next(iter(wrong))):
+            lw.AdvantageWeightedLoss(actor, **wrong)
+    with pytest.raises(ValueError, match=r"loss_function must be one of .*did you mean 'l2'"):
+        lw.AdvantageWeightedLoss(actor, loss_function="L2")
+    loss = lw.AdvantageWeightedLoss(actor)
+    for wrong in (math.nan, math.inf, -math.inf):
+        with pytest.raises(ValueError, match="advantage must hold finite numbers"):
+            loss(batch.clone().set("advantage", torch.full((12, 1), wrong)))
+    with pytest.raises(ValueError, match="action and advantage are needed"):
+        loss(batch.exclude("advantage"))
+    with pytest.raises(RuntimeError, match="incompatible"):
+        loss(batch.clone().set("action", torch.zeros(12, 1)))
+    with pytest.raises(TypeError, match="has no distribution"):
+        lw.AdvantageWeightedLoss(actor, loss_function="log_prob")(batch)
+
+
+ADVANTAGES = st.lists(st.tuples(st.integers(0, 3), FLOATS), min_size=1, max_size=20)
+
+
+def tensors(rows):
+    ids, advantages = zip(*rows, strict=True)
+    return torch.tensor(advantages).unsqueeze(-1), torch.tensor(ids)
+
+
+@settings(max_examples=50, deadline=None)
+@given(rows=ADVANTAGES)
+def test_standardized_by_hand(rows):
+    found = lw.standardize_by_task(*tensors(rows))
+    assert (found.shape, found.dtype) == ((len(rows), 1), torch.float32)
+    for (task, advantage), one in zip(rows, found.squeeze(-1).tolist(), strict=True):
+        own = np.array([np.float64(a) for t, a in rows if t == task])
+        wanted = 0.0 if (own == own[0]).all() else (advantage - own.mean()) / own.std()
+        assert one == pytest.approx(wanted, rel=1e-5, abs=1e-6)
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    rows=st.lists(st.tuples(st.integers(0, 3), st.integers(-50, 50)), min_size=1, max_size=20),
+    maps=st.lists(st.tuples(st.sampled_from([0.25, 1.0, 8.0]), st.integers(-9, 9)), min_size=4, max_size=4),
+    seed=st.integers(0, 5),
+)
+def test_a_tasks_unit_and_zero_change_nothing_nor_does_the_order(rows, maps, seed):
+    advantage, ids = tensors([(task, float(number)) for task, number in rows])
+    scale, shift = torch.tensor(maps, dtype=torch.float32).unbind(-1)
+    found = lw.standardize_by_task(advantage, ids)
+    other = lw.standardize_by_task(advantage * scale[ids].unsqueeze(-1) + shift[ids].unsqueeze(-1), ids)
+    torch.testing.assert_close(other, found, atol=1e-5, rtol=1e-5)
+    order = torch.randperm(len(rows), generator=torch.Generator().manual_seed(seed))
+    torch.testing.assert_close(lw.standardize_by_task(advantage[order], ids[order]), found[order])
+    negative = lw.standardize_by_task(-advantage, ids)
+    torch.testing.assert_close(negative, -found)
+
+
+@pytest.mark.parametrize("same", [0.1, 1e-30, -1e30])
+def test_of_a_task_whose_rows_are_all_alike_there_is_nothing_to_tell(same):
+    """0.1 has a mean over seven that is not 0.1, in rounding."""
+    advantage = torch.full((7, 1), same)
+    assert (lw.standardize_by_task(advantage, torch.zeros(7, dtype=torch.int64)) == 0).all()
+    assert (lw.standardize_by_task(advantage, torch.arange(7)) == 0).all()
+    assert lw.standardize_by_task(torch.zeros(0, 1), torch.zeros(0, dtype=torch.int64)).shape == (0, 1)
+
+
+def test_of_huge_ones_too():
+    advantage = torch.tensor([[3e38], [-3e38]])
+    assert lw.standardize_by_task(advantage, torch.zeros(2, dtype=torch.int64)).tolist() == [[1.0], [-1.0]]
+
+
+@pytest.mark.parametrize(
+    ("advantage", "ids", "message"),
+    [
+        (torch.zeros(3), torch.zeros(3, dtype=torch.int64), r"advantage must be \(R, 1\) float32, got \(3,\)"),
+        (torch.zeros(3, 2), torch.zeros(3, dtype=torch.int64), "advantage must be"),
+        (torch.zeros(3, 1).double(), torch.zeros(3, dtype=torch.int64), "got .*float64"),
+        (torch.zeros(3, 1), torch.zeros(3, 1, dtype=torch.int64), r"task_id must be \(3,\) int64"),
+        (torch.zeros(3, 1), torch.zeros(2, dtype=torch.int64), "task_id must be"),
+        (torch.zeros(3, 1), torch.zeros(3), "task_id must be .*float32"),
+        (torch.full((3, 1), math.nan), torch.zeros(3, dtype=torch.int64), "advantage must hold finite numbers"),
+    ],
+)
+def test_standardize_refuses(advantage, ids, message):
+    with pytest.raises(ValueError, match=message):
+        lw.standardize_by_task(advantage, ids)
+
+
+def test_from_the_value_to_the_weights():
+    """The three together, as they are meant: what is better than its state's value counts more."""
+    from lw_torchrl.modules import DescriptorEncoder, Value
+
+    batch = make_batch(40)
+    ended = torch.ones(40, 1, dtype=torch.bool)
+    following = batch.select("observation", "task_id").set("done", ended).set("terminated", ended)
+    batch["next"] = following.set("reward", torch.rand(40, 1))
+    value = lw.ExpectileValueLoss(Value(DescriptorEncoder("MT10"), ensemble=2, **SMALL), delay_value=False)
+    batch["advantage"] = lw.standardize_by_task(value.advantage(batch), batch["task_id"])
+    found = lw.AdvantageWeightedLoss(make_actor("description"), beta=3.0)(batch)
+    assert found["loss_actor"].isfinite()
+    assert found["ESS"] < 0.9
+
+
+ACTOR = make_actor()

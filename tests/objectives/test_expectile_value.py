@@ -1,0 +1,344 @@
+"""The value by expectile regression: against sums written out by hand, and TorchRL's own."""
+
+from __future__ import annotations
+
+import copy
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.objectives import IQLLoss, SoftUpdate, ValueEstimators
+from torchrl.objectives.value import TD0Estimator
+
+import lw_torchrl as lw
+from lw_torchrl.modules import DescriptorEncoder, ObservationFeatures, Value
+from lw_torchrl.trainers import fit_normalization
+
+PLANS = lw.load_plans("MT10")
+SMALL = dict(width=16, depth=1)
+CRITICS = {
+    "plan": lambda ensemble, **more: lw.PlanConditionedValue(PLANS, ensemble=ensemble, **SMALL, **more),
+    "description": lambda ensemble, **more: Value(DescriptorEncoder("MT10", **more), ensemble=ensemble, **SMALL),
+}
+
+
+def make_loss(kind="plan", ensemble=2, seed=0, gamma=0.9, **options):
+    """A loss whose targets differ from what it trains, as in the midst of a training."""
+    torch.manual_seed(seed)
+    noise = {"feature_noise": options.pop("feature_noise", 0.0)}
+    loss = lw.ExpectileValueLoss(CRITICS[kind](ensemble, **noise), **options)
+    loss.make_value_estimator(gamma=gamma)
+    if options.get("delay_value", True):
+        SoftUpdate(loss, eps=0.9)
+        for p in loss.parameters():
+            p.data += 0.05 * torch.randn(p.shape)
+    return loss
+
+
+def make_batch(rows=12, seed=0, steps=True):
+    generator = torch.Generator().manual_seed(seed)
+    ids = torch.tensor([lw.task_id(task) for task in PLANS])[torch.randint(10, (rows,), generator=generator)]
+
+    def state(**more):
+        return TensorDict(observation=torch.rand(rows, 39, generator=generator), task_id=ids, **more)
+
+    flags = torch.rand(2, rows, 1, generator=generator) < 0.3
+    following = state(reward=torch.rand(rows, 1, generator=generator), done=flags.any(0), terminated=flags[0])
+    batch = state(next=following)
+    if steps:
+        batch["steps_to_next_obs"] = torch.randint(1, 6, (rows,), generator=generator)
+    return lw.QAFTransform(PLANS)(batch.auto_batch_size_(1))
+
+
+def says(loss, params, state):
+    """(B, E): what the network with these parameters says of states."""
+    network = copy.deepcopy(loss.value_network)
+    params.data.to_module(network)
+    key = "state_values" if len(network.heads) > 1 else "state_value"
+    with torch.no_grad():
+        return network(state.select(*network.in_keys))[key].double().numpy()
+
+
+def by_hand(loss, batch, gamma=0.9, expectile=0.7):
+    """The loss, the mean value, the priorities and the advantages, row after row."""
+    values = says(loss, loss.value_network_params, batch)
+    now, following = (says(loss, loss.target_value_network_params, s) for s in (batch, batch["next"]))
+    total, priorities, advantages = 0.0, [], []
+    for row in range(len(batch)):
+        n = int(batch["steps_to_next_obs"][row]) if "steps_to_next_obs" in batch.keys() else 1
+        alive = 1.0 - float(batch["next", "terminated"][row])
+        target = float(batch["next", "reward"][row]) + gamma**n * alive * following[row].mean()
+        advantages.append([target - now[row].mean()])
+        errors = [target - value for value in values[row]]
+        total += sum(abs(expectile - (error < 0)) * error**2 for error in errors)
+        priorities.append(max(error**2 for error in errors))
+    return total / len(batch), values.mean(), np.array(priorities), np.array(advantages)
+
+
+@pytest.mark.parametrize("steps", [True, False])
+@pytest.mark.parametrize("ensemble", [1, 2, 3])
+@pytest.mark.parametrize("kind", CRITICS)
+def test_it_is_what_is_written_by_hand(kind, ensemble, steps):
+    for expectile in (0.3, 0.7, 1.0):
+        loss, batch = make_loss(kind, ensemble, expectile=expectile), make_batch(steps=steps)
+        wanted, value, priorities, advantages = by_hand(loss, batch, expectile=expectile)
+        found = loss(batch)
+        np.testing.assert_allclose(found["loss_value"].item(), wanted, rtol=1e-5)
+        np.testing.assert_allclose(found["value"].item(), value, rtol=1e-5)
+        np.testing.assert_allclose(batch["td_error"].numpy(), priorities, rtol=1e-4, atol=1e-7)
+        np.testing.assert_allclose(loss.advantage(batch).numpy(), advantages, rtol=1e-4, atol=1e-6)
+        assert not found["value"].requires_grad
+        assert not batch["td_error"].requires_grad
+
+
+def test_it_is_iqls_expectile_of_td0s_target():
+    """One network, no targets apart: TorchRL's own parts, put together."""
+    loss, batch = make_loss(ensemble=1, delay_value=False), make_batch()
+    estimator = TD0Estimator(gamma=0.9, value_network=loss.get_stateful_net("value_network"))
+    wanted = estimator(batch.copy())
+    torch.testing.assert_close(loss.advantage(batch), wanted["advantage"])
+    diff = wanted["value_target"] - wanted["state_value"]
+    torch.testing.assert_close(loss(batch)["loss_value"], IQLLoss.loss_value_diff(diff, 0.7).mean())
+
+
+def test_half_an_expectile_is_half_the_squared_error():
+    loss, batch = make_loss(ensemble=1, expectile=0.5), make_batch()
+    found = loss(batch)
+    torch.testing.assert_close(found["loss_value"], batch["td_error"].mean() / 2)
+
+
+def test_it_finds_the_expectile_of_what_followed():
+    """Rows that end, of one state and many rewards: V goes where the expectile's own condition holds."""
+    rewards = torch.rand(200, 1, generator=torch.Generator().manual_seed(0))
+    ended = torch.ones(200, 1, dtype=torch.bool)
+    batch = TensorDict(
+        one=torch.ones(200, 1), next=TensorDict(one=torch.ones(200, 1), reward=rewards, done=ended, terminated=ended)
+    ).auto_batch_size_(1)
+    network = TensorDictModule(nn.Linear(1, 1, bias=False), in_keys=["one"], out_keys=["state_value"])
+    loss = lw.ExpectileValueLoss(network, expectile=0.9, delay_value=False).make_value_estimator(gamma=0.9)
+    optimizer = torch.optim.SGD(loss.parameters(), lr=0.5)
+    for _ in range(300):
+        optimizer.zero_grad()
+        loss(batch)["loss_value"].backward()
+        optimizer.step()
+    value = loss(batch)["value"]
+    above, below = (rewards - value).clamp(min=0).sum(), (value - rewards).clamp(min=0).sum()
+    torch.testing.assert_close(0.9 * above, 0.1 * below, rtol=1e-3, atol=1e-3)
+    assert value > rewards.mean() + 0.1
+
+
+@settings(max_examples=20, deadline=None)
+@given(order=st.permutations(range(12)), ensemble=st.integers(1, 3))
+def test_the_order_of_rows_changes_nothing(order, ensemble):
+    loss, batch = make_loss(ensemble=ensemble), make_batch()
+    torch.testing.assert_close(loss(batch[list(order)])["loss_value"], loss(batch)["loss_value"])
+    torch.testing.assert_close(loss.advantage(batch[list(order)]), loss.advantage(batch)[list(order)])
+
+
+@pytest.mark.parametrize("kind", CRITICS)
+def test_gradients_reach_what_is_trained_and_no_target(kind):
+    loss, batch = make_loss(kind), make_batch()
+    loss(batch)["loss_value"].backward()
+    assert all(p.grad.abs().sum() > 0 for p in loss.parameters())
+    targets = list(loss.target_value_network_params.values(True, True))
+    assert targets
+    assert not any(target.requires_grad or target.grad is not None for target in targets)
+    assert not loss.advantage(batch).requires_grad
+
+
+def test_targets_follow():
+    loss = make_loss()
+    update = SoftUpdate(loss, eps=0.5)
+    path = ("heads", "0", "0", "weight")
+    trained, before = (p[path].clone() for p in (loss.value_network_params, loss.target_value_network_params))
+    update.step()
+    torch.testing.assert_close(loss.target_value_network_params[path], (trained.data + before) / 2)
+
+
+def test_without_an_updater_torchrl_warns():
+    loss = lw.ExpectileValueLoss(CRITICS["plan"](2)).make_value_estimator(gamma=0.9)
+    with pytest.warns(UserWarning, match="No target network updater"):
+        loss(make_batch())
+
+
+@pytest.mark.filterwarnings(  # what PyTorch warns of when it compiles
+    "ignore:torch._dynamo.config.inline_inbuilt_nn_modules:FutureWarning",
+    "ignore:.*LeafSpec:FutureWarning",
+    "ignore:.*torch.jit:DeprecationWarning",
+)
+@pytest.mark.parametrize("kind", CRITICS)
+def test_compiled_it_is_one_graph_with_the_same_gradients(kind):
+    torch._dynamo.reset()
+    loss, found = make_loss(kind), []
+    for run in (loss, torch.compile(loss, fullgraph=True, backend="eager")):
+        loss.zero_grad()
+        batch = make_batch()
+        value = run(batch)["loss_value"]
+        value.backward()
+        found.append([value.detach(), batch["td_error"], *(p.grad.clone() for p in loss.parameters())])
+    assert all(torch.equal(one, other) for one, other in zip(*found, strict=True))
+
+
+def test_its_state_goes_round():
+    loss, other, batch = make_loss(), make_loss(seed=1), make_batch()
+    assert loss(batch)["loss_value"] != other(batch)["loss_value"]
+    other.load_state_dict(loss.state_dict())
+    assert torch.equal(loss(batch)["loss_value"], other(batch)["loss_value"])
+    assert torch.equal(loss.advantage(batch), other.advantage(batch))
+
+
+@pytest.mark.parametrize("kind", CRITICS)
+def test_statistics_reach_value_and_target(kind):
+    loss, batch = make_loss(kind), make_batch()
+    replay = TensorDictReplayBuffer(storage=LazyTensorStorage(12), batch_size=4)
+    replay.extend(batch)
+    before = loss.advantage(batch)
+    fit_normalization(loss, replay)
+    expected = ObservationFeatures("differences")
+    expected.fit(batch["observation"])
+    for params in (loss.value_network_params, loss.target_value_network_params):
+        assert torch.equal(params["encoder", "features", "mean"], expected.mean)
+    assert not torch.equal(loss.advantage(batch), before)
+    np.testing.assert_allclose(loss(batch)["loss_value"].item(), by_hand(loss, batch)[0], rtol=1e-5)
+
+
+def test_keys_by_other_names_nested_ones_too():
+    keys = [("agent", "observation"), ("agent", "task_id")]
+    names = {"value": ("agent", "v"), "values": ("agent", "vs"), "reward": ("agent", "gain"), "priority": "urgency"}
+    names |= {"done": ("agent", "over"), "terminated": ("agent", "dead"), "steps_to_next_obs": ("agent", "n")}
+
+    def make(in_keys=None, out_keys=None):
+        torch.manual_seed(3)
+        encoder = DescriptorEncoder("MT10", in_keys=in_keys)
+        loss = lw.ExpectileValueLoss(Value(encoder, ensemble=2, out_keys=out_keys, **SMALL), delay_value=False)
+        return loss
+
+    plain, other = make().make_value_estimator(gamma=0.9), make(keys, [names["value"], names["values"]])
+    other.make_value_estimator(gamma=0.9)
+    other.set_keys(**names)
+    batch = make_batch()
+    ids, seen, following = batch["task_id"], batch["observation"], batch["next"]
+    ahead = {"observation": following["observation"], "task_id": ids, "gain": following["reward"]}
+    ahead |= {"over": following["done"], "dead": following["terminated"]}
+    renamed = TensorDict(
+        agent=TensorDict(observation=seen, task_id=ids, n=batch["steps_to_next_obs"]),
+        next=TensorDict(agent=TensorDict(ahead)),
+    ).auto_batch_size_(1)
+    assert torch.equal(other(renamed)["loss_value"], plain(batch)["loss_value"])
+    assert torch.equal(renamed["urgency"], batch["td_error"])
+    assert torch.equal(other.advantage(renamed), plain.advantage(batch))
+    assert ("next", "agent", "gain") in other.in_keys
+    again = make(keys, [names["value"], names["values"]])
+    again.set_keys(**names)
+    again.make_value_estimator(gamma=0.9)  # in the other order
+    assert torch.equal(again(renamed)["loss_value"], plain(batch)["loss_value"])
+
+
+def test_its_keys_are_enough():
+    """Dispatch, of tensors instead of a tensordict."""
+    loss, batch = make_loss("description", 1), make_batch(steps=False)
+    given = {"_".join(key) if isinstance(key, tuple) else key: batch[key] for key in loss.in_keys}
+    assert set(given) == {
+        *("observation", "task_id", "next_observation", "next_task_id", "next_reward", "next_done", "next_terminated")
+    }
+    value, mean = loss(**given)
+    wanted = loss(batch)
+    assert torch.equal(value, wanted["loss_value"])
+    assert torch.equal(mean, wanted["value"])
+
+
+def test_weights_of_a_prioritized_sampler_count():
+    loss, batch = make_loss(), make_batch()
+    weights = torch.rand(12, generator=torch.Generator().manual_seed(1))
+    wanted = sum(w * loss(batch[i : i + 1])["loss_value"] for i, w in enumerate(weights)) / weights.sum()
+    torch.testing.assert_close(loss(batch.clone().set("priority_weight", weights))["loss_value"], wanted)
+
+
+def test_noise_on_features_is_in_the_loss_alone():
+    loss, batch = make_loss(feature_noise=0.3), make_batch()
+    assert loss.value_network.training
+    assert loss(batch)["loss_value"] != loss(batch)["loss_value"]
+    assert torch.equal(loss.advantage(batch), loss.advantage(batch))
+    quiet = make_loss()
+    assert torch.equal(loss.advantage(batch), quiet.advantage(batch))
+    assert loss.value_network.encoder.features.training  # as it was
+    loss.eval()
+    assert torch.equal(loss(batch)["loss_value"], quiet(batch)["loss_value"])
+    loss.train()
+    assert loss(batch)["loss_value"] != loss(batch)["loss_value"]
+
+
+def test_what_it_is_given_keeps_its_keys():
+    loss, batch = make_loss(), make_batch()
+    before = batch.clone()
+    loss.advantage(batch)
+    assert set(batch.keys(True, True)) == set(before.keys(True, True))
+    loss(batch)
+    assert set(batch.keys(True, True)) == {*before.keys(True, True), "td_error"}
+    assert (batch.exclude("td_error") == before).all()
+
+
+def test_other_estimators():
+    loss, batch = make_loss(), make_batch()
+    wanted = loss.advantage(batch)
+    assert torch.equal(loss.make_value_estimator("td0", gamma=0.9).advantage(batch), wanted)
+    given_one = TD0Estimator(gamma=0.9, value_network=None)
+    assert torch.equal(loss.make_value_estimator(given_one).advantage(batch), wanted)
+    with pytest.raises(NotImplementedError, match=r"TDLambda.*Supported value types: ..TD0"):
+        loss.make_value_estimator(ValueEstimators.TDLambda)
+
+
+def test_by_default_a_step_is_discounted_by_099():
+    loss = lw.ExpectileValueLoss(CRITICS["plan"](2), delay_value=False)
+    batch = make_batch()
+    wanted = copy.deepcopy(loss).make_value_estimator(gamma=0.99).advantage(batch)
+    assert torch.equal(loss.advantage(batch), wanted)
+
+
+def test_what_is_refused():
+    critic = CRITICS["plan"](2)
+    for wrong in (-0.1, 1.5, float("nan")):
+        with pytest.raises(ValueError, match="expectile must be"):
+            lw.ExpectileValueLoss(critic, expectile=wrong)
+    with pytest.raises(TypeError, match="expectile must be a number"):
+        lw.ExpectileValueLoss(critic, expectile="0.7")
+    loss, batch = make_loss(), make_batch()
+    with pytest.raises(ValueError, match=r"are needed, got .*without qaf"):
+        loss(batch.exclude("qaf"))
+    with pytest.raises(RuntimeError, match="shape"):
+        loss(batch.set(("next", "reward"), torch.rand(12)))
+    renamed = Value(DescriptorEncoder("MT10"), ensemble=2, out_keys=["v", "vs"])
+    loss = lw.ExpectileValueLoss(renamed, delay_value=False)
+    with pytest.raises(ValueError, match=r"writes \['v', 'vs'\], which lack 'state_value'.*set_keys"):
+        loss(make_batch())
+    loss.set_keys(value="v")  # the least of the ensemble alone
+    with pytest.raises(ValueError, match=r"of an ensemble, 'state_values': name them by"):
+        loss(make_batch())
+    loss.set_keys(values="vs")
+    assert loss(make_batch())["loss_value"].isfinite()
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_it_goes_to_a_gpu():
+    loss, batch = make_loss(), make_batch()
+    wanted, advantage = loss(batch)["loss_value"], loss.advantage(batch)
+    loss.to("cuda")
+    there = loss(batch.to("cuda"))["loss_value"]
+    there.backward()
+    torch.testing.assert_close(there.cpu(), wanted, rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(loss.advantage(batch.to("cuda")).cpu(), advantage, rtol=1e-3, atol=1e-3)
+
+
+def test_it_can_be_copied_and_makes_no_warnings():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        loss = make_loss()
+        other, batch = copy.deepcopy(loss), make_batch()
+        assert torch.equal(loss(batch)["loss_value"], other(batch)["loss_value"])
