@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,9 +11,10 @@ from tyro.conf import Positional
 
 from lw_torchrl.cli.outputs import check_folder
 from lw_torchrl.cli.sources import read_encoder, read_plans, read_tasks
+from lw_torchrl.cli.units import report, run_there
 
 if TYPE_CHECKING:
-    from lw_torchrl.experiments.runs import Dataset, Run
+    from lw_torchrl.experiments.runs import Run
     from lw_torchrl.language.plans import Plans
     from lw_torchrl.language.text import TextEncoder
 
@@ -122,7 +122,7 @@ def reproduce(
         print(f"{one.folder}: mean success {result.mean_success:.3f}, {result.config['seconds']:.0f} s")
     else:
         if launcher == "local" and jobs == 1:
-            _report(len(named), _here(named, load, out, encoder, device))
+            report(len(named), _here(named, load, out, encoder, device))
         else:
             given = [experiment, "--preset", preset, "--episodes", str(episodes), "--out", str(out)]
             given += ["--seeds", *map(str, seeds), "--methods", *methods]
@@ -132,7 +132,7 @@ def reproduce(
             given += [] if text_encoder is None else ["--text-encoder", text_encoder]
             given += [] if task_file is None else ["--task-file", str(task_file)]
             for stage in (datasets, named):
-                _report(len(stage), _there(stage, given, launcher, jobs))
+                report(len(stage), run_there("reproduce", [*stage], given, launcher, jobs))
         _summarize(runs, load, out)
 
 
@@ -168,24 +168,6 @@ def _here(
     for name, one in named.items():
         result = execute_run(one, load(one), out, text_encoder=encoder, device=device)
         yield f"{name}: mean success {result.mean_success:.3f}, {result.config['seconds']:.0f} s"
-
-
-def _there(
-    named: dict[str, Dataset] | dict[str, Run], given: list[str], launcher: Literal["local", "ray"], jobs: int
-) -> Iterator[str]:
-    from lw_torchrl.experiments.launchers import run_commands
-
-    names = [*named]
-    for index, printed in run_commands([["reproduce", *given, "--run", name] for name in names], launcher, jobs):
-        yield printed.strip() or names[index]
-
-
-def _report(total: int, lines: Iterator[str]) -> None:
-    """Print what each run says as it ends, and how long the others will take."""
-    started = time.perf_counter()
-    for number, line in enumerate(lines, 1):
-        left = (time.perf_counter() - started) / number * (total - number)
-        print(f"[{number}/{total}] {line}; about {left / 60:.0f} min left", flush=True)
 
 
 def _summarize(runs: list[Run], load: Callable[[Run], Plans], out: Path) -> None:

@@ -60,7 +60,7 @@ def plot_success(result: EvaluationResult, path: str | os.PathLike[str] | None =
     """
     from matplotlib.figure import Figure
 
-    _check_image(path)
+    check_image(path)
     rates = {task: rate for task, rate in result.success_once.items() if rate is not None}
     trials = result.config["episodes_per_task"]
     tasks = sorted(rates, key=lambda task: (rates[task], task))
@@ -86,11 +86,11 @@ def plot_success(result: EvaluationResult, path: str | os.PathLike[str] | None =
     )
     axes.set_title(f"{title}\nmean over {counted(len(tasks), 'task')}: {result.mean_success:.3f}".strip())
     axes.spines[["top", "right"]].set_visible(False)
-    return _saved(figure, path)
+    return saved(figure, path)
 
 
 Rates = Mapping[str, float | Sequence[float]]
-_COLORS = ("#4c78a8", "#f58518", "#54a24b", "#b279a2", "#9d755d", "#e45756")
+COLORS = ("#4c78a8", "#f58518", "#54a24b", "#b279a2", "#9d755d", "#e45756")
 _DASHES = ((0, (5, 2)), (0, (1, 1.5)), (0, (5, 1, 1, 1)), (0, (3, 3)))
 
 
@@ -131,7 +131,7 @@ def plot_sorted_tasks(
     """
     from matplotlib.figure import Figure
 
-    _check_image(path)
+    check_image(path)
     check_choice("order", order, ("shared", "own"))
     if not curves:
         raise ValueError("curves must hold at least one method, got none")
@@ -150,7 +150,7 @@ def plot_sorted_tasks(
     figure = Figure(figsize=(max(7.0, 3.5 + 0.21 * len(tasks)), 6.4), layout="constrained")
     axes = figure.subplots()
     for k, (method, rates) in enumerate(named.items()):
-        _draw_method(axes, method, np.stack([rates[task] for task in tasks]), _COLORS[k % len(_COLORS)], order)
+        _draw_method(axes, method, np.stack([rates[task] for task in tasks]), COLORS[k % len(COLORS)], order)
     for k, (label, rates) in enumerate(dashed.items()):
         _draw_published(axes, label, np.array([rates[task].mean() for task in tasks]), k, order)
     shown = [*tasks] if order == "shared" else [str(rank) for rank in range(1, len(tasks) + 1)]
@@ -164,16 +164,16 @@ def plot_sorted_tasks(
     axes.spines[["top", "right"]].set_visible(False)
     axes.set_title(title)
     _add_legend(figure, axes, len(named))
-    return _saved(figure, path)
+    return saved(figure, path)
 
 
-def _check_image(path: str | os.PathLike[str] | None) -> None:
+def check_image(path: str | os.PathLike[str] | None) -> None:
     """Raise :class:`ValueError` unless the file's name tells a format."""
     if path is not None and (given := Path(path).suffix.lower()) not in _FORMATS:
         raise ValueError(f"path must end in {', '.join(_FORMATS)}, got {given!r} of {str(path)!r}")
 
 
-def _saved(figure: Figure, path: str | os.PathLike[str] | None) -> Figure:
+def saved(figure: Figure, path: str | os.PathLike[str] | None) -> Figure:
     if path is not None:
         with replacing(path) as temporary:
             figure.savefig(temporary, dpi=140)

@@ -78,8 +78,8 @@ class OnlineTrainer:
     Attributes:
         policy: what is trained.
         frames: steps of the environment done, up to the last round's end.
-        history: of each round, "frames", "success" (of the first episode of each row, which is finished whatever
-            becomes of it; NaN where a round is shorter), "episodes" (those that ended) and the means of losses.
+        history: of each round, "frames", "episodes" (those that ended), the means of losses and values, and "success",
+            that of the first episode of each row, which has the time to end; not of a round shorter than an episode.
 
     Raises:
         ValueError: a wrong method; a buffer that does not grow, or is not of these plans; the checkpoint is damaged, or
@@ -287,7 +287,7 @@ class OnlineTrainer:
         self.history.append(found)
         if self.logger is not None:
             for name, value in found.items():
-                if name != "frames" and value == value:
+                if name != "frames":
                     self.logger.log_scalar(f"train/{name}", value, step=int(found["frames"]))
 
 
@@ -313,7 +313,8 @@ class _Firsts:
         self._ended += int(done.sum())
 
     def result(self) -> dict[str, float]:
-        return {"success": float(self._success.mean()), "episodes": float(self._ended)}
+        ended = {"episodes": float(self._ended)}
+        return ended if self._success.isnan().any() else {"success": float(self._success.mean()), **ended}
 
 
 _MOST_EPISODES = 1_000_000
