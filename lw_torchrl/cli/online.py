@@ -156,10 +156,9 @@ def _summarize(runs: list[OnlineRun], plans: Plans, out: Path) -> None:
         for task in tasks
     }
     starts = {task: summary.mean for task, summary in comparison.summaries[START].per_task.items()}
-    seconds = {str(one.folder): result.config["seconds"] for one, result in found.items()}
     text = f"{comparison.per_task()}\n\n{comparison.headline()}\n"
     print(f"\n{folder}\n{text}")
-    write_json(folder / "summary.json", comparison.to_json() | {"curves": curves, "seconds": seconds})
+    write_json(folder / "summary.json", comparison.to_json() | {"curves": curves})
     write_text(folder / "summary.md", text)
     plot_learning_curves(curves, folder / "curves.png", starts=starts)
     print(f"summary.md, summary.json and curves.png are in {folder}")
