@@ -267,7 +267,8 @@ def test_a_loss_that_is_no_number_is_told(demos):
 
 
 def test_what_cannot_be_trained_on_is_refused(demos):
-    actor = make_actor()
+    actor, push = make_actor(), PLANS["push"]
+    other = lw.Plans([*(PLANS[task] for task in PLANS if task != "push"), replace(push, steps=push.steps[:1])])
     with pytest.raises(ValueError, match=r"method must be one of 'td3', .* did you mean 'td3'"):
         make_online(demos, "td4")
     plain = lw.LanguageWorldExperienceReplay(demos, transform=actor.transform())
@@ -282,7 +283,7 @@ def test_what_cannot_be_trained_on_is_refused(demos):
     with pytest.raises(ValueError, match="replay must end at success"):
         make_online(demos, replay=make_replay(demos, actor, terminate_on_success=False))
     with pytest.raises(ValueError, match="QAFTransform must have the actor's plans"):
-        make_online(demos, replay=make_replay(demos, actor, transform=lw.QAFTransform(lw.load_plans("MT50"))))
+        make_online(demos, replay=make_replay(demos, actor, transform=lw.QAFTransform(other)))
     with pytest.raises(TypeError, match="actor must be one that can have a distribution, got ScriptedSkillActor"):
         make_online(demos, "sac", actor=lw.ScriptedSkillActor(PLANS))
 
