@@ -10,7 +10,7 @@ from tyro.conf import Positional
 
 from lw_torchrl.cli.outputs import check_folder
 from lw_torchrl.cli.sources import make_logger, one_or_many, read_plans, simulated
-from lw_torchrl.cli.units import report, run_there
+from lw_torchrl.cli.units import elsewhere, report
 
 if TYPE_CHECKING:
     from lw_torchrl.experiments.online import OnlineRun
@@ -91,8 +91,7 @@ def online(
         print("\n".join(named))
         return
     found = read_plans(plans, TASKS)
-    if missing := [one.task for one in runs if one.task not in found]:
-        raise ValueError(f"--plans must have a plan for each task, they lack {missing[0]!r}")
+    found.require([one.task for one in runs])
     use_one_thread()
     if run is not None:
         print(_done(named[check_choice("run", run, named)], found, out, logger))
@@ -100,13 +99,22 @@ def online(
         if launcher == "local" and jobs == 1:
             report(len(runs), (_done(one, found, out, logger) for one in runs))
         else:
-            given = [*tasks, "--frames", str(frames), "--demonstrations", str(demonstrations), "--out", str(out)]
+            given = [
+                "online",
+                *tasks,
+                "--frames",
+                str(frames),
+                "--demonstrations",
+                str(demonstrations),
+                "--out",
+                str(out),
+            ]
             given += ["--seeds", *map(str, seeds), "--methods", *methods, "--plans", *plans]
             given += ["--condition", condition, "--episodes", str(episodes), "--logger", logger]
             given += [] if start is None else ["--start", str(start)]
             for first in (True, False):
                 stage = [name for name, one in named.items() if (one.method == START) == first]
-                report(len(stage), run_there("online", stage, given, launcher, jobs))
+                report(len(stage), elsewhere(stage, given, launcher, jobs))
         _summarize(runs, found, out)
 
 
