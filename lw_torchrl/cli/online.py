@@ -79,11 +79,12 @@ def online(
         raise FileNotFoundError(f"--start: no file {str(start)!r}; `lw-torchrl train` writes one")
     recipe = OnlineRecipe(demonstrations=demonstrations)
     recipe = replace(recipe, config=replace(recipe.config, frames=frames))
+    chosen = simulated("tasks", one_or_many(tasks), TASKS)
     runs = [
         OnlineRun(task, method, seed, recipe, condition, start, episodes)
         for stage in ((START,), tuple(method for method in dict.fromkeys(methods) if method != START))
         for seed in seeds
-        for task in simulated("tasks", one_or_many(tasks), TASKS)
+        for task in chosen
         for method in stage
     ]
     named = {str(one.folder): one for one in runs}
@@ -91,7 +92,7 @@ def online(
         print("\n".join(named))
         return
     found = read_plans(plans, TASKS)
-    found.require([one.task for one in runs])
+    found.require(chosen)
     use_one_thread()
     if run is not None:
         print(_done(named[check_choice("run", run, named)], found, out, logger))
