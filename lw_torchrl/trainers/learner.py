@@ -156,12 +156,3 @@ def stochastic(policy: Policy, distribution: DistributionName, init_std: float) 
     if not isinstance(policy, ConditionedActor):
         raise TypeError(f"actor must be one that can have a distribution, got {type(policy).__name__}")
     return (policy.stochastic(distribution, init_std) if policy.head.distribution is None else policy).eval()
-
-
-@torch.no_grad()
-def begin_with(loss: LossModule, value: float) -> None:
-    """Let a loss's critics, and their targets, say about ``value`` at first of every action."""
-    for params in (loss.qvalue_network_params, loss.target_qvalue_network_params):
-        for key, parameter in params.items(True, True):
-            if "heads" in key and key[-1] == "bias" and parameter.shape[-1] == 1:  # the last layer's
-                parameter.data.add_(value)

@@ -13,7 +13,7 @@ from lw_torchrl.modules.critics import QValue
 from lw_torchrl.modules.policy import Policy
 from lw_torchrl.modules.residual_actor import ResidualActor
 from lw_torchrl.objectives.demonstrated import DemonstratedSACLoss, DemonstratedTD3Loss
-from lw_torchrl.trainers.learner import Learner, begin_with, encoder_like, make_optimizer, stochastic
+from lw_torchrl.trainers.learner import Learner, encoder_like, make_optimizer, stochastic
 from lw_torchrl.trainers.online_config import OnlineConfig
 
 
@@ -37,7 +37,6 @@ class TD3Learner(Learner):
         )
         loss.make_value_estimator(gamma=config.gamma)
         self.targets = SoftUpdate(loss, eps=config.target_eps)
-        begin_with(loss, -config.pessimism)
         actor, critics = loss.actor_network_params, loss.qvalue_network_params
         self.optimizers["actor"] = make_optimizer(actor.values(True, True), config.actor_learning_rate)
         self.optimizers["critic"] = make_optimizer(critics.values(True, True), config.critic_learning_rate)
@@ -86,7 +85,6 @@ class SACLearner(Learner):
         self.target_entropy = loss.target_entropy  # which makes a buffer of the loss
         loss.make_value_estimator(gamma=config.gamma)
         self.targets = SoftUpdate(loss, eps=config.target_eps)
-        begin_with(loss, -config.pessimism)
         actor, critics = loss.actor_network_params, loss.qvalue_network_params
         self.optimizers["actor"] = make_optimizer(actor.values(True, True), config.actor_learning_rate)
         self.optimizers["critic"] = make_optimizer(critics.values(True, True), config.critic_learning_rate)

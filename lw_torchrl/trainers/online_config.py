@@ -22,8 +22,6 @@ class OnlineConfig:
         warm_up: gradient steps in which the critics alone are trained.
         actor_learning_rate, critic_learning_rate: of AdamW.
         cloning_learning_rate: of AdamW, of "expert-iteration".
-        pessimism: how far below 0 critics value everything at first. Of costs 0 is the best there is: whatever was not
-            tried yet would look better than what was, and a policy that knew the way would leave it.
         gamma: the discount; that of the buffer.
         target_eps: how much of the target networks stays, in each gradient step.
         policy_delay: gradient steps of the critics for one of the actor, of "td3" and "residual".
@@ -50,7 +48,6 @@ class OnlineConfig:
     actor_learning_rate: float = 1e-4
     critic_learning_rate: float = 5e-4
     cloning_learning_rate: float = 3e-4
-    pessimism: float = 0.0
     gamma: float = 0.99
     target_eps: float = 0.995
     policy_delay: int = 2
@@ -93,7 +90,6 @@ class OnlineConfig:
             "exploration",
             "gripper_exploration",
             "init_std",
-            "pessimism",
             "entropy",
             "clip",
             "residual_scale",

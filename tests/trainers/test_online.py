@@ -261,20 +261,6 @@ def test_critics_see_what_the_start_was_normalised_by(demos):
             assert torch.equal(params["encoder", "features", "mean"][number], actor.encoder.features.mean)
 
 
-@pytest.mark.parametrize("method", ["td3", "sac", "residual"])
-def test_critics_may_begin_with_the_worst(demos, method):
-    found = []
-    for pessimism in (0.0, 10.0):
-        trainer = make_online(demos, method, config=replace(CONFIG, pessimism=pessimism))
-        loss, batch = trainer.learner.loss, trainer.replay[:20]
-        for params in (loss.qvalue_network_params, loss.target_qvalue_network_params):
-            for number in range(2):
-                with params[number].to_module(loss.qvalue_network), torch.no_grad():
-                    found.append(loss.qvalue_network(batch.copy())["state_action_value"])
-    for before, after in zip(found[:4], found[4:], strict=True):
-        torch.testing.assert_close(after, before - 10.0)
-
-
 def test_a_loss_that_is_no_number_is_told(demos):
     with pytest.raises(ValueError, match=r"must be finite|is no number"):
         make_online(demos, config=replace(CONFIG, critic_learning_rate=1e30, actor_learning_rate=1e30)).train()
