@@ -47,9 +47,12 @@ if TYPE_CHECKING:  # the table below, for type checkers and editors
     from lw_torchrl.modules import PlanConditionedValue as PlanConditionedValue
     from lw_torchrl.modules import Policy as Policy
     from lw_torchrl.modules import QueryEvaluator as QueryEvaluator
+    from lw_torchrl.modules import ResidualActor as ResidualActor
     from lw_torchrl.modules import ScriptedSkillActor as ScriptedSkillActor
     from lw_torchrl.modules import plan_actor_value as plan_actor_value
     from lw_torchrl.objectives import AdvantageWeightedLoss as AdvantageWeightedLoss
+    from lw_torchrl.objectives import DemonstratedSACLoss as DemonstratedSACLoss
+    from lw_torchrl.objectives import DemonstratedTD3Loss as DemonstratedTD3Loss
     from lw_torchrl.objectives import ExpectileValueLoss as ExpectileValueLoss
     from lw_torchrl.objectives import SkillLatentLoss as SkillLatentLoss
     from lw_torchrl.objectives import standardize_by_task as standardize_by_task
@@ -58,6 +61,8 @@ if TYPE_CHECKING:  # the table below, for type checkers and editors
     from lw_torchrl.trainers import BehavioralCloningTrainer as BehavioralCloningTrainer
     from lw_torchrl.trainers import OfflineConfig as OfflineConfig
     from lw_torchrl.trainers import OfflineTrainer as OfflineTrainer
+    from lw_torchrl.trainers import OnlineConfig as OnlineConfig
+    from lw_torchrl.trainers import OnlineTrainer as OnlineTrainer
     from lw_torchrl.trainers import StackedBehavioralCloning as StackedBehavioralCloning
     from lw_torchrl.trainers import load_actor as load_actor
     from lw_torchrl.trainers import save_actor as save_actor
@@ -81,10 +86,12 @@ _NAMES = {
     "lw_torchrl.language.task_files": "load_tasks",
     "lw_torchrl.language.tasks": "MT10 MT50 TASKS Task resolve_tasks task_id",
     "lw_torchrl.modules": "ActorEnsemble DescriptorConditionedActor PlanConditionedActor PlanConditionedQValue "
-    "PlanConditionedValue Policy QueryEvaluator ScriptedSkillActor plan_actor_value",
-    "lw_torchrl.objectives": "AdvantageWeightedLoss ExpectileValueLoss SkillLatentLoss standardize_by_task",
+    "PlanConditionedValue Policy QueryEvaluator ResidualActor ScriptedSkillActor plan_actor_value",
+    "lw_torchrl.objectives": "AdvantageWeightedLoss DemonstratedSACLoss DemonstratedTD3Loss ExpectileValueLoss "
+    "SkillLatentLoss standardize_by_task",
     "lw_torchrl.record": "RerunLogger",
-    "lw_torchrl.trainers": "BehavioralCloningConfig BehavioralCloningTrainer OfflineConfig OfflineTrainer "
+    "lw_torchrl.trainers": "BehavioralCloningConfig BehavioralCloningTrainer OfflineConfig OfflineTrainer OnlineConfig "
+    "OnlineTrainer "
     "StackedBehavioralCloning load_actor save_actor",
     "lw_torchrl.transforms": "EnvState QAFTransform RandomYaw",
 }

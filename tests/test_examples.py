@@ -67,6 +67,16 @@ def test_ppo_runs(tmp_path):
     assert "window-open" in done.stdout
 
 
+def test_td3_learns_beside_demonstrations(tmp_path):
+    done = run("online_from_demonstrations.py", tmp_path, "--frames", 200, "--clone", 20, "--episodes", 1)
+    lines = [line for line in done.stdout.splitlines() if line.startswith("step ")]
+    assert [line.split()[1] for line in lines] == ["100", "200"]
+    assert "hammer " in done.stdout
+    left = {path.name for path in tmp_path.iterdir() if not path.name.startswith("torchinductor")}
+    assert not left, "it leaves nothing behind"
+    assert {"Collector", "DemonstratedTD3Loss", "SoftUpdate"} <= names(EXAMPLES / "online_from_demonstrations.py")
+
+
 def test_co_learning_runs_on_ones_own_data(tmp_path):
     done = run("co_learning.py", tmp_path, "--steps", 20, "--demonstrations", 1, "--episodes", 1)
     assert "the target's rows 50" in done.stdout

@@ -20,6 +20,7 @@ from lw_torchrl.cli.check import check
 from lw_torchrl.cli.data import data
 from lw_torchrl.cli.errors import in_its_words
 from lw_torchrl.cli.offline import offline
+from lw_torchrl.cli.online import online
 from lw_torchrl.cli.scripted import scripted
 from lw_torchrl.cli.streams import check_arguments, complain, nobody_reads, sound_streams
 
@@ -39,10 +40,11 @@ COMMANDS: dict[str, Any] = {
     "check": check,
     "reproduce": cli_experiments.reproduce,
     "offline": offline,
+    "online": online,
 }
 
 
-RESUMABLE = ("demo", "collect", "train", "reproduce", "offline")
+RESUMABLE = ("demo", "collect", "train", "reproduce", "offline", "online")
 
 
 def main(args: Sequence[str] | None = None) -> None:

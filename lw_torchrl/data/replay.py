@@ -231,7 +231,7 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
             kwargs.setdefault("collate_fn", _as_it_is)
         writer: Writer = ImmutableDatasetWriter() if grow is None else GrowingWriter()
         self.root = self.roots[0]
-        self.label, self.reward = label, reward
+        self.label, self.reward, self.terminate_on_success = label, reward, terminate_on_success
         self._grows = grow is not None
         super().__init__(
             storage=storage,

@@ -90,7 +90,7 @@ def plot_success(result: EvaluationResult, path: str | os.PathLike[str] | None =
 
 
 Rates = Mapping[str, float | Sequence[float]]
-_COLORS = ("#4c78a8", "#f58518", "#54a24b", "#b279a2", "#9d755d", "#e45756")
+COLORS = ("#4c78a8", "#f58518", "#54a24b", "#b279a2", "#9d755d", "#e45756")
 _DASHES = ((0, (5, 2)), (0, (1, 1.5)), (0, (5, 1, 1, 1)), (0, (3, 3)))
 
 
@@ -150,7 +150,7 @@ def plot_sorted_tasks(
     figure = Figure(figsize=(max(7.0, 3.5 + 0.21 * len(tasks)), 6.4), layout="constrained")
     axes = figure.subplots()
     for k, (method, rates) in enumerate(named.items()):
-        _draw_method(axes, method, np.stack([rates[task] for task in tasks]), _COLORS[k % len(_COLORS)], order)
+        _draw_method(axes, method, np.stack([rates[task] for task in tasks]), COLORS[k % len(COLORS)], order)
     for k, (label, rates) in enumerate(dashed.items()):
         _draw_published(axes, label, np.array([rates[task].mean() for task in tasks]), k, order)
     shown = [*tasks] if order == "shared" else [str(rank) for rank in range(1, len(tasks) + 1)]

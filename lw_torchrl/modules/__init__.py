@@ -13,6 +13,7 @@ from lw_torchrl.modules.plan_encoder import PlanEncoder
 from lw_torchrl.modules.plan_focus import PlanFocus
 from lw_torchrl.modules.policy import METHODS, POLICIES, Method, Policy, make_policy
 from lw_torchrl.modules.query_evaluator import EVALUATORS, QueryEvaluator
+from lw_torchrl.modules.residual_actor import ResidualActor
 from lw_torchrl.modules.scripted_skill_actor import ScriptedSkillActor
 
 __all__ = [
@@ -34,6 +35,7 @@ __all__ = [
     "Policy",
     "QValue",
     "QueryEvaluator",
+    "ResidualActor",
     "ScriptedSkillActor",
     "Value",
     "make_policy",

@@ -25,6 +25,7 @@ POLICIES: dict[str, str | type[Policy]] = {
     "ActorEnsemble": "lw_torchrl.modules.actor_ensemble",
     "DescriptorConditionedActor": "lw_torchrl.modules.descriptor_conditioned_actor",
     "PlanConditionedActor": "lw_torchrl.modules.plan_conditioned_actor",
+    "ResidualActor": "lw_torchrl.modules.residual_actor",
     "ScriptedSkillActor": "lw_torchrl.modules.scripted_skill_actor",
 }
 """The class's name, as policy files say it, to the module that has the class, or to the class itself."""

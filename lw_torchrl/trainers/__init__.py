@@ -6,13 +6,18 @@ from lw_torchrl.trainers.checkpoint import load_actor, save_actor
 from lw_torchrl.trainers.config import BehavioralCloningConfig
 from lw_torchrl.trainers.normalization import fit_normalization
 from lw_torchrl.trainers.offline import OfflineConfig, OfflineTrainer
+from lw_torchrl.trainers.online import LEARNERS, OnlineTrainer
+from lw_torchrl.trainers.online_config import OnlineConfig
 from lw_torchrl.trainers.stacked import StackedBehavioralCloning
 
 __all__ = [
+    "LEARNERS",
     "BehavioralCloningConfig",
     "BehavioralCloningTrainer",
     "OfflineConfig",
     "OfflineTrainer",
+    "OnlineConfig",
+    "OnlineTrainer",
     "StackedBehavioralCloning",
     "fit_normalization",
     "load_actor",

@@ -119,7 +119,7 @@ def load_training(path: str | os.PathLike[str], actor: Policy, weights: Mapping[
         check_texts(archive.tensors("texts"), text_vectors(actor))
         copy_weights(archive.tensors("weights"), weights)
     except (ValueError, RecursionError) as error:
-        raise _misfit(path, error) from error
+        raise misfit(path, error) from error
     return state
 
 
@@ -151,7 +151,7 @@ def load_state(
         optimizer.load_state_dict(found["optimizer"])
         schedule.load_state_dict(found["schedule"])
     except (ValueError, KeyError, TypeError, RuntimeError, AttributeError) as error:
-        raise _misfit(path, error) from error
+        raise misfit(path, error) from error
 
 
 def _check_schedule(found: Any, live: dict[str, Any], groups: list[dict[str, Any]], step: int) -> None:
@@ -161,7 +161,7 @@ def _check_schedule(found: Any, live: dict[str, Any], groups: list[dict[str, Any
     check_same(found, {**live, **now}, "schedule", set())
 
 
-def _misfit(path: str | os.PathLike[str], error: Exception) -> ValueError:
+def misfit(path: str | os.PathLike[str], error: Exception) -> ValueError:
     """The error for a file whose parts do not fit."""
     return ValueError(
         f"checkpoint: {str(path)!r} does not fit, it is of another architecture or damaged ({first_line(error)})"

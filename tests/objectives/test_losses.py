@@ -40,12 +40,14 @@ DETERMINISTIC = {
     "DDPG": lambda actor, q, v: DDPGLoss(actor, q),
     "TD3": lambda actor, q, v: TD3Loss(actor, q, **BOUNDS),
     "TD3+BC": lambda actor, q, v: TD3BCLoss(actor, q, **BOUNDS),
+    "demonstrated TD3": lambda actor, q, v: lw.DemonstratedTD3Loss(actor, q, **BOUNDS),
 }
 STOCHASTIC = {
     "BC, likelihood": lambda actor, q, v: BCLoss(actor),
     "DT": lambda actor, q, v: DTLoss(actor),
     "online DT": lambda actor, q, v: OnlineDTLoss(actor),
     "SAC": lambda actor, q, v: SACLoss(actor, q),
+    "demonstrated SAC": lambda actor, q, v: lw.DemonstratedSACLoss(actor, q),
     "REDQ": lambda actor, q, v: REDQLoss(actor, q),
     "CrossQ": lambda actor, q, v: CrossQLoss(actor, q),
     "IQL": lambda actor, q, v: IQLLoss(actor, q, v),
@@ -85,7 +87,7 @@ def make_loss(name, condition, distribution="tanh_normal", seed=0, device="cpu",
         loss = LOSSES[name](actor, q, v)
     if name not in ("BC", "BC, likelihood", "DT", "online DT"):
         loss.make_value_estimator(gamma=0.9)
-    if name in ("DDPG", "TD3", "TD3+BC", "SAC", "REDQ", "IQL", "CQL"):
+    if name in ("DDPG", "TD3", "TD3+BC", "SAC", "REDQ", "IQL", "CQL", "demonstrated TD3", "demonstrated SAC"):
         SoftUpdate(loss, eps=0.9)
     return loss, actor, v
 
@@ -100,6 +102,7 @@ def make_batch(rows=24, seed=0):
 
     following = state(reward=torch.rand(rows, 1, generator=generator), done=flag, terminated=flag)
     batch = state(action=torch.rand(rows, 4, generator=generator) * 2 - 1, next=following)
+    batch["is_target"] = torch.arange(rows) < rows // 2
     batch["action"][:6] = torch.tensor([1.0, -1.0, 0.5, 1.0])  # as half of what experts do
     return lw.QAFTransform(PLANS)(batch.auto_batch_size_(1))
 

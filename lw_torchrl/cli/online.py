@@ -1,0 +1,173 @@
+"""``lw-torchrl online``: RL from demonstrations, run by run."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from tyro.conf import Positional
+
+from lw_torchrl.cli.outputs import check_folder
+from lw_torchrl.cli.sources import make_logger, one_or_many, read_plans, simulated
+from lw_torchrl.cli.units import elsewhere, report
+
+if TYPE_CHECKING:
+    from lw_torchrl.experiments.online import OnlineRun
+    from lw_torchrl.language.plans import Plans
+
+OnlineMethod = Literal["td3", "sac", "residual", "ppo", "expert-iteration", "start"]
+LoggerName = Literal["none", "csv", "tensorboard", "wandb"]
+
+
+def online(
+    tasks: Positional[tuple[str, ...]],
+    /,
+    methods: tuple[OnlineMethod, ...] = ("td3", "expert-iteration"),
+    seeds: tuple[int, ...] = (0, 1, 2),
+    frames: int = 60_000,
+    demonstrations: int = 1,
+    start: Path | None = None,
+    condition: Literal["pcbc", "dc", "one-hot"] = "pcbc",
+    plans: tuple[str, ...] = ("MT50",),
+    episodes: int = 40,
+    launcher: Literal["local", "ray"] = "local",
+    jobs: int = 1,
+    logger: LoggerName = "none",
+    run: str | None = None,
+    list: bool = False,
+    out: Path = Path("runs/online"),
+) -> None:
+    """Train policies in their environment, beside demonstrations. Stopped and started again it carries on.
+
+    A run is a policy of one task, method and seed with its evaluation; the policy that it begins with is a run too.
+    Each can be run by a command of its own, with --run, by any scheduler; starts first. The summary is written when
+    the command is run without it.
+
+    Example: lw-torchrl online peg-insert-side hammer --methods td3 expert-iteration --seeds 0 1 2
+
+    Args:
+        tasks: to train a policy for, each: names, MT10 or MT50.
+        methods: td3, sac and residual (a small network that corrects the start), half of each minibatch demonstrations;
+            ppo; expert-iteration, behavioral cloning of demonstrations and of own successes. The first is compared with
+            the others, and with the start.
+        seeds: of demonstrations, weights, episodes and minibatches.
+        frames: steps of the environment, the same for every method.
+        demonstrations: clean ones of each task.
+        start: a policy to begin with, as train writes it; by default one is cloned from the demonstrations.
+        condition: what that one is conditioned on: plans, the task's description, its number.
+        plans: of the tasks: MT10, MT50, files or folders; where several have a plan for a task, the last one's counts.
+        episodes: evaluated, on seeds that no training used, action noise 0.1.
+        launcher: local, on this machine; ray, on a Ray cluster, or on all cores of this machine.
+        jobs: runs run at a time by the launcher local.
+        logger: also log success and losses, to a folder logs beside each policy.
+        run: run this one alone, such as pcbc/hammer/td3/seed0.
+        list: print the names of the runs and do nothing.
+        out: where everything goes; on a cluster, a folder that all its machines share.
+    """
+    if not list:
+        check_folder("--out", out)
+    elif run is not None:
+        raise ValueError("--list names the runs and does none, --run does one: give one of them")
+    from lw_torchrl._checks import check_choice, check_int
+    from lw_torchrl.cli.threads import use_one_thread
+    from lw_torchrl.experiments.online import START, OnlineRecipe, OnlineRun
+    from lw_torchrl.language.tasks import TASKS
+
+    check_int("jobs", jobs, minimum=1)
+    if start is not None and not start.is_file():
+        raise FileNotFoundError(f"--start: no file {str(start)!r}; `lw-torchrl train` writes one")
+    recipe = OnlineRecipe(demonstrations=demonstrations)
+    recipe = replace(recipe, config=replace(recipe.config, frames=frames))
+    chosen = simulated("tasks", one_or_many(tasks), TASKS)
+    runs = [
+        OnlineRun(task, method, seed, recipe, condition, start, episodes)
+        for stage in ((START,), tuple(method for method in dict.fromkeys(methods) if method != START))
+        for seed in seeds
+        for task in chosen
+        for method in stage
+    ]
+    named = {str(one.folder): one for one in runs}
+    if list:
+        print("\n".join(named))
+        return
+    found = read_plans(plans, TASKS)
+    found.require(chosen)
+    use_one_thread()
+    if run is not None:
+        print(_done(named[check_choice("run", run, named)], found, out, logger))
+    else:
+        if launcher == "local" and jobs == 1:
+            report(len(runs), (_done(one, found, out, logger) for one in runs))
+        else:
+            given = [
+                "online",
+                *tasks,
+                "--frames",
+                str(frames),
+                "--demonstrations",
+                str(demonstrations),
+                "--out",
+                str(out),
+            ]
+            given += ["--seeds", *map(str, seeds), "--methods", *methods, "--plans", *plans]
+            given += ["--condition", condition, "--episodes", str(episodes), "--logger", logger]
+            given += [] if start is None else ["--start", str(start)]
+            for first in (True, False):
+                stage = [name for name, one in named.items() if (one.method == START) == first]
+                report(len(stage), elsewhere(stage, given, launcher, jobs))
+        _summarize(runs, found, out)
+
+
+def _done(one: OnlineRun, plans: Plans, out: Path, logger: LoggerName) -> str:
+    """Do a run, and say how it went."""
+    from lw_torchrl.experiments.online import execute_online
+
+    make = None if logger == "none" else lambda file: make_logger(logger, file)
+    result = execute_online(one, plans, out, make_logger=make)
+    return f"{one.folder}: success {result.mean_success:.3f}, {result.config['seconds']:.0f} s"
+
+
+def _summarize(runs: list[OnlineRun], plans: Plans, out: Path) -> None:
+    """A summary, tables and a figure, from the results on disk."""
+    from lw_torchrl._files import write_json, write_text
+    from lw_torchrl.evaluation import EvaluationResult, MethodComparison, plot_learning_curves, summarize
+    from lw_torchrl.experiments.execution import load_result
+    from lw_torchrl.experiments.online import START, joined
+
+    found: dict[OnlineRun, EvaluationResult] = {}
+    for one in runs:
+        result = load_result(one, plans, out)
+        assert result is not None
+        found[one] = result
+    tasks, seeds = (sorted({getattr(one, name) for one in runs}) for name in ("task", "seed"))
+    methods = [method for method in dict.fromkeys(one.method for one in runs) if method != START]
+    by_method = {
+        method: {
+            seed: joined(
+                [result for one, result in found.items() if (one.method, one.seed) == (method, seed) and result]
+            )
+            for seed in seeds
+        }
+        for method in (*methods, START)
+    }
+    comparison = MethodComparison({method: summarize(results) for method, results in by_method.items()})
+    folder = out / runs[0].group
+    curves = {
+        task: {
+            method: [
+                [(round_["frames"], round_["success"]) for round_ in result.config["history"] if "success" in round_]
+                for one, result in found.items()
+                if (one.task, one.method) == (task, method)
+            ]
+            for method in methods
+        }
+        for task in tasks
+    }
+    starts = {task: summary.mean for task, summary in comparison.summaries[START].per_task.items()}
+    text = f"{comparison.per_task()}\n\n{comparison.headline()}\n"
+    print(f"\n{folder}\n{text}")
+    write_json(folder / "summary.json", comparison.to_json() | {"curves": curves})
+    write_text(folder / "summary.md", text)
+    plot_learning_curves(curves, folder / "curves.png", starts=starts)
+    print(f"summary.md, summary.json and curves.png are in {folder}")

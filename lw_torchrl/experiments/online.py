@@ -1,0 +1,247 @@
+"""Online experiments as runs of work: weak policies cloned from few demonstrations, and what methods make of them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
+from hashlib import file_digest
+from pathlib import Path
+from typing import Any
+
+import torch
+from filelock import FileLock
+from torchrl.record.loggers import Logger
+
+from lw_torchrl._checks import check_choice, check_int
+from lw_torchrl.data.co_learning_sampler import GROWN, CoLearningSampler
+from lw_torchrl.data.replay import LanguageWorldExperienceReplay
+from lw_torchrl.data.rewards import RewardName
+from lw_torchrl.evaluation import EvaluationResult, evaluate
+from lw_torchrl.experiments.execution import EVALUATION_SEED, RESULTS, load_result
+from lw_torchrl.experiments.recipes import TARGET
+from lw_torchrl.experiments.runs import Dataset, plain
+from lw_torchrl.language.plans import Plans
+from lw_torchrl.modules.policy import METHODS, Policy, make_policy
+from lw_torchrl.trainers.behavioral_cloning import BehavioralCloningTrainer
+from lw_torchrl.trainers.checkpoint import describe_data, load_actor, read_description, save_actor
+from lw_torchrl.trainers.config import BehavioralCloningConfig
+from lw_torchrl.trainers.online import LEARNERS, OnlineTrainer
+from lw_torchrl.trainers.online_config import OnlineConfig
+from lw_torchrl.trainers.training_state import check_description
+
+START = "start"
+"""The policy that is begun with: a run beside those of :data:`~lw_torchrl.trainers.LEARNERS`."""
+ONLINE_SEED = 20_000
+"""The episodes of training seed k have seed 20000 + k: neither those of its demonstrations nor of its evaluation."""
+
+
+@dataclass(frozen=True)
+class OnlineRecipe:
+    """How weak policies are made and trained on, the same for every task.
+
+    Attributes:
+        demonstrations: clean ones of the task, which succeed.
+        feature_noise: of the policy cloned from them.
+        cloning: how it is cloned; the run's seed takes the place of its own.
+        reward, n_steps: of the buffer.
+        config: of the training; the run's seed takes the place of its own.
+    """
+
+    demonstrations: int = 1
+    feature_noise: float = 0.1
+    cloning: BehavioralCloningConfig = field(
+        default_factory=lambda: BehavioralCloningConfig(steps=1_500, batch_size=200)
+    )
+    reward: RewardName = "dense_cost"
+    n_steps: int = 5
+    config: OnlineConfig = field(default_factory=OnlineConfig)
+
+    def __post_init__(self) -> None:
+        check_int("demonstrations", self.demonstrations, minimum=1)
+
+
+@dataclass(frozen=True)
+class OnlineRun:
+    """A policy of one task, method and seed, and its evaluation: what a scheduler runs.
+
+    Attributes:
+        task: its name.
+        method: a name of :data:`~lw_torchrl.trainers.LEARNERS`, or "start".
+        seed: of demonstrations, weights, episodes and minibatches.
+        recipe: the numbers.
+        condition: what the policy is conditioned on, a name of :data:`METHODS`; of a start that is given, its own.
+        start: a policy file to begin with; None to clone one from the demonstrations.
+        episodes: evaluated.
+    """
+
+    task: str
+    method: str
+    seed: int
+    recipe: OnlineRecipe = field(default_factory=OnlineRecipe)
+    condition: str = "pcbc"
+    start: Path | None = None
+    episodes: int = 40
+
+    def __post_init__(self) -> None:
+        check_choice("method", self.method, (*LEARNERS, START))
+        check_choice("condition", self.condition, METHODS)
+
+    @property
+    def group(self) -> Path:
+        """The folder of what begins alike: what methods are compared in."""
+        return Path(self.condition if self.start is None else f"from-{self.start.stem}")
+
+    @property
+    def folder(self) -> Path:
+        """Where its files go, below the experiments' folder."""
+        return self.group / self.task / self.method / f"seed{self.seed}"
+
+    @property
+    def dataset(self) -> Dataset:
+        """Its demonstrations."""
+        return Dataset(self.task, self.recipe.demonstrations, TARGET, self.seed)
+
+    @property
+    def begin(self) -> OnlineRun:
+        """The run of the policy that it begins with."""
+        return replace(self, method=START)
+
+    @cached_property
+    def _start_digest(self) -> str | None:
+        if self.start is None:
+            return None
+        with open(self.start, "rb") as file:
+            return file_digest(file, "sha256").hexdigest()
+
+    def own_plans(self, plans: Plans) -> Plans:
+        """The plan of its task."""
+        return Plans([plans[self.task]])
+
+    def describe(self, plans: Plans) -> dict[str, Any]:
+        """Everything that its result hangs on, as JSON."""
+        recipe = asdict(self.recipe)
+        if self.method == START:
+            del recipe["config"], recipe["reward"], recipe["n_steps"]
+        found = {"task": self.task, "method": self.method, "seed": self.seed, "recipe": recipe}
+        if self.start is not None:
+            return plain(found | {"start": self._start_digest})
+        return plain(found | {"condition": self.condition, "plans": self.own_plans(plans).fingerprint})
+
+
+def _load_start(run: OnlineRun, plans: Plans, out: Path, progress: bool) -> Policy:
+    """The policy that a run begins with: the one given, or the one cloned, which is kept for all methods."""
+    if run.start is not None:
+        policy = load_actor(run.start)
+        if run.task not in policy.tasks:
+            raise ValueError(f"start: the policy of {str(run.start)!r} does not know the task {run.task!r}")
+        return policy
+    folder, described = out / run.begin.folder, {"run": run.begin.describe(plans)}
+    folder.mkdir(parents=True, exist_ok=True)
+    file, checkpoint = folder / "policy.zip", folder / "checkpoint.zip"
+    with FileLock(folder / ".lock"):
+        if not file.is_file():
+            torch.manual_seed(run.seed)
+            actor = make_policy(run.condition, run.own_plans(plans), feature_noise=run.recipe.feature_noise)
+            replay = LanguageWorldExperienceReplay(
+                out / run.dataset.folder, label="executed", terminate_on_success=True, transform=actor.transform()
+            )
+            config = replace(run.recipe.cloning, seed=run.seed)
+            BehavioralCloningTrainer(actor, replay, config, checkpoint=checkpoint, progress=progress).train()
+            save_actor(actor, file, data=describe_data(replay), **described)
+        checkpoint.unlink(missing_ok=True)
+    check_description(file, described)
+    return load_actor(file)
+
+
+def _train(
+    run: OnlineRun, plans: Plans, out: Path, progress: bool, make_logger: Callable[[Path], Logger] | None
+) -> tuple[Policy, list[dict[str, float]]]:
+    """What a run makes of its start, kept in ``policy.zip``, and what became of each round."""
+    folder, described = out / run.folder, {"run": run.describe(plans)}
+    file, checkpoint = folder / "policy.zip", folder / "checkpoint.zip"
+    if not file.is_file():
+        actor = _load_start(run, plans, out, progress)
+        recipe, config = run.recipe, replace(run.recipe.config, seed=ONLINE_SEED + run.seed)
+        replay = LanguageWorldExperienceReplay(
+            out / run.dataset.folder,
+            label="executed",
+            reward=recipe.reward,
+            terminate_on_success=True,
+            n_steps=recipe.n_steps,
+            gamma=config.gamma,
+            grow=config.frames,
+            sampler=CoLearningSampler(GROWN),
+            transform=actor.transform(),
+        )
+        folder.mkdir(parents=True, exist_ok=True)
+        trainer = OnlineTrainer(
+            actor,
+            replay,
+            config,
+            method=run.method,
+            tasks=run.task,
+            checkpoint=checkpoint,
+            logger=None if make_logger is None else make_logger(file),
+            progress=progress,
+        )
+        trainer.train()
+        save_actor(trainer.policy, file, data=describe_data(replay), history=trainer.history, **described)
+    checkpoint.unlink(missing_ok=True)
+    check_description(file, described)
+    return load_actor(file), read_description(file)["history"]
+
+
+def execute_online(
+    run: OnlineRun,
+    plans: Plans,
+    out: Path,
+    *,
+    progress: bool = True,
+    make_logger: Callable[[Path], Logger] | None = None,
+) -> EvaluationResult:
+    """Do a run, or what is left of it; its result is written last, to ``out/run.folder/results.json``.
+
+    Args:
+        run: what to do.
+        plans: a plan for its task.
+        out: the experiments' folder.
+        progress: show progress bars.
+        make_logger: a TorchRL logger for a policy's file, for the training.
+
+    Returns:
+        The evaluation, action noise 0.1; ``config["run"]`` says what was done, ``config["history"]`` what became of
+        each round, and ``config["seconds"]`` how long this call took.
+
+    Raises:
+        ValueError: ``out`` holds the same run of another configuration; the start does not know the task.
+    """
+    if (done := load_result(run, plans, out)) is not None:
+        return done
+    started = time.perf_counter()
+    run.dataset.collect(out, progress)
+    more: dict[str, Any] = {"run": run.describe(plans)}
+    if run.method == START:
+        policy = _load_start(run, plans, out, progress)
+    else:
+        policy, more["history"] = _train(run, plans, out, progress, make_logger)
+    result = evaluate(
+        policy,
+        tasks=run.task,
+        episodes_per_task=run.episodes,
+        seed=EVALUATION_SEED + run.seed,
+        noise_scale=0.1,
+        stop_at_success=True,
+        progress=progress,
+    )
+    more["seconds"] = round(time.perf_counter() - started, 1)
+    result = replace(result, config=result.config | more)
+    result.save(out / run.folder / RESULTS)
+    return result
+
+
+def joined(results: Sequence[EvaluationResult]) -> EvaluationResult:
+    """One result of those of several tasks, evaluated alike."""
+    tasks = [task for one in results for task in one.config["tasks"]]
+    return EvaluationResult(results[0].config | {"tasks": tasks}, tuple(e for one in results for e in one.episodes))

@@ -1,0 +1,168 @@
+"""``lw-torchrl online``: weak starts, what methods make of them, a summary beside a figure; stopped, it carries on."""
+
+import json
+import signal
+import time
+from functools import partial
+
+import numpy as np
+import pytest
+from commands import fails, run
+
+import lw_torchrl as lw
+from lw_torchrl.experiments import online, runs
+
+TINY = """
+from functools import partial
+import lw_torchrl as lw
+from lw_torchrl.experiments import online, runs
+
+cloning = lw.BehavioralCloningConfig(steps=30, batch_size=20, checkpoint_every=10)
+config = lw.OnlineConfig(rows=4, round_steps=15, max_steps=12, batch_size=8, first_frames=20, warm_up=3, epochs=2)
+online.OnlineRecipe = partial(online.OnlineRecipe, cloning=cloning, config=config)
+online.evaluate = partial(lw.evaluate, max_steps=20)
+runs.collect_demonstrations = partial(lw.collect_demonstrations, max_steps=100)
+"""
+
+
+@pytest.fixture
+def tiny(monkeypatch):
+    """Few steps of everything."""
+    for module, name in ((online, "OnlineRecipe"), (online, "evaluate"), (runs, "collect_demonstrations")):
+        monkeypatch.setattr(module, name, getattr(module, name))  # to be put back
+    exec(TINY, {})
+
+
+def arguments(out, *more, methods=("td3", "expert-iteration"), seeds=(0,)):
+    given = ("--methods", *methods, "--seeds", *seeds, "--frames", 180, "--episodes", 2, "--out", out)
+    return ("online", "reach", *given, *more)
+
+
+def test_runs_and_their_summary(capsys, tmp_path, tiny, monkeypatch):
+    listed = run(capsys, *arguments(tmp_path, "--list", seeds=(0, 1))).split()
+    starts = [f"pcbc/reach/start/seed{seed}" for seed in (0, 1)]
+    methods = [f"pcbc/reach/{method}/seed{seed}" for seed in (0, 1) for method in ("td3", "expert-iteration")]
+    assert listed == [*starts, *methods]
+    assert not any(tmp_path.iterdir())
+
+    out = run(capsys, *arguments(tmp_path, "--run", "pcbc/reach/td3/seed1", "--logger", "csv", seeds=(0, 1)))
+    assert "pcbc/reach/td3/seed1: success 0." in out
+    folder = tmp_path / "pcbc" / "reach"
+    assert (folder / "start" / "seed1" / "policy.zip").is_file()
+    assert not (folder / "start" / "seed1" / "results.json").exists(), "the start is evaluated by its own run"
+    assert (folder / "td3" / "seed1" / "logs" / "policy" / "scalars" / "train" / "success.csv").is_file()
+    assert sorted(path.name for path in (folder / "td3" / "seed1").iterdir()) == ["logs", "policy.zip", "results.json"]
+    first = (folder / "td3" / "seed1" / "results.json").read_text()
+    config = json.loads(first)["config"]
+    assert (config["seed"], config["noise_scale"], config["tasks"]) == (10_001, 0.1, ["reach"])
+    assert [one["frames"] for one in config["history"]] == [60, 120, 180]
+    assert config["run"]["recipe"]["config"]["frames"] == 180
+    assert config["run"]["plans"] == lw.Plans([lw.load_plans("MT50")["reach"]]).fingerprint
+
+    out = run(capsys, *arguments(tmp_path, seeds=(0, 1)))
+    assert "[6/6] pcbc/reach/expert-iteration/seed1" in out
+    assert "| reach | 0." in out
+    assert "td3 - expert-iteration: " in out
+    assert "td3 - start: " in out
+    assert (folder / "td3" / "seed1" / "results.json").read_text() == first
+    summary = json.loads((tmp_path / "pcbc" / "summary.json").read_text())
+    assert list(summary["methods"]) == ["td3", "expert-iteration", "start"]
+    assert [step for step, _ in summary["curves"]["reach"]["td3"][1]] == [60, 120, 180]
+    assert (tmp_path / "pcbc" / "curves.png").read_bytes().startswith(b"\x89PNG")
+    assert "| reach | 0." in (tmp_path / "pcbc" / "summary.md").read_text()
+
+    monkeypatch.setattr(online, "evaluate", lambda *_, **__: pytest.fail("done twice"))
+    run(capsys, *arguments(tmp_path, seeds=(0, 1)))
+    message = fails(capsys, *arguments(tmp_path, "--demonstrations", 2))
+    assert "is of another configuration, it differs in recipe.demonstrations (1, now 2); choose another" in message
+
+
+@pytest.mark.parametrize("method", ["sac", "residual", "ppo"])
+def test_any_method_begins_with_a_policy_of_ones_own(capsys, tmp_path, tiny, method):
+    lw.save_actor(lw.DescriptorConditionedActor("MT10", width=16), tmp_path / "mine.zip")
+    out, given = tmp_path / "out", ("--start", tmp_path / "mine.zip")
+    printed = run(capsys, *arguments(out, *given, methods=[method]))
+    assert f"from-mine/reach/{method}/seed0" in printed
+    config = json.loads((out / "from-mine" / "reach" / method / "seed0" / "results.json").read_text())["config"]
+    assert len(config["run"]["start"]) == 64
+    assert "condition" not in config["run"]
+    kept = lw.load_actor(out / "from-mine" / "reach" / method / "seed0" / "policy.zip")
+    assert kept.tasks == lw.MT10
+    lw.save_actor(lw.DescriptorConditionedActor("MT10", width=16), tmp_path / "mine.zip")  # of other weights
+    assert "is of another configuration, it differs in start" in fails(
+        capsys, *arguments(out, *given, methods=[method])
+    )
+
+
+def test_a_start_may_be_conditioned_otherwise(capsys, tmp_path, tiny):
+    assert "one-hot/reach/td3/seed0: " in run(capsys, *arguments(tmp_path, "--condition", "one-hot", methods=["td3"]))
+    policy = lw.load_actor(tmp_path / "one-hot" / "reach" / "td3" / "seed0" / "policy.zip")
+    assert policy.config["condition"] == "one-hot"
+
+
+def test_what_it_refuses(capsys, tmp_path, tiny):
+    message = fails(capsys, *arguments(tmp_path, "--run", "pcbc/reach/tb3/seed0"))
+    assert "--run must be one of" in message
+    assert "did you mean 'pcbc/reach/td3/seed0'" in message
+    assert "--list names the runs" in fails(capsys, *arguments(tmp_path, "--list", "--run", "nope"))
+    assert "--jobs must be at least 1" in fails(capsys, *arguments(tmp_path, "--jobs", 0))
+    assert "--demonstrations must be at least 1" in fails(capsys, *arguments(tmp_path, "--demonstrations", 0))
+    assert "--frames must be a multiple of rows, 4, got 181" in fails(capsys, *arguments(tmp_path, "--frames", 181))
+    assert "--start: no file " in fails(capsys, *arguments(tmp_path, "--start", tmp_path / "nope.zip"))
+    assert "TASKS must be" in fails(capsys, "online", "raech", "--out", tmp_path)
+    (tmp_path / "push.plan").write_text(str(lw.load_plans("MT10")["push"]))
+    message = fails(capsys, *arguments(tmp_path, "--plans", tmp_path / "push.plan"))
+    assert "plans lack reach; they cover push" in message
+    lw.save_actor(lw.DescriptorConditionedActor("push", width=16), tmp_path / "push.zip")
+    message = fails(capsys, *arguments(tmp_path, "--start", tmp_path / "push.zip"))
+    assert "does not know the task 'reach'" in message
+    assert not (tmp_path / "pcbc").exists()
+
+
+def results(folder):
+    """Every results file but for the times."""
+    found = {}
+    for path in sorted(folder.rglob("results.json")):
+        result = json.loads(path.read_text())
+        del result["config"]["seconds"], result["origin"]["date"]
+        found[path.relative_to(folder).as_posix()] = result
+    return found, json.loads(next(folder.rglob("summary.json")).read_text())
+
+
+@pytest.mark.slow
+def test_killed_at_five_random_moments_it_ends_the_same(forks, tmp_path):
+    def start(out):
+        forks.start(*arguments(out), before=TINY)
+
+    def finish():
+        ended = forks.end()
+        assert ended.status == 0, ended.err[-2000:]
+
+    started = time.perf_counter()
+    start(tmp_path / "whole")
+    finish()
+    work = time.perf_counter() - started
+    killed = 0
+    for moment in np.random.default_rng(5).uniform(0.0, 0.4, 5):
+        start(tmp_path / "killed")
+        if forks.running(moment * work):
+            forks.send(signal.SIGKILL)
+        killed += forks.end().status == -signal.SIGKILL
+    assert killed >= 3
+    start(tmp_path / "killed")
+    finish()
+    assert results(tmp_path / "killed") == results(tmp_path / "whole")
+
+
+def test_a_run_killed_before_its_result_is_not_trained_again(tmp_path, tiny, monkeypatch):
+    plans = lw.load_plans("MT50")
+    recipe = online.OnlineRecipe()
+    one = online.OnlineRun("reach", "td3", 0, recipe, episodes=2)
+    one = online.replace(one, recipe=online.replace(recipe, config=online.replace(recipe.config, frames=60)))
+    monkeypatch.setattr(online, "evaluate", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        online.execute_online(one, plans, tmp_path, progress=False)
+    monkeypatch.setattr(online, "evaluate", partial(lw.evaluate, max_steps=20))
+    monkeypatch.setattr(online, "OnlineTrainer", lambda *_, **__: pytest.fail("trained again"))
+    found = online.execute_online(one, plans, tmp_path, progress=False)
+    assert [entry["frames"] for entry in found.config["history"]] == [60]
