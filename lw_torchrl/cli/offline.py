@@ -30,6 +30,7 @@ def offline(
     plans: tuple[str, ...] = ("MT10",),
     reward: Literal["sparse", "cost", "dense_cost"] | None = None,
     beta: float | None = None,
+    distance: Literal["l1", "l2"] | None = None,
     steps: int | None = None,
     episodes: int = 20,
     launcher: Literal["local", "ray"] = "local",
@@ -59,6 +60,7 @@ def offline(
         reward: what values are of, instead of the recipe's: sparse, the success; cost, of each step; dense_cost, what
             Meta-World's dense reward lacks.
         beta: how sharply advantages weigh, instead of the recipe's.
+        distance: between actions, in the methods that imitate, instead of the recipe's.
         steps: minibatches of each network, instead of the recipe's.
         episodes: evaluated for each task, on seeds that no data has, action noise 0.1.
         launcher: local, on this machine; ray, on a Ray cluster, or on all cores of this machine.
@@ -83,7 +85,7 @@ def offline(
         check_choice("mixtures", name, MIXTURES)
     for name in methods:
         check_choice("methods", name, OFFLINE_METHODS)
-    changed = {"reward": reward, "beta": beta, "steps": steps, "value_steps": steps}
+    changed = {"reward": reward, "beta": beta, "distance": distance, "steps": steps, "value_steps": steps}
     recipe = replace(OfflineRecipe(), **{name: value for name, value in changed.items() if value is not None})  # type: ignore[arg-type]
     tables = {
         name: [
@@ -120,7 +122,7 @@ def offline(
         else:
             given = ["offline", table, "--episodes", str(episodes), "--out", str(out), "--plans", *plans]
             given += ["--seeds", *map(str, seeds)]
-            for name, value in (("--reward", reward), ("--beta", beta), ("--steps", steps)):
+            for name, value in (("--reward", reward), ("--beta", beta), ("--distance", distance), ("--steps", steps)):
                 given += [] if value is None else [name, str(value)]
             for name, values in (("--mixtures", mixtures), ("--methods", methods)):
                 given += [name, *values] if values else []

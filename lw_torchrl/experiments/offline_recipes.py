@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
+from typing import Literal
 
+from lw_torchrl._checks import check_choice, check_int, check_probability, check_scale
 from lw_torchrl.data.filters import EpisodeFilter
-from lw_torchrl.data.rewards import RewardName
+from lw_torchrl.data.rewards import REWARDS, RewardName
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,8 @@ class OfflineRecipe:
         n_steps, gamma: of their targets.
         expectile: of the value.
         beta, max_weight: of the weights by advantage, as for :class:`AdvantageWeightedLoss`.
+        distance: to the action that is imitated, weighted or not. The median of what was done in a state ("l1") commits
+            itself where their mean would half open the gripper.
         temperature: of IQL's actor.
         alpha: of TD3+BC, the weight of the value beside the imitation.
         cql_weight: of CQL's penalty.
@@ -70,6 +74,7 @@ class OfflineRecipe:
     expectile: float = 0.7
     beta: float = 2.0
     max_weight: float = 20.0
+    distance: Literal["l1", "l2"] = "l1"
     temperature: float = 3.0
     alpha: float = 2.5
     cql_weight: float = 1.0
@@ -81,3 +86,13 @@ class OfflineRecipe:
     depth: int = 3
     critic_depth: int = 2
     feature_noise: float = 0.05
+
+    def __post_init__(self) -> None:
+        check_choice("reward", self.reward, REWARDS)
+        check_choice("distance", self.distance, ("l1", "l2"))
+        for name in ("expectile", "gamma"):
+            check_probability(name, getattr(self, name))
+        for name in ("beta", "max_weight", "temperature", "alpha", "cql_weight", "feature_noise"):
+            check_scale(name, getattr(self, name))
+        for name in ("n_steps", "cql_samples", "steps", "value_steps", "batch_size", "width", "depth", "critic_depth"):
+            check_int(name, getattr(self, name), minimum=1)

@@ -55,13 +55,14 @@ def _q(run: OfflineRun, plans: Plans) -> QValue:
 
 
 def _advantage(actor: Policy, run: OfflineRun, plans: Plans) -> LossModule:
-    return AdvantageWeightedLoss(actor, beta=run.recipe.beta, max_weight=run.recipe.max_weight)
+    recipe = run.recipe
+    return AdvantageWeightedLoss(actor, beta=recipe.beta, max_weight=recipe.max_weight, loss_function=recipe.distance)
 
 
 def _bc(actor: Policy, run: OfflineRun, plans: Plans) -> LossModule:
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*target_actor_network_params.*")
-        return BCLoss(actor, loss_function="l2")
+        return BCLoss(actor, loss_function=run.recipe.distance)
 
 
 def _iql(actor: Policy, run: OfflineRun, plans: Plans) -> LossModule:

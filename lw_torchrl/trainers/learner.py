@@ -20,8 +20,8 @@ from lw_torchrl.modules.encoder import Encoder
 from lw_torchrl.modules.plan_encoder import PlanEncoder
 from lw_torchrl.modules.policy import Policy
 from lw_torchrl.modules.residual_actor import ResidualActor
+from lw_torchrl.trainers.loss_state import load_tensors, tensors_of
 from lw_torchrl.trainers.online_config import OnlineConfig
-from lw_torchrl.trainers.policy_checks import check_finite
 
 
 class Learner:
@@ -85,15 +85,11 @@ class Learner:
         loss.backward()
         self.optimizers[name].step()
 
-    def tensors(self) -> dict[str, Tensor]:
-        """All parameters and buffers of the loss, by name."""
-        return {**dict(self.loss.named_parameters()), **dict(self.loss.named_buffers())}
-
     def state_dict(self) -> dict[str, Any]:
         """All that learning goes on from."""
         return {
             "made": self.made,
-            "tensors": {name: tensor.detach() for name, tensor in self.tensors().items()},
+            "tensors": {name: tensor.detach() for name, tensor in tensors_of(self.loss).items()},
             "optimizers": {name: one.state_dict() for name, one in self.optimizers.items()},
         }
 
@@ -108,12 +104,9 @@ class Learner:
         check_like({**state, "optimizers": None}, {**ours, "optimizers": None}, "learner")
         if not isinstance(state["optimizers"], Mapping) or set(state["optimizers"]) != set(self.optimizers):
             raise ValueError(f"optimizers must be {', '.join(self.optimizers)}")
-        live = self.tensors()
-        check_finite(state["tensors"], live)
         for name, optimizer in self.optimizers.items():
             check_optimizer_state(state["optimizers"][name], optimizer, state["made"])
-        for name, tensor in live.items():
-            tensor.copy_(state["tensors"][name])
+        load_tensors(self.loss, state["tensors"])
         for name, optimizer in self.optimizers.items():
             optimizer.load_state_dict(state["optimizers"][name])
         self.made = state["made"]
