@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from lw_torchrl.experiments.online import OnlineRun
     from lw_torchrl.language.plans import Plans
 
-OnlineMethod = Literal["td3", "sac", "residual", "ppo", "expert-iteration", "start"]
+OnlineMethod = Literal["advantage", "td3", "sac", "residual", "ppo", "expert-iteration", "start"]
 LoggerName = Literal["none", "csv", "tensorboard", "wandb"]
 
 

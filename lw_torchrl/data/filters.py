@@ -26,6 +26,8 @@ class EpisodeFilter:
         best: keep so large a part of each task's episodes, those of the highest return, the shorter where they tie;
             counted among those that the other conditions keep, and at least one.
         behaviours: keep those of these labels, "spoilt-30" say.
+        else_best: of a task of which the conditions leave nothing, keep so large a part of all its episodes, chosen as
+            for ``best``; None, for an error.
 
     Raises:
         ValueError, TypeError: a wrong value, by its name.
@@ -39,12 +41,14 @@ class EpisodeFilter:
     least_return: float | None = None
     best: float | None = None
     behaviours: tuple[str, ...] | None = None
+    else_best: float | None = None
 
     def __post_init__(self) -> None:
         if self.success is not None and not isinstance(self.success, bool):
             raise TypeError(f"keep: success must be True, False or None, got {self.success!r}")
-        if self.best is not None and not check_probability("keep: best", self.best):
-            raise ValueError("keep: best must be above 0, got 0")
+        for name in ("best", "else_best"):
+            if (part := getattr(self, name)) is not None and not check_probability(f"keep: {name}", part):
+                raise ValueError(f"keep: {name} must be above 0, got 0")
         least = self.least_return
         if least is not None and (isinstance(least, bool) or not isinstance(least, (int, float)) or least != least):
             raise ValueError(f"keep: least_return must be a number, got {least!r}")
@@ -74,29 +78,35 @@ class EpisodeFilter:
             (part, number, episode.task, float(earned), int(rows))
             for part, (described, found) in enumerate(zip(parts, returns, strict=True))
             for number, (episode, (earned, rows)) in enumerate(zip(described.episodes, found.tolist(), strict=True))
-            if self._keeps(described.config.behaviour, episode.success, earned)
         ]
-        if self.best is not None:
-            listed = [one for task in sorted({row[2] for row in listed}) for one in self._best(listed, task)]
-        kept = {(part, number) for part, number, *_ in listed}
-        if lost := sorted({e.task for part in parts for e in part.episodes} - {row[2] for row in listed}):
+        chosen = []
+        for task in sorted({row[2] for row in listed}):
+            ours = [row for row in listed if row[2] == task]
+            left = [row for row in ours if self._keeps(parts[row[0]], row[1], row[3])]
+            if not left and self.else_best is not None:
+                chosen += _best(ours, self.else_best)
+            else:
+                chosen += left if self.best is None else _best(left, self.best)
+        kept = {(part, number) for part, number, *_ in chosen}
+        if lost := sorted({row[2] for row in listed} - {row[2] for row in chosen}):
             raise ValueError(f"keep: {self} leaves no episode of {', '.join(lost)}")
         return [
             replace(part, episodes=tuple(e for number, e in enumerate(part.episodes) if (place, number) in kept))
             for place, part in enumerate(parts)
         ]
 
-    def _keeps(self, behaviour: str, success: bool, earned: float) -> bool:
+    def _keeps(self, part: Demonstrations, number: int, earned: float) -> bool:
         return (
-            (self.success is None or success is self.success)
+            (self.success is None or part.episodes[number].success is self.success)
             and (self.least_return is None or earned >= self.least_return)
-            and (self.behaviours is None or behaviour in self.behaviours)
+            and (self.behaviours is None or part.config.behaviour in self.behaviours)
         )
 
-    def _best(self, listed: list[_Listed], task: str) -> list[_Listed]:
-        assert self.best is not None
-        ours = sorted((row for row in listed if row[2] == task), key=lambda row: (-row[3], row[4], row[0], row[1]))
-        return ours[: max(1, round(self.best * len(ours)))]
+
+def _best(listed: list[_Listed], part: float) -> list[_Listed]:
+    """So large a part of a task's episodes, the highest returns and then the shortest first; one at least of any."""
+    ours = sorted(listed, key=lambda row: (-row[3], row[4], row[0], row[1]))
+    return ours[: max(1, round(part * len(ours)))]
 
 
 def episode_returns(reward: Tensor, lengths: Sequence[int]) -> Tensor:

@@ -34,7 +34,7 @@ OFFLINE_METHODS: Mapping[str, OfflineMethod] = MappingProxyType(
         method.name: method
         for method in (
             OfflineMethod("advantage", "advantage", critic=True),
-            OfflineMethod("filtered-bc", "bc", EpisodeFilter(success=True)),
+            OfflineMethod("filtered-bc", "bc", EpisodeFilter(success=True, else_best=0.2)),
             OfflineMethod("best-bc", "bc", EpisodeFilter(best=0.2)),
             OfflineMethod("bc", "bc"),
             OfflineMethod("iql", "iql", critic=True),
@@ -43,8 +43,9 @@ OFFLINE_METHODS: Mapping[str, OfflineMethod] = MappingProxyType(
         )
     }
 )
-"""By name: imitation weighted by the advantages of a value learned before; behavioral cloning of the successes, of the
-fifth of each task's episodes with the highest return, of all; and TorchRL's IQL, TD3+BC and CQL."""
+"""By name: imitation weighted by the advantages of a value learned before; behavioral cloning of the successes (of a
+task without any, of what the next one takes), of the fifth of each task's episodes with the highest return, and of all;
+and TorchRL's IQL, TD3+BC and CQL."""
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,8 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.data import TensorDictReplayBuffer
-from torchrl.objectives import LossModule
 
 from lw_torchrl._state_tree import check_like, check_optimizer_state
 from lw_torchrl.modules.action_head import DistributionName
@@ -43,7 +42,7 @@ class Learner:
         mean: of what was told since the last round, by name.
     """
 
-    loss: LossModule
+    loss: nn.Module
     noisy = True
     wants_round = False
 

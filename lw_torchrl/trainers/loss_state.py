@@ -42,13 +42,13 @@ def trained_parameters(loss: LossModule) -> tuple[list[Tensor], list[Tensor]]:
     return actor, others
 
 
-def tensors_of(loss: LossModule) -> dict[str, Tensor]:
+def tensors_of(loss: nn.Module) -> dict[str, Tensor]:
     """All parameters and buffers of a loss by name, targets and statistics among them."""
     return {**dict(loss.named_parameters()), **dict(loss.named_buffers())}
 
 
 @torch.no_grad()
-def load_tensors(loss: LossModule, found: Mapping[str, Tensor]) -> None:
+def load_tensors(loss: nn.Module, found: Mapping[str, Tensor]) -> None:
     """Give a loss the tensors that :func:`tensors_of` gave, in place.
 
     Raises:

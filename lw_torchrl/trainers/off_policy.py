@@ -20,6 +20,8 @@ from lw_torchrl.trainers.online_config import OnlineConfig
 class TD3Learner(Learner):
     """TD3 with as many demonstrations as rows that came, and imitation of the former."""
 
+    loss: DemonstratedTD3Loss
+
     def __init__(
         self, start: Policy, replay: TensorDictReplayBuffer, config: OnlineConfig, critic: QValue | None = None
     ) -> None:

@@ -26,6 +26,7 @@ from lw_torchrl.language.tasks import Task, named_tasks
 from lw_torchrl.modules.critics import QValue
 from lw_torchrl.modules.networks import ACTION_SIZE
 from lw_torchrl.modules.policy import Policy
+from lw_torchrl.trainers.advantage_learner import AdvantageLearner
 from lw_torchrl.trainers.checkpoint import describe_data, describe_replay, write
 from lw_torchrl.trainers.expert_iteration import ExpertIterationLearner
 from lw_torchrl.trainers.first_episodes import FirstEpisodes
@@ -39,6 +40,7 @@ from lw_torchrl.trainers.policy_checks import check_can_be_saved, check_trained
 from lw_torchrl.trainers.training_state import check_description, load_training, misfit
 
 LEARNERS: dict[str, type[Learner]] = {
+    "advantage": AdvantageLearner,
     "td3": TD3Learner,
     "sac": SACLearner,
     "residual": ResidualLearner,

@@ -21,9 +21,11 @@ class OnlineConfig:
         first_frames: steps of the environment before the first gradient step.
         warm_up: gradient steps in which the critics alone are trained.
         actor_learning_rate, critic_learning_rate: of AdamW.
-        cloning_learning_rate: of AdamW, of "expert-iteration".
+        cloning_learning_rate: of AdamW, of the actors of "advantage" and "expert-iteration".
         gamma: the discount; that of the buffer.
         target_eps: how much of the target networks stays, in each gradient step.
+        expectile: of the value, of "advantage".
+        beta: how sharply advantages weigh, of "advantage".
         policy_delay: gradient steps of the critics for one of the actor, of "td3" and "residual".
         policy_noise, noise_clip: of the targets' actions, of "td3" and "residual".
         bc_weight: of the imitation of demonstrations.
@@ -50,6 +52,8 @@ class OnlineConfig:
     cloning_learning_rate: float = 3e-4
     gamma: float = 0.99
     target_eps: float = 0.995
+    expectile: float = 0.7
+    beta: float = 2.0
     policy_delay: int = 2
     policy_noise: float = 0.1
     noise_clip: float = 0.3
@@ -84,6 +88,7 @@ class OnlineConfig:
             "actor_learning_rate",
             "critic_learning_rate",
             "cloning_learning_rate",
+            "beta",
             "policy_noise",
             "noise_clip",
             "bc_weight",
@@ -95,7 +100,7 @@ class OnlineConfig:
             "residual_scale",
         ):
             check_scale(name, getattr(self, name))
-        for name in ("gamma", "target_eps", "gae_lambda"):
+        for name in ("gamma", "target_eps", "expectile", "gae_lambda"):
             check_probability(name, getattr(self, name))
         check_int("seed", self.seed)
         if self.frames % self.rows:

@@ -52,15 +52,17 @@ filters = st.builds(
     least_return=st.sampled_from([None, -5, 0.0, 0.5]),
     best=st.sampled_from([None, 0.01, 0.25, 0.5, 1.0]),
     behaviours=st.sampled_from([None, ("expert",), ("expert", "random"), ("wrong",)]),
+    else_best=st.sampled_from([None, 0.3, 1.0]),
 )
 
 
-def oracle(parts, returns, success, least_return, best, behaviours):
+def oracle(parts, returns, success, least_return, best, behaviours, else_best):
     """The kept (part, number): written anew, by hand."""
-    kept = []
+    kept, everything = [], []
     for place, part in enumerate(parts):
         for number, episode in enumerate(part.episodes):
             earned, rows = returns[place][number].tolist()
+            everything.append((episode.task, -earned, rows, place, number))
             if success is not None and episode.success != success:
                 continue
             if least_return is not None and earned < least_return:
@@ -71,9 +73,12 @@ def oracle(parts, returns, success, least_return, best, behaviours):
     chosen = set()
     for task in TASKS:
         ours = sorted(row for row in kept if row[0] == task)
+        share = best
         if not ours:
-            return None
-        size = len(ours) if best is None else max(1, round(best * len(ours)))
+            if else_best is None:
+                return None
+            ours, share = sorted(row for row in everything if row[0] == task), else_best
+        size = len(ours) if share is None else max(1, round(share * len(ours)))
         chosen |= {row[3:] for row in ours[:size]}
     return chosen
 
