@@ -51,7 +51,7 @@ def test_it_learns_something_and_can_be_kept(demos, tmp_path, method):
     assert any(name.startswith("loss") for name in trainer.history[-1])
     trained = {name: p for name, p in trainer.policy.named_parameters() if p.requires_grad}
     assert any(not torch.equal(p, before.get(name, torch.zeros_like(p))) for name, p in trained.items())
-    in_place = method in ("td3", "expert-iteration")
+    in_place = method in ("advantage", "td3", "expert-iteration")
     assert (trainer.policy is actor) == in_place
     if not in_place:
         assert all(torch.equal(value, before[name]) for name, value in actor.state_dict().items())
@@ -269,7 +269,7 @@ def test_a_loss_that_is_no_number_is_told(demos):
 def test_what_cannot_be_trained_on_is_refused(demos):
     actor, push = make_actor(), PLANS["push"]
     other = lw.Plans([*(PLANS[task] for task in PLANS if task != "push"), replace(push, steps=push.steps[:1])])
-    with pytest.raises(ValueError, match=r"method must be one of 'td3', .* did you mean 'td3'"):
+    with pytest.raises(ValueError, match=r"method must be one of 'advantage', 'td3', .* did you mean 'td3'"):
         make_online(demos, "td4")
     plain = lw.LanguageWorldExperienceReplay(demos, transform=actor.transform())
     with pytest.raises(ValueError, match=r"replay must be .* that grows: give it grow="):
