@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from functools import partial
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -112,6 +113,7 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         demonstrations: the dataset's description; a :class:`JoinedDemonstrations` where folders are joined or
             episodes chosen.
         roots: the folders.
+        columns: of :meth:`add_column`, the name to a digest of the values.
         behaviours: the labels of who acted, sorted.
 
     Raises:
@@ -231,6 +233,7 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
             kwargs.setdefault("collate_fn", _as_it_is)
         writer: Writer = ImmutableDatasetWriter() if grow is None else GrowingWriter()
         self.root = self.roots[0]
+        self.n_steps, self.gamma, self.columns = n_steps, gamma, dict[str, str]()
         self.label, self.reward, self.terminate_on_success = label, reward, terminate_on_success
         self._grows = grow is not None
         super().__init__(
@@ -312,6 +315,7 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
             raise ValueError(f"add_column: {name!r} would be of no row that comes later, and this buffer grows")
         check_column(name, values, len(self), self.storage.get(slice(0, 1)).keys(), self.transform)
         own = values.detach().clone()
+        self.columns = {**self.columns, name: sha256(own.cpu().contiguous().numpy().tobytes()).hexdigest()}
         if isinstance(self.storage, TensorStorage):
             rows = self.storage._storage.clone(recurse=False)  # replay[:] is the one before, not a copy
             self.storage._storage = rows.set(name, own)

@@ -54,6 +54,14 @@ def describe_replay(replay: Any) -> dict[str, Any]:
     }
 
 
+def describe_learning(replay: Any) -> dict[str, Any]:
+    """As :func:`describe_replay`, for what learns from rewards too; of a buffer that is none of ours, no more."""
+    names = ("reward", "terminate_on_success", "n_steps", "gamma", "columns")
+    told = {name: getattr(replay, name) for name in names if hasattr(replay, name)}
+    grow = getattr(replay.storage, "grow", None)
+    return describe_replay(replay) | told | ({} if grow is None else {"grow": grow})
+
+
 def _describe_transform(transform: Transform) -> dict[str, str]:
     options = {name: value for name, value in vars(transform).items() if name[0] != "_" and name != "training"}
     simple = {name: repr(value) for name, value in options.items() if isinstance(value, (bool, int, float, str))}

@@ -1,4 +1,4 @@
-"""The buffer of a training in an environment: what it must be, and what its batches hang on."""
+"""What the buffer of a training in an environment must be."""
 
 from __future__ import annotations
 
@@ -10,11 +10,6 @@ from lw_torchrl.data.replay import LanguageWorldExperienceReplay
 from lw_torchrl.modules.policy import Policy
 from lw_torchrl.trainers.minibatches import check_replay
 from lw_torchrl.trainers.online_config import OnlineConfig
-
-
-def describe_growing(replay: LanguageWorldExperienceReplay) -> dict[str, Any]:
-    storage = replay.storage
-    return {"reward": replay.reward, "grow": storage.grow, "n_steps": storage.n_steps, "gamma": storage.gamma}
 
 
 def check_growing_replay(actor: Policy, replay: Any, config: OnlineConfig) -> None:

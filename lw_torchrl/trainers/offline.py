@@ -19,7 +19,7 @@ from lw_torchrl._checks import check_choice, check_int, check_probability, check
 from lw_torchrl._devices import CPU, drawn_on
 from lw_torchrl._files import sweep
 from lw_torchrl._progress import Progress
-from lw_torchrl.trainers.checkpoint import describe_data, describe_replay
+from lw_torchrl.trainers.checkpoint import describe_data, describe_learning
 from lw_torchrl.trainers.interrupts import interrupts_between_steps
 from lw_torchrl.trainers.loss_state import (
     describe_loss,
@@ -158,7 +158,7 @@ class OfflineTrainer:
                 "loss": describe_loss(loss),
                 "training": asdict(config),
                 "data": describe_data(replay),
-                "replay": describe_replay(replay),
+                "replay": describe_learning(replay),
             }
         if config.normalize:
             fit_normalization(loss, replay)

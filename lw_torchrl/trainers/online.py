@@ -27,10 +27,10 @@ from lw_torchrl.modules.critics import QValue
 from lw_torchrl.modules.networks import ACTION_SIZE
 from lw_torchrl.modules.policy import Policy
 from lw_torchrl.trainers.advantage_learner import AdvantageLearner
-from lw_torchrl.trainers.checkpoint import describe_data, describe_replay, write
+from lw_torchrl.trainers.checkpoint import describe_data, describe_learning, write
 from lw_torchrl.trainers.expert_iteration import ExpertIterationLearner
 from lw_torchrl.trainers.first_episodes import FirstEpisodes
-from lw_torchrl.trainers.growing_replay import check_growing_replay, describe_growing
+from lw_torchrl.trainers.growing_replay import check_growing_replay
 from lw_torchrl.trainers.interrupts import Interrupt, interrupts_between_steps
 from lw_torchrl.trainers.learner import Learner
 from lw_torchrl.trainers.off_policy import ResidualLearner, SACLearner, TD3Learner
@@ -154,7 +154,7 @@ class OnlineTrainer:
                 "critic": {} if critic is None else {"weights": _fingerprint(critic)},
                 "online": {"method": method, "tasks": list(named_tasks(self.tasks)), **asdict(config)},
                 "data": describe_data(replay),
-                "replay": describe_replay(replay) | describe_growing(replay),
+                "replay": describe_learning(replay),
             }
             if self.checkpoint.exists():
                 check_description(self.checkpoint, self._described)

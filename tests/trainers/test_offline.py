@@ -27,17 +27,17 @@ def demos(tmp_path_factory):
     return collect_demos(tmp_path_factory.mktemp("offline") / "demos")
 
 
-def make_replay(demos, plans=PLANS, sampler=None, **options):
+def make_replay(demos, plans=PLANS, sampler=None, n_steps=3, advantage=1.0, **options):
     replay = lw.LanguageWorldExperienceReplay(
         demos,
         label="executed",
-        n_steps=3,
+        n_steps=n_steps,
         gamma=GAMMA,
         sampler=sampler or lw.TaskBalancedSampler(),
         transform=lw.QAFTransform(plans),
         **options,
     )
-    replay.add_column("advantage", torch.linspace(-1, 1, len(replay)).unsqueeze(-1))
+    replay.add_column("advantage", torch.linspace(-1, advantage, len(replay)).unsqueeze(-1))
     return replay
 
 
@@ -228,6 +228,10 @@ def checkpoint(demos, tmp_path_factory):
         (dict(width=8), "shapes.value_network_params.heads.0.0.bias"),
         (dict(sampler=RandomSampler()), "its replay differs in sampler"),
         (dict(episodes=1), "of another configuration"),
+        (dict(reward="cost"), r"its replay differs in reward \('sparse', now 'cost'\)"),
+        (dict(n_steps=2), r"its replay differs in n_steps \(3, now 2\)"),
+        (dict(terminate_on_success=True), "its replay differs in .*terminate_on_success"),
+        (dict(advantage=0.5), "its replay differs in columns.advantage"),
     ],
 )
 def test_a_checkpoint_of_another_training_is_refused(demos, checkpoint, change, message):
@@ -239,7 +243,8 @@ def test_a_checkpoint_of_another_training_is_refused(demos, checkpoint, change, 
         )
         loss = lw.ExpectileValueLoss(value, expectile=change.get("expectile", 0.7))
         loss.make_value_estimator(gamma=change.get("gamma", GAMMA))
-    options = {name: change[name] for name in ("sampler", "episodes") if name in change}
+    shown = ("sampler", "episodes", "reward", "n_steps", "terminate_on_success", "advantage")
+    options = {name: change[name] for name in shown if name in change}
     with pytest.raises(ValueError, match=message):
         OfflineTrainer(
             loss, make_replay(demos, **options), change.get("config", CONFIG), checkpoint=checkpoint, progress=False
