@@ -59,6 +59,10 @@ class Learner:
         """Write ``action`` (N, 4) float32, without the noise."""
         return self.policy(state)
 
+    def noise_weight(self, state: TensorDictBase) -> Tensor | float:
+        """What the noise on the actions of :meth:`act` is multiplied by, (N, 1) float32 or one number for all."""
+        return 1.0
+
     def observe(self, rows: TensorDictBase) -> None:
         """Take rows (N, T) that came, time last."""
 
