@@ -72,7 +72,7 @@ def online(
         check_folder("--out", out)
     elif run is not None:
         raise ValueError("--list names the runs and does none, --run does one: give one of them")
-    from lw_torchrl._checks import check_choice, check_int
+    from lw_torchrl._checks import check_choice, check_int, counted
     from lw_torchrl.cli.threads import use_one_thread
     from lw_torchrl.experiments.online import START, OnlineRecipe, OnlineRun
     from lw_torchrl.language.tasks import TASKS
@@ -99,6 +99,10 @@ def online(
     found = read_plans(plans, TASKS)
     if missing := [one.task for one in runs if one.task not in found]:
         raise ValueError(f"--plans must have a plan for each task, they lack {missing[0]!r}")
+    if isinstance(tuned, int):
+        for one in runs if start is None else ():
+            if tuned >= (there := len(found[one.task].steps)):
+                raise ValueError(f"--step: the plan of {one.task!r} has {counted(there, 'step')}, got {step}")
     use_one_thread()
     if run is not None:
         print(_done(named[check_choice("run", run, named)], found, out, logger))
@@ -129,12 +133,13 @@ def _done(one: OnlineRun, plans: Plans, out: Path, logger: LoggerName) -> str:
 
 def _read_step(given: str) -> int | str:
     """A step's number, counted from 0, or the word for the weakest."""
+    from lw_torchrl._checks import shown
     from lw_torchrl.experiments.tuning import WEAKEST
 
     if given == WEAKEST:
         return given
     if not given.isascii() or not given.isdigit() or not 1 <= len(given) <= 4 or int(given) < 1:
-        raise ValueError(f"--step must be the number of a step, from 1, or {WEAKEST}, got {given!r}")
+        raise ValueError(f"--step must be the number of a step, from 1, or {WEAKEST}, got {shown(given)}")
     return int(given) - 1
 
 

@@ -36,29 +36,33 @@ def tune_step(
         TypeError: the policy is not conditioned on plans.
     """
     told: dict[str, Any] = {}
-    if not isinstance(step, str):
-        number = step
-    else:
+    if isinstance(step, str):
         check_choice("step", step, (WEAKEST,))
-        if start.plans is None:
-            raise TypeError(f"step: {type(start).__name__} is not conditioned on plans, whose steps can be tuned")
-        use = PlanUse(start.plans)
-        evaluate(
-            start,
-            tasks=task,
-            episodes_per_task=_EPISODES,
-            seed=seed,
-            stop_at_success=True,
-            progress=progress,
-            also_record=["qaf", "skill_weights"],
-            on_episode=use,
-        )
-        number = weakest_step(use, task).step
+        use = _watch(start, task, seed, progress)
+        step = weakest_step(use, task).step
         told["stuck"] = [asdict(found) for found in stuck_steps(use)]
-    actor = ResidualActor(start, scale=scale, steps={task: [number]})
+    actor = ResidualActor(start, scale=scale, steps={task: [step]})
     assert actor.plans is not None
-    chosen = actor.plans[task].steps[number]
-    return actor, {"step": number, "condition": str(chosen.condition), "skill": chosen.skill, **told}
+    chosen = actor.plans[task].steps[step]
+    return actor, {"step": step, "condition": str(chosen.condition), "skill": chosen.skill, **told}
+
+
+def _watch(start: Policy, task: str, seed: int, progress: bool) -> PlanUse:
+    """How a policy's plan is used in episodes of a task."""
+    if start.plans is None:
+        raise TypeError(f"step: {type(start).__name__} is not conditioned on plans, whose steps can be tuned")
+    use = PlanUse(start.plans)
+    evaluate(
+        start,
+        tasks=task,
+        episodes_per_task=_EPISODES,
+        seed=seed,
+        stop_at_success=True,
+        progress=progress,
+        also_record=["qaf", "skill_weights"],
+        on_episode=use,
+    )
+    return use
 
 
 class Elsewhere:
