@@ -54,10 +54,13 @@ if TYPE_CHECKING:  # the table below, for type checkers and editors
     from lw_torchrl.objectives import DemonstratedSACLoss as DemonstratedSACLoss
     from lw_torchrl.objectives import DemonstratedTD3Loss as DemonstratedTD3Loss
     from lw_torchrl.objectives import ExpectileValueLoss as ExpectileValueLoss
+    from lw_torchrl.objectives import SkillLatentLoss as SkillLatentLoss
     from lw_torchrl.objectives import standardize_by_task as standardize_by_task
     from lw_torchrl.record import RerunLogger as RerunLogger
     from lw_torchrl.trainers import BehavioralCloningConfig as BehavioralCloningConfig
     from lw_torchrl.trainers import BehavioralCloningTrainer as BehavioralCloningTrainer
+    from lw_torchrl.trainers import OfflineConfig as OfflineConfig
+    from lw_torchrl.trainers import OfflineTrainer as OfflineTrainer
     from lw_torchrl.trainers import OnlineConfig as OnlineConfig
     from lw_torchrl.trainers import OnlineTrainer as OnlineTrainer
     from lw_torchrl.trainers import StackedBehavioralCloning as StackedBehavioralCloning
@@ -85,9 +88,10 @@ _NAMES = {
     "lw_torchrl.modules": "ActorEnsemble DescriptorConditionedActor PlanConditionedActor PlanConditionedQValue "
     "PlanConditionedValue Policy QueryEvaluator ResidualActor ScriptedSkillActor plan_actor_value",
     "lw_torchrl.objectives": "AdvantageWeightedLoss DemonstratedSACLoss DemonstratedTD3Loss ExpectileValueLoss "
-    "standardize_by_task",
+    "SkillLatentLoss standardize_by_task",
     "lw_torchrl.record": "RerunLogger",
-    "lw_torchrl.trainers": "BehavioralCloningConfig BehavioralCloningTrainer OnlineConfig OnlineTrainer "
+    "lw_torchrl.trainers": "BehavioralCloningConfig BehavioralCloningTrainer OfflineConfig OfflineTrainer OnlineConfig "
+    "OnlineTrainer "
     "StackedBehavioralCloning load_actor save_actor",
     "lw_torchrl.transforms": "EnvState QAFTransform RandomYaw",
 }

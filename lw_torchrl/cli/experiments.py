@@ -11,7 +11,7 @@ from tyro.conf import Positional
 
 from lw_torchrl.cli.outputs import check_folder
 from lw_torchrl.cli.sources import read_encoder, read_plans, read_tasks
-from lw_torchrl.cli.units import report, run_there
+from lw_torchrl.cli.units import elsewhere, report
 
 if TYPE_CHECKING:
     from lw_torchrl.experiments.runs import Run
@@ -132,7 +132,7 @@ def reproduce(
             given += [] if text_encoder is None else ["--text-encoder", text_encoder]
             given += [] if task_file is None else ["--task-file", str(task_file)]
             for stage in (datasets, named):
-                report(len(stage), run_there("reproduce", [*stage], given, launcher, jobs))
+                report(len(stage), elsewhere(stage, ["reproduce", *given], launcher, jobs))
         _summarize(runs, load, out)
 
 

@@ -18,6 +18,7 @@ from lw_torchrl.cli import language as cli_language
 from lw_torchrl.cli import policies, show
 from lw_torchrl.cli.check import check
 from lw_torchrl.cli.errors import in_its_words
+from lw_torchrl.cli.offline import offline
 from lw_torchrl.cli.online import online
 from lw_torchrl.cli.scripted import scripted
 from lw_torchrl.cli.streams import check_arguments, complain, nobody_reads, sound_streams
@@ -36,11 +37,12 @@ COMMANDS: dict[str, Any] = {
     "plans": cli_language.plans,
     "check": check,
     "reproduce": cli_experiments.reproduce,
+    "offline": offline,
     "online": online,
 }
 
 
-RESUMABLE = ("demo", "collect", "train", "reproduce", "online")
+RESUMABLE = ("demo", "collect", "train", "reproduce", "offline", "online")
 
 
 def main(args: Sequence[str] | None = None) -> None:

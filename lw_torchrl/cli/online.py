@@ -10,7 +10,7 @@ from tyro.conf import Positional
 
 from lw_torchrl.cli.outputs import check_folder
 from lw_torchrl.cli.sources import make_logger, one_or_many, read_plans, simulated
-from lw_torchrl.cli.units import report, run_there
+from lw_torchrl.cli.units import elsewhere, report
 
 if TYPE_CHECKING:
     from lw_torchrl.experiments.online import OnlineRun
@@ -85,11 +85,12 @@ def online(
         raise ValueError(f"--step is of the method residual, --methods are {', '.join(methods)}")
     recipe = OnlineRecipe(demonstrations=demonstrations)
     recipe = replace(recipe, config=replace(recipe.config, frames=frames))
+    chosen = simulated("tasks", one_or_many(tasks), TASKS)
     runs = [
         OnlineRun(task, method, seed, recipe, condition, start, episodes, step=tuned if method == "residual" else None)
         for stage in ((START,), tuple(method for method in dict.fromkeys(methods) if method != START))
         for seed in seeds
-        for task in simulated("tasks", one_or_many(tasks), TASKS)
+        for task in chosen
         for method in stage
     ]
     named = {str(one.folder): one for one in runs}
@@ -97,12 +98,11 @@ def online(
         print("\n".join(named))
         return
     found = read_plans(plans, TASKS)
-    if missing := [one.task for one in runs if one.task not in found]:
-        raise ValueError(f"--plans must have a plan for each task, they lack {missing[0]!r}")
-    if isinstance(tuned, int):
-        for one in runs if start is None else ():
-            if tuned >= (there := len(found[one.task].steps)):
-                raise ValueError(f"--step: the plan of {one.task!r} has {counted(there, 'step')}, got {step}")
+    found.require(chosen)
+    if isinstance(tuned, int) and start is None:
+        for task in chosen:
+            if tuned >= (there := len(found[task].steps)):
+                raise ValueError(f"--step: the plan of {task!r} has {counted(there, 'step')}, got {step}")
     use_one_thread()
     if run is not None:
         print(_done(named[check_choice("run", run, named)], found, out, logger))
@@ -110,14 +110,23 @@ def online(
         if launcher == "local" and jobs == 1:
             report(len(runs), (_done(one, found, out, logger) for one in runs))
         else:
-            given = [*tasks, "--frames", str(frames), "--demonstrations", str(demonstrations), "--out", str(out)]
+            given = [
+                "online",
+                *tasks,
+                "--frames",
+                str(frames),
+                "--demonstrations",
+                str(demonstrations),
+                "--out",
+                str(out),
+            ]
             given += ["--seeds", *map(str, seeds), "--methods", *methods, "--plans", *plans]
             given += ["--condition", condition, "--episodes", str(episodes), "--logger", logger]
             given += [] if start is None else ["--start", str(start)]
             given += [] if step is None else ["--step", step]
             for first in (True, False):
                 stage = [name for name, one in named.items() if (one.method == START) == first]
-                report(len(stage), run_there("online", stage, given, launcher, jobs))
+                report(len(stage), elsewhere(stage, given, launcher, jobs))
         _summarize(runs, found, out)
 
 

@@ -80,6 +80,7 @@ def train(
     batch_size: int = 500,
     learning_rate: float = 1e-3,
     after_success: int | None = 20,
+    latent_consistency: float = 0.0,
     seed: int = 0,
     logger: Literal["csv", "tensorboard", "wandb"] | None = None,
     device: str = "cpu",
@@ -106,6 +107,7 @@ def train(
         batch_size: rows of a minibatch, equally many of each task.
         learning_rate: at the start; a cosine brings it to 0.
         after_success: leave out steps so long after an episode's first success; None keeps all.
+        latent_consistency: weight of a term that keeps skills near whose texts are near; of a policy with plans.
         seed: of the initial weights and the minibatches.
         logger: also write loss and learning rate there, below logs/ beside the policy.
         device: where the networks work: cpu; cuda, or cuda:1 for the second of several; mps, a Mac's; or auto, the GPU
@@ -129,9 +131,17 @@ def train(
     reads_plans = policy_class(METHODS[check_choice("method", method, METHODS)].policy).plan_options
     if mix is not None and not reads_plans:
         raise ValueError(f"--mix is for a method that reads plans, --method {method} does not")
+    if latent_consistency and not reads_plans:
+        raise ValueError(f"--latent-consistency is for a method that reads plans, --method {method} does not")
     if reads_plans:
         options["mix"] = mix or "latents"
-    config = lw.BehavioralCloningConfig(steps=steps, batch_size=batch_size, learning_rate=learning_rate, seed=seed)
+    config = lw.BehavioralCloningConfig(
+        steps=steps,
+        batch_size=batch_size,
+        learning_rate=learning_rate,
+        latent_consistency=latent_consistency,
+        seed=seed,
+    )
     replay = lw.LanguageWorldExperienceReplay(
         data,
         episodes=_all_of(data, lw.resolve_tasks(one_or_many(tasks), tasks=known)) if tasks else None,

@@ -170,6 +170,8 @@ class CoLearningSampler(GroupSampler):
         sizes = label[label >= 0].bincount()
         share = torch.full((len(sizes),), (1 - mine) / (len(sizes) - 1))
         share[0] = mine
+        if isinstance(storage, GrowingStorage) and not storage.num_grown:  # demonstrations are all there is
+            share[1:] /= 1 - mine
         return torch.where(label >= 0, (share / sizes)[label.clamp(min=0)], 0.0)
 
     def _shares(self, batch_size: int) -> Tensor:

@@ -4,6 +4,7 @@ import lw_torchrl._torchrl  # noqa: F401
 from lw_torchrl.evaluation.comparison import MethodComparison, Pair
 from lw_torchrl.evaluation.figures import plot_sorted_tasks, plot_success
 from lw_torchrl.evaluation.learning_curves import plot_learning_curves
+from lw_torchrl.evaluation.method_figure import plot_methods
 from lw_torchrl.evaluation.plan_use import PlanUse
 from lw_torchrl.evaluation.protocol import evaluate
 from lw_torchrl.evaluation.published import published, published_curves, published_plans
@@ -35,6 +36,7 @@ __all__ = [
     "mean_difference",
     "mean_rate",
     "plot_learning_curves",
+    "plot_methods",
     "plot_sorted_tasks",
     "plot_success",
     "probability_of_improvement",

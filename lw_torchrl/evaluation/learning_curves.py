@@ -70,13 +70,13 @@ def plot_learning_curves(
         if starts is not None and task in starts:
             axes.axhline(starts[task], color="#333333", linewidth=1.2, linestyle=":", label="start, evaluated")
         axes.set_title(task, fontsize=10)
+        axes.set_xlabel("thousand steps of the environment", fontsize=9)
         axes.set_ylim(-0.02, 1.02)
         axes.grid(axis="y", color="#dddddd", linewidth=0.6)
         axes.set_axisbelow(True)
         axes.spines[["top", "right"]].set_visible(False)
     for axes in panels[len(curves) :]:
         axes.set_visible(False)
-    figure.supxlabel("thousand steps of the environment", fontsize=10)
     figure.supylabel("success in training", fontsize=10)
     named: dict[str, Artist] = {}
     for axes in panels[: len(curves)]:

@@ -121,7 +121,7 @@ class Run:
                 "preset": self.preset.name,
                 "datasets": [asdict(dataset) for dataset in self.datasets],
                 "members": [{"actor": self.actor_options(one), "yaw": one.yaw} for one in self.preset.members],
-                "training": asdict(self.preset.training),
+                "training": self.preset.training.describe(),
                 "label": self.preset.label,
                 "after_success": self.preset.after_success,
                 "passes": self.preset.passes,

@@ -1,15 +1,17 @@
-"""Losses that TorchRL lacks, as TorchRL's are: a value by expectile regression, imitation by advantage, and TD3 and SAC
-that imitate demonstrations."""
+"""Losses that TorchRL lacks, as TorchRL's are: a value by expectile regression, imitation by advantage, TD3 and SAC
+that imitate demonstrations, and terms on skills' latents."""
 
 import lw_torchrl._torchrl  # noqa: F401
 from lw_torchrl.objectives.advantage_weighted import AdvantageWeightedLoss, standardize_by_task
 from lw_torchrl.objectives.demonstrated import DemonstratedSACLoss, DemonstratedTD3Loss
 from lw_torchrl.objectives.expectile_value import ExpectileValueLoss
+from lw_torchrl.objectives.skill_latents import SkillLatentLoss
 
 __all__ = [
     "AdvantageWeightedLoss",
     "DemonstratedSACLoss",
     "DemonstratedTD3Loss",
     "ExpectileValueLoss",
+    "SkillLatentLoss",
     "standardize_by_task",
 ]

@@ -26,6 +26,7 @@ def imitation(action: Tensor, demonstrated: Tensor, is_target: Tensor) -> Tensor
         is_target: (B,) or (B, 1) bool, false of demonstrations.
 
     Example:
+        >>> import torch
         >>> one, other = torch.zeros(4, 2), torch.tensor([[9.0, 9.0], [9.0, 9.0], [1.0, 1.0], [0.0, 2.0]])
         >>> imitation(one, other, torch.tensor([True, True, False, False])).mean()
         tensor(1.5000)

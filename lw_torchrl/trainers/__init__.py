@@ -1,10 +1,11 @@
-"""Training: behavioral cloning of one actor or of many at once, and the checkpoints that it leaves."""
+"""Training: behavioral cloning of one actor or of many at once, any loss over a buffer, and what they leave."""
 
 import lw_torchrl._torchrl  # noqa: F401
 from lw_torchrl.trainers.behavioral_cloning import BehavioralCloningTrainer
 from lw_torchrl.trainers.checkpoint import load_actor, save_actor
 from lw_torchrl.trainers.config import BehavioralCloningConfig
 from lw_torchrl.trainers.normalization import fit_normalization
+from lw_torchrl.trainers.offline import OfflineConfig, OfflineTrainer
 from lw_torchrl.trainers.online import LEARNERS, OnlineTrainer
 from lw_torchrl.trainers.online_config import OnlineConfig
 from lw_torchrl.trainers.stacked import StackedBehavioralCloning
@@ -13,6 +14,8 @@ __all__ = [
     "LEARNERS",
     "BehavioralCloningConfig",
     "BehavioralCloningTrainer",
+    "OfflineConfig",
+    "OfflineTrainer",
     "OnlineConfig",
     "OnlineTrainer",
     "StackedBehavioralCloning",

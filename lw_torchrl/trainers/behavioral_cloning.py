@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import warnings
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +22,7 @@ from lw_torchrl.modules.policy import Policy
 from lw_torchrl.trainers.checkpoint import describe_data, describe_replay, write
 from lw_torchrl.trainers.config import BehavioralCloningConfig, make_optimizer
 from lw_torchrl.trainers.interrupts import interrupts_between_steps
+from lw_torchrl.trainers.latent_terms import LatentTerms
 from lw_torchrl.trainers.minibatches import check_replay, draw_batch
 from lw_torchrl.trainers.normalization import fit_normalization
 from lw_torchrl.trainers.policy_checks import check_can_be_saved, check_trained
@@ -62,7 +62,8 @@ class BehavioralCloningTrainer:
 
     Raises:
         ValueError: the checkpoint is damaged, of another architecture, configuration or data; the actor writes no
-            ``action``; or, in :meth:`train`, the loss or the weights are no numbers.
+            ``action``, or has no plans and the configuration has a term on skills' latents; or, in :meth:`train`, the
+            loss or the weights are no numbers.
         TypeError: a checkpoint for an actor that is no :class:`Policy`.
         OSError: the checkpoint cannot be written; the earlier one stays.
 
@@ -97,11 +98,12 @@ class BehavioralCloningTrainer:
         self.config = config = config or BehavioralCloningConfig()
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
         check_replay(actor, replay, config.batch_size)
+        self._latent_terms = LatentTerms(actor, config)
         self._policy = None if self.checkpoint is None else check_can_be_saved(actor)
         self._described: dict[str, Any] = {}
         if self.checkpoint is not None and self._policy is not None:
             sweep(self.checkpoint)
-            self._described = {"actor": self._policy.describe(), "training": asdict(config)}
+            self._described = {"actor": self._policy.describe(), "training": config.describe()}
             self._described |= {"data": describe_data(replay), "replay": describe_replay(replay)}
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message=".*target_actor_network_params.*")
@@ -136,6 +138,8 @@ class BehavioralCloningTrainer:
             batch = draw_batch(self.replay, self.config.batch_size, self.device)
             loss = self.loss(batch)["loss_bc"]
             self.state.torch_generator = torch.get_rng_state()
+        if self._latent_terms.weights:
+            loss = loss + self._latent_terms()
         if self.device == CPU:
             self._losses.check(loss, self.state.step)
         self.optimizer.zero_grad()

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -11,6 +12,8 @@ from torch import Tensor
 from lw_torchrl._checks import check_choice, check_int, check_scale
 
 LOSSES = ("l1", "l2", "smooth_l1")
+_LATER = {"latent_consistency", "latent_contrast"}
+"""Options that files did not say at first: at 0, training is what it was before them."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +33,9 @@ class BehavioralCloningConfig:
         max_grad_norm: gradients are clipped to it.
         seed: of the minibatches, and of what the buffer's transforms and the actor draw while training.
         checkpoint_every: steps between checkpoints; the last step always makes one.
+        latent_consistency: weight of :class:`SkillLatentLoss` "consistency" in the loss, of a policy with plans: skills
+            whose texts are near stay near.
+        latent_contrast: weight of the "contrastive" one: different skills keep apart.
     """
 
     steps: int = 8000
@@ -44,16 +50,22 @@ class BehavioralCloningConfig:
     max_grad_norm: float = 1.0
     seed: int = 0
     checkpoint_every: int = 500
+    latent_consistency: float = 0.0
+    latent_contrast: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("steps", "batch_size", "checkpoint_every"):
             check_int(name, getattr(self, name), minimum=1)
-        for name in ("learning_rate", "weight_decay", "momentum", "max_grad_norm"):
+        for name in ("learning_rate", "weight_decay", "momentum", "max_grad_norm", *sorted(_LATER)):
             check_scale(name, getattr(self, name))
         check_int("seed", self.seed)
         check_choice("loss_function", self.loss_function, LOSSES)
         check_choice("optimizer", self.optimizer, ("adamw", "sgd"))
         check_choice("schedule", self.schedule, ("cosine", "constant"))
+
+    def describe(self) -> dict[str, Any]:
+        """What files say of it, as JSON: files from before an option hold what those with its default hold."""
+        return {name: value for name, value in asdict(self).items() if value or name not in _LATER}
 
 
 def make_optimizer(

@@ -316,7 +316,7 @@ class _Firsts:
 
     def result(self) -> dict[str, float]:
         ended = {"episodes": float(self._ended)}
-        return ended if self._success.isnan().any() else {"success": float(self._success.mean()), **ended}
+        return ended if self._success.isnan().any() else {"success": float(self._success.double().mean()), **ended}
 
 
 _MOST_EPISODES = 1_000_000

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Sequence
-from dataclasses import asdict
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ from lw_torchrl.modules.policy import Policy
 from lw_torchrl.trainers.checkpoint import describe_data, describe_replay, write
 from lw_torchrl.trainers.config import BehavioralCloningConfig, make_optimizer
 from lw_torchrl.trainers.interrupts import interrupts_between_steps
+from lw_torchrl.trainers.latent_terms import LatentTerms
 from lw_torchrl.trainers.minibatches import check_replay, draw_batch
 from lw_torchrl.trainers.normalization import fit_normalization
 from lw_torchrl.trainers.policy_checks import check_can_be_saved, check_trained
@@ -149,6 +149,8 @@ class StackedBehavioralCloning:
             raise ValueError(f"actors must be of one architecture ({error})") from error
         self._parameters = {name: nn.Parameter(value.detach()) for name, value in parameters.items()}
         shared = modules[0]
+        terms = LatentTerms(actors[0], config)
+        self._latent_terms = vmap(lambda p, b: functional_call(terms, (p, b), ())) if terms.weights else None
         self._act = vmap(lambda p, b, prepared: functional_call(shared, (p, b), prepared))
         self._buffers = buffers
         self.optimizer, self.schedule = make_optimizer(list(self._parameters.values()), config)
@@ -162,7 +164,7 @@ class StackedBehavioralCloning:
         return {
             "actor": self.actors[0].describe() | {"number": len(self.actors)},
             "actors": {str(number): _fingerprint(actor) for number, actor in enumerate(self.actors)},
-            "training": asdict(self.config),
+            "training": self.config.describe(),
             "data": {str(number): describe_data(replay) for number, replay in enumerate(self.replays)},
             "replay": {str(number): describe_replay(replay) for number, replay in enumerate(self.replays)},
         }
@@ -195,6 +197,8 @@ class StackedBehavioralCloning:
         inputs = tuple(torch.stack(column) for column in zip(*prepared, strict=True))
         actions = self._act(self._parameters, self._buffers, inputs)
         losses = distance_loss(actions, torch.stack(targets), self.config.loss_function).flatten(1).mean(1)
+        if self._latent_terms is not None:
+            losses = losses + self._latent_terms(self._parameters, self._buffers)
         if self.device == CPU:
             self._losses.check(losses, self.steps)
         self.optimizer.zero_grad()

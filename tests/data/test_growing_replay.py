@@ -240,6 +240,18 @@ def test_what_cannot_go_with_growing_is_refused(root, options, error, message):
         open_replay(root, **options)
 
 
+def test_before_anything_has_come_demonstrations_weigh_all_there_is(root):
+    """As normalisation wants: with weights of the sum 0.5, means would be half of what they are."""
+    replay = open_replay(root)
+    weights = replay.sampler.row_weights(replay.storage)
+    assert weights.sum().item() == pytest.approx(1.0)
+    assert (weights > 0).all()
+    replay.extend(next(collect(batches=1)))
+    weights = replay.sampler.row_weights(replay.storage)
+    here = replay.storage.num_joined
+    assert [weights[:here].sum().item(), weights[here:].sum().item()] == pytest.approx([0.5, 0.5])
+
+
 def test_refused_later_too(root):
     replay = open_replay(root)
     with pytest.raises(ValueError, match="sampler: a SliceSampler by end"):

@@ -325,6 +325,21 @@ def test_what_is_refused():
     assert loss(make_batch())["loss_value"].isfinite()
 
 
+@pytest.mark.parametrize("kind", CRITICS)
+def test_on_a_buffers_rows_of_n_steps(tmp_path, kind):
+    lw.collect_demonstrations(["reach", "push"], episodes_per_task=2, root=tmp_path / "d", max_steps=60, progress=False)
+    replay = lw.LanguageWorldExperienceReplay(
+        tmp_path / "d", label="executed", n_steps=5, gamma=0.9, transform=lw.QAFTransform(PLANS), batch_size=32
+    )
+    loss = make_loss(kind)
+    fit_normalization(loss, replay)
+    batch = replay.sample()
+    assert batch["steps_to_next_obs"].max() == 5
+    wanted, _, _, advantages = by_hand(loss, batch)
+    np.testing.assert_allclose(loss.advantage(batch).numpy(), advantages, rtol=1e-3, atol=1e-5)
+    np.testing.assert_allclose(loss(batch)["loss_value"].item(), wanted, rtol=1e-4)
+
+
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 def test_it_goes_to_a_gpu():
     loss, batch = make_loss(), make_batch()

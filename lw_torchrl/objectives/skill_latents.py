@@ -1,0 +1,93 @@
+"""SkillLatentLoss: what skills' latents should be to each other, as their texts are, or apart."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict.nn import TensorDictModule
+from torch import Tensor
+from torch.nn.functional import normalize
+from torchrl.objectives import LossModule
+
+from lw_torchrl._checks import check_choice
+from lw_torchrl.modules.plan_encoder import PlanEncoder
+
+Kind = Literal["consistency", "contrastive"]
+KINDS = ("consistency", "contrastive")
+_TEMPERATURE = 0.1
+
+
+class SkillLatentLoss(LossModule):
+    """A term on the latents of a plan's skills, to be added to any loss of the policy that has them.
+
+    "consistency": skills whose texts are near stay near. The cosine of two latents is drawn to that of the texts'
+    vectors: the mean over pairs of the squared difference. A text that training has not seen is then where texts like
+    it are.
+
+    "contrastive": latents of different skills keep apart. InfoNCE with each skill as its own positive and the others as
+    negatives, at temperature 0.1; 0 would be the least that is. It draws nothing at random.
+
+    It reads no batch, and gives ``loss_latents`` () float32.
+
+    Args:
+        network: a :class:`PlanEncoder`, or a policy or critic with one, of at least two different skills; its weights
+            are trained, not copies.
+        kind: "consistency" or "contrastive".
+
+    Raises:
+        ValueError: a network without plans, fewer than two skills, or another kind.
+
+    Example:
+        >>> import lw_torchrl as lw
+        >>> actor = lw.PlanConditionedActor(lw.load_plans("MT10"))
+        >>> sorted(lw.SkillLatentLoss(actor)().keys())
+        ['loss_latents']
+
+    Source: paper, what it leaves to future work: 'regularization or contrastive learning'. "consistency": Tung, Mori,
+    "Similarity-Preserving Knowledge Distillation", 2019, with the text encoder as the teacher. "contrastive": van den
+    Oord, Li, Vinyals, "Representation Learning with Contrastive Predictive Coding", 2018; where the positive is the
+    skill itself, the part that keeps apart remains, the uniformity of Wang, Isola, 2020.
+    """
+
+    out_keys = ["loss_latents"]
+    in_keys: list[str] = []
+
+    encoder: TensorDictModule
+    encoder_params: TensorDictParams
+    target_encoder_params: TensorDictParams
+
+    def __init__(self, network: Any, kind: Kind = "consistency") -> None:
+        super().__init__()
+        self.kind: Kind = check_choice("kind", kind, KINDS)
+        self.convert_to_functional(skill_encoder("network", network), "encoder")
+
+    def forward(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
+        """The term; what is given is not read."""
+        with self.encoder_params.to_module(self.encoder, preserve_module_state=False):
+            found = TensorDict(loss_latents=latent_term(self.encoder, self.kind))
+        self._clear_weakrefs(found, "encoder_params")
+        return found
+
+
+def skill_encoder(argument: str, network: Any) -> PlanEncoder:
+    """The encoder of a network that is one or has one; :class:`ValueError` if it has no two skills to tell apart."""
+    encoder = network if isinstance(network, PlanEncoder) else getattr(network, "encoder", None)
+    if not isinstance(encoder, PlanEncoder):
+        raise ValueError(
+            f"{argument} is for policies with plans, whose skills have latents; {type(network).__name__} has none"
+        )
+    if len(encoder.skills) < 2:
+        raise ValueError(f"{argument} is for plans of at least two different skills, got {', '.join(encoder.skills)}")
+    return encoder
+
+
+def latent_term(encoder: PlanEncoder, kind: Kind) -> Tensor:
+    """() float32, differentiable; works within ``vmap`` over the encoder's parameters."""
+    latents = normalize(encoder.latents(), dim=-1)
+    near = latents @ latents.mT
+    if kind == "contrastive":
+        return (near / _TEMPERATURE).logsumexp(-1).mean() - 1.0 / _TEMPERATURE
+    texts = normalize(encoder.text_vectors, dim=-1)
+    pairs = len(texts) * (len(texts) - 1)  # the diagonal is 1 in both
+    return (near - texts @ texts.mT).square().sum() / pairs

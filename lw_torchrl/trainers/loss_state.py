@@ -1,0 +1,117 @@
+"""What a TorchRL loss learns from and goes on from: its tensors, its optimizer's groups, its targets."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torchrl.objectives import LossModule, SoftUpdate
+
+from lw_torchrl._state_tree import check_like, join, split
+from lw_torchrl._tensor_archive import TensorArchive, write_archive
+from lw_torchrl.trainers.policy_checks import check_finite
+from lw_torchrl.trainers.training_state import check_same_description
+
+FORMAT = "lw_torchrl.training"
+FORMAT_VERSION = 1
+
+
+def networks_of(loss: LossModule) -> list[nn.Module]:
+    """The networks that a loss holds, without their parameters."""
+    found = (getattr(loss, name.removesuffix("_params"), None) for name, _ in loss.named_children())
+    return [network for network in found if isinstance(network, nn.Module)]
+
+
+def targets_of(loss: LossModule, eps: float) -> SoftUpdate | None:
+    """What moves a loss's target networks by 1 - eps a step; None for a loss without any."""
+    delayed = any(name.startswith("target_") and name.endswith("_params") for name, _ in loss.named_children())
+    return SoftUpdate(loss, eps=eps) if delayed else None
+
+
+def trained_parameters(loss: LossModule) -> tuple[list[Tensor], list[Tensor]]:
+    """The parameters of a loss's actor, and the others."""
+    actor: list[Tensor] = []
+    others: list[Tensor] = []
+    for name, parameter in loss.named_parameters():
+        if parameter.requires_grad:
+            (actor if name.startswith("actor_network_params") else others).append(parameter)
+    return actor, others
+
+
+def tensors_of(loss: LossModule) -> dict[str, Tensor]:
+    """All parameters and buffers of a loss by name, targets and statistics among them."""
+    return {**dict(loss.named_parameters()), **dict(loss.named_buffers())}
+
+
+@torch.no_grad()
+def load_tensors(loss: LossModule, found: Mapping[str, Tensor]) -> None:
+    """Give a loss the tensors that :func:`tensors_of` gave, in place.
+
+    Raises:
+        ValueError: they are those of another loss, or hold NaN.
+    """
+    live = tensors_of(loss)
+    check_like(dict(found), {name: tensor.detach() for name, tensor in live.items()}, "loss")
+    check_finite(found, live)
+    for name, tensor in live.items():
+        tensor.copy_(found[name])
+
+
+def sum_of_losses(found: Mapping[str, Any]) -> Tensor:
+    """What is minimised of what a loss gives: the sum of its ``loss_`` entries."""
+    terms = [value for name, value in found.items() if name.startswith("loss_")]
+    return torch.stack(terms).sum()
+
+
+def describe_loss(loss: LossModule) -> dict[str, Any]:
+    """What tells a loss from another, its trained weights aside: its class and options, the kinds of its networks, and
+    a digest of what no training changes, plans and texts among it."""
+    digest = sha256()
+    for name, tensor in sorted(loss.named_buffers()):
+        fixed = not name.startswith("target_") and not name.endswith(("features.mean", "features.std"))
+        digest.update(f"{name} {tuple(tensor.shape)}".encode())
+        if fixed:
+            digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+    options = {name: value for name, value in vars(loss).items() if name[0] != "_" and name != "training"}
+    return {
+        "class": type(loss).__name__,
+        "options": {name: v for name, v in options.items() if isinstance(v, (bool, int, float, str))},
+        "networks": [type(network).__name__ for network in networks_of(loss)],
+        "shapes": {name: list(parameter.shape) for name, parameter in loss.named_parameters()},
+        "fixed": digest.hexdigest(),
+    }
+
+
+def write_training(
+    path: Path, described: Mapping[str, Any], state: Mapping[str, Any], tensors: Mapping[str, Tensor]
+) -> None:
+    """Write how the training of a loss stands, and its tensors; an earlier file is replaced whole."""
+    training: dict[str, Tensor] = {}
+    tree = split(state, training)
+    write_archive(
+        path,
+        {"format": FORMAT, "version": FORMAT_VERSION, **described, "state": tree},
+        {"loss": tensors, "training": training},
+    )
+
+
+def open_training(path: Path, described: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """The state and the tensors that :func:`write_training` wrote of a training of this description.
+
+    Raises:
+        ValueError: it is no such file, damaged, or of another description.
+    """
+    try:
+        archive = TensorArchive(path)
+        found = archive.description
+        if (found.get("format"), found.get("version")) != (FORMAT, FORMAT_VERSION):
+            raise ValueError(f"it is of format {found.get('format')!r:.60} version {found.get('version')!r:.60}")
+        state, tensors = join(found.get("state"), archive.tensors("training")), archive.tensors("loss")
+    except (ValueError, OSError, RecursionError) as error:
+        raise ValueError(f"checkpoint: {str(path)!r} is damaged or none of a loss's training ({error})") from error
+    check_same_description(path, found, dict(described))
+    return state, tensors
