@@ -59,8 +59,8 @@ def online(
         condition: what that one is conditioned on: plans, the task's description, its number.
         plans: of the tasks: MT10, MT50, files or folders; where several have a plan for a task, the last one's counts.
         episodes: evaluated, on seeds that no training used, action noise 0.1.
-        step: of residual, correct the actions in this step of the task's plan alone, and leave all others as they are:
-            its number, from 1, or weakest, the one that failed episodes of the start came to and not beyond.
+        step: of residual, correct the actions in this step of the task's plan alone, by 1 at most, and leave all others
+            as they are: its number, from 1, or weakest, the one that failed episodes came to and not beyond.
         launcher: local, on this machine; ray, on a Ray cluster, or on all cores of this machine.
         jobs: runs run at a time by the launcher local.
         logger: also log success and losses, to a folder logs beside each policy.
@@ -85,9 +85,12 @@ def online(
         raise ValueError(f"--step is of the method residual, --methods are {', '.join(methods)}")
     recipe = OnlineRecipe(demonstrations=demonstrations)
     recipe = replace(recipe, config=replace(recipe.config, frames=frames))
+    whole = replace(recipe, config=replace(recipe.config, residual_scale=1.0))  # of a step: to any action at all
     chosen = simulated("tasks", one_or_many(tasks), TASKS)
     runs = [
-        OnlineRun(task, method, seed, recipe, condition, start, episodes, step=tuned if method == "residual" else None)
+        OnlineRun(task, method, seed, recipe, condition, start, episodes)
+        if tuned is None or method != "residual"
+        else OnlineRun(task, method, seed, whole, condition, start, episodes, step=tuned)
         for stage in ((START,), tuple(method for method in dict.fromkeys(methods) if method != START))
         for seed in seeds
         for task in chosen

@@ -92,8 +92,8 @@ def stuck_table(steps: Sequence[StuckStep]) -> str:
     """
     rows = [("task", "step", "ended here", "no further", "skill", "while")]
     for s in steps:
-        counts = (f"{count} of {s.failed}" for count in (s.stuck, s.furthest))
-        rows.append((s.task, str(s.step + 1), *counts, s.skill, s.condition))
+        ended, reached = (f"{count} of {s.failed}" for count in (s.stuck, s.furthest))
+        rows.append((s.task, str(s.step + 1), ended, reached, s.skill, s.condition))
     task, skill = (max(len(row[column]) for row in rows) for column in (0, 4))
     return "\n".join(
         f"{row[0]:{task}}  {row[1]:>4}  {row[2]:>10}  {row[3]:>10}  {row[4]:{skill}}  {row[5]}" for row in rows

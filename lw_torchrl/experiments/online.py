@@ -184,10 +184,16 @@ def _train(
         recipe, config = run.recipe, replace(run.recipe.config, seed=ONLINE_SEED + run.seed)
         told: dict[str, Any] = {}
         if run.step is not None:
-            found = {"scale": config.residual_scale, "seed": DIAGNOSIS_SEED + run.seed}
             with torch.random.fork_rng(devices=[]):
                 torch.manual_seed(config.seed)
-                actor, told["tuned"] = tune_step(actor, run.task, run.step, progress=progress, **found)
+                actor, told["tuned"] = tune_step(
+                    actor,
+                    run.task,
+                    run.step,
+                    scale=config.residual_scale,
+                    seed=DIAGNOSIS_SEED + run.seed,
+                    progress=progress,
+                )
         replay = LanguageWorldExperienceReplay(
             out / run.dataset.folder,
             label="executed",
