@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 from tensordict import TensorDictBase
-from torch import Tensor
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import SoftUpdate
@@ -64,20 +63,12 @@ class TD3Learner(Learner):
 
 
 class ResidualLearner(TD3Learner):
-    """TD3 of a small network that corrects the start's actions, which stays as it is.
-
-    A start that is a :class:`~lw_torchrl.ResidualActor` is trained itself; there is noise only where it corrects, since
-    elsewhere noise would teach it nothing, and lead astray what is to stay as it is.
-    """
+    """TD3 of a small network that corrects the start's actions, which stays as it is; of the start itself if it is such
+    a :class:`~lw_torchrl.ResidualActor`."""
 
     def make_policy(self, start: Policy) -> Policy:
         made = start if isinstance(start, ResidualActor) else ResidualActor(start, scale=self.config.residual_scale)
         return made.eval()
-
-    def noise_weight(self, state: TensorDictBase) -> Tensor | float:
-        policy = self.policy
-        assert isinstance(policy, ResidualActor)
-        return 1.0 if policy.steps is None else state.get(policy.out_keys[2])
 
 
 class SACLearner(Learner):

@@ -41,10 +41,11 @@ def rows_that_came(trainer):
     return trainer.replay[:][trainer.replay.storage.num_joined :]
 
 
+@pytest.mark.parametrize("method", ["residual", "td3"])
 @pytest.mark.parametrize("steps", [{"push": [0]}, {"push": [0, 1, 2, 3], "reach": [0]}])
-def test_what_is_done_outside_of_the_steps_is_what_the_base_does_without_noise(demos, steps):
+def test_what_is_done_outside_of_the_steps_is_what_the_base_does_without_noise(demos, steps, method):
     actor = make_residual(steps)
-    trainer = make_online(demos, "residual", actor=actor, config=OFTEN)
+    trainer = make_online(demos, method, actor=actor, config=OFTEN)
     trainer.train()
     rows = rows_that_came(trainer)
     state = rows.select("observation", "task_id", "qaf").copy()
