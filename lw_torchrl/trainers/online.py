@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.record.loggers import Logger
@@ -20,8 +19,6 @@ from lw_torchrl._devices import CPU, drawn_on
 from lw_torchrl._files import sweep
 from lw_torchrl._progress import Progress
 from lw_torchrl._state_tree import check_like
-from lw_torchrl.data.co_learning_sampler import GROWN, CoLearningSampler
-from lw_torchrl.data.growing import GrowingStorage
 from lw_torchrl.data.replay import LanguageWorldExperienceReplay
 from lw_torchrl.data.rewards import REWARDS
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
@@ -31,9 +28,10 @@ from lw_torchrl.modules.networks import ACTION_SIZE
 from lw_torchrl.modules.policy import Policy
 from lw_torchrl.trainers.checkpoint import describe_data, describe_replay, write
 from lw_torchrl.trainers.expert_iteration import ExpertIterationLearner
+from lw_torchrl.trainers.first_episodes import FirstEpisodes
+from lw_torchrl.trainers.growing_replay import check_growing_replay, describe_growing
 from lw_torchrl.trainers.interrupts import Interrupt, interrupts_between_steps
 from lw_torchrl.trainers.learner import Learner
-from lw_torchrl.trainers.minibatches import check_replay
 from lw_torchrl.trainers.off_policy import ResidualLearner, SACLearner, TD3Learner
 from lw_torchrl.trainers.on_policy import PPOLearner
 from lw_torchrl.trainers.online_config import OnlineConfig
@@ -131,7 +129,7 @@ class OnlineTrainer:
         self.config = config = config or OnlineConfig()
         self.method = check_choice("method", method, LEARNERS)
         check_can_be_saved(actor)
-        _check_replay(actor, replay, config)
+        check_growing_replay(actor, replay, config)
         self.replay, self.logger, self.progress = replay, logger, progress
         self.tasks = replay.tasks if tasks is None else tasks
         self.num_threads = num_threads
@@ -155,7 +153,7 @@ class OnlineTrainer:
                 "critic": {} if critic is None else {"weights": _fingerprint(critic)},
                 "online": {"method": method, "tasks": list(named_tasks(self.tasks)), **asdict(config)},
                 "data": describe_data(replay),
-                "replay": describe_replay(replay) | _describe_growing(replay),
+                "replay": describe_replay(replay) | describe_growing(replay),
             }
             if self.checkpoint.exists():
                 check_description(self.checkpoint, self._described)
@@ -241,7 +239,7 @@ class OnlineTrainer:
         """Do a round; what to log of it, or None where it was interrupted."""
         config, learner = self.config, self.learner
         state, done_before = env.reset(), self.frames
-        first = _Firsts(config.rows)
+        first = FirstEpisodes(config.rows)
         came = []
         steps = min(config.round_steps, config.steps - self.round * config.round_steps)
         due = 0
@@ -293,33 +291,6 @@ class OnlineTrainer:
                     self.logger.log_scalar(f"train/{name}", value, step=int(found["frames"]))
 
 
-class _Firsts:
-    """Which trajectory each row of a round is in, and how the first episode of each went."""
-
-    def __init__(self, rows: int) -> None:
-        self._episode = torch.zeros(rows, dtype=torch.int64)
-        self._ended = 0
-        self._success = torch.full((rows,), torch.nan)
-
-    def ids(self, round_number: int) -> Tensor:
-        """(N,) int64, of each row's trajectory: no two in a training are the same."""
-        rows = len(self._episode)
-        return (round_number * _MOST_EPISODES + self._episode) * rows + torch.arange(rows)
-
-    def note(self, step: TensorDictBase) -> None:
-        """Look at a step of all rows."""
-        done, success = (step.get(("next", name)).squeeze(-1) for name in ("done", "success"))
-        first = done & (self._episode == 0)
-        self._success = torch.where(first, success.to(torch.float32), self._success)
-        self._episode = self._episode + done
-        self._ended += int(done.sum())
-
-    def result(self) -> dict[str, float]:
-        ended = {"episodes": float(self._ended)}
-        return ended if self._success.isnan().any() else {"success": float(self._success.double().mean()), **ended}
-
-
-_MOST_EPISODES = 1_000_000
 _UNLIKE = {"replay": None, "history": None, "learner": None, "episodes": None}
 
 
@@ -329,24 +300,3 @@ def _fingerprint(module: torch.nn.Module) -> str:
     for name, tensor in sorted(module.state_dict().items()):
         found.update(name.encode() + tensor.cpu().contiguous().numpy().tobytes())
     return found.hexdigest()
-
-
-def _describe_growing(replay: LanguageWorldExperienceReplay) -> dict[str, Any]:
-    storage = replay.storage
-    return {"reward": replay.reward, "grow": storage.grow, "n_steps": storage.n_steps, "gamma": storage.gamma}
-
-
-def _check_replay(actor: Policy, replay: Any, config: OnlineConfig) -> None:
-    """Raise :class:`ValueError` unless a buffer grows, and is what rows of the environment can stand beside."""
-    if not isinstance(replay, LanguageWorldExperienceReplay) or not isinstance(replay.storage, GrowingStorage):
-        raise ValueError("replay must be a LanguageWorldExperienceReplay that grows: give it grow=, a number of rows")
-    sampler = replay.sampler
-    if not isinstance(sampler, CoLearningSampler) or sampler.target != GROWN:
-        raise ValueError(
-            "replay's sampler must be CoLearningSampler('grown'), which says which rows are demonstrations"
-        )
-    if not replay.terminate_on_success:
-        raise ValueError("replay must end at success, as the environment does: give it terminate_on_success=True")
-    if replay.storage.n_steps > 1 and replay.storage.gamma != config.gamma:
-        raise ValueError(f"gamma must be the replay buffer's, {replay.storage.gamma}, got {config.gamma}")
-    check_replay(actor, replay, config.batch_size)
