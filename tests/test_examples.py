@@ -35,7 +35,7 @@ def names(path):
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.name)
 def test_an_example_is_one_page(path):
     lines = path.read_text("utf-8").splitlines()
-    assert len(lines) <= (120 if path.name.startswith(("offline", "online")) else 80)
+    assert len(lines) <= (120 if path.name.startswith(("offline", "online", "tune")) else 80)
     assert max(map(len, lines)) <= 120
 
 
@@ -75,6 +75,17 @@ def test_td3_learns_beside_demonstrations(tmp_path):
     left = {path.name for path in tmp_path.iterdir() if not path.name.startswith("torchinductor")}
     assert not left, "it leaves nothing behind"
     assert {"Collector", "DemonstratedTD3Loss", "SoftUpdate"} <= names(EXAMPLES / "online_from_demonstrations.py")
+
+
+def test_one_step_of_a_plan_is_tuned(tmp_path):
+    done = run("tune_one_step.py", tmp_path, "--frames", 400, "--clone", 20, "--episodes", 2)
+    lines = done.stdout.splitlines()
+    assert any(line.startswith("pick-place     4  ") for line in lines), "the table"
+    assert any(line.startswith("tuning step ") for line in lines)
+    assert any(line.startswith("pick-place: success 0.") for line in lines)
+    assert lines[-1].endswith("as before in every episode")
+    left = {path.name for path in tmp_path.iterdir() if not path.name.startswith("torchinductor")}
+    assert not left, "it leaves nothing behind"
 
 
 def test_co_learning_runs_on_ones_own_data(tmp_path):

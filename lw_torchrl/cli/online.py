@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
@@ -31,6 +31,7 @@ def online(
     condition: Literal["pcbc", "dc", "one-hot"] = "pcbc",
     plans: tuple[str, ...] = ("MT50",),
     episodes: int = 40,
+    step: str | None = None,
     launcher: Literal["local", "ray"] = "local",
     jobs: int = 1,
     logger: LoggerName = "none",
@@ -58,6 +59,8 @@ def online(
         condition: what that one is conditioned on: plans, the task's description, its number.
         plans: of the tasks: MT10, MT50, files or folders; where several have a plan for a task, the last one's counts.
         episodes: evaluated, on seeds that no training used, action noise 0.1.
+        step: of residual, correct the actions in this step of the task's plan alone, by 1 at most, and leave all others
+            as they are: its number, from 1, or weakest, the one that failed episodes came to and not beyond.
         launcher: local, on this machine; ray, on a Ray cluster, or on all cores of this machine.
         jobs: runs run at a time by the launcher local.
         logger: also log success and losses, to a folder logs beside each policy.
@@ -69,7 +72,7 @@ def online(
         check_folder("--out", out)
     elif run is not None:
         raise ValueError("--list names the runs and does none, --run does one: give one of them")
-    from lw_torchrl._checks import check_choice, check_int
+    from lw_torchrl._checks import check_choice, check_int, counted
     from lw_torchrl.cli.threads import use_one_thread
     from lw_torchrl.experiments.online import START, OnlineRecipe, OnlineRun
     from lw_torchrl.language.tasks import TASKS
@@ -77,11 +80,17 @@ def online(
     check_int("jobs", jobs, minimum=1)
     if start is not None and not start.is_file():
         raise FileNotFoundError(f"--start: no file {str(start)!r}; `lw-torchrl train` writes one")
+    tuned = None if step is None else _read_step(step)
+    if tuned is not None and "residual" not in methods:
+        raise ValueError(f"--step is of the method residual, --methods are {', '.join(methods)}")
     recipe = OnlineRecipe(demonstrations=demonstrations)
     recipe = replace(recipe, config=replace(recipe.config, frames=frames))
+    whole = replace(recipe, config=replace(recipe.config, residual_scale=1.0))  # of a step: to any action at all
     chosen = simulated("tasks", one_or_many(tasks), TASKS)
     runs = [
         OnlineRun(task, method, seed, recipe, condition, start, episodes)
+        if tuned is None or method != "residual"
+        else OnlineRun(task, method, seed, whole, condition, start, episodes, step=tuned)
         for stage in ((START,), tuple(method for method in dict.fromkeys(methods) if method != START))
         for seed in seeds
         for task in chosen
@@ -93,6 +102,10 @@ def online(
         return
     found = read_plans(plans, TASKS)
     found.require(chosen)
+    if isinstance(tuned, int) and start is None:
+        for task in chosen:
+            if tuned >= (there := len(found[task].steps)):
+                raise ValueError(f"--step: the plan of {task!r} has {counted(there, 'step')}, got {step}")
     use_one_thread()
     if run is not None:
         print(_done(named[check_choice("run", run, named)], found, out, logger))
@@ -113,6 +126,7 @@ def online(
             given += ["--seeds", *map(str, seeds), "--methods", *methods, "--plans", *plans]
             given += ["--condition", condition, "--episodes", str(episodes), "--logger", logger]
             given += [] if start is None else ["--start", str(start)]
+            given += [] if step is None else ["--step", step]
             for first in (True, False):
                 stage = [name for name, one in named.items() if (one.method == START) == first]
                 report(len(stage), elsewhere(stage, given, launcher, jobs))
@@ -125,7 +139,34 @@ def _done(one: OnlineRun, plans: Plans, out: Path, logger: LoggerName) -> str:
 
     make = None if logger == "none" else lambda file: make_logger(logger, file)
     result = execute_online(one, plans, out, make_logger=make)
-    return f"{one.folder}: success {result.mean_success:.3f}, {result.config['seconds']:.0f} s"
+    said = f"{one.folder}: success {result.mean_success:.3f}, {result.config['seconds']:.0f} s"
+    return said if one.step is None else f"{said}\n{_told_of_step(result.config)}"
+
+
+def _read_step(given: str) -> int | str:
+    """A step's number, counted from 0, or the word for the weakest."""
+    from lw_torchrl._checks import shown
+    from lw_torchrl.experiments.tuning import WEAKEST
+
+    if given == WEAKEST:
+        return given
+    if not given.isascii() or not given.isdigit() or not 1 <= len(given) <= 4 or int(given) < 1:
+        raise ValueError(f"--step must be the number of a step, from 1, or {WEAKEST}, got {shown(given)}")
+    return int(given) - 1
+
+
+def _told_of_step(config: dict[str, Any]) -> str:
+    """Where failed episodes got stuck, which step was tuned, and that nothing changed elsewhere."""
+    from lw_torchrl.evaluation import StuckStep, stuck_table
+
+    tuned, elsewhere = config["tuned"], config["elsewhere"]
+    lines = [stuck_table([StuckStep(**step) for step in tuned["stuck"]])] if "stuck" in tuned else []
+    lines.append(f"tuned: step {tuned['step'] + 1}, {tuned['skill']}; success before {config['before']:.3f}")
+    lines.append(
+        f"{elsewhere['outside']} of {elsewhere['states']} states are outside of it: in {elsewhere['changed']} of them "
+        "the action has changed"
+    )
+    return "\n".join(lines)
 
 
 def _summarize(runs: list[OnlineRun], plans: Plans, out: Path) -> None:

@@ -5,6 +5,7 @@ from lw_torchrl.evaluation.comparison import MethodComparison, Pair
 from lw_torchrl.evaluation.figures import plot_sorted_tasks, plot_success
 from lw_torchrl.evaluation.learning_curves import plot_learning_curves
 from lw_torchrl.evaluation.method_figure import plot_methods
+from lw_torchrl.evaluation.plan_use import PlanUse
 from lw_torchrl.evaluation.protocol import evaluate
 from lw_torchrl.evaluation.published import published, published_curves, published_plans
 from lw_torchrl.evaluation.result import EpisodeResult, EvaluationResult
@@ -16,6 +17,7 @@ from lw_torchrl.evaluation.statistics import (
     mean_rate,
     probability_of_improvement,
 )
+from lw_torchrl.evaluation.stuck_steps import StuckStep, stuck_steps, stuck_table, weakest_step
 from lw_torchrl.evaluation.summary import Summary, TaskSummary, summarize, summarize_rates
 
 __all__ = [
@@ -24,6 +26,8 @@ __all__ = [
     "EvaluationResult",
     "MethodComparison",
     "Pair",
+    "PlanUse",
+    "StuckStep",
     "Summary",
     "TaskSummary",
     "count_solved",
@@ -39,6 +43,9 @@ __all__ = [
     "published",
     "published_curves",
     "published_plans",
+    "stuck_steps",
+    "stuck_table",
     "summarize",
     "summarize_rates",
+    "weakest_step",
 ]

@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import one_hot
 from torchrl.envs import TransformedEnv
 
 from lw_torchrl.envs.episodes import FinishedEpisode, run_episodes
@@ -20,6 +21,7 @@ from lw_torchrl.transforms import QAFTransform
 
 _AFTER = 20  # steps after the first success that still count, as in training data
 _ROWS = 250  # or so, stepped together
+_A_WHILE = 5  # states in which a step must have been in charge for an episode to have reached it
 _STUCK = 50  # the last steps of a failed episode, in which it got nowhere
 
 
@@ -34,6 +36,7 @@ class TaskUse:
         covered: the share of the states before the first success in which some condition held.
         num_true: the median number of conditions that held, before the first success.
         stuck: per step, in how many failed episodes it was the one chosen (or true) most in the last 50 steps.
+        furthest: per step, in how many failed episodes it was the plan's last that was chosen (or true) in 5 states.
         failed: how many episodes failed.
     """
 
@@ -43,6 +46,7 @@ class TaskUse:
     covered: float = 0.0
     num_true: float = 0.0
     stuck: list[int] = field(default_factory=list)
+    furthest: list[int] = field(default_factory=list)
     failed: int = 0
 
     def to_json(self) -> dict[str, Any]:
@@ -75,11 +79,14 @@ def _summed(seen: list[tuple[Tensor, Tensor | None, int, bool]]) -> TaskUse:
     qaf = torch.cat([q for q, _, _, _ in seen])
     steps = qaf.shape[1]
     before = torch.cat([q[:length] for q, _, length, _ in seen])
-    stuck = [0] * steps
+    stuck, furthest = [0] * steps, [0] * steps
     for q, chosen, _, success in seen:
         if not success:
-            end = q[-_STUCK:].sum(0) if chosen is None else torch.bincount(chosen[-_STUCK:], minlength=steps)
-            stuck[int(end.argmax())] += 1
+            in_charge = q.long() if chosen is None else one_hot(chosen, steps)
+            stuck[int(in_charge[-_STUCK:].sum(0).argmax())] += 1
+            states = in_charge.sum(0)
+            reached = (states >= states.max().clamp(1, _A_WHILE)).nonzero()
+            furthest[int(reached[-1]) if len(reached) else 0] += 1
     shares: list[float] = []
     if all(c is not None for _, c, _, _ in seen):
         counts = torch.bincount(torch.cat([c for _, c, _, _ in seen if c is not None]), minlength=steps)
@@ -91,6 +98,7 @@ def _summed(seen: list[tuple[Tensor, Tensor | None, int, bool]]) -> TaskUse:
         covered=float(before.any(-1).float().mean()),
         num_true=float(median(before.sum(-1).tolist())),
         stuck=stuck,
+        furthest=furthest,
         failed=sum(not success for _, _, _, success in seen),
     )
 

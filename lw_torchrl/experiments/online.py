@@ -22,8 +22,10 @@ from lw_torchrl.evaluation import EvaluationResult, evaluate
 from lw_torchrl.experiments.execution import EVALUATION_SEED, RESULTS, load_result
 from lw_torchrl.experiments.recipes import TARGET
 from lw_torchrl.experiments.runs import Dataset, plain
+from lw_torchrl.experiments.tuning import WEAKEST, Elsewhere, tune_step
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.modules.policy import METHODS, Policy, make_policy
+from lw_torchrl.modules.residual_actor import ResidualActor
 from lw_torchrl.trainers.behavioral_cloning import BehavioralCloningTrainer
 from lw_torchrl.trainers.checkpoint import describe_data, load_actor, read_description, save_actor
 from lw_torchrl.trainers.config import BehavioralCloningConfig
@@ -35,6 +37,8 @@ START = "start"
 """The policy that is begun with: a run beside those of :data:`~lw_torchrl.trainers.LEARNERS`."""
 ONLINE_SEED = 20_000
 """The episodes of training seed k have seed 20000 + k: neither those of its demonstrations nor of its evaluation."""
+DIAGNOSIS_SEED = 30_000
+"""Those in which a policy's weakest step is looked for."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +78,8 @@ class OnlineRun:
         condition: what the policy is conditioned on, a name of :data:`METHODS`; of a start that is given, its own.
         start: a policy file to begin with; None to clone one from the demonstrations.
         episodes: evaluated.
+        step: of method "residual", the step of the task's plan that alone is corrected, counted from 0, or "weakest",
+            the one that the start's failed episodes came to and not beyond; None for everywhere.
     """
 
     task: str
@@ -83,9 +89,16 @@ class OnlineRun:
     condition: str = "pcbc"
     start: Path | None = None
     episodes: int = 40
+    step: int | str | None = None
 
     def __post_init__(self) -> None:
         check_choice("method", self.method, (*LEARNERS, START))
+        if self.step is not None and self.method != "residual":
+            raise ValueError(f"step is of the method 'residual', got it with {self.method!r}")
+        if isinstance(self.step, str):
+            check_choice("step", self.step, (WEAKEST,))
+        elif self.step is not None:
+            check_int("step", self.step, minimum=0)
         check_choice("condition", self.condition, METHODS)
 
     @property
@@ -96,7 +109,9 @@ class OnlineRun:
     @property
     def folder(self) -> Path:
         """Where its files go, below the experiments' folder."""
-        return self.group / self.task / self.method / f"seed{self.seed}"
+        step = f"step{self.step + 1}" if isinstance(self.step, int) else self.step
+        method = self.method if step is None else f"{self.method}-{step}"
+        return self.group / self.task / method / f"seed{self.seed}"
 
     @property
     def dataset(self) -> Dataset:
@@ -106,7 +121,7 @@ class OnlineRun:
     @property
     def begin(self) -> OnlineRun:
         """The run of the policy that it begins with."""
-        return replace(self, method=START)
+        return replace(self, method=START, step=None)
 
     @cached_property
     def _start_digest(self) -> str | None:
@@ -125,6 +140,8 @@ class OnlineRun:
         if self.method == START:
             del recipe["config"], recipe["reward"], recipe["n_steps"]
         found = {"task": self.task, "method": self.method, "seed": self.seed, "recipe": recipe}
+        if self.step is not None:
+            found["step"] = self.step
         if self.start is not None:
             return plain(found | {"start": self._start_digest})
         return plain(found | {"condition": self.condition, "plans": self.own_plans(plans).fingerprint})
@@ -157,13 +174,26 @@ def _load_start(run: OnlineRun, plans: Plans, out: Path, progress: bool) -> Poli
 
 def _train(
     run: OnlineRun, plans: Plans, out: Path, progress: bool, make_logger: Callable[[Path], Logger] | None
-) -> tuple[Policy, list[dict[str, float]]]:
-    """What a run makes of its start, kept in ``policy.zip``, and what became of each round."""
+) -> tuple[Policy, dict[str, Any]]:
+    """What a run makes of its start, kept in ``policy.zip``; its "history", what became of each round, and "tuned", the
+    step of a plan if it is of one."""
     folder, described = out / run.folder, {"run": run.describe(plans)}
     file, checkpoint = folder / "policy.zip", folder / "checkpoint.zip"
     if not file.is_file():
         actor = _load_start(run, plans, out, progress)
         recipe, config = run.recipe, replace(run.recipe.config, seed=ONLINE_SEED + run.seed)
+        told: dict[str, Any] = {}
+        if run.step is not None:
+            with torch.random.fork_rng(devices=[]):
+                torch.manual_seed(config.seed)
+                actor, told["tuned"] = tune_step(
+                    actor,
+                    run.task,
+                    run.step,
+                    scale=config.residual_scale,
+                    seed=DIAGNOSIS_SEED + run.seed,
+                    progress=progress,
+                )
         replay = LanguageWorldExperienceReplay(
             out / run.dataset.folder,
             label="executed",
@@ -187,10 +217,11 @@ def _train(
             progress=progress,
         )
         trainer.train()
-        save_actor(trainer.policy, file, data=describe_data(replay), history=trainer.history, **described)
+        save_actor(trainer.policy, file, data=describe_data(replay), history=trainer.history, **told, **described)
     checkpoint.unlink(missing_ok=True)
     check_description(file, described)
-    return load_actor(file), read_description(file)["history"]
+    description = read_description(file)
+    return load_actor(file), {name: description[name] for name in ("history", "tuned") if name in description}
 
 
 def execute_online(
@@ -212,7 +243,9 @@ def execute_online(
 
     Returns:
         The evaluation, action noise 0.1; ``config["run"]`` says what was done, ``config["history"]`` what became of
-        each round, and ``config["seconds"]`` how long this call took.
+        each round, and ``config["seconds"]`` how long this call took. Of a run of one step, ``config["tuned"]`` says
+        which, ``config["before"]`` the start's success in the same episodes, and ``config["elsewhere"]`` in how many
+        "states" of them the step was not in force ("outside"), and in how many of these the action is not the start's.
 
     Raises:
         ValueError: ``out`` holds the same run of another configuration; the start does not know the task.
@@ -222,10 +255,17 @@ def execute_online(
     started = time.perf_counter()
     run.dataset.collect(out, progress)
     more: dict[str, Any] = {"run": run.describe(plans)}
+    watching: dict[str, Any] = {}
     if run.method == START:
         policy = _load_start(run, plans, out, progress)
     else:
-        policy, more["history"] = _train(run, plans, out, progress, make_logger)
+        policy, told = _train(run, plans, out, progress, make_logger)
+        more |= told
+    if run.step is not None:
+        assert isinstance(policy, ResidualActor)
+        more["before"] = execute_online(run.begin, plans, out, progress=progress).mean_success
+        watch = Elsewhere(_load_start(run, plans, out, progress), policy)
+        watching = {"also_record": policy.in_keys, "on_episode": watch}
     result = evaluate(
         policy,
         tasks=run.task,
@@ -234,7 +274,10 @@ def execute_online(
         noise_scale=0.1,
         stop_at_success=True,
         progress=progress,
+        **watching,
     )
+    if run.step is not None:
+        more["elsewhere"] = watch.to_json()
     more["seconds"] = round(time.perf_counter() - started, 1)
     result = replace(result, config=result.config | more)
     result.save(out / run.folder / RESULTS)

@@ -23,7 +23,7 @@ from lw_torchrl.modules.plan_focus import PlanFocus
 from lw_torchrl.modules.query_evaluator import QueryEvaluator
 from lw_torchrl.transforms.qaf import QAFTransform, plan_number_key
 
-_IN_FORCE = 0.01  # a step whose condition does not hold beside one that does has a weight of 1e-4
+IN_FORCE = 0.01  # a step whose condition does not hold beside one that does has a weight of 1e-4
 
 
 def _check_evaluator(evaluator: QueryEvaluator | None, plans: Plans, reads_truth: float) -> QueryEvaluator | None:
@@ -148,7 +148,7 @@ class PlanEncoder(Encoder):
         self.attention.tables.refuse_others(tensordict.get(self._answered, None), rows)
         weights = self.attention.over_steps(rest[0], rows)
         if self.training and self.config["swap_unmentioned"]:
-            kept = ((weights > _IN_FORCE).unsqueeze(-1) & self.mentioned[rows]).any(-2)
+            kept = ((weights > IN_FORCE).unsqueeze(-1) & self.mentioned[rows]).any(-2)
             observation = swap_unmentioned(observation, kept, self.config["swap_unmentioned"])
         seen = self.features(observation)
         if self.focus is not None:

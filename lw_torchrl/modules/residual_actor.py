@@ -11,11 +11,14 @@ from torch import Tensor, nn
 from torchrl.envs import Transform
 
 from lw_torchrl._checks import check_scale
-from lw_torchrl.language.plans import ConditionalPlan, Plans
+from lw_torchrl._keys import key_beside, read
+from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.tasks import Task
 from lw_torchrl.language.text import TextEncoder
+from lw_torchrl.modules.chosen_steps import as_table, check_same_skills, check_steps, weight_in_force
 from lw_torchrl.modules.conditioned_actor import ConditionedActor
 from lw_torchrl.modules.networks import ACTION_SIZE, head
+from lw_torchrl.modules.plan_encoder import PlanEncoder
 from lw_torchrl.modules.policy import Policy, from_description
 
 
@@ -25,19 +28,26 @@ class ResidualActor(Policy):
     Reads what the policy reads; writes ``action`` (B, 4) float32 in [-1, 1], the policy's plus ``scale`` times tanh of
     the network, cut off at ±1. The network sees the policy's encoding and its action.
 
+    Of ``steps`` of plans alone, the correction is multiplied by the attention to these steps. Where none of them is in
+    force, in other tasks too, the action is the policy's, bit for bit. Then ``skill_weights`` (B, S) float32, the
+    policy's, and ``action_corrected`` (B, 1) float32, what the correction is multiplied by, are written too.
+
     Args:
         base: a :class:`~lw_torchrl.PlanConditionedActor` or :class:`~lw_torchrl.DescriptorConditionedActor` without a
             distribution. It is not trained any more, nor noisy, and not copied.
         scale: how far an action can be corrected.
         width, depth: hidden layers of the network; a tuple of widths says both.
+        steps: task name to the numbers of its plan's steps, counted from 0, where actions are corrected; None for
+            everywhere. A step also counts as in force where no condition of the plan holds, as for the policy.
 
     Attributes:
         base: the policy.
+        steps: where actions are corrected.
         network: what is trained.
 
     Raises:
         TypeError: a base that is none of these.
-        ValueError: a base with a distribution, or that mixes actions; a wrong option.
+        ValueError: a base with a distribution, or that mixes actions; steps that its plans do not have; a wrong option.
 
     Example:
         >>> import lw_torchrl as lw
@@ -46,11 +56,25 @@ class ResidualActor(Policy):
         >>> actor = lw.ResidualActor(base)
         >>> actor(state.copy())["action"].equal(base(state.copy())["action"])
         True
+        >>> plans = lw.load_plans("MT10")
+        >>> actor = lw.ResidualActor(lw.PlanConditionedActor(plans), steps={"pick-place": [3]})
+        >>> plans["pick-place"].steps[3].skill, actor.out_keys
+        ('move the puck to the target location', ['action', 'skill_weights', 'action_corrected'])
 
     Source: Johannink et al., 'Residual Reinforcement Learning for Robot Control'.
     """
 
-    def __init__(self, base: Policy, *, scale: float = 0.3, width: int | Sequence[int] = 256, depth: int = 2) -> None:
+    chosen: Tensor
+
+    def __init__(
+        self,
+        base: Policy,
+        *,
+        scale: float = 0.3,
+        width: int | Sequence[int] = 256,
+        depth: int = 2,
+        steps: Mapping[str, Sequence[int]] | None = None,
+    ) -> None:
         super().__init__()
         if not isinstance(base, ConditionedActor):
             raise TypeError(
@@ -68,6 +92,14 @@ class ResidualActor(Policy):
         nn.init.zeros_(self.network[-1].weight)
         nn.init.zeros_(self.network[-1].bias)
         self.config = {"scale": check_scale("scale", scale), "width": width, "depth": depth}
+        self.steps = None
+        if steps is not None:
+            if not isinstance(base.encoder, PlanEncoder):
+                raise TypeError(f"steps are of plans, which the base, a {type(base).__name__}, does not read")
+            self.steps = self.config["steps"] = check_steps(steps, base.encoder.plans)
+            self.out_keys = [*base.out_keys[:2], key_beside(base.out_keys[0], "_corrected")]
+            table = as_table(self.steps, base.encoder.attention.tables)
+            self.register_buffer("chosen", table, persistent=False)
 
     def train(self, mode: bool = True) -> ResidualActor:
         """As a module's, but for the base, whose features stay without noise."""
@@ -82,15 +114,31 @@ class ResidualActor(Policy):
         return self.base.transform()
 
     def prepare(self, tensordict: TensorDictBase) -> tuple[Tensor, ...]:
-        """As the base's."""
-        return self.base.prepare(tensordict)
+        """As the base's; of steps, behind it which of each row's steps they are, (B, S) bool."""
+        prepared = self.base.prepare(tensordict)
+        if self.steps is None:
+            return prepared
+        assert isinstance(self.base.encoder, PlanEncoder)
+        (task,) = read(tensordict, self.in_keys[1:2])
+        return *prepared, self.chosen[self.base.encoder.attention.tables.rows(task)]
 
     def act(self, *prepared: Tensor) -> tuple[Tensor, ...]:
-        """The action."""
-        encoding = self.base.encoder.encode(*prepared).joined
+        """From what :meth:`prepare` gives to a tensor for each of ``out_keys``."""
+        if self.steps is None:
+            encoding = self.base.encoder.encode(*prepared)
+            action, more = self._corrections(encoding.joined)
+            return ((action + more).clamp(-1.0, 1.0),)
+        encoding = self.base.encoder.encode(*prepared[:-1])
+        assert encoding.weights is not None
+        action, more = self._corrections(encoding.joined)
+        weight = weight_in_force(encoding.weights, prepared[-1])
+        corrected = (action + weight * more).clamp(-1.0, 1.0)
+        return torch.where(weight > 0, corrected, action), encoding.weights, weight
+
+    def _corrections(self, encoding: Tensor) -> tuple[Tensor, Tensor]:
+        """The base's action, and what may be added to it, (B, 4) each."""
         action = self.base.head(encoding)
-        more = torch.tanh(self.network(torch.cat((encoding, action), -1)))
-        return ((action + self.config["scale"] * more).clamp(-1.0, 1.0),)
+        return action, self.config["scale"] * torch.tanh(self.network(torch.cat((encoding, action), -1)))
 
     def describe(self) -> dict[str, Any]:
         return super().describe() | {"base": self.base.describe()}
@@ -107,7 +155,11 @@ class ResidualActor(Policy):
 
         Raises:
             TypeError: the base is not conditioned on plans.
+            ValueError: the other plans do not have the steps where actions are corrected, with the same skills.
         """
+        if self.steps is not None:
+            assert self.plans is not None
+            check_same_skills(self.steps, self.plans, as_plans(plans))
         base = self.base.with_plans(plans)
         assert isinstance(base, ConditionedActor)
         other = ResidualActor(base, **self.config)

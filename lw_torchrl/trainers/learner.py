@@ -58,6 +58,16 @@ class Learner:
         """Write ``action`` (N, 4) float32, without the noise."""
         return self.policy(state)
 
+    def noise_weight(self, state: TensorDictBase) -> Tensor | float:
+        """What the noise on the actions of :meth:`act` is multiplied by, (N, 1) float32 or one number for all.
+
+        A residual of some steps has noise in these alone: elsewhere it would teach nothing, and lead astray what is to
+        stay as it is.
+        """
+        policy = self.policy
+        of_steps = isinstance(policy, ResidualActor) and policy.steps is not None
+        return state.get(policy.out_keys[2]) if of_steps else 1.0
+
     def observe(self, rows: TensorDictBase) -> None:
         """Take rows (N, T) that came, time last."""
 

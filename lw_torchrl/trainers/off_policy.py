@@ -65,10 +65,12 @@ class TD3Learner(Learner):
 
 
 class ResidualLearner(TD3Learner):
-    """TD3 of a small network that corrects the start's actions, which stays as it is."""
+    """TD3 of a small network that corrects the start's actions, which stays as it is; of the start itself if it is such
+    a :class:`~lw_torchrl.ResidualActor`."""
 
     def make_policy(self, start: Policy) -> Policy:
-        return ResidualActor(start, scale=self.config.residual_scale).eval()
+        made = start if isinstance(start, ResidualActor) else ResidualActor(start, scale=self.config.residual_scale)
+        return made.eval()
 
 
 class SACLearner(Learner):

@@ -60,7 +60,8 @@ class OnlineTrainer:
 
     Args:
         actor: the policy to begin with, one that was cloned, say. Methods "td3" and "expert-iteration" train it in
-            place; the others train one that is made of it, ``policy``.
+            place, and so does "residual" a :class:`ResidualActor`, of some steps of a plan say; the others train one
+            that is made of it, ``policy``.
         replay: demonstrations that grow: ``LanguageWorldExperienceReplay(..., grow=, label="executed",
             terminate_on_success=True, sampler=CoLearningSampler("grown"))`` with the actor's transform. Its reward is
             what is learned from. Its generator is set to the configuration's seed.
@@ -253,7 +254,8 @@ class OnlineTrainer:
                 with torch.no_grad():
                     state = learner.act(state)
                 if noise is not None:
-                    state.set("action", (state.get("action") + noise).clamp(-1.0, 1.0))
+                    explored = state.get("action") + learner.noise_weight(state) * noise
+                    state.set("action", explored.clamp(-1.0, 1.0))
                 state.set(("collector", "traj_ids"), first.ids(self.round))
                 step, state = env.step_and_maybe_reset(state)
                 first.note(step)

@@ -10,17 +10,17 @@ import pytest
 from commands import fails, run
 
 import lw_torchrl as lw
-from lw_torchrl.experiments import online, runs
+from lw_torchrl.experiments import online, runs, tuning
 
 TINY = """
 from functools import partial
 import lw_torchrl as lw
-from lw_torchrl.experiments import online, runs
+from lw_torchrl.experiments import online, runs, tuning
 
 cloning = lw.BehavioralCloningConfig(steps=30, batch_size=20, checkpoint_every=10)
 config = lw.OnlineConfig(rows=4, round_steps=15, max_steps=12, batch_size=8, first_frames=20, warm_up=3, epochs=2)
 online.OnlineRecipe = partial(online.OnlineRecipe, cloning=cloning, config=config)
-online.evaluate = partial(lw.evaluate, max_steps=20)
+online.evaluate = tuning.evaluate = partial(lw.evaluate, max_steps=20)
 runs.collect_demonstrations = partial(lw.collect_demonstrations, max_steps=100)
 """
 
@@ -28,7 +28,12 @@ runs.collect_demonstrations = partial(lw.collect_demonstrations, max_steps=100)
 @pytest.fixture
 def tiny(monkeypatch):
     """Few steps of everything."""
-    for module, name in ((online, "OnlineRecipe"), (online, "evaluate"), (runs, "collect_demonstrations")):
+    for module, name in (
+        (online, "OnlineRecipe"),
+        (online, "evaluate"),
+        (tuning, "evaluate"),
+        (runs, "collect_demonstrations"),
+    ):
         monkeypatch.setattr(module, name, getattr(module, name))  # to be put back
     exec(TINY, {})
 
@@ -117,6 +122,58 @@ def test_what_it_refuses(capsys, tmp_path, tiny):
     message = fails(capsys, *arguments(tmp_path, "--start", tmp_path / "push.zip"))
     assert "does not know the task 'reach'" in message
     assert not (tmp_path / "pcbc").exists()
+
+
+@pytest.mark.parametrize("step", ["2", "weakest"])
+def test_one_step_of_a_plan_is_tuned(capsys, tmp_path, tiny, monkeypatch, step):
+    given = arguments(tmp_path, "--step", step, methods=["residual"])
+    name = "residual-step2" if step == "2" else "residual-weakest"
+    assert run(capsys, *given, "--list").split() == ["pcbc/reach/start/seed0", f"pcbc/reach/{name}/seed0"]
+    out = run(capsys, *given, "--run", f"pcbc/reach/{name}/seed0")
+    config = json.loads((tmp_path / "pcbc" / "reach" / name / "seed0" / "results.json").read_text())["config"]
+    tuned, elsewhere = config["tuned"], config["elsewhere"]
+    chosen = lw.load_plans("MT50")["reach"].steps[tuned["step"]]
+    assert (tuned["skill"], tuned["condition"]) == (chosen.skill, str(chosen.condition))
+    if step == "2":
+        assert tuned["step"] == 1
+        assert "ended here" not in out
+    else:
+        most = max(tuned["stuck"], key=lambda one: one["furthest"])
+        assert most["step"] == tuned["step"]
+        assert [line.split()[:2] for line in out.splitlines()[1:5]] == [
+            ["task", "step"],
+            *(["reach", str(number)] for number in (1, 2, 3)),
+        ]
+    assert f"tuned: step {tuned['step'] + 1}, {chosen.skill}; success before {config['before']:.3f}" in out
+    start = json.loads((tmp_path / "pcbc" / "reach" / "start" / "seed0" / "results.json").read_text())
+    assert config["before"] == sum(one["success"] for one in start["episodes"]) / 2
+    assert elsewhere["states"] == 2 * 20
+    assert elsewhere["outside"] <= elsewhere["states"]
+    assert elsewhere["changed"] == 0
+    assert f"{elsewhere['outside']} of {elsewhere['states']} states are outside of it" in out
+    policy = lw.load_actor(tmp_path / "pcbc" / "reach" / name / "seed0" / "policy.zip")
+    assert policy.steps == {"reach": [tuned["step"]]}
+
+    assert "residual - start: " in run(capsys, *given)
+    monkeypatch.setattr(online, "tune_step", lambda *_, **__: pytest.fail("done twice"))
+    assert out.splitlines()[-1] in run(capsys, *given)
+
+
+def test_steps_that_it_refuses(capsys, tmp_path, tiny):
+    for step in ("0", "-1", "first", "1.5", "²", "9" * 5000, ""):
+        message = fails(capsys, *arguments(tmp_path, f"--step={step}", methods=["residual"]))
+        assert "--step must be the number of a step, from 1, or weakest, got " in message
+        assert len(message) < 300
+    message = fails(capsys, *arguments(tmp_path, "--step", "1"))
+    assert "--step is of the method residual, --methods are td3, expert-iteration" in message
+    message = fails(capsys, *arguments(tmp_path, "--step", "9", methods=["residual"]))
+    assert "--step: the plan of 'reach' has 3 steps, got 9" in message
+    lw.save_actor(lw.DescriptorConditionedActor("MT10", width=16), tmp_path / "mine.zip")
+    for step, part in (("1", "step1"), ("weakest", "weakest")):  # alone, since the start's run would print
+        given = ("--start", tmp_path / "mine.zip", "--step", step, "--run", f"from-mine/reach/residual-{part}/seed0")
+        message = fails(capsys, *arguments(tmp_path / "out", *given, methods=["residual"]))
+        assert "DescriptorConditionedActor" in message
+        assert "plans" in message
 
 
 def results(folder):
