@@ -72,6 +72,7 @@ def test_exported_it_gives_the_same_bits_at_every_number_of_rows(name):
 
 @pytest.mark.parametrize("name", ACTORS)
 def test_compiled_it_is_one_graph(name):
+    torch._dynamo.reset()  # all share one forward, which is compiled eight times at most
     module = Deployed(ACTORS[name]().eval())
     compiled = torch.compile(module, fullgraph=True, backend="eager", dynamic=True)
     for number in (2, 7, 64):

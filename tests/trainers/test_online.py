@@ -137,6 +137,9 @@ KILLER = """
         return flat(everything(trainer))
 
     whole = train(None)  # before any child: it takes the time that there is to import and compile
+    begun = time.perf_counter()
+    train(None)
+    work = time.perf_counter() - begun
     draw, kills = random.Random(0), 0
     for _ in range(6):
         child = os.fork()
@@ -147,7 +150,7 @@ KILLER = """
                 print(repr(error), file=sys.stderr)
                 os._exit(1)
             os._exit(0)
-        time.sleep(draw.uniform(0.05, 0.8))
+        time.sleep(draw.uniform(0.1, 0.5) * work)
         os.kill(child, signal.SIGKILL)
         status = os.waitpid(child, 0)[1]
         assert not os.WIFEXITED(status) or os.WEXITSTATUS(status) == 0
