@@ -12,8 +12,12 @@ import select
 import signal
 import subprocess
 import sys
+import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
+
+import numpy as np
 
 PARENT = """
 import json, os, sys, traceback
@@ -93,6 +97,32 @@ class Forks:
             self.send(signal.SIGKILL)
             raise TimeoutError(f"it still ran after {seconds} s; it said {self.said[1].read_text()[-2000:]}")
         return Ended(self._number(), *(path.read_text() for path in self.said))
+
+    def whole_and_killed(
+        self, command: Callable[[Path], Sequence[object]], folder: Path, before: str = ""
+    ) -> tuple[Path, Path]:
+        """Do a command undisturbed, and once more killed at five random moments before it comes to its end: where each
+        was told to put what it makes."""
+
+        def finish() -> None:
+            ended = self.end()
+            assert ended.status == 0, ended.err[-2000:]
+
+        whole, killed = folder / "whole", folder / "killed"
+        started = time.perf_counter()
+        self.start(*command(whole), before=before)
+        finish()
+        work = time.perf_counter() - started
+        kills = 0
+        for moment in np.random.default_rng(5).uniform(0.0, 0.4, 5):
+            self.start(*command(killed), before=before)
+            if self.running(moment * work):
+                self.send(signal.SIGKILL)
+            kills += self.end().status == -signal.SIGKILL
+        assert kills >= 3
+        self.start(*command(killed), before=before)
+        finish()
+        return whole, killed
 
     def close(self) -> None:
         """End the process that forks."""

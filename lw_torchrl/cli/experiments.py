@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Literal, cast
 
 from tyro.conf import Positional
 
-from lw_torchrl.cli.outputs import check_folder
 from lw_torchrl.cli.sources import read_encoder, read_plans, read_tasks
-from lw_torchrl.cli.units import elsewhere, report
+from lw_torchrl.cli.units import check_asked, elsewhere, report
 
 if TYPE_CHECKING:
     from lw_torchrl.experiments.runs import Run
@@ -70,10 +69,7 @@ def reproduce(
         list: print the names of the runs and do nothing.
         out: where everything goes; on a cluster, a folder that all its machines share.
     """
-    if not list:
-        check_folder("--out", out)
-    elif run is not None:
-        raise ValueError("--list names the runs and does none, --run does one: give one of them")
+    check_asked(list, run, out, jobs)
     from lw_torchrl._checks import check_choice, check_int
     from lw_torchrl._devices import check_device
     from lw_torchrl.cli.threads import use_one_thread
@@ -82,7 +78,6 @@ def reproduce(
     from lw_torchrl.experiments.runs import SCRIPTED, Run
     from lw_torchrl.modules.policy import METHODS
 
-    check_int("jobs", jobs, minimum=1)
     if launcher == "ray" and device != "cpu":
         raise ValueError(f"--device {device} is for the launcher local: the tasks of ray have a CPU core each")
     recipes = PRESETS[preset]

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Literal
 
 from tyro.conf import Positional
 
-from lw_torchrl.cli.outputs import check_folder
 from lw_torchrl.cli.sources import read_plans, read_tasks
-from lw_torchrl.cli.units import elsewhere, report
+from lw_torchrl.cli.units import check_asked, elsewhere, report
 
 if TYPE_CHECKING:
     from lw_torchrl.evaluation import EvaluationResult
@@ -69,18 +68,14 @@ def offline(
         list: print the names of the runs and do nothing.
         out: where everything goes; on a cluster, a folder that all its machines share.
     """
-    if not list:
-        check_folder("--out", out)
-    elif run is not None:
-        raise ValueError("--list names the runs and does none, --run does one: give one of them")
-    from lw_torchrl._checks import check_choice, check_int
+    check_asked(list, run, out, jobs)
+    from lw_torchrl._checks import check_choice
     from lw_torchrl.cli.threads import use_one_thread
     from lw_torchrl.experiments.mixtures import MIXTURES, TASK_SETS
     from lw_torchrl.experiments.offline_recipes import OFFLINE_METHODS, OfflineRecipe
     from lw_torchrl.experiments.offline_tables import OFFLINE_TABLES, advantages_of, write_table
     from lw_torchrl.experiments.offline_training import execute_offline, make_advantages
 
-    check_int("jobs", jobs, minimum=1)
     for name in mixtures:
         check_choice("mixtures", name, MIXTURES)
     for name in methods:

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
-from lw_torchrl.cli.outputs import check_folder
 from lw_torchrl.cli.sources import make_logger, one_or_many, read_plans, simulated
-from lw_torchrl.cli.units import elsewhere, report
+from lw_torchrl.cli.units import check_asked, elsewhere, report
 
 if TYPE_CHECKING:
     from lw_torchrl.experiments.online import OnlineRun
@@ -68,16 +67,12 @@ def online(
         list: print the names of the runs and do nothing.
         out: where everything goes; on a cluster, a folder that all its machines share.
     """
-    if not list:
-        check_folder("--out", out)
-    elif run is not None:
-        raise ValueError("--list names the runs and does none, --run does one: give one of them")
-    from lw_torchrl._checks import check_choice, check_int, counted
+    check_asked(list, run, out, jobs)
+    from lw_torchrl._checks import check_choice, counted
     from lw_torchrl.cli.threads import use_one_thread
     from lw_torchrl.experiments.online import START, OnlineRecipe, OnlineRun
     from lw_torchrl.language.tasks import TASKS
 
-    check_int("jobs", jobs, minimum=1)
     if start is not None and not start.is_file():
         raise FileNotFoundError(f"--start: no file {str(start)!r}; `lw-torchrl train` writes one")
     tuned = None if step is None else _read_step(step)

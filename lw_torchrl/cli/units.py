@@ -4,7 +4,20 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
 from typing import Literal
+
+from lw_torchrl._checks import check_int
+from lw_torchrl.cli.outputs import check_folder
+
+
+def check_asked(list: bool, run: str | None, out: Path, jobs: int) -> None:
+    """Raise :class:`ValueError` for what cannot be asked of runs at once, or where nothing can be written."""
+    if not list:
+        check_folder("--out", out)
+    elif run is not None:
+        raise ValueError("--list names the runs and does none, --run does one: give one of them")
+    check_int("jobs", jobs, minimum=1)
 
 
 def report(total: int, lines: Iterable[str]) -> None:

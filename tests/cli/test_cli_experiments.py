@@ -2,13 +2,10 @@
 
 import json
 import shutil
-import signal
-import time
 from dataclasses import replace
 from functools import partial
 from types import MappingProxyType
 
-import numpy as np
 import pytest
 from commands import fails, run
 
@@ -132,28 +129,11 @@ def results(folder):
 @pytest.mark.slow
 @pytest.mark.parametrize("setting", ["few-shot", "one-shot"])
 def test_killed_at_five_random_moments_it_ends_the_same(forks, tmp_path, setting):
-    def start(out):
-        arguments = ("--methods", "pcbc", "--seeds", 0, "--episodes", 1, "--out", out)
-        forks.start("reproduce", setting, *arguments, before=TINY)
+    def command(out):
+        return "reproduce", setting, "--methods", "pcbc", "--seeds", 0, "--episodes", 1, "--out", out
 
-    def finish():
-        ended = forks.end()
-        assert ended.status == 0, ended.err[-2000:]
-
-    started = time.perf_counter()
-    start(tmp_path / "whole")
-    finish()
-    work = time.perf_counter() - started
-    killed = 0
-    for moment in np.random.default_rng(5).uniform(0.0, 0.4, 5):
-        start(tmp_path / "killed")
-        if forks.running(moment * work):
-            forks.send(signal.SIGKILL)
-        killed += forks.end().status == -signal.SIGKILL
-    assert killed >= 3
-    start(tmp_path / "killed")
-    finish()
-    assert results(tmp_path / "killed") == results(tmp_path / "whole")
+    whole, killed = forks.whole_and_killed(command, tmp_path, TINY)
+    assert results(killed) == results(whole)
 
 
 @pytest.mark.slow

@@ -1,11 +1,8 @@
 """``lw-torchrl offline``: runs one by one, tables, and that a killed command carries on to the same results."""
 
 import json
-import signal
-import time
 from dataclasses import replace
 
-import numpy as np
 import pytest
 from commands import fails, run
 
@@ -132,25 +129,8 @@ def test_two_processes_give_what_one_gives(capsys, forks, tmp_path):
 
 @pytest.mark.slow
 def test_killed_at_five_random_moments_it_ends_the_same(forks, tmp_path):
-    def start(out):
-        more = ("--steps", 1500, "--episodes", 1, "--seeds", 0, "--out", out)
-        forks.start("offline", "quick", *more, before=TINY)
+    def command(out):
+        return "offline", "quick", "--steps", 1500, "--episodes", 1, "--seeds", 0, "--out", out
 
-    def finish():
-        ended = forks.end()
-        assert ended.status == 0, ended.err[-2000:]
-
-    started = time.perf_counter()
-    start(tmp_path / "whole")
-    finish()
-    work = time.perf_counter() - started
-    killed = 0
-    for moment in np.random.default_rng(7).uniform(0.0, 0.4, 5):
-        start(tmp_path / "killed")
-        if forks.running(moment * work):
-            forks.send(signal.SIGKILL)
-        killed += forks.end().status == -signal.SIGKILL
-    assert killed >= 3
-    start(tmp_path / "killed")
-    finish()
-    assert results(tmp_path / "killed") == results(tmp_path / "whole")
+    whole, killed = forks.whole_and_killed(command, tmp_path, TINY)
+    assert results(killed) == results(whole)

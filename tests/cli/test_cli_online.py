@@ -1,11 +1,8 @@
 """``lw-torchrl online``: weak starts, what methods make of them, a summary beside a figure; stopped, it carries on."""
 
 import json
-import signal
-import time
 from functools import partial
 
-import numpy as np
 import pytest
 from commands import fails, run
 
@@ -188,27 +185,8 @@ def results(folder):
 
 @pytest.mark.slow
 def test_killed_at_five_random_moments_it_ends_the_same(forks, tmp_path):
-    def start(out):
-        forks.start(*arguments(out), before=TINY)
-
-    def finish():
-        ended = forks.end()
-        assert ended.status == 0, ended.err[-2000:]
-
-    started = time.perf_counter()
-    start(tmp_path / "whole")
-    finish()
-    work = time.perf_counter() - started
-    killed = 0
-    for moment in np.random.default_rng(5).uniform(0.0, 0.4, 5):
-        start(tmp_path / "killed")
-        if forks.running(moment * work):
-            forks.send(signal.SIGKILL)
-        killed += forks.end().status == -signal.SIGKILL
-    assert killed >= 3
-    start(tmp_path / "killed")
-    finish()
-    assert results(tmp_path / "killed") == results(tmp_path / "whole")
+    whole, killed = forks.whole_and_killed(arguments, tmp_path, TINY)
+    assert results(killed) == results(whole)
 
 
 def test_a_run_killed_before_its_result_is_not_trained_again(tmp_path, tiny, monkeypatch):
