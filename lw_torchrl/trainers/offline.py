@@ -22,6 +22,7 @@ from lw_torchrl._progress import Progress
 from lw_torchrl.trainers.checkpoint import describe_data, describe_learning
 from lw_torchrl.trainers.interrupts import interrupts_between_steps
 from lw_torchrl.trainers.loss_state import (
+    check_loss,
     describe_loss,
     load_tensors,
     networks_of,
@@ -30,6 +31,7 @@ from lw_torchrl.trainers.loss_state import (
     targets_of,
     tensors_of,
     trained_parameters,
+    with_steps,
     write_training,
 )
 from lw_torchrl.trainers.minibatches import check_minibatches, draw_batch
@@ -84,7 +86,8 @@ class OfflineConfig:
 
 class OfflineTrainer:
     """Trains what a loss holds on a buffer's minibatches: a step minimises the sum of the loss's ``loss_`` entries,
-    each of which reaches its own network alone, and moves its targets.
+    each of which reaches its own network alone, and moves its targets. CQL's ``loss_actor_bc``, which is for its first
+    steps instead of ``loss_actor``, is left out.
 
     Args:
         loss: of ``torchrl.objectives`` or ``lw_torchrl.objectives``, with its value estimator; networks are trained in
@@ -101,7 +104,9 @@ class OfflineTrainer:
 
     Raises:
         ValueError: the checkpoint is damaged, or of another loss, configuration or data; a buffer that answers the
-            queries of other plans; or, in :meth:`train`, the loss or the weights are no numbers.
+            queries of other plans, or draws by priorities; a loss whose value estimator has another gamma than the
+            buffer's n steps, that gives no mean, or CQL's with a Lagrange multiplier; or, in :meth:`train`, the loss or
+            the weights are no numbers.
         OSError: the checkpoint cannot be written; the earlier one stays.
 
     Example:
@@ -138,6 +143,8 @@ class OfflineTrainer:
         self.networks = networks_of(loss)
         self.device = next(loss.parameters()).device
         check_minibatches(self.networks, replay, config.batch_size)
+        check_loss(loss, replay)
+        getattr(loss, "target_entropy", None)  # SAC's is a buffer from the first time on that it is asked for
         self.state = TrainingState(replay, config.seed)
         self.targets = targets_of(loss, config.target_eps)
         actor, others = trained_parameters(loss)
@@ -181,7 +188,8 @@ class OfflineTrainer:
     def step(self) -> TensorDictBase:
         """Train on one minibatch and return what the loss gives, detached."""
         with drawn_on(self.device, self.state.torch_generator):
-            found = self.loss(draw_batch(self.replay, self.config.batch_size, self.device))
+            batch = draw_batch(self.replay, self.config.batch_size, self.device)
+            found = self.loss(with_steps(self.loss, batch))
             self.state.torch_generator = torch.get_rng_state()
         total = sum_of_losses(found)
         if self.device == CPU:
