@@ -35,7 +35,7 @@ from lw_torchrl.trainers.loss_state import (
     write_training,
 )
 from lw_torchrl.trainers.minibatches import check_minibatches, draw_batch
-from lw_torchrl.trainers.normalization import fit_normalization
+from lw_torchrl.trainers.normalization import fit_untrained
 from lw_torchrl.trainers.policy_checks import check_trained
 from lw_torchrl.trainers.recent_losses import READ_EVERY, RecentLosses
 from lw_torchrl.trainers.training_state import TrainingState, load_state, state_of
@@ -53,7 +53,8 @@ class OfflineConfig:
         weight_decay: AdamW's.
         target_eps: how much of target networks stays at a step, where the loss has any.
         schedule: "cosine" to 0 or "constant".
-        normalize: first take the statistics of the observation's features from the buffer, for all networks.
+        normalize: first take the statistics of the observation's features from the buffer, for all networks; False
+            for those that were trained before on others.
         max_grad_norm: the actor's gradients, and those of all else, are clipped to it.
         seed: of the minibatches, and of what networks and transforms draw while training.
         checkpoint_every: steps between checkpoints.
@@ -105,7 +106,8 @@ class OfflineTrainer:
     Raises:
         ValueError: the checkpoint is damaged, or of another loss, configuration or data; a buffer that answers the
             queries of other plans, or draws by priorities; a loss whose value estimator has another gamma than the
-            buffer's n steps, that gives no mean, or CQL's with a Lagrange multiplier; or, in :meth:`train`, the loss or
+            buffer's n steps, that gives no mean, or CQL's with a Lagrange multiplier; networks that were
+            trained with other statistics, where ``normalize``; or, in :meth:`train`, the loss or
             the weights are no numbers.
         OSError: the checkpoint cannot be written; the earlier one stays.
 
@@ -168,7 +170,7 @@ class OfflineTrainer:
                 "replay": describe_learning(replay),
             }
         if config.normalize:
-            fit_normalization(loss, replay)
+            fit_untrained(loss, replay)
         if self.checkpoint is not None and self.checkpoint.exists():
             found, tensors = open_training(self.checkpoint, self._described)
             load_state(self.checkpoint, found, self.optimizer, self.schedule, [self.state], config.steps)

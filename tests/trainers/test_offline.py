@@ -226,6 +226,18 @@ def test_statistics_of_the_rows_reach_networks_and_their_targets(demos, name):
     )
 
 
+def test_a_policy_that_was_trained_keeps_its_statistics(demos):
+    actor = Networks(0.0, "cpu").actor()
+    OfflineTrainer(lw.AdvantageWeightedLoss(actor), make_replay(demos), CONFIG, progress=False).train()
+    before = {name: tensor.clone() for name, tensor in actor.state_dict().items()}
+    OfflineTrainer(lw.AdvantageWeightedLoss(actor), make_replay(demos), CONFIG, progress=False)  # of the same rows
+    others = make_replay(demos, episodes={"reach": 1}, sampler=RandomSampler())
+    with pytest.raises(ValueError, match="has the statistics of other rows"):
+        OfflineTrainer(lw.AdvantageWeightedLoss(actor), others, CONFIG, progress=False)
+    OfflineTrainer(lw.AdvantageWeightedLoss(actor), others, replace(CONFIG, normalize=False), progress=False)
+    assert_same(actor.state_dict(), before)
+
+
 def test_networks_are_in_eval_mode_afterwards_and_in_train_mode_meanwhile(demos):
     trainer = make_trainer(demos, "td3-bc")
     seen = []
