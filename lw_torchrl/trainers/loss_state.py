@@ -69,8 +69,17 @@ def load_tensors(loss: nn.Module, found: Mapping[str, Tensor]) -> None:
 
 
 def check_loss(loss: LossModule, replay: TensorDictReplayBuffer) -> None:
-    """Raise :class:`ValueError` for a loss whose sum must not be minimised, or whose discount is not that of the
-    buffer's n steps; a value estimator that TorchRL would make in the first step is made."""
+    """Make a loss's value estimator see the buffer's n steps; one that TorchRL would make in the first step is made.
+
+    Raises:
+        TypeError: it is no :class:`LossModule`, but what ``torch.compile`` made of one.
+        ValueError: its sum must not be minimised, or its discount is not that of the buffer's n steps.
+    """
+    if not isinstance(loss, LossModule):
+        raise TypeError(
+            f"loss must be a LossModule, got {type(loss).__name__}, whose targets and actor cannot be found; compile a "
+            "loss in place, by loss.compile()"
+        )
     if getattr(loss, "reduction", "mean") == "none":
         raise ValueError("loss must give the mean of its rows, got reduction='none'")
     if getattr(loss, "with_lagrange", False):

@@ -109,6 +109,7 @@ class OfflineTrainer:
             buffer's n steps, that gives no mean, or CQL's with a Lagrange multiplier; networks that were
             trained with other statistics, where ``normalize``; or, in :meth:`train`, the loss or
             the weights are no numbers.
+        TypeError: the loss is none of TorchRL's kind.
         OSError: the checkpoint cannot be written; the earlier one stays.
 
     Example:
@@ -139,13 +140,13 @@ class OfflineTrainer:
         progress: bool = True,
         title: str = "training",
     ) -> None:
+        check_loss(loss, replay)
         self.loss, self.replay, self.logger, self.progress, self.title = loss, replay, logger, progress, title
         self.config = config = config or OfflineConfig()
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
         self.networks = networks_of(loss)
         self.device = next(loss.parameters()).device
         check_minibatches(self.networks, replay, config.batch_size)
-        check_loss(loss, replay)
         getattr(loss, "target_entropy", None)  # SAC's is a buffer from the first time on that it is asked for
         self.state = TrainingState(replay, config.seed)
         self.targets = targets_of(loss, config.target_eps)
