@@ -17,7 +17,10 @@ from lw_torchrl.experiments.offline_runs import Advantages, OfflineRun
 
 _PLAN = "pcbc", "pcbc"
 _SEEN = ("pcbc", "dc", "one-hot")
-_BRACKETS = "Brackets are 95 % intervals, bootstraps over seeds, each drawn with all its tasks; of three seeds they are too narrow."
+_BRACKETS = (
+    "Brackets are 95 % intervals, bootstraps over seeds, each drawn with all its tasks; with three seeds they are too "
+    "narrow."
+)
 
 
 @dataclass(frozen=True)
