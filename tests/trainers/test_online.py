@@ -263,6 +263,12 @@ def test_a_critic_may_be_given(demos):
             make_online(demos, method, critic=critic)
 
 
+def test_a_critic_of_other_plans_is_refused(demos):
+    others = lw.Plans([lw.ConditionalPlan(plan.task, plan.steps[::-1]) for plan in PLANS.values()])
+    with pytest.raises(ValueError, match="replay's QAFTransform must have the critic's plans"):
+        make_online(demos, critic=lw.PlanConditionedQValue(others, width=16, depth=1))
+
+
 def test_critics_see_what_the_start_was_normalised_by(demos):
     actor = make_actor()
     actor.fit_normalization(torch.rand(50, 39))
