@@ -21,12 +21,14 @@ class OfflineMethod:
         loss: a name of :data:`lw_torchrl.experiments.offline_training.LOSSES`.
         keep: which episodes it sees; None for all.
         critic: whether it has a critic, which may see something else than the actor.
+        version: 1 more whenever it is changed, so that what it gave before is refused.
     """
 
     name: str
     loss: str
     keep: EpisodeFilter | None = None
     critic: bool = False
+    version: int = 1
 
 
 OFFLINE_METHODS: Mapping[str, OfflineMethod] = MappingProxyType(
@@ -37,9 +39,9 @@ OFFLINE_METHODS: Mapping[str, OfflineMethod] = MappingProxyType(
             OfflineMethod("filtered-bc", "bc", EpisodeFilter(success=True, else_best=0.2)),
             OfflineMethod("best-bc", "bc", EpisodeFilter(best=0.2)),
             OfflineMethod("bc", "bc"),
-            OfflineMethod("iql", "iql", critic=True),
+            OfflineMethod("iql", "iql", critic=True, version=2),
             OfflineMethod("td3-bc", "td3-bc", critic=True),
-            OfflineMethod("cql", "cql", critic=True),
+            OfflineMethod("cql", "cql", critic=True, version=2),
         )
     }
 )

@@ -127,7 +127,8 @@ class OfflineRun(Learned):
 
     def describe(self, plans: Plans) -> dict[str, Any]:
         without = {"episodes"} if self.how.critic else {"episodes", "critic"}
-        return {key: value for key, value in super().describe(plans).items() if key not in without}
+        described = {key: value for key, value in super().describe(plans).items() if key not in without}
+        return described | ({"version": self.how.version} if self.how.version > 1 else {})
 
 
 SEEN_BY: Mapping[str, str] = {"pcbc": "plan", "dc": "description", "one-hot": "one-hot"}

@@ -17,6 +17,10 @@ from lw_torchrl.experiments.offline_runs import Advantages, OfflineRun
 
 _PLAN = "pcbc", "pcbc"
 _SEEN = ("pcbc", "dc", "one-hot")
+_BRACKETS = (
+    "Brackets are 95 % intervals, bootstraps over seeds, each drawn with all its tasks; with three seeds they are too "
+    "narrow."
+)
 
 
 @dataclass(frozen=True)
@@ -82,7 +86,7 @@ def write_table(
         compared[mixture] = MethodComparison(summaries, whole_seeds=True)
     rows = [[label, *(_mean(compared[mixture], label) for mixture in mixtures)] for label in labels]
     head = markdown_table(["method, conditioned on", *mixtures], rows)
-    parts = [f"# {name}: {runs[0].tasks} tasks, mean success", head]
+    parts = [f"# {name}: {runs[0].tasks} tasks, mean success", head, _BRACKETS]
     for mixture, one in compared.items():
         portions = ", ".join(f"{part.episodes} {part.behaviour}" for part in MIXTURES[mixture].portions)
         parts += [f"## {mixture}: of each task {portions}", one.headline(), one.per_task()]

@@ -175,7 +175,7 @@ def train_offline(run: OfflineRun, plans: Plans, out: Path, progress: bool = Tru
     config = _config(run, recipe.steps)
     OfflineTrainer(loss, replay, config, checkpoint=checkpoint, progress=progress, title=run.label).train()
     save_actor(actor, file, data=describe_data(replay), run=described)
-    checkpoint.unlink()
+    checkpoint.unlink(missing_ok=True)  # another process did the same run
     return actor.eval()
 
 

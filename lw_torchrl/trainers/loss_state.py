@@ -8,16 +8,23 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor, nn
-from torchrl.objectives import LossModule, SoftUpdate
+from torchrl.data import TensorDictReplayBuffer
+from torchrl.envs import MultiStepTransform
+from torchrl.objectives import IQLLoss, LossModule, REDQLoss, SoftUpdate
 
 from lw_torchrl._state_tree import check_like, join, split
 from lw_torchrl._tensor_archive import TensorArchive, write_archive
+from lw_torchrl.data.n_steps import STEPS
 from lw_torchrl.trainers.policy_checks import check_finite
 from lw_torchrl.trainers.training_state import check_same_description
 
 FORMAT = "lw_torchrl.training"
 FORMAT_VERSION = 1
+
+_INSTEAD = {"loss_actor_bc"}
+"""What is to be minimised instead of another entry, for a while: CQL's first steps of the actor."""
 
 
 def networks_of(loss: LossModule) -> list[nn.Module]:
@@ -61,9 +68,63 @@ def load_tensors(loss: nn.Module, found: Mapping[str, Tensor]) -> None:
         tensor.copy_(found[name])
 
 
+def check_loss(loss: LossModule, replay: TensorDictReplayBuffer) -> None:
+    """Make a loss's value estimator see the buffer's n steps; one that TorchRL would make in the first step is made.
+
+    Raises:
+        TypeError: it is no :class:`LossModule`, but what ``torch.compile`` made of one.
+        ValueError: its sum must not be minimised, or its discount is not that of the buffer's n steps.
+    """
+    if not isinstance(loss, LossModule):
+        raise TypeError(
+            f"loss must be a LossModule, got {type(loss).__name__}, whose targets and actor cannot be found; compile a "
+            "loss in place, by loss.compile()"
+        )
+    if getattr(loss, "reduction", "mean") == "none":
+        raise ValueError("loss must give the mean of its rows, got reduction='none'")
+    if getattr(loss, "with_lagrange", False):
+        raise ValueError(
+            "loss: with_lagrange=True gives a loss_alpha_prime that reaches the critics, and takes from them what "
+            "loss_cql adds; give with_lagrange=False"
+        )
+    if _forgets_steps(loss):
+        loss.value_estimator.set_keys(steps_to_next_obs=("next", STEPS))
+    if (shown := _gamma_of(replay)) is None or loss.default_value_estimator is None:
+        return
+    own = getattr(loss.value_estimator, "gamma", None)
+    if own is not None and abs(float(own) - shown) > 1e-6:
+        raise ValueError(
+            f"loss: its value estimator's gamma must be that of the replay buffer's n steps, {shown}, got "
+            f"{float(own):.6g}; call loss.make_value_estimator(gamma={shown})"
+        )
+
+
+def _gamma_of(replay: TensorDictReplayBuffer) -> float | None:
+    """The discount of the rewards that a buffer sums; None where ``next`` is one step ahead."""
+    summed = [part.gamma for part in replay.transform if isinstance(part, MultiStepTransform)]
+    return next(iter(summed), getattr(replay, "gamma", None))
+
+
+def _forgets_steps(loss: LossModule) -> bool:
+    """Whether a loss shows its value estimator ``next``, but not how many steps it lies ahead: as if it were one."""
+    return isinstance(loss, (IQLLoss, REDQLoss))
+
+
+def with_steps(loss: LossModule, batch: TensorDictBase) -> TensorDictBase:
+    """A minibatch whose n steps the loss's value estimator sees, too."""
+    steps = batch.get(STEPS, None)
+    return batch if steps is None or not _forgets_steps(loss) else batch.set(("next", STEPS), steps)
+
+
 def sum_of_losses(found: Mapping[str, Any]) -> Tensor:
-    """What is minimised of what a loss gives: the sum of its ``loss_`` entries."""
-    terms = [value for name, value in found.items() if name.startswith("loss_")]
+    """What is minimised of what a loss gives: the sum of its ``loss_`` entries, without those that stand for another.
+
+    Raises:
+        ValueError: there is none.
+    """
+    terms = [value for name, value in found.items() if name.startswith("loss_") and name not in _INSTEAD]
+    if not terms:
+        raise ValueError(f"loss must give entries that begin with 'loss_', it gives {', '.join(found.keys())}")
     return torch.stack(terms).sum()
 
 

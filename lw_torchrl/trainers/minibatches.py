@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torchrl.data import TensorDictReplayBuffer
-from torchrl.data.replay_buffers.samplers import RandomSampler
+from torchrl.data.replay_buffers.samplers import PrioritizedSampler, RandomSampler
 
 from lw_torchrl._devices import CPU
 from lw_torchrl.data.device_storage import DeviceStorage, device_of_rows
@@ -43,8 +43,11 @@ def _check_batch_size(replay: TensorDictReplayBuffer, size: int) -> None:
 
 
 def _check_draws(replay: TensorDictReplayBuffer) -> None:
-    """Raise :class:`ValueError` if the sampler would draw on a device, where the trainers' generators are not."""
+    """Raise :class:`ValueError` if the sampler would draw on a device, where the trainers' generators are not, or by
+    priorities, which no trainer changes."""
     rows, sampler = replay.storage, replay.sampler
+    if isinstance(sampler, PrioritizedSampler):
+        raise ValueError("replay: nothing here gives rows new priorities, so a PrioritizedSampler draws them all alike")
     ours = isinstance(sampler, GroupSampler) or (isinstance(rows, DeviceStorage) and type(sampler) is RandomSampler)
     if not ours and (device := device_of_rows(rows)).type != "cpu":
         raise ValueError(

@@ -66,6 +66,26 @@ def fit_normalization(target: nn.Module, replay: TensorDictReplayBuffer) -> None
         raise ValueError(f"{type(target).__name__} holds no ObservationFeatures: there is nothing to normalise")
 
 
+def fit_untrained(loss: LossModule, replay: TensorDictReplayBuffer) -> None:
+    """As :func:`fit_normalization`, of networks that have no statistics yet, or these.
+
+    Raises:
+        ValueError: one was trained with others: it would see, and do, something else than before.
+    """
+    before = [(mean, mean.clone(), std, std.clone()) for _, mean, std in _statistics(loss)]
+    fit_normalization(loss, replay)
+    for mean, old_mean, std, old_std in before:
+        untrained = not old_mean.any() and bool((old_std == 1).all())
+        if not untrained and not (torch.allclose(mean, old_mean) and torch.allclose(std, old_std)):
+            for now, then in ((a, b) for row in before for a, b in (row[:2], row[2:])):
+                now.copy_(then)
+            raise ValueError(
+                "normalize: a network of the loss has the statistics of other rows, with which it was trained; give "
+                "OfflineConfig(normalize=False) to keep them, and fresh networks theirs by fit_normalization(network, "
+                "replay) before the loss is made"
+            )
+
+
 def _statistics(target: nn.Module) -> Iterator[tuple[str, Tensor, Tensor]]:
     """The kind of each :class:`ObservationFeatures`, its mean and its standard deviation; of a loss, every copy's."""
     if not isinstance(target, LossModule):

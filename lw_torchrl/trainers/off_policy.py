@@ -104,11 +104,11 @@ class SACLearner(Learner):
     def learn(self, steps: int) -> None:
         for _ in range(steps):
             found = self.loss(self.replay.sample(self.config.batch_size))
-            self.optimize("critic", found["loss_qvalue"])
-            self.tell(loss_qvalue=found["loss_qvalue"], entropy=found["entropy"])
-            if self.made >= self.config.warm_up:
+            if self.made >= self.config.warm_up:  # before the critics move: the actor's gradient goes through them
                 self.optimize("actor", found["loss_actor"])
                 self.optimize("alpha", found["loss_alpha"])
                 self.tell(loss_actor=found["loss_actor"])
+            self.optimize("critic", found["loss_qvalue"])
+            self.tell(loss_qvalue=found["loss_qvalue"], entropy=found["entropy"])
             self.targets.step()
             self.made += 1

@@ -22,6 +22,7 @@ from lw_torchrl._progress import Progress
 from lw_torchrl.trainers.checkpoint import describe_data, describe_learning
 from lw_torchrl.trainers.interrupts import interrupts_between_steps
 from lw_torchrl.trainers.loss_state import (
+    check_loss,
     describe_loss,
     load_tensors,
     networks_of,
@@ -30,10 +31,11 @@ from lw_torchrl.trainers.loss_state import (
     targets_of,
     tensors_of,
     trained_parameters,
+    with_steps,
     write_training,
 )
 from lw_torchrl.trainers.minibatches import check_minibatches, draw_batch
-from lw_torchrl.trainers.normalization import fit_normalization
+from lw_torchrl.trainers.normalization import fit_untrained
 from lw_torchrl.trainers.policy_checks import check_trained
 from lw_torchrl.trainers.recent_losses import READ_EVERY, RecentLosses
 from lw_torchrl.trainers.training_state import TrainingState, load_state, state_of
@@ -51,7 +53,8 @@ class OfflineConfig:
         weight_decay: AdamW's.
         target_eps: how much of target networks stays at a step, where the loss has any.
         schedule: "cosine" to 0 or "constant".
-        normalize: first take the statistics of the observation's features from the buffer, for all networks.
+        normalize: first take the statistics of the observation's features from the buffer, for all networks; False
+            for those that were trained before on others.
         max_grad_norm: the actor's gradients, and those of all else, are clipped to it.
         seed: of the minibatches, and of what networks and transforms draw while training.
         checkpoint_every: steps between checkpoints.
@@ -84,7 +87,8 @@ class OfflineConfig:
 
 class OfflineTrainer:
     """Trains what a loss holds on a buffer's minibatches: a step minimises the sum of the loss's ``loss_`` entries,
-    each of which reaches its own network alone, and moves its targets.
+    each of which reaches its own network alone, and moves its targets. CQL's ``loss_actor_bc``, which is for its first
+    steps instead of ``loss_actor``, is left out.
 
     Args:
         loss: of ``torchrl.objectives`` or ``lw_torchrl.objectives``, with its value estimator; networks are trained in
@@ -101,7 +105,11 @@ class OfflineTrainer:
 
     Raises:
         ValueError: the checkpoint is damaged, or of another loss, configuration or data; a buffer that answers the
-            queries of other plans; or, in :meth:`train`, the loss or the weights are no numbers.
+            queries of other plans, or draws by priorities; a loss whose value estimator has another gamma than the
+            buffer's n steps, that gives no mean, or CQL's with a Lagrange multiplier; networks that were
+            trained with other statistics, where ``normalize``; or, in :meth:`train`, the loss or
+            the weights are no numbers.
+        TypeError: the loss is none of TorchRL's kind.
         OSError: the checkpoint cannot be written; the earlier one stays.
 
     Example:
@@ -132,12 +140,14 @@ class OfflineTrainer:
         progress: bool = True,
         title: str = "training",
     ) -> None:
+        check_loss(loss, replay)
         self.loss, self.replay, self.logger, self.progress, self.title = loss, replay, logger, progress, title
         self.config = config = config or OfflineConfig()
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
         self.networks = networks_of(loss)
         self.device = next(loss.parameters()).device
         check_minibatches(self.networks, replay, config.batch_size)
+        getattr(loss, "target_entropy", None)  # SAC's is a buffer from the first time on that it is asked for
         self.state = TrainingState(replay, config.seed)
         self.targets = targets_of(loss, config.target_eps)
         actor, others = trained_parameters(loss)
@@ -161,7 +171,7 @@ class OfflineTrainer:
                 "replay": describe_learning(replay),
             }
         if config.normalize:
-            fit_normalization(loss, replay)
+            fit_untrained(loss, replay)
         if self.checkpoint is not None and self.checkpoint.exists():
             found, tensors = open_training(self.checkpoint, self._described)
             load_state(self.checkpoint, found, self.optimizer, self.schedule, [self.state], config.steps)
@@ -181,7 +191,8 @@ class OfflineTrainer:
     def step(self) -> TensorDictBase:
         """Train on one minibatch and return what the loss gives, detached."""
         with drawn_on(self.device, self.state.torch_generator):
-            found = self.loss(draw_batch(self.replay, self.config.batch_size, self.device))
+            batch = draw_batch(self.replay, self.config.batch_size, self.device)
+            found = self.loss(with_steps(self.loss, batch))
             self.state.torch_generator = torch.get_rng_state()
         total = sum_of_losses(found)
         if self.device == CPU:

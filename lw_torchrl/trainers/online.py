@@ -33,6 +33,7 @@ from lw_torchrl.trainers.first_episodes import FirstEpisodes
 from lw_torchrl.trainers.growing_replay import check_growing_replay
 from lw_torchrl.trainers.interrupts import Interrupt, interrupts_between_steps
 from lw_torchrl.trainers.learner import Learner
+from lw_torchrl.trainers.minibatches import check_minibatches
 from lw_torchrl.trainers.off_policy import ResidualLearner, SACLearner, TD3Learner
 from lw_torchrl.trainers.on_policy import PPOLearner
 from lw_torchrl.trainers.online_config import OnlineConfig
@@ -69,7 +70,8 @@ class OnlineTrainer:
         method: "td3", "sac" or "residual", from demonstrations and what came, half of a minibatch each; "ppo"; or
             "expert-iteration", behavioral cloning of demonstrations and own successes. See :data:`LEARNERS`.
         tasks: to run, as for :class:`LanguageWorldEnv`; None for those of the demonstrations.
-        critic: whose copies are trained by "td3", "sac" and "residual"; None for one that sees what the actor sees.
+        critic: whose copies are trained by "td3", "sac" and "residual", with its normalisation as it is
+            (``critic.fit_normalization``); None for one that sees what the actor sees, by the actor's.
         checkpoint: a file to write checkpoints to, the buffer's rows among it. If it is there already, training
             carries on from it.
         logger: a TorchRL logger, for what ``history`` holds, by steps of the environment.
@@ -132,6 +134,8 @@ class OnlineTrainer:
         self.method = check_choice("method", method, LEARNERS)
         check_can_be_saved(actor)
         check_growing_replay(actor, replay, config)
+        if critic is not None:
+            check_minibatches([critic], replay, config.batch_size)
         self.replay, self.logger, self.progress = replay, logger, progress
         self.tasks = replay.tasks if tasks is None else tasks
         self.num_threads = num_threads

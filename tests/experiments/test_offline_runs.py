@@ -185,6 +185,24 @@ def test_results_and_advantages_of_another_recipe_are_refused(made):
         train_offline(tiny(recipe=other), PLANS, made, progress=False)
 
 
+def test_what_a_method_gave_before_it_was_changed_is_refused(out, monkeypatch):
+    run = tiny("bc")
+    execute_offline(run, PLANS, out, progress=False)
+    changed = replace(OFFLINE_METHODS["bc"], version=2)
+    monkeypatch.setattr("lw_torchrl.experiments.offline_runs.OFFLINE_METHODS", {**OFFLINE_METHODS, "bc": changed})
+    with pytest.raises(ValueError, match=r"it differs in version"):
+        execute_offline(run, PLANS, out, progress=False)
+
+
+def test_a_run_that_another_process_ends_first_is_the_same(out, monkeypatch):
+    run = tiny("bc")
+    kept = "lw_torchrl.experiments.offline_training.save_actor"
+    monkeypatch.setattr(
+        kept, lambda *one, **about: (lw.save_actor(*one, **about), (out / run.folder / "checkpoint.zip").unlink())
+    )
+    assert execute_offline(run, PLANS, out, progress=False).config["run"] == run.describe(PLANS)
+
+
 def test_damaged_advantages_are_refused(made, out):
     one = tiny().advantages
     make_advantages(one, PLANS, out, progress=False)

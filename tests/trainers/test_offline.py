@@ -9,13 +9,15 @@ import pytest
 import torch
 from small_training import PLANS, SMALL, assert_same, collect_demos, flat
 from torch.nn.utils import clip_grad_norm_
-from torchrl.data import RandomSampler
-from torchrl.objectives import BCLoss, CQLLoss, IQLLoss, SoftUpdate, TD3BCLoss
+from torchrl.data import PrioritizedSampler, RandomSampler
+from torchrl.envs import Transform
+from torchrl.objectives import BCLoss, CQLLoss, IQLLoss, REDQLoss, SACLoss, SoftUpdate, TD3BCLoss
 from torchrl.record.loggers import Logger
 
 import lw_torchrl as lw
 from lw_torchrl.trainers import OfflineConfig, OfflineTrainer, fit_normalization
-from lw_torchrl.trainers.loss_state import tensors_of
+from lw_torchrl.trainers.loss_state import sum_of_losses, tensors_of
+from lw_torchrl.trainers.minibatches import check_minibatches
 
 CONFIG = OfflineConfig(steps=12, batch_size=8, checkpoint_every=5)
 CRITIC = dict(width=16, depth=1)
@@ -32,7 +34,7 @@ def make_replay(demos, plans=PLANS, sampler=None, n_steps=3, advantage=1.0, **op
         demos,
         label="executed",
         n_steps=n_steps,
-        gamma=GAMMA,
+        gamma=GAMMA if n_steps > 1 else None,
         sampler=sampler or lw.TaskBalancedSampler(),
         transform=lw.QAFTransform(plans),
         **options,
@@ -70,6 +72,10 @@ LOSSES = {
     "iql": lambda made: IQLLoss(made.actor(distribution="normal"), made.qvalue(), made.value()),
     "td3-bc": lambda made: TD3BCLoss(made.actor(), made.qvalue(), bounds=(-1.0, 1.0), delay_actor=True),
     "cql": lambda made: CQLLoss(made.actor(distribution="tanh_normal"), made.qvalue(), num_random=2),
+    "sac": lambda made: SACLoss(made.actor(distribution="tanh_normal"), made.qvalue()),
+    "redq": lambda made: REDQLoss(
+        made.actor(distribution="tanh_normal"), made.qvalue(), num_qvalue_nets=2, sub_sample_len=2
+    ),
 }
 
 
@@ -158,6 +164,45 @@ def test_a_step_is_the_one_written_by_hand(demos):
     assert_same(flat(tensors_of(trainer.loss)), flat(tensors_of(loss)))
 
 
+@pytest.mark.parametrize("name", ["value", "iql", "td3-bc", "cql", "sac", "redq"])
+def test_what_lies_n_steps_ahead_is_discounted_as_often(demos, name):
+    seen = []
+    trainer = make_trainer(demos, name, config=replace(CONFIG, steps=1))
+    estimator = trainer.loss.value_estimator
+    estimate = type(estimator).value_estimate
+
+    def note(rows, **options):
+        zero, never = torch.zeros_like(rows["next", "reward"]), torch.zeros_like(rows["next", "terminated"])
+        rows = rows.copy().set("next", rows["next"].copy().update({"reward": zero, "terminated": never}))
+        seen.append(estimate(estimator, rows, **{**options, "next_value": torch.ones_like(zero)}).reshape(-1))
+        return zero
+
+    estimator.value_estimate = note
+    steps = []
+    trainer.replay.append_transform(_Note(steps))
+    trainer.train()
+    torch.testing.assert_close(seen[0], GAMMA ** steps[0].float())
+    assert steps[0].max() == 3
+
+
+class _Note(Transform):
+    def __init__(self, noted):
+        super().__init__()
+        self.noted = noted
+
+    def forward(self, tensordict):
+        self.noted.append(tensordict["steps_to_next_obs"].clone())
+        return tensordict
+
+
+def test_the_first_steps_of_cqls_actor_stand_for_its_loss_and_not_beside_it(demos):
+    trainer = make_trainer(demos, "cql", config=replace(CONFIG, steps=1))
+    found = trainer.loss(trainer.replay.sample(8))
+    wanted = sum(found[name] for name in ("loss_actor", "loss_qvalue", "loss_cql", "loss_alpha"))
+    assert found["loss_actor_bc"] > 1
+    torch.testing.assert_close(sum_of_losses(found), wanted)
+
+
 def test_an_actor_learns_from_its_own_loss_and_a_critic_from_its_own(demos):
     trainer = make_trainer(demos, "td3-bc", config=replace(CONFIG, critic_learning_rate=0.0, weight_decay=0.0))
     before = {name: p.detach().clone() for name, p in trainer.loss.named_parameters()}
@@ -179,6 +224,18 @@ def test_statistics_of_the_rows_reach_networks_and_their_targets(demos, name):
     assert all(
         tensor.abs().sum() == 0 for key, tensor in tensors_of(untouched.loss).items() if key.endswith("features.mean")
     )
+
+
+def test_a_policy_that_was_trained_keeps_its_statistics(demos):
+    actor = Networks(0.0, "cpu").actor()
+    OfflineTrainer(lw.AdvantageWeightedLoss(actor), make_replay(demos), CONFIG, progress=False).train()
+    before = {name: tensor.clone() for name, tensor in actor.state_dict().items()}
+    OfflineTrainer(lw.AdvantageWeightedLoss(actor), make_replay(demos), CONFIG, progress=False)  # of the same rows
+    others = make_replay(demos, episodes={"reach": 1}, sampler=RandomSampler())
+    with pytest.raises(ValueError, match="has the statistics of other rows"):
+        OfflineTrainer(lw.AdvantageWeightedLoss(actor), others, CONFIG, progress=False)
+    OfflineTrainer(lw.AdvantageWeightedLoss(actor), others, replace(CONFIG, normalize=False), progress=False)
+    assert_same(actor.state_dict(), before)
 
 
 def test_networks_are_in_eval_mode_afterwards_and_in_train_mode_meanwhile(demos):
@@ -224,7 +281,7 @@ def checkpoint(demos, tmp_path_factory):
         (dict(config=replace(CONFIG, learning_rate=1e-2)), "its training differs in learning_rate"),
         (dict(name="advantage"), "its loss differs in class"),
         (dict(expectile=0.9), r"its loss differs in options.expectile \(0.7, now 0.9\)"),
-        (dict(gamma=0.5), "its loss differs in fixed"),
+        (dict(gamma=0.5, n_steps=1), "its loss differs in fixed"),
         (dict(width=8), "shapes.value_network_params.heads.0.0.bias"),
         (dict(sampler=RandomSampler()), "its replay differs in sampler"),
         (dict(episodes=1), "of another configuration"),
@@ -279,6 +336,36 @@ def test_a_buffer_of_other_plans_is_refused(demos):
     loss = make_loss("value")
     with pytest.raises(ValueError, match="replay's QAFTransform must have the critic's plans"):
         OfflineTrainer(loss, make_replay(demos, others), CONFIG, progress=False)
+
+
+@pytest.mark.parametrize("made", [True, False])
+def test_a_value_of_another_discount_than_the_rows_is_refused(demos, made):
+    loss = LOSSES["value"](Networks(0.0, "cpu"))
+    if made:
+        loss.make_value_estimator(gamma=0.9)
+    with pytest.raises(ValueError, match=rf"the replay buffer's n steps, 0.95, got 0.9{'' if made else '9'};"):
+        OfflineTrainer(loss, make_replay(demos), CONFIG, progress=False)
+
+
+def test_losses_that_cannot_be_summed_are_refused(demos):
+    made = Networks(0.0, "cpu")
+    actor, critic = made.actor(distribution="tanh_normal"), made.qvalue()
+    unreduced = SACLoss(actor, critic, reduction="none", scalar_output_mode="exclude")
+    with pytest.raises(ValueError, match="got reduction='none'"):
+        OfflineTrainer(unreduced, make_replay(demos), CONFIG, progress=False)
+    with pytest.raises(ValueError, match="with_lagrange=False"):
+        OfflineTrainer(CQLLoss(actor, critic, with_lagrange=True), make_replay(demos), CONFIG, progress=False)
+    with pytest.raises(TypeError, match=r"got Sequential.*by loss.compile\(\)"):
+        OfflineTrainer(torch.nn.Sequential(make_loss("td3-bc")), make_replay(demos), CONFIG, progress=False)
+    with pytest.raises(ValueError, match="entries that begin with 'loss_', it gives loss"):
+        sum_of_losses({"loss": torch.zeros(())})
+
+
+def test_priorities_that_nothing_would_change_are_refused(demos):
+    replay = make_replay(demos)
+    replay._sampler = PrioritizedSampler.__new__(PrioritizedSampler)  # made as users do, it needs compiled code
+    with pytest.raises(ValueError, match="a PrioritizedSampler draws them all alike"):
+        check_minibatches([], replay, 8)
 
 
 def test_a_loss_that_is_no_number_stops_the_training(demos, tmp_path):

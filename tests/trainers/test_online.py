@@ -188,6 +188,17 @@ def test_the_critic_is_trained_alone_at_first(demos):
     assert torch.equal(actor.head.network[0].weight, before)
 
 
+def test_sacs_actor_learns_from_the_critics_that_judged_it(demos):
+    actors = []
+    for rate in (0.0, 1.0):
+        config = replace(CONFIG, frames=60, utd=0.05, warm_up=0, critic_learning_rate=rate)
+        trainer = make_online(demos, "sac", config=config)
+        trainer.train()
+        assert trainer.learner.made == 1
+        actors.append(dict(trainer.policy.state_dict()))
+    assert_same(*actors)
+
+
 def test_expert_iteration_makes_as_many_steps_of_what_succeeded(demos, monkeypatch):
     trainer = make_online(demos, "expert-iteration")
     trainer.train()
@@ -253,6 +264,12 @@ def test_a_critic_may_be_given(demos):
     for method in ("ppo", "expert-iteration"):
         with pytest.raises(ValueError, match=r"critic: .* leave it out"):
             make_online(demos, method, critic=critic)
+
+
+def test_a_critic_of_other_plans_is_refused(demos):
+    others = lw.Plans([lw.ConditionalPlan(plan.task, plan.steps[::-1]) for plan in PLANS.values()])
+    with pytest.raises(ValueError, match="replay's QAFTransform must have the critic's plans"):
+        make_online(demos, critic=lw.PlanConditionedQValue(others, width=16, depth=1))
 
 
 def test_critics_see_what_the_start_was_normalised_by(demos):
