@@ -80,7 +80,7 @@ def main() -> None:
 
         print("a policy, by advantage")
         weighted = show(roots, plans, reward="dense_cost")
-        weighted.add_column("advantage", lw.standardize_by_task(advantage, weighted[:]["task_id"]))
+        weighted.add_column("advantage", lw.standardize_by_task(advantage, weighted[:]["task_id"]), of=rows)
         ours = lw.PlanConditionedActor(plans)
         train(lw.AdvantageWeightedLoss(ours, beta=2.0), weighted, args.steps, 1e-3)
 

@@ -299,21 +299,27 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
             raise ValueError(f"path: {str(file)!r} holds no buffer's state ({error})") from error
         self.load_state_dict(state)
 
-    def add_column(self, name: str, values: Tensor) -> None:
+    def add_column(self, name: str, values: Tensor, *, of: LanguageWorldExperienceReplay | None = None) -> None:
         """Give each row a number of its own, held in memory, that samples then have: its advantage, say.
 
         Args:
             name: of the column, a new one.
             values: (R, ...), for each row in the order of ``replay[:]``; a copy is kept where the rows are.
+            of: the buffer that they were made of, where that is another one, looking n steps ahead say: it must show
+                the same rows in the same order. A filter by return shows other episodes by another reward.
 
         Raises:
             ValueError: another number of rows, a name that samples have, or a buffer that grows, whose later rows would
-                have none.
+                have none; or ``of`` shows other rows.
             TypeError: ``name`` is no text, or ``values`` is no tensor.
         """
         if self._grows:
             raise ValueError(f"add_column: {name!r} would be of no row that comes later, and this buffer grows")
         check_column(name, values, len(self), self.storage.get(slice(0, 1)).keys(), self.transform)
+        if of is not None and not torch.equal(*(each.storage[:].get("observation").cpu() for each in (self, of))):
+            raise ValueError(
+                "of must show the rows of this buffer, in their order: the same folders, episodes and keep"
+            )
         own = values.detach().clone()
         self.columns = {**self.columns, name: sha256(own.cpu().contiguous().numpy().tobytes()).hexdigest()}
         if isinstance(self.storage, TensorStorage):

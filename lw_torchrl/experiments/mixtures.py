@@ -101,12 +101,12 @@ class BehaviourData:
                 seed=_SEEDS * list(BEHAVIOURS).index(self.portion.behaviour) + self.seed,
                 max_steps=self.max_steps,
                 progress=progress,
-                **_NOISE[self.portion.behaviour],
+                **NOISE[self.portion.behaviour],
             )
 
 
 _LED_ASTRAY: dict[str, Any] = {"noise_scale": 0.3, "noise_hold": 10, "gripper_noise_factor": 0.5}
-_NOISE = dict.fromkeys(BEHAVIOURS, _LED_ASTRAY) | {
+NOISE: Mapping[str, dict[str, Any]] = dict.fromkeys(BEHAVIOURS, _LED_ASTRAY) | {
     "expert": {"noise_scale": 0.0},
     "random": {"noise_scale": 0.1, "noise_hold": 10, "gripper_noise_factor": 1.0},
 }

@@ -39,9 +39,9 @@ OFFLINE_METHODS: Mapping[str, OfflineMethod] = MappingProxyType(
             OfflineMethod("filtered-bc", "bc", EpisodeFilter(success=True, else_best=0.2)),
             OfflineMethod("best-bc", "bc", EpisodeFilter(best=0.2)),
             OfflineMethod("bc", "bc"),
-            OfflineMethod("iql", "iql", critic=True, version=2),
+            OfflineMethod("iql", "iql", critic=True),
             OfflineMethod("td3-bc", "td3-bc", critic=True),
-            OfflineMethod("cql", "cql", critic=True, version=2),
+            OfflineMethod("cql", "cql", critic=True),
         )
     }
 )

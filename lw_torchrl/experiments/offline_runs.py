@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from lw_torchrl._checks import check_choice
-from lw_torchrl.experiments.mixtures import MIXTURES, TASK_SETS, BehaviourData, Mixture
+from lw_torchrl.experiments.mixtures import MIXTURES, NOISE, TASK_SETS, BehaviourData, Mixture
 from lw_torchrl.experiments.offline_recipes import OFFLINE_METHODS, OfflineMethod, OfflineRecipe
 from lw_torchrl.experiments.runs import plain
 from lw_torchrl.language.plans import Plans
@@ -56,7 +56,8 @@ class Learned:
 
     def describe(self, plans: Plans) -> dict[str, Any]:
         """Everything that it hangs on, as JSON."""
-        return plain(asdict(self) | {"plans": self.own_plans(plans).fingerprint})
+        data = [asdict(dataset.portion) | NOISE[dataset.portion.behaviour] for dataset in self.datasets]
+        return plain(asdict(self) | {"plans": self.own_plans(plans).fingerprint, "data": data})
 
 
 @dataclass(frozen=True)
@@ -128,7 +129,7 @@ class OfflineRun(Learned):
     def describe(self, plans: Plans) -> dict[str, Any]:
         without = {"episodes"} if self.how.critic else {"episodes", "critic"}
         described = {key: value for key, value in super().describe(plans).items() if key not in without}
-        return described | ({"version": self.how.version} if self.how.version > 1 else {})
+        return described | {"how": plain(asdict(self.how))}
 
 
 SEEN_BY: Mapping[str, str] = {"pcbc": "plan", "dc": "description", "one-hot": "one-hot"}

@@ -95,10 +95,10 @@ class AdvantageWeightedLoss(LossModule):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The loss; what is given stays as it is."""
         action, advantage = read(tensordict, [self.tensor_keys.action, self.tensor_keys.advantage])
-        if advantage.shape != (*tensordict.batch_size, 1):
+        if advantage.shape != (*tensordict.batch_size, 1) or advantage.dtype != action.dtype:
             raise ValueError(
-                f"advantage must be {(*tensordict.batch_size, 1)}, a number for each row, got shape "
-                f"{tuple(advantage.shape)}"
+                f"advantage must be {(*tensordict.batch_size, 1)}, a number for each row, in the action's "
+                f"{action.dtype}, got shape {tuple(advantage.shape)} in {advantage.dtype}"
             )
         check_finite("advantage", advantage)
         logs, most = self.beta * advantage.detach().squeeze(-1), math.log(self.max_weight)

@@ -17,6 +17,15 @@ from lw_torchrl.trainers.learner import Learner, encoder_like, make_optimizer, s
 from lw_torchrl.trainers.online_config import OnlineConfig
 
 
+def _critic(policy: Policy, given: QValue | None) -> QValue:
+    """The critic that is given, or one that sees what the policy sees."""
+    if given is None:
+        return QValue(encoder_like(policy))
+    if not isinstance(given, QValue):
+        raise TypeError(f"critic must be a QValue, which judges actions, got {type(given).__name__}")
+    return given
+
+
 class TD3Learner(Learner):
     """TD3 with as many demonstrations as rows that came, and imitation of the former."""
 
@@ -27,7 +36,7 @@ class TD3Learner(Learner):
     ) -> None:
         super().__init__(start, replay, config)
         self.policy = self.make_policy(start)
-        critic = QValue(encoder_like(self.policy)) if critic is None else critic
+        critic = _critic(self.policy, critic)
         self.loss = loss = DemonstratedTD3Loss(
             self.policy,
             critic.eval(),
@@ -83,7 +92,7 @@ class SACLearner(Learner):
     ) -> None:
         super().__init__(start, replay, config)
         self.policy = stochastic(start, "tanh_normal", config.init_std)
-        critic = QValue(encoder_like(self.policy)) if critic is None else critic
+        critic = _critic(self.policy, critic)
         options: dict[str, Any] = {"bc_weight": config.bc_weight, "loss_function": "l2", "alpha_init": config.entropy}
         self.loss = loss = DemonstratedSACLoss(self.policy, critic.eval(), **options)
         self.target_entropy = loss.target_entropy  # which makes a buffer of the loss

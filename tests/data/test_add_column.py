@@ -144,3 +144,12 @@ def test_nothing_on_disk_changes(roots):
     replay.add_column("advantage", torch.ones(len(replay)))
     assert "advantage" not in opened(roots, "one")[:].keys()
     assert before == {path: path.read_bytes() for path in roots[0].rglob("*") if path.is_file()}
+
+
+def test_values_of_other_rows_are_refused(roots):
+    replay, ahead = opened(roots, "joined"), opened(roots, "n steps")
+    replay.add_column("advantage", torch.zeros(len(ahead), 1), of=ahead)
+    turned = lw.LanguageWorldExperienceReplay(list(roots[::-1]), label="executed")
+    assert len(turned) == len(replay)
+    with pytest.raises(ValueError, match="of must show this buffer's rows, in their order"):
+        replay.add_column("other", torch.zeros(len(turned), 1), of=turned)

@@ -13,6 +13,7 @@ import torch
 import lw_torchrl as lw
 from lw_torchrl.data.behaviours import BEHAVIOURS
 from lw_torchrl.data.metadata import read_metadata
+from lw_torchrl.experiments import mixtures
 from lw_torchrl.experiments.execution import EVALUATION_SEED
 from lw_torchrl.experiments.mixtures import MIXTURES, TASK_SETS, BehaviourData, Portion
 from lw_torchrl.experiments.offline_recipes import OFFLINE_METHODS, OfflineRecipe
@@ -190,7 +191,7 @@ def test_what_a_method_gave_before_it_was_changed_is_refused(out, monkeypatch):
     execute_offline(run, PLANS, out, progress=False)
     changed = replace(OFFLINE_METHODS["bc"], version=2)
     monkeypatch.setattr("lw_torchrl.experiments.offline_runs.OFFLINE_METHODS", {**OFFLINE_METHODS, "bc": changed})
-    with pytest.raises(ValueError, match=r"it differs in version"):
+    with pytest.raises(ValueError, match=r"it differs in how.version"):
         execute_offline(run, PLANS, out, progress=False)
 
 
@@ -236,6 +237,7 @@ def test_the_table_says_means_intervals_and_differences(made):
 
 def test_descriptions_tell_what_a_result_hangs_on():
     run = OfflineRun("five", "B", 0)
+    described = run.describe(PLANS)
     changes = [
         replace(run, method="iql"),
         replace(run, actor="dc"),
@@ -249,4 +251,9 @@ def test_descriptions_tell_what_a_result_hangs_on():
     assert replace(run, episodes=3).describe(PLANS) == run.describe(PLANS)
     cloned = replace(run, method="bc")
     assert replace(cloned, critic="dc").describe(PLANS) == cloned.describe(PLANS)
+    noise = {**mixtures.NOISE, "wrong": {"noise_scale": 0.1}}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("lw_torchrl.experiments.offline_runs.NOISE", noise)
+        assert run.describe(PLANS) != described
+    assert described["data"][0] == {"behaviour": "spoilt-30", "episodes": 20, **mixtures.NOISE["spoilt-30"]}
     assert isinstance(Advantages("five", "B", 0).describe(PLANS)["recipe"], dict)

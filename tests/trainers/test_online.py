@@ -306,6 +306,11 @@ def test_what_cannot_be_trained_on_is_refused(demos):
         make_online(demos, replay=make_replay(demos, actor, transform=lw.QAFTransform(other)))
     with pytest.raises(TypeError, match="actor must be one that can have a distribution, got ScriptedSkillActor"):
         make_online(demos, "sac", actor=lw.ScriptedSkillActor(PLANS))
+    value, qvalue = lw.PlanConditionedValue(PLANS), lw.PlanConditionedQValue(PLANS)
+    with pytest.raises(TypeError, match="critic must be a QValue, which judges actions, got PlanConditionedValue"):
+        make_online(demos, "td3", critic=value)
+    with pytest.raises(TypeError, match=r"critic must be a Value, of states alone, .* got a QValue"):
+        make_online(demos, "advantage", critic=qvalue)
 
 
 @pytest.mark.parametrize(
