@@ -114,7 +114,7 @@ class Forks:
         finish()
         work = time.perf_counter() - started
         kills = 0
-        for moment in np.random.default_rng(5).uniform(0.0, 0.4, 5):
+        for moment in np.random.default_rng(5).uniform(0.0, 0.25, 5):
             self.start(*command(killed), before=before)
             if self.running(moment * work):
                 self.send(signal.SIGKILL)

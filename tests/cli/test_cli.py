@@ -33,6 +33,8 @@ COMMANDS = (
     "plans",
     "check",
     "reproduce",
+    "offline",
+    "online",
 )
 
 

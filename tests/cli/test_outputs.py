@@ -15,6 +15,8 @@ FOLDERS = {
     "evaluate": ["expert", "--out"],
     "scripted": ["reach", "--out"],
     "reproduce": ["few-shot", "--out"],
+    "offline": ["quick", "--out"],
+    "online": ["reach", "--out"],
 }
 FILES = {"train": ["demos", "--out"], "view": ["x.rrd", "--screenshot"]}
 

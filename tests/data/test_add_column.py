@@ -151,5 +151,5 @@ def test_values_of_other_rows_are_refused(roots):
     replay.add_column("advantage", torch.zeros(len(ahead), 1), of=ahead)
     turned = lw.LanguageWorldExperienceReplay(list(roots[::-1]), label="executed")
     assert len(turned) == len(replay)
-    with pytest.raises(ValueError, match="of must show this buffer's rows, in their order"):
+    with pytest.raises(ValueError, match="of must show the rows of this buffer, in their order"):
         replay.add_column("other", torch.zeros(len(turned), 1), of=turned)

@@ -276,7 +276,7 @@ def test_an_evaluation_there_is_the_cpus(kind):
     expected = lw.evaluate(actor, **options)
     WAITS.clear()
     found = lw.evaluate(actor, device="pretend", **options)
-    assert [wait for wait in WAITS if "protocol" in wait], "it was there"
+    assert [wait for wait in WAITS if "episodes" in wait], "it was there"
     assert {p.device for p in actor.parameters()} <= {PRETEND}, "and stays"
     again = lw.evaluate(actor, **options)  # where it is
     for result in (found, again):
@@ -390,7 +390,7 @@ def test_a_run_is_the_same_wherever_it_is_done(tmp_path, setting):
     WAITS.clear()
     found = execute_run(one, RUN_PLANS, tmp_path, tasks=task_of(one), progress=False, device="pretend")
     assert [wait for wait in WAITS if "recent_losses" in wait], "trained there"
-    assert [wait for wait in WAITS if "protocol" in wait], "evaluated there"
+    assert [wait for wait in WAITS if "episodes" in wait], "evaluated there"
     there = {path.relative_to(tmp_path) for path in tmp_path.rglob("*") if path.is_file()}
     assert load_result(one, RUN_PLANS, tmp_path) == found
     (tmp_path / one.folder / "results.json").unlink()
