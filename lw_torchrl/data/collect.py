@@ -6,7 +6,7 @@ import os
 import shutil
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +40,7 @@ from lw_torchrl.data.rows import (
     write_rows,
 )
 from lw_torchrl.language.tasks import resolve_tasks, task_id
+from lw_torchrl.modules.networks import evaluating
 from lw_torchrl.modules.policy import Policy
 
 _PATIENCE = 1.0  # seconds to wait for another call: it may be about to end
@@ -125,18 +126,6 @@ def _take_apart(root: Path, config: CollectConfig, whole: list[EpisodeInfo], rea
         if not files.has(info.task, info.episode):
             files.put(info.task, info.episode, read_rows(root / DATA, info.start, info.length))
     (root / METADATA).unlink()
-
-
-@contextmanager
-def _in_eval_mode(policy: Policy | None) -> Iterator[None]:
-    training = policy is not None and policy.training
-    if policy is not None:
-        policy.eval()
-    try:
-        yield
-    finally:
-        if policy is not None:
-            policy.train(training)
 
 
 @contextmanager
@@ -298,6 +287,6 @@ def collect_demonstrations(
     elif folder.is_dir() and {path.name for path in folder.iterdir()} - {LOCK} and not (folder / PARTIAL).is_dir():
         raise DatasetError(f"root: {str(folder)!r} is not empty and holds no dataset; choose another folder")
     if found is None or (folder / PARTIAL).is_dir():
-        with _alone(folder), _in_eval_mode(actor):
+        with _alone(folder), nullcontext() if actor is None else evaluating(actor):
             found = _made(folder, config, actor, num_envs, progress)
     return found

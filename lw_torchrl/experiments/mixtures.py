@@ -39,32 +39,17 @@ class Portion:
     episodes: int
 
 
-@dataclass(frozen=True)
-class Mixture:
-    """Portions that a policy learns from together.
-
-    Attributes:
-        name: "B", "W" or "C".
-        portions: in the order of their rows.
-    """
-
-    name: str
-    portions: tuple[Portion, ...]
-
-
 _WRONG, _RANDOM = Portion("wrong", 20), Portion("random", 10)
-MIXTURES: Mapping[str, Mixture] = MappingProxyType(
+MIXTURES: Mapping[str, tuple[Portion, ...]] = MappingProxyType(
     {
-        mixture.name: mixture
-        for mixture in (
-            Mixture("B", (Portion("spoilt-30", 20), Portion("spoilt-60", 20), _WRONG, _RANDOM)),
-            Mixture("W", (Portion("spoilt-30", 20), _WRONG, _RANDOM)),
-            Mixture("C", (Portion("expert", 5), _WRONG, _RANDOM)),
-        )
+        "B": (Portion("spoilt-30", 20), Portion("spoilt-60", 20), _WRONG, _RANDOM),
+        "W": (Portion("spoilt-30", 20), _WRONG, _RANDOM),
+        "C": (Portion("expert", 5), _WRONG, _RANDOM),
     }
 )
-"""By name: B, plans spoilt a little and much, wrong skills, chance, and no expert; W, the same without what is spoilt a
-little; C, five clean demonstrations of the expert among wrong skills and chance, the hard case."""
+"""What a policy learns from together, by name: B, plans spoilt a little and much, wrong skills, chance, and no expert;
+W, the same without what is spoilt a little; C, five clean demonstrations of the expert among wrong skills and chance,
+the hard case."""
 
 
 @dataclass(frozen=True)

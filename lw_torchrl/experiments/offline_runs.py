@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from lw_torchrl._checks import check_choice
-from lw_torchrl.experiments.mixtures import MIXTURES, NOISE, TASK_SETS, BehaviourData, Mixture
+from lw_torchrl.experiments.mixtures import MIXTURES, NOISE, TASK_SETS, BehaviourData
 from lw_torchrl.experiments.offline_recipes import OFFLINE_METHODS, OfflineMethod, OfflineRecipe
 from lw_torchrl.experiments.runs import plain
 from lw_torchrl.language.plans import Plans
@@ -47,8 +47,8 @@ class Learned:
     @property
     def datasets(self) -> tuple[BehaviourData, ...]:
         """What it learns from."""
-        mixture: Mixture = MIXTURES[self.mixture]
-        return tuple(BehaviourData(self.tasks, portion, self.seed, self.max_steps) for portion in mixture.portions)
+        portions = MIXTURES[self.mixture]
+        return tuple(BehaviourData(self.tasks, portion, self.seed, self.max_steps) for portion in portions)
 
     def own_plans(self, plans: Plans) -> Plans:
         """The plans of its tasks."""

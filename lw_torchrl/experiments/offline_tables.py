@@ -88,7 +88,7 @@ def write_table(
     head = markdown_table(["method, conditioned on", *mixtures], rows)
     parts = [f"# {name}: {runs[0].tasks} tasks, mean success", head, _BRACKETS]
     for mixture, one in compared.items():
-        portions = ", ".join(f"{part.episodes} {part.behaviour}" for part in MIXTURES[mixture].portions)
+        portions = ", ".join(f"{part.episodes} {part.behaviour}" for part in MIXTURES[mixture])
         parts += [f"## {mixture}: of each task {portions}", one.headline(), one.per_task()]
     write_text(out / f"{name}.md", "\n\n".join(parts) + "\n")
     told: dict[str, Any] = {mixture: one.to_json() for mixture, one in compared.items()}

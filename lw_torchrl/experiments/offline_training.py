@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Any
 import torch
 from filelock import FileLock
 from torch import Tensor
-from torchrl.objectives import BCLoss, CQLLoss, IQLLoss, LossModule, TD3BCLoss
+from torchrl.objectives import CQLLoss, IQLLoss, LossModule, TD3BCLoss
 
 from lw_torchrl._tensor_archive import ArchiveError, TensorArchive, write_archive
 from lw_torchrl.data import LanguageWorldExperienceReplay, TaskBalancedSampler
@@ -27,6 +26,7 @@ from lw_torchrl.modules.encoder import Encoder
 from lw_torchrl.modules.policy import METHODS, Policy, make_policy
 from lw_torchrl.objectives import AdvantageWeightedLoss, ExpectileValueLoss, standardize_by_task
 from lw_torchrl.trainers.checkpoint import describe_data, load_actor, save_actor
+from lw_torchrl.trainers.loss_state import bc_loss
 from lw_torchrl.trainers.offline import OfflineConfig, OfflineTrainer
 from lw_torchrl.trainers.training_state import check_description, check_same_description
 from lw_torchrl.transforms import QAFTransform
@@ -60,9 +60,7 @@ def _advantage(actor: Policy, run: OfflineRun, plans: Plans) -> LossModule:
 
 
 def _bc(actor: Policy, run: OfflineRun, plans: Plans) -> LossModule:
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message=".*target_actor_network_params.*")
-        return BCLoss(actor, loss_function=run.recipe.distance)
+    return bc_loss(actor, run.recipe.distance)
 
 
 def _iql(actor: Policy, run: OfflineRun, plans: Plans) -> LossModule:
@@ -120,9 +118,9 @@ def make_advantages(one: Advantages, plans: Plans, out: Path, progress: bool) ->
     file.parent.mkdir(parents=True, exist_ok=True)
     described = _FORMAT | {"run": one.describe(plans)}
     with FileLock(file.with_name(".advantages.lock")):
-        for dataset in one.datasets:
-            dataset.make(out, progress)
         if not file.is_file():
+            for dataset in one.datasets:
+                dataset.make(out, progress)
             own = one.own_plans(plans)
             torch.manual_seed(one.seed)
             loss = _value_loss(one, own)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,13 +9,14 @@ import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey, unravel_key
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.objectives import LossModule, ValueEstimators
 from torchrl.objectives.utils import dispatch_value_estimator
 
 from lw_torchrl._checks import check_probability
 from lw_torchrl._keys import read
 from lw_torchrl.modules.critics import Value
+from lw_torchrl.modules.networks import evaluating
 
 
 class ExpectileValueLoss(LossModule):
@@ -152,7 +151,7 @@ class ExpectileValueLoss(LossModule):
         Returns:
             (B, 1) float32.
         """
-        with _evaluating(self.value_network):
+        with evaluating(self.value_network):
             value = self._values(tensordict, self.target_value_network_params).mean(-1, keepdim=True)
             return self._target(tensordict) - value
 
@@ -176,15 +175,3 @@ class ExpectileValueLoss(LossModule):
         with params.to_module(network, preserve_module_state=False):
             (found,) = read(network(tensordict.select(*network.in_keys, strict=False)), [key])
         return found
-
-
-@contextmanager
-def _evaluating(network: nn.Module) -> Iterator[None]:
-    """The network is in evaluation's mode meanwhile, and each of its modules in its own again afterwards."""
-    modes = [(module, module.training) for module in network.modules()]
-    network.eval()
-    try:
-        yield
-    finally:
-        for module, mode in modes:
-            module.training = mode

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,6 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torch.nn.utils import clip_grad_norm_
 from torchrl.data import TensorDictReplayBuffer
-from torchrl.objectives import BCLoss
 from torchrl.record.loggers import Logger
 
 from lw_torchrl._devices import CPU, drawn_on, place
@@ -23,6 +21,7 @@ from lw_torchrl.trainers.checkpoint import describe_data, describe_replay, write
 from lw_torchrl.trainers.config import BehavioralCloningConfig, make_optimizer
 from lw_torchrl.trainers.interrupts import interrupts_between_steps
 from lw_torchrl.trainers.latent_terms import LatentTerms
+from lw_torchrl.trainers.loss_state import bc_loss
 from lw_torchrl.trainers.minibatches import check_replay, draw_batch
 from lw_torchrl.trainers.normalization import fit_normalization
 from lw_torchrl.trainers.policy_checks import check_can_be_saved, check_trained
@@ -105,9 +104,7 @@ class BehavioralCloningTrainer:
             sweep(self.checkpoint)
             self._described = {"actor": self._policy.describe(), "training": config.describe()}
             self._described |= {"data": describe_data(replay), "replay": describe_replay(replay)}
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message=".*target_actor_network_params.*")
-            self.loss = BCLoss(actor, loss_function=config.loss_function)
+        self.loss = bc_loss(actor, config.loss_function)
         self.optimizer, self.schedule = make_optimizer(self.loss.parameters(), config)
         self._losses = RecentLosses(("the loss",), config.learning_rate)
         self.state = TrainingState(replay, config.seed)

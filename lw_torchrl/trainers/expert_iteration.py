@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import warnings
-
 import torch
 from tensordict import TensorDictBase
 from torchrl.data import TensorDictReplayBuffer
-from torchrl.objectives import BCLoss
 
 from lw_torchrl.modules.critics import QValue
 from lw_torchrl.modules.policy import Policy
 from lw_torchrl.trainers.learner import Learner, make_optimizer
+from lw_torchrl.trainers.loss_state import bc_loss
 from lw_torchrl.trainers.online_config import OnlineConfig
 
 
@@ -27,9 +25,7 @@ class ExpertIterationLearner(Learner):
         if critic is not None:
             raise ValueError("critic: expert iteration has none; leave it out")
         super().__init__(start, replay, config)
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message=".*target_actor_network_params.*")
-            self.loss = BCLoss(self.policy.train(), loss_function="l2")  # its copy has the start's noise on features
+        self.loss = bc_loss(self.policy.train(), "l2")  # its copy has the start's noise on features
         self.policy.eval()
         self.optimizers["actor"] = make_optimizer(self.loss.parameters(), config.cloning_learning_rate)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from hashlib import sha256
 from pathlib import Path
@@ -12,7 +13,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import MultiStepTransform
-from torchrl.objectives import IQLLoss, LossModule, REDQLoss, SoftUpdate
+from torchrl.objectives import BCLoss, IQLLoss, LossModule, REDQLoss, SoftUpdate
 
 from lw_torchrl._state_tree import check_like, join, split
 from lw_torchrl._tensor_archive import TensorArchive, write_archive
@@ -25,6 +26,13 @@ FORMAT_VERSION = 1
 
 _INSTEAD = {"loss_actor_bc"}
 """What is to be minimised instead of another entry, for a while: CQL's first steps of the actor."""
+
+
+def bc_loss(actor: nn.Module, distance: str) -> BCLoss:
+    """TorchRL's BCLoss, without its warning about itself."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*target_actor_network_params.*")
+        return BCLoss(actor, loss_function=distance)
 
 
 def networks_of(loss: LossModule) -> list[nn.Module]:
