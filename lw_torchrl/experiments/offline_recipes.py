@@ -64,7 +64,6 @@ class OfflineRecipe:
         temperature: of IQL's actor.
         alpha: of TD3+BC, the weight of the value beside the imitation.
         cql_weight: of CQL's penalty.
-        cql_samples: actions that it draws for each row.
         steps: minibatches of every actor; of the value, ``value_steps``.
         batch_size: rows of one.
         width, depth: hidden layers of actors; of critics, ``critic_depth``.
@@ -81,7 +80,6 @@ class OfflineRecipe:
     temperature: float = 3.0
     alpha: float = 2.5
     cql_weight: float = 1.0
-    cql_samples: int = 4
     steps: int = 4000
     value_steps: int = 4000
     batch_size: int = 250
@@ -97,5 +95,5 @@ class OfflineRecipe:
             check_probability(name, getattr(self, name))
         for name in ("beta", "max_weight", "temperature", "alpha", "cql_weight", "feature_noise"):
             check_scale(name, getattr(self, name))
-        for name in ("n_steps", "cql_samples", "steps", "value_steps", "batch_size", "width", "depth", "critic_depth"):
+        for name in ("n_steps", "steps", "value_steps", "batch_size", "width", "depth", "critic_depth"):
             check_int(name, getattr(self, name), minimum=1)

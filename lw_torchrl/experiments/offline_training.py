@@ -75,7 +75,8 @@ def _td3_bc(actor: Policy, run: OfflineRun, plans: Plans) -> LossModule:
 
 
 def _cql(actor: Policy, run: OfflineRun, plans: Plans) -> LossModule:
-    options: dict[str, Any] = {"min_q_weight": run.recipe.cql_weight, "num_random": run.recipe.cql_samples}
+    # TorchRL makes rows of the actions that it draws: one or ten, each soft maximum is of three actions.
+    options: dict[str, Any] = {"min_q_weight": run.recipe.cql_weight, "num_random": 1}
     return CQLLoss(actor, _q(run, plans), loss_function="l2", **options)
 
 

@@ -22,7 +22,7 @@ from lw_torchrl.experiments.offline_tables import OFFLINE_TABLES, advantages_of,
 from lw_torchrl.experiments.offline_training import LOSSES, execute_offline, make_advantages, train_offline
 
 PLANS = lw.load_plans("MT10")
-TINY = OfflineRecipe(steps=6, value_steps=6, batch_size=10, width=16, depth=1, critic_depth=1, cql_samples=2)
+TINY = OfflineRecipe(steps=6, value_steps=6, batch_size=10, width=16, depth=1, critic_depth=1)
 STEPS = 120  # of an episode: a few wrong skills open a drawer in so many
 
 
