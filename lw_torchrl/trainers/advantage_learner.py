@@ -29,7 +29,7 @@ class AdvantageLearner(Learner):
         self.value = ExpectileValueLoss(value.eval(), expectile=config.expectile)
         self.value.make_value_estimator(gamma=config.gamma)
         self.targets = SoftUpdate(self.value, eps=config.target_eps)
-        self.actor = AdvantageWeightedLoss(start, beta=config.beta, loss_function="l1")
+        self.actor = AdvantageWeightedLoss(start, beta=config.beta, loss_function=config.distance)
         self.loss = nn.ModuleDict({"value": self.value, "actor": self.actor})
         self.optimizers["critic"] = make_optimizer(self.value.parameters(), config.critic_learning_rate)
         self.optimizers["actor"] = make_optimizer(self.actor.parameters(), config.cloning_learning_rate)

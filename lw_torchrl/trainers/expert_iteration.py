@@ -25,7 +25,7 @@ class ExpertIterationLearner(Learner):
         if critic is not None:
             raise ValueError("critic: expert iteration has none; leave it out")
         super().__init__(start, replay, config)
-        self.loss = bc_loss(self.policy.train(), "l2")  # its copy has the start's noise on features
+        self.loss = bc_loss(self.policy.train(), config.distance)  # its copy has the start's noise on features
         self.policy.eval()
         self.optimizers["actor"] = make_optimizer(self.loss.parameters(), config.cloning_learning_rate)
 

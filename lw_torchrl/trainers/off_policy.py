@@ -44,7 +44,7 @@ class TD3Learner(Learner):
             bc_weight=config.bc_weight,
             policy_noise=config.policy_noise,
             noise_clip=config.noise_clip,
-            loss_function="l2",
+            loss_function=config.distance,
         )
         loss.make_value_estimator(gamma=config.gamma)
         self.targets = SoftUpdate(loss, eps=config.target_eps)
@@ -93,7 +93,11 @@ class SACLearner(Learner):
         super().__init__(start, replay, config)
         self.policy = stochastic(start, "tanh_normal", config.init_std)
         critic = _critic(self.policy, critic)
-        options: dict[str, Any] = {"bc_weight": config.bc_weight, "loss_function": "l2", "alpha_init": config.entropy}
+        options: dict[str, Any] = {
+            "bc_weight": config.bc_weight,
+            "loss_function": config.distance,
+            "alpha_init": config.entropy,
+        }
         self.loss = loss = DemonstratedSACLoss(self.policy, critic.eval(), **options)
         self.target_entropy = loss.target_entropy  # which makes a buffer of the loss
         loss.make_value_estimator(gamma=config.gamma)

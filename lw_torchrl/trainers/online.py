@@ -24,11 +24,11 @@ from lw_torchrl.data.rewards import REWARDS
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.language.tasks import Task, named_tasks
 from lw_torchrl.modules.critics import QValue
-from lw_torchrl.modules.networks import ACTION_SIZE
 from lw_torchrl.modules.policy import Policy
 from lw_torchrl.trainers.advantage_learner import AdvantageLearner
 from lw_torchrl.trainers.checkpoint import describe_data, describe_learning, write
 from lw_torchrl.trainers.expert_iteration import ExpertIterationLearner
+from lw_torchrl.trainers.exploration import Exploration, longest_standstill
 from lw_torchrl.trainers.first_episodes import FirstEpisodes
 from lw_torchrl.trainers.growing_replay import check_growing_replay
 from lw_torchrl.trainers.interrupts import Interrupt, interrupts_between_steps
@@ -148,6 +148,7 @@ class OnlineTrainer:
             self.learner = LEARNERS[method](actor, replay, config, critic)
             self._drawn = torch.get_rng_state()
         self.policy = self.learner.policy
+        self._patience = longest_standstill(replay[: len(replay) - replay.storage.num_grown])
         self.history: list[dict[str, float]] = []
         self.round = 0
         self._episodes: Tensor | None = None
@@ -246,23 +247,27 @@ class OnlineTrainer:
         config, learner = self.config, self.learner
         state, done_before = env.reset(), self.frames
         first = FirstEpisodes(config.rows)
+        exploration = Exploration(config, self._patience) if learner.noisy else None
         came = []
         steps = min(config.round_steps, config.steps - self.round * config.round_steps)
         due = 0
         for begin in range(0, steps, config.exploration_hold):
             if interrupt.asked:
                 return None
-            noise = self._noise()
+            if exploration is not None:
+                exploration.draw()
             chunk = []
             for _ in range(min(config.exploration_hold, steps - begin)):
                 with torch.no_grad():
                     state = learner.act(state)
-                if noise is not None:
-                    explored = state.get("action") + learner.noise_weight(state) * noise
+                if exploration is not None:
+                    explored = state.get("action") + learner.noise_weight(state) * exploration.noise(state)
                     state.set("action", explored.clamp(-1.0, 1.0))
                 state.set(("collector", "traj_ids"), first.ids(self.round))
                 step, state = env.step_and_maybe_reset(state)
                 first.note(step)
+                if exploration is not None:
+                    exploration.note(step.get(("next", "done")).squeeze(-1))
                 chunk.append(step)
             rows = torch.stack(chunk, 1)
             learner.observe(rows)
@@ -279,12 +284,6 @@ class OnlineTrainer:
     def _due(self, frames: int) -> int:
         """The gradient steps that are to be made in the first so many steps of the environment."""
         return int(max(0, frames - self.config.first_frames) * self.config.utd)
-
-    def _noise(self) -> Tensor | None:
-        if not self.learner.noisy:
-            return None
-        scale = torch.tensor([1.0, 1.0, 1.0, self.config.gripper_exploration]) * self.config.exploration
-        return torch.randn(self.config.rows, ACTION_SIZE) * scale
 
     def _log(self, found: dict[str, float]) -> None:
         for name, value in found.items():

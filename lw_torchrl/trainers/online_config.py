@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
-from lw_torchrl._checks import check_int, check_probability, check_scale
+from lw_torchrl._checks import check_choice, check_int, check_probability, check_scale
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,10 @@ class OnlineConfig:
         policy_delay: gradient steps of the critics for one of the actor, of "td3" and "residual".
         policy_noise, noise_clip: of the targets' actions, of "td3" and "residual".
         bc_weight: of the imitation of demonstrations.
+        distance: to the action that is imitated.
         exploration: standard deviation of the noise on the executed action.
+        stuck_exploration: the same for the hand where the plan has not gone on for longer than in any demonstration; of
+            a policy without a plan, and of distributions, "sac" and "ppo", it is not read.
         exploration_hold: steps for which each draw of it is kept.
         gripper_exploration: what it is multiplied by for the gripper.
         init_std: the distribution's standard deviation at first, of "sac" and "ppo".
@@ -58,9 +62,11 @@ class OnlineConfig:
     policy_noise: float = 0.1
     noise_clip: float = 0.3
     bc_weight: float = 2.0
-    exploration: float = 0.15
+    distance: Literal["l1", "l2"] = "l1"
+    exploration: float = 0.05
+    stuck_exploration: float = 0.5
     exploration_hold: int = 5
-    gripper_exploration: float = 0.5
+    gripper_exploration: float = 0.2
     init_std: float = 0.15
     entropy: float = 1e-3
     gae_lambda: float = 0.95
@@ -93,6 +99,7 @@ class OnlineConfig:
             "noise_clip",
             "bc_weight",
             "exploration",
+            "stuck_exploration",
             "gripper_exploration",
             "init_std",
             "entropy",
@@ -102,6 +109,7 @@ class OnlineConfig:
             check_scale(name, getattr(self, name))
         for name in ("gamma", "target_eps", "expectile", "gae_lambda"):
             check_probability(name, getattr(self, name))
+        check_choice("distance", self.distance, ("l1", "l2"))
         check_int("seed", self.seed)
         if self.frames % self.rows:
             raise ValueError(

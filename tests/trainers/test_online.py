@@ -323,6 +323,8 @@ def test_what_cannot_be_trained_on_is_refused(demos):
         ({"gamma": 1.5}, "gamma must be from 0 to 1, got 1.5"),
         ({"warm_up": -1}, "warm_up must be at least 0"),
         ({"exploration_hold": 0}, "exploration_hold must be at least 1"),
+        ({"distance": "l3"}, "distance must be one of"),
+        ({"stuck_exploration": -1.0}, "stuck_exploration must be finite and at least 0"),
     ],
 )
 def test_a_wrong_configuration_is_named(options, message):
