@@ -13,14 +13,14 @@ from lw_torchrl.language.formats.prose_reader import read_prose
 from lw_torchrl.language.formats.python_reader import read_python
 from lw_torchrl.language.formats.written import Clause, Note, Reading, Section, listed_steps
 from lw_torchrl.language.plans import ConditionalPlan, PlanStep
-from lw_torchrl.language.queries import Query
+from lw_torchrl.language.queries import Query, read_query
 from lw_torchrl.language.skill_text import canonical_skill
 from lw_torchrl.language.skills import ScriptedSkill
 from lw_torchrl.language.step_mapping import StepMapper
-from lw_torchrl.language.tasks import TASKS, Task, get_task
+from lw_torchrl.language.tasks import TASKS, Task, check_task
 
-LIMIT = 0.5
-"""The distance beyond which a text is taken for nothing: see docs/planners.md for what it leaves out."""
+LIMIT, SKILL_LIMIT = 0.4, 0.7
+"""The distances beyond which a condition and a skill are taken for nothing; docs/planners.md shows what that leaves out."""
 _LONGEST = 65_536  # characters of a text that are read
 
 
@@ -85,6 +85,7 @@ def decode_plan(
     *,
     by: Literal["edit", "embedding"] = "edit",
     limit: float = LIMIT,
+    skill_limit: float = SKILL_LIMIT,
     skills: Mapping[str, ScriptedSkill] | None = None,
     tasks: Mapping[str, Task] = TASKS,
 ) -> DecodedPlan:
@@ -102,7 +103,8 @@ def decode_plan(
         task: the task that was asked for, or its name.
         format: the format that was asked for, a name in :data:`~lw_torchrl.PLAN_FORMATS`.
         by: nearest in spelling ("edit"), or in meaning ("embedding"), which wants the extra ``[text]``.
-        limit: the largest distance, from 0 to 1, at which a text is taken for something else.
+        limit: the largest distance, from 0 to 1, at which a condition or a goal is taken for a query.
+        skill_limit: the same of skills and scripted ones.
         skills: the scripted skills to choose from; None for the shipped ones.
         tasks: where a task's name is looked up, as from :func:`~lw_torchrl.load_tasks`.
 
@@ -130,15 +132,11 @@ def decode_plan(
     """
     if not isinstance(text, str):
         raise TypeError(f"text must be a string, got {shown(text)} ({type(text).__name__})")
-    owner = (
-        task
-        if isinstance(task, Task)
-        else get_task(task)
-        if tasks is TASKS
-        else tasks[check_choice("task", task, tasks)]
-    )
+    owner = task if isinstance(task, Task) else tasks[check_task(task, tasks)]
     read = PLAN_FORMATS[check_choice("format", format, PLAN_FORMATS)].read
-    mapper = StepMapper(owner, skills, check_choice("by", by, ("edit", "embedding")), check_probability("limit", limit))
+    check_choice("by", by, ("edit", "embedding"))
+    limits = check_probability("limit", limit), check_probability("skill_limit", skill_limit)
+    mapper = StepMapper(owner, skills, by, *limits)
     notes = []
     if len(text) > _LONGEST:
         notes.append(Note(text.count("\n", 0, _LONGEST) + 1, f"the rest of {len(text)} characters is not read"))
@@ -188,20 +186,15 @@ def _named(section: Section) -> list[Clause]:
 
 
 def _in_words(goal: str) -> str:
-    """A state to reach as a skill: "the robot's gripper is above mug" is "move the gripper above mug"."""
-    first, *others = re.split(r"\s+and\s+", goal)
-    moved = re.sub(r"^(?:the\s+)?(?:robot's\s+)?gripper\s+is\s+", "gripper ", first)
-    held = [
-        re.sub(r"^(?:the\s+)?(?:robot's\s+)?gripper\s+is\s+(open|closed?)$", r"\1 the gripper", one) for one in others
-    ]
-    said = " and ".join([f"move {moved}", *(one.replace("closed the", "close the") for one in held)])
-    return (
-        "close the gripper"
-        if said == "move gripper closed"
-        else "open the gripper"
-        if said == "move gripper open"
-        else said
-    )
+    """A state to reach as a skill: "the robot's gripper is above mug" is "move gripper above mug"."""
+    said = []
+    for state in re.split(r"\s+and\s+", goal):
+        found = re.match(r"(?:the\s+)?(?:robot's\s+)?(.+?)\s+is\s+(.+)", state)
+        if found and found.groups() in (("gripper", "open"), ("gripper", "closed")):
+            said.append(f"{found[2].removesuffix('d')} the gripper")
+        else:
+            said.append(f"move {found[1]} {found[2]}" if found else f"move until {state}")
+    return " and ".join(said)
 
 
 def _mapped(clause: Clause, mapper: StepMapper, notes: list[Note]) -> DecodedStep:
@@ -221,18 +214,18 @@ def _mapped(clause: Clause, mapper: StepMapper, notes: list[Note]) -> DecodedSte
     scripted, skill_distance = mapper.skill(words)
     if condition is None:
         dropped = f"no query is near enough to the condition {shown(written)} (distance {distance:.2f})"
-    elif distance > 0:
+    elif read_query(written, mapper.task) is None:
         note(f"the condition {shown(written)} is taken for {str(condition)!r} (distance {distance:.2f})")
     if dropped:
         note(f"a step is left out: {dropped}")
     else:
         if clause.goal and goal is None:
             note(f"no query is near enough to the goal {shown(clause.goal)} (distance {goal_distance:.2f})")
-        elif goal_distance > 0:
+        elif clause.goal and read_query(clause.goal, mapper.task) is None:
             note(f"the goal {shown(clause.goal)} is taken for {str(goal)!r} (distance {goal_distance:.2f})")
         if scripted is None:
             note(f"no scripted skill is near enough to {shown(words)} (distance {skill_distance:.2f})")
-        elif skill_distance > 0:
+        elif scripted != words:
             note(f"the skill {shown(words)} is nearest to the scripted {scripted!r} (distance {skill_distance:.2f})")
     return DecodedStep(
         clause.line, written, words, condition, distance, scripted, skill_distance, clause.goal, goal, goal_distance,

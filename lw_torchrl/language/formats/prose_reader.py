@@ -10,6 +10,7 @@ import re
 
 from lw_torchrl._checks import shown
 from lw_torchrl.language.formats.written import END, Clause, Reading, item
+from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.language.tasks import TASKS
 
 _NAMED = re.compile(r"[\s#>*\"'`]*(?:the\s+)?task\b[\s:]*([`\"'“‘*]*)([A-Za-z0-9][\w-]*)", re.IGNORECASE)
@@ -114,7 +115,8 @@ def _clause(number: int, line: str, reason: str, bullet: bool) -> Clause | None:
     rest = found[2]
     should, until = _SHOULD.search(rest), _UNTIL.search(rest)
     if until and not (should and should.start() < until.start()):
-        return Clause(number, rest[: until.start()], "", _ended(rest[until.end() :]), reason)
+        goal = re.sub(r"^it is\b", f"the {GRIPPER} is", _ended(rest[until.end() :]))
+        return Clause(number, rest[: until.start()], "", goal, reason)
     if (should and found[1].lower() in ("when", "if", "whenever", "once")) or (should and bullet):
         return Clause(number, rest[: should.start()], _ended(rest[should.end() :]), "", reason)
     comma = _COMMA.search(rest)

@@ -22,7 +22,8 @@ def py_md(style: Style) -> PlanFormat:
             "I control a robot that has one arm with a gripper. A function says what the robot does: each `if` asks about "
             "the state, and its skill is carried out while the answer is yes. These functions do other tasks:\n\n"
             + _fenced("\n".join(write(plan, style) for plan in examples))
-            + "".join(f"\n{line}\n" for line in hints)
+            + "".join(f"\n{line}" for line in hints)
+            + ("\n" if hints else "")
             + f"\nPlease write the function for `{task.name}` in the same way, the whole of it in one block:\n\n"
             + _fenced(opening(task))
         )
