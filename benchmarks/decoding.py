@@ -1,7 +1,8 @@
-"""python -m benchmarks.decoding FILE [--count 100000]: decode_plan on recorded answers, and on as many mutations of them.
+"""python -m benchmarks.decoding FILE [--count 100000]: decode_plan on recorded answers and on mutations of them.
 
-FILE holds an answer a line, JSON with "completion", "task" and "format". Says how many give a plan, and what a call costs: CPU
-time of this thread, so that what runs beside does not count. Fails if a text raises, or a mutation takes longer than --most.
+FILE holds an answer a line, JSON with "completion", "task" and "format". Says how many give a plan, and what a call
+costs: CPU time of this thread, so that what runs beside does not count. Fails if a text raises, or if a mutation takes
+longer than --most.
 """
 
 from __future__ import annotations
@@ -18,8 +19,9 @@ import lw_torchrl as lw
 
 _ODD = "\"'\\`#-:()[]{}<>*.,=\n\t\r\x00\x0b\x85\u2028\ufeff\ud800é手🤖 0"
 _WORDS = (
-    'if check("', '"):', "robot.", "move_gripper(", "def ", "else:", "elif ", "print(", "```", "[eod]", "# Steps:", "Steps:  1. ",
-    "- When ", ", the robot should ", "move the robot's gripper until ", " and ", " not ", "The task `", "\n    ", '\\"',
+    'if check("', '"):', "robot.", "move_gripper(", "def ", "else:", "elif ", "print(", "```", "[eod]", "# Steps:",
+    "Steps:  1. ", "- When ", ", the robot should ", "move the robot's gripper until ", " and ", " not ", "The task `",
+    "\n    ", '\\"',
 )  # fmt: skip
 
 
@@ -59,7 +61,7 @@ def main(file: tyro.conf.Positional[Path], count: int = 100_000, seed: int = 0, 
     for name in lw.TASKS:  # tables are made once
         lw.decode_plan('if check("the gripper is holding it"):\n    robot.grab("it")', name, "basic_py")
     found = [_timed(row["completion"], row["task"], row["format"]) for row in rows]
-    print(f"{len(rows)} answers: {sum(plan for plan, _ in found)} give a plan", _costs([cost for _, cost in found]))
+    print(f"{len(rows)} answers: {sum(plan for plan, _ in found)} give a plan" + _costs([cost for _, cost in found]))
     draw, texts = random.Random(seed), [row["completion"] for row in rows]
     costs: list[float] = []
     for number in range(count):
@@ -75,7 +77,7 @@ def main(file: tyro.conf.Positional[Path], count: int = 100_000, seed: int = 0, 
         if cost > most:
             print(f"mutation {number}, {task}, {format}: {cost * 1e3:.0f} ms", file=sys.stderr)
         costs.append(cost)
-    print(f"{count} mutations: none raises", _costs(costs))
+    print(f"{count} mutations: none raises" + _costs(costs))
     if max(costs) > most:
         sys.exit(f"{sum(cost > most for cost in costs)} of them took more than {most * 1e3:.0f} ms")
 

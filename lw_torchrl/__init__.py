@@ -20,8 +20,8 @@ if TYPE_CHECKING:  # the table below, for type checkers and editors
     from lw_torchrl.evaluation import EvaluationResult as EvaluationResult
     from lw_torchrl.evaluation import evaluate as evaluate
     from lw_torchrl.evaluation import plot_success as plot_success
-    from lw_torchrl.language.decoding import DecodedPlan as DecodedPlan
-    from lw_torchrl.language.decoding import DecodedStep as DecodedStep
+    from lw_torchrl.language.decoded import DecodedPlan as DecodedPlan
+    from lw_torchrl.language.decoded import DecodedStep as DecodedStep
     from lw_torchrl.language.decoding import decode_plan as decode_plan
     from lw_torchrl.language.formats import PLAN_FORMATS as PLAN_FORMATS
     from lw_torchrl.language.formats import encode_plan as encode_plan
@@ -83,7 +83,8 @@ _NAMES = {
     "collect_demonstrations",
     "lw_torchrl.envs": "ExpertActor LanguageWorldEnv",
     "lw_torchrl.evaluation": "EvaluationResult evaluate plot_success",
-    "lw_torchrl.language.decoding": "DecodedPlan DecodedStep decode_plan",
+    "lw_torchrl.language.decoded": "DecodedPlan DecodedStep",
+    "lw_torchrl.language.decoding": "decode_plan",
     "lw_torchrl.language.formats": "PLAN_FORMATS encode_plan",
     "lw_torchrl.language.plan_files": "load_plans save_plans",
     "lw_torchrl.language.plans": "ConditionalPlan PlanError Plans PlanStep",

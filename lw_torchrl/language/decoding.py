@@ -1,81 +1,28 @@
-"""decode_plan: what a language model wrote, as a plan of one task, with everything said that was left out or changed."""
+"""decode_plan: what a language model wrote, as a plan of one task, and all that was left out or changed."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 from lw_torchrl._checks import check_choice, check_probability, counted, shown
+from lw_torchrl.language.decoded import DecodedPlan, DecodedStep
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.formats.prose_reader import read_prose
 from lw_torchrl.language.formats.python_reader import read_python
 from lw_torchrl.language.formats.written import Clause, Note, Reading, Section, listed_steps
 from lw_torchrl.language.plans import ConditionalPlan, PlanStep
-from lw_torchrl.language.queries import Query, read_query
+from lw_torchrl.language.queries import read_query
 from lw_torchrl.language.skill_text import canonical_skill
 from lw_torchrl.language.skills import ScriptedSkill
 from lw_torchrl.language.step_mapping import StepMapper
 from lw_torchrl.language.tasks import TASKS, Task, check_task
 
 LIMIT, SKILL_LIMIT = 0.4, 0.7
-"""The distances beyond which a condition and a skill are taken for nothing; docs/planners.md shows what that leaves out."""
+"""Distances beyond which a condition and a skill are taken for nothing; docs/planners.md says what that leaves out."""
 _LONGEST = 65_536  # characters of a text that are read
-
-
-@dataclass(frozen=True)
-class DecodedStep:
-    """One clause of a text, and what became of it.
-
-    Distances are 0 for a text that is itself a query or a skill, and at most 1.
-
-    Attributes:
-        line: where it stands in the text, from 1.
-        written_condition: the condition in the text's words.
-        written_skill: the skill in the text's words, as a sentence: ``robot.put("gripper above mug")`` is "put gripper
-            above mug".
-        condition: the query it was mapped to; None if nothing is near enough.
-        condition_distance: of the clause that is furthest from what it was taken for.
-        scripted: the text of the scripted skill it was mapped to; None if nothing is near enough.
-        skill_distance: between the skill and that one.
-        written_goal: the state to reach in the text's words, "" if it says none.
-        goal: the query that was mapped to; None if nothing is near enough.
-        goal_distance: as ``condition_distance``.
-        dropped: why it is no step of the plan; "" if it is one.
-    """
-
-    line: int
-    written_condition: str
-    written_skill: str
-    condition: Query | None
-    condition_distance: float
-    scripted: str | None
-    skill_distance: float
-    written_goal: str = ""
-    goal: Query | None = None
-    goal_distance: float = 0.0
-    dropped: str = ""
-
-
-@dataclass(frozen=True)
-class DecodedPlan:
-    """What :func:`decode_plan` made of a text.
-
-    Attributes:
-        plan: the plan, its conditions as queries and its skills in the text's words; None if there is none.
-        scripted: the same with the nearest scripted skills, what :class:`~lw_torchrl.ScriptedSkillActor` runs; steps
-            whose skill is near none are left out. None if no step is left.
-        reason: why there is no plan; "" if there is one.
-        notes: what was left out and what was changed, each with its line, in the order of the lines.
-        steps: the clauses for the task, those that were dropped included.
-    """
-
-    plan: ConditionalPlan | None
-    scripted: ConditionalPlan | None
-    reason: str
-    notes: tuple[Note, ...]
-    steps: tuple[DecodedStep, ...]
 
 
 def decode_plan(
@@ -92,8 +39,8 @@ def decode_plan(
     """Read a plan from whatever a language model wrote. No text is an error, and none is executed.
 
     Only clauses for ``task`` count: those of functions and headings of its name, and those before any other name, which
-    go on from where the prompt ended. Where a text has several versions the longest counts, of equals the first. A text in
-    Python where prose was asked for, or the other way round, is read as what it is.
+    go on from where the prompt ended. Where a text has several versions the longest counts, of equals the first. A text
+    in Python where prose was asked for, or the other way round, is read as what it is.
 
     A condition outside the query language is taken for the nearest query, clause by clause, and one beyond ``limit`` is
     dropped with its step. Skills stay as they are written in ``plan``; ``scripted`` has the nearest scripted ones.

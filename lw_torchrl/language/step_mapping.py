@@ -28,7 +28,7 @@ _TARGET = re.compile(
 
 
 class StepMapper:
-    """Maps the words of one answer. Distances are 1 less a similarity in [0, 1]; 0 also where a word stood for another."""
+    """Maps the words of one answer. A distance is 1 less a similarity in [0, 1], after words were put into ours."""
 
     def __init__(
         self,

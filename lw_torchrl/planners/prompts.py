@@ -41,9 +41,8 @@ def prompt_examples(
         ['pick-place', 'push', 'peg-insert-side']
     """
     owner = task if isinstance(task, Task) else tasks[check_task(task, tasks)]
-    others = [
-        plan for name, plan in as_plans(load_plans("MT10") if plans is None else plans).items() if name != owner.name
-    ]
+    known = as_plans(load_plans("MT10") if plans is None else plans)
+    others = [plan for name, plan in known.items() if name != owner.name]
     if not others:
         raise ValueError(f"plans must hold one of another task than {owner.name!r}, got none")
 
@@ -64,8 +63,8 @@ def plan_prompt(
 ) -> str:
     """The text that asks a language model for a plan.
 
-    It shows the plans of :func:`prompt_examples`, and ends with the name and the description of the task, all of it in the
-    format. A model that completes texts goes on from there; what it answers is for :func:`~lw_torchrl.decode_plan`.
+    It shows the plans of :func:`prompt_examples`, and ends with the name and the description of the task, all of it in
+    the format. A model that completes texts goes on from there; what it answers is for :func:`~lw_torchrl.decode_plan`.
 
     Args:
         task: the task, or its name.

@@ -29,7 +29,8 @@ def encode_plan(plan: ConditionalPlan, format: str) -> str:
     """A plan as text.
 
     :func:`~lw_torchrl.decode_plan` reads an equal plan from it: its conditions and skills, and in the goal formats its
-    goals. Reasons are written where a format explains; a goal of a step's own has no place in the basic and chain formats.
+    goals. Reasons are written where a format explains; a goal that is not its skill's usual one has no place in the
+    basic and chain formats.
 
     Args:
         plan: the plan.

@@ -1,5 +1,5 @@
-"""The container md: prose, a bullet for each step. "When C, the robot should S.", or in the goal style "When C, move the
-robot's gripper until G."
+"""The container md: prose, a bullet for each step. "When C, the robot should S.", or in the goal style "When C, move
+the robot's gripper until G."
 
 Source: paper section 'Conditional Plan Generation', which tried plans in prose beside those in code.
 """

@@ -1,7 +1,7 @@
 """Reads plans in prose as models really write it: "- When C, the robot should S." Nothing is an error.
 
-A clause is a bullet that begins with "When", "If", "Once" and the like. Where a text has no such bullets, sentences count that
-say "When C, the robot should S". Other sentences before a clause are its reason.
+A clause is a bullet that begins with "When", "If", "Once" and the like. Where a text has no such bullets, sentences
+count that say "When C, the robot should S". Other sentences before a clause are its reason.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ _NAMED = re.compile(r"[\s#>*\"'`]*(?:the\s+)?task\b[\s:]*([`\"'“‘*]*)([A-Za-
 _ALONE = re.compile(r"[\s#>*\"'`]*([a-z0-9]+(?:[-_][a-z0-9]+)*)[\s\"'`:,*]*")
 _BULLET = re.compile(r"\s*(?:[-*•–+>]|\(?\[?\d{1,3}[.)\]]|[a-z]\))\s+")
 _WHEN = re.compile(
-    r"(?:<[^<>]*>)?[\"'`*]*(?:(?:finally|then|next|first|lastly|and|or|else),?\s+)?(when|whenever|if|once|while|as long as|as soon as|after)\s+(.+)",
+    r"(?:<[^<>]*>)?[\"'`*]*(?:(?:finally|then|next|first|lastly|and|or|else),?\s+)?"
+    r"(when|whenever|if|once|while|as long as|as soon as|after)\s+(.+)",
     re.IGNORECASE,
 )
 _SHOULD = re.compile(
@@ -116,6 +117,8 @@ def _clause(number: int, line: str, reason: str, bullet: bool) -> Clause | None:
     should, until = _SHOULD.search(rest), _UNTIL.search(rest)
     if until and not (should and should.start() < until.start()):
         goal = re.sub(r"^it is\b", f"the {GRIPPER} is", _ended(rest[until.end() :]))
+        if not goal:
+            return None  # cut off
         return Clause(number, rest[: until.start()], "", goal, reason)
     if (should and found[1].lower() in ("when", "if", "whenever", "once")) or (should and bullet):
         return Clause(number, rest[: should.start()], _ended(rest[should.end() :]), "", reason)

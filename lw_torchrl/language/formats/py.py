@@ -1,7 +1,7 @@
 """The container py: a function that looks like Python, ``if check("…"):`` and ``robot.verb("…")`` for each step.
 
-In the goal style a skill is ``robot.move_gripper("above the puck", close_gripper=True)``, the place that the gripper is to
-reach, or ``robot.move_gripper(until="the puck is near the target location")`` for any other state.
+In the goal style a skill is ``robot.move_gripper("above the puck", close_gripper=True)``, the place that the gripper is
+to reach, or ``robot.move_gripper(until="the puck is near the target location")`` for any other state.
 Source: paper section 'Conditional Plan Generation' and its figure of a plan.
 """
 

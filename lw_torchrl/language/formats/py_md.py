@@ -1,4 +1,4 @@
-"""The container py_md: a chat message, with the functions of :mod:`~lw_torchrl.language.formats.py` in fenced blocks."""
+"""The container py_md: a chat message with the functions of :mod:`~lw_torchrl.language.formats.py` in fenced blocks."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ def py_md(style: Style) -> PlanFormat:
 
     def prompt(examples: Sequence[ConditionalPlan], task: Task, hints: Sequence[str]) -> str:
         return (
-            "I control a robot that has one arm with a gripper. A function says what the robot does: each `if` asks about "
-            "the state, and its skill is carried out while the answer is yes. These functions do other tasks:\n\n"
+            "I control a robot that has one arm with a gripper. A function says what the robot does: each `if` asks "
+            "about the state, and its skill is carried out while the answer is yes. These functions do other tasks:\n\n"
             + _fenced("\n".join(write(plan, style) for plan in examples))
             + "".join(f"\n{line}" for line in hints)
             + ("\n" if hints else "")

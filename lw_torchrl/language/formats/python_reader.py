@@ -1,38 +1,41 @@
 """Reads plans in text that looks like Python, as models really write it. Nothing is executed, and nothing is an error.
 
 Lines are matched against a few forms: ``def name(``, ``if check("…"):``, ``robot.verb("…")``, comments. All others are
-passed over and noted. Blocks go by indentation, also where it is broken: an ``if`` within another one's block asks for both.
+passed over and noted. Blocks go by indentation, also where it is broken: an ``if`` within another one's block asks for
+both.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 from lw_torchrl._checks import shown
+from lw_torchrl.language.formats.python_lines import (
+    BRANCH,
+    STRING,
+    arguments,
+    bare,
+    is_cut,
+    statements,
+    task_name,
+    unquoted,
+)
 from lw_torchrl.language.formats.written import END, Clause, Reading, item
 from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.language.tasks import TASKS
 
-_STRING = r'(?:[fFrRbBuU]{0,2}(?:"(?:[^"\\]|\\.)*+"|\'(?:[^\'\\]|\\.)*+\'))'
-_STRINGS = re.compile(_STRING)
-_LITERAL = re.compile(r'"(?:[^"\\]|\\.?)*+("|\Z)|\'(?:[^\'\\]|\\.?)*+(\'|\Z)')  # also one that is cut off
 _DEF = re.compile(r"(?:async\s+)?def\b\s*(\w*)")
-_BRANCH = re.compile(r"(if|elif|while)\b\s*|(else)\s*:")
 _CHECK = re.compile(
-    rf"(and\b|or\b)?\s*(not\b)?\s*\(?\s*(?:self\.|robot\.)?check\s*\(\s*({_STRING}(?:[\s+]*{_STRING})*)\s*\)?\s*"
+    rf"(and\b|or\b)?\s*(not\b)?\s*\(?\s*(?:self\.|robot\.)?check\s*\(\s*({STRING}(?:[\s+]*{STRING})*)\s*\)?\s*"
 )
 _CALL = re.compile(r"(?:self\.)?robot\.(\w+)\s*\(\s*")
-_ARGUMENT = re.compile(rf"(?:(\w+)\s*=\s*)?(?:({_STRING}(?:[\s+]*{_STRING})*)|([^\s,()\"'][^,()\"']*))\s*(?:,\s*)?")
-_PRINTED = re.compile(r"\s*print\(\s*(\"|')(.*)\1\s*\)\s*;?")
 _HEADING = re.compile(r"#+\s*([A-Za-z][\w-]*)\s*:")
-_MOST_JOINED = 6  # lines of one statement
 
 
 @dataclass
 class _Block:
-    """An ``if``: where it stands, what it asks (None: nothing that could be read), and where its block is indented to."""
+    """An ``if``: where it stands, what it asks (None: nothing that could be read), and its block's indentation."""
 
     indent: int
     line: int
@@ -55,7 +58,7 @@ class _Reader:
         self.ignored: tuple[int, int, str] | None = (
             None  # first and last line that are no part of a plan, and the first's text
         )
-        for number, line in _statements(text):
+        for number, line in statements(text):
             if not self.read(number, line):
                 break
         self.flush()
@@ -89,13 +92,13 @@ class _Reader:
         elif code:
             self.listing = False
             self.code(number, line, code)
-        return END.search(_bare(code)) is None
+        return END.search(bare(code)) is None
 
     def comment(self, number: int, line: str) -> None:
         said = line.strip().lstrip("#")
         found = item(said)
         heading = _HEADING.match(line)
-        if heading and (name := _task_name(heading[1])) in TASKS:
+        if heading and (name := task_name(heading[1])) in TASKS:
             self.open(name, number)
         elif re.fullmatch(r"\s*steps\s*:?\s*", said, re.IGNORECASE):
             self.listing = True
@@ -119,8 +122,8 @@ class _Reader:
         if not waiting:  # a call right below its condition belongs to it, however it is indented
             self.leave(indent)
         if found := _DEF.match(code):
-            self.open(_task_name(found[1]), number)
-        elif branch := _BRANCH.match(code):
+            self.open(task_name(found[1]), number)
+        elif branch := BRANCH.match(code):
             self.branch(number, indent, code, branch)
         elif call:
             self.call(number, indent, code, call)
@@ -154,7 +157,7 @@ class _Reader:
         asked: list[str] = []
         fault = ""
         while match := _CHECK.match(code, at):
-            text = _unquoted(match[3])
+            text = unquoted(match[3])
             if match[1] == "or":
                 fault = "an 'or' of conditions cannot be said in a plan"
             if match[2] and re.search(r"\band\b", text):
@@ -163,7 +166,7 @@ class _Reader:
             at = match.end()
         rest = code[at:].lstrip(" )")
         if not asked:
-            cut = _is_cut(code)
+            cut = is_cut(code)
             fault = f"is cut off: {shown(code)}" if cut else f'asks nothing by check("..."): {shown(code)}'
         elif not rest.startswith(":") and not rest.startswith("#"):
             fault = fault or (f'is more than check("..."): {shown(code)}' if rest else "")
@@ -172,7 +175,7 @@ class _Reader:
         return (None if fault else " and ".join(asked)), rest.lstrip(": ")
 
     def call(self, number: int, indent: int, code: str, call: re.Match[str]) -> None:
-        words, named, whole = _arguments(code, call.end())
+        words, named, whole = arguments(code, call.end())
         if not whole:
             self.note(number, f"is cut off: {shown(code)}")
             return
@@ -193,7 +196,7 @@ class _Reader:
 
 
 def _said(verb: str, words: list[str], named: dict[str, str]) -> tuple[str, str]:
-    """The skill and the goal of a call, either may be "". Where there is a place to reach, its words are the skill's too."""
+    """The skill and the goal of a call; either may be ""."""
     if verb != "move_gripper":
         return f"{verb} {' '.join(words)}", named.get("goal", "")
     place = " ".join(words)
@@ -202,71 +205,4 @@ def _said(verb: str, words: list[str], named: dict[str, str]) -> tuple[str, str]
     for name, state in (("close_gripper", "closed"), ("open_gripper", "open")):
         if named.get(name) == "True":
             parts.append(f"the {GRIPPER} is {state}")
-    return "", " and ".join(parts)
-
-
-def _arguments(code: str, at: int) -> tuple[list[str], dict[str, str], bool]:
-    """The arguments of a call from where they begin: in order, by name, and whether none is cut off."""
-    words, named = [], {}
-    while match := _ARGUMENT.match(code, at):
-        value = _unquoted(match[2]) if match[2] else match[3].strip()
-        if match[1]:
-            named[match[1]] = value
-        else:
-            words.append(value)
-        at = match.end()
-    return words, named, code[at : at + 1] == ")" or (bool(words or named) and at == len(code))
-
-
-def _unquoted(strings: str) -> str:
-    """The text of one or more string literals in a row."""
-    parts = []
-    for found in _STRINGS.findall(strings):
-        body = found.lstrip("fFrRbBuU")[1:-1]
-        parts.append(re.sub(r"\\(.)", r"\1", body))
-    return " ".join("".join(parts).split())
-
-
-def _task_name(name: str) -> str:
-    """ "DoorLock" and "door_lock" are names of functions for "door-lock"."""
-    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "-", name).replace("_", "-").strip("-").lower() or "?"
-
-
-def _statements(text: str) -> Iterator[tuple[int, str]]:
-    """The lines of a text, with their numbers; those of one call are joined, and what is printed is taken as it is."""
-    lines = text.expandtabs(4).splitlines()
-    at = 0
-    while at < len(lines):
-        line = lines[at]
-        start = at
-        if printed := _PRINTED.fullmatch(line):
-            line = re.sub(r"\\(.)", r"\1", printed[2])
-        at += 1
-        if "check" in line or "robot." in line:
-            while at < len(lines) and at - start < _MOST_JOINED and _depth(line) > 0 and not _begins(lines[at]):
-                line += " " + lines[at].strip()
-                at += 1
-        yield start + 1, line
-
-
-def _begins(line: str) -> bool:
-    """Whether a line begins a statement of its own."""
-    code = line.strip()
-    return not code or code.startswith(("#", "```", "def ", "robot.")) or _BRANCH.match(code) is not None
-
-
-def _is_cut(code: str) -> bool:
-    """Whether a string that begins in a line does not end in it, or a condition has no end."""
-    bare = _bare(code)
-    return '"' in bare or not bare.rstrip().endswith(":")
-
-
-def _depth(line: str) -> int:
-    """How many parentheses are open at the end of a line; 0 if a string is."""
-    bare = _bare(line)
-    return 0 if '"' in bare else bare.count("(") - bare.count(")")
-
-
-def _bare(code: str) -> str:
-    """A line without its strings and its comment; of a string that is cut off a quote is left."""
-    return _LITERAL.sub(lambda found: "" if found[1] or found[2] else '"', code).partition("#")[0]
+    return ("" if parts else "move gripper"), " and ".join(parts)
