@@ -47,7 +47,11 @@ def cupboard_open(robot):
     "has no indentation at all": Answer(
         "push",
         "basic_py",
-        'def push(robot):\nif check("gripper open"):\nrobot.hold("puck")\nif check("gripper closed"):\nrobot.move("puck")',
+        """def push(robot):
+if check("gripper open"):
+robot.hold("puck")
+if check("gripper closed"):
+robot.move("puck")""",
         [(f"{GRIPPER} open", "hold the puck"), (f"{GRIPPER} closed", "move the puck")],
     ),
     "nests conditions": Answer(
@@ -157,7 +161,10 @@ def reach(robot):
     "prints its plan": Answer(
         "push",
         "basic_py",
-        'print("def push(robot):")\nprint("    if check(\\"gripper open\\"):")\nprint("        robot.move(\\"puck\\")")\n',
+        """print("def push(robot):")
+print("    if check(\\"gripper open\\"):")
+print("        robot.move(\\"puck\\")")
+""",
         [(f"{GRIPPER} open", "move the puck")],
     ),
     "states to reach, named by the steps": Answer(
@@ -172,7 +179,10 @@ def reach(robot):
     if check("the robot's gripper is above puck"):
         robot.move_gripper("near puck", close_gripper=True)
 """,
-        [(f"{GRIPPER} not above the puck", "Place the gripper above the puck"), (f"{GRIPPER} above the puck", "Take the puck")],
+        [
+            (f"{GRIPPER} not above the puck", "Place the gripper above the puck"),
+            (f"{GRIPPER} above the puck", "Take the puck"),
+        ],
     ),
     "states to reach, without names": Answer(
         "push",
@@ -222,7 +232,7 @@ The task `drawer-shut` is to undo it:
   "push":
     "When the gripper is open, the robot should fly.",
   "reach":
-    "<b>When the robot's gripper is not near the reach target, the robot should move the gripper to the reach target.</b>",
+    "<b>When the gripper is not near the reach target, the robot should move the gripper to the reach target.</b>",
 }""",
         [(f"{GRIPPER} not near the reach target", "move the gripper to the reach target")],
         ["line 2: 'push' was not asked for; 1 step left out"],
@@ -237,7 +247,7 @@ The task `drawer-shut` is to undo it:
     "words outside the language": Answer(
         "push",
         "basic_py",
-        """    if check("the robot's gripper is holding onto the puck and the disc is at the goal"):
+        """    if check("the robot's gripper is holding onto the puck and the puk is at the goal"):
         robot.release("puck")
     if check("the moon is made of green cheese"):
         robot.place("gripper above puck")
@@ -251,7 +261,7 @@ The task `drawer-shut` is to undo it:
             "line 6: is cut off",
         ],
     ),
-    "a refusal": Answer("push", "basic_py", "I'm sorry, but I can't see the function `push`.", [], [], "it has no steps"),
+    "a refusal": Answer("push", "basic_py", "I'm sorry, I can't see the function `push`.", [], [], "it has no steps"),
     "nothing": Answer("push", "basic_md", " \n", [], [], "the text is empty"),
     "only another task": Answer(
         "push", "basic_py", 'def shove(robot):\n  if check("gripper open"):\n    robot.push("puck")', [], [],

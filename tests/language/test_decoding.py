@@ -1,4 +1,4 @@
-"""decode_plan: what models really write becomes a plan and notes, or a reason; never an error, and nothing is executed."""
+"""decode_plan: what models really write becomes a plan and notes, or a reason; no error, and nothing is executed."""
 
 import json
 import os
@@ -41,7 +41,7 @@ def test_what_models_write(name):
 def test_a_step_tells_what_was_written_and_what_became_of_it():
     kept, dropped = decoded("words outside the language").steps
     assert (kept.line, dropped.line) == (1, 3)
-    assert kept.written_condition == "the robot's gripper is holding onto the puck and the disc is at the goal"
+    assert kept.written_condition == "the robot's gripper is holding onto the puck and the puk is at the goal"
     assert kept.written_skill == "release the puck"
     assert str(kept.condition) == f"{GRIPPER} around the puck and the puck is near the target location"
     assert 0.0 < kept.condition_distance <= 0.4 < dropped.condition_distance <= 1.0
@@ -87,7 +87,7 @@ def test_the_scripted_plan_has_the_nearest_skills_of_the_task():
         "close the gripper around the mug",
         "move the mug to the target location",
     ]
-    assert [step.skill for step in found.plan.steps][1] == "grab the mug handle" or len(found.plan.steps) == 4
+    assert [step.skill for step in found.plan.steps][1] == "grab mug handle"
     assert found.steps[3].scripted is None
     assert any("no scripted skill is near enough to 'xyzzy qqq'" in note.text for note in found.notes)
     lw.ScriptedSkillActor(lw.Plans([found.scripted]))
@@ -190,7 +190,7 @@ def test_a_text_is_never_executed(tmp_path):
             attack,
             f'    if check(f"{{{attack}}}"):\n        robot.push("puck")',
             f'    if check("gripper open"):\n        robot.push({attack})\n        {attack}',
-            f'@{attack}\ndef push(robot={attack}):\n    if check("gripper open"):\n        robot.push("puck"); {attack}',
+            f'@{attack}\ndef push(robot={attack}):\n    if check("gripper open"):\n        robot.x(""); {attack}',
             f"- When gripper open, the robot should {attack}.",
         ):
             lw.decode_plan(text, "push", format)

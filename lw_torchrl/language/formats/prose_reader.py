@@ -17,7 +17,7 @@ _NAMED = re.compile(r"[\s#>*\"'`]*(?:the\s+)?task\b[\s:]*([`\"'“‘*]*)([A-Za-
 _ALONE = re.compile(r"[\s#>*\"'`]*([a-z0-9]+(?:[-_][a-z0-9]+)*)[\s\"'`:,*]*")
 _BULLET = re.compile(r"\s*(?:[-*•–+>]|\(?\[?\d{1,3}[.)\]]|[a-z]\))\s+")
 _WHEN = re.compile(
-    r"(?:<[^<>]*>)?[\"'`*]*(?:(?:finally|then|next|first|lastly|and|or|else),?\s+)?"
+    r"(?:<[^<>]*>|[\"'`*])*(?:(?:finally|then|next|first|lastly|and|or|else),?\s+)?"
     r"(when|whenever|if|once|while|as long as|as soon as|after)\s+(.+)",
     re.IGNORECASE,
 )

@@ -76,7 +76,7 @@ class _Reader:
         if self.ignored is not None:
             first, last, line = self.ignored
             self.ignored = None
-            which = "is" if first == last else f"to {last} are"
+            which = "is" if first == last else f"and what follows up to line {last} is"
             self.reading.note(first, f"{which} no part of a plan: {shown(line.strip())}")
 
     def read(self, number: int, line: str) -> bool:
@@ -117,15 +117,17 @@ class _Reader:
 
     def code(self, number: int, line: str, code: str) -> None:
         indent = len(line) - len(line.lstrip())
-        call = _CALL.match(code)
+        call, branch = _CALL.match(code), BRANCH.match(code)
         waiting = bool(call and self.blocks and self.blocks[-1].body is None and indent == self.blocks[-1].indent)
         if not waiting:  # a call right below its condition belongs to it, however it is indented
             self.leave(indent)
         if found := _DEF.match(code):
             self.open(task_name(found[1]), number)
-        elif branch := BRANCH.match(code):
+        elif branch:
+            self.flush()
             self.branch(number, indent, code, branch)
         elif call:
+            self.flush()
             self.call(number, indent, code, call)
         elif code.startswith("robot."):
             self.note(number, f"is cut off: {shown(code)}")
