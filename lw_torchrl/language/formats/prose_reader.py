@@ -77,7 +77,7 @@ class _Reader:
             return
         elif bullet and not item(line):
             self.reading.note(number, f"a rule without a condition or a skill is left out: {shown(line)}")
-        elif line and not line.startswith(("```", "~~~")):
+        elif line and not line.startswith(("```", "~~~")) and not line.endswith(":"):
             self.reason.append(line)
         self.listing = self.listing and steps is not None
 
