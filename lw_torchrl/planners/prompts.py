@@ -6,6 +6,7 @@ Source: paper section 'Conditional Plan Generation'.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 
 from rapidfuzz.distance import Levenshtein
 
@@ -41,7 +42,7 @@ def prompt_examples(
         ['pick-place', 'push', 'peg-insert-side']
     """
     owner = task if isinstance(task, Task) else tasks[check_task(task, tasks)]
-    known = as_plans(load_plans("MT10") if plans is None else plans)
+    known = _hand_written() if plans is None else as_plans(plans)
     others = [plan for name, plan in known.items() if name != owner.name]
     if not others:
         raise ValueError(f"plans must hold one of another task than {owner.name!r}, got none")
@@ -51,6 +52,11 @@ def prompt_examples(
 
     first, *nearest = sorted(others, key=distance)[:_EXAMPLES]
     return (first, *reversed(nearest)) if first.task == _ALWAYS else (*reversed(nearest), first)
+
+
+@cache
+def _hand_written() -> Plans:
+    return load_plans("MT10")
 
 
 def plan_prompt(

@@ -87,7 +87,7 @@ def test_the_scripted_plan_has_the_nearest_skills_of_the_task():
         "close the gripper around the mug",
         "move the mug to the target location",
     ]
-    assert [step.skill for step in found.plan.steps][1] == "grab mug handle"
+    assert [step.skill for step in found.plan.steps][1] == "grab the mug handle"
     assert found.steps[3].scripted is None
     assert any("no scripted skill is near enough to 'xyzzy qqq'" in note.text for note in found.notes)
     lw.ScriptedSkillActor(lw.Plans([found.scripted]))

@@ -134,9 +134,11 @@ def _clause(number: int, line: str, reason: str, bullet: bool) -> Clause | None:
 def _ended(text: str) -> str:
     """A sentence's end without its full stop, and without the quotes and tags that a line may end in."""
     said = text.rstrip()
-    while said.endswith(">") and "</" in said:
-        before, _, tag = said.rpartition("</")
-        if not tag[:-1].isalnum():
-            break
-        said = before.rstrip()
-    return said.rstrip("\"'`,\\* ").removesuffix(".")
+    while True:
+        shorter = said.rstrip("\"'`,\\* ")
+        before, tag, name = shorter.rpartition("</")
+        if tag and name.endswith(">") and name[:-1].isalnum():
+            shorter = before
+        if shorter == said:
+            return said.removesuffix(".")
+        said = shorter

@@ -88,6 +88,7 @@ class _Reader:
         if code.startswith("#"):
             self.comment(number, line)
         elif code.startswith(("```", "~~~")):
+            self.flush()
             self.blocks.clear()
         elif code:
             self.listing = False
