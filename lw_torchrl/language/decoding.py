@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Literal
 
@@ -105,21 +105,20 @@ def _same(name: str, task: Task) -> bool:
     return re.sub(r"[^a-z0-9]", "", name.lower()) == task.name.replace("-", "")
 
 
-def _read(text: str, task: Task, read: object) -> tuple[Reading, Section]:
+def _read(text: str, task: Task, read: Callable[[str], Reading]) -> tuple[Reading, Section]:
     """What the text says, by the reader that finds something for the task, and the section that is taken."""
     readers = [read, *(other for other in (read_python, read_prose) if other is not read)]
-    first: tuple[Reading, Section] | None = None
+    found = []
     for reader in readers:
-        reading = reader(text)  # type: ignore[operator]
+        reading = reader(text)
         asked = [reading.sections[0], *(section for section in reading.sections[1:] if _same(section.task, task))]
-        found = reading, max(asked, key=lambda section: len(section.clauses))
-        if found[1].clauses:
-            if first is not None:
-                reading.note(found[1].clauses[0].line, "is written in another format than was asked for")
-            return found
-        first = first or found
-    assert first is not None
-    return first
+        section = max(asked, key=lambda section: len(section.clauses))
+        if section.clauses:
+            if found:
+                reading.note(section.clauses[0].line, "is written in another format than was asked for")
+            return reading, section
+        found.append((reading, section))
+    return found[0]
 
 
 def _named(section: Section) -> list[Clause]:

@@ -39,7 +39,7 @@ def prompt_examples(
 
     Example:
         >>> [plan.task for plan in prompt_examples("coffee-push")]
-        ['pick-place', 'push', 'peg-insert-side']
+        ['pick-place', 'reach', 'push']
     """
     owner = task if isinstance(task, Task) else tasks[check_task(task, tasks)]
     known = _hand_written() if plans is None else as_plans(plans)

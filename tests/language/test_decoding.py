@@ -7,13 +7,16 @@ from pathlib import Path
 from time import thread_time
 
 import pytest
+import torch
 from answers import ANSWERS, GRIPPER
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import lw_torchrl as lw
 from benchmarks.decoding import mutated
+from lw_torchrl.language import query_search, skills, step_mapping
 from lw_torchrl.language import text as text_encoders
+from lw_torchrl.language.skills import ScriptedSkill
 
 formats = st.sampled_from(list(lw.PLAN_FORMATS))
 
@@ -93,11 +96,46 @@ def test_the_scripted_plan_has_the_nearest_skills_of_the_task():
     lw.ScriptedSkillActor(lw.Plans([found.scripted]))
 
 
+@pytest.mark.parametrize(
+    ("condition", "query"),
+    [
+        ("the robot's gripper is holding the puck", f"{GRIPPER} around the puck"),
+        ("the puck is at the goal", "the puck is near the target location"),
+        ("the puck is not in the target area", "the puck is not near the target location"),
+        ("the gripper is on top of the puck", f"{GRIPPER} above the puck"),
+        ("the puck is on the table", "the puck is touching the table"),
+        ("the puck is to the left of the gripper", "the puck is left of the robot's gripper"),
+        ("the puck is next to the goal position", "the puck is near the target location"),
+    ],
+)
+def test_what_models_call_things(condition, query):
+    found = lw.decode_plan(f'if check("{condition}"):\n    robot.push("puck")', "push", "basic_py")
+    assert str(found.plan.steps[0].condition) == query
+    assert found.steps[0].condition_distance == 0.0
+    assert f"is taken for {query!r}" in str(found.notes[0])
+
+
+@pytest.mark.parametrize(
+    ("skill", "scripted"),
+    [
+        ('grab("puck")', "close the gripper around the puck"),
+        ('put("gripper around puck")', "lower the gripper around the puck"),
+        ('drop("gripper around the puck")', "lower the gripper around the puck"),
+        ('put("gripper above puck")', "place the gripper above the puck"),
+        ('place("puck at goal")', "move the puck to the target location"),
+        ('slide("the puck to target")', "move the puck to the target location"),
+    ],
+)
+def test_what_models_call_skills(skill, scripted):
+    found = lw.decode_plan(f'if check("gripper open"):\n    robot.{skill}', "push", "basic_py")
+    assert found.scripted.steps[0].skill == scripted
+
+
 def test_skills_of_ones_own_are_chosen_from():
-    skills = {"hover over the puck": lw.load_skills()["place the gripper above the puck"]}
+    mine = {"hover over the puck": ScriptedSkill("hover over the puck", "puck")}
     text = '    if check("gripper open"):\n        robot.hover("above puck")'
-    found = lw.decode_plan(text, "push", "basic_py", skills={"hover over the puck": skills["hover over the puck"]})
-    assert found.steps[0].scripted == "place the gripper above the puck"
+    found = lw.decode_plan(text, "push", "basic_py", skills=mine)
+    assert found.scripted.steps[0].skill == "hover over the puck"
     none = lw.decode_plan(text, "push", "basic_py", skills={})
     assert (none.scripted, none.plan.steps[0].skill) == (None, "hover above the puck")
 
@@ -113,9 +151,19 @@ def test_limits():
     assert (exact.scripted, exact.plan) == (None, usual.plan)
 
 
-def test_nearest_in_meaning(monkeypatch):
-    torch = pytest.importorskip("torch")
+@pytest.fixture
+def _no_vectors_kept():
+    def forget():
+        for cached in (query_search._vectors, skills._vectors, step_mapping._nearest):
+            cached.cache_clear()
 
+    forget()
+    yield
+    forget()
+
+
+@pytest.mark.usefixtures("_no_vectors_kept")
+def test_nearest_in_meaning(monkeypatch):
     def encoder(texts):  # "hand" means the gripper, "atop" above
         words = ["gripper", "above", "near", "puck", "place", "close"]
         said = [text.replace("hand", "gripper").replace("atop", "above") for text in texts]

@@ -55,9 +55,7 @@ class _Reader:
         self.blocks: list[_Block] = []
         self.reason: list[str] = []
         self.listing = False
-        self.ignored: tuple[int, int, str] | None = (
-            None  # first and last line that are no part of a plan, and the first's text
-        )
+        self.ignored: tuple[int, int, str] | None = None  # lines that are no part of a plan: from, to, the first
         for number, line in statements(text):
             if not self.read(number, line):
                 break
@@ -149,8 +147,8 @@ class _Reader:
             self.note(number, "an 'else' says no condition; what follows from it is left out")
         if branch[1] == "elif":
             self.note(number, "'elif' is taken for 'if': that what is above it does not hold is left out")
-        if self.blocks:
-            self.blocks[-1].body = self.blocks[-1].body or indent
+        if self.blocks and self.blocks[-1].body is None:
+            self.blocks[-1].body = indent
         self.blocks.append(_Block(indent, number, condition))
         if call := _CALL.match(rest):
             self.call(number, indent + 1, rest, call)
