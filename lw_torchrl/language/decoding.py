@@ -108,7 +108,7 @@ def _same(name: str, task: Task) -> bool:
 def _read(text: str, task: Task, read: Callable[[str], Reading]) -> tuple[Reading, Section]:
     """What the text says, by the reader that finds something for the task, and the section that is taken."""
     readers = [read, *(other for other in (read_python, read_prose) if other is not read)]
-    found = []
+    found: list[tuple[Reading, Section]] = []
     for reader in readers:
         reading = reader(text)
         asked = [reading.sections[0], *(section for section in reading.sections[1:] if _same(section.task, task))]
