@@ -20,6 +20,11 @@ if TYPE_CHECKING:  # the table below, for type checkers and editors
     from lw_torchrl.evaluation import EvaluationResult as EvaluationResult
     from lw_torchrl.evaluation import evaluate as evaluate
     from lw_torchrl.evaluation import plot_success as plot_success
+    from lw_torchrl.language.decoded import DecodedPlan as DecodedPlan
+    from lw_torchrl.language.decoded import DecodedStep as DecodedStep
+    from lw_torchrl.language.decoding import decode_plan as decode_plan
+    from lw_torchrl.language.formats import PLAN_FORMATS as PLAN_FORMATS
+    from lw_torchrl.language.formats import encode_plan as encode_plan
     from lw_torchrl.language.plan_files import load_plans as load_plans
     from lw_torchrl.language.plan_files import save_plans as save_plans
     from lw_torchrl.language.plans import ConditionalPlan as ConditionalPlan
@@ -56,6 +61,7 @@ if TYPE_CHECKING:  # the table below, for type checkers and editors
     from lw_torchrl.objectives import ExpectileValueLoss as ExpectileValueLoss
     from lw_torchrl.objectives import SkillLatentLoss as SkillLatentLoss
     from lw_torchrl.objectives import standardize_by_task as standardize_by_task
+    from lw_torchrl.planners import plan_prompt as plan_prompt
     from lw_torchrl.record import RerunLogger as RerunLogger
     from lw_torchrl.trainers import BehavioralCloningConfig as BehavioralCloningConfig
     from lw_torchrl.trainers import BehavioralCloningTrainer as BehavioralCloningTrainer
@@ -77,6 +83,9 @@ _NAMES = {
     "collect_demonstrations",
     "lw_torchrl.envs": "ExpertActor LanguageWorldEnv",
     "lw_torchrl.evaluation": "EvaluationResult evaluate plot_success",
+    "lw_torchrl.language.decoded": "DecodedPlan DecodedStep",
+    "lw_torchrl.language.decoding": "decode_plan",
+    "lw_torchrl.language.formats": "PLAN_FORMATS encode_plan",
     "lw_torchrl.language.plan_files": "load_plans save_plans",
     "lw_torchrl.language.plans": "ConditionalPlan PlanError Plans PlanStep",
     "lw_torchrl.language.queries": "QueryError parse_query supported_queries",
@@ -89,6 +98,7 @@ _NAMES = {
     "PlanConditionedValue Policy QueryEvaluator ResidualActor ScriptedSkillActor plan_actor_value",
     "lw_torchrl.objectives": "AdvantageWeightedLoss DemonstratedSACLoss DemonstratedTD3Loss ExpectileValueLoss "
     "SkillLatentLoss standardize_by_task",
+    "lw_torchrl.planners": "plan_prompt",
     "lw_torchrl.record": "RerunLogger",
     "lw_torchrl.trainers": "BehavioralCloningConfig BehavioralCloningTrainer OfflineConfig OfflineTrainer OnlineConfig "
     "OnlineTrainer "
@@ -104,6 +114,7 @@ _PACKAGES = (
     "language",
     "modules",
     "objectives",
+    "planners",
     "record",
     "trainers",
     "transforms",

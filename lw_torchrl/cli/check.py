@@ -79,26 +79,19 @@ def _check_table(file: Path, known: Mapping[str, Task], hint: str) -> str:
     return f"{file.name}: {counted(len(rows), 'skill')}, valid"
 
 
-def _foreign(task: Task) -> set[str]:
-    """The words for things of the 50 tasks that this one lacks."""
-    from lw_torchrl.language.tasks import TASKS
-
-    own = {word for name in task.object_names for word in name.split()}
-    return {name.split()[-1] for one in TASKS.values() for name in one.object_names} - own
-
-
 def _check_plan(
     text: str, task: str | None, source: str, skills: Mapping[str, ScriptedSkill], tasks: Mapping[str, Task]
 ) -> tuple[list[str], int, list[str]]:
     """Every fault of a plan, the steps it has if there is none, and what the scripted skills make of it."""
     import lw_torchrl as lw
     from lw_torchrl.language.formats.chain_py import check_plan
+    from lw_torchrl.language.skills import skills_for
 
     plan, faults = check_plan(text, task, source, tasks)
     if plan is None:
         return faults, 0, []
     notes = []
-    offered = {text: skill for text, skill in skills.items() if not set(text.split()) & _foreign(plan.definition)}
+    offered = skills_for(plan.definition, skills)
     for step in plan.steps:
         if step.skill not in skills or not skills[step.skill].suits(plan.definition):
             try:

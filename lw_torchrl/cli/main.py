@@ -15,6 +15,7 @@ import tyro
 from lw_torchrl import __version__
 from lw_torchrl.cli import experiments as cli_experiments
 from lw_torchrl.cli import language as cli_language
+from lw_torchrl.cli import plan as cli_plan
 from lw_torchrl.cli import policies, show
 from lw_torchrl.cli.check import check
 from lw_torchrl.cli.data import data
@@ -37,11 +38,14 @@ COMMANDS: dict[str, Any] = {
     "queries": cli_language.queries,
     "skills": cli_language.skills,
     "plans": cli_language.plans,
+    "plan": cli_plan.plan,
     "check": check,
     "reproduce": cli_experiments.reproduce,
     "offline": offline,
     "online": online,
 }
+GROUPS: dict[str, dict[str, Any]] = {"plan": cli_plan.COMMANDS}
+"""Commands that have commands of their own."""
 
 
 RESUMABLE = ("demo", "collect", "train", "reproduce", "offline", "online")
@@ -63,10 +67,10 @@ def main(args: Sequence[str] | None = None) -> None:
                 raise
             if isinstance(error, BrokenPipeError) and nobody_reads():
                 raise
-            command = given[0] if given else ""
             message = str(error)
-            if command in COMMANDS:
-                message = in_its_words(command, COMMANDS[command], message)
+            command, table = _table(given)
+            if command in table:
+                message = in_its_words(command, table[command], message)
             complain(f"lw-torchrl: error: {message}")
             sys.exit(2)
 
@@ -76,15 +80,24 @@ def _run(given: Sequence[str]) -> None:
     if list(given) == ["--version"]:
         print(f"lw-torchrl {__version__}")
         return
+    about = "Language-World with TorchRL: policies carried by plans in English. --version tells which."
+    group = given[0] if given and given[0] in GROUPS else ""
     try:
         tyro.extras.subcommand_cli_from_dict(
-            COMMANDS,
-            prog="lw-torchrl",
-            description="Language-World with TorchRL: policies carried by plans in English. --version tells which.",
-            args=given,
+            GROUPS.get(group, COMMANDS),
+            prog=f"lw-torchrl {group}".strip(),
+            description=COMMANDS[group].__doc__ if group else about,
+            args=given[1:] if group else given,
         )
     finally:
         sys.stdout.flush()
+
+
+def _table(given: Sequence[str]) -> tuple[str, dict[str, Any]]:
+    """The command that is given, and the table it may be found in."""
+    group = given[0] if given and given[0] in GROUPS else ""
+    rest = given[1:] if group else given
+    return rest[0] if rest else "", GROUPS.get(group, COMMANDS)
 
 
 @contextmanager

@@ -9,19 +9,27 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from hashlib import sha256
 from typing import Any
 
 from lw_torchrl._checks import shown
-from lw_torchrl.language.queries import Query, check_query
+from lw_torchrl.language.queries import Query, check_query, read_query
 from lw_torchrl.language.relations import PREDICATES
 from lw_torchrl.language.skill_text import canonical_skill
+from lw_torchrl.language.skills import load_skills
 from lw_torchrl.language.tasks import TASKS, Task, check_task, get_task
 
 
 class PlanError(ValueError):
     """A text or a list of steps that is no conditional plan."""
+
+
+@lru_cache(maxsize=1024)
+def usual_goal(skill: str, task: Task) -> Query | None:
+    """The state that the scripted skill of this text steers to, if it has one that the task's queries can say."""
+    found = load_skills().get(skill)
+    return None if found is None else read_query(found.variants.get(task.name, found).goal, task)
 
 
 @dataclass(frozen=True)
@@ -32,11 +40,14 @@ class PlanStep:
         condition: a query of the plan's task.
         skill: plain English, "place the gripper above the puck".
         reason: why, a comment for the reader; it plays no part in what the plan does.
+        goal: the state that the skill is to reach, a query of the plan's task, where it is another than
+            :func:`usual_goal` gives for the skill; :attr:`ConditionalPlan.goals` has them all.
     """
 
     condition: Query
     skill: str
     reason: str = field(default="", compare=False)
+    goal: Query | None = None
 
 
 @dataclass(frozen=True)
@@ -46,12 +57,13 @@ class ConditionalPlan:
     Attributes:
         task: the task's name.
         steps: at least one :class:`PlanStep`, in canonical spelling, so that the plan's text reads back as
-            the same plan: conditions as ``str(query)`` gives them, skills with "the" before the task's nouns.
+            the same plan: conditions as ``str(query)`` gives them, skills with "the" before the task's nouns. Plans
+            are equal whose conditions, skills and goals are.
         definition: the :class:`Task` whose objects the conditions name; None for ours of that name.
 
     Raises:
         PlanError: (a ValueError) the plan has no steps, a skill does not begin with a plain word, or a
-            condition names objects of another task.
+            condition or a goal names objects of another task.
         TypeError: a step is no PlanStep, or its skill no string.
 
     Example:
@@ -76,9 +88,11 @@ class ConditionalPlan:
                 raise TypeError(f"{where} must be a PlanStep with a skill in words, got {step!r}")
             try:
                 condition, skill = check_query(step.condition, definition), canonical_skill(step.skill, definition)
+                goal = None if step.goal is None else check_query(step.goal, definition)
             except ValueError as error:
                 raise PlanError(f"{where}: {error}") from error
-            steps.append(replace(step, condition=condition, skill=skill))
+            goal = None if goal == usual_goal(skill, definition) else goal
+            steps.append(replace(step, condition=condition, skill=skill, goal=goal))
         if not steps:
             raise PlanError(f"plan of task {self.task!r} must have at least one step, got none")
         object.__setattr__(self, "steps", tuple(steps))
@@ -89,6 +103,12 @@ class ConditionalPlan:
         definition = get_task(task)
         steps = tuple(PlanStep(check_query(query, definition), skill) for query, skill in pairs)
         return cls(definition.name, steps, definition)
+
+    @property
+    def goals(self) -> tuple[Query | None, ...]:
+        """The state that each step's skill is to reach: its own goal, or the usual one of the skill; None where there
+        is neither."""
+        return tuple(step.goal or usual_goal(step.skill, self.definition) for step in self.steps)
 
     def __str__(self) -> str:
         from lw_torchrl.language.formats.chain_py import format_plan

@@ -125,13 +125,15 @@ def _cut(text: str, most: int = 80) -> str:
 class _ClauseParser:
     """Reads one clause from left to right; every failure says at which word."""
 
-    def __init__(self, words: Sequence[str], task: Task, text: str) -> None:
-        self.words, self.task, self.text, self.at = words, task, text, 0
+    def __init__(self, words: Sequence[str], task: Task, text: str, explain: bool) -> None:
+        self.words, self.task, self.text, self.explain, self.at = words, task, text, explain, 0
         self.inferred = ""  # of a clause that leaves its subject out, what it says by that
         self.names = {name: name for name in task.object_names}
         self.names.update({alias: name for alias, name in _ALIASES.items() if alias not in self.names})
 
     def error(self, expected: str) -> QueryError:
+        if not self.explain:
+            return QueryError("no query")
         found = f"{_cut(self.words[self.at], 40)!r} (word {self.at + 1})" if self.at < len(self.words) else "its end"
         said = " ".join(self.words[max(0, self.at - 8) : self.at + 8])
         close = process.extractOne((self.inferred + said)[:300], self.comparable(), scorer=fuzz.ratio)
@@ -231,13 +233,25 @@ def parse_query(text: str, task: str | Task) -> Query:
     """
     if not isinstance(text, str):
         raise TypeError(f"text must be a string, got {text!r} ({type(text).__name__})")
-    owner = get_task(task)
+    return _parse(text, get_task(task), explain=True)
+
+
+def read_query(text: str, task: Task) -> Query | None:
+    """As :func:`parse_query`, and None for a text that is no query: looking for the nearest one takes most of the
+    time of an error."""
+    try:
+        return _parse(text, task, explain=False)
+    except QueryError:
+        return None
+
+
+def _parse(text: str, task: Task, explain: bool) -> Query:
     plain = re.sub(r"\s+", " ", text.replace("’", "'").casefold()).strip(" ?.!")
     clauses: list[Clause] = []
     parts = re.split(r" and |^and | and$", plain)
     check_length(text, parts)
     for part in parts:
-        parser = _ClauseParser(part.split(), owner, text)
+        parser = _ClauseParser(part.split(), task, text, explain)
         clauses.append(parser.parse(clauses[-1].subject if clauses else None))
     return Query(tuple(clauses))
 

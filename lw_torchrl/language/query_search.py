@@ -11,7 +11,7 @@ from rapidfuzz import fuzz, process
 from torch import Tensor
 
 from lw_torchrl._checks import check_choice
-from lw_torchrl.language.queries import Clause, Query, QueryError, base_clauses, check_length, parse_query
+from lw_torchrl.language.queries import Clause, Query, base_clauses, check_length, parse_query, read_query
 from lw_torchrl.language.relations import PUBLISHED, RELATIONS, UNARY
 from lw_torchrl.language.tasks import Task, get_task
 
@@ -71,11 +71,8 @@ def _vectors(task: Task, relations: tuple[str, ...]) -> Tensor:
 
 def _parse(text: str, task: Task, relations: tuple[str, ...]) -> Query | None:
     """The query that a text is, if it is one that has no other relations."""
-    try:
-        query = parse_query(text, task)
-    except QueryError:
-        return None
-    return query if all(clause.predicate in (*relations, *UNARY) for clause in query.clauses) else None
+    query = read_query(text, task)
+    return query if query and all(clause.predicate in (*relations, *UNARY) for clause in query.clauses) else None
 
 
 def _nearest(part: str, task: Task, relations: tuple[str, ...], by: str) -> QueryPart:

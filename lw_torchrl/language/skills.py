@@ -5,16 +5,17 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
-from functools import cache
+from functools import cache, lru_cache
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Literal
 
 from rapidfuzz import fuzz, process
+from torch import Tensor
 
-from lw_torchrl._checks import nearest, shown
+from lw_torchrl._checks import check_choice, nearest, shown
 from lw_torchrl._files import read_toml
 from lw_torchrl.language.named_objects import GRIPPER, is_number
 from lw_torchrl.language.tasks import TASKS, Task, check_task, get_task
@@ -38,11 +39,12 @@ class ScriptedSkill:
         offset: added to the target, metres. x points to the robot's right, y away from it, z up.
         gain: per axis, action per metre; 0 leaves an axis alone.
         gripper: effort in [-1, 1]; -1 opens, 1 closes.
+        goal: the state it steers to, as a query of the tasks that it suits; "" where the language has no words for it.
         variants: task name to what differs there, any of the above but the text.
 
     Raises:
-        SkillError: (a ValueError) a number is not finite, a negative gain, an effort outside [-1, 1], or a variant
-            for an unknown task.
+        SkillError: (a ValueError) a number is not finite, a negative gain, an effort outside [-1, 1], a goal
+            that is no text, or a variant for an unknown task.
 
     Example:
         >>> skill = ScriptedSkill("place the gripper above the puck", "puck", offset=(0.0, 0.0, 0.1), gripper=-1.0)
@@ -58,6 +60,7 @@ class ScriptedSkill:
     offset: Triple = (0.0, 0.0, 0.0)
     gain: Triple = (10.0, 10.0, 10.0)
     gripper: float = 0.0
+    goal: str = ""
     variants: Mapping[str, ScriptedSkill] = field(default_factory=dict, hash=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -72,6 +75,8 @@ class ScriptedSkill:
                 raise SkillError(f"{name} of skill {self.text!r} must be three numbers, got {shown(numbers)}")
         if min(self.gain) < 0:
             raise SkillError(f"gain of skill {self.text!r} must not be negative, got {self.gain!r}")
+        if not isinstance(self.goal, str):
+            raise SkillError(f"goal of skill {self.text!r} must be a query in words, got {shown(self.goal)}")
         if not is_number(self.gripper) or not -1 <= self.gripper <= 1:
             raise SkillError(f"gripper of skill {self.text!r} must lie in [-1, 1], got {shown(self.gripper)}")
 
@@ -165,19 +170,55 @@ def load_skills(
     return MappingProxyType({**_shipped(), **_read(Path(path), tasks)})
 
 
+@lru_cache(maxsize=256)
+def _foreign_words(task: Task) -> frozenset[str]:
+    """The words for things of the 50 tasks that this one lacks."""
+    own = {word for name in task.object_names for word in name.split()}
+    return frozenset(name.split()[-1] for one in TASKS.values() for name in one.object_names) - own
+
+
+def skills_for(task: Task, skills: Mapping[str, ScriptedSkill] | None = None) -> Mapping[str, ScriptedSkill]:
+    """The skills that a task may use, of the shipped ones if none are given: it has the objects that they speak of, and
+    their texts name nothing that other tasks have and it has not."""
+    return _shipped_for(task) if skills is None else _for(task, skills)
+
+
+@lru_cache(maxsize=256)
+def _shipped_for(task: Task) -> Mapping[str, ScriptedSkill]:
+    return MappingProxyType(_for(task, _shipped()))
+
+
+def _for(task: Task, skills: Mapping[str, ScriptedSkill]) -> dict[str, ScriptedSkill]:
+    foreign = _foreign_words(task)
+    return {text: skill for text, skill in skills.items() if skill.suits(task) and not foreign & set(text.split())}
+
+
+@lru_cache(maxsize=64)
+def _vectors(texts: tuple[str, ...]) -> Tensor:
+    from lw_torchrl.language.text import encode_texts
+
+    return encode_texts(texts)
+
+
 def nearest_skill(
-    text: str, task: str | Task | None = None, skills: Mapping[str, ScriptedSkill] | Iterable[str] | None = None
+    text: str,
+    task: str | Task | None = None,
+    skills: Mapping[str, ScriptedSkill] | Iterable[str] | None = None,
+    by: Literal["edit", "embedding"] = "edit",
 ) -> tuple[ScriptedSkill, float]:
-    """The scripted skill whose text is closest in spelling, and how close it is, in [0, 1].
+    """The scripted skill whose text is closest, and how close it is, in [0, 1].
 
     Args:
         text: what to do, in any words.
         task: consider only skills whose objects this task has.
         skills: to choose from; None for the shipped ones.
+        by: "edit", closest in spelling; "embedding", closest in meaning, by the sentence encoder.
 
     Raises:
         TypeError: ``text`` is no string.
         SkillError: (a ValueError) no skill suits the task.
+        ValueError: another value for ``by``.
+        ImportError: by="embedding" without the extra ``[text]``.
 
     Example:
         >>> nearest_skill("put gripper above puck", task="push")[0].text
@@ -187,11 +228,18 @@ def nearest_skill(
     """
     if not isinstance(text, str):
         raise TypeError(f"text must be a string, got {type(text).__name__}")
+    check_choice("by", by, ("edit", "embedding"))
     table = _shipped() if skills is None else skills
     if not isinstance(table, Mapping):
         table = {name: _shipped()[name] for name in table}
     allowed = [name for name, skill in table.items() if task is None or skill.suits(task)]
-    found = process.extractOne(" ".join(text.lower().replace("_", " ").split()), allowed, scorer=fuzz.ratio)
-    if found is None:
+    if not allowed:
         raise SkillError(f"no scripted skill suits task {task!r}")
+    said = " ".join(text.lower().replace("_", " ").split())
+    if by == "embedding":
+        from lw_torchrl.language.text import encode_texts
+
+        alike = _vectors(tuple(allowed)) @ encode_texts([said.encode("utf-8", "replace").decode()])[0]
+        return table[allowed[int(alike.argmax())]], float(alike.max().clamp(0.0, 1.0))
+    found = process.extractOne(said, allowed, scorer=fuzz.ratio)
     return table[found[0]], found[1] / 100

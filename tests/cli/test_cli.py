@@ -31,6 +31,7 @@ COMMANDS = (
     "queries",
     "skills",
     "plans",
+    "plan",
     "check",
     "reproduce",
     "offline",

@@ -10,7 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import lw_torchrl as lw
-from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.named_objects import NamedObject
 from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans
 from lw_torchrl.language.relations import RELATIONS, Comparison
@@ -151,16 +150,6 @@ def test_json_of_no_plan_says_what_is_wrong(found, says):
     assert len(str(caught.value)) < 1000
 
 
-def test_formats_by_name():
-    assert list(PLAN_FORMATS) == ["chain_py"]
-    for plan in MT10_PLANS.values():
-        text = PLAN_FORMATS["chain_py"].encode(plan)
-        assert text == str(plan)
-        assert PLAN_FORMATS["chain_py"].decode(text, plan.task) == plan
-    with pytest.raises(TypeError):
-        PLAN_FORMATS["mine"] = PLAN_FORMATS["chain_py"]
-
-
 def test_the_types_can_be_imported_first(python):
-    for module in ("plans", "formats", "formats.chain_py"):
+    for module in ("plans", "formats", "formats.chain_py", "decoding"):
         assert python(f"import lw_torchrl.language.{module}").returncode == 0

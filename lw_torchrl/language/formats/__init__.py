@@ -1,30 +1,53 @@
-"""How plans are written: a module for each format, and the table of them by name."""
+"""How plans are written: the nine formats of the paper, by name, and what else one adds to the table.
+
+A style (what is said) in a container (how): ``basic_py`` to ``goal_md``. docs/planners.md shows them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from types import MappingProxyType
 
-from lw_torchrl.language.formats import chain_py
+from lw_torchrl._checks import check_choice
+from lw_torchrl.language.formats.md import md
+from lw_torchrl.language.formats.plan_format import STYLES, PlanFormat
+from lw_torchrl.language.formats.py import py
+from lw_torchrl.language.formats.py_md import py_md
 from lw_torchrl.language.plans import ConditionalPlan
 
-
-@dataclass(frozen=True)
-class PlanFormat:
-    """A way to write a plan.
-
-    Attributes:
-        encode: a plan to its text.
-        decode: ``(text, task=None, source="plan", tasks=TASKS)`` to the plan, as
-            :func:`~lw_torchrl.language.formats.chain_py.parse_plan`; a text that is none is a ``PlanError``.
-    """
-
-    encode: Callable[[ConditionalPlan], str]
-    decode: Callable[..., ConditionalPlan]
-
-
 PLAN_FORMATS: Mapping[str, PlanFormat] = MappingProxyType(
-    {"chain_py": PlanFormat(chain_py.format_plan, chain_py.parse_plan)}
+    {
+        f"{name}_{container}": make(style)
+        for name, style in STYLES.items()
+        for container, make in {"py": py, "py_md": py_md, "md": md}.items()
+    }
 )
 """The formats by name."""
+
+
+def encode_plan(plan: ConditionalPlan, format: str) -> str:
+    """A plan as text.
+
+    :func:`~lw_torchrl.decode_plan` reads an equal plan from it: its conditions and skills, and in the goal formats its
+    goals. Reasons are written where a format explains; a goal that is not its skill's usual one has no place in the
+    basic and chain formats.
+
+    Args:
+        plan: the plan.
+        format: a name in :data:`PLAN_FORMATS`.
+
+    Raises:
+        TypeError: ``plan`` is no ConditionalPlan.
+        ValueError: an unknown format.
+
+    Example:
+        >>> from lw_torchrl.language.plan_files import load_plans
+        >>> print(encode_plan(load_plans("MT10")["window-open"], "basic_md").splitlines()[2])
+        - When the robot's gripper is not almost vertically aligned with the window handle, the robot should place the \
+gripper above the window handle.
+
+    Source: paper section 'Conditional Plan Generation'.
+    """
+    if not isinstance(plan, ConditionalPlan):
+        raise TypeError(f"plan must be a ConditionalPlan, got {type(plan).__name__}")
+    return PLAN_FORMATS[check_choice("format", format, PLAN_FORMATS)].encode(plan)

@@ -1,4 +1,4 @@
-"""The chain_py format: a plan as a function that looks like Python.
+"""Plan files: chain_py, read strictly. A plan is a function that looks like Python.
 
     # drawer-open: Take hold of the drawer handle and pull the drawer open.
     def drawer_open(robot):
@@ -6,7 +6,9 @@
         if check("the robot's gripper is not vertically aligned with the drawer handle"):
             robot.place("the gripper above the drawer handle")
 
-It is never executed: every line is matched against the few forms above.
+It is never executed: every line is matched against the few forms above. Where a step's goal is not the usual one of its
+skill, the skill ends with it: ``robot.place("the gripper above the puck", goal="the puck is near the gripper")``.
+What models write is read with patience instead, by :func:`~lw_torchrl.language.decoding.decode_plan`.
 Source: paper section 'Conditional Plan Generation' and its figure of a chain_py plan.
 """
 
@@ -23,7 +25,7 @@ from lw_torchrl.language.tasks import TASKS, Task
 _TEXT = r'"((?:[^"\\]|\\.)*)"|\'((?:[^\'\\]|\\.)*)\''
 _DEF = re.compile(r"def\s+([A-Za-z]\w*)\s*\(\s*robot\s*\)\s*:")
 _CHECK = re.compile(rf"if\s+check\s*\(\s*(?:{_TEXT})\s*\)\s*:")
-_SKILL = re.compile(rf"robot\.([A-Za-z]\w*)\s*\(\s*(?:{_TEXT})?\s*\)")
+_SKILL = re.compile(rf"robot\.([A-Za-z]\w*)\s*\(\s*(?:{_TEXT})?\s*(?:,?\s*goal\s*=\s*(?:{_TEXT}))?\s*\)")
 
 
 def _unquote(match: re.Match[str], group: int) -> str:
@@ -77,7 +79,12 @@ def _read(
             if not opened:
                 fault = 'the skill has no condition; expected if check("condition"): above it'
             elif condition is not None:
-                steps.append(PlanStep(condition, f"{match[1]} {_unquote(match, 2)}", " ".join(reason)))
+                goal = _unquote(match, 4)
+                try:
+                    reached = check_query(goal, tasks[found]) if goal else None
+                    steps.append(PlanStep(condition, f"{match[1]} {_unquote(match, 2)}", " ".join(reason), reached))
+                except ValueError as error:
+                    fault = f"goal: {error}"
             opened, condition, reason = False, None, []
         else:
             fault = f'expected a comment, if check("condition"): or robot.verb("details"), got {shown(line)}'
@@ -144,11 +151,13 @@ def parse_plan(
     raise fault
 
 
+def quote(text: str) -> str:
+    """A text in quotes, as :func:`parse_plan` and Python read it."""
+    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
+
+
 def format_plan(plan: ConditionalPlan) -> str:
     """The plan as text in the chain_py format; :func:`parse_plan` reads it back."""
-
-    def quote(text: str) -> str:
-        return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
 
     description = " ".join(plan.definition.description.split())  # a comment is one line
     lines = [f"# {plan.task}: {description}", f"def {plan.task.replace('-', '_')}(robot):"]
@@ -156,5 +165,8 @@ def format_plan(plan: ConditionalPlan) -> str:
         if reason := " ".join(step.reason.split()).lstrip("# "):
             lines.append(f"    # {reason}")
         verb, _, details = step.skill.partition(" ")
-        lines += [f"    if check({quote(str(step.condition))}):", f"        robot.{verb}({quote(details)})"]
+        said = [quote(details)]
+        if step.goal is not None:
+            said.append(f"goal={quote(str(step.goal))}")
+        lines += [f"    if check({quote(str(step.condition))}):", f"        robot.{verb}({', '.join(said)})"]
     return "\n".join(lines) + "\n"

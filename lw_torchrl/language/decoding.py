@@ -1,0 +1,219 @@
+"""decode_plan: what a language model wrote, as a plan of one task, and all that was left out or changed."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Literal
+
+from lw_torchrl._checks import check_choice, check_probability, counted, shown
+from lw_torchrl.language.decoded import DecodedPlan, DecodedStep
+from lw_torchrl.language.formats import PLAN_FORMATS
+from lw_torchrl.language.formats.prose_reader import read_prose
+from lw_torchrl.language.formats.python_reader import read_python
+from lw_torchrl.language.formats.written import Clause, Note, Reading, Section, listed_steps
+from lw_torchrl.language.plans import ConditionalPlan, PlanStep
+from lw_torchrl.language.queries import read_query
+from lw_torchrl.language.skill_text import canonical_skill
+from lw_torchrl.language.skills import ScriptedSkill
+from lw_torchrl.language.step_mapping import StepMapper
+from lw_torchrl.language.tasks import TASKS, Task, check_task
+
+LIMIT, SKILL_LIMIT = 0.4, 0.7
+"""Distances beyond which a condition and a skill are taken for nothing; docs/planners.md says what that leaves out."""
+_LONGEST = 65_536  # characters of a text that are read
+
+
+def decode_plan(
+    text: str,
+    task: str | Task,
+    format: str,
+    *,
+    by: Literal["edit", "embedding"] = "edit",
+    limit: float = LIMIT,
+    skill_limit: float = SKILL_LIMIT,
+    skills: Mapping[str, ScriptedSkill] | None = None,
+    tasks: Mapping[str, Task] = TASKS,
+) -> DecodedPlan:
+    """Read a plan from whatever a language model wrote. No text is an error, and none is executed.
+
+    Only clauses for ``task`` count: those of functions and headings of its name, and those before any other name, which
+    go on from where the prompt ended. Where a text has several versions the longest counts, of equals the first. A text
+    in Python where prose was asked for, or the other way round, is read as what it is.
+
+    A condition outside the query language is taken for the nearest query, clause by clause, and one beyond ``limit`` is
+    dropped with its step. Skills stay as they are written in ``plan``; ``scripted`` has the nearest scripted ones.
+
+    Args:
+        text: the answer; of more than 65,536 characters the rest is left out.
+        task: the task that was asked for, or its name.
+        format: the format that was asked for, a name in :data:`~lw_torchrl.PLAN_FORMATS`.
+        by: nearest in spelling ("edit"), or in meaning ("embedding"), which wants the extra ``[text]``.
+        limit: the largest distance, from 0 to 1, at which a condition or a goal is taken for a query.
+        skill_limit: the same of skills and scripted ones.
+        skills: the scripted skills to choose from; None for the shipped ones.
+        tasks: where a task's name is looked up, as from :func:`~lw_torchrl.load_tasks`.
+
+    Returns:
+        The plan or the reason why there is none, notes, and the steps.
+
+    Raises:
+        TypeError: ``text`` is no string.
+        ValueError: an unknown task or format, another value for ``by``, or a limit outside [0, 1].
+        ImportError: by="embedding" without the extra ``[text]``.
+
+    Example:
+        >>> answer = '''Sure! Here you go:
+        ... def push(robot):
+        ...     if check("the gripper isn't above puck"):
+        ...         robot.put("gripper above puck")
+        ...     if check("the gripper is holding the'''
+        >>> decoded = decode_plan(answer, "push", "basic_py")
+        >>> print(decoded.scripted.steps[0].condition, "->", decoded.scripted.steps[0].skill)
+        the robot's gripper is not above the puck -> place the gripper above the puck
+        >>> print(decoded.notes[-1])
+        line 5: is cut off: 'if check("the gripper is holding the'
+
+    Source: paper sections 'Conditional Plan Generation' and 'LLM Experiments'.
+    """
+    if not isinstance(text, str):
+        raise TypeError(f"text must be a string, got {shown(text)} ({type(text).__name__})")
+    owner = task if isinstance(task, Task) else tasks[check_task(task, tasks)]
+    read = PLAN_FORMATS[check_choice("format", format, PLAN_FORMATS)].read
+    check_choice("by", by, ("edit", "embedding"))
+    limits = check_probability("limit", limit), check_probability("skill_limit", skill_limit)
+    mapper = StepMapper(owner, skills, by, *limits)
+    notes = []
+    if len(text) > _LONGEST:
+        notes.append(Note(text.count("\n", 0, _LONGEST) + 1, f"the rest of {len(text)} characters is not read"))
+    reading, section = _read(text[:_LONGEST], owner, read)
+    steps = [_mapped(clause, mapper, notes) for clause in _named(section)]
+    notes += _about(reading, section, owner)
+    plan = _plan(owner, [(step, step.written_skill) for step in steps], section)
+    return DecodedPlan(
+        plan,
+        _plan(owner, [(step, step.scripted) for step in steps], section),
+        "" if plan is not None else _why_none(reading, section, steps, owner, text),
+        tuple(sorted(notes, key=lambda note: note.line)),
+        tuple(steps),
+    )
+
+
+def _same(name: str, task: Task) -> bool:
+    """Whether a text means the task by a name: spelling aside."""
+    return re.sub(r"[^a-z0-9]", "", name.lower()) == task.name.replace("-", "")
+
+
+def _read(text: str, task: Task, read: Callable[[str], Reading]) -> tuple[Reading, Section]:
+    """What the text says, by the reader that finds something for the task, and the section that is taken."""
+    readers = [read, *(other for other in (read_python, read_prose) if other is not read)]
+    found: list[tuple[Reading, Section]] = []
+    for reader in readers:
+        reading = reader(text)
+        asked = [reading.sections[0], *(section for section in reading.sections[1:] if _same(section.task, task))]
+        section = max(asked, key=lambda section: len(section.clauses))
+        if section.clauses:
+            if found:
+                reading.note(section.clauses[0].line, "is written in another format than was asked for")
+            return reading, section
+        found.append((reading, section))
+    return found[0]
+
+
+def _named(section: Section) -> list[Clause]:
+    """The clauses; one that only says a state to reach has its skill's name from the list of steps, if that has one for
+    each clause, else from the state."""
+    listed = listed_steps(section.listed, len(section.clauses)) or [""] * len(section.clauses)
+    return [
+        clause if clause.skill else replace(clause, skill=name or _in_words(clause.goal))
+        for clause, name in zip(section.clauses, listed, strict=True)
+    ]
+
+
+def _in_words(goal: str) -> str:
+    """A state to reach as a skill: "the robot's gripper is above mug" is "move gripper above mug"."""
+    said = []
+    for state in re.split(r"\s+and\s+", goal):
+        found = re.match(r"(?:the\s+)?(?:robot's\s+)?(.+?)\s+is\s+(.+)", state)
+        if found and found.groups() in (("gripper", "open"), ("gripper", "closed")):
+            said.append(f"{found[2].removesuffix('d')} the gripper")
+        else:
+            said.append(f"move {found[1]} {found[2]}" if found else f"move until {state}")
+    return " and ".join(said)
+
+
+def _mapped(clause: Clause, mapper: StepMapper, notes: list[Note]) -> DecodedStep:
+    """A clause mapped, with notes of what was changed and why it was dropped."""
+
+    def note(text: str) -> None:
+        notes.append(Note(clause.line, text))
+
+    written = " ".join(clause.condition.split())
+    condition, distance = mapper.query(written)
+    goal, goal_distance = mapper.query(clause.goal) if clause.goal else (None, 0.0)
+    dropped = ""
+    try:
+        words = canonical_skill(clause.skill, mapper.task)
+    except ValueError as error:
+        words, dropped = " ".join(clause.skill.split()), str(error)
+    scripted, skill_distance = mapper.skill(words)
+    if condition is None:
+        dropped = f"no query is near enough to the condition {shown(written)} (distance {distance:.2f})"
+    elif read_query(written, mapper.task) is None:
+        note(f"the condition {shown(written)} is taken for {str(condition)!r} (distance {distance:.2f})")
+    if dropped:
+        note(f"a step is left out: {dropped}")
+    else:
+        if clause.goal and goal is None:
+            note(f"no query is near enough to the goal {shown(clause.goal)} (distance {goal_distance:.2f})")
+        elif clause.goal and read_query(clause.goal, mapper.task) is None:
+            note(f"the goal {shown(clause.goal)} is taken for {str(goal)!r} (distance {goal_distance:.2f})")
+        if scripted is None:
+            note(f"no scripted skill is near enough to {shown(words)} (distance {skill_distance:.2f})")
+        elif scripted != words:
+            note(f"the skill {shown(words)} is nearest to the scripted {scripted!r} (distance {skill_distance:.2f})")
+    return DecodedStep(
+        clause.line, written, words, condition, distance, scripted, skill_distance, clause.goal, goal, goal_distance,
+        dropped,
+    )  # fmt: skip
+
+
+def _plan(task: Task, steps: list[tuple[DecodedStep, str | None]], section: Section) -> ConditionalPlan | None:
+    """The plan of the steps that are not dropped and have a skill."""
+    reasons = {clause.line: clause.reason for clause in section.clauses}
+    kept = tuple(
+        PlanStep(step.condition, skill, reasons[step.line], step.goal)
+        for step, skill in steps
+        if not step.dropped and step.condition is not None and skill is not None
+    )
+    return ConditionalPlan(task.name, kept, task) if kept else None
+
+
+def _about(reading: Reading, section: Section, task: Task) -> list[Note]:
+    """The reader's notes of what stands in the section that counts, and one for each other section."""
+    ends = [later.line for later in reading.sections[1:]]
+    notes = []
+    for found, end in zip(reading.sections, [*ends, float("inf")], strict=True):
+        own = [note for note in reading.notes if found.line <= note.line < end]
+        if found is section or (not found.task and not found.clauses):
+            notes += own
+        elif found.clauses:
+            steps = counted(len(found.clauses), "step")
+            what = "was not asked for" if not _same(found.task, task) else "is another version"
+            named = repr(found.task) if found.task else "what stands before any name"
+            notes.append(Note(found.line, f"{named} {what}; {steps} left out"))
+    return notes
+
+
+def _why_none(reading: Reading, section: Section, steps: list[DecodedStep], task: Task, text: str) -> str:
+    if steps:
+        return (
+            f"none of its {counted(len(steps), 'step')} for {task.name} could be kept; of the first: {steps[0].dropped}"
+        )
+    if not text.strip():
+        return "the text is empty"
+    others = sorted({other.task for other in reading.sections if other.clauses})
+    if others:
+        return f"it has no steps for {task.name}, but some for {', '.join(map(shown, others))}"
+    return f"it has no steps, neither for {task.name} nor for another task"

@@ -1,0 +1,144 @@
+"""Reads plans in prose as models really write it: "- When C, the robot should S." Nothing is an error.
+
+A clause is a bullet that begins with "When", "If", "Once" and the like. Where a text has no such bullets, sentences
+count that say "When C, the robot should S". Other sentences before a clause are its reason.
+"""
+
+from __future__ import annotations
+
+import re
+
+from lw_torchrl._checks import shown
+from lw_torchrl.language.formats.written import END, Clause, Reading, item
+from lw_torchrl.language.named_objects import GRIPPER
+from lw_torchrl.language.tasks import TASKS
+
+_NAMED = re.compile(r"[\s#>*\"'`]*(?:the\s+)?task\b[\s:]*([`\"'“‘*]*)([A-Za-z0-9][\w-]*)", re.IGNORECASE)
+_ALONE = re.compile(r"[\s#>*\"'`]*([a-z0-9]+(?:[-_][a-z0-9]+)*)[\s\"'`:,*]*")
+_BULLET = re.compile(r"\s*(?:[-*•–+>]|\(?\[?\d{1,3}[.)\]]|[a-z]\))\s+")
+_WHEN = re.compile(
+    r"(?:<[^<>]*>|[\"'`*])*(?:(?:finally|then|next|first|lastly|and|or|else),?\s+)?"
+    r"(when|whenever|if|once|while|as long as|as soon as|after)\s+(.+)",
+    re.IGNORECASE,
+)
+_SHOULD = re.compile(
+    r",?\s(?:then\s)?(?:the\s)?(?:robot|it)\s(?:should|must|needs to|has to|will|can|shall)\s(?:then\s|just\s)?",
+    re.IGNORECASE,
+)
+_UNTIL = re.compile(r",?\s(?:then\s)?move\s(?:the\s)?(?:robot's\s)?gripper\suntil\s", re.IGNORECASE)
+_COMMA = re.compile(r",\s(?:then\s)?")
+_NO_SKILL = frozenset(("the", "a", "an", "it", "this", "that", "you", "we", "they", "there", "and", "or"))
+
+
+def read_prose(text: str) -> Reading:
+    """What a text says in prose; see :class:`~lw_torchrl.language.formats.plan_format.PlanFormat`."""
+    return _Reader(text).reading
+
+
+def is_comment(line: str) -> bool:
+    """Whether a line is a sentence to the reader, by which a plan is not read otherwise."""
+    return not (
+        END.search(line)
+        or _heading(line)
+        or _BULLET.match(line)
+        or item(line)
+        or _listing(line) is not None
+        or _clause(1, line, "", bullet=False)
+    )
+
+
+class _Reader:
+    def __init__(self, text: str) -> None:
+        self.reading = Reading()
+        self.section = self.reading.sections[0]
+        self.bulleted: dict[int, bool] = {}  # of a section, by its place: whether its clauses are bullets
+        self.reason: list[str] = []
+        self.listing = False
+        for number, line in enumerate(text.splitlines(), 1):
+            said, *cut = END.split(line, maxsplit=1)
+            self.read(number, said.strip())
+            if cut:
+                self.reading.note(number, "the answer ends here")
+                break
+
+    def read(self, number: int, raw: str) -> None:
+        line = " ".join(raw.split())
+        bullet = _BULLET.match(line)
+        if name := _heading(line):
+            self.section = self.reading.open(name, number)
+            self.listing = False
+            self.reason.clear()
+        elif (steps := _listing(raw)) is not None:
+            self.listing, self.section.listed = True, steps
+        elif found := _clause(number, line, " ".join(self.reason), bullet is not None):
+            self.add(found, bullet is not None, line)
+        elif self.listing and (numbered := item(line)):
+            self.section.listed += f"  {numbered[0]}. {numbered[1]}"
+            return
+        elif bullet and not item(line):
+            self.reading.note(number, f"a rule without a condition or a skill is left out: {shown(line)}")
+        elif line and not line.startswith(("```", "~~~")) and not line.endswith(":"):
+            self.reason.append(line)
+        self.listing = self.listing and steps is not None
+
+    def add(self, found: Clause, bullet: bool, line: str) -> None:
+        place = len(self.reading.sections)
+        if bullet and not self.bulleted.get(place, True):
+            self.section.clauses.clear()  # sentences that only say why
+        if bullet or not self.bulleted.get(place, False):
+            self.bulleted[place] = bullet
+            self.section.clauses.append(found)
+            self.reason.clear()
+        else:
+            self.reason.append(line)
+
+
+def _heading(line: str) -> str:
+    """The task that a line begins, "" if it is no heading."""
+    if (named := _NAMED.match(line)) and (named[1] or named[2].lower() in TASKS):
+        return named[2].replace("_", "-").lower()
+    if (alone := _ALONE.fullmatch(line)) and ("-" in alone[1] or alone[1].replace("_", "-") in TASKS):
+        return alone[1].replace("_", "-")
+    return ""
+
+
+def _listing(line: str) -> str | None:
+    """What a line that begins a list of steps lists, maybe nothing yet."""
+    found = re.match(r"[#*\s]*steps\s*:[*\s]*(.*)", line, re.IGNORECASE)
+    return found[1] if found else None
+
+
+def _clause(number: int, line: str, reason: str, bullet: bool) -> Clause | None:
+    start = _BULLET.match(line)
+    found = _WHEN.match(line, start.end() if start else 0)
+    if not found:
+        return None
+    rest = found[2]
+    should, until = _SHOULD.search(rest), _UNTIL.search(rest)
+    if until and not (should and should.start() < until.start()):
+        goal = re.sub(r"^it is\b", f"the {GRIPPER} is", _ended(rest[until.end() :]))
+        if not goal:
+            return None  # cut off
+        return Clause(number, rest[: until.start()], "", goal, reason)
+    if (should and found[1].lower() in ("when", "if", "whenever", "once")) or (should and bullet):
+        return Clause(number, rest[: should.start()], _ended(rest[should.end() :]), "", reason)
+    comma = _COMMA.search(rest)
+    if not bullet or not comma:
+        return None
+    skill = _ended(rest[comma.end() :])
+    if skill.partition(" ")[0].lower() in _NO_SKILL:
+        return None
+    return Clause(number, rest[: comma.start()], skill, "", reason)
+
+
+def _ended(text: str) -> str:
+    """A sentence's end without its full stop, and without the quotes and tags that a line may end in."""
+    said = text.rstrip()
+    while True:
+        shorter = said.rstrip("\"'`,\\* ")
+        before, tag, name = shorter.rpartition("</")
+        if tag and name.endswith(">") and name[:-1].isalnum():
+            shorter = before
+        if shorter == said:
+            return said.removesuffix(".")
+        said = shorter

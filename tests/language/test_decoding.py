@@ -1,0 +1,317 @@
+"""decode_plan: what models really write becomes a plan and notes, or a reason; no error, and nothing is executed."""
+
+import json
+import os
+import random
+from pathlib import Path
+from time import thread_time
+
+import pytest
+import torch
+from answers import ANSWERS, GRIPPER
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+import lw_torchrl as lw
+from benchmarks.decoding import mutated
+from lw_torchrl.language import query_search, skills, step_mapping
+from lw_torchrl.language import text as text_encoders
+from lw_torchrl.language.skills import ScriptedSkill
+
+formats = st.sampled_from(list(lw.PLAN_FORMATS))
+
+
+def decoded(name):
+    answer = ANSWERS[name]
+    return lw.decode_plan(answer.text, answer.task, answer.format)
+
+
+@pytest.mark.parametrize("name", ANSWERS)
+def test_what_models_write(name):
+    answer, found = ANSWERS[name], decoded(name)
+    steps = found.plan.steps if found.plan else ()
+    assert [(str(step.condition), step.skill) for step in steps] == answer.steps
+    assert answer.reason in found.reason
+    assert bool(found.reason) == (found.plan is None) == (not answer.steps)
+    for note in answer.notes:
+        assert any(note in str(told) for told in found.notes), [str(told) for told in found.notes]
+    lines = answer.text.splitlines()
+    assert [note.line for note in found.notes] == sorted(note.line for note in found.notes)
+    assert all(1 <= note.line <= len(lines) for note in found.notes)
+    assert sum(not step.dropped for step in found.steps) == len(answer.steps)
+
+
+def test_a_step_tells_what_was_written_and_what_became_of_it():
+    kept, dropped = decoded("words outside the language").steps
+    assert (kept.line, dropped.line) == (1, 3)
+    assert kept.written_condition == "the robot's gripper is holding onto the puck and the puk is at the goal"
+    assert kept.written_skill == "release the puck"
+    assert str(kept.condition) == f"{GRIPPER} around the puck and the puck is near the target location"
+    assert 0.0 < kept.condition_distance <= 0.4 < dropped.condition_distance <= 1.0
+    assert kept.dropped == ""
+    assert dropped.condition is None
+    assert "green cheese" in dropped.dropped
+
+
+def test_a_text_in_the_language_has_no_distance_and_no_note():
+    plan = lw.load_plans("MT50")["stick-pull"]
+    found = lw.decode_plan(lw.encode_plan(plan, "goal_md"), "stick-pull", "goal_md")
+    assert found.notes == ()
+    assert found.scripted == found.plan == plan
+    assert {(s.condition_distance, s.skill_distance, s.goal_distance) for s in found.steps} == {(0.0, 0.0, 0.0)}
+    assert tuple(step.goal for step in found.steps) == plan.goals
+
+
+def test_goals_are_queries_where_they_are_near_one():
+    named, nameless = decoded("states to reach, named by the steps"), decoded("states to reach, without names")
+    assert [str(goal) for goal in named.plan.goals] == [
+        f"{GRIPPER} above the puck and {GRIPPER} open",
+        f"{GRIPPER} near the puck and {GRIPPER} closed",
+    ]
+    assert str(nameless.steps[1].goal) == f"{GRIPPER} near the puck and {GRIPPER} closed"
+    assert nameless.steps[2].written_goal == "peace is reached everywhere on earth"
+    assert nameless.steps[2].goal is None
+    assert nameless.steps[2].goal_distance > 0.4
+
+
+def test_the_scripted_plan_has_the_nearest_skills_of_the_task():
+    text = """    if check("the gripper is not above the mug"):
+        robot.put("gripper above the mug")
+    if check("the gripper is above the mug"):
+        robot.grab("mug handle")
+    if check("the gripper is closed"):
+        robot.push("mug to goal")
+    if check("the gripper is open"):
+        robot.xyzzy("qqq")
+"""
+    found = lw.decode_plan(text, "coffee-push", "basic_py")
+    assert [step.skill for step in found.scripted.steps] == [
+        "place the gripper above the mug",
+        "close the gripper around the mug",
+        "move the mug to the target location",
+    ]
+    assert [step.skill for step in found.plan.steps][1] == "grab the mug handle"
+    assert found.steps[3].scripted is None
+    assert any("no scripted skill is near enough to 'xyzzy qqq'" in note.text for note in found.notes)
+    lw.ScriptedSkillActor(lw.Plans([found.scripted]))
+
+
+@pytest.mark.parametrize(
+    ("condition", "query"),
+    [
+        ("the robot's gripper is holding the puck", f"{GRIPPER} around the puck"),
+        ("the puck is at the goal", "the puck is near the target location"),
+        ("the puck is not in the target area", "the puck is not near the target location"),
+        ("the gripper is on top of the puck", f"{GRIPPER} above the puck"),
+        ("the puck is on the table", "the puck is touching the table"),
+        ("the puck is to the left of the gripper", "the puck is left of the robot's gripper"),
+        ("the puck is next to the goal position", "the puck is near the target location"),
+    ],
+)
+def test_what_models_call_things(condition, query):
+    found = lw.decode_plan(f'if check("{condition}"):\n    robot.push("puck")', "push", "basic_py")
+    assert str(found.plan.steps[0].condition) == query
+    assert found.steps[0].condition_distance == 0.0
+    assert f"is taken for {query!r}" in str(found.notes[0])
+
+
+@pytest.mark.parametrize(
+    ("skill", "scripted"),
+    [
+        ('grab("puck")', "close the gripper around the puck"),
+        ('put("gripper around puck")', "lower the gripper around the puck"),
+        ('drop("gripper around the puck")', "lower the gripper around the puck"),
+        ('put("gripper above puck")', "place the gripper above the puck"),
+        ('place("puck at goal")', "move the puck to the target location"),
+        ('slide("the puck to target")', "move the puck to the target location"),
+    ],
+)
+def test_what_models_call_skills(skill, scripted):
+    found = lw.decode_plan(f'if check("gripper open"):\n    robot.{skill}', "push", "basic_py")
+    assert found.scripted.steps[0].skill == scripted
+
+
+def test_skills_of_ones_own_are_chosen_from():
+    mine = {"hover over the puck": ScriptedSkill("hover over the puck", "puck")}
+    text = '    if check("gripper open"):\n        robot.hover("above puck")'
+    found = lw.decode_plan(text, "push", "basic_py", skills=mine)
+    assert found.scripted.steps[0].skill == "hover over the puck"
+    none = lw.decode_plan(text, "push", "basic_py", skills={})
+    assert (none.scripted, none.plan.steps[0].skill) == (None, "hover above the puck")
+
+
+def test_limits():
+    text = '    if check("the gripper is abov the puk"):\n        robot.plac("gripper abov puck")'
+    usual = lw.decode_plan(text, "push", "basic_py")
+    assert str(usual.plan.steps[0].condition) == f"{GRIPPER} above the puck"
+    strict = lw.decode_plan(text, "push", "basic_py", limit=0.0)
+    assert strict.plan is None
+    assert strict.steps[0].condition_distance == usual.steps[0].condition_distance > 0
+    exact = lw.decode_plan(text, "push", "basic_py", skill_limit=0.0)
+    assert (exact.scripted, exact.plan) == (None, usual.plan)
+
+
+@pytest.fixture
+def _no_vectors_kept():
+    def forget():
+        for cached in (query_search._vectors, skills._vectors, step_mapping._nearest):
+            cached.cache_clear()
+
+    forget()
+    yield
+    forget()
+
+
+@pytest.mark.usefixtures("_no_vectors_kept")
+def test_nearest_in_meaning(monkeypatch):
+    def encoder(texts):  # "hand" means the gripper, "atop" above
+        words = ["gripper", "above", "near", "puck", "place", "close"]
+        said = [text.replace("hand", "gripper").replace("atop", "above") for text in texts]
+        found = torch.tensor([[float(text.count(word)) for word in words] for text in said]) + 1e-3
+        return found / found.norm(dim=-1, keepdim=True)
+
+    monkeypatch.setattr(text_encoders, "sentence_encoder", encoder)
+    monkeypatch.setattr(text_encoders, "_shipped", dict)
+    text = '    if check("the hand is atop the puck"):\n        robot.place("the hand atop the puck")'
+    found = lw.decode_plan(text, "push", "basic_py", by="embedding")
+    assert str(found.plan.steps[0].condition) == f"{GRIPPER} above the puck"
+    assert found.steps[0].scripted == "place the gripper above the puck"
+
+
+def test_a_task_of_ones_own(tmp_path):
+    (tmp_path / "tasks.toml").write_text('[stack]\ndescription = "Stack it."\nobjects.brick = "obs[4:7]"\n')
+    tasks = lw.load_tasks(tmp_path / "tasks.toml")
+    text = 'def stack(robot):\n  if check("gripper not near brick"):\n    robot.reach("brick")'
+    for task in ("stack", tasks["stack"]):
+        found = lw.decode_plan(text, task, "basic_py", tasks=tasks)
+        assert found.plan.steps[0].skill == "reach the brick"
+        assert found.plan.definition == tasks["stack"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "says"),
+    [
+        ((None, "push", "basic_py"), TypeError, "text must be a string"),
+        (("", "psuh", "basic_py"), ValueError, "'push'"),
+        (("", "push", "basic_pi"), ValueError, "format must be one of .* did you mean 'basic_py'"),
+    ],
+)
+def test_wrong_arguments_are_named(arguments, error, says):
+    with pytest.raises(error, match=says):
+        lw.decode_plan(*arguments)
+    with pytest.raises(ValueError, match="limit must be"):
+        lw.decode_plan("", "push", "basic_py", limit=2)
+    with pytest.raises(ValueError, match="by must be"):
+        lw.decode_plan("", "push", "basic_py", by="luck")
+
+
+LINES = [line for answer in ANSWERS.values() for line in answer.text.splitlines()]
+any_text = st.text(st.characters()) | st.lists(st.sampled_from(LINES) | st.text(max_size=20), max_size=12).map(
+    "\n".join
+)
+
+
+@example("    if check(", "basic_py")
+@example('if check("\\"', "basic_py")
+@example("def", "goal_py")
+@example("robot.move_gripper()", "goal_py")
+@example('if check("gripper open"):\n robot.move_gripper()', "goal_py")
+@example("- When , the robot should .", "basic_md")
+@example("- When x, move the robot's gripper until .", "goal_md")
+@example("Steps:  1.", "goal_md")
+@example("\ud800 if \x00", "basic_py_md")
+@settings(max_examples=300, deadline=None)
+@given(any_text, formats)
+def test_any_text_is_a_plan_or_a_reason(text, format):
+    found = lw.decode_plan(text, "push", format)
+    assert (found.plan is None) == bool(found.reason)
+    assert len(found.reason) < 1000
+    if found.plan:
+        assert lw.decode_plan(lw.encode_plan(found.plan, format), "push", format).plan.steps[0].skill
+
+
+def test_a_text_is_never_executed(tmp_path):
+    mark = tmp_path / "executed"
+    attack = f"__import__('pathlib').Path({str(mark)!r}).touch()"
+    for format in lw.PLAN_FORMATS:
+        for text in (
+            attack,
+            f'    if check(f"{{{attack}}}"):\n        robot.push("puck")',
+            f'    if check("gripper open"):\n        robot.push({attack})\n        {attack}',
+            f'@{attack}\ndef push(robot={attack}):\n    if check("gripper open"):\n        robot.x(""); {attack}',
+            f"- When gripper open, the robot should {attack}.",
+        ):
+            lw.decode_plan(text, "push", format)
+    assert not mark.exists()
+
+
+def test_mutations_of_answers_raise_nothing_and_cost_little():
+    texts, draw = [answer.text for answer in ANSWERS.values()], random.Random(0)
+    for answer in ANSWERS.values():
+        lw.decode_plan(answer.text, answer.task, answer.format)
+    for _ in range(500):
+        answer = draw.choice(list(ANSWERS.values()))
+        text = mutated(draw, answer.text, texts)
+        start = thread_time()
+        found = lw.decode_plan(text, answer.task, answer.format)
+        assert thread_time() - start < 0.05, text
+        assert (found.plan is None) == bool(found.reason)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "x" * 10**6,
+        '"' * 20_000,
+        '\\"' * 20_000,
+        "(" * 20_000,
+        'if check("' * 5_000,
+        " " * 50_000 + "if",
+        "- When a, " * 5_000,
+        "</a>" * 10_000,
+        "1. " * 10_000,
+        "\n".join(f'if check("a{k} b"):\n robot.x("c")' for k in range(2_000)),
+        "\n".join(f"{' ' * k}if check('open'):" for k in range(300)),
+    ],
+)
+@pytest.mark.parametrize("format", ["goal_py", "goal_md"])
+def test_long_texts_take_no_more_than_their_length(text, format):
+    start = thread_time()
+    lw.decode_plan(text, "stick-pull", format)
+    assert thread_time() - start < 1.0
+
+
+NO_CLAUSE = {  # answers of the recorded file that say nothing for the task they were asked about: refusals, other tasks
+    ("GPT-3.5", "basic_py", "coffee-push", 0), ("GPT-3.5", "basic_py", "coffee-push", 1),
+    ("GPT-3.5", "goal_py", "door-lock", 0), ("PaLM 2", "basic_py_md", "coffee-push", 0),
+    ("PaLM 2", "basic_py_md", "coffee-push", 1), ("PaLM 2", "basic_py_md", "door-lock", 0),
+    ("PaLM 2", "chain_py_md", "door-lock", 0), ("PaLM 2", "chain_py_md", "plate-slide", 0),
+    ("PaLM 2", "chain_py_md", "plate-slide", 1), ("PaLM 2", "chain_py_md", "stick-pull", 0),
+    ("PaLM 2", "chain_py_md", "stick-pull", 1), ("PaLM 2", "goal_py_md", "coffee-push", 0),
+    ("PaLM 2", "basic_md", "door-lock", 1), ("PaLM 2", "basic_md", "plate-slide", 1),
+    ("PaLM 2", "chain_md", "door-lock", 0), ("PaLM 2", "chain_md", "plate-slide", 1),
+    ("PaLM 2", "chain_md", "stick-pull", 1), ("PaLM 2", "goal_md", "coffee-push", 1),
+    ("PaLM 2", "goal_md", "door-lock", 0), ("PaLM 2", "goal_md", "door-lock", 1),
+    ("PaLM 2", "goal_md", "plate-slide", 1),
+}  # fmt: skip
+
+
+def test_recorded_answers_of_three_models():
+    """Which answers have a clause was decided by reading all of them, before the decoder read any."""
+    path = os.environ.get("LW_TORCHRL_COMPLETIONS", "")
+    if not path:
+        pytest.skip("LW_TORCHRL_COMPLETIONS names no file of recorded answers")
+    rows = [json.loads(line) for line in Path(path).read_text("utf-8").splitlines()]
+    kept, written, with_clause = 0, 0, 0
+    for row in rows:
+        found = lw.decode_plan(row["completion"], row["task"], row["format"])
+        assert (found.plan is None) == bool(found.reason)
+        if (row["llm"], row["format"], row["task"], row["attempt"]) in NO_CLAUSE:
+            assert found.plan is None
+        else:
+            with_clause += found.plan is not None
+            written += len(found.steps)
+            kept += sum(not step.dropped for step in found.steps)
+    assert len(rows) == 216
+    assert with_clause >= 0.95 * (len(rows) - len(NO_CLAUSE))
+    assert kept >= 0.95 * written

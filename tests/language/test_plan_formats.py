@@ -1,0 +1,152 @@
+"""The nine formats: each reads back what it wrote, and looks as it should."""
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from plan_texts import conditional_plans, queries
+
+import lw_torchrl as lw
+from lw_torchrl.language.formats.chain_py import format_plan, parse_plan
+from lw_torchrl.language.plans import ConditionalPlan, PlanStep
+from lw_torchrl.language.queries import parse_query
+
+NINE = [f"{style}_{container}" for style in ("basic", "chain", "goal") for container in ("py", "py_md", "md")]
+SHIPPED = [
+    plan for skills in ("own", "MT10") for plan in lw.load_plans("MT50", skills=skills).values()
+]  # both ways to word the skills
+
+
+def read_back(plan, format):
+    found = lw.decode_plan(lw.encode_plan(plan, format), plan.definition, format)
+    assert found.plan is not None, found.reason
+    assert not any(step.dropped for step in found.steps)
+    return found.plan
+
+
+@st.composite
+def plans_with_goals(draw):
+    plan = draw(conditional_plans())
+    goals = [draw(st.none() | queries(plan.task)) for _ in plan.steps]
+    steps = [PlanStep(s.condition, s.skill, s.reason, goal) for s, goal in zip(plan.steps, goals, strict=True)]
+    return ConditionalPlan(plan.task, tuple(steps))
+
+
+def test_the_formats_by_name():
+    assert list(lw.PLAN_FORMATS) == NINE
+    with pytest.raises(TypeError):
+        lw.PLAN_FORMATS["mine"] = lw.PLAN_FORMATS["chain_py"]
+
+
+@pytest.mark.parametrize("format", NINE)
+def test_shipped_plans_are_read_back(format):
+    for plan in SHIPPED:
+        assert read_back(plan, format) == plan
+
+
+@settings(max_examples=150, deadline=None)
+@given(conditional_plans(), st.sampled_from(NINE))
+def test_any_plan_is_read_back(plan, format):
+    assert read_back(plan, format) == plan
+
+
+@settings(max_examples=100, deadline=None)
+@given(plans_with_goals(), st.sampled_from(NINE[6:]))
+def test_goals_are_read_back_where_they_have_a_place(plan, format):
+    assert read_back(plan, format) == plan
+
+
+@settings(max_examples=100, deadline=None)
+@given(plans_with_goals())
+def test_plan_files_hold_goals(plan):
+    assert parse_plan(format_plan(plan)) == plan
+    assert lw.Plans.from_json(lw.Plans([plan]).to_json()) == {plan.task: plan}
+    without = ConditionalPlan(plan.task, tuple(PlanStep(s.condition, s.skill, s.reason) for s in plan.steps))
+    assert lw.Plans([plan]).fingerprint == lw.Plans([without]).fingerprint
+    assert (format_plan(plan) == format_plan(without)) == (plan == without)
+
+
+def test_plans_without_goals_of_their_own_write_none():
+    for plan in SHIPPED:
+        assert "goal=" not in str(plan)
+        assert all(step.goal is None for step in plan.steps)
+
+
+@pytest.mark.parametrize("format", [name for name in NINE if not name.startswith("basic")])
+def test_reasons_are_read_back_where_they_have_a_place(format):
+    for plan in SHIPPED:
+        assert [step.reason for step in read_back(plan, format).steps] == [step.reason for step in plan.steps]
+
+
+@pytest.mark.parametrize(
+    "reason",
+    ["2. and so on", "- When the gripper is open, the robot should go.", "Steps: 1. go", "The task `reach` is next",
+     "When the gripper is open, the robot should go", "[eod]", "# push: x", "```", "def push(robot):"],
+)  # fmt: skip
+@pytest.mark.parametrize("format", NINE)
+def test_a_reason_is_never_read_as_a_step(reason, format):
+    goal = parse_query("the puck is near the target location", "push")
+    step = PlanStep(parse_query("gripper open", "push"), "push the puck", reason, goal if "goal" in format else None)
+    plan = ConditionalPlan("push", (step, step))
+    assert read_back(plan, format) == plan
+
+
+def test_chain_py_is_read_as_a_plan_file_too():
+    for plan in SHIPPED[:50]:
+        assert parse_plan(lw.encode_plan(plan, "chain_py"), plan.task) == plan
+
+
+CONDITION = "the robot's gripper is near the puck and the puck is touching the table"
+HEAD = "# pick-place: Pick up the puck and hold it at the target location in the air.\ndef pick_place(robot):\n"
+
+
+def test_what_the_formats_look_like():
+    plan = lw.load_plans("MT10")["pick-place"]
+    texts = {name: lw.encode_plan(plan, name) for name in NINE}
+    for style in ("basic", "chain", "goal"):
+        assert texts[f"{style}_py"].startswith(HEAD)
+        assert f"```python\n{texts[f'{style}_py']}```\n" in texts[f"{style}_py_md"]
+        assert "`pick-place`" in texts[f"{style}_md"]
+    call = f'    if check("{CONDITION}"):\n        robot.close("the gripper around the puck")\n'
+    why = f"    # {plan.steps[2].reason}\n"
+    assert call in texts["basic_py"]
+    assert "#  " not in texts["basic_py"]
+    assert why not in texts["basic_py"]
+    assert why + call in texts["chain_py"]
+    assert "    # Steps:\n    #  1. place the gripper above the puck\n    #  2. lower" in texts["chain_py"]
+    assert f"- When {CONDITION}, the robot should close the gripper around the puck.\n" in texts["basic_md"]
+    assert f"{plan.steps[2].reason}\n- When {CONDITION}, the robot should" in texts["chain_md"]
+    assert "Steps:  1. place the gripper above the puck  2. lower" in texts["chain_md"]
+    assert 'robot.move_gripper("above the puck")\n' in texts["goal_py"]
+    assert 'robot.move_gripper("vertically aligned with the puck", close_gripper=True)\n' in texts["goal_py"]
+    assert 'robot.move_gripper(until="the puck is near the target location")\n' in texts["goal_py"]
+    assert ", move the robot's gripper until the puck is near the target location.\n" in texts["goal_md"]
+
+
+def test_a_skill_without_a_goal_is_written_as_one():
+    plan = lw.load_plans("MT50")["door-lock"]
+    assert plan.goals[2] is None
+    assert 'robot.turn("the door\'s lock to the right")' in lw.encode_plan(plan, "goal_py")
+    assert "the robot should turn the door's lock to the right." in lw.encode_plan(plan, "goal_md")
+
+
+def test_a_description_of_several_lines_stays_in_one(tmp_path):
+    (tmp_path / "tasks.toml").write_text(
+        '[stack]\ndescription = "Stack.\\n- When open, the robot should go."\nobjects.brick = "obs[4:7]"\n'
+    )
+    task = lw.load_tasks(tmp_path / "tasks.toml")["stack"]
+    plan = ConditionalPlan.from_pairs(task, [("gripper open", "stack the brick")])
+    for format in NINE:
+        assert read_back(plan, format) == plan
+
+
+@pytest.mark.parametrize(
+    ("plan", "format", "error", "says"),
+    [
+        (None, "chain_py", TypeError, "plan must be a ConditionalPlan"),
+        (SHIPPED[0], "chain", ValueError, "format must be one of .* did you mean 'chain_py'"),
+        (SHIPPED[0], None, ValueError, "format must be one of"),
+    ],
+)
+def test_wrong_arguments_are_named(plan, format, error, says):
+    with pytest.raises(error, match=says):
+        lw.encode_plan(plan, format)
