@@ -57,6 +57,8 @@ if TYPE_CHECKING:  # the table below, for type checkers and editors
     from lw_torchrl.objectives import SkillLatentLoss as SkillLatentLoss
     from lw_torchrl.objectives import standardize_by_task as standardize_by_task
     from lw_torchrl.record import RerunLogger as RerunLogger
+    from lw_torchrl.record import RolloutRecorder as RolloutRecorder
+    from lw_torchrl.record import log_rollout as log_rollout
     from lw_torchrl.trainers import BehavioralCloningConfig as BehavioralCloningConfig
     from lw_torchrl.trainers import BehavioralCloningTrainer as BehavioralCloningTrainer
     from lw_torchrl.trainers import OfflineConfig as OfflineConfig
@@ -89,7 +91,7 @@ _NAMES = {
     "PlanConditionedValue Policy QueryEvaluator ResidualActor ScriptedSkillActor plan_actor_value",
     "lw_torchrl.objectives": "AdvantageWeightedLoss DemonstratedSACLoss DemonstratedTD3Loss ExpectileValueLoss "
     "SkillLatentLoss standardize_by_task",
-    "lw_torchrl.record": "RerunLogger",
+    "lw_torchrl.record": "RerunLogger RolloutRecorder log_rollout",
     "lw_torchrl.trainers": "BehavioralCloningConfig BehavioralCloningTrainer OfflineConfig OfflineTrainer OnlineConfig "
     "OnlineTrainer "
     "StackedBehavioralCloning load_actor save_actor",

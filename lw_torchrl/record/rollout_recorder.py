@@ -1,0 +1,3 @@
+from torchrl.envs import Transform
+class RolloutRecorder(Transform):
+    pass
