@@ -50,10 +50,10 @@ class Heading:
             return f"failed: {self.failure.cause}"
         return "" if episode.success is None else "failed"
 
-    def title(self, episode: RecordedEpisode, name: str) -> str:
-        """The tab's: the name that the user gave or all that is known, and how it ended."""
-        told = self.parts() if name == self.name else [name, *self.parts()[1:]]
-        return " · ".join([*told, *filter(None, [self.outcome(episode)])])
+    def title(self, episode: RecordedEpisode, name: str | None) -> str:
+        """The tab's: the name that a user gave or the task's, what else is known, and how it ended."""
+        told = [name or self.task, *self.parts()[1:], self.outcome(episode)]
+        return " · ".join(filter(None, told))
 
 
 def decisive_step(heading: Heading, episode: RecordedEpisode) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -33,6 +33,7 @@ def log_rollout(
     name: str | None = None,
     policy: str | None = None,
     failure: Failure | Sequence[Failure | None] | None = None,
+    tasks: Iterable[Task] = (),
 ) -> Any:
     """Add a rollout to a recording: the robot in 3-D, a verdict, the plan at the cursor, lanes and curves.
 
@@ -52,6 +53,7 @@ def log_rollout(
         name: of the episode in the recording; None takes "push-7", of task and episode, or else "push".
         policy: who acted, in a word, for the tab.
         failure: why it failed, for the verdict; of N rows one for each, None where there is none.
+        tasks: of your own, where the plans do not say what they are.
 
     Returns:
         The name; of N rows a list of names.
@@ -83,11 +85,11 @@ def log_rollout(
         failures = failure if isinstance(failure, Sequence) else [failure] * len(rollout)
         if len(failures) != len(rollout):
             raise ValueError(f"failure must be one for each of {len(rollout)} rows, got {len(failures)}")
-        rows = zip(rollout, failures, strict=True)
-        return [log_rollout(logger, row, plans, seed=seed, policy=policy, failure=why) for row, why in rows]
+        rows, tasks = zip(rollout, failures, strict=True), list(tasks)
+        return [log_rollout(logger, row, plans, seed=seed, policy=policy, failure=why, tasks=tasks) for row, why in rows]
     if isinstance(failure, Sequence):
         raise ValueError(f"failure must be one Failure for one episode, got {len(failure)}")
-    heading, episode = read_rollout(rollout, plans, seed=seed, policy=policy, failure=failure)
+    heading, episode = read_rollout(rollout, plans, seed=seed, policy=policy, failure=failure, tasks=tasks)
     motion = None
     if seed is not None and heading.task in TASKS:
         motion = _motion(heading, episode)
@@ -101,6 +103,7 @@ def read_rollout(
     seed: int | None = None,
     policy: str | None = None,
     failure: Failure | None = None,
+    tasks: Iterable[Task] = (),
 ) -> tuple[Heading, RecordedEpisode]:
     """What a page shows of a rollout (T,), checked, as :func:`log_rollout` has it."""
     plans = None if plans is None else as_plans(plans)
@@ -109,7 +112,7 @@ def read_rollout(
     number = _single(rollout, "task_id", required=True)
     index = _single(rollout, "episode", required=seed is not None)
     assert number is not None
-    task = _definition(number, plans)
+    task = _definition(number, [*tasks, *(plan.definition for plan in (plans or {}).values())])
     label = f"task-{number}" if task is None else task.name
     plan = None
     if plans is not None:
@@ -163,12 +166,10 @@ def _single(rollout: TensorDictBase, key: str, *, required: bool) -> int | None:
     return int(found[0])
 
 
-def _definition(number: int, plans: Plans | None) -> Task | None:
-    """The task of an id: of the plans, or one of the 50."""
-    for plan in () if plans is None else plans.values():
-        if task_id(plan.task) == number:
-            return plan.definition
-    return TASKS[MT50[number]] if 0 <= number < len(MT50) else None
+def _definition(number: int, tasks: Sequence[Task]) -> Task | None:
+    """The task of an id: one of these, or of the 50."""
+    found = next((task for task in tasks if task_id(task.name) == number), None)
+    return TASKS[MT50[number]] if found is None and 0 <= number < len(MT50) else found
 
 
 def _check_answers(rollout: TensorDictBase, plan: ConditionalPlan) -> None:

@@ -10,6 +10,7 @@ from lw_torchrl.record.curves import log_curves
 from lw_torchrl.record.heading import Heading, decisive_step, telling_steps
 from lw_torchrl.record.lanes import log_lanes
 from lw_torchrl.record.mujoco_scene import Motion
+from lw_torchrl.record.opening_steps import COMPONENT
 from lw_torchrl.record.plan_text import log_plan
 from lw_torchrl.record.recorded_episode import RecordedEpisode
 from lw_torchrl.record.scene import log_scene
@@ -24,36 +25,43 @@ Point = tuple[float, float, float]
 
 # From behind the robot's right shoulder, over a table whose middle is at (0, 0.6, 0); with the arm, from the front.
 SIMPLE_EYE: tuple[Point, Point] = ((0.54, 0.23, 0.46), (0.03, 0.63, 0.10))
-ROBOT_EYE: tuple[Point, Point] = ((0.78, 0.12, 0.56), (-0.02, 0.6, 0.12))
+ROBOT_EYE: tuple[Point, Point] = ((0.60, 0.16, 0.50), (-0.03, 0.62, 0.13))
 
 CURVES = {
     "distance": ("Distance of what the skill moves from where it goes, cm", 3),
-    "action": ("Action", 3),
+    "action": ("Action", 4),
     "reward": ("Reward", 2),
     "skill_weights": ("Skill weights", 4),
     "corrected": ("How much of the correction counts", 2),
 }
 """Each curve's title and its share of the height."""
+LIMITS = {"action": (-1.2, 1.2), "skill_weights": (-0.1, 1.1), "corrected": (-0.1, 1.1)}
+"""The range of a curve whose numbers have one."""
 
 
 def send_page(
-    stream: RecordingStream, name: str, heading: Heading, episode: RecordedEpisode, motion: Motion | None = None
+    stream: RecordingStream,
+    name: str,
+    title: str,
+    heading: Heading,
+    episode: RecordedEpisode,
+    motion: Motion | None = None,
 ) -> rrb.Horizontal:
-    """Log an episode under ``name``; returns the views of it."""
+    """Log an episode under ``name``; returns the views of it, a tab called ``title``."""
     import rerun as rr
 
     root = entity_path(name)
     trails = log_scene(stream, root, episode, motion)
     stream.log(f"{root}/verdict", rr.TextDocument(verdict(heading, episode), media_type="text/markdown"), static=True)
     # Layouts cannot set the viewer's cursor; whoever opens the file can.
-    stream.log(root, rr.AnyValues(opens_at=decisive_step(heading, episode)), static=True)
+    stream.log(root, rr.AnyValues(**{COMPONENT: decisive_step(heading, episode)}), static=True)
     if episode.steps:
         log_plan(stream, root, episode)
     curves = log_curves(stream, root, episode)
     lanes = log_lanes(stream, root, episode)
     return _layout(
         root,
-        heading.title(episode, name),
+        title,
         trails=trails,
         eye=SIMPLE_EYE if motion is None else ROBOT_EYE,
         shown=telling_steps(heading, episode),
@@ -89,9 +97,9 @@ def _layout(
     left: list[tuple[float, Any]] = [(13, scene)]
     for name, (words, share) in CURVES.items():
         if name in curves:
-            left.append((share, _curve(f"{root}/{name}", words, shown)))
+            left.append((share, _curve(f"{root}/{name}", words, shown, many=name in ("action", "skill_weights"))))
     # Shares are about as many pixels as a view needs; what is longer scrolls.
-    right: list[tuple[float, Any]] = [(190, rrb.TextDocumentView(origin=f"{root}/verdict", name="Verdict"))]
+    right: list[tuple[float, Any]] = [(215, rrb.TextDocumentView(origin=f"{root}/verdict", name="Verdict"))]
     if steps:
         right.append((60 + 72 * min(steps, 5), rrb.TextDocumentView(origin=f"{root}/plan", name="Plan")))
     if lanes:
@@ -117,14 +125,14 @@ def _up_to_now(timeline: str) -> Any:
     )
 
 
-def _curve(origin: str, name: str, shown: tuple[int, int]) -> rrb.TimeSeriesView:
+def _curve(origin: str, name: str, shown: tuple[int, int], *, many: bool) -> rrb.TimeSeriesView:
     import rerun.blueprint as rrb
 
-    limits = {"action": (-1.2, 1.2), "skill_weights": (-0.1, 1.1), "corrected": (-0.1, 1.1)}
+    limits = LIMITS.get(origin.rpartition("/")[2])
     return rrb.TimeSeriesView(
         origin=origin,
         name=name,
         axis_x=_window(shown),
-        axis_y=rrb.ScalarAxis(range=limits.get(origin.rpartition("/")[2])),
-        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=True),
+        axis_y=None if limits is None else rrb.ScalarAxis(range=limits, zoom_lock=True),
+        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=many),
     )

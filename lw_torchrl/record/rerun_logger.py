@@ -239,6 +239,11 @@ class RerunLogger(Logger):
 
     # ---------------------------------------------------------------- episodes
 
+    @property
+    def episodes(self) -> list[str]:
+        """The names of the episodes so far."""
+        return list(self._episodes)
+
     def log_episode(
         self,
         rollout: TensorDictBase,
@@ -289,6 +294,7 @@ class RerunLogger(Logger):
     ) -> str:
         """Add the page of an episode that was checked; returns its name. With a motion the robot is shown as it is."""
         stream = self._open()
-        name = episode_name(heading.name, name, self._episodes)
-        self._episodes[name] = send_page(stream, name, heading, episode, motion)
-        return name
+        entity = episode_name(heading.name, name, self._episodes)
+        title = heading.title(episode, name)
+        self._episodes[entity] = send_page(stream, entity, title, heading, episode, motion)
+        return entity

@@ -72,7 +72,7 @@ def log_scene(stream: RecordingStream, root: str, episode: RecordedEpisode, moti
             lines(f"trails{part}", _from_row_before(position), 0.003 if motion is None else 0.002, color)
 
     if goal.any():
-        point("goal", goal, None if goals else "goal", 0.02, (*GREEN, 120))
+        point("goal", goal, None if goals else "goal", 0.018, GREEN)
     _log_aim(stream, scene, episode, times)
     return trails
 
@@ -90,12 +90,13 @@ def _log_aim(stream: RecordingStream, scene: str, episode: RecordedEpisode, time
     for step, aim in enumerate(episode.aims):
         if aim is not None:
             rows = episode.in_force == step
-            start[rows], end[rows], colors[rows], shown[rows] = aim.moved[rows], aim.point[rows], (*step_color(step), 255), True
+            start[rows], end[rows] = aim.moved[rows], aim.point[rows]
+            colors[rows], shown[rows] = (*step_color(step), 255), True
     arrows = rr.Arrows3D.columns(origins=start[shown], vectors=(end - start)[shown], colors=colors[shown])
     stream.log(f"{scene}/aim", rr.Arrows3D.from_fields(radii=[0.003]), static=True)
     stream.send_columns(f"{scene}/aim", times, arrows.partition(shown.astype(int)))
     balls = rr.Points3D.columns(positions=end[shown], colors=colors[shown])
-    stream.log(f"{scene}/aim/point", rr.Points3D.from_fields(radii=[0.01]), static=True)
+    stream.log(f"{scene}/aim/point", rr.Points3D.from_fields(radii=[0.01], labels=["aim"], show_labels=True), static=True)
     stream.send_columns(f"{scene}/aim/point", times, balls.partition(shown.astype(int)))
 
 

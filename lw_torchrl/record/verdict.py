@@ -18,7 +18,7 @@ def verdict(heading: Heading, episode: RecordedEpisode) -> str:
         if episode.success is not None and not episode.success[-1]:
             lines.append(f"It did not last: the task stood done in {held} steps, and at the end no more.")
     elif heading.failure is not None:
-        lines = [f"## FAILED: {heading.failure.cause}", *_why(heading.failure, episode)]
+        lines = [f"## FAILED, {heading.failure.cause}: {CAUSES[heading.failure.cause]}", *_why(heading.failure, episode)]
     elif episode.success is not None:
         lines = [f"## FAILED in {length} steps", *_facts(episode)]
     else:
@@ -27,22 +27,21 @@ def verdict(heading: Heading, episode: RecordedEpisode) -> str:
 
 
 def _why(failure: Failure, episode: RecordedEpisode) -> list[str]:
-    lines = [f"**{failure.why}**" if failure.why else CAUSES[failure.cause]]
+    lines = [failure.why] if failure.why else []
     if failure.also is not None:
         lines.append(f"Also: {failure.also}, {CAUSES[failure.also]}.")
     seen = f"Seen at step {failure.at} of {len(episode)}"
     if failure.step is not None and failure.step < len(episode.steps):
         seen += f", in {_step(episode, failure.step)}"
     lines.append(f"{seen}.")
-    mended = [name for name, worked in failure.swaps.items() if worked]
-    not_mended = [name for name, worked in failure.swaps.items() if not worked]
+    mended, useless = ([swap for swap, worked in failure.swaps.items() if worked == good] for good in (True, False))
+    told = []
     if mended:
-        lines.append(f"Exchanging {_listed(mended)} made it a success" + ("." if not not_mended else ""))
-    if not_mended:
-        start = "; exchanging" if mended else "Exchanging"
-        lines[-1 if mended else len(lines) :] = [
-            (lines[-1] if mended else "") + f"{start} {_listed(not_mended)} did not help."
-        ]
+        told.append(f"exchanging {' or '.join(mended)} made it a success")
+    if useless:
+        told.append(f"exchanging {' or '.join(useless)} did not help")
+    if told:
+        lines.append("; ".join(told).capitalize() + ".")
     return lines
 
 
@@ -56,7 +55,7 @@ def _facts(episode: RecordedEpisode) -> list[str]:
         facts.append("At the end no step of the plan was in force alone.")
     else:
         steps = int((episode.in_force == last).sum())
-        facts.append(f"At the end {_step(episode, last)} was in force, as in {steps} of {len(episode)} steps.")
+        facts.append(f"At the end {_step(episode, last)}, was in force, as in {steps} of {len(episode)} steps.")
         aim = episode.aims[last] if episode.aims else None
         if aim is not None and not aim.relative:
             distance = np.where(episode.in_force == last, aim.distance, np.inf)
@@ -73,8 +72,5 @@ def _facts(episode: RecordedEpisode) -> list[str]:
 
 
 def _step(episode: RecordedEpisode, step: int) -> str:
-    return f"**step {step + 1}, “{episode.steps[step][1]}”,**"
+    return f"step {step + 1}, **“{episode.steps[step][1]}”**"
 
-
-def _listed(names: list[str]) -> str:
-    return " or ".join(names)
