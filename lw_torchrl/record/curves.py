@@ -57,9 +57,7 @@ def _send(
     stream.send_columns(path, time_columns(steps), columns)
 
 
-def _send_distance(
-    stream: RecordingStream, path: str, distance: NDArray[np.float32], episode: RecordedEpisode
-) -> None:
+def _send_distance(stream: RecordingStream, path: str, distance: NDArray[np.float32], episode: RecordedEpisode) -> None:
     """One line in centimetres, in the colour of the step in force."""
     import rerun as rr
 

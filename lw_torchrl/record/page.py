@@ -25,7 +25,7 @@ Point = tuple[float, float, float]
 
 # From behind the robot's right shoulder, over a table whose middle is at (0, 0.6, 0); with the arm, from the front.
 SIMPLE_EYE: tuple[Point, Point] = ((0.54, 0.23, 0.46), (0.03, 0.63, 0.10))
-ROBOT_EYE: tuple[Point, Point] = ((0.60, 0.16, 0.50), (-0.03, 0.62, 0.13))
+ROBOT_EYE: tuple[Point, Point] = ((0.54, 0.18, 0.47), (-0.02, 0.62, 0.13))
 
 CURVES = {
     "distance": ("Distance of what the skill moves from where it goes, cm", 3),
@@ -68,6 +68,7 @@ def send_page(
         curves=curves,
         steps=len(episode.steps),
         lanes=lanes,
+        good=episode.first_success is not None,
     )
 
 
@@ -81,6 +82,7 @@ def _layout(
     curves: Collection[str],
     steps: int,
     lanes: int,
+    good: bool,
 ) -> rrb.Horizontal:
     """Scene and curves on the left, words and lanes on the right."""
     import rerun.blueprint as rrb
@@ -99,13 +101,19 @@ def _layout(
         if name in curves:
             left.append((share, _curve(f"{root}/{name}", words, shown, many=name in ("action", "skill_weights"))))
     # Shares are about as many pixels as a view needs; what is longer scrolls.
-    right: list[tuple[float, Any]] = [(215, rrb.TextDocumentView(origin=f"{root}/verdict", name="Verdict"))]
+    right: list[tuple[float, Any]] = [
+        (115 if good else 215, rrb.TextDocumentView(origin=f"{root}/verdict", name="Verdict"))
+    ]
     if steps:
-        right.append((60 + 72 * min(steps, 5), rrb.TextDocumentView(origin=f"{root}/plan", name="Plan")))
+        right.append((70 + 58 * min(steps, 6), rrb.TextDocumentView(origin=f"{root}/plan", name="Plan")))
     if lanes:
-        view = rrb.StateTimelineView(origin=f"{root}/lanes", name="The step in force, and what holds", time_view=_window(shown))
+        view = rrb.StateTimelineView(
+            origin=f"{root}/lanes", name="The step in force, and what holds", time_view=_window(shown)
+        )
         right.append((50 + 40 * min(lanes, 8), view))
-    columns = [rrb.Vertical(*(view for _, view in part), row_shares=[share for share, _ in part]) for part in (left, right)]
+    columns = [
+        rrb.Vertical(*(view for _, view in part), row_shares=[share for share, _ in part]) for part in (left, right)
+    ]
     return rrb.Horizontal(*columns, column_shares=[6, 5], name=title)
 
 

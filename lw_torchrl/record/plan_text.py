@@ -26,7 +26,7 @@ def log_plan(stream: RecordingStream, root: str, episode: RecordedEpisode) -> No
     ]
     states = np.concatenate(columns, axis=1)
     changes = np.flatnonzero(np.concatenate([[True], (states[1:] != states[:-1]).any(axis=1)]))
-    texts = [plan_text(episode, row) for row in changes]
+    texts = [plan_text(episode, row) for row in changes.tolist()]
     documents = rr.TextDocument.columns(text=texts, media_type=[rr.MediaType.MARKDOWN] * len(texts))
     stream.send_columns(f"{root}/plan", time_columns(changes), documents)
 
@@ -41,7 +41,7 @@ def plan_text(episode: RecordedEpisode, row: int) -> str:
             believed = bool(episode.believed[row, step])
             line += f"  (evaluator: {MARKS[believed]})" if believed != truth else ""
         if episode.in_force is not None and episode.in_force[row] == step:
-            parts.append(f"**{line}**\n\n### → {skill}\n")
+            parts.append(f"**{line}**\n### → {skill}\n")
         else:
-            parts.append(f"{line}\n\n> {skill}\n")
+            parts.append(f"{line}  \n\u2003\u2003{skill}\n")
     return "\n".join(parts)

@@ -1,4 +1,4 @@
-"""RolloutRecorder: episodes of chosen rows recorded while they run, in an environment that goes on with other things."""
+"""RolloutRecorder: episodes of chosen rows of an environment, recorded while they run."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
@@ -17,25 +18,17 @@ from lw_torchrl._checks import check_int
 from lw_torchrl.envs.engine import BodyPoses
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
-from lw_torchrl.record.log_rollout import read_rollout
 from lw_torchrl.record.mujoco_scene import Motion, model_geometry
+from lw_torchrl.record.rollout_pages import read_rollout
 from lw_torchrl.transforms.containers import base_env, refuse_changed
 
 if TYPE_CHECKING:
     from lw_torchrl.record.rerun_logger import RerunLogger
 
-_BEFORE: tuple[NestedKey, ...] = (
-    "observation",
-    "task_id",
-    "episode",
-    "action",
-    "qaf",
-    "qaf_plan",
-    "qaf_logits",
-    "skill_weights",
-    "action_corrected",
-)
-_AFTER: tuple[str, ...] = ("executed_action", "success", "reward")
+_FIXED = ("task_id", "episode", "qaf_plan")
+_BEFORE = ("observation", "qaf", "qaf_logits", "skill_weights", "action_corrected")
+_AFTER = ("executed_action", "success", "reward")
+"""Keys of a step: those that an episode keeps, those of the state and the policy, those of what it led to."""
 
 
 class RolloutRecorder(Transform):
@@ -146,7 +139,9 @@ class RolloutRecorder(Transform):
                 stacklevel=4,
             )
             return
-        heading, episode = read_rollout(rollout, self.plans, tasks=[running.task], seed=running.seed, policy=self.policy)
+        heading, episode = read_rollout(
+            rollout, self.plans, tasks=[running.task], seed=running.seed, policy=self.policy
+        )
         self.logger.add_page(heading, episode, motion=motion)
 
 
@@ -159,11 +154,14 @@ class _Row:
         self.seed = env.seed
         self._env, self._row = env, row
         # An engine of one's own may have no bodies.
-        self._engine: Any = env.engine if hasattr(env.engine, "poses") else None
+        engine: Any = env.engine
+        self._engine = engine if hasattr(engine, "poses") else None
         self._model = None if self._engine is None else self._engine.model(row)
         if self._model is not None:
             model_geometry(self._model)
-        self._steps: list[dict[NestedKey, Tensor]] = []
+        self._fixed: dict[str, NDArray[Any]] = {}
+        self._read: tuple[list[str], list[str]] = [], []
+        self._steps: list[list[NDArray[Any]]] = []
         self._poses: list[BodyPoses] = []
         self._recorded = self._stepped = False
 
@@ -175,11 +173,14 @@ class _Row:
     def take(self, before: TensorDictBase, after: TensorDictBase) -> None:
         """Note a step: what it was decided on and what it led to."""
         self._stepped = True
-        if self._recorded:
-            found = {key: self._of(before.get(key, None)) for key in _BEFORE}
-            found |= {("next", key): self._of(after.get(key, None)) for key in _AFTER}
-            self._steps.append({key: value for key, value in found.items() if value is not None})
-            self._look()
+        if not self._recorded:
+            return
+        if not self._steps:
+            self._read = [key for key in _BEFORE if key in before], [key for key in _AFTER if key in after]
+            self._fixed = {key: self._of(before.get(key)) for key in _FIXED if key in before}
+        now, then = self._read
+        self._steps.append([self._of(before.get(key)) for key in now] + [self._of(after.get(key)) for key in then])
+        self._look()
 
     def finish(self) -> tuple[TensorDict | None, Motion | None]:
         """The episode so far, (T,), and its motion; afterwards none runs. None where no step was noted."""
@@ -189,17 +190,22 @@ class _Row:
         self._recorded = self._stepped = False
         if not steps:
             return None, None
-        rollout = TensorDict({key: torch.stack([step[key] for step in steps]) for key in steps[0]}, [len(steps)])
+        length, (now, then) = len(steps), self._read
+        names: list[NestedKey] = [*now, *(("next", key) for key in then)]
+        columns: dict[NestedKey, Any] = {
+            name: torch.from_numpy(np.stack(parts)) for name, parts in zip(names, zip(*steps, strict=True), strict=True)
+        }
+        columns |= {key: torch.from_numpy(value).reshape(-1).expand(length) for key, value in self._fixed.items()}
+        rollout = TensorDict(columns, [length])
         if self._model is None:
             return rollout, None
         positions, quaternions = (np.stack(parts).astype(np.float32) for parts in zip(*poses, strict=True))
         return rollout, Motion(self._model, positions, quaternions)
 
-    def _of(self, values: Tensor | None) -> Tensor | None:
+    def _of(self, values: Tensor) -> NDArray[Any]:
         """This row's part of a tensor of all rows, as a copy: some environments write into theirs again."""
-        if values is None:
-            return None
-        return (values[self._row] if self._env.batch_size else values).clone()
+        array = values.numpy(force=True)
+        return np.array(array[self._row] if self._env.batch_size else array)
 
     def _look(self) -> None:
         if self._recorded and self._engine is not None:

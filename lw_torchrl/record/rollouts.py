@@ -17,8 +17,8 @@ from lw_torchrl.evaluation.protocol import make_env, tasks_of
 from lw_torchrl.language.plans import ConditionalPlan
 from lw_torchrl.language.tasks import Task
 from lw_torchrl.modules.policy import Policy, plans_of
-from lw_torchrl.record.log_rollout import log_rollout
 from lw_torchrl.record.rerun_logger import RerunLogger
+from lw_torchrl.record.rollout_pages import log_rollout
 
 _KEYS: list[NestedKey] = ["observation", "task_id", "episode", "action", ("next", "success"), ("next", "reward")]
 _PLAN_KEYS = {"qaf", "skill_weights", "action_corrected"}

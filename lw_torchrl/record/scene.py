@@ -93,10 +93,12 @@ def _log_aim(stream: RecordingStream, scene: str, episode: RecordedEpisode, time
             start[rows], end[rows] = aim.moved[rows], aim.point[rows]
             colors[rows], shown[rows] = (*step_color(step), 255), True
     arrows = rr.Arrows3D.columns(origins=start[shown], vectors=(end - start)[shown], colors=colors[shown])
-    stream.log(f"{scene}/aim", rr.Arrows3D.from_fields(radii=[0.003]), static=True)
+    stream.log(f"{scene}/aim", rr.Arrows3D.from_fields(radii=[0.004]), static=True)
     stream.send_columns(f"{scene}/aim", times, arrows.partition(shown.astype(int)))
     balls = rr.Points3D.columns(positions=end[shown], colors=colors[shown])
-    stream.log(f"{scene}/aim/point", rr.Points3D.from_fields(radii=[0.01], labels=["aim"], show_labels=True), static=True)
+    stream.log(
+        f"{scene}/aim/point", rr.Points3D.from_fields(radii=[0.012], labels=["aim"], show_labels=True), static=True
+    )
     stream.send_columns(f"{scene}/aim/point", times, balls.partition(shown.astype(int)))
 
 

@@ -18,7 +18,10 @@ def verdict(heading: Heading, episode: RecordedEpisode) -> str:
         if episode.success is not None and not episode.success[-1]:
             lines.append(f"It did not last: the task stood done in {held} steps, and at the end no more.")
     elif heading.failure is not None:
-        lines = [f"## FAILED, {heading.failure.cause}: {CAUSES[heading.failure.cause]}", *_why(heading.failure, episode)]
+        lines = [
+            f"## FAILED, {heading.failure.cause}: {CAUSES[heading.failure.cause]}",
+            *_why(heading.failure, episode),
+        ]
     elif episode.success is not None:
         lines = [f"## FAILED in {length} steps", *_facts(episode)]
     else:
@@ -73,4 +76,3 @@ def _facts(episode: RecordedEpisode) -> list[str]:
 
 def _step(episode: RecordedEpisode, step: int) -> str:
     return f"step {step + 1}, **“{episode.steps[step][1]}”**"
-

@@ -38,9 +38,7 @@ def logged(path, *rollouts, **kwargs):
 def poses_in_the_file(found, name, step):
     """Body to (7,) position and quaternion (w last) at a step."""
     start, end = f"/{name}/scene/bodies/", "Transform3D:translation"
-    bodies = [
-        entity for entity, component in found.columns if component == end and entity.startswith(start)
-    ]
+    bodies = [entity for entity, component in found.columns if component == end and entity.startswith(start)]
     return {
         entity.removeprefix(start): np.array(
             [*found.at(entity, end, step)[0], *found.at(entity, "Transform3D:quaternion", step)[0]]
@@ -171,7 +169,7 @@ def test_a_failure_is_the_verdict(tmp_path, pushed):
     failed = pushed.clone()
     failed["next", "success"][:] = False
     why = failure_of(failed, swaps={"skill": True, "plan": False, "query": False})
-    names, found = logged(tmp_path / "a.rrd", failed, plans=PLANS, seed=SEED, policy="mine", failure=why)
+    _, found = logged(tmp_path / "a.rrd", failed, plans=PLANS, seed=SEED, policy="mine", failure=why)
     verdict = found.text("/push-0/verdict")
     assert verdict.startswith("## FAILED, skill: a skill was clumsy\n\nIt came to rest 10 cm away.\n")
     skill = PLANS["push"].steps[1].skill

@@ -54,7 +54,7 @@ def test_the_plan_follows_the_cursor(tmp_path):
     (first, one), (second, two) = STEPS
     assert f"**✓  1.  if {first}**" in texts[0]
     assert f"### → {one}" in texts[0]
-    assert f"\n✗  2.  if {second}\n\n> {two}" in texts[0]
+    assert f"\n✗  2.  if {second}  \n\u2003\u2003{two}\n" in texts[0]
     assert f"✗  1.  if {first}" in texts[1]
     assert f"### → {two}" in texts[1]
 
@@ -177,7 +177,15 @@ def test_the_layout_is_in_the_file(tmp_path):
     (store,) = found.reader.blueprints()
     chunks = found.reader.stream(store=store)
     text = " ".join(f"{chunk.entity_path} {chunk.to_record_batch()}" for chunk in chunks)
-    for expected in ("Scene", "Verdict", "Plan", "Skill weights", "Action", "/push/scene/trails/puck", "push · success at 11"):
+    for expected in (
+        "Scene",
+        "Verdict",
+        "Plan",
+        "Skill weights",
+        "Action",
+        "/push/scene/trails/puck",
+        "push · success at 11",
+    ):
         assert expected in text
 
 
@@ -186,9 +194,9 @@ def test_speed(tmp_path):
     objects = make_objects(rollout)
     with RerunLogger(tmp_path / "a.rrd") as logger:
         logger.log_episode(rollout, task="push", objects=objects, plan=PLAN)
-        start = time.perf_counter()
+        start = time.process_time()  # other processes may be busy
         logger.log_episode(rollout, task="push", objects=objects, plan=PLAN)
-        assert time.perf_counter() - start < 0.3
+        assert time.process_time() - start < 0.3
 
 
 @pytest.mark.parametrize(

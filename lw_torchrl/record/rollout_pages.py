@@ -59,8 +59,8 @@ def log_rollout(
         The name; of N rows a list of names.
 
     Raises:
-        ValueError: a key is missing, has another shape or dtype or holds a NaN; the rows are of several episodes; ``qaf``
-            answers other plans, or the failure is another episode's; with a seed, there is no ``episode``.
+        ValueError: a key is missing, has another shape or dtype or holds a NaN; the rows are of several episodes;
+            ``qaf`` answers other plans, or the failure is another episode's; with a seed, there is no ``episode``.
         PlanError: (a ValueError) there is no plan for the task.
         TypeError: ``rollout`` is no TensorDict.
 
@@ -86,7 +86,9 @@ def log_rollout(
         if len(failures) != len(rollout):
             raise ValueError(f"failure must be one for each of {len(rollout)} rows, got {len(failures)}")
         rows, tasks = zip(rollout, failures, strict=True), list(tasks)
-        return [log_rollout(logger, row, plans, seed=seed, policy=policy, failure=why, tasks=tasks) for row, why in rows]
+        return [
+            log_rollout(logger, row, plans, seed=seed, policy=policy, failure=why, tasks=tasks) for row, why in rows
+        ]
     if isinstance(failure, Sequence):
         raise ValueError(f"failure must be one Failure for one episode, got {len(failure)}")
     heading, episode = read_rollout(rollout, plans, seed=seed, policy=policy, failure=failure, tasks=tasks)
@@ -159,7 +161,9 @@ def _single(rollout: TensorDictBase, key: str, *, required: bool) -> int | None:
         return None
     length = tuple(rollout.batch_size)
     if column.is_floating_point() or tuple(column.shape) not in (length, (*length, 1)):
-        raise ValueError(f"rollout[{key!r}] must be integers of shape {length}, got {column.dtype} {tuple(column.shape)}")
+        raise ValueError(
+            f"rollout[{key!r}] must be integers of shape {length}, got {column.dtype} {tuple(column.shape)}"
+        )
     found = torch.unique(column).tolist()
     if len(found) != 1:
         raise ValueError(f"rollout must be one episode of one task, got {key!r} {found[:5]}; split it")
