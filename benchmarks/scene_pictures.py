@@ -73,9 +73,9 @@ def _mujocos_picture(model: Any, data: Any) -> Any:
         return renderer.render()
 
 
-def _our_picture(client: Any, motion: Motion, folder: str) -> Any:
+def _our_picture(client: Any, task: str, motion: Motion, folder: str) -> Any:
     file, picture = f"{folder}/scene.rrd", f"{folder}/scene.png"
-    stream = rr.RecordingStream(f"scene of {motion.model.path}")  # the viewer keeps an application's layout
+    stream = rr.RecordingStream(f"scene-of-{task}")  # an application has one layout
     stream.save(file)
     stream.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     log_model(stream, "", model_geometry(motion.model))
@@ -90,7 +90,10 @@ def _our_picture(client: Any, motion: Motion, folder: str) -> Any:
     state = _patiently(lambda: _loaded(client))
     time.sleep(3)
     _patiently(lambda: client.save_screenshot(picture, view_id=state.views[0].view_id))
-    return plt.imread(picture)
+    pixels = plt.imread(picture)
+    height, width = pixels.shape[:2]
+    beside = max(0, width - height * WIDTH // HEIGHT) // 2
+    return pixels[:, beside : width - beside]
 
 
 def _loaded(client: Any) -> Any:
@@ -115,14 +118,15 @@ def main(arguments: Arguments) -> None:
         free.bind(("127.0.0.1", 0))
         port = str(free.getsockname()[1])
     command = [sys.executable, "-m", "rerun", "--headless", "--bind", "127.0.0.1", "--port", port]
-    viewer = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    quiet = {**os.environ, "RUST_LOG": "off"}  # its messages lie over the views
+    viewer = subprocess.Popen(command, env=quiet, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     client = _patiently(lambda: ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy"))
-    figure, axes = plt.subplots(3, 4, figsize=(12, 7.2), layout="constrained")
+    figure, axes = plt.subplots(3, 4, figsize=(12, 7.4), layout="constrained")
     with TemporaryDirectory() as folder:
         for task, pair in zip(arguments.tasks, axes.reshape(-1, 2), strict=True):
             motion, theirs = _at_success(task, arguments.seed)
             for axis, picture, whose in zip(
-                pair, (_our_picture(client, motion, folder), theirs), ("recorded", "MuJoCo"), strict=True
+                pair, (_our_picture(client, task, motion, folder), theirs), ("recorded", "MuJoCo"), strict=True
             ):
                 axis.imshow(picture)
                 axis.set_title(f"{task}, {whose}", fontsize=9)
@@ -130,7 +134,7 @@ def main(arguments: Arguments) -> None:
     viewer.terminate()
     viewer.wait()
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(arguments.out, dpi=90)
+    figure.savefig(arguments.out, dpi=80)
     print(f"written to {arguments.out}")
 
 

@@ -144,8 +144,8 @@ def _motion(heading: Heading, episode: RecordedEpisode) -> Motion | None:
     if not isinstance(found, Difference):
         return found
     warnings.warn(
-        f"simulating {heading.task}, episode {heading.episode} of seed {heading.seed}, again gives another observation "
-        f"at step {found.step}: number {found.entry} is {found.by:.3g} off. Was it the seed, and are these the executed "
+        f"simulating {heading.task}, episode {heading.episode} of seed {heading.seed}, again gives other numbers at "
+        f"step {found.step}: number {found.entry} is {found.by:.3g} off. Was it the seed, and are these the executed "
         "actions? A hand over a table is drawn in the place of the robot",
         stacklevel=3,
     )
