@@ -44,14 +44,14 @@ def recording(settings: Settings) -> list[Row]:
             pages = [timed(lambda: logger.add_page(heading, episode, motion=motion)) for _ in range(EPISODES)]
         sizes = [os.path.getsize(path) / 1e6 for path in (one, ten)]
         live = _live(settings, plans, f"{folder}/live.rrd")
-    name = f"recorded episode of {steps} steps"
+    name = f"recorded episode of {steps} steps:"
     return [
         under(
-            f"{name}, page after the first of its model", median(pages) * 1e3, "ms", 40, f"first {first * 1e3:.0f} ms"
+            f"{name} page, after the first of its model", median(pages) * 1e3, "ms", 40, f"first {first * 1e3:.0f} ms"
         ),
-        Row(f"{name}, simulated again", simulating * 1e3, "ms"),
-        under(f"{name}, size", sizes[0], "MB", 3, "with meshes"),
-        under(f"{EPISODES} {name}s in one file, size", sizes[1], "MB", 25, "with meshes"),
+        Row(f"{name} simulating it again", simulating * 1e3, "ms"),
+        under(f"{name} file", sizes[0], "MB", 3, "with meshes"),
+        under(f"{EPISODES} recorded episodes of {steps} steps: file", sizes[1], "MB", 25, "with meshes"),
         live,
     ]
 
