@@ -85,7 +85,7 @@ def _our_picture(client: Any, task: str, motion: Motion, folder: str) -> Any:
     stream.send_blueprint(rrb.Blueprint(view, collapse_panels=True))
     stream.flush()
     stream.disconnect()
-    client.close_recordings("all")
+    client.close("all")
     client.open(file)
     state = _patiently(lambda: _loaded(client))
     time.sleep(3)
