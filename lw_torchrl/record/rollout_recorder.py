@@ -134,7 +134,7 @@ class RolloutRecorder(Transform):
             return
         if not self.logger.is_alive:
             warnings.warn(
-                f"{len(rollout)} steps of an episode of {running.task!r} are dropped: the logger was closed before the "
+                f"{len(rollout)} steps of an episode of {running.task.name!r} are dropped: the logger was closed before the "
                 "environment",
                 stacklevel=4,
             )
