@@ -134,8 +134,8 @@ class RolloutRecorder(Transform):
             return
         if not self.logger.is_alive:
             warnings.warn(
-                f"{len(rollout)} steps of an episode of {running.task.name!r} are dropped: the logger was closed before "
-                "the environment",
+                f"{len(rollout)} steps of an episode of {running.task.name!r} are dropped: the logger was closed "
+                "before the environment",
                 stacklevel=4,
             )
             return
