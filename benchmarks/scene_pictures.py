@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -119,7 +120,7 @@ def main(arguments: Arguments) -> None:
         port = str(free.getsockname()[1])
     command = [sys.executable, "-m", "rerun", "--headless", "--bind", "127.0.0.1", "--port", port]
     quiet = {**os.environ, "RUST_LOG": "off"}  # its messages lie over the views
-    viewer = subprocess.Popen(command, env=quiet, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    viewer = subprocess.Popen(command, env=quiet, stderr=subprocess.DEVNULL, start_new_session=True)
     client = _patiently(lambda: ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy"))
     figure, axes = plt.subplots(3, 4, figsize=(12, 7.4), layout="constrained")
     with TemporaryDirectory() as folder:
@@ -131,7 +132,7 @@ def main(arguments: Arguments) -> None:
                 axis.imshow(picture)
                 axis.set_title(f"{task}, {whose}", fontsize=9)
                 axis.axis("off")
-    viewer.terminate()
+    os.killpg(viewer.pid, signal.SIGTERM)  # the viewer is a child of the module
     viewer.wait()
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(arguments.out, dpi=80)
