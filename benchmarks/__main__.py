@@ -21,7 +21,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # torch and the simulation are no
 import torch
 import tyro
 
-from benchmarks import environment, language, pipelines, sampling, simulation, training
+from benchmarks import environment, language, pipelines, recording, sampling, simulation, training
 from benchmarks.report import Row, Settings, Skipped, as_markdown, as_text
 from lw_torchrl._files import write_json, write_text
 from lw_torchrl.envs.engines.vectorized.engine import available_cores
@@ -40,6 +40,7 @@ BENCHMARKS: dict[str, Callable[[Settings], list[Row]]] = {
     "train_step": training.train_step,
     "evaluation": pipelines.evaluation,
     "collection": pipelines.collection,
+    "recording": recording.recording,
 }
 PACKAGES = ("lw_torchrl", "metaworld", "mujoco", "numpy", "torch", "torchrl", "tensordict", "envpool")
 FORMAT_VERSION = 1

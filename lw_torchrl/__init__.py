@@ -63,6 +63,8 @@ if TYPE_CHECKING:  # the table below, for type checkers and editors
     from lw_torchrl.objectives import standardize_by_task as standardize_by_task
     from lw_torchrl.planners import plan_prompt as plan_prompt
     from lw_torchrl.record import RerunLogger as RerunLogger
+    from lw_torchrl.record import RolloutRecorder as RolloutRecorder
+    from lw_torchrl.record import log_rollout as log_rollout
     from lw_torchrl.trainers import BehavioralCloningConfig as BehavioralCloningConfig
     from lw_torchrl.trainers import BehavioralCloningTrainer as BehavioralCloningTrainer
     from lw_torchrl.trainers import OfflineConfig as OfflineConfig
@@ -99,7 +101,7 @@ _NAMES = {
     "lw_torchrl.objectives": "AdvantageWeightedLoss DemonstratedSACLoss DemonstratedTD3Loss ExpectileValueLoss "
     "SkillLatentLoss standardize_by_task",
     "lw_torchrl.planners": "plan_prompt",
-    "lw_torchrl.record": "RerunLogger",
+    "lw_torchrl.record": "RerunLogger RolloutRecorder log_rollout",
     "lw_torchrl.trainers": "BehavioralCloningConfig BehavioralCloningTrainer OfflineConfig OfflineTrainer OnlineConfig "
     "OnlineTrainer "
     "StackedBehavioralCloning load_actor save_actor",

@@ -264,7 +264,7 @@ def evaluate(
         if policy is not None:
             shown: list[str | Task] = list(result.config["tasks"][:3])
             rollouts = rollout_tasks(policy, shown, seed=seed, noise_scale=noise)
-            write_recording(out / "rollout.rrd", policy, rollouts)
+            write_recording(out / "rollout.rrd", policy, rollouts, seed=seed, policy=checkpoint.stem)
         print(f"written to {out}")
 
 

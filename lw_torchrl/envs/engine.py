@@ -7,14 +7,14 @@ numbers (float64 observations); the environment above converts, counts steps and
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lw_torchrl.language.observation import ACTION_SIZE, OBSERVATION_SIZE
 
-__all__ = ["ACTION_SIZE", "OBSERVATION_SIZE", "Engine", "EngineStep", "Pictured"]
+__all__ = ["ACTION_SIZE", "OBSERVATION_SIZE", "BodyPoses", "Engine", "EngineStep", "Pictured", "Posed", "RowModel"]
 
 
 class EngineStep(NamedTuple):
@@ -65,4 +65,40 @@ class Pictured(Engine, Protocol):
 
     def render(self, rows: Sequence[int], *, camera: str, height: int, width: int) -> NDArray[np.uint8]:
         """Pictures of the rows as they are now: (len(rows), height, width, 3) uint8, the first line on top."""
+        ...
+
+
+class RowModel(NamedTuple):
+    """The compiled MuJoCo model of a row, to be looked at.
+
+    Attributes:
+        path: its XML file; models of one file have the same geoms and meshes.
+        model: the MjModel. Rows share it, so its ``body_pos`` and ``site_pos`` may be another row's.
+    """
+
+    path: str
+    model: Any
+
+
+class BodyPoses(NamedTuple):
+    """Where the bodies of a row are; the arrays are the caller's to keep.
+
+    Attributes:
+        position: (bodies, 3) float64, metres, of the world.
+        quaternion: (bodies, 4) float64, w first.
+    """
+
+    position: NDArray[np.float64]
+    quaternion: NDArray[np.float64]
+
+
+class Posed(Engine, Protocol):
+    """An engine whose bodies can be read, as recordings of the scene want it."""
+
+    def model(self, row: int) -> RowModel:
+        """The model of a row."""
+        ...
+
+    def poses(self, row: int) -> BodyPoses:
+        """Where the bodies of a row are now, those that stand still too."""
         ...

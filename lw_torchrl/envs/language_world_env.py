@@ -164,6 +164,11 @@ class LanguageWorldEnv(EnvBase):
         return self._counter.tasks
 
     @property
+    def engine(self) -> Engine:
+        """The simulator of the rows, to look at: what steps or resets it behind the environment's back breaks both."""
+        return self._engine
+
+    @property
     def seed(self) -> int:
         """The seed that, with task and episode, fixes every reset."""
         return self._counter.seed

@@ -113,7 +113,8 @@ def run_demo(out: Path, config: DemoConfig) -> EvaluationResult:
     print("4/4  recording a rollout")
     rollouts = rollout_tasks(actor, config.tasks, seed=config.evaluation_seed, noise_scale=config.evaluation_noise)
     recorded = [task for task in RECORDED if task in rollouts] or list(rollouts)[:1]
-    write_recording(out / "rollout.rrd", actor, {task: rollouts[task] for task in recorded})
+    chosen = {task: rollouts[task] for task in recorded}
+    write_recording(out / "rollout.rrd", actor, chosen, seed=config.evaluation_seed, policy="demo")
     print(f"\n{result.table()}\n")
     print("skills that led, in order, up to the first success (steps):")
     for task in config.tasks:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
@@ -11,7 +12,12 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
 
-GRIPPER = "robot's gripper"
+from lw_torchrl.language.named_objects import GRIPPER
+from lw_torchrl.language.tasks import Task
+from lw_torchrl.record.aims import Aim, aim_of
+
+NOBODY = -1
+"""In the place of a step's number: no step is in force alone."""
 
 
 class StepLike(Protocol):
@@ -39,20 +45,26 @@ class RecordedEpisode:
         action: T×4 float32, displacement xyz and gripper effort in [-1,1].
         objects: name -> T×3 float32 position in metres; the gripper is among them.
         qaf: T×S bool, truth of each condition, or None.
+        believed: T×S bool, the truth that a learned evaluator gives, or None.
         skill_weights: T×S float32, attention over the steps, or None.
         success: T bool, of the state that the row's action led to, or None.
         reward: T float32, likewise, or None.
+        corrected: T float32, how much of a correction counts, or None.
         steps: the S (condition, skill) texts; empty where there is no plan.
+        aims: of each step where its skill is going; None where it is no scripted skill.
     """
 
     observation: NDArray[np.float32]
     action: NDArray[np.float32]
     objects: dict[str, NDArray[np.float32]]
     qaf: NDArray[np.bool_] | None
+    believed: NDArray[np.bool_] | None
     skill_weights: NDArray[np.float32] | None
     success: NDArray[np.bool_] | None
     reward: NDArray[np.float32] | None
+    corrected: NDArray[np.float32] | None
     steps: tuple[tuple[str, str], ...]
+    aims: tuple[Aim | None, ...] = ()
 
     @property
     def skills(self) -> list[str]:
@@ -60,6 +72,54 @@ class RecordedEpisode:
         count = 0 if self.skill_weights is None else self.skill_weights.shape[1]
         texts = [f" {skill}" for _, skill in self.steps] or [""] * count
         return [f"{i}{text}" for i, text in enumerate(texts, 1)]
+
+    @property
+    def answers(self) -> NDArray[np.bool_] | None:
+        """The truth that the policy went by: the learned evaluator's, where there is one."""
+        return self.qaf if self.believed is None else self.believed
+
+    @cached_property
+    def in_force(self) -> NDArray[np.int64] | None:
+        """T, the step of the plan with the largest weight, or without weights the first whose condition holds;
+        -1 where none stands out. None where there are neither."""
+        if self.skill_weights is not None:
+            weights = self.skill_weights
+            if weights.shape[1] == 1:
+                return np.zeros(len(self), np.int64)
+            second, first = np.sort(weights, axis=1)[:, -2:].T
+            return np.where(first - second > 1e-6, weights.argmax(axis=1), NOBODY)
+        if (answers := self.answers) is not None:
+            return np.where(answers.any(axis=1), answers.argmax(axis=1), NOBODY)
+        return None
+
+    @property
+    def attends_softly(self) -> bool:
+        """Whether weights ever lie between 0 and 1."""
+        weights = self.skill_weights
+        return weights is not None and bool(((weights > 1e-3) & (weights < 1 - 1e-3)).any())
+
+    @property
+    def first_success(self) -> int | None:
+        """The step at which the task was first seen done: one more than the row whose action did it."""
+        if self.success is None or not self.success.any():
+            return None
+        return int(self.success.argmax()) + 1
+
+    def distance(self) -> NDArray[np.float32] | None:
+        """T float32, metres: how far what the skill in force moves is from where it goes; NaN where no scripted skill
+        that goes to a place is in force, None where that is everywhere."""
+        if self.in_force is None:
+            return None
+        found = np.full(len(self), np.nan, np.float32)
+        for step, aim in enumerate(self.aims):
+            if aim is not None:
+                rows = self.in_force == step
+                found[rows] = aim.distance[rows]
+        return None if np.isnan(found).all() else found
+
+    def with_aims(self, task: Task) -> RecordedEpisode:
+        """The episode with the aims of its plan's skills in ``task``."""
+        return replace(self, aims=tuple(aim_of(skill, task, self.observation) for _, skill in self.steps))
 
     def __len__(self) -> int:
         return len(self.observation)
@@ -78,12 +138,14 @@ class RecordedEpisode:
         length = rollout.batch_size[0]
         return cls(
             observation=_column(rollout, "observation", length, 39),
-            action=_column(rollout, "action", length, 4),
+            action=_action(rollout, length),
             objects=_positions(objects, rollout, length),
             qaf=_truth(rollout, "qaf", length, len(steps)),
+            believed=_positive(_of_steps(rollout, "qaf_logits", length, len(steps))),
             skill_weights=_of_steps(rollout, "skill_weights", length, len(steps)),
             success=_flat(_truth(rollout, ("next", "success"), length, 1)),
             reward=_flat(_of_steps(rollout, ("next", "reward"), length, 1)),
+            corrected=_flat(_of_steps(rollout, "action_corrected", length, 1)),
             steps=steps,
         )
 
@@ -111,6 +173,12 @@ def _column(rollout: TensorDictBase, key: Any, length: int, size: int | None) ->
     return _array(value, f"rollout[{key!r}]", (length, size))
 
 
+def _action(rollout: TensorDictBase, length: int) -> NDArray[np.float32]:
+    """What was done, where the rollout says so; else the action."""
+    executed = ("next", "executed_action")
+    return _column(rollout, "action" if rollout.get(executed, None) is None else executed, length, 4)
+
+
 def _of_steps(rollout: TensorDictBase, key: Any, length: int, steps: int) -> NDArray[Any] | None:
     """An optional column with at least ``steps`` columns; those beyond are padding and dropped."""
     if rollout.get(key, None) is None:
@@ -126,6 +194,10 @@ def _truth(rollout: TensorDictBase, key: Any, length: int, steps: int) -> NDArra
     if array is not None and array.dtype != np.bool_:
         raise ValueError(f"rollout[{key!r}] must be bool, got {rollout.get(key).dtype}")
     return array
+
+
+def _positive(array: NDArray[Any] | None) -> NDArray[np.bool_] | None:
+    return None if array is None else array > 0
 
 
 def _flat(array: NDArray[Any] | None) -> NDArray[Any] | None:

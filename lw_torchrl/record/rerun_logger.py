@@ -15,7 +15,8 @@ from torch import Tensor
 from torchrl.record.loggers import Logger
 
 from lw_torchrl.record.blueprint import make_blueprint, metric_views
-from lw_torchrl.record.episodes import episode_name, send_episode
+from lw_torchrl.record.episodes import episode_name
+from lw_torchrl.record.heading import Heading
 from lw_torchrl.record.metrics import (
     check_name,
     check_video,
@@ -26,6 +27,8 @@ from lw_torchrl.record.metrics import (
     send_scalars,
     send_video,
 )
+from lw_torchrl.record.mujoco_scene import Motion
+from lw_torchrl.record.page import send_page
 from lw_torchrl.record.recorded_episode import PlanLike, RecordedEpisode
 from lw_torchrl.record.recording_file import check_path, hidden_beside, open_stream
 from lw_torchrl.record.timelines import CONTROL_PERIOD, entity_path
@@ -236,6 +239,11 @@ class RerunLogger(Logger):
 
     # ---------------------------------------------------------------- episodes
 
+    @property
+    def episodes(self) -> list[str]:
+        """The names of the episodes so far."""
+        return list(self._episodes)
+
     def log_episode(
         self,
         rollout: TensorDictBase,
@@ -245,18 +253,20 @@ class RerunLogger(Logger):
         plan: PlanLike | None = None,
         name: str | None = None,
     ) -> str:
-        """Add one episode: the scene in 3-D, the plan, the truth of its conditions, skill weights, actions.
+        """Add one episode of anything: a simple scene in 3-D, the verdict, the plan, lanes and curves.
 
-        Row t stands at step t and t · 0.0125 seconds; success and reward, its action's outcome, at t + 1.
+        For Meta-World's robot as it is, see :func:`lw_torchrl.log_rollout`. Row t stands at step t and
+        t · 0.0125 seconds; success and reward, its action's outcome, at t + 1.
 
         Args:
-            rollout: batch size (T,). "observation" T×39 (metres), "action" T×4 in [-1,1]; optional are "qaf"
-                T×S bool, "skill_weights" T×S, ("next", "success") T×1 bool, ("next", "reward") T×1. Columns
-                beyond the plan's steps are padding and left out.
+            rollout: batch size (T,). "observation" T×39 (metres), "action" T×4 in [-1,1], or in its place
+                ("next", "executed_action"); optional are "qaf" T×S bool, "qaf_logits" T×S, "skill_weights" T×S,
+                "action_corrected" T×1, ("next", "success") T×1 bool, ("next", "reward") T×1. Columns beyond the
+                plan's steps are padding and left out.
             task: the task's name.
             objects: name -> T×3 positions in metres; without "robot's gripper" it is observation 0:3.
             plan: its ``steps`` each have a ``condition`` and a ``skill``; None shows numbered columns.
-            name: the entity that all lies under, and the tab's title; None takes ``task``, then "task 2".
+            name: the entity that all lies under, and the tab's title; None takes ``task``, then "task-2".
 
         Returns:
             The name.
@@ -274,8 +284,17 @@ class RerunLogger(Logger):
             ...     logger.log_episode(rollout, task="reach", objects=objects)
             'reach'
         """
-        stream = self._open()
-        name = episode_name(task, name, self._episodes)
+        if not isinstance(task, str) or not task.strip():
+            raise ValueError(f"task must be a task's name, got {task!r}")
         episode = RecordedEpisode.from_rollout(rollout, objects, plan)
-        self._episodes[name] = send_episode(stream, name, task, episode)
-        return name
+        return self.add_page(Heading(task), episode, name=name)
+
+    def add_page(
+        self, heading: Heading, episode: RecordedEpisode, *, motion: Motion | None = None, name: str | None = None
+    ) -> str:
+        """Add the page of an episode that was checked; returns its name. With a motion the robot is shown as it is."""
+        stream = self._open()
+        entity = episode_name(heading.name, name, self._episodes)
+        title = heading.title(episode, name)
+        self._episodes[entity] = send_page(stream, entity, title, heading, episode, motion)
+        return entity

@@ -8,7 +8,9 @@ import numpy as np
 import torch
 from rerun.chunk import RrdReader
 from tensordict import TensorDict
+from torchrl.envs import TransformedEnv
 
+import lw_torchrl as lw
 from lw_torchrl.record import RerunLogger
 from lw_torchrl.record.recorded_episode import GRIPPER
 
@@ -37,6 +39,19 @@ def make_rollout(length=20, columns=3, seed=0):
         },
         [length],
     )
+
+
+def run(tasks, length, *, seed=5, plans=None, skills=None):
+    """A rollout (tasks, T) of scripted skills, or without plans of experts."""
+    base = lw.LanguageWorldEnv(tasks, seed=seed, num_threads=1, max_steps=length)
+    if plans is None:
+        env, actor = base, lw.ExpertActor(tasks)
+    else:
+        env, actor = TransformedEnv(base, lw.QAFTransform(plans)), lw.ScriptedSkillActor(plans, skills=skills)
+    with torch.no_grad():
+        rollout = env.rollout(length, actor)
+    env.close()
+    return rollout
 
 
 def make_objects(rollout):
@@ -80,6 +95,15 @@ class Recording:
 
     def text(self, entity):
         return self.values(entity, "TextDocument:text")[0][0]
+
+    def at(self, entity, component, step):
+        """The instances that the viewer shows at a step: the static ones, or the latest."""
+        (times, *_), rows = self.times_or_none(entity, component), self.values(entity, component)
+        return rows[-1] if times is None else rows[np.searchsorted(times, step, side="right") - 1]
+
+    def times_or_none(self, entity, component):
+        first, _ = self.columns[entity, component][0]
+        return (self.times(entity, component) if "step" in first else None,)
 
     def lane(self, entity, length, first=0):
         """The state at each of ``length`` steps, unrolled from its changes."""

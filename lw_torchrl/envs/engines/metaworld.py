@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lw_torchrl._checks import check_choice
 from lw_torchrl._rendering import naming_absent_renderer
 from lw_torchrl.envs.cameras import Cameras
-from lw_torchrl.envs.engine import OBSERVATION_SIZE, EngineStep
+from lw_torchrl.envs.engine import OBSERVATION_SIZE, BodyPoses, EngineStep, RowModel
 from lw_torchrl.language.tasks import MT50
 
 
@@ -97,6 +97,14 @@ class MetaWorldEngine:
         size: Any = {"camera": camera, "height": height, "width": width}
         envs = [(self._tasks[row], self._envs[row]) for row in rows]
         return np.stack([self._cameras.picture(task, env.model, env.data, **size) for task, env in envs])
+
+    def model(self, row: int) -> RowModel:
+        env = self._envs[row]
+        return RowModel(str(env.model_name), env.model)
+
+    def poses(self, row: int) -> BodyPoses:
+        data = self._envs[row].data
+        return BodyPoses(data.xpos.copy(), data.xquat.copy())
 
     def close(self) -> None:
         if self._cameras is not None:

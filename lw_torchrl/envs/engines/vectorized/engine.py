@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lw_torchrl._checks import check_choice, check_int
 from lw_torchrl.envs.cameras import Cameras
-from lw_torchrl.envs.engine import ACTION_SIZE, OBSERVATION_SIZE, EngineStep
+from lw_torchrl.envs.engine import ACTION_SIZE, OBSERVATION_SIZE, BodyPoses, EngineStep, RowModel
 from lw_torchrl.envs.engines.vectorized.models import SharedModel, borrow_model, check_versions, return_models
 from lw_torchrl.envs.engines.vectorized.observation import Observer
 from lw_torchrl.envs.engines.vectorized.rewards.dense_reward import DenseReward, EpisodeNotes
@@ -170,6 +170,14 @@ class VectorizedEngine:
         cameras = self._cameras = self._cameras or Cameras()
         pictures = [self._rows[row].picture(cameras, camera=camera, height=height, width=width) for row in rows]
         return np.stack(pictures)
+
+    def model(self, row: int) -> RowModel:
+        """The compiled model of a row, which other rows use too."""
+        return self._rows[row].model
+
+    def poses(self, row: int) -> BodyPoses:
+        """Where the bodies of a row are now; about 3 µs."""
+        return self._rows[row].poses()
 
     def close(self) -> None:
         """End the threads and give the models back, for the next engine of this process."""

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lw_torchrl.envs.cameras import Cameras
+from lw_torchrl.envs.engine import BodyPoses, RowModel
 from lw_torchrl.envs.engines.vectorized.models import SharedModel
 from lw_torchrl.envs.engines.vectorized.rewards.table import TaskReward
 from lw_torchrl.envs.engines.vectorized.sensors import StateView, sensor_index
@@ -93,6 +94,15 @@ class SimulatedRow:
         self._looked = True
         self._numbers.take(self._sensor_index, out=sensors, mode="clip")
         warnings[...] = self._warnings
+
+    @property
+    def model(self) -> RowModel:
+        """The model that the row shares."""
+        return RowModel(self.shared.path, self._model)
+
+    def poses(self) -> BodyPoses:
+        """Where the bodies are; the state holds them, whoever has the model."""
+        return BodyPoses(self._data.xpos.copy(), self._data.xquat.copy())
 
     def picture(self, cameras: Cameras, **size: Any) -> NDArray[np.uint8]:
         """A picture of the row as it is now."""

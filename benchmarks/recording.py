@@ -1,0 +1,112 @@
+"""What recordings cost: an episode's page, its size, and a row recorded while 49 others go on."""
+
+from __future__ import annotations
+
+import os
+from statistics import median
+from tempfile import TemporaryDirectory
+from time import perf_counter
+from typing import Any
+
+import torch
+from torchrl.envs import Compose, TransformedEnv
+
+import lw_torchrl as lw
+from benchmarks.report import Row, Settings, timed, under
+from lw_torchrl.record.mujoco_scene import Motion
+from lw_torchrl.record.resimulation import simulate_again
+from lw_torchrl.record.rollout_pages import read_rollout
+
+TASK, SEED = "pick-place", 0
+EPISODES = 10
+
+
+def recording(settings: Settings) -> list[Row]:
+    """An episode of scripted skills with the robot as it moved; ten of them; one of 50 rows recorded live."""
+    steps = settings.pick(500, 20)
+    plans = lw.load_plans("MT50")
+    rollout = _rollout(plans, steps)
+    heading, episode = read_rollout(rollout, plans, seed=SEED, policy="scripted")
+    motion: Any = None
+
+    def simulate() -> None:
+        nonlocal motion
+        motion = simulate_again(TASK, SEED, 0, episode.action, episode.observation)
+
+    simulate()  # compiles the model
+    simulating = timed(simulate)
+    assert isinstance(motion, Motion)
+    with TemporaryDirectory() as folder:
+        one, ten = f"{folder}/one.rrd", f"{folder}/ten.rrd"
+        with lw.RerunLogger(one) as logger:
+            first = timed(lambda: logger.add_page(heading, episode, motion=motion))
+        with lw.RerunLogger(ten) as logger:
+            pages = [timed(lambda: logger.add_page(heading, episode, motion=motion)) for _ in range(EPISODES)]
+        sizes = [os.path.getsize(path) / 1e6 for path in (one, ten)]
+        live = _live(settings, plans, f"{folder}/live.rrd")
+    name = f"recorded episode of {steps} steps:"
+    return [
+        under(
+            f"{name} page, after the first of its model", median(pages) * 1e3, "ms", 40, f"first {first * 1e3:.0f} ms"
+        ),
+        Row(f"{name} simulating it again", simulating * 1e3, "ms"),
+        under(f"{name} file", sizes[0], "MB", 3, "with meshes"),
+        under(f"{EPISODES} recorded episodes of {steps} steps: file", sizes[1], "MB", 25, "with meshes"),
+        live,
+    ]
+
+
+def _rollout(plans: lw.Plans, steps: int) -> Any:
+    base = lw.LanguageWorldEnv(TASK, seed=SEED, num_threads=1, max_steps=steps)
+    env = TransformedEnv(base, lw.QAFTransform(plans))
+    with torch.no_grad():
+        rollout = env.rollout(steps, lw.ScriptedSkillActor(plans))[0]
+    env.close()
+    return rollout
+
+
+def _live(settings: Settings, plans: lw.Plans, path: str) -> Row:
+    """The recorder's own time in a rollout of 50 rows, its page included, over the rest of it."""
+    steps = settings.pick(500, 20)
+    logger = lw.RerunLogger(path)
+    recorder = _Timed(logger, plans=plans)
+    base = lw.LanguageWorldEnv("MT50", seed=SEED, max_steps=steps)
+    env = TransformedEnv(base, Compose(lw.QAFTransform(plans), recorder))
+    actor = lw.ScriptedSkillActor(plans)
+    recorder.seconds = 0.0
+    with torch.no_grad():
+        total = timed(lambda: env.rollout(steps, actor))
+    env.close()
+    logger.shutdown()
+    rest = total - recorder.seconds
+    ratio = total / rest
+    return Row(
+        f"rollout of 50 rows × {steps} steps, one recorded live",
+        total,
+        "s",
+        "without the recorder's share",
+        rest,
+        ratio,
+        (ratio, ratio),
+        "≤ 1.01",
+        ratio <= 1.01,
+        f"{recorder.seconds / steps * 1e6:.0f} µs a step",
+    )
+
+
+class _Timed(lw.RolloutRecorder):
+    """A recorder that counts its own seconds."""
+
+    seconds = 0.0
+
+    def _step(self, *arguments: Any) -> Any:
+        start = perf_counter()
+        found = super()._step(*arguments)
+        self.seconds += perf_counter() - start
+        return found
+
+    def _reset(self, *arguments: Any) -> Any:
+        start = perf_counter()
+        found = super()._reset(*arguments)
+        self.seconds += perf_counter() - start
+        return found

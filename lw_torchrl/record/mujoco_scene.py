@@ -1,0 +1,175 @@
+"""A MuJoCo model in a recording: its geoms once, as they stand in their bodies; then where the bodies are.
+
+Drawn is what Meta-World's cameras show: the geoms of groups 0 to 2 that are not transparent. Planes, which have no end,
+are left out, and a texture is its mean colour.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from lw_torchrl.envs.engine import RowModel
+from lw_torchrl.record.mesh_clusters import clustered
+from lw_torchrl.record.timelines import entity_path, time_columns
+
+if TYPE_CHECKING:
+    from rerun import RecordingStream
+
+SHOWN_GROUPS = (0, 1, 2)
+"""Meta-World keeps what only collides in group 4."""
+DEFAULT_RGBA = (0.5, 0.5, 0.5, 1.0)
+"""MuJoCo's colour of a geom that was given none: the material's counts."""
+
+_prepared: dict[str, ModelGeometry] = {}
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Where the bodies of a model were, T rows, B bodies.
+
+    Attributes:
+        model: the model.
+        position: T×B×3 float32, metres, of the world.
+        quaternion: T×B×4 float32, w first.
+    """
+
+    model: RowModel
+    position: NDArray[np.float32]
+    quaternion: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class ModelGeometry:
+    """What is drawn of a model.
+
+    Attributes:
+        bodies: body number to its entity's name, of those that have something to show.
+        parts: a body's name, the part's name in it, and what is logged there.
+    """
+
+    bodies: dict[int, str]
+    parts: tuple[tuple[str, str, tuple[Any, ...]], ...]
+
+
+def model_geometry(model: RowModel) -> ModelGeometry:
+    """What is drawn of a model; prepared once for each XML file, in about half a second."""
+    found = _prepared.get(model.path)
+    if found is None:
+        found = _prepared[model.path] = _prepare(model.model)
+    return found
+
+
+def log_model(stream: RecordingStream, root: str, geometry: ModelGeometry) -> None:
+    """The geoms below ``root``, each under its body's name; they never change."""
+    for body, part, archetypes in geometry.parts:
+        stream.log(f"{root}{entity_path(body, part)}", *archetypes, static=True)
+
+
+def log_motion(stream: RecordingStream, root: str, motion: Motion) -> None:
+    """The poses of the bodies below ``root``, row t at step t: a static one of a body that does not move, else a row
+    wherever it does."""
+    import rerun as rr
+
+    for body, name in model_geometry(motion.model).bodies.items():
+        path = f"{root}{entity_path(name)}"
+        place, turn = motion.position[:, body], motion.quaternion[:, body][:, [1, 2, 3, 0]]
+        moved = (place[1:] != place[:-1]).any(axis=1) | (turn[1:] != turn[:-1]).any(axis=1)
+        if not moved.any():
+            pose = rr.Transform3D(translation=place[0], quaternion=rr.Quaternion(xyzw=turn[0]))
+            stream.log(path, pose, static=True)
+            continue
+        steps = np.flatnonzero(np.concatenate([[True], moved]))
+        columns = rr.Transform3D.columns(translation=place[steps], quaternion=turn[steps])
+        stream.send_columns(path, time_columns(steps), columns)
+
+
+def _prepare(model: Any) -> ModelGeometry:
+    bodies: dict[int, str] = {}
+    parts = []
+    for geom in range(model.ngeom):
+        color = _color(model, geom)
+        if model.geom_group[geom] not in SHOWN_GROUPS or color[3] == 0:
+            continue
+        shape = _shape(model, geom, color)
+        if shape is None:
+            continue
+        body = int(model.geom_bodyid[geom])
+        name = bodies.setdefault(body, model.body(body).name or f"body-{body}")
+        parts.append((name, f"geom-{geom}", (shape, _pose(model, geom))))
+    return ModelGeometry(bodies, tuple(parts))
+
+
+def _pose(model: Any, geom: int) -> Any:
+    import rerun as rr
+
+    turn = rr.Quaternion(xyzw=model.geom_quat[geom][[1, 2, 3, 0]])
+    return rr.Transform3D(translation=model.geom_pos[geom], quaternion=turn)
+
+
+def _shape(model: Any, geom: int, color: NDArray[np.uint8]) -> Any:
+    """The geom as rerun draws it, None for a plane."""
+    import rerun as rr
+
+    kinds = mujoco.mjtGeom
+    kind, size = model.geom_type[geom], model.geom_size[geom]
+    look: dict[str, Any] = {"colors": [color], "fill_mode": rr.components.FillMode.Solid}
+    if kind == kinds.mjGEOM_PLANE:
+        return None
+    if kind == kinds.mjGEOM_MESH:
+        mesh = clustered(*_corners(model, model.geom_dataid[geom]))
+        return rr.Mesh3D(
+            vertex_positions=mesh.vertices,
+            vertex_normals=mesh.normals,
+            triangle_indices=mesh.triangles,
+            albedo_factor=color,
+        )
+    if kind == kinds.mjGEOM_BOX:
+        return rr.Boxes3D(half_sizes=[size], **look)
+    if kind == kinds.mjGEOM_SPHERE:
+        return rr.Ellipsoids3D(half_sizes=[[size[0]] * 3], **look)
+    if kind == kinds.mjGEOM_ELLIPSOID:
+        return rr.Ellipsoids3D(half_sizes=[size], **look)
+    if kind == kinds.mjGEOM_CYLINDER:
+        return rr.Cylinders3D(lengths=[2 * size[1]], radii=[size[0]], **look)
+    if kind == kinds.mjGEOM_CAPSULE:
+        # MuJoCo's stands around its middle, rerun's begins at its origin.
+        return rr.Capsules3D(lengths=[2 * size[1]], radii=[size[0]], translations=[[0, 0, -size[1]]], **look)
+    raise NotImplementedError(f"geom {geom} is of type {kinds(int(kind)).name}, which no model of Meta-World has")
+
+
+def _corners(model: Any, mesh: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The corners of a mesh's triangles and their normals, each F×3×3: MuJoCo numbers the two apart."""
+
+    def part(values: Any, start: Any, count: Any) -> NDArray[np.float64]:
+        return np.asarray(values[start[mesh] : start[mesh] + count[mesh]])
+
+    faces = part(model.mesh_face, model.mesh_faceadr, model.mesh_facenum)
+    normals = part(model.mesh_facenormal, model.mesh_faceadr, model.mesh_facenum)
+    vertices = part(model.mesh_vert, model.mesh_vertadr, model.mesh_vertnum)
+    directions = part(model.mesh_normal, model.mesh_normaladr, model.mesh_normalnum)
+    return vertices[faces].astype(np.float64), directions[normals].astype(np.float64)
+
+
+def _color(model: Any, geom: int) -> NDArray[np.uint8]:
+    """(4,) uint8: the geom's colour or else its material's, times what the texture is on average."""
+    material = model.geom_matid[geom]
+    rgba = np.array(model.geom_rgba[geom], np.float64)
+    if material >= 0:
+        if np.allclose(rgba, DEFAULT_RGBA):
+            rgba = np.array(model.mat_rgba[material], np.float64)
+        textures = model.mat_texid[material]
+        for texture in textures[textures >= 0][:1]:
+            rgba[:3] *= _mean_color(model, texture)
+    return np.rint(np.clip(rgba, 0, 1) * 255).astype(np.uint8)
+
+
+def _mean_color(model: Any, texture: int) -> NDArray[np.float64]:
+    height, width, channels = model.tex_height[texture], model.tex_width[texture], model.tex_nchannel[texture]
+    start = model.tex_adr[texture]
+    pixels = model.tex_data[start : start + height * width * channels].reshape(-1, channels)
+    return pixels[:, :3].mean(axis=0) / 255.0

@@ -1,0 +1,146 @@
+"""The page of an episode: all that is logged of it, and how its views are laid out."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import TYPE_CHECKING, Any
+
+from lw_torchrl.record.colors import BACKGROUND
+from lw_torchrl.record.curves import log_curves
+from lw_torchrl.record.heading import Heading, decisive_step, telling_steps
+from lw_torchrl.record.lanes import log_lanes
+from lw_torchrl.record.mujoco_scene import Motion
+from lw_torchrl.record.opening_steps import COMPONENT
+from lw_torchrl.record.plan_text import log_plan
+from lw_torchrl.record.recorded_episode import RecordedEpisode
+from lw_torchrl.record.scene import log_scene
+from lw_torchrl.record.timelines import EPISODE_TIMELINE, SECONDS_TIMELINE, entity_path
+from lw_torchrl.record.verdict import verdict
+
+if TYPE_CHECKING:
+    import rerun.blueprint as rrb
+    from rerun import RecordingStream
+
+Point = tuple[float, float, float]
+
+# From behind the robot's right shoulder, over a table whose middle is at (0, 0.6, 0); with the arm, from the front.
+SIMPLE_EYE: tuple[Point, Point] = ((0.54, 0.23, 0.46), (0.03, 0.63, 0.10))
+ROBOT_EYE: tuple[Point, Point] = ((0.54, 0.18, 0.47), (-0.02, 0.62, 0.13))
+
+CURVES = {
+    "distance": ("Distance of what the skill moves from where it goes, cm", 3),
+    "action": ("Action", 4),
+    "reward": ("Reward", 2),
+    "skill_weights": ("Skill weights", 4),
+    "corrected": ("How much of the correction counts", 2),
+}
+"""Each curve's title and its share of the height."""
+LIMITS = {"action": (-1.2, 1.2), "skill_weights": (-0.1, 1.1), "corrected": (-0.1, 1.1)}
+"""The range of a curve whose numbers have one."""
+
+
+def send_page(
+    stream: RecordingStream,
+    name: str,
+    title: str,
+    heading: Heading,
+    episode: RecordedEpisode,
+    motion: Motion | None = None,
+) -> rrb.Horizontal:
+    """Log an episode under ``name``; returns the views of it, a tab called ``title``."""
+    import rerun as rr
+
+    root = entity_path(name)
+    trails = log_scene(stream, root, episode, motion)
+    stream.log(f"{root}/verdict", rr.TextDocument(verdict(heading, episode), media_type="text/markdown"), static=True)
+    # Layouts cannot set the viewer's cursor; whoever opens the file can.
+    stream.log(root, rr.AnyValues(**{COMPONENT: decisive_step(heading, episode)}), static=True)
+    if episode.steps:
+        log_plan(stream, root, episode)
+    curves = log_curves(stream, root, episode)
+    lanes = log_lanes(stream, root, episode)
+    return _layout(
+        root,
+        title,
+        trails=trails,
+        eye=SIMPLE_EYE if motion is None else ROBOT_EYE,
+        shown=telling_steps(heading, episode),
+        curves=curves,
+        steps=len(episode.steps),
+        lanes=lanes,
+        good=episode.first_success is not None,
+    )
+
+
+def _layout(
+    root: str,
+    title: str,
+    *,
+    trails: Collection[str],
+    eye: tuple[Point, Point],
+    shown: tuple[int, int],
+    curves: Collection[str],
+    steps: int,
+    lanes: int,
+    good: bool,
+) -> rrb.Horizontal:
+    """Scene and curves on the left, words and lanes on the right."""
+    import rerun.blueprint as rrb
+
+    trail = rrb.VisibleTimeRanges([_up_to_now(name) for name in (EPISODE_TIMELINE, SECONDS_TIMELINE)])
+    scene = rrb.Spatial3DView(
+        origin=f"{root}/scene",
+        name="Scene",
+        background=BACKGROUND,
+        line_grid=False,
+        eye_controls=rrb.EyeControls3D(position=eye[0], look_target=eye[1], eye_up=(0.0, 0.0, 1.0)),
+        overrides={path: trail for path in trails},
+    )
+    left: list[tuple[float, Any]] = [(13, scene)]
+    for name, (words, share) in CURVES.items():
+        if name in curves:
+            left.append((share, _curve(f"{root}/{name}", words, shown, many=name in ("action", "skill_weights"))))
+    # Shares are about as many pixels as a view needs; what is longer scrolls.
+    right: list[tuple[float, Any]] = [
+        (115 if good else 215, rrb.TextDocumentView(origin=f"{root}/verdict", name="Verdict"))
+    ]
+    if steps:
+        right.append((70 + 58 * min(steps, 6), rrb.TextDocumentView(origin=f"{root}/plan", name="Plan")))
+    if lanes:
+        view = rrb.StateTimelineView(
+            origin=f"{root}/lanes", name="The step in force, and what holds", time_view=_window(shown)
+        )
+        right.append((50 + 40 * min(lanes, 8), view))
+    columns = [
+        rrb.Vertical(*(view for _, view in part), row_shares=[share for share, _ in part]) for part in (left, right)
+    ]
+    return rrb.Horizontal(*columns, column_shares=[6, 5], name=title)
+
+
+def _window(shown: tuple[int, int]) -> Any:
+    import rerun as rr
+    import rerun.blueprint as rrb
+
+    first, last = (rr.TimeRangeBoundary.absolute(seq=step) for step in shown)
+    return rrb.TimeAxis(view_range=rr.TimeRange(start=first, end=last))
+
+
+def _up_to_now(timeline: str) -> Any:
+    import rerun as rr
+
+    return rr.VisibleTimeRange(
+        timeline, start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.cursor_relative()
+    )
+
+
+def _curve(origin: str, name: str, shown: tuple[int, int], *, many: bool) -> rrb.TimeSeriesView:
+    import rerun.blueprint as rrb
+
+    limits = LIMITS.get(origin.rpartition("/")[2])
+    return rrb.TimeSeriesView(
+        origin=origin,
+        name=name,
+        axis_x=_window(shown),
+        axis_y=None if limits is None else rrb.ScalarAxis(range=limits, zoom_lock=True),
+        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=many),
+    )

@@ -1,0 +1,190 @@
+"""log_rollout: a rollout as a page of a recording, with the robot as it moved."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from lw_torchrl._checks import check_int, missing_keys
+from lw_torchrl.evaluation.failures import Failure
+from lw_torchrl.language.named_objects import GRIPPER
+from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
+from lw_torchrl.language.tasks import MT50, TASKS, Task, task_id
+from lw_torchrl.record.heading import Heading
+from lw_torchrl.record.mujoco_scene import Motion
+from lw_torchrl.record.recorded_episode import RecordedEpisode
+from lw_torchrl.record.resimulation import Difference, simulate_again
+
+if TYPE_CHECKING:
+    from lw_torchrl.record.rerun_logger import RerunLogger
+
+
+def log_rollout(
+    logger: RerunLogger,
+    rollout: TensorDictBase,
+    plans: Plans | Mapping[str, ConditionalPlan] | None = None,
+    *,
+    seed: int | None = None,
+    name: str | None = None,
+    policy: str | None = None,
+    failure: Failure | Sequence[Failure | None] | None = None,
+    tasks: Iterable[Task] = (),
+) -> Any:
+    """Add a rollout to a recording: the robot in 3-D, a verdict, the plan at the cursor, lanes and curves.
+
+    Where the environment's seed is given, the episode is simulated again, from its task, ``seed``, ``episode`` and
+    actions, and the robot is shown as it moved. The observations must come out the same, bit for bit; where they do
+    not, a warning says so, and a hand over a table stands for the robot, as it does without a seed.
+
+    Args:
+        logger: the recording.
+        rollout: batch size (T,), one episode from its first state on: "observation" T×39 float32 (metres), "task_id" T
+            int64, "action" T×4 float32 in [-1, 1], as executed, and ("next", "success") T×1 bool. Where they are there:
+            ("next", "executed_action") T×4, which is taken in the place of the action, "episode" T int64, "qaf" T×S
+            bool, "qaf_plan" T int64, "qaf_logits" T×S float32 (positive: true), "skill_weights" T×S float32,
+            "action_corrected" T×1 and ("next", "reward") T×1 float32. Or batch size (N, T), an episode in each row.
+        plans: what ``qaf`` answers; None for no plan.
+        seed: of the environment; with ``episode`` it says how the episode began.
+        name: of the episode in the recording; None takes "push-7", of task and episode, or else "push".
+        policy: who acted, in a word, for the tab.
+        failure: why it failed, for the verdict; of N rows one for each, None where there is none.
+        tasks: of your own, where the plans do not say what they are.
+
+    Returns:
+        The name; of N rows a list of names.
+
+    Raises:
+        ValueError: a key is missing, has another shape or dtype or holds a NaN; the rows are of several episodes;
+            ``qaf`` answers other plans, or the failure is another episode's; with a seed, there is no ``episode``.
+        PlanError: (a ValueError) there is no plan for the task.
+        TypeError: ``rollout`` is no TensorDict.
+
+    Warns:
+        UserWarning: the simulation gave other observations.
+
+    Example:
+        >>> import tempfile
+        >>> import lw_torchrl as lw
+        >>> env = lw.LanguageWorldEnv("reach", seed=7)
+        >>> rollout = env.rollout(20, lw.ExpertActor("reach"))[0]
+        >>> with lw.RerunLogger(tempfile.mkdtemp() + "/reach.rrd") as logger:
+        ...     lw.log_rollout(logger, rollout, seed=7, policy="expert")
+        'reach-0'
+        >>> env.close()
+    """
+    if not isinstance(rollout, TensorDictBase):
+        raise TypeError(f"rollout must be a TensorDict, got {type(rollout).__name__}")
+    if len(rollout.batch_size) == 2:
+        if name is not None:
+            raise ValueError(f"name is of one episode, but rollout holds {len(rollout)}; got {name!r}")
+        failures = failure if isinstance(failure, Sequence) else [failure] * len(rollout)
+        if len(failures) != len(rollout):
+            raise ValueError(f"failure must be one for each of {len(rollout)} rows, got {len(failures)}")
+        rows, tasks = zip(rollout, failures, strict=True), list(tasks)
+        return [
+            log_rollout(logger, row, plans, seed=seed, policy=policy, failure=why, tasks=tasks) for row, why in rows
+        ]
+    if isinstance(failure, Sequence):
+        raise ValueError(f"failure must be one Failure for one episode, got {len(failure)}")
+    heading, episode = read_rollout(rollout, plans, seed=seed, policy=policy, failure=failure, tasks=tasks)
+    motion = None
+    if seed is not None and heading.task in TASKS:
+        motion = _motion(heading, episode)
+    return logger.add_page(heading, episode, motion=motion, name=name)
+
+
+def read_rollout(
+    rollout: TensorDictBase,
+    plans: Plans | Mapping[str, ConditionalPlan] | None = None,
+    *,
+    seed: int | None = None,
+    policy: str | None = None,
+    failure: Failure | None = None,
+    tasks: Iterable[Task] = (),
+) -> tuple[Heading, RecordedEpisode]:
+    """What a page shows of a rollout (T,), checked, as :func:`log_rollout` has it."""
+    plans = None if plans is None else as_plans(plans)
+    if seed is not None:
+        check_int("seed", seed)
+    number = _single(rollout, "task_id", required=True)
+    index = _single(rollout, "episode", required=seed is not None)
+    assert number is not None
+    task = _definition(number, [*tasks, *(plan.definition for plan in (plans or {}).values())])
+    label = f"task-{number}" if task is None else task.name
+    plan = None
+    if plans is not None:
+        plans.require([label])
+        plan = plans[label]
+        _check_answers(rollout, plan)
+    if failure is not None and (failure.task, failure.episode) != (label, failure.episode if index is None else index):
+        raise ValueError(
+            f"failure must be of the rollout's episode, {label} {index}, got that of {failure.task} {failure.episode}"
+        )
+    observation = rollout.get("observation", None)
+    objects: dict[str, Tensor] = {}
+    if task is not None and observation is not None and observation.shape[1:] == (39,):
+        objects = {
+            named: position for named, position in task.positions(observation).items() if _is_told_of(named, plan)
+        }
+    episode = RecordedEpisode.from_rollout(rollout, objects, plan)
+    if task is not None and plan is not None:
+        episode = episode.with_aims(task)
+    return Heading(label, index, seed, policy, failure), episode
+
+
+def _motion(heading: Heading, episode: RecordedEpisode) -> Motion | None:
+    assert heading.seed is not None
+    assert heading.episode is not None
+    found = simulate_again(heading.task, heading.seed, heading.episode, episode.action, episode.observation)
+    if not isinstance(found, Difference):
+        return found
+    warnings.warn(
+        f"simulating {heading.task}, episode {heading.episode} of seed {heading.seed}, again gives other numbers at "
+        f"step {found.step}: number {found.entry} is {found.by:.3g} off. Was it the seed, and are these the executed "
+        "actions? A hand over a table is drawn in the place of the robot",
+        stacklevel=3,
+    )
+    return None
+
+
+def _single(rollout: TensorDictBase, key: str, *, required: bool) -> int | None:
+    """The one number that a column of integers holds."""
+    column = rollout.get(key, None)
+    if column is None:
+        if required:
+            raise missing_keys(rollout.keys(True, True), key)
+        return None
+    length = tuple(rollout.batch_size)
+    if column.is_floating_point() or tuple(column.shape) not in (length, (*length, 1)):
+        raise ValueError(
+            f"rollout[{key!r}] must be integers of shape {length}, got {column.dtype} {tuple(column.shape)}"
+        )
+    found = torch.unique(column).tolist()
+    if len(found) != 1:
+        raise ValueError(f"rollout must be one episode of one task, got {key!r} {found[:5]}; split it")
+    return int(found[0])
+
+
+def _definition(number: int, tasks: Sequence[Task]) -> Task | None:
+    """The task of an id: one of these, or of the 50."""
+    found = next((task for task in tasks if task_id(task.name) == number), None)
+    return TASKS[MT50[number]] if found is None and 0 <= number < len(MT50) else found
+
+
+def _check_answers(rollout: TensorDictBase, plan: ConditionalPlan) -> None:
+    answered = rollout.get("qaf_plan", None)
+    if answered is None:
+        return
+    expected = Plans([plan]).numbers[plan.task]
+    if not bool((answered == expected).all()):
+        raise ValueError(f"rollout['qaf'] answers another plan of {plan.task!r} than was given, as 'qaf_plan' tells")
+
+
+def _is_told_of(name: str, plan: ConditionalPlan | None) -> bool:
+    """Whether a plan speaks of an object; without a plan all are of interest."""
+    return plan is None or name == GRIPPER or any(name in f"{step.condition} {step.skill}" for step in plan.steps)

@@ -1,0 +1,217 @@
+"""RolloutRecorder: episodes of chosen rows of an environment, recorded while they run."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.envs import EnvBase, Transform
+
+from lw_torchrl._checks import check_int
+from lw_torchrl.envs.engine import BodyPoses
+from lw_torchrl.envs.language_world_env import LanguageWorldEnv
+from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
+from lw_torchrl.record.mujoco_scene import Motion, model_geometry
+from lw_torchrl.record.rollout_pages import read_rollout
+from lw_torchrl.transforms.containers import base_env, refuse_changed
+
+if TYPE_CHECKING:
+    from lw_torchrl.record.rerun_logger import RerunLogger
+
+_FIXED = ("task_id", "episode", "qaf_plan")
+_BEFORE = ("observation", "qaf", "qaf_logits", "skill_weights", "action_corrected")
+_AFTER = ("executed_action", "success", "reward")
+"""Keys of a step: those that an episode keeps, those of the state and the policy, those of what it led to."""
+
+
+class RolloutRecorder(Transform):
+    """Records episodes of chosen rows of a :class:`~lw_torchrl.LanguageWorldEnv` as they run, and changes no entry.
+
+    At each step it reads where the bodies of those rows are, and copies what :func:`lw_torchrl.log_rollout` shows of
+    them; at an episode's end it adds the page to the recording. An episode that is cut off, by a reset or by closing
+    the environment, is recorded as far as it came. Put it after :class:`~lw_torchrl.QAFTransform` and before what
+    changes the observation, and close the environment before the logger.
+
+    Args:
+        logger: a :class:`~lw_torchrl.RerunLogger`.
+        rows: which rows of the environment.
+        plans: what ``qaf`` answers, with a plan for the task of each of the rows; None for no plan.
+        every: record the first episode of a row, and then every so manieth.
+        policy: who acts, in a word, for the tab.
+
+    Raises:
+        TypeError: the environment is no LanguageWorldEnv. One in a worker of another process cannot be recorded.
+        ValueError: a row that the environment does not have, or ``every`` under 1.
+        PlanError: (a ValueError) there is no plan for the task of a row.
+
+    Warns:
+        UserWarning: an unfinished episode is dropped, for the logger was closed before the environment.
+
+    Example:
+        >>> import tempfile
+        >>> from torchrl.envs import TransformedEnv
+        >>> import lw_torchrl as lw
+        >>> logger = lw.RerunLogger(tempfile.mkdtemp() + "/reach.rrd")
+        >>> base = lw.LanguageWorldEnv("reach", num_envs=3, max_steps=10)
+        >>> env = TransformedEnv(base, lw.RolloutRecorder(logger, rows=[1], policy="expert"))
+        >>> _ = env.rollout(10, lw.ExpertActor("reach"))
+        >>> env.close()
+        >>> logger.episodes
+        ['reach-1']
+        >>> logger.shutdown()
+    """
+
+    def __init__(
+        self,
+        logger: RerunLogger,
+        rows: Sequence[int] = (0,),
+        *,
+        plans: Plans | Mapping[str, ConditionalPlan] | None = None,
+        every: int = 1,
+        policy: str | None = None,
+    ) -> None:
+        super().__init__(in_keys=[], out_keys=[])
+        self.logger = logger
+        self.rows = tuple(dict.fromkeys(check_int("rows", row, minimum=0) for row in rows))
+        self.plans = None if plans is None else as_plans(plans)
+        self.every = check_int("every", every, minimum=1)
+        self.policy = policy
+        self._running: dict[int, _Row] = {}
+
+    def clone(self) -> RolloutRecorder:
+        """A recorder into the same recording, which has seen nothing yet."""
+        copied = super().clone()
+        copied._running = {}
+        return copied
+
+    def set_container(self, container: Transform | EnvBase) -> None:
+        """Join an environment; what is drawn of its models is prepared now, in half a second for each."""
+        super().set_container(container)
+        env = base_env(self)
+        if env is None:
+            return
+        if not isinstance(env, LanguageWorldEnv):
+            raise TypeError(f"RolloutRecorder needs a LanguageWorldEnv in its own process, got {type(env).__name__}")
+        refuse_changed(self, "observation")
+        for row in self.rows:
+            if row >= len(env.row_tasks):
+                raise ValueError(f"rows must be below {len(env.row_tasks)}, the environment's rows, got {row}")
+        if self.plans is not None:
+            self.plans.require(env.row_tasks[row] for row in self.rows)
+        self._running = {row: _Row(env, row) for row in self.rows}
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        for row in _named(tensordict.get("_reset", None), self.rows):
+            running = self._running[row]
+            self._end(running)
+            running.begin(recorded=running.ended % self.every == 0)
+        return tensordict_reset
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        for row in _named(tensordict.get("_step", None), self.rows):
+            running = self._running[row]
+            running.take(tensordict, next_tensordict)
+            if bool(next_tensordict.get("done").reshape(-1)[row]):
+                self._end(running)
+        return next_tensordict
+
+    def close(self) -> None:
+        """Record what is unfinished; a second call does nothing."""
+        for running in self._running.values():
+            self._end(running)
+
+    def _end(self, running: _Row) -> None:
+        """Add the page of the episode that runs in a row, if it is one to record and has begun."""
+        rollout, motion = running.finish()
+        if rollout is None:
+            return
+        if not self.logger.is_alive:
+            warnings.warn(
+                f"{len(rollout)} steps of an episode of {running.task.name!r} are dropped: the logger was closed "
+                "before the environment",
+                stacklevel=4,
+            )
+            return
+        heading, episode = read_rollout(
+            rollout, self.plans, tasks=[running.task], seed=running.seed, policy=self.policy
+        )
+        self.logger.add_page(heading, episode, motion=motion)
+
+
+class _Row:
+    """One row of an environment, and what there is of its episode."""
+
+    def __init__(self, env: LanguageWorldEnv, row: int) -> None:
+        self.task = env.task_of_row[row]
+        self.ended = 0
+        self.seed = env.seed
+        self._env, self._row = env, row
+        # An engine of one's own may have no bodies.
+        engine: Any = env.engine
+        self._engine = engine if hasattr(engine, "poses") else None
+        self._model = None if self._engine is None else self._engine.model(row)
+        if self._model is not None:
+            model_geometry(self._model)
+        self._fixed: dict[str, NDArray[Any]] = {}
+        self._read: tuple[list[str], list[str]] = [], []
+        self._steps: list[list[NDArray[Any]]] = []
+        self._poses: list[BodyPoses] = []
+        self._recorded = self._stepped = False
+
+    def begin(self, *, recorded: bool) -> None:
+        self.seed = self._env.seed
+        self._recorded, self._stepped = recorded, False
+        self._look()
+
+    def take(self, before: TensorDictBase, after: TensorDictBase) -> None:
+        """Note a step: what it was decided on and what it led to."""
+        self._stepped = True
+        if not self._recorded:
+            return
+        if not self._steps:
+            self._read = [key for key in _BEFORE if key in before], [key for key in _AFTER if key in after]
+            self._fixed = {key: self._of(before.get(key)) for key in _FIXED if key in before}
+        now, then = self._read
+        self._steps.append([self._of(before.get(key)) for key in now] + [self._of(after.get(key)) for key in then])
+        self._look()
+
+    def finish(self) -> tuple[TensorDict | None, Motion | None]:
+        """The episode so far, (T,), and its motion; afterwards none runs. None where no step was noted."""
+        self.ended += self._stepped
+        steps, poses = self._steps, self._poses
+        self._steps, self._poses = [], []
+        self._recorded = self._stepped = False
+        if not steps:
+            return None, None
+        length, (now, then) = len(steps), self._read
+        names: list[NestedKey] = [*now, *(("next", key) for key in then)]
+        columns: dict[NestedKey, Any] = {
+            name: torch.from_numpy(np.stack(parts)) for name, parts in zip(names, zip(*steps, strict=True), strict=True)
+        }
+        columns |= {key: torch.from_numpy(value).reshape(-1).expand(length) for key, value in self._fixed.items()}
+        rollout = TensorDict(columns, [length])
+        if self._model is None:
+            return rollout, None
+        positions, quaternions = (np.stack(parts).astype(np.float32) for parts in zip(*poses, strict=True))
+        return rollout, Motion(self._model, positions, quaternions)
+
+    def _of(self, values: Tensor) -> NDArray[Any]:
+        """This row's part of a tensor of all rows, as a copy: some environments write into theirs again."""
+        array = values.numpy(force=True)
+        return np.array(array[self._row] if self._env.batch_size else array)
+
+    def _look(self) -> None:
+        if self._recorded and self._engine is not None:
+            self._poses.append(self._engine.poses(self._row))
+
+
+def _named(mask: Tensor | None, rows: Sequence[int]) -> list[int]:
+    """Those of ``rows`` that a mask names, all where there is none."""
+    return list(rows) if mask is None else [row for row in rows if mask.reshape(-1)[row]]

@@ -1,0 +1,249 @@
+"""Rollouts as pages: the robot stands where MuJoCo has it, and a rollout that is another episode is noticed."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import time
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from recordings import Recording, run
+
+import lw_torchrl as lw
+from lw_torchrl.envs.engines import MetaWorldEngine
+from lw_torchrl.envs.seeding import episode_seed
+from lw_torchrl.evaluation.failures import Failure
+from lw_torchrl.record.opening_steps import opening_steps
+from lw_torchrl.record.viewer import open_viewer
+
+PLANS = lw.load_plans("MT10")
+SEED = 5
+
+
+@pytest.fixture(scope="module")
+def pushed():
+    """One episode of push by scripted skills, 60 steps."""
+    return run("push", 60, plans=PLANS)[0]
+
+
+def logged(path, *rollouts, **kwargs):
+    with lw.RerunLogger(path) as logger:
+        names = [lw.log_rollout(logger, rollout, **kwargs) for rollout in rollouts]
+    return names, Recording(path)
+
+
+def poses_in_the_file(found, name, step):
+    """Body to (7,) position and quaternion (w last) at a step."""
+    start, end = f"/{name}/scene/bodies/", "Transform3D:translation"
+    bodies = [entity for entity, component in found.columns if component == end and entity.startswith(start)]
+    return {
+        entity.removeprefix(start): np.array(
+            [*found.at(entity, end, step)[0], *found.at(entity, "Transform3D:quaternion", step)[0]]
+        )
+        for entity in bodies
+        if "/" not in entity.removeprefix(start)
+    }
+
+
+def check_against_metaworld(found, name, rollout, steps):
+    """Meta-World's own environment, given the same actions, has its bodies where the file says."""
+    task, length = lw.MT50[int(rollout["task_id"][0])], len(rollout)
+    engine = MetaWorldEngine([task])
+    engine.reset([0], [episode_seed(task, SEED, int(rollout["episode"][0]))])
+    model = engine.model(0).model
+    for step in range(length + 1):
+        if step in steps:
+            expected = engine.poses(0)
+            in_file = poses_in_the_file(found, name, step)
+            assert len(in_file) >= 15
+            for body, pose in in_file.items():
+                number = int(body[5:]) if body.startswith("body-") else model.body(body).id
+                np.testing.assert_allclose(pose[:3], expected.position[number], rtol=0, atol=1e-5)
+                np.testing.assert_allclose(pose[3:], expected.quaternion[number][[1, 2, 3, 0]], rtol=0, atol=1e-5)
+        if step < length:
+            engine.step(rollout["next", "executed_action"][step : step + 1].numpy(), np.ones(1, bool))
+    engine.close()
+
+
+def test_bodies_stand_where_mujoco_has_them(tmp_path):
+    rollouts = run(["drawer-open", "soccer"], 30)
+    names, found = logged(tmp_path / "a.rrd", rollouts, seed=SEED)
+    assert names == [["drawer-open-0", "soccer-0"]]
+    for name, rollout in zip(names[0], rollouts, strict=True):
+        check_against_metaworld(found, name, rollout, (0, 11, 30))
+
+
+@pytest.mark.slow
+def test_all_tasks(tmp_path):
+    rollouts = run("MT50", 12)
+    names, found = logged(tmp_path / "a.rrd", rollouts, seed=SEED, policy="expert")
+    assert names[0] == [f"{task}-0" for task in lw.MT50]
+    for name, rollout in zip(names[0], rollouts, strict=True):
+        check_against_metaworld(found, name, rollout, (0, 5, 12))
+
+
+def test_the_viewer_has_nothing_to_complain_of(tmp_path, pushed):
+    logged(tmp_path / "a.rrd", pushed, plans=PLANS, seed=SEED)
+    try:
+        open_viewer(tmp_path / "a.rrd", tmp_path / "a.png", "800x600")  # a report of a view is a warning
+    except RuntimeError as error:
+        if "no graphics driver" in str(error):
+            pytest.skip("no graphics driver")
+        raise
+
+
+def test_an_episode_is_small_and_quick(tmp_path):
+    rollout = run("door-open", 500)[0]
+    with lw.RerunLogger(tmp_path / "a.rrd") as logger:
+        lw.log_rollout(logger, rollout, seed=SEED)
+    assert os.path.getsize(tmp_path / "a.rrd") < 3e6
+    seconds = []
+    with lw.RerunLogger(tmp_path / "b.rrd") as logger:
+        for _ in range(10):
+            start = time.process_time()
+            lw.log_rollout(logger, rollout, seed=SEED)
+            seconds.append(time.process_time() - start)
+    assert os.path.getsize(tmp_path / "b.rrd") < 25e6
+    assert min(seconds) < 0.5  # 30 ms of it write, the rest simulates
+
+
+def test_another_simulation_is_noticed(tmp_path, pushed):
+    other = pushed.clone()
+    other["next", "executed_action"][20] += 0.01
+    with pytest.warns(
+        UserWarning, match=r"push, episode 0 of seed 5, again gives other numbers at step 21: number \d+ is .* off"
+    ):
+        _, found = logged(tmp_path / "a.rrd", other, seed=SEED)
+    assert "/push-0/scene/gripper" in found.entities()
+    assert not any("/bodies" in entity for entity in found.entities())
+    with pytest.warns(UserWarning, match="at step 0"):
+        logged(tmp_path / "b.rrd", pushed, seed=SEED + 1)
+
+
+def test_without_a_seed_nothing_is_simulated(tmp_path, pushed):
+    names, found = logged(tmp_path / "a.rrd", pushed.exclude("episode"), plans=PLANS)
+    assert names == ["push"]
+    assert "/push/scene/gripper" in found.entities()
+
+
+def test_the_executed_action_counts(tmp_path, pushed):
+    wild = pushed.clone()
+    wild["action"] = wild["action"] * 100
+    _, found = logged(tmp_path / "a.rrd", wild, seed=SEED)
+    np.testing.assert_array_equal(
+        found.array("/push-0/action", "Scalars:scalars"), pushed["next", "executed_action"].double()
+    )
+    assert any("/bodies" in entity for entity in found.entities())
+
+
+def test_the_aim_is_the_skills(tmp_path, pushed):
+    _, found = logged(tmp_path / "a.rrd", pushed, plans=PLANS, seed=SEED)
+    steps = PLANS["push"].steps
+    in_force = pushed["skill_weights"].argmax(-1)
+    observation = pushed["observation"]
+    for row in (0, 30, 59):
+        skill = lw.load_skills()[steps[in_force[row]].skill].for_task("push")
+        positions = lw.TASKS["push"].positions(observation[row])
+        aimed = positions[skill.target] + torch.tensor(skill.offset)
+        expected = torch.where(torch.tensor(skill.gain) > 0, aimed, positions[skill.moved])
+        shown = found.at("/push-0/scene/aim/point", "Points3D:positions", row)[0]
+        np.testing.assert_allclose(shown, expected, atol=1e-6)
+        distance = found.at("/push-0/distance", "Scalars:scalars", row)[0]
+        assert distance == pytest.approx(100 * float((expected - positions[skill.moved]).norm()), abs=1e-3)
+
+
+def test_objects_that_the_plan_speaks_of_are_named(tmp_path, pushed):
+    _, found = logged(tmp_path / "a.rrd", pushed, plans=PLANS)
+    told = " ".join(f"{step.condition} {step.skill}" for step in PLANS["push"].steps)
+    shown = {e.split("/")[4].replace("\\", "") for e in found.entities() if e.startswith("/push-0/scene/objects/")}
+    assert shown == {name for name in lw.TASKS["push"].object_names if name in told}
+
+
+def failure_of(rollout, **changes):
+    found = Failure("push", SEED, 0, "skill", None, 1, 33, "It came to rest 10 cm away.", {}, {"skill": True})
+    return dataclasses.replace(found, **changes)
+
+
+def test_a_failure_is_the_verdict(tmp_path, pushed):
+    failed = pushed.clone()
+    failed["next", "success"][:] = False
+    why = failure_of(failed, swaps={"skill": True, "plan": False, "query": False})
+    _, found = logged(tmp_path / "a.rrd", failed, plans=PLANS, seed=SEED, policy="mine", failure=why)
+    verdict = found.text("/push-0/verdict")
+    assert verdict.startswith("## FAILED, skill: a skill was clumsy\n\nIt came to rest 10 cm away.\n")
+    skill = PLANS["push"].steps[1].skill
+    assert f"Seen at step 33 of 60, in step 2, **“{skill}”**." in verdict
+    assert "Exchanging skill made it a success; exchanging plan or query did not help." in verdict
+    assert "push · episode 0 · seed 5 · mine" in verdict
+    assert opening_steps(tmp_path / "a.rrd") == {"/push-0": 33}
+    (store,) = found.reader.blueprints()
+    layout = " ".join(str(chunk.to_record_batch()) for chunk in found.reader.stream(store=store))
+    assert "push · episode 0 · seed 5 · mine · failed: skill" in layout
+
+
+def test_without_a_failure_the_verdict_tells_facts(tmp_path, pushed):
+    failed = pushed.clone()
+    failed["next", "success"][:] = False
+    failed["qaf"][:, 1] = False
+    _, found = logged(tmp_path / "a.rrd", failed, plans=PLANS)
+    verdict = found.text("/push-0/verdict")
+    assert verdict.startswith("## FAILED in 60 steps")
+    last = int(pushed["skill_weights"][-1].argmax())
+    assert f"At the end step {last + 1}, **“{PLANS['push'].steps[last].skill}”**, was in force" in verdict
+    assert f"condition 2, “{PLANS['push'].steps[1].condition}”" in verdict
+    assert opening_steps(tmp_path / "a.rrd") == {"/push-0": 60}
+
+
+def test_a_success_is_the_verdict(tmp_path, pushed):
+    succeeded = pushed.clone()
+    succeeded["next", "success"][:] = (torch.arange(60) == 40)[:, None]
+    _, found = logged(tmp_path / "a.rrd", succeeded)
+    verdict = found.text("/push-0/verdict")
+    assert verdict.startswith("## SUCCESS at step 41 of 60")
+    assert "did not last: the task stood done in 1 steps" in verdict
+    assert opening_steps(tmp_path / "a.rrd") == {"/push-0": 41}
+
+
+@pytest.mark.parametrize(
+    ("change", "kwargs", "message"),
+    [
+        (lambda r: r.exclude("task_id"), {}, "task_id are needed, got"),
+        (lambda r: r.exclude("episode"), {"seed": SEED}, "episode are needed, got"),
+        (lambda r: r.exclude("observation"), {"seed": SEED}, r"must have the key 'observation' \(60×39\)"),
+        (lambda r: r.set("task_id", torch.rand(60)), {}, r"rollout\['task_id'\] must be integers of shape \(60,\)"),
+        (lambda r: r.set("episode", torch.arange(60) // 30), {}, r"one episode of one task, got 'episode' \[0, 1\]"),
+        (lambda r: r.set("qaf_plan", r["qaf_plan"] + 1), {"plans": PLANS}, r"\['qaf'\] answers another plan of 'push'"),
+        (lambda r: r, {"plans": lw.Plans([PLANS["reach"]])}, "plans lack push"),
+        (lambda r: r, {"failure": failure_of(None, episode=3)}, "failure must be of the rollout's episode, push 0"),
+        (lambda r: r, {"failure": [None]}, "failure must be one Failure for one episode"),
+        (lambda r: r[None], {"name": "mine"}, "name is of one episode, but rollout holds 1"),
+        (lambda r: r[None], {"failure": []}, "failure must be one for each of 1 rows, got 0"),
+    ],
+)
+def test_wrong_rollouts_of_tasks_are_named(tmp_path, pushed, change, kwargs, message):
+    with lw.RerunLogger(tmp_path / "a.rrd") as logger:
+        with pytest.raises(ValueError, match=message):
+            lw.log_rollout(logger, change(pushed.clone()), **kwargs)
+        assert logger.episodes == []
+
+
+def test_a_rollout_must_be_a_tensordict(tmp_path):
+    with lw.RerunLogger(tmp_path / "a.rrd") as logger, pytest.raises(TypeError, match="rollout must be a TensorDict"):
+        lw.log_rollout(logger, {"observation": torch.rand(3, 39)})
+
+
+def test_importing_a_recording_loads_no_rendering(tmp_path, pushed, monkeypatch):
+    # The scene is rerun's to draw: neither OpenGL nor MuJoCo's renderer is touched.
+    import mujoco
+
+    def refuse(*_, **__):
+        raise AssertionError("OpenGL was asked for")
+
+    monkeypatch.setattr(mujoco, "MjrContext", refuse)
+    monkeypatch.setattr(mujoco, "Renderer", refuse)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        logged(tmp_path / "a.rrd", pushed, seed=SEED)

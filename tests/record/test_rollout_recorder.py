@@ -1,0 +1,146 @@
+"""RolloutRecorder: what it records live is what log_rollout makes of the rollout afterwards."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from recordings import Recording
+from torchrl.collectors import Collector
+from torchrl.envs import Compose, SerialEnv, TransformedEnv
+from torchrl.envs.transforms import ObservationNorm
+
+import lw_torchrl as lw
+from lw_torchrl.record import RolloutRecorder
+
+PLANS = lw.load_plans("MT10")
+
+
+def make(logger, tasks=("push", "reach"), *, rows=(0,), num_envs=2, length=8, **options):
+    recorder = RolloutRecorder(logger, rows, plans=PLANS, **options)
+    base = lw.LanguageWorldEnv(tasks, num_envs=num_envs, seed=5, num_threads=1, max_steps=length)
+    return TransformedEnv(base, Compose(lw.QAFTransform(PLANS), recorder))
+
+
+def content(path):
+    """All columns, by entity and component, with their times."""
+    found = Recording(path)
+    return {
+        (entity, component): (found.times_or_none(entity, component), found.values(entity, component))
+        for entity, component in found.columns
+        if not entity.startswith("/__")
+    }
+
+
+def test_live_is_what_is_logged_afterwards(tmp_path):
+    live = lw.RerunLogger(tmp_path / "live.rrd")
+    env = make(live, num_envs=3, rows=(1, 2), policy="scripted")
+    rollout = env.rollout(8, lw.ScriptedSkillActor(PLANS))
+    env.close()
+    live.shutdown()
+    with lw.RerunLogger(tmp_path / "later.rrd") as later:
+        names = lw.log_rollout(later, rollout[1:], PLANS, seed=5, policy="scripted")
+    assert live.episodes == names == ["reach-0", "push-1"]
+    first, second = content(tmp_path / "live.rrd"), content(tmp_path / "later.rrd")
+    assert first.keys() == second.keys()
+    assert any("/bodies/" in entity for entity, _ in first)
+    for key, value in first.items():
+        assert str(value) == str(second[key]), key
+
+
+def test_every_so_manieth_episode(tmp_path):
+    with lw.RerunLogger(tmp_path / "a.rrd") as logger:
+        env = make(logger, ["reach"], num_envs=1, length=3, every=2)
+        for _ in range(5):
+            env.rollout(3)
+        env.close()
+        assert logger.episodes == ["reach-0", "reach-2", "reach-4"]
+
+
+def test_a_reset_alone_is_no_episode(tmp_path):
+    with lw.RerunLogger(tmp_path / "a.rrd") as logger:
+        env = make(logger, ["reach"], num_envs=1, length=3, every=2)
+        env.reset()
+        env.reset()
+        env.rollout(3)
+        env.close()
+        assert logger.episodes == ["reach-2"]
+
+
+def test_partial_resets_and_steps(tmp_path):
+    with lw.RerunLogger(tmp_path / "a.rrd") as logger:
+        env = make(logger, rows=(0, 1))
+        state = env.reset()
+        for _ in range(2):
+            state = env.step_mdp(env.step(env.rand_action(state)))
+        state["_step"] = torch.tensor([False, True])
+        state = env.step_mdp(env.step(env.rand_action(state)))
+        state["_reset"] = torch.tensor([[True], [False]])
+        state = env.reset(state).exclude("_reset", "_step")
+        assert logger.episodes == ["push-0"]
+        env.step(env.rand_action(state))
+        env.close()
+        env.transform.close()
+        assert logger.episodes == ["push-0", "push-1", "reach-0"]
+    found = Recording(tmp_path / "a.rrd")
+    lengths = [len(found.values(f"/{name}/action", "Scalars:scalars")) for name in logger.episodes]
+    assert lengths == [2, 1, 4]
+
+
+def test_a_collector_records(tmp_path):
+    with lw.RerunLogger(tmp_path / "a.rrd") as logger:
+        collector = Collector(
+            make(logger, length=5),
+            lw.ScriptedSkillActor(PLANS),
+            frames_per_batch=16,
+            total_frames=32,
+            auto_register_policy_transforms=False,
+        )
+        for _ in collector:
+            pass
+        collector.shutdown()
+        # 16 steps of each row: three episodes and one step.
+        assert logger.episodes == ["push-0", "push-1", "push-2", "push-3"]
+
+
+def test_a_clone_has_rows_of_its_own(tmp_path):
+    with lw.RerunLogger(tmp_path / "a.rrd") as logger:
+        env = make(logger, ["reach"], num_envs=1)
+        state = env.reset()
+        env.step(env.rand_action(state))
+        other = TransformedEnv(lw.LanguageWorldEnv("reach", seed=6), env.transform[1].clone())
+        other.close()
+        assert logger.episodes == []
+        env.close()
+        assert logger.episodes == ["reach-0"]
+
+
+def test_a_single_environment_without_rows(tmp_path):
+    with lw.RerunLogger(tmp_path / "a.rrd") as logger:
+        env = TransformedEnv(lw.LanguageWorldEnv("reach", batch_size=(), max_steps=3), RolloutRecorder(logger))
+        env.rollout(3)
+        env.close()
+        assert logger.episodes == ["reach-0"]
+
+
+def test_a_logger_closed_first_loses_what_is_unfinished(tmp_path):
+    logger = lw.RerunLogger(tmp_path / "a.rrd")
+    env = make(logger)
+    env.step(env.rand_action(env.reset()))
+    logger.shutdown()
+    with pytest.warns(UserWarning, match="1 steps of an episode of 'push' are dropped"):
+        env.close()
+
+
+def test_wrong_places_for_a_recorder(tmp_path):
+    with lw.RerunLogger(tmp_path / "a.rrd") as logger:
+        with pytest.raises(ValueError, match="rows must be below 2, the environment's rows, got 7"):
+            make(logger, rows=(7,))
+        with pytest.raises(ValueError, match="every must be at least 1"):
+            RolloutRecorder(logger, every=0)
+        with pytest.raises(ValueError, match="plans lack soccer"):
+            TransformedEnv(lw.LanguageWorldEnv("soccer"), RolloutRecorder(logger, plans=PLANS))
+        with pytest.raises(TypeError, match="needs a LanguageWorldEnv in its own process, got SerialEnv"):
+            TransformedEnv(SerialEnv(1, lambda: lw.LanguageWorldEnv("reach")), RolloutRecorder(logger))
+        norm = ObservationNorm(loc=0.0, scale=2.0, in_keys=["observation"])
+        with pytest.raises(ValueError, match="ObservationNorm changes 'observation' before RolloutRecorder"):
+            TransformedEnv(lw.LanguageWorldEnv("reach"), Compose(norm, RolloutRecorder(logger)))
