@@ -5,12 +5,14 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable
 from itertools import groupby
+from pathlib import Path
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 
+from lw_torchrl._files import replacing
 from lw_torchrl.envs.episodes import policy_of, run_episodes
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.evaluation.protocol import make_env, tasks_of
@@ -66,7 +68,7 @@ def write_recording(
     rollouts: dict[str, TensorDictBase],
 ) -> None:
     """Write rollouts to a rerun file, each with its plan where there is one; the file is replaced whole."""
-    with RerunLogger(path) as logger:
+    with replacing(path) as file, RerunLogger(file, exp_name=Path(path).stem) as logger:
         for task, rollout in rollouts.items():
             definition = actor.definition(task)
             objects = {} if definition is None else definition.positions(rollout.get("observation"))
