@@ -36,20 +36,21 @@ def copy_recording(source: Path, target: Path, tab: str | None = None) -> None:
             front = None if tab is None else tabs.find(tab)
             if tab is not None and front is None:
                 raise unknown_name("episode", tab, tabs.titles())
-            stream = rr.RecordingStream(known.application_id, recording_id=known.recording_id, send_properties=False)
-            stream.save(target)
             # What came in many small pieces becomes a few: a training's curves take a twentieth.
-            stream.send_chunks(reader.stream(store=known).collect(optimize=OptimizationProfile.LIVE))
+            data = reader.stream(store=known).collect(optimize=OptimizationProfile.LIVE)
         except RuntimeError as error:
             raise ValueError(str(error)) from error
+    stream = rr.RecordingStream(known.application_id, recording_id=known.recording_id, send_properties=False)
     try:
-        if layout:
+        stream.save(target)
+        if layout:  # it comes first, else a slow browser shows views of its own choice meanwhile
             native = rerun_bindings.new_blueprint(known.application_id, make_default=False, make_thread_default=False)
             rows = rr.RecordingStream._from_native(native)
             rows.send_chunks(layout)
             if front is not None:
                 tabs.bring_to_front(rows, front)
             rerun_bindings.send_blueprint(rows.memory_recording().storage, True, True, recording=stream.to_native())
+        stream.send_chunks(data)
         stream.flush(timeout_sec=FLUSH_SECONDS)
     except RuntimeError as error:
         raise OSError(f"{str(target)!r} could not be written: {error}") from error
