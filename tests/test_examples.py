@@ -10,6 +10,7 @@ import tempfile
 from pathlib import Path
 
 import pytest
+from rerun.chunk import RrdReader
 
 import lw_torchrl as lw
 
@@ -35,7 +36,7 @@ def names(path):
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.name)
 def test_an_example_is_one_page(path):
     lines = path.read_text("utf-8").splitlines()
-    assert len(lines) <= (120 if path.name.startswith(("offline", "online", "tune")) else 80)
+    assert len(lines) <= (120 if path.name.startswith(("offline", "online", "rerun", "tune")) else 80)
     assert max(map(len, lines)) <= 120
 
 
@@ -86,6 +87,16 @@ def test_one_step_of_a_plan_is_tuned(tmp_path):
     assert lines[-1].endswith("as before in every episode")
     left = {path.name for path in tmp_path.iterdir() if not path.name.startswith("torchinductor")}
     assert not left, "it leaves nothing behind"
+
+
+def test_a_training_is_recorded(tmp_path):
+    options = ["--steps", 20, "--demonstrations", 1, "--rollouts", 2, "--length", 30]
+    done = run("rerun_training.py", tmp_path, *options)
+    assert [line.split()[1] for line in done.stdout.splitlines() if line.startswith("step ")] == ["10", "20"]
+    recording = RrdReader(tmp_path / "runs" / "rerun_training" / "training.rrd")
+    found = {chunk.entity_path for chunk in recording.stream()}
+    assert {"/metrics/loss/bc", "/metrics/success/mean", "/histograms/action", "/hparams"} <= found
+    assert {f"/{task}\\ after\\ {step}/action" for task in ("drawer-open", "window-open") for step in (10, 20)} <= found
 
 
 def test_co_learning_runs_on_ones_own_data(tmp_path):

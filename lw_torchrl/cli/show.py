@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -30,29 +31,51 @@ def demo(out: Path | None = None, quick: bool = False) -> None:
 
 
 def view(
-    recording: Positional[Annotated[Path, arg(metavar="RECORDING")]],
+    recording: Positional[Annotated[Path, arg(metavar="RUN|FILE")]],
     /,
+    episode: str | None = None,
     screenshot: Path | None = None,
     step: int | None = None,
     window_size: str = "1400x900",
+    html: Path | None = None,
+    web: bool = False,
+    port: int = 0,
 ) -> None:
-    """Open a recording in the rerun viewer, or take a picture of it without a screen.
+    """Open a recording in the rerun viewer; or take a picture of it, write it as one page, or serve it as one.
 
-    Example: lw-torchrl view runs/demo/rollout.rrd --screenshot picture.png --step 80
+    Example: lw-torchrl view runs/demo --episode drawer-open --screenshot picture.png --step 80
 
     Args:
-        recording: an .rrd file.
+        recording: an .rrd file, or a folder that holds one.
+        episode: open at this tab, by its title or its episode's name.
         screenshot: write a .png here and open no window; wants Debian's mesa-vulkan-drivers and libvulkan1.
         step: the step at which to take the picture; the last if none is given.
-        window_size: of the picture, WIDTHxHEIGHT.
+        window_size: of the picture or the window, WIDTHxHEIGHT.
+        html: write one self-contained page here, some 20 MB, that opens from disk in a browser.
+        web: serve a page on this machine and print its address, until Ctrl-C.
+        port: of the page; 0 takes a free one.
     """
+    given = [f"--{name}" for name, value in (("screenshot", screenshot), ("html", html), ("web", web)) if value]
+    if len(given) > 1:
+        raise ValueError(f"give one of --screenshot, --html and --web, got {' and '.join(given)}")
     if screenshot is not None:
         check_file("--screenshot", screenshot)
-    from lw_torchrl.record import open_viewer
+    if html is not None:
+        check_file("--html", html)
+    from lw_torchrl.record import WebPage, open_viewer, write_html
 
-    open_viewer(recording, screenshot, window_size, step=step)
-    if screenshot is not None:
-        print(f"written to {screenshot}")
+    if web:
+        with WebPage(recording, episode=episode, port=port) as page:
+            print(f"{page.address}  (Ctrl-C ends it)", flush=True)
+            with suppress(KeyboardInterrupt):
+                page.serve()
+        return
+    if html is not None:
+        write_html(recording, html, episode=episode)
+    else:
+        open_viewer(recording, screenshot, window_size, step=step, episode=episode)
+    if written := html or screenshot:
+        print(f"written to {written}")
 
 
 def query(

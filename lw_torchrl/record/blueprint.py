@@ -11,20 +11,6 @@ if TYPE_CHECKING:
     import rerun.blueprint as rrb
 
 
-def metric_views(*, metrics: bool, histograms: Sequence[str], videos: Sequence[str], hparams: bool) -> list[Any]:
-    """The tabs of what is not an episode, those that have something to show."""
-    import rerun.blueprint as rrb
-
-    views: list[Any] = []
-    if metrics:
-        views.append(rrb.TimeSeriesView(origin="/metrics", name="Metrics"))
-    views += [rrb.BarChartView(origin=path, name=path.removeprefix("/")) for path in histograms]
-    views += [rrb.Spatial2DView(origin=path, name=path.removeprefix("/")) for path in videos]
-    if hparams:
-        views.append(rrb.TextDocumentView(origin="/hparams", name="Hyperparameters"))
-    return views
-
-
 def make_blueprint(episodes: Sequence[Any], others: Sequence[Any]) -> rrb.Blueprint:
     """The whole layout; the time panel plays episodes at Meta-World's 80 steps a second."""
     import rerun.blueprint as rrb

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from itertools import count
 
-RESERVED = ("metrics", "histograms", "videos", "hparams")
+RESERVED = ("metrics", "histograms", "images", "videos", "hparams")
 
 
 def episode_name(wanted: str, name: str | None, taken: Collection[str]) -> str:

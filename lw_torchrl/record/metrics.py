@@ -1,7 +1,8 @@
-"""What training logs: curves, histograms, videos and hyperparameters, checked and sent to a recording."""
+"""What training logs: curves, histograms, images, videos and hyperparameters, checked and sent to a recording."""
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,11 @@ if TYPE_CHECKING:
     from rerun import RecordingStream
 
 
+MOST_CURVES = 64
+JPEG_QUALITY = 90
+BARS = (80, 170, 255)
+
+
 def check_name(name: str) -> str:
     """Return a metric's name, else raise :class:`ValueError`."""
     if not isinstance(name, str) or not all(part.strip() for part in name.split("/")):
@@ -23,12 +29,39 @@ def check_name(name: str) -> str:
     return name
 
 
-def send_scalars(stream: RecordingStream, path: str, steps: Sequence[int], values: Sequence[float]) -> None:
-    """Add numbers to the curve ``path``."""
+def numbers(name: str, value: Any) -> list[float]:
+    """A metric's value as a list, of one number or of several; else :class:`ValueError`."""
+    if type(value) is float or type(value) is int:
+        return [float(value)]
+    try:
+        if value is None or isinstance(value, str):
+            raise TypeError
+        if isinstance(value, Tensor):
+            value = value.detach().cpu().to(torch.float64).numpy()
+        found = np.asarray(value, dtype=np.float64).ravel().tolist()
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"value of {name!r} must be a number or several, got {value!r}") from error
+    if not 1 <= len(found) <= MOST_CURVES:
+        hint = "; log_histogram shows more" if found else ""
+        raise ValueError(f"value of {name!r} must be 1 to {MOST_CURVES} numbers, got {len(found)}{hint}")
+    return found
+
+
+def send_scalars(stream: RecordingStream, path: str, steps: Sequence[int], values: Sequence[Sequence[float]]) -> None:
+    """Add a row of numbers for each step to the curves ``path``."""
     import rerun as rr
 
     index = [rr.TimeColumn(METRIC_TIMELINE, sequence=steps)]
-    stream.send_columns(path, index, rr.Scalars.columns(scalars=values))
+    columns = rr.Scalars.columns(scalars=[number for row in values for number in row])
+    stream.send_columns(path, index, columns.partition([len(row) for row in values]))
+
+
+def name_curves(stream: RecordingStream, path: str, name: str, curves: int) -> None:
+    """Name the curves of ``path`` in the legend: "bc", or "bc 0", "bc 1" where there are several."""
+    import rerun as rr
+
+    names = [name] if curves == 1 else [f"{name} {i}" for i in range(curves)]
+    stream.log(path, rr.SeriesLines(names=names, widths=[1.5] * curves), static=True)
 
 
 def histogram(name: str, data: Any, bins: Any) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -47,7 +80,8 @@ def send_histogram(
     import rerun as rr
 
     index = [rr.TimeColumn(METRIC_TIMELINE, sequence=[step])]
-    chart = rr.BarChart.columns(values=[counts], abscissa=[(edges[1:] + edges[:-1]) / 2])
+    centers, widths = (edges[1:] + edges[:-1]) / 2, np.diff(edges)
+    chart = rr.BarChart.columns(values=[counts], abscissa=[centers], widths=[widths], color=[BARS])
     stream.send_columns(path, index, chart)
 
 
@@ -61,17 +95,49 @@ def check_video(name: str, video: Tensor) -> None:
 
 
 def send_video(stream: RecordingStream, path: str, video: Tensor, fps: float) -> None:
-    """Add the frames T×C×H×W of a video as images."""
+    """Add the frames T×C×H×W of a video, each a JPEG."""
     import rerun as rr
 
-    frames, channels, height, width = video.shape
-    image_format = rr.components.ImageFormat(
-        width=width, height=height, color_model="RGB" if channels == 3 else "L", channel_datatype="U8"
-    )
-    stream.log(path, rr.Image.from_fields(format=image_format), static=True)
-    pixels = video.permute(0, 2, 3, 1).reshape(frames, -1).contiguous().numpy()
-    times = time_columns(np.arange(frames), 1 / fps)
-    stream.send_columns(path, times, rr.Image.columns(buffer=pixels))
+    pixels = video.permute(0, 2, 3, 1).contiguous().numpy()
+    stream.log(path, rr.EncodedImage.from_fields(media_type="image/jpeg"), static=True)
+    times = time_columns(np.arange(len(pixels)), 1 / fps)
+    stream.send_columns(path, times, rr.EncodedImage.columns(blob=[jpeg(frame) for frame in pixels]))
+
+
+def jpeg(pixels: NDArray[np.uint8]) -> bytes:
+    """Pixels H×W×C as a JPEG, C = 1 or 3."""
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    Image.fromarray(pixels[..., 0] if pixels.shape[-1] == 1 else pixels).save(buffer, "JPEG", quality=JPEG_QUALITY)
+    return buffer.getvalue()
+
+
+def check_image(name: str, image: Any) -> NDArray[np.uint8]:
+    """An image as H×W×C uint8: from H×W, H×W×C or C×H×W with C = 1 or 3, of uint8 or of floats in [0, 1]."""
+    pixels = torch.as_tensor(image).detach().cpu()
+    shape = tuple(pixels.shape)
+    if pixels.ndim == 2:
+        pixels = pixels[..., None]
+    elif pixels.ndim == 3 and shape[-1] not in (1, 3) and shape[0] in (1, 3):
+        pixels = pixels.permute(1, 2, 0)
+    if pixels.is_floating_point() and bool(((pixels >= 0) & (pixels <= 1)).all()):
+        pixels = (pixels * 255).round().to(torch.uint8)
+    if pixels.ndim != 3 or pixels.shape[-1] not in (1, 3) or not pixels.numel() or pixels.dtype != torch.uint8:
+        raise ValueError(
+            f"image {name!r} must be uint8, or floats in [0, 1], of shape H×W, H×W×C or C×H×W with C = 1 or 3, "
+            f"got {str(pixels.dtype).removeprefix('torch.')} of shape {'×'.join(map(str, shape))}"
+        )
+    return pixels.contiguous().numpy()
+
+
+def send_image(stream: RecordingStream, path: str, step: int, pixels: NDArray[np.uint8]) -> None:
+    """Add an image H×W×C as a JPEG."""
+    import rerun as rr
+
+    stream.log(path, rr.EncodedImage.from_fields(media_type="image/jpeg"), static=True)
+    index = [rr.TimeColumn(METRIC_TIMELINE, sequence=[step])]
+    stream.send_columns(path, index, rr.EncodedImage.columns(blob=[jpeg(pixels)]))
 
 
 def send_hparams(stream: RecordingStream, hparams: Mapping[str, str]) -> None:

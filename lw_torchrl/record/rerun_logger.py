@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import atexit
 import os
-from collections import defaultdict
+import threading
+import warnings
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
@@ -14,24 +17,31 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.record.loggers import Logger
 
-from lw_torchrl.record.blueprint import make_blueprint, metric_views
+from lw_torchrl.record.blueprint import make_blueprint
 from lw_torchrl.record.episodes import episode_name
 from lw_torchrl.record.heading import Heading
+from lw_torchrl.record.layout import Layout, MetricTabs
+from lw_torchrl.record.live import check_address
 from lw_torchrl.record.metrics import (
+    check_image,
     check_name,
     check_video,
     flatten,
     histogram,
+    name_curves,
+    numbers,
     send_histogram,
     send_hparams,
+    send_image,
     send_scalars,
     send_video,
 )
 from lw_torchrl.record.mujoco_scene import Motion
 from lw_torchrl.record.page import send_page
 from lw_torchrl.record.recorded_episode import PlanLike, RecordedEpisode
-from lw_torchrl.record.recording_file import check_path, hidden_beside, open_stream
+from lw_torchrl.record.recording_file import check_path
 from lw_torchrl.record.timelines import CONTROL_PERIOD, entity_path
+from lw_torchrl.record.writer import RecordingWriter
 
 if TYPE_CHECKING:
     from rerun import RecordingStream
@@ -40,23 +50,29 @@ BUFFERED_SCALARS = 1024
 
 
 class RerunLogger(Logger):
-    """A torchrl Logger that writes one rerun recording: metrics, videos, and whole episodes in 3-D.
+    """A torchrl Logger that makes one rerun recording: metrics, images, videos, and whole episodes in 3-D.
 
-    The recording grows in a hidden file beside ``path`` and takes that name at :meth:`shutdown`, replacing a
-    file that has it already; until then, and after an error inside a ``with`` block, ``path`` is untouched.
-    The recording is the logger's own: rerun's global one is neither used nor changed.
+    Everything is written within half a second, with the layout, to a file that has its name from the start: whoever
+    is killed leaves a recording that opens. An older file of that name is kept, as "run.previous.rrd", then
+    "run.previous-2.rrd". A viewer that is absent or goes away, and a full disk, cost one warning each, and training
+    goes on. The recording is the logger's own: rerun's global one is neither used nor changed.
 
     Args:
-        path: the file, ending in ".rrd"; missing folders are made.
+        path: the file, ending in ".rrd"; missing folders are made. None writes no file.
+        connect: the address of a viewer that shows the recording as it grows, "127.0.0.1:9876" or
+            "rerun+http://127.0.0.1:9876/proxy"; start it with ``rerun``.
         exp_name: the name of the run; None takes the file's, without ".rrd".
         application_id: recordings of one application share their layout in rerun's viewer.
 
     Attributes:
-        path: the file, as a Path.
+        path: the file, as a Path, or None.
+        previous: where an older file of that name is kept, or None.
         experiment: the rerun RecordingStream, for logging more by hand.
 
     Raises:
-        ValueError: ``path`` does not end in ".rrd", is a folder, or lies below a file.
+        ValueError: there is neither ``path`` nor ``connect``; ``path`` does not end in ".rrd", is a folder, or lies
+            below a file; ``connect`` is no address.
+        OSError: the file cannot be made.
 
     Example:
         >>> import tempfile, os
@@ -73,31 +89,49 @@ class RerunLogger(Logger):
 
     def __init__(
         self,
-        path: str | os.PathLike[str],
+        path: str | os.PathLike[str] | None = None,
         *,
+        connect: str | None = None,
         exp_name: str | None = None,
         application_id: str = "lw_torchrl",
     ) -> None:
-        self.path = check_path(path)
+        if path is None and connect is None:
+            raise ValueError("give path, a file to write, or connect, a viewer to show it in, or both; got neither")
+        self.path = None if path is None else check_path(path)
+        self.connect = None if connect is None else check_address(connect)[0]
         self.application_id = application_id
-        self._partial = hidden_beside(self.path)
-        self._scalars: defaultdict[str, tuple[list[int], list[float]]] = defaultdict(lambda: ([], []))
+        self._lock = threading.Lock()
+        self._scalars: dict[str, tuple[list[int], list[list[float]]]] = {}
+        self._curves: dict[str, int] = {}
         self._counters: dict[str, int] = {}
         self._hparams: dict[str, str] = {}
         self._episodes: dict[str, Any] = {}
-        self._histograms: dict[str, None] = {}
-        self._videos: dict[str, None] = {}
-        super().__init__(exp_name=exp_name or self.path.stem, log_dir=str(self.path.parent))
+        self._tabs = MetricTabs()
+        self._shown = (0, 0)
+        super().__init__(
+            exp_name=exp_name or (self.path.stem if self.path else application_id),
+            log_dir=str(self.path.parent) if self.path else os.curdir,
+        )
 
     def _create_experiment(self) -> RecordingStream:
-        stream = open_stream(self._partial, self.application_id, self.exp_name)
+        self._layout = Layout(self.application_id)
+        self._writer = RecordingWriter(self.path, self.connect, self.application_id, self.exp_name, self._send_waiting)
+        stream = self._writer.stream
         # In another process (service_backend="process") torchrl ends the experiment, not the logger.
         stream.finish = self.shutdown
+        self._layout.send(stream, make_blueprint([], []))
+        atexit.register(self.shutdown)
+        self._tell()
         return stream
+
+    @property
+    def previous(self) -> Path | None:
+        return self._writer.previous
 
     def __repr__(self) -> str:
         state = "closed" if self._service_shutdown else "open"
-        return f"RerunLogger(path={str(self.path)!r}, exp_name={self.exp_name!r}, {state})"
+        places = f"path={None if self.path is None else str(self.path)!r}, connect={self.connect!r}"
+        return f"RerunLogger({places}, exp_name={self.exp_name!r}, {state})"
 
     def __enter__(self) -> RerunLogger:
         return self.start()
@@ -105,39 +139,63 @@ class RerunLogger(Logger):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if kind is None:
-            self.shutdown()
-        else:
-            self.discard()
+        self.shutdown()
 
     def _open(self) -> RecordingStream:
         if self._service_shutdown:
             raise RuntimeError(f"{self!r} takes nothing more; make a new RerunLogger")
+        self._tell()
         return self.experiment
+
+    def _tell(self) -> None:
+        for trouble in self._writer.take_troubles():
+            warnings.warn(trouble, stacklevel=4)
 
     # ---------------------------------------------------------------- torchrl's Logger
 
-    def log_scalar(self, name: str, value: float, step: int | None = None) -> None:
-        """Add a number to the curve "metrics/<name>", on the timeline "global_step".
+    def log_scalar(self, name: str, value: Any, step: int | None = None) -> None:
+        """Add a number, or several, to the curves "metrics/<name>", on the timeline "global_step".
 
         Args:
-            name: "loss/bc"; slashes make a tree.
-            value: a number, or a tensor of one element; NaN is recorded, and leaves a gap.
+            name: "loss/bc"; what comes before the first slash is the group, which has a view and an axis of its own.
+            value: a number, or up to 64 of them (a tensor, an array, a list), each a curve; NaN leaves a gap.
             step: the training step; None counts the calls with this name from 0.
+
+        Raises:
+            ValueError: ``value`` is not made of 1 to 64 numbers, or ``name`` not of words joined by slashes.
         """
-        self._open()
-        steps, values = self._scalars[check_name(name)]
-        try:
-            number = float(value)
-        except (TypeError, ValueError, RuntimeError) as error:
-            raise ValueError(f"value of {name!r} must be one number, got {value!r}") from error
-        steps.append(self._count(f"metrics/{name}", step))
-        values.append(number)
-        if len(values) >= BUFFERED_SCALARS:
-            self._send_scalars(name)
+        stream = self._open()
+        row, parts = numbers(name, value), check_name(name).split("/")
+        if len(row) > self._curves.get(name, 0):
+            self._curves[name] = len(row)
+            self._tabs.add("metrics", parts[0])
+            name_curves(stream, entity_path("metrics", *parts), parts[-1], len(row))
+        with self._lock:
+            steps, values = self._scalars.setdefault(name, ([], []))
+            steps.append(self._count(f"metrics/{name}", step))
+            values.append(row)
+            full = len(values) >= BUFFERED_SCALARS
+        if full:
+            self._send_scalars()
+
+    def log_image(self, name: str, image: Any, step: int | None = None) -> None:
+        """Add an image "images/<name>", a JPEG on the timeline "global_step".
+
+        Args:
+            name: "eval/scene".
+            image: H×W, H×W×C or C×H×W, C = 1 or 3; uint8, or floats in [0, 1].
+            step: the training step; None counts the calls with this name from 0.
+
+        Raises:
+            ValueError: the image has another shape or dtype.
+        """
+        stream, parts, pixels = self._open(), check_name(name).split("/"), check_image(name, image)
+        path = entity_path("images", *parts)
+        send_image(stream, path, self._count(path, step), pixels)
+        self._tabs.add("images", *parts)
 
     def log_video(self, name: str, video: Tensor, step: int | None = None, **kwargs: Any) -> None:
-        """Add a video as images "videos/<name>", frame i at step i of the episodes' timelines.
+        """Add a video as JPEG images "videos/<name>", frame i at step i of the episodes' timelines.
 
         Args:
             name: "eval/corner2".
@@ -155,11 +213,11 @@ class RerunLogger(Logger):
             return
         video = video[0] if video.ndim == 5 else video
         check_video(name, video)
-        stream, path = self._open(), entity_path("videos", *check_name(name).split("/"))
+        stream, parts = self._open(), check_name(name).split("/")
         if step is not None:
-            path += entity_path(f"step {int(step)}")
-        send_video(stream, path, video, float(kwargs.get("fps", 1 / CONTROL_PERIOD)))
-        self._videos[path] = None
+            parts.append(f"step {int(step)}")
+        send_video(stream, entity_path("videos", *parts), video, float(kwargs.get("fps", 1 / CONTROL_PERIOD)))
+        self._tabs.add("videos", *parts)
 
     def log_hparams(self, cfg: Any) -> None:
         """Show the configuration as a table of keys and values in "hparams"; a later call adds to it.
@@ -171,6 +229,7 @@ class RerunLogger(Logger):
             raise TypeError(f"cfg must be a mapping, got {type(cfg).__name__}")
         self._hparams.update(flatten(cfg))
         send_hparams(self._open(), self._hparams)
+        self._tabs.add("hparams")
 
     def log_histogram(self, name: str, data: Sequence[float] | Tensor | NDArray[Any], **kwargs: Any) -> None:
         """Add the counts of ``data`` as a bar chart "histograms/<name>", on the timeline "global_step".
@@ -185,39 +244,31 @@ class RerunLogger(Logger):
             ValueError: ``data`` is empty or holds a NaN or an infinity.
         """
         counts, edges = histogram(name, data, kwargs.get("bins", 30))
-        path = entity_path("histograms", *check_name(name).split("/"))
+        parts = check_name(name).split("/")
+        path = entity_path("histograms", *parts)
         send_histogram(self._open(), path, self._count(path, kwargs.get("step")), counts, edges)
-        self._histograms[path] = None
+        self._tabs.add("histograms", *parts)
 
     def flush(self, timeout: float | None = None) -> None:
-        """Write what is buffered to the hidden file, within ``timeout`` seconds."""
+        """Write what waits to the file, within ``timeout`` seconds; by itself that is done each half second."""
         if not self._service_shutdown:
-            for name in list(self._scalars):
-                self._send_scalars(name)
-            self.experiment.flush(timeout_sec=1e38 if timeout is None else timeout)
+            self._writer.write(timeout)
+            self._tell()
 
     def shutdown(self, timeout: float | None = None) -> None:
-        """Write the rest and the layout, close the file and give it its name. A second call does nothing."""
-        if self._service_shutdown:
-            return
-        others = metric_views(
-            metrics=bool(self._scalars),
-            histograms=list(self._histograms),
-            videos=list(self._videos),
-            hparams=bool(self._hparams),
-        )
-        self.experiment.send_blueprint(make_blueprint(list(self._episodes.values()), others))
-        self.flush(timeout)
-        self.experiment.disconnect()
-        self._service_shutdown = True
-        os.replace(self._partial, self.path)
+        """Write the rest and close the file; a viewer gets a second for it, or ``timeout``. Once is enough."""
+        if not self._service_shutdown:
+            self._service_shutdown = True
+            atexit.unregister(self.shutdown)
+            self._writer.close(timeout)
+            self._tell()
 
     def discard(self) -> None:
-        """Close without a file: what was logged is dropped, ``path`` stays as it was."""
+        """Close without a file: what was logged is dropped, an older file of that name gets it back."""
         if not self._service_shutdown:
-            self.experiment.disconnect()
             self._service_shutdown = True
-            self._partial.unlink(missing_ok=True)
+            atexit.unregister(self.shutdown)
+            self._writer.discard()
 
     def _checkpoint_state(self) -> dict[str, Any]:
         return {"counters": dict(self._counters)}
@@ -230,12 +281,20 @@ class RerunLogger(Logger):
         self._counters[path] = now + 1
         return now
 
-    def _send_scalars(self, name: str) -> None:
-        steps, values = self._scalars[name]
-        if values:
-            send_scalars(self.experiment, entity_path("metrics", *name.split("/")), steps, values)
-            steps.clear()
-            values.clear()
+    def _send_scalars(self) -> None:
+        with self._lock:
+            waiting, self._scalars = self._scalars, {}
+        for name, (steps, values) in waiting.items():
+            send_scalars(self._writer.stream, entity_path("metrics", *name.split("/")), steps, values)
+
+    def _send_waiting(self) -> None:
+        """Send numbers that wait, and the layout where there is something new to show."""
+        self._send_scalars()
+        shown = len(self._episodes), self._tabs.count()
+        if shown != self._shown:
+            self._shown = shown
+            blueprint = make_blueprint(list(self._episodes.values()), self._tabs.tabs())
+            self._layout.send(self._writer.stream, blueprint)
 
     # ---------------------------------------------------------------- episodes
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable
 from itertools import groupby
+from pathlib import Path
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 
+from lw_torchrl._files import replacing
 from lw_torchrl.envs.episodes import policy_of, run_episodes
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.evaluation.protocol import make_env, tasks_of
@@ -82,7 +84,7 @@ def write_recording(
         policy: who acted, in a word.
     """
     definitions = [definition for task in rollouts if (definition := actor.definition(task)) is not None]
-    with RerunLogger(path) as logger:
+    with replacing(path) as file, RerunLogger(file, exp_name=Path(path).stem) as logger:
         for rollout in rollouts.values():
             log_rollout(logger, rollout, actor.plans, seed=seed, policy=policy, tasks=definitions)
 

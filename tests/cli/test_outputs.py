@@ -36,7 +36,9 @@ def _no_work(monkeypatch):
 
 
 def test_these_are_all_commands_that_write():
-    writing = {name for name, function in COMMANDS.items() if {"out", "screenshot"} & {*function.__annotations__}}
+    writing = {
+        name for name, function in COMMANDS.items() if {"out", "screenshot", "html"} & {*function.__annotations__}
+    }
     assert writing == {*FOLDERS, *FILES}
 
 

@@ -1,23 +1,34 @@
-"""The file of a recording is there whole or not at all."""
+"""The file of a recording has its name from the start, is whole after each write, and spares an older one."""
 
 from __future__ import annotations
 
 import os
+from types import SimpleNamespace
 
 import pytest
 from recordings import Recording, make_rollout
 
 from lw_torchrl.record import RerunLogger
+from lw_torchrl.record.opening import opened
+from lw_torchrl.record.rrd_stream import is_whole
 
 
-def test_no_file_before_the_end(tmp_path):
+def test_the_file_has_its_name_from_the_start(tmp_path):
     path = tmp_path / "a.rrd"
     logger = RerunLogger(path)
     logger.log_scalar("loss", 1.0)
     logger.flush()
-    assert not path.exists()
+    assert os.listdir(tmp_path) == ["a.rrd"]
+    written = path.read_bytes()
+    assert written.startswith(b"RRF2")
+    assert written.endswith(bytes(16)), "it ends as a stream does"
+    assert not is_whole(path)
+    logger.log_scalar("loss", 2.0)
+    logger.flush()
+    assert path.read_bytes().startswith(written[:-16]), "what was written stays as it is"
     logger.shutdown()
     assert os.listdir(tmp_path) == ["a.rrd"]
+    assert is_whole(path)
 
 
 def test_ending_the_experiment_ends_the_logger(tmp_path):
@@ -30,30 +41,48 @@ def test_ending_the_experiment_ends_the_logger(tmp_path):
     assert "/metrics/loss" in Recording(tmp_path / "a.rrd").entities()
 
 
-def test_an_older_file_is_replaced_at_the_end(tmp_path):
+def test_older_files_are_kept(tmp_path):
     path = tmp_path / "a.rrd"
-    path.write_bytes(b"older")
-    with RerunLogger(path) as logger:
-        logger.log_scalar("loss", 1.0)
-        assert path.read_bytes() == b"older"
+    for content in (b"first", b"second"):
+        path.write_bytes(content)
+        with RerunLogger(path) as logger:
+            logger.log_scalar("loss", 1.0)
+    assert logger.previous == tmp_path / "a.previous-2.rrd"
+    assert (tmp_path / "a.previous.rrd").read_bytes() == b"first"
+    assert (tmp_path / "a.previous-2.rrd").read_bytes() == b"second"
     assert "/metrics/loss" in Recording(path).entities()
+    assert len(os.listdir(tmp_path)) == 3
 
 
-def test_an_error_leaves_the_path_untouched(tmp_path):
+def test_an_empty_file_is_no_recording_to_keep(tmp_path):
+    (tmp_path / "a.rrd").touch()
+    with RerunLogger(tmp_path / "a.rrd") as logger:
+        assert logger.previous is None
+    assert os.listdir(tmp_path) == ["a.rrd"]
+
+
+def test_discarding_gives_the_older_file_its_name_back(tmp_path):
     path = tmp_path / "a.rrd"
     path.write_bytes(b"older")
     logger = RerunLogger(path)
-
-    def interrupted():
-        with logger:
-            logger.log_episode(make_rollout(), task="push", objects={})
-            raise KeyError("mine")
-
-    with pytest.raises(KeyError):
-        interrupted()
+    logger.log_episode(make_rollout(), task="push", objects={})
+    logger.flush()
+    logger.discard()
+    logger.discard()
     assert not logger.is_alive
     assert path.read_bytes() == b"older"
     assert os.listdir(tmp_path) == ["a.rrd"]
+
+
+def test_a_file_without_room_for_an_index_stays_as_it_is(tmp_path, monkeypatch):
+    import shutil
+
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=0))
+    with RerunLogger(tmp_path / "a.rrd") as logger:
+        logger.log_scalar("loss", 1.0)
+    assert not is_whole(tmp_path / "a.rrd")
+    with pytest.warns(UserWarning, match="was not closed"), opened(tmp_path / "a.rrd") as copy:
+        assert "/metrics/loss" in Recording(copy).entities()
 
 
 def test_two_loggers_do_not_mix(tmp_path):
@@ -82,4 +111,11 @@ def test_wrong_paths_are_named(tmp_path):
         with pytest.raises(ValueError, match=message):
             RerunLogger(path)
     with pytest.raises(TypeError, match="path must be a path"):
-        RerunLogger(None)
+        RerunLogger(3)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_a_folder_that_may_not_be_written_to(tmp_path):
+    tmp_path.chmod(0o500)
+    with pytest.raises(PermissionError):
+        RerunLogger(tmp_path / "a.rrd")

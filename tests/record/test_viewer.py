@@ -1,16 +1,20 @@
-"""The viewer: opened, made to draw, and a recording refused before it waits for what does not come."""
+"""The viewer: opened at a tab, made to draw, and shown what is left of a recording that was cut."""
 
 from __future__ import annotations
 
 import os
 import stat
-import time
 
 import pytest
 import torch
+from recordings import Recording
+from rerun.chunk import RrdReader
 from tensordict import TensorDict
 
 from lw_torchrl.record import RerunLogger, open_viewer
+from lw_torchrl.record.opening import find_recording, opened
+from lw_torchrl.record.rrd_stream import is_whole
+from lw_torchrl.record.tabs import Tabs
 
 
 def write(path, steps=20):
@@ -61,7 +65,7 @@ def test_wrong_arguments_of_the_viewer(tmp_path):
     (tmp_path / "b.rrd").write_text("no recording")
     with pytest.raises(FileNotFoundError, match="does not exist"):
         open_viewer(tmp_path / "c.rrd")
-    with pytest.raises(FileNotFoundError, match="is a folder"):
+    with pytest.raises(FileNotFoundError, match=r"must hold one recording \(\*\.rrd\), got a\.rrd, b\.rrd"):
         open_viewer(tmp_path)
     with pytest.raises(ValueError, match="is no rerun recording: it begins with b'no r'"):
         open_viewer(tmp_path / "b.rrd")
@@ -87,14 +91,80 @@ def test_a_picture_is_taken_where_the_machine_can_draw(tmp_path):
     assert sorted(os.listdir(tmp_path)) == ["a.png", "a.rrd"]
 
 
-@pytest.mark.parametrize("share", [0.1, 0.5, 0.9, 0.99])
-@pytest.mark.parametrize("picture", [False, True])
-def test_a_cut_recording_is_refused_at_once(tmp_path, share, picture):
-    write(tmp_path / "a.rrd")
+def entities_of_copy(path):
+    """What a viewer would open of a recording that was not closed."""
+    with opened(path) as copy:
+        assert is_whole(copy)
+        return Recording(copy).entities()
+
+
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.9, 0.99])
+def test_what_is_left_of_a_cut_recording_is_shown(tmp_path, share):
+    write(tmp_path / "a.rrd", steps=400)
     content = (tmp_path / "a.rrd").read_bytes()
     (tmp_path / "cut.rrd").write_bytes(content[: int(share * len(content))])
-    started = time.monotonic()
-    with pytest.raises(ValueError, match=r"cut\.rrd' is cut or damaged: "):
-        open_viewer(tmp_path / "cut.rrd", tmp_path / "a.png" if picture else None)
-    assert time.monotonic() - started < 30
+    whole = Recording(tmp_path / "a.rrd").entities()
+    with pytest.warns(UserWarning, match=r"cut\.rrd' was not closed"):
+        found = entities_of_copy(tmp_path / "cut.rrd")
+    assert found <= whole
+    assert len(found) > 1
+    assert "/reach/action" in found or share < 0.9
+
+
+def test_a_recording_of_which_nothing_is_left(tmp_path):
+    write(tmp_path / "a.rrd")
+    (tmp_path / "cut.rrd").write_bytes((tmp_path / "a.rrd").read_bytes()[:50])
+    for picture in (None, tmp_path / "a.png"):
+        with (
+            pytest.warns(UserWarning, match="was not closed"),
+            pytest.raises(ValueError, match=r"cut\.rrd' is damaged: "),
+        ):
+            open_viewer(tmp_path / "cut.rrd", picture)
     assert sorted(os.listdir(tmp_path)) == ["a.rrd", "cut.rrd"]
+
+
+def test_a_damaged_recording_is_refused(tmp_path):
+    write(tmp_path / "a.rrd")
+    content = bytearray((tmp_path / "a.rrd").read_bytes())
+    content[len(content) // 2 : len(content) // 2 + 2000] = bytes(2000)
+    (tmp_path / "a.rrd").write_bytes(content)
+    with pytest.raises(ValueError, match=r"a\.rrd' is damaged: "):
+        open_viewer(tmp_path / "a.rrd")
+
+
+def test_a_folder_stands_for_its_recording(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"must hold one recording .*, got none"):
+        find_recording(tmp_path)
+    for _ in range(2):
+        write(tmp_path / "a.rrd")
+    assert sorted(os.listdir(tmp_path)) == ["a.previous.rrd", "a.rrd"]
+    assert find_recording(tmp_path) == tmp_path / "a.rrd"
+
+
+@pytest.mark.parametrize(
+    ("name", "title", "timeline"),
+    [
+        ("reach", "reach", "step"),
+        ("Metrics", "Metrics", "global_step"),
+        ("metri", "Metrics", "global_step"),
+        ("2", "reach 2", "step"),
+    ],
+)
+def test_a_tab_is_brought_to_the_front(tmp_path, name, title, timeline):
+    rollout = TensorDict({"observation": torch.rand(5, 39), "action": torch.rand(5, 4)}, [5])
+    with RerunLogger(tmp_path / "a.rrd") as logger:
+        for _ in range(2):
+            logger.log_episode(rollout, task="reach", objects={})
+        logger.log_scalar("loss/bc", 1.0)
+    with opened(tmp_path / "a.rrd", name) as copy:
+        assert Recording(copy).entities() == Recording(tmp_path / "a.rrd").entities()
+        reader = RrdReader(copy)
+        tabs = Tabs(reader.stream(store=reader.blueprints()[-1]).to_chunks())
+    (front,) = tabs._values[tabs._root(), "active_tab"]
+    assert tabs._values[front, "display_name"] == [title]
+    assert tabs._values["time_panel", "timeline"] == [timeline]
+    with (
+        pytest.raises(ValueError, match="episode must be one of 'reach', 'reach 2', 'Metrics', got 'rea'"),
+        opened(tmp_path / "a.rrd", "rea"),
+    ):
+        pass

@@ -1,0 +1,101 @@
+"""A training to watch while it runs: curves in groups, what the policy does, and whole rollouts, in one recording.
+
+python examples/rerun_training.py                          # drawer-open and window-open, about two minutes
+python examples/rerun_training.py --connect 127.0.0.1:9876 # the same, live in a viewer: start it with `rerun`
+python examples/rerun_training.py --steps 20               # only to see it run
+lw-torchrl view runs/rerun_training                        # look at it, now or while it trains
+"""
+
+import argparse
+import tempfile
+import time
+import warnings
+
+import torch
+from torchrl.envs import TransformedEnv
+from torchrl.objectives import BCLoss
+
+import lw_torchrl as lw
+
+TASKS = ["drawer-open", "window-open"]
+
+
+def show(logger, env, actor, plans, step, length) -> None:
+    """One rollout of each task: how many succeeded, what was done, and the episodes to look at."""
+    with torch.no_grad():
+        rollout = env.rollout(length, actor.eval())
+    actor.train()
+    success = rollout["next", "success"].any(-2).flatten()
+    for task, done in zip(TASKS, success.tolist(), strict=True):
+        logger.log_scalar(f"success/{task}", done, step=step)
+    logger.log_scalar("success/mean", success.float().mean(), step=step)
+    logger.log_scalar("skills/share of steps", rollout["skill_weights"].mean((0, 1)), step=step)
+    logger.log_histogram("action", rollout["action"], step=step)
+    for row, task in enumerate(TASKS):
+        definition = lw.TASKS[task]
+        logger.log_episode(
+            rollout[row],
+            task=task,
+            objects=definition.positions(rollout[row]["observation"]),
+            plan=plans[task],
+            name=f"{task} after {step}",
+        )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--steps", type=int, default=1000)
+    parser.add_argument("--demonstrations", type=int, default=5)
+    parser.add_argument("--rollouts", type=int, default=4, help="how often the policy is shown")
+    parser.add_argument("--length", type=int, default=150, help="steps of a rollout")
+    parser.add_argument("--out", default="runs/rerun_training/training.rrd")
+    parser.add_argument("--connect", help="the address of a viewer that is open")
+    args = parser.parse_args()
+    torch.manual_seed(0)
+    plans = lw.load_plans("MT10")
+
+    with tempfile.TemporaryDirectory() as root:
+        lw.collect_demonstrations(
+            TASKS,
+            episodes_per_task=args.demonstrations,
+            root=f"{root}/demos",
+            noise_scale=[0.0, 0.1, 0.2],
+            redraw_failures=True,
+        )
+        replay = lw.LanguageWorldExperienceReplay(
+            f"{root}/demos",
+            batch_size=100,
+            sampler=lw.TaskBalancedSampler(),
+            transform=lw.QAFTransform(plans),
+            after_success=20,
+        )
+        actor = lw.PlanConditionedActor(plans)
+        actor.fit_normalization(replay[:]["observation"])
+        warnings.filterwarnings("ignore", message=".*target_actor_network_params")  # BCLoss about itself
+        loss = BCLoss(actor, loss_function="l2")
+        optimizer = torch.optim.AdamW(loss.parameters(), lr=1e-3)
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, args.steps)
+        env = TransformedEnv(lw.LanguageWorldEnv(TASKS, seed=1_000), lw.QAFTransform(plans))
+
+        with lw.RerunLogger(args.out, connect=args.connect) as logger:
+            logger.log_hparams(vars(args) | {"optimizer": {"name": "AdamW", "lr": 1e-3}})
+            began = time.perf_counter()
+            for step in range(args.steps):
+                value = loss(replay.sample())["loss_bc"]
+                optimizer.zero_grad()
+                value.backward()
+                size = torch.nn.utils.clip_grad_norm_(loss.parameters(), 10.0)
+                optimizer.step()
+                schedule.step()
+                if step % 10 == 0:
+                    speed = (step + 1) / (time.perf_counter() - began)
+                    logger.log_metrics({"loss/bc": value, "gradient/norm": size, "speed/steps a second": speed}, step)
+                if (step + 1) % max(1, args.steps // args.rollouts) == 0:
+                    show(logger, env, actor, plans, step + 1, args.length)
+                    print(f"step {step + 1:5}  loss {value.item():.4f}")
+        env.close()
+    print(f"lw-torchrl view {args.out}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,81 @@
+"""A recording as a page: in one file, and served; opened in a browser where there is one."""
+
+from __future__ import annotations
+
+import io
+import threading
+import urllib.request
+from pathlib import Path
+
+import numpy as np
+import pytest
+from chromium import Page, find
+from PIL import Image
+from recordings import PLAN, make_objects, make_rollout
+
+from lw_torchrl.record import RerunLogger, WebPage, write_html
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    path = tmp_path_factory.mktemp("pages") / "a <b> & c.rrd"
+    rollout = make_rollout()
+    with RerunLogger(path) as logger:
+        logger.log_episode(rollout, task="push", objects=make_objects(rollout), plan=PLAN)
+        for step in range(20):
+            logger.log_scalar("loss/bc", step % 3, step=step)
+    return path
+
+
+def shows_the_viewer(page):
+    """The page has loaded, and its canvas is no empty ground: it has many colours."""
+    page.wait_for("document.documentElement.dataset.state", "ready")
+    for _ in range(60):
+        picture = np.asarray(Image.open(io.BytesIO(page.picture())).convert("RGB"))
+        if len(np.unique(picture.reshape(-1, 3), axis=0)) > 200:
+            return
+        page.value("new Promise(done => setTimeout(done, 500))")
+    raise AssertionError("nothing is drawn")
+
+
+def test_one_file_opens_from_disk(tmp_path, recording):
+    file = write_html(recording, tmp_path / "page.html", episode="Metrics")
+    assert file.stat().st_size < 30e6
+    text = file.read_text("utf-8")
+    assert "<title>a &lt;b&gt; &amp; c</title>" in text
+    assert "http://" not in text.split("<script>")[0]
+    assert [path.name for path in tmp_path.iterdir()] == ["page.html"]
+    find()
+    with Page(file.as_uri(), tmp_path) as page:
+        shows_the_viewer(page)
+
+
+def test_a_page_is_served_until_it_is_closed(tmp_path, recording):
+    page = WebPage(recording)
+    server = threading.Thread(target=page.serve)
+    server.start()
+    try:
+        assert page.address.startswith("http://127.0.0.1:")
+        with urllib.request.urlopen(page.address, timeout=20) as answer:
+            assert b'<script src="viewer.js">' in answer.read()
+        with pytest.raises(urllib.error.HTTPError, match="404"):
+            urllib.request.urlopen(page.address + "../etc/passwd", timeout=20)
+        find()
+        with Page(page.address, tmp_path) as browser:
+            shows_the_viewer(browser)
+    finally:
+        page.close()
+        server.join(20)
+    assert not server.is_alive()
+    with pytest.raises(OSError, match="refused"):
+        urllib.request.urlopen(page.address, timeout=5)
+
+
+def test_wrong_pages_are_named(tmp_path, recording):
+    with pytest.raises(ValueError, match=r"page must end in '\.html', got "):
+        write_html(recording, tmp_path / "page.htmx")
+    with pytest.raises(ValueError, match="episode must be one of 'push', 'Metrics', got 'pusch'; did you mean 'push'"):
+        write_html(recording, tmp_path / "page.html", episode="pusch")
+    with pytest.raises(FileNotFoundError, match="does not exist"):
+        WebPage(tmp_path / "none.rrd")
+    assert not list(Path(tmp_path).iterdir())
