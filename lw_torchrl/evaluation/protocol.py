@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import nullcontext
 from typing import Any, Literal
 
 import torch
@@ -21,6 +22,7 @@ from lw_torchrl.evaluation.result import EpisodeResult, EvaluationResult
 from lw_torchrl.evaluation.swaps import answered_by, make_env
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.tasks import TASKS, Task, named_tasks
+from lw_torchrl.modules.networks import evaluating
 from lw_torchrl.modules.policy import Policy, plans_of
 
 _ROWS = 256  # more hardly make a step of all of them cheaper per row, and cost memory
@@ -195,14 +197,12 @@ def evaluate(
     seen: dict[NestedKey, None] = dict.fromkeys(also_record)
     if attribute:
         seen |= dict.fromkeys(keys_to_attribute(actor, env))
-    training = getattr(actor, "training", False)
-    if isinstance(actor, torch.nn.Module):
-        actor.eval()
     found: list[EpisodeResult] = []
     failed: list[FinishedEpisode] = []
     bar = Progress("evaluating", len(names) * episodes_per_task * max_steps, "step", show=progress)
     try:
-        with bar, torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        mode = evaluating(actor) if isinstance(actor, torch.nn.Module) else nullcontext()
+        with mode, bar, torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
             for finished in run_episodes(
                 env,
                 _checked(policy, env, list(seen)),
@@ -219,8 +219,6 @@ def evaluate(
                     on_episode(finished)
     finally:
         env.close()
-        if isinstance(actor, torch.nn.Module):
-            actor.train(training)
     config = {
         "tasks": list(names),
         "episodes_per_task": episodes_per_task,

@@ -120,16 +120,13 @@ def see(task: str, episode: int, steps: TensorDictBase, plans: Plans, given: Ten
     """A failed episode under the policy's plan; ``given`` are the answers it acted on, None for what is recorded."""
     number = len(plans[task].steps)
     truth = plan_program(Plans([plans[task]]))(steps.get("observation"), steps.get("task_id"))[:, :number]
-    if given is None:
-        given = steps.get("qaf", None)
     if (logits := steps.get("qaf_logits", None)) is not None:
         given = logits > 0
-    given = truth if given is None else given[:, :number] > 0.5 if given.dtype != torch.bool else given[:, :number]
+    elif given is None and (recorded := steps.get("qaf", None)) is not None:
+        given = recorded > 0.5
+    given = truth if given is None else given[:, :number]
     weights = steps.get("skill_weights", None)
-    if weights is None:
-        in_force = chosen(given, number)
-    else:
-        in_force = attended(weights, torch.full((len(weights),), number))
+    in_force = chosen(given, number) if weights is None else attended(weights, torch.full((len(weights),), number))
     return Visited(task, episode, steps, truth, given, in_force)
 
 
@@ -169,6 +166,13 @@ def stay(states: Tensor) -> int:
             break
         begin = state
     return begin
+
+
+def in_charge(seen: Visited, plan: ConditionalPlan, step: int) -> str:
+    """How long a step was in force, in words."""
+    late = min(LATE, len(seen.in_force))
+    inside = int((seen.in_force == step)[-late:].sum())
+    return f"step {step + 1}, '{plan.steps[step].skill}', was in force in {inside} of the last {late} states"
 
 
 def explain(
@@ -225,7 +229,7 @@ def explain(
     inside = seen.in_force == stuck
     evidence["in_step_late"] = float(inside[-late:].float().mean())
     steps["skill"], at["skill"] = stuck, stay(inside)
-    told = f"step {stuck + 1}, '{plan.steps[stuck].skill}', was in force in {int(inside[-late:].sum())} of the last {late} states"
+    told = in_charge(seen, plan, stuck)
     if scripts.known[seen.task][stuck]:
         far = float(scripts.distance(observation[-1:], task_id[-1:], stuck))
         evidence["distance_at_end"] = far
