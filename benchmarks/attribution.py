@@ -57,7 +57,7 @@ class Arguments:
     """Of each task, fault and step."""
     seed: int = 2000
     """Of the episodes."""
-    max_steps: int = 300
+    max_steps: int = 200
     """Steps of an episode; with --policy 500 is usual."""
     policies: tuple[str, ...] = ("scripted", "learned")
     """Who acts: the scripted skills, and a policy trained on what they did."""

@@ -46,6 +46,7 @@ def plot_failures(result: EvaluationResult, path: str | os.PathLike[str] | None 
         '1 of 1 episode failed'
     """
     from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
 
     check_image(path)
     failures, trials = attributed(result), result.config["episodes_per_task"]
@@ -62,7 +63,7 @@ def plot_failures(result: EvaluationResult, path: str | os.PathLike[str] | None 
         for task, number in zip(tasks, numbers, strict=True):
             left[task] += number
     axes.set_xlim(0, trials * 1.02)
-    axes.xaxis.get_major_locator().set_params(integer=True)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.margins(y=0.5 / max(1, len(tasks)))
     axes.set_xlabel(f"failed episodes (of {trials}; tasks without any are left out)")
     episodes = counted(trials * len(counts), "episode")
