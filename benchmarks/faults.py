@@ -70,8 +70,8 @@ class Liar(TensorDictModuleBase):
 
 
 class Clumsy(TensorDictModuleBase):
-    """A policy that misses by 10 cm while the skill of one step of each plan is in force: it is shown the hand, or, where
-    it moves an object, the goal, in another place. Other plans have its clumsy skill wherever they name it.
+    """A policy that misses by 10 cm while the skill of one step of each plan is in force: it is shown the hand, or the
+    goal where it moves an object, in another place. Other plans have its clumsy skill wherever they name it.
 
     Args:
         actor: a policy with plans.
