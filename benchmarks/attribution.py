@@ -156,12 +156,12 @@ def train(args: Arguments, plans: lw.Plans) -> lw.Policy:
         root=data,
         policy="scripted",
         seed=0,
-        noise_scale=(0.0, 0.1, 0.2),
-        noise_hold=10,
+        noise_scale=(0.05, 0.1, 0.2),
         max_steps=150,
         progress=False,
     )
-    replay = lw.LanguageWorldExperienceReplay(data, sampler=lw.TaskBalancedSampler(), after_success=20)
+    sampler = lw.TaskBalancedSampler()
+    replay = lw.LanguageWorldExperienceReplay(data, label="executed", sampler=sampler, after_success=20)
     torch.manual_seed(0)
     actor = lw.PlanConditionedActor(plans, features="both", width=192)
     transform = actor.transform()

@@ -96,8 +96,8 @@ class Clumsy(TensorDictModuleBase):
         tensordict = self.actor(tensordict)
         observation = tensordict.get("observation")
         rows = self._tables.rows(tensordict.get("task_id"))
-        step = attended(tensordict.get("skill_weights"), self._tables.mask[rows].sum(-1))
-        chosen, hand = self._chosen[rows, step], self._hand[rows, step]
+        step = attended(tensordict.get("skill_weights"), self._tables.mask[rows])
+        chosen, hand = self._chosen[rows, step] & (step >= 0), self._hand[rows, step]
         shown = observation.clone()
         shown[:, [0, 18]] -= OFFSET * (chosen & hand).unsqueeze(-1)
         shown[:, 36] += OFFSET * (chosen & ~hand)

@@ -146,7 +146,7 @@ def attribute_failures(
         progress=progress,
     )
     exchanges = Exchanges(actor, answered, evaluator, trusted, scripts, table, again)
-    exchanges.run(seen)
+    exchanges.run(seen, [which for which, one in told.items() if one.evidence.get("plan_departs") == 0.0])
     shares = exchanges.shares()
     return [by_exchanges(one, told[one.task, one.episode], exchanges, shares.get(one.task, {}), seed) for one in seen]
 

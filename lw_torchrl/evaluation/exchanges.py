@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -66,8 +66,13 @@ class Exchanges:
     def _unmended(self, which: Sequence[Which], names: Iterable[str]) -> list[Which]:
         return [one for one in which if not any(self.mends(name, one) for name in names)]
 
-    def run(self, seen: Sequence[Visited]) -> None:
-        """All exchanges that are worth it."""
+    def run(self, seen: Sequence[Visited], same: Collection[Which] = ()) -> None:
+        """All exchanges that are worth it.
+
+        Args:
+            seen: the episodes.
+            same: those in whose states the reference never asks for anything else, so that it mends nothing.
+        """
         every = [(one.task, one.episode) for one in seen]
         wrong = [w for w, one in zip(every, seen, strict=True) if bool((one.given != one.truth).any())]
         with_reference = [w for w in every if self.reference is not None and w[0] in self.reference]
@@ -77,7 +82,8 @@ class Exchanges:
             self._run("query", "true answers", wrong, true, self.plans)
         self._skills(seen)
         self._run("plan", "the reference plan", with_reference, self.other, self.reference, self.other_evaluator)
-        left = self._unmended(every, ("query", "skill", "skills", "plan"))
+        left = self._unmended(every, ("query", "skill", "skills"))
+        left = [one for one in left if one in same or not self.mends("plan", one)]
         self._run("time", "twice the time", left, self.actor, self.plans, self.evaluator, longer=2)
         left = self._unmended(left, ("time",))
         if can_answer:
@@ -140,7 +146,7 @@ class Exchanges:
 
 
 def unlike_scripts(actor: Any, seen: Visited, scripts: Scripts) -> Tensor | None:
-    """(T,) bool, the states in which the policy does something else than the scripted skill of the step it is in.
+    """(T,) bool, the states in which the policy does something else than the scripted skills of the steps it is in.
 
     None where it cannot be asked, since it reads what was not recorded or draws its actions.
     """
@@ -155,7 +161,7 @@ def unlike_scripts(actor: Any, seen: Visited, scripts: Scripts) -> Tensor | None
         states.set("qaf", torch.nn.functional.pad(seen.given, (0, width - seen.given.shape[1])))
     with torch.no_grad(), evaluating(actor):
         action = actor(states.to(device_of(actor))).get("action").cpu()
-    rows = torch.arange(len(action))
-    wanted = scripts.program(seen.steps.get("observation"), seen.steps.get("task_id"))[rows, seen.in_force]
+    program = scripts.program(seen.steps.get("observation"), seen.steps.get("task_id"))[:, : seen.weights.shape[1]]
+    wanted = (seen.weights.unsqueeze(-1) * program).sum(-2)
     unscripted = ~torch.tensor(scripts.known[seen.task])[seen.in_force]
-    return ((action - wanted).abs().amax(-1) > _SAME) | unscripted
+    return (seen.in_force >= 0) & (((action - wanted).abs().amax(-1) > _SAME) | unscripted)

@@ -23,6 +23,7 @@ from lw_torchrl.language.plan_tables import PlanTables
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.tasks import TASKS, Task, task_id
 from lw_torchrl.modules.networks import evaluating
+from lw_torchrl.modules.plan_encoder import IN_FORCE
 from lw_torchrl.modules.policy import transform_of
 from lw_torchrl.modules.query_evaluator import QueryEvaluator
 from lw_torchrl.transforms.qaf import plan_program
@@ -88,14 +89,15 @@ def answered_by(actor: Any, evaluator: Any) -> Any:
 
 
 class WithScripts(nn.Module):
-    """A policy whose action is a scripted skill's while some steps of its plan are in force, and the expert's where
-    their skills are no scripted ones.
+    """A policy whose skills are scripted ones: its attention mixes their actions, where it singles any steps out.
+
+    Where the step in force has no scripted skill, the action is the expert's.
 
     Args:
-        actor: the policy; its plan and its answers stay as they are.
+        actor: the policy; its plan, its answers and its attention stay as they are.
         plans: its plans.
         scripts: of their steps.
-        steps: the step in which it is replaced, for each episode; None for all of them.
+        steps: for each episode, the step whose attention the scripts wait for; None to act wherever there is any.
     """
 
     def __init__(self, actor: Acts, plans: Plans, scripts: Scripts, steps: Mapping[Which, int] | None) -> None:
@@ -112,22 +114,29 @@ class WithScripts(nn.Module):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         seen = tensordict.select("observation", "task_id", "episode", "_step", strict=False).clone()
         tensordict = self.actor(tensordict)
-        action, weights = tensordict.get("action"), tensordict.get("skill_weights", None)
-        task, device = seen.get("task_id"), action.device
+        action, task = tensordict.get("action"), seen.get("task_id")
         rows = self._tables.rows(task)
-        weights = tensordict.get("qaf").float() if weights is None else weights
-        step = attended(weights, self._tables.mask.to(device)[rows].sum(-1))
-        here = torch.arange(len(step), device=device)
-        proper = self.scripts.program(seen.get("observation"), task)[here, step].to(action.dtype)
-        known = self._known.to(device)[rows, step]
-        replaced = torch.ones_like(known)
+        mask, known = self._tables.mask.to(action.device)[rows], self._known.to(action.device)[rows]
+        weights = tensordict.get("skill_weights", None)
+        if weights is None:
+            truth = tensordict.get("qaf") & mask
+            first = torch.where(truth.any(-1), truth.int().argmax(-1), mask.sum(-1) - 1)
+            weights = torch.nn.functional.one_hot(first, mask.shape[-1]).float()
+        step = attended(weights, mask)
+        replaced = step >= 0
         if self._steps is not None:
             which = zip(task.tolist(), seen.get("episode").tolist(), strict=True)
-            replaced = torch.tensor([self._steps.get(one, -1) for one in which], device=device) == step
-        if self._expert is not None and (asked := replaced & ~known).any():
-            seen = seen.set("_step", asked).cpu()
-            expert = self._expert(seen).get("action").to(device)
-            proper = torch.where(known.unsqueeze(-1), proper, expert)
+            asked = torch.tensor([self._steps.get(one, -1) for one in which], device=action.device)
+            there = weights.gather(-1, asked.clamp(min=0).unsqueeze(-1)).squeeze(-1) > IN_FORCE
+            replaced = replaced & there & (asked >= 0)
+        scripted = (weights * known).unsqueeze(-1) * self.scripts.program(seen.get("observation"), task)
+        proper = scripted.sum(-2).to(action.dtype)
+        unknown = ~known.gather(-1, step.clamp(min=0).unsqueeze(-1)).squeeze(-1)
+        if self._expert is None:
+            replaced = replaced & ~unknown
+        elif (needed := replaced & unknown).any():
+            expert = self._expert(seen.set("_step", needed).cpu()).get("action").to(action.device)
+            proper = torch.where(unknown.unsqueeze(-1), expert, proper)
         return tensordict.set("action", torch.where(replaced.unsqueeze(-1), proper, action))
 
 

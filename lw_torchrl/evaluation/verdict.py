@@ -89,11 +89,10 @@ def by_exchanges(
         swaps[shown] = swaps.get(shown, False) or name in mended
     cause: Cause = "undecided"
     also: Cause | None = None
-    best = decide(mended, shares)
+    same = told.evidence.get("plan_departs") == 0.0
+    best = decide([name for name in mended if not (same and name == "plan")], shares)
     pair = None if best else decide_pair(mended, shares)
-    if best == "plan" and told.evidence["plan_departs"] == 0.0:
-        words = "With the reference plan it succeeds, though in no state that asks for anything else"
-    elif best is not None:
+    if best is not None:
         cause = _CAUSE[best]
         words = f"With {_WORDS[best]} the same episode succeeds, at step {tried[best]}"
         if others := [name for name in mended if name in _ORDER and name != best]:
@@ -101,6 +100,8 @@ def by_exchanges(
     elif pair is not None:
         cause, also = pair
         words = f"Neither {_PARTS[cause]} nor {_PARTS[also]} alone mend it, both together do"
+    elif same and "plan" in mended:
+        words = "With the reference plan it succeeds, though in no state that asks for anything else"
     elif told.cause == "query" and "query" not in tried:
         cause, words = "query", "These answers could not be exchanged"
     elif tried:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torch.nn.functional import one_hot
 
 from lw_torchrl.evaluation.failures import Cause
 from lw_torchrl.language.named_objects import GRIPPER
@@ -35,7 +36,8 @@ class Visited(NamedTuple):
         steps: TensorDict of batch (T,).
         truth: (T, S) bool, the query answering function's own answers.
         given: (T, S) bool, those that the policy acted on.
-        in_force: (T,) int64, the step of the plan that the policy was in.
+        weights: (T, S) float32, the policy's attention over the plan's steps.
+        in_force: (T,) int64, the step with most of it; -1 where all have the same, so that none is in force.
     """
 
     task: str
@@ -43,6 +45,7 @@ class Visited(NamedTuple):
     steps: TensorDictBase
     truth: Tensor
     given: Tensor
+    weights: Tensor
     in_force: Tensor
 
 
@@ -107,13 +110,21 @@ def chosen(truth: Tensor, steps: int) -> Tensor:
 
 
 def attended(weights: Tensor, steps: Tensor) -> Tensor:
-    """(..., S) attention and how many steps (...) there are to (...) int64: the first of those with most weight, the
-    last step where all have the same."""
-    there = torch.arange(weights.shape[-1], device=weights.device) < steps.unsqueeze(-1)
-    most = weights.masked_fill(~there, -1.0).amax(-1, keepdim=True)
-    least = weights.masked_fill(~there, 2.0).amin(-1, keepdim=True)
-    first = (there & (weights >= most - 1e-6)).int().argmax(-1)
-    return torch.where((most - least).squeeze(-1) < 1e-3, steps - 1, first)
+    """The step in force: the first of those with most attention; -1 where all steps have the same, since no condition
+    holds or every one does.
+
+    Args:
+        weights: (..., S) float32.
+        steps: (..., S) bool, those that there are.
+
+    Returns:
+        (...) int64.
+    """
+    most = weights.masked_fill(~steps, -1.0).amax(-1, keepdim=True)
+    least = weights.masked_fill(~steps, 2.0).amin(-1, keepdim=True)
+    first = (steps & (weights >= most - 1e-6)).int().argmax(-1)
+    none = ((most - least).squeeze(-1) < 1e-3) & (steps.sum(-1) > 1)
+    return torch.where(none, -1, first)
 
 
 def see(task: str, episode: int, steps: TensorDictBase, plans: Plans, given: Tensor | None) -> Visited:
@@ -126,8 +137,9 @@ def see(task: str, episode: int, steps: TensorDictBase, plans: Plans, given: Ten
         given = recorded > 0.5
     given = truth if given is None else given[:, :number]
     weights = steps.get("skill_weights", None)
-    in_force = chosen(given, number) if weights is None else attended(weights, torch.full((len(weights),), number))
-    return Visited(task, episode, steps, truth, given, in_force)
+    weights = one_hot(chosen(given, number), number).float() if weights is None else weights[:, :number]
+    in_force = attended(weights, torch.ones_like(weights, dtype=torch.bool))
+    return Visited(task, episode, steps, truth, given, weights, in_force)
 
 
 def candidates(seen: Visited, among: Tensor | None = None) -> list[int]:
@@ -140,7 +152,7 @@ def candidates(seen: Visited, among: Tensor | None = None) -> list[int]:
     """
     late = torch.zeros(len(seen.in_force), dtype=torch.bool)
     late[-LATE:] = True
-    counted = torch.ones_like(late) if among is None else among
+    counted = seen.in_force >= 0 if among is None else (seen.in_force >= 0) & among
     if not counted.any():
         return []
     ranked: list[int] = []
@@ -186,9 +198,8 @@ def explain(
     plan, length = plans[seen.task], len(seen.in_force)
     observation, task_id = seen.steps.get("observation"), seen.steps.get("task_id")
     late = min(LATE, length)
-    listed = candidates(seen)
-    stuck = listed[0]
-    steps: dict[str, int | None] = {"out of time": int(seen.in_force[-1]), "undecided": stuck}
+    stuck = next(iter(candidates(seen)), len(plan.steps) - 1)
+    steps: dict[str, int | None] = {"out of time": stuck, "undecided": stuck}
     at = {"out of time": length - 1, "undecided": stay(seen.in_force == stuck)}
     why, evidence = {}, {"states": float(length)}
 
@@ -235,8 +246,7 @@ def explain(
         evidence["distance_at_end"] = far
         told += f" and ended {100 * far:.0f} cm from where it goes"
     why["skill"] = told
-    why["out of time"] = f"step {int(seen.in_force[-1]) + 1} was in force at the end"
-    why["undecided"] = told
+    why["out of time"] = why["undecided"] = told
 
     cause: Cause = "undecided"
     if share >= WRONG:

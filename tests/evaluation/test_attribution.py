@@ -135,6 +135,15 @@ def test_the_rule_alone_runs_nothing_and_is_weaker():
     assert (found.cause, found.evidence["answers_wrong"]) == ("query", 1.0)
 
 
+def test_a_hole_in_the_plan_is_no_skill_s_fault():
+    """Where no condition holds, networks attend to all steps: scripts in their place would fill the hole."""
+    pairs = [(str(step.condition), step.skill) for step in PLANS[TASK].steps]
+    holed = lw.Plans({TASK: lw.ConditionalPlan.from_pairs(TASK, pairs[1:])})
+    [failure] = evaluated(still(plans=holed)).failures
+    assert (failure.cause, failure.swaps) == ("undecided", {"time": False})
+    assert failure.evidence["no_condition_late"] == 1.0
+
+
 # ---- every kind of policy
 
 
@@ -146,9 +155,9 @@ class Still(lw.PlanConditionedActor):
         return (torch.zeros_like(action), *rest)
 
 
-def still(**options):
+def still(plans=PLANS, **options):
     torch.manual_seed(0)
-    return Still(PLANS, width=8, depth=1, **options)
+    return Still(plans, width=8, depth=1, **options)
 
 
 @pytest.mark.parametrize("wrapped", [lambda a: a, lambda a: lw.ActorEnsemble([a, still()])])
@@ -222,8 +231,9 @@ def test_of_two_causes_the_certain_one_comes_first_or_the_one_that_mends_more():
 
 
 def test_the_step_in_force():
-    weights = torch.tensor([[0.4999, 0.5, 0.0001], [1 / 3] * 3, [0.5, 0.5, 0.0]])
-    assert attended(weights, torch.tensor([3, 3, 2])).tolist() == [1, 2, 1]
+    weights = torch.tensor([[0.4999, 0.5, 0.0001], [1 / 3] * 3, [0.5, 0.5, 0.0], [1.0, 0.0, 0.0]])
+    steps = torch.arange(3) < torch.tensor([[3], [3], [2], [1]])
+    assert attended(weights, steps).tolist() == [1, -1, -1, 0]
     answers = torch.tensor([[False, True, True], [False, False, False], [False, False, True]])
     assert chosen(answers, 3).tolist() == [1, 2, 2]
     assert chosen(answers, 2).tolist() == [1, 1, 1], "what is beyond the last step is none"
