@@ -28,8 +28,8 @@ def failure_table(tasks: Sequence[str], episodes_per_task: int, failures: Sequen
 
     Example:
         >>> print(failure_table(["reach"], 20, [Failure("reach", 0, 3, "skill", None, 1, 40, "It missed.")]))
-        task         failed  query   plan  skill  out of time  undecided
-        reach       1 of 20      0      0      1            0          0
+        task       failed  query   plan  skill  out of time  undecided
+        reach     1 of 20      0      0      1            0          0
     """
     width = max(len("task"), len("all"), *map(len, tasks))
     lines = [f"{'task':{width}}  {'failed':>10}  " + "  ".join(f"{cause:>5}" for cause in CAUSES)]
