@@ -18,6 +18,7 @@ if TYPE_CHECKING:  # the table below, for type checkers and editors
     from lw_torchrl.envs import ExpertActor as ExpertActor
     from lw_torchrl.envs import LanguageWorldEnv as LanguageWorldEnv
     from lw_torchrl.evaluation import EvaluationResult as EvaluationResult
+    from lw_torchrl.evaluation import attribute_failures as attribute_failures
     from lw_torchrl.evaluation import evaluate as evaluate
     from lw_torchrl.evaluation import plot_success as plot_success
     from lw_torchrl.language.decoded import DecodedPlan as DecodedPlan
@@ -84,7 +85,7 @@ _NAMES = {
     "lw_torchrl.data": "Behaviour CoLearningSampler EpisodeFilter LanguageWorldExperienceReplay TaskBalancedSampler "
     "collect_demonstrations",
     "lw_torchrl.envs": "ExpertActor LanguageWorldEnv",
-    "lw_torchrl.evaluation": "EvaluationResult evaluate plot_success",
+    "lw_torchrl.evaluation": "EvaluationResult attribute_failures evaluate plot_success",
     "lw_torchrl.language.decoded": "DecodedPlan DecodedStep",
     "lw_torchrl.language.decoding": "decode_plan",
     "lw_torchrl.language.formats": "PLAN_FORMATS encode_plan",

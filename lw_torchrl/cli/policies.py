@@ -200,6 +200,8 @@ def evaluate(
     noise: float = 0.1,
     stop_at_success: bool = False,
     num_envs: int | None = None,
+    attribute: bool = False,
+    reference: tuple[str, ...] = (),
     out: Path | None = None,
     device: str = "cpu",
 ) -> None:
@@ -220,14 +222,21 @@ def evaluate(
         noise: standard deviation of the noise on the executed action.
         stop_at_success: end an episode at its first success; any-step success stays the same.
         num_envs: environments stepped together; the result does not depend on it.
-        out: folder for results.json, success.png and rollout.rrd.
+        attribute: say of each failed episode whether a query, the plan or a skill was at fault, or time; they are run
+            again a few times.
+        reference: with --attribute, plans that are trusted, for failed episodes to be run again with: MT10, MT50, .plan
+            or .json files, or folders.
+        out: folder for results.json, success.png and rollout.rrd; with --attribute also failures.png.
         device: where the networks work: cpu; cuda, or cuda:1 for the second of several; mps, a Mac's; or auto, the GPU
             where there is one. The simulation is always on the CPU.
     """
     if out is not None:
         check_folder("--out", out)
+    if reference and not attribute:
+        raise ValueError("--reference is for --attribute, which runs failed episodes again with these plans")
     import lw_torchrl as lw
     from lw_torchrl._devices import check_device
+    from lw_torchrl.evaluation import plot_failures
     from lw_torchrl.record.rollouts import rollout_tasks, write_recording
 
     use_one_thread()
@@ -244,6 +253,8 @@ def evaluate(
         chosen = _default_tasks(policy, checkpoint, trained=not plans)
     if policy is None and there.type != "cpu":
         raise ValueError("--device is for a policy; the scripted experts work on the CPU")
+    if attribute and (policy is None or policy.plans is None):
+        raise ValueError(f"--attribute is for a policy with plans, {checkpoint} has none")
     result = lw.evaluate(
         policy or lw.ExpertActor(chosen),
         tasks=chosen,
@@ -253,14 +264,20 @@ def evaluate(
         stop_at_success=stop_at_success,
         num_envs=num_envs,
         device=there,
+        attribute=attribute,
+        reference=read_plans(reference, known) if reference else None,
     )
     print(result.table())
+    if attribute:
+        print(f"\n{result.failure_table()}")
     if out is not None:
         told: dict[str, Any] = {} if policy is None else {"checkpoint": checkpoint}
         if policy is not None and policy.plans is not None:
             told["plans"] = policy.plans.fingerprint
         result.save(out / "results.json", **told)
         lw.plot_success(result, out / "success.png", title=f"{checkpoint}, {episodes} episodes a task")
+        if attribute:
+            plot_failures(result, out / "failures.png", title=str(checkpoint))
         if policy is not None:
             shown: list[str | Task] = list(result.config["tasks"][:3])
             rollouts = rollout_tasks(policy, shown, seed=seed, noise_scale=noise)

@@ -1,7 +1,10 @@
 """Evaluation: exactly k episodes of each task, their results, statistics over seeds, and figures."""
 
 import lw_torchrl._torchrl  # noqa: F401
+from lw_torchrl.evaluation.attribution import attribute_failures
 from lw_torchrl.evaluation.comparison import MethodComparison, Pair
+from lw_torchrl.evaluation.failure_figure import plot_failures
+from lw_torchrl.evaluation.failures import CAUSES, Failure
 from lw_torchrl.evaluation.figures import plot_sorted_tasks, plot_success
 from lw_torchrl.evaluation.learning_curves import plot_learning_curves
 from lw_torchrl.evaluation.method_figure import plot_methods
@@ -21,20 +24,24 @@ from lw_torchrl.evaluation.stuck_steps import StuckStep, stuck_steps, stuck_tabl
 from lw_torchrl.evaluation.summary import Summary, TaskSummary, summarize, summarize_rates
 
 __all__ = [
+    "CAUSES",
     "EpisodeResult",
     "Estimate",
     "EvaluationResult",
+    "Failure",
     "MethodComparison",
     "Pair",
     "PlanUse",
     "StuckStep",
     "Summary",
     "TaskSummary",
+    "attribute_failures",
     "count_solved",
     "evaluate",
     "interquartile_mean",
     "mean_difference",
     "mean_rate",
+    "plot_failures",
     "plot_learning_curves",
     "plot_methods",
     "plot_sorted_tasks",

@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import nullcontext
 from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from lw_torchrl._checks import check_int, check_scale, unknown_name
 from lw_torchrl._progress import Progress
 from lw_torchrl.envs.episodes import FinishedEpisode, policy_of, read_action, run_episodes
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
+from lw_torchrl.evaluation.attribution import attribute_failures, keys_to_attribute
 from lw_torchrl.evaluation.result import EpisodeResult, EvaluationResult
+from lw_torchrl.evaluation.swaps import answered_by, make_env
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.tasks import TASKS, Task, named_tasks
-from lw_torchrl.modules.policy import Policy, plans_of, transform_of
+from lw_torchrl.modules.networks import evaluating
+from lw_torchrl.modules.policy import Policy, plans_of
 
 _ROWS = 256  # more hardly make a step of all of them cheaper per row, and cost memory
 
@@ -44,12 +48,6 @@ def tasks_of(tasks: str | Task | Iterable[str | Task], plans: Plans | None) -> d
     """The tasks by name; a name of the user's own stands for the task that its plan is for."""
     own = {} if plans is None else {plan.task: plan.definition for plan in plans.values() if plan.task not in TASKS}
     return named_tasks(tasks, known={**TASKS, **own})
-
-
-def make_env(actor: Any, plans: Plans | None, base: LanguageWorldEnv) -> EnvBase:
-    """The environment with what must run before the actor, and the answers to the plans' queries beside it."""
-    transform = transform_of(actor, plans)
-    return base if transform is None else TransformedEnv(base, transform)
 
 
 def _result(task: str, episode: int, steps: TensorDictBase, stopped_early: bool, keep_actions: bool) -> EpisodeResult:
@@ -105,6 +103,9 @@ def evaluate(
     also_record: Sequence[NestedKey] = (),
     on_episode: Callable[[FinishedEpisode], object] | None = None,
     device: str | torch.device | None = None,
+    evaluator: Any = None,
+    attribute: bool = False,
+    reference: Plans | Mapping[str, ConditionalPlan] | None = None,
 ) -> EvaluationResult:
     """Run episodes 0 to k - 1 of each task and report how they went.
 
@@ -134,16 +135,24 @@ def evaluate(
             ``("next", "reward")`` and those of ``also_record``.
         device: where the actor works: "cpu", "cuda", "cuda:1", "mps", or "auto"; it is moved there, and stays. None for
             where it is. The environment and its queries are always on the CPU.
+        evaluator: answers the conditions in the query answering function's place, between it and the actor, as for
+            :func:`attribute_failures`; None for exact truth.
+        attribute: say of each failed episode why it failed, see :func:`attribute_failures`; these are run again a few
+            times.
+        reference: trusted plans for the same tasks, with which failed episodes are run again.
 
     Warns:
-        UserWarning: a simulation became unstable; its episode ends there, a failure unless it had succeeded.
+        UserWarning: a simulation became unstable; its episode ends there, a failure unless it had succeeded. The actor
+            cannot carry out the reference.
 
     Returns:
-        The result; ``.success_once`` maps each task to its success rate.
+        The result; ``.success_once`` maps each task to its success rate. With ``attribute``, ``.failures`` says why
+        episodes failed, ``.failure_table()`` counts.
 
     Raises:
         ValueError: a wrong argument, plans that differ from the actor's, a task without a plan or not among the
-            actor's, a key in ``also_record`` that nobody writes, or an actor that gives NaN.
+            actor's, a key in ``also_record`` that nobody writes, an actor that gives NaN, or ``attribute`` without
+            plans.
 
     Example:
         >>> import lw_torchrl as lw
@@ -163,6 +172,10 @@ def evaluate(
         raise ValueError(
             f"tasks must be among the actor's, {', '.join(known)}; it was not made for: {', '.join(other)}"
         )
+    if attribute and answered is None:
+        raise ValueError("attribute must be False for an actor without plans, unless plans are given")
+    if reference is not None and not attribute:
+        raise ValueError("reference is for attribute=True, which runs failed episodes again with it")
     check_int("episodes_per_task", episodes_per_task, minimum=1)
     check_scale("noise_scale", noise_scale)
     most = len(names) * episodes_per_task  # a row more would have nothing to do
@@ -179,31 +192,33 @@ def evaluate(
         max_steps=max_steps,
         strict=True,
     )
-    env = make_env(actor, answered, base)
-    policy = policy_of(actor, device)
-    training = getattr(actor, "training", False)
-    if isinstance(actor, torch.nn.Module):
-        actor.eval()
+    env = make_env(actor, answered, base, evaluator)
+    policy = policy_of(answered_by(actor, evaluator), device)
+    seen: dict[NestedKey, None] = dict.fromkeys(also_record)
+    if attribute:
+        seen |= dict.fromkeys(keys_to_attribute(actor, env))
     found: list[EpisodeResult] = []
+    failed: list[FinishedEpisode] = []
     bar = Progress("evaluating", len(names) * episodes_per_task * max_steps, "step", show=progress)
     try:
-        with bar, torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        mode = evaluating(actor) if isinstance(actor, torch.nn.Module) else nullcontext()
+        with mode, bar, torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
             for finished in run_episodes(
                 env,
-                _checked(policy, env, also_record),
+                _checked(policy, env, list(seen)),
                 {task: range(episodes_per_task) for task in names},
-                keys=["action", ("next", "success"), ("next", "reward"), *also_record],
+                keys=["action", ("next", "success"), ("next", "reward"), *seen],
                 noise=(lambda _: (noise_scale,) * 4) if noise_scale else None,
                 after_success=0 if stop_at_success else None,
                 on_progress=bar.update,
             ):
                 found.append(_result(*finished, stop_at_success, record_actions))
+                if attribute and not found[-1].success:
+                    failed.append(finished)
                 if on_episode is not None:
                     on_episode(finished)
     finally:
         env.close()
-        if isinstance(actor, torch.nn.Module):
-            actor.train(training)
     config = {
         "tasks": list(names),
         "episodes_per_task": episodes_per_task,
@@ -213,4 +228,24 @@ def evaluate(
         "reward": reward,
         "max_steps": max_steps,
     }
-    return EvaluationResult(config, tuple(sorted(found, key=lambda e: (e.task, e.episode))))
+    failures = None
+    if attribute:
+        assert answered is not None
+        failures = tuple(
+            attribute_failures(
+                sorted(failed, key=lambda episode: (episode.task, episode.episode)),
+                answered,
+                actor=actor,
+                reference=reference,
+                evaluator=evaluator,
+                seed=seed,
+                noise_scale=noise_scale,
+                max_steps=max_steps,
+                num_envs=num_envs,
+                engine=engine,
+                num_threads=num_threads,
+                device=device,
+                progress=progress,
+            )
+        )
+    return EvaluationResult(config, tuple(sorted(found, key=lambda e: (e.task, e.episode))), failures=failures)

@@ -16,6 +16,8 @@ from torch import Tensor
 
 from lw_torchrl._files import read_json, write_json
 from lw_torchrl._versions import package_versions
+from lw_torchrl.evaluation.failure_table import failure_table, read_failures
+from lw_torchrl.evaluation.failures import Failure
 
 FORMAT = "lw_torchrl.evaluation"
 FORMAT_VERSION = 1
@@ -54,11 +56,14 @@ class EvaluationResult:
         origin: what it came from, once it was saved: ``date`` (UTC, ISO 8601), ``versions`` of the packages and, if
             they were told, ``checkpoint`` (``path`` and ``sha256``) and ``plans``. Results that differ in it alone are
             equal.
+        failures: why each failed episode failed, by task and episode, where :func:`evaluate` was asked to attribute
+            them; None where it was not.
     """
 
     config: dict[str, Any]
     episodes: tuple[EpisodeResult, ...]
     origin: dict[str, Any] = field(default_factory=dict, compare=False)
+    failures: tuple[Failure, ...] | None = None
 
     def _by_task(self, value: Callable[[list[EpisodeResult]], float | None]) -> dict[str, float | None]:
         found: dict[str, list[EpisodeResult]] = {}
@@ -118,6 +123,7 @@ class EvaluationResult:
         if plans is not None:
             origin["plans"] = plans
         episodes = [{k: v for k, v in asdict(e).items() if k != "actions"} for e in self.episodes]
+        failures = {} if self.failures is None else {"failures": [asdict(failure) for failure in self.failures]}
         write_json(
             path,
             {
@@ -131,6 +137,7 @@ class EvaluationResult:
                 "first_success": self.first_success,
                 "mean_return": self.mean_return,
                 "episodes": episodes,
+                **failures,
             },
         )
 
@@ -153,7 +160,8 @@ class EvaluationResult:
             episodes = _read_episodes(found["episodes"], config)
             if not isinstance(found["success_once"], dict) or set(found["success_once"]) != set(config["tasks"]):
                 raise ValueError("the tasks of its success_once are not those of its config")
-            return cls(config, episodes, origin)
+            failures = read_failures(found["failures"], config, episodes) if "failures" in found else None
+            return cls(config, episodes, origin, failures)
         except FileNotFoundError:
             raise FileNotFoundError(
                 f"path: no result file {str(path)!r}; evaluate(...).save(path) writes one"
@@ -180,6 +188,22 @@ class EvaluationResult:
             lines.append(row(task, rate, self.success_at_end[task], self.first_success[task]))
         lines.append(row("mean", self.mean_success, _mean(list(self.success_at_end.values())), None))
         return "\n".join(lines)
+
+    def failure_table(self) -> str:
+        """Why episodes failed, as text in columns: a row for each task, a column for each cause, and the numbers of
+        episodes.
+
+        Raises:
+            ValueError: the failures were not attributed.
+        """
+        return failure_table(self.config["tasks"], self.config["episodes_per_task"], attributed(self))
+
+
+def attributed(result: EvaluationResult) -> tuple[Failure, ...]:
+    """The failures; :class:`ValueError` where they were not attributed."""
+    if result.failures is None:
+        raise ValueError("the result has no failures: they are attributed by evaluate(..., attribute=True)")
+    return result.failures
 
 
 def _mean(values: list[Any]) -> float | None:

@@ -239,6 +239,18 @@ def test_evaluate_writes_result_figure_and_recording(capsys, checkpoint, tmp_pat
     assert again.episodes == result.episodes
 
 
+def test_evaluate_says_why_episodes_failed(capsys, checkpoint, tmp_path, monkeypatch):
+    monkeypatch.setattr(lw, "evaluate", partial(lw.evaluate, max_steps=5))
+    args = ("evaluate", checkpoint, "--tasks", "push", "--episodes", 1, "--attribute", "--reference", "MT10")
+    printed = run(capsys, *args, "--out", tmp_path)
+    assert (tmp_path / "failures.png").is_file()
+    result = lw.EvaluationResult.load(tmp_path / "results.json")
+    assert [failure.cause for failure in result.failures] == ["undecided"], "in 10 steps nobody pushes"
+    assert result.failure_table() in printed
+    for wrong in (("evaluate", checkpoint, "--reference", "MT10"), ("evaluate", "expert", "--attribute")):
+        assert wrong[2] in fails(capsys, *wrong)
+
+
 def test_evaluate_runs_the_tasks_of_the_training(capsys, demos, checkpoint, tmp_path, monkeypatch):
     monkeypatch.setattr(lw, "evaluate", partial(lw.evaluate, max_steps=5))
     said = "that it was trained on, of 10 that it knows; --tasks names others"

@@ -1,0 +1,208 @@
+"""attribute_failures: why episodes failed, by exchanging one part of what acted in them and running them again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from lw_torchrl._checks import check_int, check_scale, missing_keys
+from lw_torchrl._devices import device_of
+from lw_torchrl.envs.episodes import FinishedEpisode
+from lw_torchrl.evaluation.exchanges import Exchanges
+from lw_torchrl.evaluation.failures import Failure
+from lw_torchrl.evaluation.swaps import Again, Which, definitions, own_evaluators
+from lw_torchrl.evaluation.verdict import by_exchanges, by_rule
+from lw_torchrl.evaluation.visited import Scripts, explain, see
+from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
+from lw_torchrl.language.skills import ScriptedSkill, load_skills
+from lw_torchrl.language.tasks import task_id
+from lw_torchrl.modules.networks import evaluating
+from lw_torchrl.modules.policy import plans_of
+
+
+def attribute_failures(
+    rollouts: Iterable[FinishedEpisode | TensorDictBase],
+    plans: Plans | Mapping[str, ConditionalPlan],
+    *,
+    actor: Any = None,
+    reference: Plans | Mapping[str, ConditionalPlan] | None = None,
+    evaluator: Any = None,
+    skills: Mapping[str, ScriptedSkill] | None = None,
+    seed: int,
+    noise_scale: float = 0.1,
+    max_steps: int = 500,
+    num_envs: int | None = None,
+    engine: Any = "vectorized",
+    num_threads: int | None = None,
+    device: str | torch.device | None = None,
+    progress: bool = True,
+) -> list[Failure]:
+    """Say of each failed episode whether a query was answered wrongly, the plan led astray, a skill was clumsy, or
+    more time was all it lacked.
+
+    **A rule explains.** *Query*, if the policy acted on other answers than the query answering function gives in the
+    same states; else *plan*, if late in the episode the plan's true step asks for something else than the reference
+    plan's; else *skill*. Without ``actor`` that is all. Without a reference the rule is weak: it can tell wrong
+    answers, a plan of which no condition holds, and a skill that stays far from where it goes; what else there is, is
+    undecided. Even with one it is no proof, since another plan that succeeds asks for other things as well.
+
+    **An exchange decides**, with ``actor``: the very same episode, its noise too, is run again with true answers, where
+    they were wrong; with scripted skills in one step of the plan, or, if that mends nothing, in all (where a text is
+    no scripted skill, with the expert's actions); with the reference plan; with twice the time. What alone mends the
+    episode is its cause. Where several do, the smallest exchange counts: answers, a skill in one step, the plan,
+    skills in all steps, unless another one mends clearly more of the task's failed episodes. Time counts where
+    nothing else mends. Where no single exchange mends, pairs of them are tried, which give ``cause`` and ``also``.
+    One episode that is mended is one bit, and luck has its part in it: ``evidence`` holds how much of the task's failed
+    episodes each exchange mended.
+
+    Args:
+        rollouts: episodes as :func:`evaluate` gives them to ``on_episode``, or TensorDicts of batch (T,), each one
+            episode from its first state on; those with success are left out. Keys: ``observation`` (T, 39) float32,
+            ``task_id`` (T,) int64, ``("next", "success")`` (T, 1) bool; of a TensorDict ``episode`` (T,) int64; where
+            they are there, ``qaf`` (T, S) bool, the answers that the policy acted on, ``qaf_logits`` (T, S) float32,
+            which count before ``qaf``, and ``skill_weights`` (T, S) float32, for the step in force.
+        plans: the plans that were carried out.
+        actor: what acted: anything with ``plans`` and ``with_plans`` that writes ``action`` and ``skill_weights``. None
+            for the rule alone. One that draws its actions cannot be run again alike; its exchanges tell less.
+        reference: other plans for the same tasks, which are trusted. Tasks that they lack have no reference.
+        evaluator: what answered in the query answering function's place, between it and the actor: a module or
+            function that writes ``qaf`` into the tensordict (read with ``observation`` and ``task_id``), or a
+            :class:`torchrl.envs.Transform` that does. An evaluator inside the policy is found there.
+        skills: the scripted skills by text that are trusted, as from :func:`load_skills`; None for the shipped ones.
+        seed, noise_scale, max_steps, engine: with which the episodes were run.
+        num_envs, num_threads, device: as for :func:`evaluate`; the result depends on none of them.
+        progress: show a bar for each exchange.
+
+    Returns:
+        A :class:`Failure` for each failed episode, in the order of the rollouts.
+
+    Raises:
+        ValueError: a rollout without a key that is needed, twice the same episode, a task without a plan, plans that
+            are not the actor's, or an episode that does not begin as (task, seed, episode) does.
+
+    Warns:
+        UserWarning: the policy cannot carry out the reference; no plan is exchanged.
+
+    Example:
+        A wrong offset, planted in the skill that reaches:
+
+        >>> import lw_torchrl as lw
+        >>> from dataclasses import replace
+        >>> plans = lw.Plans({"reach": lw.load_plans("MT10")["reach"]})
+        >>> spoilt = {text: replace(skill, offset=(0.1, 0.0, 0.0)) for text, skill in lw.load_skills().items()}
+        >>> actor, episodes = lw.ScriptedSkillActor(plans, skills=spoilt), []
+        >>> result = lw.evaluate(
+        ...     actor,
+        ...     tasks="reach",
+        ...     episodes_per_task=1,
+        ...     seed=1_000,
+        ...     max_steps=100,
+        ...     also_record=["observation", "task_id", "qaf", "skill_weights"],
+        ...     on_episode=episodes.append,
+        ... )
+        >>> [failure] = attribute_failures(episodes, plans, actor=actor, seed=1_000, max_steps=100)
+        >>> failure.cause, failure.swaps
+        ('skill', {'skill': True})
+
+    Source: the plan's conditions, its steps and what carries them out are apart, so each can be exchanged.
+    """
+    answered = as_plans(plans)
+    check_int("seed", seed)
+    check_scale("noise_scale", noise_scale)
+    check_int("max_steps", max_steps, minimum=1)
+    if num_envs is not None:
+        check_int("num_envs", num_envs, minimum=1)
+    if actor is not None and (own := plans_of(actor)) is not None and (other := answered.differences(own)):
+        raise ValueError(f"plans differ from the actor's own for {', '.join(other)}; pass the actor's plans")
+    table = load_skills() if skills is None else skills
+    failed = _failed(rollouts, answered)
+    if not failed:
+        return []
+    names = sorted({task for task, _, _ in failed})
+    others = {} if reference is None else {task: plan for task, plan in as_plans(reference).items() if task in names}
+    trusted = Plans(others) if others else None
+    seen = [see(task, k, steps, answered, _answers(steps, actor)) for task, k, steps in failed]
+    scripts = Scripts(answered, table)
+    theirs = None if trusted is None else Scripts(trusted, table)
+    told = {(one.task, one.episode): explain(one, answered, scripts, trusted, theirs) for one in seen}
+    if actor is None:
+        return [by_rule(one, told[one.task, one.episode], seed) for one in seen]
+    again = Again(
+        tasks=definitions(names, answered),
+        firsts={(one.task, one.episode): one.steps.get("observation")[0] for one in seen},
+        seed=seed,
+        noise_scale=noise_scale,
+        max_steps=max_steps,
+        num_envs=num_envs,
+        engine=engine,
+        num_threads=num_threads,
+        device=device,
+        progress=progress,
+    )
+    exchanges = Exchanges(actor, answered, evaluator, trusted, scripts, table, again)
+    exchanges.run(seen, [which for which, one in told.items() if one.evidence.get("plan_departs") == 0.0])
+    shares = exchanges.shares()
+    return [by_exchanges(one, told[one.task, one.episode], exchanges, shares.get(one.task, {}), seed) for one in seen]
+
+
+def _failed(
+    rollouts: Iterable[FinishedEpisode | TensorDictBase], plans: Plans
+) -> list[tuple[str, int, TensorDictBase]]:
+    """The failed episodes: task, episode and steps."""
+    by_id = {task_id(task): task for task in plans}
+    found: list[tuple[str, int, TensorDictBase]] = []
+    seen: set[Which] = set()
+    for place, rollout in enumerate(rollouts):
+        steps = rollout.steps if isinstance(rollout, FinishedEpisode) else rollout
+        if not isinstance(steps, TensorDictBase) or steps.batch_dims != 1 or not len(steps):
+            raise ValueError(
+                f"rollouts[{place}] must be a finished episode, or a TensorDict of batch (T,), got "
+                f"{type(steps).__name__}"
+            )
+        needed = ["observation", "task_id", ("next", "success")]
+        needed += [] if isinstance(rollout, FinishedEpisode) else ["episode"]
+        if missing := [key for key in needed if steps.get(key, None) is None]:
+            raise missing_keys(steps.keys(True, True), *(str(key) for key in missing))
+        given = steps.get("task_id").unique().tolist()
+        if len(given) != 1 or given[0] not in by_id:
+            raise ValueError(f"rollouts[{place}] must be of one task that plans has, {', '.join(plans)}; got {given}")
+        task = by_id[given[0]]
+        if isinstance(rollout, FinishedEpisode):
+            episode = rollout.episode
+        else:
+            episodes = steps.get("episode").unique().tolist()
+            if len(episodes) != 1:
+                raise ValueError(f"rollouts[{place}] must be one episode, got {len(episodes)}: split them")
+            episode = episodes[0]
+        if (task, episode) in seen:
+            raise ValueError(f"rollouts[{place}] is episode {episode} of {task!r} again")
+        seen.add((task, episode))
+        if not steps.get(("next", "success")).any():
+            found.append((task, episode, steps))
+    return found
+
+
+def _answers(steps: TensorDictBase, actor: Any) -> Tensor | None:
+    """What the evaluators inside a policy answer in these states, the mean of several; None where that is not known."""
+    evaluators = own_evaluators(actor)
+    if not evaluators or any(steps.get(key, None) is None for one in evaluators for key in one.in_keys):
+        return None
+    with torch.no_grad(), evaluating(actor):
+        device = device_of(actor)
+        logits = [one.answers(*(steps.get(key).to(device) for key in one.in_keys)) for one in evaluators]
+    return torch.stack(logits).mean(0).cpu() > 0
+
+
+def keys_to_attribute(actor: Any, env: EnvBase) -> list[NestedKey]:
+    """What to record of each step, of what is there, for failures to be attributed."""
+    there = env.full_observation_spec.keys(True, True)
+    keys: list[NestedKey] = ["observation", "task_id", *(["qaf"] if "qaf" in there else [])]
+    keys += [key for key in getattr(actor, "in_keys", ()) if key in there]
+    keys += [key for key in ("skill_weights", "qaf_logits") if key in getattr(actor, "out_keys", ())]
+    return list(dict.fromkeys(keys))

@@ -1,0 +1,243 @@
+"""Parts of a policy exchanged for sound ones, and the very same episodes run again with them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from copy import deepcopy
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from lw_torchrl._progress import Progress
+from lw_torchrl.envs.episodes import policy_of, run_episodes
+from lw_torchrl.envs.experts import ExpertActor
+from lw_torchrl.envs.language_world_env import LanguageWorldEnv
+from lw_torchrl.evaluation.visited import Scripts, attended
+from lw_torchrl.language.plan_tables import PlanTables
+from lw_torchrl.language.plans import Plans
+from lw_torchrl.language.tasks import TASKS, Task, task_id
+from lw_torchrl.modules.networks import evaluating
+from lw_torchrl.modules.plan_encoder import IN_FORCE
+from lw_torchrl.modules.policy import transform_of
+from lw_torchrl.modules.query_evaluator import QueryEvaluator
+from lw_torchrl.transforms.qaf import plan_program
+
+Acts = Callable[[TensorDictBase], TensorDictBase]
+Which = tuple[str, int]  # task, episode
+_ROWS = 256
+
+
+class TrueAnswers(QueryEvaluator):
+    """The query answering function in an evaluator's place: 5 where a condition holds, else -5."""
+
+    def __init__(self, plans: Plans) -> None:
+        super().__init__(plans)
+        self.program = plan_program(plans)
+
+    def logits(self, *read: Tensor) -> Tensor:
+        observation, task = read
+        return 10.0 * self.program(observation, task).to(torch.float32) - 5.0
+
+
+def own_evaluators(actor: Any) -> list[QueryEvaluator]:
+    """The evaluators inside a policy."""
+    modules = actor.modules() if isinstance(actor, nn.Module) else ()
+    return [module for module in modules if isinstance(module, QueryEvaluator)]
+
+
+def with_true_answers(actor: Any) -> Any:
+    """The policy with the query answering function in the place of its own evaluators; itself if it has none."""
+    if not own_evaluators(actor):
+        return actor
+    other = deepcopy(actor)
+    for module in list(other.modules()):
+        for name, child in list(module.named_children()):
+            if isinstance(child, QueryEvaluator):
+                setattr(module, name, TrueAnswers(child.plans))
+    return other
+
+
+def make_env(actor: Any, plans: Plans | None, base: LanguageWorldEnv, evaluator: Any = None) -> EnvBase:
+    """The environment with what must run before the actor, and the answers to the plans' queries beside it; behind it
+    an evaluator that is a transform."""
+    before = [one for one in (transform_of(actor, plans),) if one is not None]
+    if isinstance(evaluator, Transform):
+        before.append(evaluator.clone())  # a transform has one environment
+    return TransformedEnv(base, before[0] if len(before) == 1 else Compose(*before)) if before else base
+
+
+class AnsweredBy(nn.Module):
+    """A policy that acts on an evaluator's answers, which take the place of ``qaf``."""
+
+    def __init__(self, actor: Acts, evaluator: Acts) -> None:
+        super().__init__()
+        self.actor, self.evaluator = actor, evaluator
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return self.actor(self.evaluator(tensordict))
+
+
+def answered_by(actor: Any, evaluator: Any) -> Any:
+    """The actor behind an evaluator that is a module or a function; a transform belongs into the environment."""
+    return actor if evaluator is None or isinstance(evaluator, Transform) else AnsweredBy(actor, evaluator)
+
+
+class WithScripts(nn.Module):
+    """A policy whose skills are scripted ones: its attention mixes their actions, where it singles any steps out.
+
+    Where the step in force has no scripted skill, the action is the expert's.
+
+    Args:
+        actor: the policy; its plan, its answers and its attention stay as they are.
+        plans: its plans.
+        scripts: of their steps.
+        steps: for each episode, the step whose attention the scripts wait for; None to act wherever there is any.
+    """
+
+    def __init__(self, actor: Acts, plans: Plans, scripts: Scripts, steps: Mapping[Which, int] | None) -> None:
+        super().__init__()
+        self.actor, self.scripts = actor, scripts
+        self._tables = PlanTables(plans)
+        self._known = torch.zeros_like(self._tables.mask)
+        for row, task in enumerate(self._tables.index.tasks):
+            self._known[row, : len(plans[task].steps)] = torch.tensor(scripts.known[task])
+        self._steps = None if steps is None else {(task_id(task), k): step for (task, k), step in steps.items()}
+        unscripted = [task for task, known in scripts.known.items() if not all(known) and task in TASKS]
+        self._expert = ExpertActor(unscripted) if unscripted else None
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        seen = tensordict.select("observation", "task_id", "episode", "_step", strict=False).clone()
+        tensordict = self.actor(tensordict)
+        action, task = tensordict.get("action"), seen.get("task_id")
+        rows = self._tables.rows(task)
+        mask, known = self._tables.mask.to(action.device)[rows], self._known.to(action.device)[rows]
+        weights = tensordict.get("skill_weights", None)
+        if weights is None:
+            truth = tensordict.get("qaf") & mask
+            first = torch.where(truth.any(-1), truth.int().argmax(-1), mask.sum(-1) - 1)
+            weights = torch.nn.functional.one_hot(first, mask.shape[-1]).float()
+        step = attended(weights, mask)
+        replaced = step >= 0
+        if self._steps is not None:
+            which = zip(task.tolist(), seen.get("episode").tolist(), strict=True)
+            asked = torch.tensor([self._steps.get(one, -1) for one in which], device=action.device)
+            there = weights.gather(-1, asked.clamp(min=0).unsqueeze(-1)).squeeze(-1) > IN_FORCE
+            replaced = replaced & there & (asked >= 0)
+        scripted = (weights * known).unsqueeze(-1) * self.scripts.program(seen.get("observation"), task)
+        proper = scripted.sum(-2).to(action.dtype)
+        unknown = ~known.gather(-1, step.clamp(min=0).unsqueeze(-1)).squeeze(-1)
+        if self._expert is None:
+            replaced = replaced & ~unknown
+        elif (needed := replaced & unknown).any():
+            expert = self._expert(seen.set("_step", needed).cpu()).get("action").to(action.device)
+            proper = torch.where(unknown.unsqueeze(-1), expert, proper)
+        return tensordict.set("action", torch.where(replaced.unsqueeze(-1), proper, action))
+
+
+@dataclass(frozen=True)
+class Again:
+    """Runs episodes again as they were run, whatever acts in them.
+
+    Attributes:
+        tasks: their tasks by name.
+        firsts: each episode's first observation, (39,) float32.
+        seed, noise_scale, max_steps, num_envs, engine, num_threads, device, progress: as for :func:`evaluate`.
+    """
+
+    tasks: Mapping[str, Task]
+    firsts: Mapping[Which, Tensor]
+    seed: int
+    noise_scale: float
+    max_steps: int
+    num_envs: int | None
+    engine: Any
+    num_threads: int | None
+    device: str | torch.device | None
+    progress: bool
+
+    def __call__(
+        self, what: str, which: Sequence[Which], actor: Any, plans: Plans, evaluator: Any = None, longer: int = 1
+    ) -> dict[Which, int | None]:
+        """Each episode's first successful step, counted from 0, or None.
+
+        Args:
+            what: is exchanged, in words.
+            which: the episodes.
+            actor: what acts in them.
+            plans: whose conditions are answered.
+            evaluator: what answers in the query answering function's place.
+            longer: how many times as long they may be.
+
+        Raises:
+            ValueError: an episode does not begin as it was recorded.
+        """
+        if not which:
+            return {}
+        wanted: dict[str, list[int]] = {}
+        for task, episode in sorted(which):
+            wanted.setdefault(task, []).append(episode)
+        rows = len(wanted) * max(1, min(max(map(len, wanted.values())), _ROWS // len(wanted)))
+        if self.num_envs is not None:
+            rows = max(len(wanted), min(rows, self.num_envs))
+        max_steps = self.max_steps * longer
+        base = LanguageWorldEnv(
+            [self.tasks[task] for task in wanted],
+            num_envs=rows,
+            seed=self.seed,
+            engine=self.engine,
+            num_threads=self.num_threads,
+            max_steps=max_steps,
+            strict=True,
+        )
+        env = make_env(inner_policy(actor), plans, base, evaluator)
+        actor = answered_by(actor, evaluator)
+        found: dict[Which, int | None] = {}
+        scale = self.noise_scale
+        try:
+            with ExitStack() as stack:
+                if isinstance(actor, nn.Module):
+                    stack.enter_context(evaluating(actor))
+                stack.enter_context(torch.no_grad())
+                stack.enter_context(set_exploration_type(ExplorationType.DETERMINISTIC))
+                bar = Progress(f"again with {what}", len(which) * max_steps, "step", show=self.progress)
+                stack.enter_context(bar)
+                for task, episode, steps in run_episodes(
+                    env,
+                    policy_of(actor, self.device),
+                    wanted,
+                    keys=["observation", ("next", "success")],
+                    noise=(lambda _: (scale,) * 4) if scale else None,
+                    after_success=0,
+                    on_progress=bar.update,
+                ):
+                    self._check_first(task, episode, steps)
+                    hits = steps.get(("next", "success")).flatten().nonzero().flatten()
+                    found[task, episode] = int(hits[0]) if len(hits) else None
+        finally:
+            env.close()
+        return found
+
+    def _check_first(self, task: str, episode: int, steps: TensorDictBase) -> None:
+        if not torch.equal(steps.get("observation")[0], self.firsts[task, episode]):
+            raise ValueError(
+                f"rollouts: episode {episode} of {task!r} does not begin as episode {episode} of seed={self.seed} "
+                "does; give the seed and the engine that it was run with, and the episode from its first state on"
+            )
+
+
+def inner_policy(actor: Any) -> Any:
+    """The policy in the midst of what was put around it."""
+    while isinstance(actor, WithScripts | AnsweredBy):
+        actor = actor.actor
+    return actor
+
+
+def definitions(names: Sequence[str], plans: Plans) -> dict[str, Task]:
+    """The tasks as the simulator is told of them: ours, or else those of the plans."""
+    return {name: TASKS.get(name, plans[name].definition) for name in names}

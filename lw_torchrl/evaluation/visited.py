@@ -1,0 +1,277 @@
+"""What the states of a failed episode tell: which answers were wrong, where the plan asks for something else than a
+reference, which step it ended in."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torch.nn.functional import one_hot
+
+from lw_torchrl.evaluation.failures import Cause
+from lw_torchrl.language.named_objects import GRIPPER
+from lw_torchrl.language.plans import ConditionalPlan, Plans
+from lw_torchrl.language.skill_program import SkillProgram
+from lw_torchrl.language.skills import ScriptedSkill
+from lw_torchrl.transforms.qaf import plan_program
+
+LATE = 100  # the last states, in which a failed episode got nowhere
+A_WHILE = 5  # states in which a step was in force that the episode came to
+_AWAY = 25  # states that a stay in a step may be left for: two steps that alternate are one stay
+WRONG = 0.01  # the share of states with wrong answers from which they count
+OTHER = 0.3  # how far two actions differ, on some axis, that are not meant to do the same
+_REST = ScriptedSkill("", GRIPPER, gain=(0.0, 0.0, 0.0))  # in the place of a text that is no scripted skill
+_RULER = 1e-3  # action per metre, so small that no distance is cut off
+
+
+class Visited(NamedTuple):
+    """A failed episode, and what its states say of a plan.
+
+    Attributes:
+        task, episode: which.
+        steps: TensorDict of batch (T,).
+        truth: (T, S) bool, the query answering function's own answers.
+        given: (T, S) bool, those that the policy acted on.
+        weights: (T, S) float32, the policy's attention over the plan's steps.
+        in_force: (T,) int64, the step with most of it; -1 where all have the same, so that none is in force.
+    """
+
+    task: str
+    episode: int
+    steps: TensorDictBase
+    truth: Tensor
+    given: Tensor
+    weights: Tensor
+    in_force: Tensor
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """What the states say by themselves.
+
+    Attributes:
+        cause: "undecided" where they do not tell.
+        steps: for each cause, the step that it would hang on.
+        at: for each cause, the state to look at.
+        why: for each cause, half a sentence with its numbers.
+        evidence: name to number.
+    """
+
+    cause: Cause
+    steps: Mapping[str, int | None]
+    at: Mapping[str, int]
+    why: Mapping[str, str]
+    evidence: Mapping[str, float] = field(default_factory=dict)
+
+
+class Scripts:
+    """The scripted skills of plans' steps, as far as there are any.
+
+    Args:
+        plans: the plans.
+        table: text to scripted skill.
+
+    Attributes:
+        known: task to which of its plan's steps there are scripts for.
+        program: the actions, (..., S, 4); zeros for other steps.
+    """
+
+    def __init__(self, plans: Plans, table: Mapping[str, ScriptedSkill]) -> None:
+        found = {plan.definition: [_script(plan, step.skill, table) for step in plan.steps] for plan in plans.values()}
+        self.known = {task.name: [skill is not None for skill in listed] for task, listed in found.items()}
+        self.program = SkillProgram({task: [skill or _REST for skill in listed] for task, listed in found.items()})
+        self._ruler = SkillProgram(
+            {task: [_ruler(skill or _REST) for skill in listed] for task, listed in found.items()}
+        )
+
+    def distance(self, observation: Tensor, task_id: Tensor, step: int) -> Tensor:
+        """(T,) metres, how far what a step's skill moves is from where it goes."""
+        return self._ruler(observation, task_id)[:, step, :3].norm(dim=-1) / _RULER
+
+
+def _script(plan: ConditionalPlan, text: str, table: Mapping[str, ScriptedSkill]) -> ScriptedSkill | None:
+    skill = table.get(text)
+    return skill.for_task(plan.definition) if skill is not None and skill.suits(plan.definition) else None
+
+
+def _ruler(skill: ScriptedSkill) -> ScriptedSkill:
+    x, y, z = (_RULER if gain else 0.0 for gain in skill.gain)
+    return replace(skill, gain=(x, y, z), variants={})
+
+
+def chosen(truth: Tensor, steps: int) -> Tensor:
+    """(T, S) bool to (T,) int64: the first of ``steps`` steps whose condition holds, the last where none does."""
+    here = truth[..., :steps]
+    return torch.where(here.any(-1), here.int().argmax(-1), steps - 1)
+
+
+def attended(weights: Tensor, steps: Tensor) -> Tensor:
+    """The step in force: the first of those with most attention; -1 where all steps have the same, since no condition
+    holds or every one does.
+
+    Args:
+        weights: (..., S) float32.
+        steps: (..., S) bool, those that there are.
+
+    Returns:
+        (...) int64.
+    """
+    most = weights.masked_fill(~steps, -1.0).amax(-1, keepdim=True)
+    least = weights.masked_fill(~steps, 2.0).amin(-1, keepdim=True)
+    first = (steps & (weights >= most - 1e-6)).int().argmax(-1)
+    none = ((most - least).squeeze(-1) < 1e-3) & (steps.sum(-1) > 1)
+    return torch.where(none, -1, first)
+
+
+def see(task: str, episode: int, steps: TensorDictBase, plans: Plans, given: Tensor | None) -> Visited:
+    """A failed episode under the policy's plan; ``given`` are the answers it acted on, None for what is recorded."""
+    number = len(plans[task].steps)
+    truth = plan_program(Plans([plans[task]]))(steps.get("observation"), steps.get("task_id"))[:, :number]
+    if (logits := steps.get("qaf_logits", None)) is not None:
+        given = logits > 0
+    elif given is None and (recorded := steps.get("qaf", None)) is not None:
+        given = recorded > 0.5
+    given = truth if given is None else given[:, :number]
+    weights = steps.get("skill_weights", None)
+    weights = one_hot(chosen(given, number), number).float() if weights is None else weights[:, :number]
+    in_force = attended(weights, torch.ones_like(weights, dtype=torch.bool))
+    return Visited(task, episode, steps, truth, given, weights, in_force)
+
+
+def candidates(seen: Visited, among: Tensor | None = None) -> list[int]:
+    """The steps that a failure may hang on, the likeliest first: of those in force for a while late in the episode the
+    furthest and the most frequent, then the furthest of all, then the others.
+
+    Args:
+        seen: the episode.
+        among: (T,) bool, the states that count; None for all.
+    """
+    late = torch.zeros(len(seen.in_force), dtype=torch.bool)
+    late[-LATE:] = True
+    counted = seen.in_force >= 0 if among is None else (seen.in_force >= 0) & among
+    if not counted.any():
+        return []
+    ranked: list[int] = []
+    for states in (late & counted, counted):
+        if not states.any():
+            continue
+        count = torch.bincount(seen.in_force[states], minlength=seen.truth.shape[1])
+        reached = (count >= count.max().clamp(1, A_WHILE)).nonzero().flatten()
+        ranked += [int(reached[-1]), int(count.argmax())]
+    ranked += torch.bincount(seen.in_force[counted]).argsort(descending=True).tolist()
+    present = set(seen.in_force[counted].tolist())
+    return [step for step in dict.fromkeys(ranked) if step in present]
+
+
+def stay(states: Tensor) -> int:
+    """(T,) bool to where the last stay in them begins; interruptions of up to 25 states do not end it."""
+    found = states.nonzero().flatten().tolist()
+    if not found:
+        return len(states) - 1
+    begin = found[-1]
+    for state in reversed(found):
+        if begin - state > _AWAY + 1:
+            break
+        begin = state
+    return begin
+
+
+def in_charge(seen: Visited, plan: ConditionalPlan, step: int) -> str:
+    """How long a step was in force, in words."""
+    late = min(LATE, len(seen.in_force))
+    inside = int((seen.in_force == step)[-late:].sum())
+    return f"step {step + 1}, '{plan.steps[step].skill}', was in force in {inside} of the last {late} states"
+
+
+def explain(
+    seen: Visited, plans: Plans, scripts: Scripts, reference: Plans | None, reference_scripts: Scripts | None
+) -> Explanation:
+    """The rule: wrong answers, else a plan that asks for something else than the reference, else a skill.
+
+    Without a reference plan: no condition that holds tells of a plan, one step all the while that does not get what it
+    moves where it goes, of a skill.
+    """
+    plan, length = plans[seen.task], len(seen.in_force)
+    observation, task_id = seen.steps.get("observation"), seen.steps.get("task_id")
+    late = min(LATE, length)
+    stuck = next(iter(candidates(seen)), len(plan.steps) - 1)
+    steps: dict[str, int | None] = {"out of time": stuck, "undecided": stuck}
+    at = {"out of time": length - 1, "undecided": stay(seen.in_force == stuck)}
+    why, evidence = {}, {"states": float(length)}
+
+    wrong = seen.given != seen.truth
+    share = float(wrong.any(-1).float().mean())
+    evidence["answers_wrong"] = share
+    if share:
+        changes = chosen(seen.given, len(plan.steps)) != chosen(seen.truth, len(plan.steps))
+        matter = wrong & changes.unsqueeze(-1) if changes.any() else wrong
+        column = int(matter.sum(0).argmax())
+        steps["query"], at["query"] = column, int(matter[:, column].int().argmax())
+        evidence["answers_wrong_late"] = float(wrong[-late:].any(-1).float().mean())
+        why["query"] = (
+            f"'{plan.steps[column].condition}' (step {column + 1}) was answered wrongly in "
+            f"{int(wrong[:, column].sum())} of {length} states, first at {int(wrong[:, column].int().argmax())}"
+        )
+
+    none = ~seen.truth.any(-1)
+    evidence["no_condition_late"] = float(none[-late:].float().mean())
+    if reference is not None and reference_scripts is not None and seen.task in reference:
+        departs, ours, theirs = _departs(seen, plan, scripts, reference[seen.task], reference_scripts)
+        evidence["plan_departs"] = float(departs.float().mean())
+        evidence["plan_departs_late"] = float(departs[-late:].float().mean())
+        where = departs.clone()
+        where[:-late] &= not bool(departs[-late:].any())
+        step = int(torch.bincount(ours[where]).argmax()) if where.any() else stuck
+        steps["plan"], at["plan"] = step, stay(departs & (ours == step)) if departs.any() else at["undecided"]
+        other = int(torch.bincount(theirs[where & (ours == step)]).argmax()) if where.any() else 0
+        why["plan"] = (
+            f"in {int(departs[-late:].sum())} of the last {late} states the plan asks for something else than the "
+            f"reference, as step {step + 1}, '{plan.steps[step].skill}', where the reference says "
+            f"'{reference[seen.task].steps[other].skill}'"
+        )
+    else:
+        steps["plan"], at["plan"] = stuck, stay(none) if none.any() else at["undecided"]
+        why["plan"] = f"no condition of the plan held in {int(none[-late:].sum())} of the last {late} states"
+
+    inside = seen.in_force == stuck
+    evidence["in_step_late"] = float(inside[-late:].float().mean())
+    steps["skill"], at["skill"] = stuck, stay(inside)
+    told = in_charge(seen, plan, stuck)
+    if scripts.known[seen.task][stuck]:
+        far = float(scripts.distance(observation[-1:], task_id[-1:], stuck))
+        evidence["distance_at_end"] = far
+        told += f" and ended {100 * far:.0f} cm from where it goes"
+    why["skill"] = told
+    why["out of time"] = why["undecided"] = told
+
+    cause: Cause = "undecided"
+    if share >= WRONG:
+        cause = "query"
+    elif "plan_departs_late" in evidence:
+        cause = "plan" if evidence["plan_departs_late"] > 0.5 else "skill"
+    elif evidence["no_condition_late"] > 0.5:
+        cause = "plan"
+    elif evidence["in_step_late"] > 0.9 and evidence.get("distance_at_end", 0.0) > 0.05:
+        cause = "skill"
+    return Explanation(cause, steps, at, why, evidence)
+
+
+def _departs(
+    seen: Visited, plan: ConditionalPlan, scripts: Scripts, other: ConditionalPlan, other_scripts: Scripts
+) -> tuple[Tensor, Tensor, Tensor]:
+    """(T,) bool, whether the plan's true step is to do something else than the reference's, and which steps these are;
+    skills that are no scripts differ where their texts do."""
+    observation, task_id = seen.steps.get("observation"), seen.steps.get("task_id")
+    answers = plan_program(Plans([other]))(observation, task_id)
+    ours, theirs = chosen(seen.truth, len(plan.steps)), chosen(answers, len(other.steps))
+    rows = torch.arange(len(ours))
+    done = scripts.program(observation, task_id)[rows, ours]
+    wanted = other_scripts.program(observation, task_id)[rows, theirs]
+    differ = (done - wanted).abs().amax(-1) > OTHER
+    same_text = torch.tensor([[a.skill == b.skill for b in other.steps] for a in plan.steps])[ours, theirs]
+    scripted = torch.tensor(scripts.known[plan.task])[ours] & torch.tensor(other_scripts.known[other.task])[theirs]
+    return torch.where(scripted, differ, ~same_text), ours, theirs

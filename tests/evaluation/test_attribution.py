@@ -1,0 +1,305 @@
+"""attribute_failures: planted faults are found, and what cannot be told is undecided."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+
+import lw_torchrl as lw
+from lw_torchrl.envs.episodes import FinishedEpisode
+from lw_torchrl.evaluation import attribute_failures
+from lw_torchrl.evaluation.swaps import own_evaluators, with_true_answers
+from lw_torchrl.evaluation.verdict import decide, decide_pair
+from lw_torchrl.evaluation.visited import attended, chosen, stay
+from lw_torchrl.transforms.qaf import plan_program
+
+TASK, SEED, STEPS = "drawer-open", 7, 80
+PLANS = lw.Plans({TASK: lw.load_plans("MT10")[TASK]})
+REFERENCE = {
+    TASK: lw.ConditionalPlan.from_pairs(
+        TASK,
+        [
+            ("gripper is not almost vertically aligned with the drawer handle", PLANS[TASK].steps[0].skill),
+            (
+                "gripper is almost vertically aligned with the drawer handle and gripper is not near the drawer handle",
+                PLANS[TASK].steps[1].skill,
+            ),
+            ("gripper is near the drawer handle", PLANS[TASK].steps[2].skill),
+        ],
+    )
+}
+RECORDED = ["observation", "task_id", "qaf", "skill_weights"]
+RUN = {"seed": SEED, "max_steps": STEPS, "progress": False, "num_threads": 1}
+
+
+def evaluated(actor, episodes=1, **options):
+    return lw.evaluate(
+        actor, tasks=TASK, episodes_per_task=episodes, stop_at_success=True, **{**RUN, "attribute": True, **options}
+    )
+
+
+def clumsy(step=1):
+    table = dict(lw.load_skills())
+    text = PLANS[TASK].steps[step].skill
+    x, y, z = table[text].offset
+    table[text] = replace(table[text], offset=(x + 0.1, y, z))
+    return lw.ScriptedSkillActor(PLANS, skills=table)
+
+
+def hopeless():
+    """A plan that never goes down to the handle."""
+    pairs = [(str(step.condition), step.skill) for step in PLANS[TASK].steps]
+    pairs[1] = (pairs[1][0], pairs[0][1])
+    return lw.Plans({TASK: lw.ConditionalPlan.from_pairs(TASK, pairs)})
+
+
+def lie(tensordict):
+    answers = tensordict.get("qaf").clone()
+    answers[..., 1] ^= True
+    return tensordict.set("qaf", answers)
+
+
+class Lie(lw.QueryEvaluator):
+    """The same lie, inside a policy."""
+
+    def __init__(self, plans):
+        super().__init__(plans)
+        self.program = plan_program(plans)
+
+    def logits(self, observation, task_id):
+        answers = self.program(observation, task_id)
+        answers[..., 1] ^= True
+        return 10.0 * answers.float() - 5.0
+
+
+# ---- planted faults
+
+
+def test_a_clumsy_skill_and_the_step_it_is_in():
+    [failure] = evaluated(clumsy(), reference=REFERENCE).failures
+    assert (failure.cause, failure.also, failure.step) == ("skill", None, 1)
+    assert failure.swaps == {"skill": True, "plan": False}
+    assert "lower the gripper around the drawer handle" in failure.why
+    assert failure.evidence["mended_by_skill"] == 1.0
+    assert 0 <= failure.at < STEPS
+
+
+def test_a_plan_that_leads_astray():
+    [failure] = evaluated(lw.ScriptedSkillActor(hopeless()), reference=REFERENCE).failures
+    assert (failure.cause, failure.step) == ("plan", 1)
+    assert failure.swaps == {"plan": True}, "its skills are the scripts, so there is none to exchange"
+    assert failure.evidence["plan_departs_late"] > 0.5
+
+
+def test_a_lie_and_the_condition_it_is_about():
+    [failure] = evaluated(lw.ScriptedSkillActor(PLANS), evaluator=lie, reference=REFERENCE).failures
+    assert (failure.cause, failure.step) == ("query", 1)
+    assert failure.swaps["query"] is True
+    assert str(PLANS[TASK].steps[1].condition) in failure.why
+    assert failure.evidence["answers_wrong"] == 1.0
+
+
+def test_two_faults_at_once_are_both_named():
+    [failure] = evaluated(clumsy(), evaluator=lie).failures
+    assert (failure.cause, failure.also) == ("query", "skill")
+    assert failure.swaps["query + skill"] is True
+    assert not any(bit for name, bit in failure.swaps.items() if "+" not in name)
+    assert "both together" in failure.why
+
+
+def test_what_lacks_time_alone_is_out_of_time():
+    [failure] = evaluated(lw.ScriptedSkillActor(PLANS), max_steps=45).failures
+    assert (failure.cause, failure.swaps, failure.at) == ("out of time", {"time": True}, 44)
+
+
+def test_what_nothing_mends_is_undecided():
+    plans = hopeless()
+    [failure] = evaluated(lw.ScriptedSkillActor(plans)).failures
+    assert (failure.cause, failure.also, failure.swaps) == ("undecided", None, {"time": False})
+
+
+def test_the_rule_alone_runs_nothing_and_is_weaker():
+    episodes = []
+    lw.evaluate(clumsy(), tasks=TASK, episodes_per_task=1, also_record=RECORDED, on_episode=episodes.append, **RUN)
+    [alone] = attribute_failures(episodes, PLANS, seed=SEED)
+    assert (alone.cause, alone.swaps) == ("undecided", {})
+    [judged] = attribute_failures(episodes, PLANS, reference=REFERENCE, seed=SEED)
+    assert judged.cause in ("skill", "plan")
+    steps = episodes[0].steps
+    lied = steps.clone().set("qaf", ~steps["qaf"])
+    [found] = attribute_failures([FinishedEpisode(TASK, 0, lied)], PLANS, seed=SEED)
+    assert (found.cause, found.evidence["answers_wrong"]) == ("query", 1.0)
+
+
+def test_a_hole_in_the_plan_is_no_skill_s_fault():
+    """Where no condition holds, networks attend to all steps: scripts in their place would fill the hole."""
+    pairs = [(str(step.condition), step.skill) for step in PLANS[TASK].steps]
+    holed = lw.Plans({TASK: lw.ConditionalPlan.from_pairs(TASK, pairs[1:])})
+    [failure] = evaluated(still(plans=holed)).failures
+    assert (failure.cause, failure.swaps) == ("undecided", {"time": False})
+    assert failure.evidence["no_condition_late"] == 1.0
+
+
+# ---- every kind of policy
+
+
+class Still(lw.PlanConditionedActor):
+    """One whose hand does not move."""
+
+    def act(self, *prepared):
+        action, *rest = super().act(*prepared)
+        return (torch.zeros_like(action), *rest)
+
+
+def still(plans=PLANS, **options):
+    torch.manual_seed(0)
+    return Still(plans, width=8, depth=1, **options)
+
+
+@pytest.mark.parametrize("wrapped", [lambda a: a, lambda a: lw.ActorEnsemble([a, still()])])
+def test_a_network_s_skills_are_exchanged_and_its_mode_stays(wrapped):
+    actor = wrapped(still()).train()
+    actor.get_submodule(next(name for name, _ in actor.named_modules() if name)).eval()
+    modes = [module.training for module in actor.modules()]
+    [failure] = evaluated(actor).failures
+    assert (failure.cause, failure.swaps) == ("skill", {"skill": True})
+    assert failure.step is not None
+    assert [module.training for module in actor.modules()] == modes
+
+
+def test_an_evaluator_inside_a_policy_is_exchanged_for_the_truth():
+    actor = still(evaluator=Lie(PLANS))
+    true = with_true_answers(actor)
+    assert true is not actor
+    assert len(own_evaluators(true)) == len(own_evaluators(actor)) == 1
+    assert isinstance(actor.evaluator, Lie)
+    state = rollout().exclude("next")
+    exact = lw.PlanConditionedActor(PLANS)(lw.QAFTransform(PLANS)(state.copy()))["skill_weights"]
+    assert torch.allclose(true(state.copy())["skill_weights"], exact)
+    assert not torch.allclose(actor(state.copy())["skill_weights"], exact)
+    [failure] = evaluated(actor).failures
+    assert (failure.cause, failure.also) == ("query", "skill")
+
+
+def test_a_policy_that_cannot_carry_out_the_reference_is_told():
+    class Fixed(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.actor, self.plans = lw.ScriptedSkillActor(hopeless()), hopeless()
+            self.in_keys, self.out_keys = self.actor.in_keys, self.actor.out_keys
+
+        def forward(self, tensordict):
+            return self.actor(tensordict)
+
+    with pytest.warns(UserWarning, match="the policy cannot carry it out"):
+        [failure] = evaluated(Fixed(), reference=REFERENCE).failures
+    assert "plan" not in failure.swaps
+
+
+# ---- the same whatever runs beside
+
+
+def test_failures_hang_on_neither_environments_nor_order():
+    actor = clumsy()
+    result = evaluated(actor, episodes=3, reference=REFERENCE)
+    assert evaluated(actor, episodes=3, reference=REFERENCE, num_envs=1).failures == result.failures
+    assert [failure.episode for failure in result.failures] == [0, 1, 2]
+
+
+# ---- what decides
+
+
+def test_the_smallest_exchange_decides_unless_another_mends_clearly_more():
+    same = dict.fromkeys(("query", "skill", "plan", "skills", "time"), 0.5)
+    assert decide(["skills", "plan", "skill", "query"], same) == "query"
+    assert decide(["skills", "plan", "time"], same) == "plan"
+    assert decide(["skills", "plan"], {**same, "skills": 0.9}) == "skills"
+    assert decide(["time"], same) == "time"
+    assert decide([], same) is None
+
+
+def test_of_two_causes_the_certain_one_comes_first_or_the_one_that_mends_more():
+    assert decide_pair(["query + skill"], {"skill": 0.9}) == ("query", "skill")
+    assert decide_pair(["plan + skill"], {}) == ("plan", "skill")
+    assert decide_pair(["plan + skill"], {"skills": 0.2}) == ("skill", "plan")
+    assert decide_pair(["query + plan", "query + skill"], {"skill": 0.2}) == ("query", "skill")
+    assert decide_pair(["query"], {}) is None
+
+
+def test_the_step_in_force():
+    weights = torch.tensor([[0.4999, 0.5, 0.0001], [1 / 3] * 3, [0.5, 0.5, 0.0], [1.0, 0.0, 0.0]])
+    steps = torch.arange(3) < torch.tensor([[3], [3], [2], [1]])
+    assert attended(weights, steps).tolist() == [1, -1, -1, 0]
+    answers = torch.tensor([[False, True, True], [False, False, False], [False, False, True]])
+    assert chosen(answers, 3).tolist() == [1, 2, 2]
+    assert chosen(answers, 2).tolist() == [1, 1, 1], "what is beyond the last step is none"
+
+
+def test_a_stay_may_be_left_for_a_while():
+    states = torch.zeros(100, dtype=torch.bool)
+    states[[3, 40, 60, 61, 80]] = True
+    assert stay(states) == 40
+    assert stay(torch.zeros(5, dtype=torch.bool)) == 4
+
+
+# ---- what is refused
+
+
+def rollout(steps=3, **changed):
+    found = TensorDict(
+        {
+            "observation": torch.zeros(steps, 39),
+            "task_id": torch.full((steps,), lw.task_id(TASK)),
+            "episode": torch.zeros(steps, dtype=torch.int64),
+            "next": TensorDict({"success": torch.zeros(steps, 1, dtype=torch.bool)}, [steps]),
+        },
+        [steps],
+    )
+    for key, value in changed.items():
+        found = found.exclude(key) if value is None else found.set(key, value)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("rollouts", "message"),
+    [
+        ([rollout(observation=None)], "observation"),
+        ([rollout(episode=None)], "episode"),
+        ([rollout(episode=torch.tensor([0, 0, 1]))], r"rollouts\[0\] must be one episode, got 2: split them"),
+        ([rollout(task_id=torch.zeros(3, dtype=torch.int64))], r"rollouts\[0\] must be of one task that plans has"),
+        ([rollout(), rollout()], r"rollouts\[1\] is episode 0 of 'drawer-open' again"),
+        ([torch.zeros(3)], r"rollouts\[0\] must be a finished episode, or a TensorDict of batch \(T,\), got Tensor"),
+    ],
+)
+def test_rollouts_that_are_none_are_named(rollouts, message):
+    with pytest.raises(ValueError, match=message):
+        attribute_failures(rollouts, PLANS, seed=0)
+
+
+def test_an_episode_of_another_seed_is_refused():
+    with pytest.raises(ValueError, match=r"rollouts: episode 0 of 'drawer-open' does not begin as episode 0 of seed=0"):
+        attribute_failures([rollout()], PLANS, actor=clumsy(), seed=0, max_steps=5, progress=False)
+
+
+def test_other_arguments_that_are_wrong_are_named():
+    with pytest.raises(ValueError, match="plans differ from the actor's own for drawer-open"):
+        attribute_failures([rollout()], hopeless(), actor=clumsy(), seed=0)
+    with pytest.raises(ValueError, match="noise_scale"):
+        attribute_failures([rollout()], PLANS, seed=0, noise_scale=-1.0)
+    with pytest.raises(ValueError, match="max_steps"):
+        attribute_failures([rollout()], PLANS, seed=0, max_steps=0)
+    with pytest.raises(ValueError, match="attribute must be False for an actor without plans"):
+        evaluated(lw.ExpertActor(TASK))
+    with pytest.raises(ValueError, match="reference is for attribute=True"):
+        evaluated(clumsy(), attribute=False, reference=REFERENCE)
+
+
+def test_where_nothing_failed_there_is_nothing_to_say():
+    assert attribute_failures([], PLANS, seed=0) == []
+    result = evaluated(lw.ScriptedSkillActor(PLANS))
+    assert result.failures == ()
+    assert result.success_once == {TASK: 1.0}

@@ -1,0 +1,127 @@
+"""Failures in a result: the table, the figure, and a file that is whole or refused."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from lw_torchrl.evaluation import EpisodeResult, EvaluationResult, Failure, plot_failures
+
+CONFIG = {
+    "tasks": ["push", "reach"],
+    "episodes_per_task": 2,
+    "seed": 1,
+    "noise_scale": 0.1,
+    "stop_at_success": False,
+    "reward": "sparse",
+    "max_steps": 500,
+}
+FAILURES = (
+    Failure("push", 1, 0, "query", "skill", 2, 31, "Wrong.", {"wrong": 0.4}, {"query": False, "query + skill": True}),
+    Failure("push", 1, 1, "undecided", None, None, 499, "Nothing told."),
+    Failure("reach", 1, 1, "skill", None, 0, 0, "Clumsy.", {}, {"skill": True}),
+)  # fmt: skip
+
+
+def make_result(failures=FAILURES):
+    episodes = [
+        EpisodeResult("push", 0, False, None, False, 0.0),
+        EpisodeResult("push", 1, False, None, False, 0.0),
+        EpisodeResult("reach", 0, True, 4, True, 496.0),
+        EpisodeResult("reach", 1, False, None, False, 0.0),
+    ]
+    return EvaluationResult(CONFIG, tuple(episodes), failures=failures)
+
+
+def test_failures_read_back(tmp_path):
+    result = make_result()
+    result.save(tmp_path / "results.json")
+    found = EvaluationResult.load(tmp_path / "results.json")
+    assert found == result
+    assert found.failures == FAILURES
+    found.save(tmp_path / "again.json")
+    assert (tmp_path / "again.json").read_bytes() == (tmp_path / "results.json").read_bytes()
+
+
+def test_a_result_without_failures_says_nothing_of_them(tmp_path):
+    make_result(None).save(tmp_path / "results.json")
+    assert "failures" not in json.loads((tmp_path / "results.json").read_text())
+    assert EvaluationResult.load(tmp_path / "results.json").failures is None
+
+
+def test_the_table_counts():
+    assert make_result().failure_table().splitlines() == [
+        "task       failed  query   plan  skill  out of time  undecided",
+        "push       2 of 2      1      0      0            0          1",
+        "reach      1 of 2      0      0      1            0          0",
+        "all        3 of 4      1      0      1            0          1",
+    ]
+
+
+def test_without_failures_there_is_neither_table_nor_figure():
+    with pytest.raises(ValueError, match=r"evaluate\(\.\.\., attribute=True\)"):
+        make_result(None).failure_table()
+    with pytest.raises(ValueError, match=r"evaluate\(\.\.\., attribute=True\)"):
+        plot_failures(make_result(None))
+
+
+def test_the_figure_has_a_bar_for_each_task_that_failed(tmp_path):
+    axes = plot_failures(make_result(), tmp_path / "failures.png", title="a policy").axes[0]
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["reach", "push"]
+    widths = [[bar.get_width() for bar in bars] for bars in axes.containers]
+    assert widths == [[0, 1], [0, 0], [1, 0], [0, 0], [0, 1]]
+    assert axes.get_title() == "a policy\n3 of 4 episodes failed"
+    assert (tmp_path / "failures.png").stat().st_size > 1000
+    with pytest.raises(ValueError, match="path must end in"):
+        plot_failures(make_result(), tmp_path / "failures.txt")
+
+
+def test_where_nothing_failed_the_figure_is_empty():
+    episodes = tuple(EpisodeResult(task, k, True, 1, True, 1.0) for task in CONFIG["tasks"] for k in range(2))
+    result = EvaluationResult(CONFIG, episodes, failures=())
+    assert plot_failures(result).axes[0].get_title() == "0 of 4 episodes failed"
+
+
+DAMAGE = {
+    "task": ["sweep", 3, None],
+    "seed": [2, True, 1.0],
+    "episode": [-1, 0.0, 7],
+    "cause": ["luck", None, []],
+    "also": ["query", "undecided", 1],
+    "step": [-1, 1.5, True],
+    "at": [-1, 500, None],
+    "why": [None, 3],
+    "evidence": [[], {"x": "1"}, {"x": 1e301}, {"x": True}],
+    "swaps": [[], {"luck": True}, {"query": 1}, {"": True}],
+}
+
+
+@pytest.mark.parametrize(("name", "value"), [(name, value) for name, listed in DAMAGE.items() for value in listed])
+def test_a_damaged_failure_is_refused(tmp_path, name, value):
+    make_result().save(tmp_path / "results.json")
+    found = json.loads((tmp_path / "results.json").read_text())
+    found["failures"][0][name] = value
+    (tmp_path / "results.json").write_text(json.dumps(found))
+    with pytest.raises(ValueError, match="failures"):
+        EvaluationResult.load(tmp_path / "results.json")
+
+
+@pytest.mark.parametrize("failures", [{}, [3], [{}], FAILURES[:2], (*FAILURES, FAILURES[0])])
+def test_failures_that_are_not_one_for_each_failed_episode_are_refused(tmp_path, failures):
+    if isinstance(failures, tuple):
+        make_result(failures).save(tmp_path / "results.json")
+    else:
+        make_result(()).save(tmp_path / "results.json")
+        found = json.loads((tmp_path / "results.json").read_text())
+        (tmp_path / "results.json").write_text(json.dumps({**found, "failures": failures}))
+    with pytest.raises(ValueError, match="failures"):
+        EvaluationResult.load(tmp_path / "results.json")
+
+
+def test_a_second_cause_of_what_is_undecided_is_refused(tmp_path):
+    other = (FAILURES[0], replace(FAILURES[1], also="skill"), FAILURES[2])
+    make_result(other).save(tmp_path / "results.json")
+    with pytest.raises(ValueError, match="also must be null or another cause"):
+        EvaluationResult.load(tmp_path / "results.json")
