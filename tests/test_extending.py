@@ -20,7 +20,7 @@ from lw_torchrl.language.skills import ScriptedSkill
 from lw_torchrl.language.task_index import TaskIndex
 from lw_torchrl.modules import EVALUATORS, METHODS, POLICIES, Method, ObservationFeatures, make_policy
 from lw_torchrl.modules.action_head import ActionHead
-from lw_torchrl.record.rollouts import rollout_tasks, write_recording
+from lw_torchrl.record.rollouts import run_recorded, write_recording
 
 STEPS = 40
 TASK = """
@@ -175,8 +175,8 @@ def test_it_is_trained_saved_loaded_evaluated_and_recorded(kind, plans, replay, 
         noise_scale=0.0,
     )
     assert result.success_once["touch-the-block"] >= 0.8
-    rollouts = rollout_tasks(loaded, definitions, seed=1_000, engine=PointEngine, max_steps=STEPS)
-    write_recording(tmp_path / "rollout.rrd", loaded, rollouts)
+    episodes = run_recorded(loaded, definitions, seed=1_000, engine=PointEngine, max_steps=STEPS)
+    write_recording(tmp_path / "rollout.rrd", episodes, loaded.plans, tasks=definitions)
     assert (tmp_path / "rollout.rrd").stat().st_size > 10_000
     if kind == "evaluator":
         assert actor.evaluator.radius.item() != pytest.approx(0.1)

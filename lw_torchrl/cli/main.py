@@ -22,6 +22,7 @@ from lw_torchrl.cli.data import data
 from lw_torchrl.cli.errors import in_its_words
 from lw_torchrl.cli.offline import offline
 from lw_torchrl.cli.online import online
+from lw_torchrl.cli.record import record
 from lw_torchrl.cli.scripted import scripted
 from lw_torchrl.cli.streams import check_arguments, complain, nobody_reads, sound_streams
 
@@ -31,6 +32,7 @@ COMMANDS: dict[str, Any] = {
     "data": data,
     "train": policies.train,
     "evaluate": policies.evaluate,
+    "record": record,
     "view": show.view,
     "query": show.query,
     "scripted": scripted,

@@ -9,11 +9,18 @@ from tyro.conf import Positional, arg
 
 from lw_torchrl._checks import counted
 from lw_torchrl.cli.outputs import check_file, check_folder
-from lw_torchrl.cli.sources import make_logger, one_or_many, read_encoder, read_plans, read_tasks, simulated
+from lw_torchrl.cli.sources import (
+    load_policy,
+    make_logger,
+    one_or_many,
+    read_encoder,
+    read_plans,
+    read_tasks,
+    simulated,
+)
 from lw_torchrl.cli.threads import use_one_thread
 
 if TYPE_CHECKING:
-    from lw_torchrl.language.plans import Plans
     from lw_torchrl.language.tasks import Task
     from lw_torchrl.modules.policy import Policy
 
@@ -237,7 +244,7 @@ def evaluate(
     import lw_torchrl as lw
     from lw_torchrl._devices import check_device
     from lw_torchrl.evaluation import plot_failures
-    from lw_torchrl.record.rollouts import rollout_tasks, write_recording
+    from lw_torchrl.record.rollouts import run_recorded, write_recording
 
     use_one_thread()
     there = check_device("device", device)
@@ -245,7 +252,7 @@ def evaluate(
     given = read_plans(plans, known) if plans else None
     policy = None
     if str(checkpoint) != "expert":
-        policy = _load(checkpoint, seed, given, text_encoder)
+        policy = load_policy(checkpoint, seed, given, text_encoder)
         known.update({task: found for task in policy.tasks if (found := policy.definition(task)) is not None})
     if tasks or policy is None:
         chosen = simulated("tasks", one_or_many(tasks) or "MT10", known)
@@ -280,8 +287,8 @@ def evaluate(
             plot_failures(result, out / "failures.png", title=str(checkpoint))
         if policy is not None:
             shown: list[str | Task] = list(result.config["tasks"][:3])
-            rollouts = rollout_tasks(policy, shown, seed=seed, noise_scale=noise)
-            write_recording(out / "rollout.rrd", policy, rollouts, seed=seed, policy=checkpoint.stem)
+            recorded = run_recorded(policy, shown, seed=seed, noise_scale=noise)
+            write_recording(out / "rollout.rrd", recorded, policy.plans, seed=seed, policy=checkpoint.stem)
         print(f"written to {out}")
 
 
@@ -305,14 +312,3 @@ def _default_tasks(policy: Policy, checkpoint: Path, *, trained: bool) -> tuple[
     if own:
         print(f"without {', '.join(own)}, which the simulator lacks")
     return tuple(task for task in chosen if task in TASKS)
-
-
-def _load(checkpoint: Path, seed: int, plans: Plans | None, text_encoder: str | None) -> Policy:
-    """The policy of a file, with the plans that are given; none that has seen the seed's states."""
-    import lw_torchrl as lw
-    from lw_torchrl.trainers.checkpoint import demonstration_seeds
-
-    if seed in demonstration_seeds(checkpoint):
-        raise ValueError(f"seed must differ from the demonstrations' seed, {seed}; an evaluation wants fresh states")
-    policy = lw.load_actor(checkpoint, text_encoder=read_encoder(text_encoder))
-    return policy if plans is None else policy.with_plans(plans)

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from lw_torchrl.language.plans import Plans
     from lw_torchrl.language.tasks import Task
     from lw_torchrl.language.text import TextEncoder
+    from lw_torchrl.modules.policy import Policy
 
 SETS = ("MT10", "MT50")
 
@@ -122,3 +123,14 @@ def make_logger(kind: Literal["csv", "tensorboard", "wandb"], out: Path) -> Any:
         return WandbLogger(exp_name=out.stem, save_dir=str(folder))
     except ImportError as error:
         raise ImportError(f"--logger {kind} needs the package {kind}: pip install {kind}") from error
+
+
+def load_policy(checkpoint: Path, seed: int, plans: Plans | None, text_encoder: str | None) -> Policy:
+    """The policy of a file, with the plans that are given; none that has seen the seed's states."""
+    import lw_torchrl as lw
+    from lw_torchrl.trainers.checkpoint import demonstration_seeds
+
+    if seed in demonstration_seeds(checkpoint):
+        raise ValueError(f"seed must differ from the demonstrations' seed, {seed}; an evaluation wants fresh states")
+    policy = lw.load_actor(checkpoint, text_encoder=read_encoder(text_encoder))
+    return policy if plans is None else policy.with_plans(plans)

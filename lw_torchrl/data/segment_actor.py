@@ -29,6 +29,8 @@ class SegmentActor(TensorDictModuleBase):
         max_steps: of an episode.
     """
 
+    row_by_row = True  # no network; what it draws stays with its rows
+
     def __init__(self, behaviour: Behaviour, plans: Plans, seed: int, max_steps: int) -> None:
         super().__init__()
         self.behaviour, self.seed, self.max_steps = behaviour, seed, max_steps

@@ -15,7 +15,7 @@ from lw_torchrl.evaluation import EvaluationResult, evaluate, plot_success
 from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.tasks import MT10
 from lw_torchrl.modules import PlanConditionedActor
-from lw_torchrl.record.rollouts import active_skills, rollout_tasks, write_recording
+from lw_torchrl.record.rollouts import active_skills, run_recorded, write_recording
 from lw_torchrl.trainers import BehavioralCloningConfig, BehavioralCloningTrainer
 from lw_torchrl.transforms import QAFTransform
 
@@ -111,10 +111,10 @@ def run_demo(out: Path, config: DemoConfig) -> EvaluationResult:
         result.save(results, checkpoint=out / "checkpoint.zip", plans=plans.fingerprint)
     plot_success(result, out / "success.png", title="Plan-conditioned behavioral cloning")
     print("4/4  recording a rollout")
-    rollouts = rollout_tasks(actor, config.tasks, seed=config.evaluation_seed, noise_scale=config.evaluation_noise)
-    recorded = [task for task in RECORDED if task in rollouts] or list(rollouts)[:1]
-    chosen = {task: rollouts[task] for task in recorded}
-    write_recording(out / "rollout.rrd", actor, chosen, seed=config.evaluation_seed, policy="demo")
+    episodes = run_recorded(actor, config.tasks, seed=config.evaluation_seed, noise_scale=config.evaluation_noise)
+    chosen = [one for one in episodes if one.task in RECORDED] or episodes[:1]
+    write_recording(out / "rollout.rrd", chosen, plans, seed=config.evaluation_seed, policy="demo")
+    rollouts = {one.task: one.steps for one in episodes}
     print(f"\n{result.table()}\n")
     print("skills that led, in order, up to the first success (steps):")
     for task in config.tasks:

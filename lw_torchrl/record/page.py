@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from lw_torchrl.record.colors import BACKGROUND
@@ -39,6 +40,108 @@ LIMITS = {"action": (-1.2, 1.2), "skill_weights": (-0.1, 1.1), "corrected": (-0.
 """The range of a curve whose numbers have one."""
 
 
+@dataclass(frozen=True)
+class Page:
+    """What was logged of an episode, as far as its views depend on it.
+
+    Attributes:
+        root: the entity that all lies under.
+        title: of its tab.
+        trails: entities that are shown up to the cursor.
+        eye: where the scene is seen from, and what is looked at.
+        shown: the first and last step worth a look.
+        curves: names of :data:`CURVES` that there are.
+        steps, lanes: how many the plan has, and how many there are.
+        good: whether it succeeded.
+    """
+
+    root: str
+    title: str
+    trails: Collection[str]
+    eye: tuple[Point, Point]
+    shown: tuple[int, int]
+    curves: Collection[str]
+    steps: int
+    lanes: int
+    good: bool
+
+    def tab(self) -> rrb.Horizontal:
+        """Scene and curves on the left, words and lanes on the right."""
+        import rerun.blueprint as rrb
+
+        left: list[tuple[float, Any]] = [(13, self._scene("Scene"))]
+        left += [(share, self._curve(name)) for name, (_, share) in CURVES.items() if name in self.curves]
+        # Shares are about as many pixels as a view needs; what is longer scrolls.
+        right: list[tuple[float, Any]] = [(115 if self.good else 215, self._words("verdict", "Verdict"))]
+        if self.steps:
+            right.append((70 + 58 * min(self.steps, 6), self._words("plan", "Plan")))
+        right += self._lanes()
+        columns = [
+            rrb.Vertical(*(view for _, view in part), row_shares=[share for share, _ in part]) for part in (left, right)
+        ]
+        return rrb.Horizontal(*columns, column_shares=[6, 5], name=self.title)
+
+    def column(self, shown: tuple[int, int]) -> rrb.Vertical:
+        """Verdict, scene, lanes and distance in a column, to stand beside others; all of them show the same steps."""
+        import rerun.blueprint as rrb
+
+        page = replace(self, shown=shown)
+        parts: list[tuple[float, Any]] = [(130, page._words("verdict", self.title)), (420, page._scene("Scene"))]
+        if "distance" in page.curves:
+            parts.append((120, page._curve("distance")))
+        parts += page._lanes()
+        return rrb.Vertical(*(view for _, view in parts), row_shares=[share for share, _ in parts], name=self.title)
+
+    def _scene(self, name: str) -> rrb.Spatial3DView:
+        import rerun.blueprint as rrb
+
+        trail = rrb.VisibleTimeRanges([_up_to_now(timeline) for timeline in (EPISODE_TIMELINE, SECONDS_TIMELINE)])
+        return rrb.Spatial3DView(
+            origin=f"{self.root}/scene",
+            name=name,
+            background=BACKGROUND,
+            line_grid=False,
+            eye_controls=rrb.EyeControls3D(position=self.eye[0], look_target=self.eye[1], eye_up=(0.0, 0.0, 1.0)),
+            overrides={path: trail for path in self.trails},
+        )
+
+    def _words(self, part: str, name: str) -> rrb.TextDocumentView:
+        import rerun.blueprint as rrb
+
+        return rrb.TextDocumentView(origin=f"{self.root}/{part}", name=name)
+
+    def _lanes(self) -> list[tuple[float, Any]]:
+        import rerun.blueprint as rrb
+
+        if not self.lanes:
+            return []
+        view = rrb.StateTimelineView(
+            origin=f"{self.root}/lanes", name="The step in force, and what holds", time_view=_window(self.shown)
+        )
+        return [(50 + 40 * min(self.lanes, 8), view)]
+
+    def _curve(self, name: str) -> rrb.TimeSeriesView:
+        import rerun.blueprint as rrb
+
+        limits = LIMITS.get(name)
+        many = name in ("action", "skill_weights")
+        return rrb.TimeSeriesView(
+            origin=f"{self.root}/{name}",
+            name=CURVES[name][0],
+            axis_x=_window(self.shown),
+            axis_y=None if limits is None else rrb.ScalarAxis(range=limits, zoom_lock=True),
+            plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=many),
+        )
+
+
+def side_by_side(pages: Sequence[Page], title: str) -> rrb.Horizontal:
+    """Episodes beside one another, a column each."""
+    import rerun.blueprint as rrb
+
+    shown = min(page.shown[0] for page in pages), max(page.shown[1] for page in pages)
+    return rrb.Horizontal(*(page.column(shown) for page in pages), name=title)
+
+
 def send_page(
     stream: RecordingStream,
     name: str,
@@ -46,8 +149,8 @@ def send_page(
     heading: Heading,
     episode: RecordedEpisode,
     motion: Motion | None = None,
-) -> rrb.Horizontal:
-    """Log an episode under ``name``; returns the views of it, a tab called ``title``."""
+) -> Page:
+    """Log an episode under ``name``; what its views, a tab called ``title``, are to show."""
     import rerun as rr
 
     root = entity_path(name)
@@ -59,7 +162,7 @@ def send_page(
         log_plan(stream, root, episode)
     curves = log_curves(stream, root, episode)
     lanes = log_lanes(stream, root, episode)
-    return _layout(
+    return Page(
         root,
         title,
         trails=trails,
@@ -70,51 +173,6 @@ def send_page(
         lanes=lanes,
         good=episode.first_success is not None,
     )
-
-
-def _layout(
-    root: str,
-    title: str,
-    *,
-    trails: Collection[str],
-    eye: tuple[Point, Point],
-    shown: tuple[int, int],
-    curves: Collection[str],
-    steps: int,
-    lanes: int,
-    good: bool,
-) -> rrb.Horizontal:
-    """Scene and curves on the left, words and lanes on the right."""
-    import rerun.blueprint as rrb
-
-    trail = rrb.VisibleTimeRanges([_up_to_now(name) for name in (EPISODE_TIMELINE, SECONDS_TIMELINE)])
-    scene = rrb.Spatial3DView(
-        origin=f"{root}/scene",
-        name="Scene",
-        background=BACKGROUND,
-        line_grid=False,
-        eye_controls=rrb.EyeControls3D(position=eye[0], look_target=eye[1], eye_up=(0.0, 0.0, 1.0)),
-        overrides={path: trail for path in trails},
-    )
-    left: list[tuple[float, Any]] = [(13, scene)]
-    for name, (words, share) in CURVES.items():
-        if name in curves:
-            left.append((share, _curve(f"{root}/{name}", words, shown, many=name in ("action", "skill_weights"))))
-    # Shares are about as many pixels as a view needs; what is longer scrolls.
-    right: list[tuple[float, Any]] = [
-        (115 if good else 215, rrb.TextDocumentView(origin=f"{root}/verdict", name="Verdict"))
-    ]
-    if steps:
-        right.append((70 + 58 * min(steps, 6), rrb.TextDocumentView(origin=f"{root}/plan", name="Plan")))
-    if lanes:
-        view = rrb.StateTimelineView(
-            origin=f"{root}/lanes", name="The step in force, and what holds", time_view=_window(shown)
-        )
-        right.append((50 + 40 * min(lanes, 8), view))
-    columns = [
-        rrb.Vertical(*(view for _, view in part), row_shares=[share for share, _ in part]) for part in (left, right)
-    ]
-    return rrb.Horizontal(*columns, column_shares=[6, 5], name=title)
 
 
 def _window(shown: tuple[int, int]) -> Any:
@@ -130,17 +188,4 @@ def _up_to_now(timeline: str) -> Any:
 
     return rr.VisibleTimeRange(
         timeline, start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.cursor_relative()
-    )
-
-
-def _curve(origin: str, name: str, shown: tuple[int, int], *, many: bool) -> rrb.TimeSeriesView:
-    import rerun.blueprint as rrb
-
-    limits = LIMITS.get(origin.rpartition("/")[2])
-    return rrb.TimeSeriesView(
-        origin=origin,
-        name=name,
-        axis_x=_window(shown),
-        axis_y=None if limits is None else rrb.ScalarAxis(range=limits, zoom_lock=True),
-        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=many),
     )

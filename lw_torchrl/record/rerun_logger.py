@@ -17,6 +17,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.record.loggers import Logger
 
+from lw_torchrl._checks import check_choice
 from lw_torchrl.record.blueprint import make_blueprint
 from lw_torchrl.record.episodes import episode_name
 from lw_torchrl.record.heading import Heading
@@ -37,7 +38,7 @@ from lw_torchrl.record.metrics import (
     send_video,
 )
 from lw_torchrl.record.mujoco_scene import Motion
-from lw_torchrl.record.page import send_page
+from lw_torchrl.record.page import Page, send_page, side_by_side
 from lw_torchrl.record.recorded_episode import PlanLike, RecordedEpisode
 from lw_torchrl.record.recording_file import check_path
 from lw_torchrl.record.timelines import CONTROL_PERIOD, entity_path
@@ -105,7 +106,9 @@ class RerunLogger(Logger):
         self._curves: dict[str, int] = {}
         self._counters: dict[str, int] = {}
         self._hparams: dict[str, str] = {}
-        self._episodes: dict[str, Any] = {}
+        self._pages: dict[str, Page] = {}
+        self._episodes: list[Any] = []
+        self._compared: list[Any] = []
         self._tabs = MetricTabs()
         self._shown = (0, 0)
         super().__init__(
@@ -290,10 +293,10 @@ class RerunLogger(Logger):
     def _send_waiting(self) -> None:
         """Send numbers that wait, and the layout where there is something new to show."""
         self._send_scalars()
-        shown = len(self._episodes), self._tabs.count()
+        shown = len(self._compared) + len(self._episodes), self._tabs.count()
         if shown != self._shown:
             self._shown = shown
-            blueprint = make_blueprint(list(self._episodes.values()), self._tabs.tabs())
+            blueprint = make_blueprint([*self._compared, *self._episodes], self._tabs.tabs())
             self._layout.send(self._writer.stream, blueprint)
 
     # ---------------------------------------------------------------- episodes
@@ -301,7 +304,7 @@ class RerunLogger(Logger):
     @property
     def episodes(self) -> list[str]:
         """The names of the episodes so far."""
-        return list(self._episodes)
+        return list(self._pages)
 
     def log_episode(
         self,
@@ -353,7 +356,24 @@ class RerunLogger(Logger):
     ) -> str:
         """Add the page of an episode that was checked; returns its name. With a motion the robot is shown as it is."""
         stream = self._open()
-        entity = episode_name(heading.name, name, self._episodes)
-        title = heading.title(episode, name)
-        self._episodes[entity] = send_page(stream, entity, title, heading, episode, motion)
+        entity = episode_name(heading.name, name, self._pages)
+        self._pages[entity] = page = send_page(stream, entity, heading.title(episode, name), heading, episode, motion)
+        self._episodes.append(page.tab())
         return entity
+
+    def compare(self, names: Sequence[str], title: str = "Side by side") -> None:
+        """Show episodes beside one another, in a tab before their own: one cursor moves in all of them.
+
+        Args:
+            names: of two episodes or more, as :func:`lw_torchrl.log_rollout` returned them.
+            title: of the tab.
+
+        Raises:
+            ValueError: there are not two, or no episode of such a name.
+        """
+        self._open()
+        names = [names] if isinstance(names, str) else list(names)
+        if len(names) < 2:
+            raise ValueError(f"names must be of two episodes or more, got {', '.join(names) or 'none'}")
+        pages = [self._pages[check_choice("names", name, self._pages)] for name in names]
+        self._compared.append(side_by_side(pages, title))

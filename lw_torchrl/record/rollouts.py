@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -11,14 +11,15 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from lw_torchrl._files import replacing
-from lw_torchrl.envs.episodes import policy_of, run_episodes
+from lw_torchrl._progress import Progress
+from lw_torchrl.envs.episodes import FinishedEpisode, policy_of, run_episodes
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
-from lw_torchrl.evaluation.protocol import make_env, tasks_of
-from lw_torchrl.language.plans import ConditionalPlan
+from lw_torchrl.evaluation.protocol import actor_plans, make_env, tasks_of
+from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.language.tasks import Task
-from lw_torchrl.modules.policy import Policy, plans_of
 from lw_torchrl.record.rerun_logger import RerunLogger
 from lw_torchrl.record.rollout_pages import log_rollout
 
@@ -26,67 +27,84 @@ _KEYS: list[NestedKey] = ["observation", "task_id", "episode", "action", ("next"
 _PLAN_KEYS = {"qaf", "skill_weights", "action_corrected"}
 
 
-def rollout_tasks(
-    actor: Policy,
+def run_recorded(
+    actor: Any,
     tasks: str | Task | Iterable[str | Task],
     *,
+    plans: Plans | None = None,
     seed: int,
-    episode: int = 0,
+    episodes: Sequence[int] = (0,),
     noise_scale: float = 0.1,
     max_steps: int = 500,
     engine: Any = "vectorized",
-) -> dict[str, TensorDictBase]:
-    """One episode of each task, the same as :func:`lw_torchrl.evaluate` runs it.
+    progress: bool = False,
+) -> list[FinishedEpisode]:
+    """Episodes with all that a recording shows of them, the same as :func:`lw_torchrl.evaluate` runs them.
+
+    Args:
+        actor: a policy, or a module as for :func:`lw_torchrl.evaluate`.
+        tasks: as there.
+        plans: whose queries to answer; None for the actor's own.
+        seed: of the environment.
+        episodes: indices, of each task.
+        noise_scale, max_steps, engine: as there.
+        progress: show a bar where it takes longer than a second.
 
     Returns:
-        Task to a TensorDict of batch (T,): observation (T, 39) and action (T, 4) float32, the executed one, task_id and
-        episode (T,) int64, next/success (T, 1) bool, next/reward (T, 1) float32; where the actor has plans qaf (T, S)
-        bool, and skill_weights (T, S) and action_corrected (T, 1) float32 where it writes them; where it has an
-        evaluator of queries, its qaf_logits (T, S) float32.
+        By task, as they were given, and episode: a TensorDict of batch (T,), observation (T, 39) and action (T, 4)
+        float32, the executed one, task_id and episode (T,) int64, next/success (T, 1) bool, next/reward (T, 1) float32;
+        with plans qaf (T, S) bool, and skill_weights (T, S) and action_corrected (T, 1) float32 where the actor writes
+        them; where it has an evaluator of queries, its qaf_logits (T, S) float32.
     """
-    chosen = tasks_of(tasks, plans_of(actor))
+    answered = actor_plans(actor, plans)
+    chosen = tasks_of(tasks, answered)
     base = LanguageWorldEnv(list(chosen.values()), seed=seed, max_steps=max_steps, engine=engine, strict=True)
-    env = make_env(actor, plans_of(actor), base)
-    written = {"qaf", *actor.out_keys} if plans_of(actor) is not None else set()
+    env = make_env(actor, answered, base)
+    written = set() if answered is None else {"qaf", *actor.out_keys}
     evaluator = getattr(actor, "evaluator", None)
     asked = [] if evaluator is None else evaluator.in_keys
+    bar = Progress("recording", len(chosen) * len(episodes) * max_steps, "step", show=progress)
+    found = {}
     try:
-        with torch.no_grad():
-            return {
-                found.task: found.steps if evaluator is None else evaluator(found.steps)
-                for found in run_episodes(
-                    env,
-                    policy_of(actor.eval()),
-                    {task: [episode] for task in chosen},
-                    keys=list(dict.fromkeys([*_KEYS, *sorted(_PLAN_KEYS & written), *asked])),
-                    noise=(lambda _: (noise_scale,) * 4) if noise_scale else None,
-                )
-            }
+        with bar, torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            for one in run_episodes(
+                env,
+                policy_of(actor.eval()),
+                {task: list(episodes) for task in chosen},
+                keys=list(dict.fromkeys([*_KEYS, *sorted(_PLAN_KEYS & written), *asked])),
+                noise=(lambda _: (noise_scale,) * 4) if noise_scale else None,
+                on_progress=bar.update,
+            ):
+                steps = one.steps if evaluator is None else evaluator(one.steps)
+                found[one.task, one.episode] = one._replace(steps=steps)
     finally:
         env.close()
+    return [found[task, episode] for task in chosen for episode in episodes]
 
 
 def write_recording(
     path: str | os.PathLike[str],
-    actor: Policy,
-    rollouts: dict[str, TensorDictBase],
+    episodes: Iterable[FinishedEpisode],
+    plans: Plans | None = None,
     *,
     seed: int | None = None,
     policy: str | None = None,
+    tasks: Iterable[Task] = (),
 ) -> None:
-    """Write rollouts to a rerun file, each with its plan where there is one; the file is replaced whole.
+    """Write episodes to a rerun file, each with its plan where there is one; the file is replaced whole.
 
     Args:
         path: the .rrd file.
-        actor: whose plans and tasks they are.
-        rollouts: task to rollout, as from :func:`rollout_tasks`.
+        episodes: as from :func:`run_recorded`.
+        plans: what their queries answer.
         seed: that they were run with; None draws a hand over a table in the place of the robot.
         policy: who acted, in a word.
+        tasks: of your own, where the plans do not say what they are.
     """
-    definitions = [definition for task in rollouts if (definition := actor.definition(task)) is not None]
+    tasks = list(tasks)
     with replacing(path) as file, RerunLogger(file, exp_name=Path(path).stem) as logger:
-        for rollout in rollouts.values():
-            log_rollout(logger, rollout, actor.plans, seed=seed, policy=policy, tasks=definitions)
+        for one in episodes:
+            log_rollout(logger, one.steps, plans, seed=seed, policy=policy, tasks=tasks)
 
 
 def active_skills(rollout: TensorDictBase, plan: ConditionalPlan) -> list[tuple[str, int]]:

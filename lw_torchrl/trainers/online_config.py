@@ -47,10 +47,10 @@ class OnlineConfig:
     rows: int = 20
     max_steps: int = 250
     round_steps: int = 250
-    utd: float = 0.2
+    utd: float = 0.4
     batch_size: int = 200
     first_frames: int = 1_000
-    warm_up: int = 400
+    warm_up: int = 2_000
     actor_learning_rate: float = 1e-4
     critic_learning_rate: float = 5e-4
     cloning_learning_rate: float = 3e-4

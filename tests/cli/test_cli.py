@@ -24,6 +24,7 @@ COMMANDS = (
     "data",
     "train",
     "evaluate",
+    "record",
     "view",
     "query",
     "scripted",

@@ -18,7 +18,7 @@ FOLDERS = {
     "offline": ["quick", "--out"],
     "online": ["reach", "--out"],
 }
-FILES = {"train": ["demos", "--out"], "view": ["x.rrd", "--screenshot"]}
+FILES = {"train": ["demos", "--out"], "record": ["reach", "--out"], "view": ["x.rrd", "--screenshot"]}
 
 
 @pytest.fixture(autouse=True)

@@ -1,0 +1,58 @@
+"""``lw-torchrl record``: any task under any policy, two of them side by side, and why it failed."""
+
+import pytest
+from commands import fails, run
+
+import lw_torchrl as lw
+from lw_torchrl.record.opening_steps import opening_steps
+
+SHORT = ("--max-steps", 120, "--seed", 1000)
+
+
+def test_an_expert_is_recorded_with_the_shipped_plan(capsys, tmp_path):
+    out = tmp_path / "recordings" / "reach.rrd"
+    printed = run(capsys, "record", "reach", "--episodes", 0, 2, *SHORT, "--out", out)
+    assert "reach, episode 0, expert: success at step " in printed
+    assert "reach, episode 2, expert: " in printed
+    assert f"lw-torchrl view {out}" in printed
+    assert set(opening_steps(out)) == {"/reach-0", "/reach-2"}
+
+
+@pytest.mark.parametrize("who", ["random", "wrong"])
+def test_who_acts_by_chance_is_the_same_each_time(capsys, tmp_path, who):
+    found = [run(capsys, "record", "push", "--policy", who, *SHORT, "--out", tmp_path / "x.rrd") for _ in range(2)]
+    assert found[0] == found[1]
+    assert f"push, episode 0, {who}: failed" in found[0]
+
+
+def test_two_policies_side_by_side(capsys, tmp_path):
+    policy, out = tmp_path / "mine.zip", tmp_path / "x.rrd"
+    lw.save_actor(lw.PlanConditionedActor(lw.load_plans("MT10"), width=16, depth=1), policy)
+    printed = run(capsys, "record", "reach", "--policy", policy, "--compare", "scripted", *SHORT, "--out", out)
+    assert "reach, episode 0, mine: failed" in printed
+    assert "reach, episode 0, scripted: success at step " in printed
+    assert set(opening_steps(out)) == {"/reach-0-1", "/reach-0-2"}
+
+
+def test_a_failure_is_explained(capsys, tmp_path):
+    out = tmp_path / "x.rrd"
+    printed = run(
+        capsys, "record", "push", "--policy", "scripted", "--attribute", "--max-steps", 45, "--seed", 1000, "--out", out
+    )
+    assert "push, episode 0, scripted: failed, out of time: " in printed
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (("--policy", "experts"), "did you mean 'expert'"),
+        (("--compare", "nowhere.zip"), "'nowhere.zip'"),
+        (("--reference", "MT10"), "--reference is for --attribute"),
+        (("--out", "x.mp4"), "--out must end in '.rrd'"),
+        (("--episodes", -1), "-1"),
+    ],
+)
+def test_what_it_refuses(capsys, tmp_path, monkeypatch, more, message):
+    monkeypatch.chdir(tmp_path)
+    assert message in fails(capsys, "record", "reach", *more)
+    assert not list(tmp_path.rglob("*.rrd"))
