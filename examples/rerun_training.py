@@ -18,6 +18,7 @@ from torchrl.objectives import BCLoss
 import lw_torchrl as lw
 
 TASKS = ["drawer-open", "window-open"]
+SEED = 1_000
 
 
 def show(logger, env, actor, plans, step, length) -> None:
@@ -32,14 +33,7 @@ def show(logger, env, actor, plans, step, length) -> None:
     logger.log_scalar("skills/share of steps", rollout["skill_weights"].mean((0, 1)), step=step)
     logger.log_histogram("action", rollout["action"], step=step)
     for row, task in enumerate(TASKS):
-        definition = lw.TASKS[task]
-        logger.log_episode(
-            rollout[row],
-            task=task,
-            objects=definition.positions(rollout[row]["observation"]),
-            plan=plans[task],
-            name=f"{task} after {step}",
-        )
+        lw.log_rollout(logger, rollout[row], plans, seed=SEED, policy=f"step {step}", name=f"{task} after {step}")
 
 
 def main() -> None:
@@ -75,7 +69,7 @@ def main() -> None:
         loss = BCLoss(actor, loss_function="l2")
         optimizer = torch.optim.AdamW(loss.parameters(), lr=1e-3)
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, args.steps)
-        env = TransformedEnv(lw.LanguageWorldEnv(TASKS, seed=1_000), lw.QAFTransform(plans))
+        env = TransformedEnv(lw.LanguageWorldEnv(TASKS, seed=SEED), lw.QAFTransform(plans))
 
         with lw.RerunLogger(args.out, connect=args.connect) as logger:
             logger.log_hparams(vars(args) | {"optimizer": {"name": "AdamW", "lr": 1e-3}})
