@@ -35,7 +35,7 @@ def copy_recording(source: Path, target: Path, tab: str | None = None) -> None:
             tabs = Tabs(layout)
             front = None if tab is None else tabs.find(tab)
             if tab is not None and front is None:
-                raise unknown_name("episode", tab, tabs.titles())
+                raise unknown_name("episode", tab, tabs.names())
             # What came in many small pieces becomes a few: a training's curves take a twentieth.
             data = reader.stream(store=known).collect(optimize=OptimizationProfile.LIVE)
         except RuntimeError as error:

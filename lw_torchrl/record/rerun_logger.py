@@ -357,7 +357,8 @@ class RerunLogger(Logger):
         """Add the page of an episode that was checked; returns its name. With a motion the robot is shown as it is."""
         stream = self._open()
         entity = episode_name(heading.name, name, self._pages)
-        self._pages[entity] = page = send_page(stream, entity, heading.title(episode, name), heading, episode, motion)
+        title = heading.title(episode, None if entity == heading.name else entity)
+        self._pages[entity] = page = send_page(stream, entity, title, heading, episode, motion)
         self._episodes.append(page.tab())
         return entity
 

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
+from lw_torchrl.record.episodes import RESERVED
 from lw_torchrl.record.timelines import EPISODE_TIMELINE, METRIC_TIMELINE
 
 if TYPE_CHECKING:
@@ -56,9 +57,14 @@ class Tabs:
         origins = (self._values.get((other[-1], "space_origin"), [""])[0] for other in inside)
         return {origin.strip("/").partition("/")[0].replace("\\", "") for origin in origins} - {""}
 
-    def titles(self) -> list[str]:
-        """The titles of the outermost tabs."""
-        return [title for path in self._tabs if len(path) == 2 and (title := self._title(path))]
+    def names(self) -> list[str]:
+        """What the outermost tabs are found by: the episode's name where there is one, or else the title."""
+        found = []
+        for path in self._tabs:
+            if len(path) == 2 and (title := self._title(path)):
+                episodes = self._origins(path) - set(RESERVED)
+                found.append(episodes.pop() if len(episodes) == 1 else title)
+        return found
 
     def find(self, name: str) -> tuple[str, ...] | None:
         """The tab of that title, or of that episode, or the only one whose title holds those words; None: no one."""

@@ -147,7 +147,7 @@ def test_a_folder_stands_for_its_recording(tmp_path):
         ("reach", "reach", "step"),
         ("Metrics", "Metrics", "global_step"),
         ("metri", "Metrics", "global_step"),
-        ("2", "reach 2", "step"),
+        ("2", "reach-2", "step"),
     ],
 )
 def test_a_tab_is_brought_to_the_front(tmp_path, name, title, timeline):
@@ -164,7 +164,7 @@ def test_a_tab_is_brought_to_the_front(tmp_path, name, title, timeline):
     assert tabs._values[front, "display_name"] == [title]
     assert tabs._values["time_panel", "timeline"] == [timeline]
     with (
-        pytest.raises(ValueError, match="episode must be one of 'reach', 'reach 2', 'Metrics', got 'rea'"),
+        pytest.raises(ValueError, match="episode must be one of 'reach', 'reach-2', 'Metrics', got 'rea'"),
         opened(tmp_path / "a.rrd", "rea"),
     ):
         pass
