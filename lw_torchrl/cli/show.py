@@ -49,7 +49,7 @@ def view(
         recording: an .rrd file, or a folder that holds one.
         episode: open at this tab, by its title or its episode's name.
         screenshot: write a .png here and open no window; wants Debian's mesa-vulkan-drivers and libvulkan1.
-        step: the step at which to take the picture; the last if none is given.
+        step: the step at which to take the picture; if none is given, the one that tells most, of a training the last.
         window_size: of the picture or the window, WIDTHxHEIGHT.
         html: write one self-contained page here, some 20 MB, that opens from disk in a browser.
         web: serve a page on this machine and print its address, until Ctrl-C.

@@ -66,6 +66,11 @@ class Tabs:
                 found.append(episodes.pop() if len(episodes) == 1 else title)
         return found
 
+    def episodes(self, name: str | None = None) -> set[str]:
+        """The episodes that a tab shows; without a name the first tab."""
+        path = self.find(name) if name is not None else next((path for path in self._tabs if len(path) == 2), None)
+        return set() if path is None else self._origins(path) - set(RESERVED)
+
     def find(self, name: str) -> tuple[str, ...] | None:
         """The tab of that title, or of that episode, or the only one whose title holds those words; None: no one."""
         outer = [path for path in self._tabs if len(path) == 2]

@@ -9,6 +9,7 @@ from pathlib import Path
 from lw_torchrl._checks import check_int
 from lw_torchrl._files import replacing
 from lw_torchrl.record.opening import find_recording, opened
+from lw_torchrl.record.opening_steps import opening_step
 from lw_torchrl.record.rerun_binary import failure, running
 from lw_torchrl.record.screenshot import take_picture
 
@@ -30,7 +31,7 @@ def open_viewer(
         screenshot: a PNG file to write instead of opening a window; it is replaced whole or not at all.
         window_size: of the picture or the window, "1400x900" points.
         step: for a picture, the step of the episode, or of the training, that the time cursor stands at; None takes
-            the last.
+            the one that tells most of an episode, its first success, say, and of a training the last.
         episode: the tab to open at, by its title ("Metrics") or its episode's name; None takes the layout's.
 
     Raises:
@@ -53,8 +54,9 @@ def open_viewer(
         raise ValueError(f"screenshot must end in '.png', got {str(screenshot)!r}")
     with opened(recording, episode) as file:
         if screenshot is not None:
+            at = opening_step(file, episode) if step is None else step
             with replacing(screenshot) as picture:
-                take_picture(file, picture.absolute(), window_size, step)
+                take_picture(file, picture.absolute(), window_size, at)
             return
         with running(file, "--window-size", window_size) as (process, output):
             if process.wait():

@@ -13,6 +13,7 @@ from tensordict import TensorDict
 
 from lw_torchrl.record import RerunLogger, open_viewer
 from lw_torchrl.record.opening import find_recording, opened
+from lw_torchrl.record.opening_steps import opening_step
 from lw_torchrl.record.rrd_stream import is_whole
 from lw_torchrl.record.tabs import Tabs
 
@@ -168,3 +169,28 @@ def test_a_tab_is_brought_to_the_front(tmp_path, name, title, timeline):
         opened(tmp_path / "a.rrd", "rea"),
     ):
         pass
+
+
+def test_a_picture_of_an_episode_is_of_the_step_that_tells_most(tmp_path):
+    rollout = TensorDict({"observation": torch.rand(9, 39), "action": torch.rand(9, 4)}, [9])
+    won = rollout.clone().set(("next", "success"), torch.arange(9).unsqueeze(-1) >= 3)
+    with RerunLogger(tmp_path / "a.rrd") as logger:
+        names = [logger.log_episode(one, task="reach", objects={}) for one in (won, rollout)]
+        logger.log_scalar("loss/bc", 1.0)
+    found = [opening_step(tmp_path / "a.rrd", tab) for tab in (None, *names, "Metrics")]
+    assert found == [4, 4, 9, None]
+
+
+def test_episodes_are_compared_before_their_own_tabs(tmp_path):
+    rollout = TensorDict({"observation": torch.rand(9, 39), "action": torch.rand(9, 4)}, [9])
+    with RerunLogger(tmp_path / "a.rrd") as logger:
+        names = [logger.log_episode(rollout, task="reach", objects={}) for _ in range(2)]
+        logger.compare(names)
+        with pytest.raises(ValueError, match="names must be of two episodes or more, got reach"):
+            logger.compare(["reach"])
+        with pytest.raises(ValueError, match="names must be one of 'reach', 'reach-2', got 'push'"):
+            logger.compare(["reach", "push"])
+    reader = RrdReader(tmp_path / "a.rrd")
+    tabs = Tabs(reader.stream(store=reader.blueprints()[-1]).to_chunks())
+    assert tabs.names() == ["Side by side", "reach", "reach-2"]
+    assert tabs.episodes() == {"reach", "reach-2"}
