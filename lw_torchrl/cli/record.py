@@ -86,22 +86,15 @@ def record(
             if attribute and shown is not None and hasattr(actor, "with_plans"):
                 failures = lw.attribute_failures(found, shown, actor=actor, reference=trusted, **options)
                 why = {(one.task, one.episode): one for one in failures}
+            pages = []
             for one in found:
-                print(_line(one, who, why.get((one.task, one.episode))))
-            recorded.append(
-                [
-                    lw.log_rollout(
-                        logger,
-                        one.steps,
-                        shown,
-                        seed=seed,
-                        policy=who,
-                        failure=why.get((one.task, one.episode)),
-                        name=None if compare is None else f"{one.task}-{one.episode}-{len(recorded) + 1}",
-                    )
-                    for one in found
-                ]
-            )
+                failure = why.get((one.task, one.episode))
+                print(_line(one, who, failure))
+                name = None if compare is None else f"{one.task}-{one.episode}-{len(recorded) + 1}"
+                pages.append(
+                    lw.log_rollout(logger, one.steps, shown, seed=seed, policy=who, failure=failure, name=name)
+                )
+            recorded.append(pages)
         for pair, one in zip(zip(*recorded, strict=True), found, strict=True) if compare is not None else ():
             logger.compare(pair, f"{one.task} · episode {one.episode} · side by side")
     print(f"written to {out}\nlook at it with: lw-torchrl view {out}")
@@ -143,7 +136,7 @@ def _cast(
 
 def _line(episode: FinishedEpisode, who: str, failure: Failure | None) -> str:
     """How an episode went, in a line."""
-    hits = episode.steps.get(("next", "success")).flatten().nonzero().flatten()
-    ended = f"success at step {int(hits[0]) + 1}" if len(hits) else "failed"
+    first = episode.first_success
+    ended = "failed" if first is None else f"success at step {first}"
     why = "" if failure is None else f", {failure.cause}: {failure.why}"
     return f"{episode.task}, episode {episode.episode}, {who}: {ended}{why}"

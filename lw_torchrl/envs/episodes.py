@@ -34,6 +34,12 @@ class FinishedEpisode(NamedTuple):
     episode: int
     steps: TensorDictBase
 
+    @property
+    def first_success(self) -> int | None:
+        """The first successful step, counted from 1; None without success. It wants ("next", "success") recorded."""
+        hits = self.steps.get(("next", "success")).flatten().nonzero().flatten()
+        return int(hits[0]) + 1 if len(hits) else None
+
 
 def in_blocks(
     policy: Callable[[TensorDictBase], TensorDictBase],

@@ -62,13 +62,13 @@ class PlanUse:
         self._seen: dict[str, list[tuple[Tensor, Tensor | None, int, bool]]] = {}
 
     def __call__(self, episode: FinishedEpisode) -> None:
-        hits = episode.steps.get(("next", "success")).flatten().nonzero().flatten()
-        before = int(hits[0]) + 1 if len(hits) else len(episode.steps)
+        success = episode.first_success
+        before = success or len(episode.steps)
         steps = len(self.plans[episode.task].steps)
         qaf = episode.steps.get("qaf")[: before + _AFTER, :steps]
         weights = episode.steps.get("skill_weights", None)
         chosen = None if weights is None else weights[: before + _AFTER, :steps].argmax(-1)
-        self._seen.setdefault(episode.task, []).append((qaf, chosen, before, len(hits) > 0))
+        self._seen.setdefault(episode.task, []).append((qaf, chosen, before, success is not None))
 
     def tasks(self) -> dict[str, TaskUse]:
         """What was seen of each task."""

@@ -50,15 +50,15 @@ def tasks_of(tasks: str | Task | Iterable[str | Task], plans: Plans | None) -> d
     return named_tasks(tasks, known={**TASKS, **own})
 
 
-def _result(task: str, episode: int, steps: TensorDictBase, stopped_early: bool, keep_actions: bool) -> EpisodeResult:
-    success = steps.get(("next", "success")).flatten()
-    hits = success.nonzero().flatten()
+def _result(finished: FinishedEpisode, stopped_early: bool, keep_actions: bool) -> EpisodeResult:
+    task, episode, steps = finished
+    first = finished.first_success
     return EpisodeResult(
         task=task,
         episode=episode,
-        success=len(hits) > 0,
-        first_success=int(hits[0]) + 1 if len(hits) else None,
-        success_at_end=None if stopped_early else bool(success[-1]),
+        success=first is not None,
+        first_success=first,
+        success_at_end=None if stopped_early else bool(steps.get(("next", "success"))[-1]),
         episode_return=None if stopped_early else float(steps.get(("next", "reward")).double().sum()),
         actions=steps.get("action").clone() if keep_actions else None,
     )
@@ -212,7 +212,7 @@ def evaluate(
                 after_success=0 if stop_at_success else None,
                 on_progress=bar.update,
             ):
-                found.append(_result(*finished, stop_at_success, record_actions))
+                found.append(_result(finished, stop_at_success, record_actions))
                 if attribute and not found[-1].success:
                     failed.append(finished)
                 if on_episode is not None:

@@ -207,7 +207,7 @@ class Again:
                 stack.enter_context(set_exploration_type(ExplorationType.DETERMINISTIC))
                 bar = Progress(f"again with {what}", len(which) * max_steps, "step", show=self.progress)
                 stack.enter_context(bar)
-                for task, episode, steps in run_episodes(
+                for one in run_episodes(
                     env,
                     policy_of(actor, self.device),
                     wanted,
@@ -216,9 +216,9 @@ class Again:
                     after_success=0,
                     on_progress=bar.update,
                 ):
-                    self._check_first(task, episode, steps)
-                    hits = steps.get(("next", "success")).flatten().nonzero().flatten()
-                    found[task, episode] = int(hits[0]) if len(hits) else None
+                    self._check_first(*one)
+                    first = one.first_success
+                    found[one.task, one.episode] = None if first is None else first - 1
         finally:
             env.close()
         return found

@@ -114,13 +114,12 @@ def run_demo(out: Path, config: DemoConfig) -> EvaluationResult:
     episodes = run_recorded(actor, config.tasks, seed=config.evaluation_seed, noise_scale=config.evaluation_noise)
     chosen = [one for one in episodes if one.task in RECORDED] or episodes[:1]
     write_recording(out / "rollout.rrd", chosen, plans, seed=config.evaluation_seed, policy="demo")
-    rollouts = {one.task: one.steps for one in episodes}
     print(f"\n{result.table()}\n")
     print("skills that led, in order, up to the first success (steps):")
-    for task in config.tasks:
-        led = [f"{skill} ({steps})" for skill, steps in active_skills(rollouts[task], plans[task])]
+    for one in episodes:
+        led = [f"{skill} ({steps})" for skill, steps in active_skills(one, plans[one.task])]
         shown = led if len(led) <= 8 else [*led[:4], f"... {len(led) - 7} changes ...", *led[-3:]]
-        print(f"  {task}: " + " > ".join(shown))
+        print(f"  {one.task}: " + " > ".join(shown))
     print(f"\nresults   {results}\nfigure    {out / 'success.png'}\npolicy    {out / 'checkpoint.zip'}")
     print(f"recording lw-torchrl view {out / 'rollout.rrd'}")
     return result

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -107,14 +106,13 @@ def write_recording(
             log_rollout(logger, one.steps, plans, seed=seed, policy=policy, tasks=tasks)
 
 
-def active_skills(rollout: TensorDictBase, plan: ConditionalPlan) -> list[tuple[str, int]]:
+def active_skills(episode: FinishedEpisode, plan: ConditionalPlan) -> list[tuple[str, int]]:
     """The skills in the order in which they led, with how many steps each did, up to the first success.
 
     A skill leads where it has the largest weight; steps in which no condition holds count as "no condition holds".
     """
-    success = rollout.get(("next", "success")).flatten().nonzero().flatten()
-    end = int(success[0]) + 1 if len(success) else rollout.batch_size[0]
-    leading = rollout.get("skill_weights")[:end].argmax(-1).tolist()
-    answered = rollout.get("qaf")[:end].any(-1).tolist()
+    end = episode.first_success
+    leading = episode.steps.get("skill_weights")[:end].argmax(-1).tolist()
+    answered = episode.steps.get("qaf")[:end].any(-1).tolist()
     names = [plan.steps[i].skill if any_ else "no condition holds" for i, any_ in zip(leading, answered, strict=True)]
     return [(name, len(list(group))) for name, group in groupby(names)]
