@@ -11,11 +11,11 @@ from types import SimpleNamespace
 
 import pytest
 
+from benchmarks import __main__ as cli
+from benchmarks import ablations, latents
+from benchmarks.report import Row, Skipped, compare, part_of, times_as_long, under
+
 ROOT = Path(__file__).parent.parent
-sys.path.insert(0, str(ROOT))
-from benchmarks import __main__ as cli  # noqa: E402
-from benchmarks import ablations, latents  # noqa: E402
-from benchmarks.report import Row, Skipped, compare, part_of, times_as_long, under  # noqa: E402
 
 FIELDS = {"name", "ours", "unit", "rival", "theirs", "ratio", "spread", "target", "met", "note"}
 
