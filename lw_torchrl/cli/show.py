@@ -49,7 +49,7 @@ def view(
         recording: an .rrd file, or a folder that holds one.
         episode: open at this tab, by its title or its episode's name.
         screenshot: write a .png here and open no window; wants Debian's mesa-vulkan-drivers and libvulkan1.
-        step: the step at which to take the picture; if none is given, the one that tells most, of a training the last.
+        step: the step to open at; if none is given, the one that tells most, of a training the last.
         window_size: of the picture or the window, WIDTHxHEIGHT.
         html: write one self-contained page here, some 20 MB, that opens from disk in a browser.
         web: serve a page on this machine and print its address, until Ctrl-C.
@@ -65,13 +65,13 @@ def view(
     from lw_torchrl.record import WebPage, open_viewer, write_html
 
     if web:
-        with WebPage(recording, episode=episode, port=port) as page:
+        with WebPage(recording, episode=episode, step=step, port=port) as page:
             print(f"{page.address}  (Ctrl-C ends it)", flush=True)
             with suppress(KeyboardInterrupt):
                 page.serve()
         return
     if html is not None:
-        write_html(recording, html, episode=episode)
+        write_html(recording, html, episode=episode, step=step)
     else:
         open_viewer(recording, screenshot, window_size, step=step, episode=episode)
     if written := html or screenshot:

@@ -16,7 +16,9 @@ from string import Template
 from urllib.error import URLError
 
 from lw_torchrl._files import replacing
+from lw_torchrl.record.cursor import request
 from lw_torchrl.record.opening import find_recording, opened
+from lw_torchrl.record.opening_step import opening_step
 from lw_torchrl.record.rerun_binary import LOCAL, failure, free_port, running
 
 LARGE = 30 * 10**6
@@ -30,7 +32,9 @@ _INSIDE = """const load = (name) => {
 };"""
 
 
-def write_html(path: str | os.PathLike[str], page: str | os.PathLike[str], *, episode: str | None = None) -> Path:
+def write_html(
+    path: str | os.PathLike[str], page: str | os.PathLike[str], *, episode: str | None = None, step: int | None = None
+) -> Path:
     """Write a recording as one page to send to somebody: it opens from disk, without a network.
 
     The page is some 20 MB of viewer and the recording, compressed. It wants WebGL 2 or WebGPU.
@@ -39,13 +43,14 @@ def write_html(path: str | os.PathLike[str], page: str | os.PathLike[str], *, ep
         path: the .rrd file, or a folder that holds one.
         page: the .html file; it is replaced whole or not at all.
         episode: the tab to open at, by its title or its episode's name; None takes the layout's.
+        step: where the time cursor stands; None takes the step that tells most of an episode.
 
     Returns:
         The page's path.
 
     Raises:
         FileNotFoundError: there is no such recording, or rerun is not installed.
-        ValueError: the recording is damaged or has no such tab, or ``page`` does not end in ".html".
+        ValueError: the recording is damaged or has no such tab or step, or ``page`` does not end in ".html".
 
     Example:
         >>> write_html("runs/demo/rollout.rrd", "rollout.html")  # doctest: +SKIP
@@ -54,6 +59,7 @@ def write_html(path: str | os.PathLike[str], page: str | os.PathLike[str], *, ep
     if target.suffix not in (".html", ".htm"):
         raise ValueError(f"page must end in '.html', got {str(target)!r}")
     with opened(recording, episode) as file:
+        at = opening_step(file, episode, step)
         data = {"wasm": viewer_wasm(), "recording": gzip.compress(file.read_bytes(), 6)}
     script = viewer_script().replace("</script", "<\\/script")
     inline = [f"<script>{script}</script>"]
@@ -61,7 +67,7 @@ def write_html(path: str | os.PathLike[str], page: str | os.PathLike[str], *, ep
         f'<script type="text/plain" id="{name}">{base64.b64encode(content).decode()}</script>'
         for name, content in data.items()
     ]
-    text = page_of(recording.stem, "\n".join(inline), _INSIDE)
+    text = page_of(recording.stem, "\n".join(inline), _INSIDE, at)
     with replacing(target) as file:
         file.write_text(text, encoding="utf-8")
     if len(text) > LARGE:
@@ -69,11 +75,12 @@ def write_html(path: str | os.PathLike[str], page: str | os.PathLike[str], *, ep
     return target
 
 
-def page_of(title: str, data: str, load: str) -> str:
-    """The page of the viewer, which gets its parts by the JavaScript function ``load``."""
+def page_of(title: str, data: str, load: str, step: int | None) -> str:
+    """The page of the viewer, which gets its parts by the JavaScript function ``load`` and opens at ``step``."""
     template = Template((Path(__file__).with_name("viewer_page.html")).read_text(encoding="utf-8"))
     quoted = json.dumps(title).replace("<", "\\u003c")
-    return template.substitute(title=html.escape(title), title_json=quoted, data=data, load=load)
+    cursor = json.dumps(None if step is None else list(request(step)))
+    return template.substitute(title=html.escape(title), title_json=quoted, data=data, load=load, cursor=cursor)
 
 
 def viewer_script() -> str:

@@ -11,7 +11,7 @@ from lw_torchrl.record.curves import log_curves
 from lw_torchrl.record.heading import Heading, decisive_step, telling_steps
 from lw_torchrl.record.lanes import log_lanes
 from lw_torchrl.record.mujoco_scene import Motion
-from lw_torchrl.record.opening_steps import COMPONENT
+from lw_torchrl.record.opening_step import COMPONENT
 from lw_torchrl.record.plan_text import log_plan
 from lw_torchrl.record.recorded_episode import RecordedEpisode
 from lw_torchrl.record.scene import log_scene

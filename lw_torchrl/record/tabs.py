@@ -68,8 +68,19 @@ class Tabs:
 
     def episodes(self, name: str | None = None) -> set[str]:
         """The episodes that a tab shows; without a name the first tab."""
-        path = self.find(name) if name is not None else next((path for path in self._tabs if len(path) == 2), None)
+        path = self._named(name)
         return set() if path is None else self._origins(path) - set(RESERVED)
+
+    def timeline(self, name: str | None = None) -> str:
+        """The timeline of what a tab shows; without a name of the first tab."""
+        path = self._named(name)
+        return METRIC_TIMELINE if path is None else self._timeline(path)
+
+    def _timeline(self, path: tuple[str, ...]) -> str:
+        return METRIC_TIMELINE if self._origins(path) <= OF_TRAINING else EPISODE_TIMELINE
+
+    def _named(self, name: str | None) -> tuple[str, ...] | None:
+        return self.find(name) if name is not None else next((path for path in self._tabs if len(path) == 2), None)
 
     def find(self, name: str) -> tuple[str, ...] | None:
         """The tab of that title, or of that episode, or the only one whose title holds those words; None: no one."""
@@ -90,8 +101,7 @@ class Tabs:
         rows.set_time("blueprint", sequence=0)
         for container, tab in pairwise(path):
             rows.log(container, ContainerBlueprint.from_fields(active_tab=tab))
-        timeline = METRIC_TIMELINE if self._origins(path) <= OF_TRAINING else EPISODE_TIMELINE
-        rows.log("time_panel", TimePanelBlueprint.from_fields(timeline=timeline))
+        rows.log("time_panel", TimePanelBlueprint.from_fields(timeline=self._timeline(path)))
 
 
 def _uuid(value: Any) -> str:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 import re
+from contextlib import suppress
 from pathlib import Path
 
-from lw_torchrl._checks import check_int
 from lw_torchrl._files import replacing
+from lw_torchrl.record.cursor import connect, go_to
 from lw_torchrl.record.opening import find_recording, opened
-from lw_torchrl.record.opening_steps import opening_step
-from lw_torchrl.record.rerun_binary import failure, running
+from lw_torchrl.record.opening_step import opening_step
+from lw_torchrl.record.rerun_binary import failure, free_port, running
 from lw_torchrl.record.screenshot import take_picture
 
 
@@ -30,8 +31,8 @@ def open_viewer(
         path: the .rrd file, or a folder that holds one.
         screenshot: a PNG file to write instead of opening a window; it is replaced whole or not at all.
         window_size: of the picture or the window, "1400x900" points.
-        step: for a picture, the step of the episode, or of the training, that the time cursor stands at; None takes
-            the one that tells most of an episode, its first success, say, and of a training the last.
+        step: of the episode, or of the training, that the time cursor stands at; None takes the one that tells most of
+            an episode, its first success, say, and of a training the last.
         episode: the tab to open at, by its title ("Metrics") or its episode's name; None takes the layout's.
 
     Raises:
@@ -46,18 +47,17 @@ def open_viewer(
     recording = find_recording(path)
     if not re.fullmatch(r"[1-9]\d*x[1-9]\d*", window_size):
         raise ValueError(f"window_size must be like '1400x900', got {window_size!r}")
-    if step is not None:
-        check_int("step", step, minimum=0)
-        if screenshot is None:
-            raise ValueError("step is the moment of a picture; give screenshot as well")
     if screenshot is not None and Path(screenshot).suffix != ".png":
         raise ValueError(f"screenshot must end in '.png', got {str(screenshot)!r}")
     with opened(recording, episode) as file:
+        at = opening_step(file, episode, step)
         if screenshot is not None:
-            at = opening_step(file, episode) if step is None else step
             with replacing(screenshot) as picture:
                 take_picture(file, picture.absolute(), window_size, at)
             return
-        with running(file, "--window-size", window_size) as (process, output):
+        port = free_port()
+        with running(file, "--port", str(port), "--window-size", window_size) as (process, output):
+            with suppress(ConnectionError, TimeoutError):  # it may have been closed at once
+                go_to(*connect(process, port), at)
             if process.wait():
                 raise failure(output)

@@ -10,6 +10,7 @@ from types import TracebackType
 
 from lw_torchrl.record.html import page_of, viewer_script, viewer_wasm
 from lw_torchrl.record.opening import find_recording, opened
+from lw_torchrl.record.opening_step import opening_step
 from lw_torchrl.record.rerun_binary import LOCAL
 
 _FETCHED = """const load = async (name) => {
@@ -27,12 +28,13 @@ class WebPage(AbstractContextManager["WebPage"]):
     Args:
         path: the .rrd file, or a folder that holds one.
         episode: the tab to open at, by its title or its episode's name; None takes the layout's.
+        step: where the time cursor stands; None takes the step that tells most of an episode.
         port: of this machine, 127.0.0.1; 0 takes a free one. Another machine reaches it through a tunnel,
             ``ssh -L 8000:127.0.0.1:PORT``.
 
     Raises:
         FileNotFoundError: there is no such recording, or rerun is not installed.
-        ValueError: the recording is damaged, or has no such tab.
+        ValueError: the recording is damaged, or has no such tab or step.
         OSError: the port is taken.
 
     Example:
@@ -41,11 +43,14 @@ class WebPage(AbstractContextManager["WebPage"]):
         ...     page.serve()
     """
 
-    def __init__(self, path: str | os.PathLike[str], *, episode: str | None = None, port: int = 0) -> None:
+    def __init__(
+        self, path: str | os.PathLike[str], *, episode: str | None = None, step: int | None = None, port: int = 0
+    ) -> None:
         recording = find_recording(path)
         with opened(recording, episode) as file:
+            at = opening_step(file, episode, step)
             data = gzip.compress(file.read_bytes(), 1)
-        page = page_of(recording.stem, '<script src="viewer.js"></script>', _FETCHED)
+        page = page_of(recording.stem, '<script src="viewer.js"></script>', _FETCHED, at)
         files = {
             "/": ("text/html; charset=utf-8", page.encode()),
             "/viewer.js": ("text/javascript; charset=utf-8", viewer_script().encode()),

@@ -2,11 +2,17 @@
 
 import pytest
 from commands import fails, run
+from rerun.chunk import RrdReader
 
 import lw_torchrl as lw
-from lw_torchrl.record.opening_steps import opening_steps
+from lw_torchrl.record.tabs import Tabs
 
 SHORT = ("--max-steps", 120, "--seed", 1000)
+
+
+def tabs(recording):
+    reader = RrdReader(recording)
+    return Tabs(reader.stream(store=reader.blueprints()[-1]).to_chunks()).names()
 
 
 def test_an_expert_is_recorded_with_the_shipped_plan(capsys, tmp_path):
@@ -15,7 +21,7 @@ def test_an_expert_is_recorded_with_the_shipped_plan(capsys, tmp_path):
     assert "reach, episode 0, expert: success at step " in printed
     assert "reach, episode 2, expert: " in printed
     assert f"lw-torchrl view {out}" in printed
-    assert set(opening_steps(out)) == {"/reach-0", "/reach-2"}
+    assert tabs(out) == ["reach-0", "reach-2"]
 
 
 @pytest.mark.parametrize("who", ["random", "wrong"])
@@ -31,7 +37,7 @@ def test_two_policies_side_by_side(capsys, tmp_path):
     printed = run(capsys, "record", "reach", "--policy", policy, "--compare", "scripted", *SHORT, "--out", out)
     assert "reach, episode 0, mine: failed" in printed
     assert "reach, episode 0, scripted: success at step " in printed
-    assert set(opening_steps(out)) == {"/reach-0-1", "/reach-0-2"}
+    assert tabs(out) == ["reach · episode 0 · side by side", "reach-0-1", "reach-0-2"]
 
 
 def test_a_failure_is_explained(capsys, tmp_path):

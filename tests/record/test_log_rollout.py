@@ -16,7 +16,7 @@ import lw_torchrl as lw
 from lw_torchrl.envs.engines import MetaWorldEngine
 from lw_torchrl.envs.seeding import episode_seed
 from lw_torchrl.evaluation.failures import Failure
-from lw_torchrl.record.opening_steps import opening_steps
+from lw_torchrl.record.opening_step import opening_step
 from lw_torchrl.record.viewer import open_viewer
 
 PLANS = lw.load_plans("MT10")
@@ -178,7 +178,7 @@ def test_a_failure_is_the_verdict(tmp_path, pushed):
     assert f"Seen at step 33 of 60, in step 2, **“{skill}”**." in verdict
     assert "Exchanging skill made it a success; exchanging plan or query did not help." in verdict
     assert "push · episode 0 · seed 5 · mine" in verdict
-    assert opening_steps(tmp_path / "a.rrd") == {"/push-0": 33}
+    assert opening_step(tmp_path / "a.rrd") == 33
     (store,) = found.reader.blueprints()
     layout = " ".join(str(chunk.to_record_batch()) for chunk in found.reader.stream(store=store))
     assert "push · episode 0 · seed 5 · mine · failed: skill" in layout
@@ -194,7 +194,7 @@ def test_without_a_failure_the_verdict_tells_facts(tmp_path, pushed):
     last = int(pushed["skill_weights"][-1].argmax())
     assert f"At the end step {last + 1}, **“{PLANS['push'].steps[last].skill}”**, was in force" in verdict
     assert f"condition 2, “{PLANS['push'].steps[1].condition}”" in verdict
-    assert opening_steps(tmp_path / "a.rrd") == {"/push-0": 60}
+    assert opening_step(tmp_path / "a.rrd") == 60
 
 
 def test_a_success_is_the_verdict(tmp_path, pushed):
@@ -204,7 +204,7 @@ def test_a_success_is_the_verdict(tmp_path, pushed):
     verdict = found.text("/push-0/verdict")
     assert verdict.startswith("## SUCCESS at step 41 of 60")
     assert "did not last: the task stood done in 1 steps" in verdict
-    assert opening_steps(tmp_path / "a.rrd") == {"/push-0": 41}
+    assert opening_step(tmp_path / "a.rrd") == 41
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from PIL import Image
 from recordings import PLAN, make_objects, make_rollout
 
 from lw_torchrl.record import RerunLogger, WebPage, write_html
+from lw_torchrl.record.cursor import request
 
 
 @pytest.fixture(scope="module")
@@ -50,6 +51,29 @@ def test_one_file_opens_from_disk(tmp_path, recording):
         shows_the_viewer(page)
 
 
+def stands_at(page, step):
+    """The time cursor of the page's viewer, read from the state that it tells of (a ``GetStateResponse``)."""
+    found = bytes(page.value("Array.from(window.viewer.viewer_state())"))
+    return b"\n\x04step\x10\x01\x1a\x02\x08" + bytes([step]) in found
+
+
+@pytest.mark.parametrize(("step", "expected"), [(None, 11), (5, 5)])
+def test_a_page_opens_at_the_step_that_tells_most_or_that_was_asked_for(tmp_path, recording, step, expected):
+    file = write_html(recording, tmp_path / "page.html", step=step)
+    find()
+    with Page(file.as_uri(), tmp_path) as page:
+        shows_the_viewer(page)
+        assert stands_at(page, expected)
+        assert not stands_at(page, expected + 1)
+        assert b"Skill weights" in bytes(page.value("Array.from(window.viewer.viewer_state())")), (
+            "our layout is in force"
+        )
+
+
+def test_a_cursor_is_asked_for_in_the_viewer_s_own_words():
+    assert request(300) == bytes.fromhex("32 07 1a 03 08 ac 02 28 01")
+
+
 def test_a_page_is_served_until_it_is_closed(tmp_path, recording):
     page = WebPage(recording)
     server = threading.Thread(target=page.serve)
@@ -78,4 +102,6 @@ def test_wrong_pages_are_named(tmp_path, recording):
         write_html(recording, tmp_path / "page.html", episode="pusch")
     with pytest.raises(FileNotFoundError, match="does not exist"):
         WebPage(tmp_path / "none.rrd")
+    with pytest.raises(ValueError, match="step must be at most 21, the recording's last, got 22"):
+        write_html(recording, tmp_path / "page.html", step=22)
     assert not list(Path(tmp_path).iterdir())

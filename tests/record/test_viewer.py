@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import stat
+from contextlib import contextmanager
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -11,9 +13,11 @@ from recordings import Recording
 from rerun.chunk import RrdReader
 from tensordict import TensorDict
 
-from lw_torchrl.record import RerunLogger, open_viewer
+from lw_torchrl.record import RerunLogger, open_viewer, viewer
+from lw_torchrl.record.cursor import go_to
 from lw_torchrl.record.opening import find_recording, opened
-from lw_torchrl.record.opening_steps import opening_step
+from lw_torchrl.record.opening_step import opening_step
+from lw_torchrl.record.rerun_binary import running
 from lw_torchrl.record.rrd_stream import is_whole
 from lw_torchrl.record.tabs import Tabs
 
@@ -74,7 +78,7 @@ def test_wrong_arguments_of_the_viewer(tmp_path):
         open_viewer(tmp_path / "a.rrd", window_size="big")
     with pytest.raises(ValueError, match=r"screenshot must end in '\.png'"):
         open_viewer(tmp_path / "a.rrd", tmp_path / "a.jpg")
-    with pytest.raises(ValueError, match="give screenshot as well"):
+    with pytest.raises(ValueError, match="step 3 was given, but the recording holds no steps"):
         open_viewer(tmp_path / "a.rrd", step=3)
 
 
@@ -179,6 +183,29 @@ def test_a_picture_of_an_episode_is_of_the_step_that_tells_most(tmp_path):
         logger.log_scalar("loss/bc", 1.0)
     found = [opening_step(tmp_path / "a.rrd", tab) for tab in (None, *names, "Metrics")]
     assert found == [4, 4, 9, None]
+    assert opening_step(tmp_path / "a.rrd", names[1], 7) == 7
+    with pytest.raises(ValueError, match="step must be at most 0, the recording's last, got 1"):
+        opening_step(tmp_path / "a.rrd", "Metrics", 1)
+
+
+def test_a_window_opens_at_the_step_that_tells_most(tmp_path, monkeypatch):
+    """The window is one without a screen, which is asked where it stands."""
+    write(tmp_path / "a.rrd")
+    stood = []
+
+    @contextmanager
+    def headless(*arguments):
+        with running(*arguments, "--headless") as (process, output):
+            yield SimpleNamespace(poll=process.poll, wait=lambda: 0), output
+
+    def go_and_close(client, recording, step):
+        go_to(client, recording, step)
+        stood.append(client.get_state().recordings[0].current_time)
+
+    monkeypatch.setattr(viewer, "running", headless)
+    monkeypatch.setattr(viewer, "go_to", go_and_close)
+    open_viewer(tmp_path / "a.rrd")
+    assert stood == [11]
 
 
 def test_episodes_are_compared_before_their_own_tabs(tmp_path):

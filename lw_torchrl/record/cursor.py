@@ -1,0 +1,60 @@
+"""Where the viewer's time cursor stands: set in a running viewer, or as what a page asks its viewer for."""
+
+from __future__ import annotations
+
+import subprocess
+import time
+from typing import Any
+
+from lw_torchrl.record.rerun_binary import LOCAL
+from lw_torchrl.record.timelines import EPISODE_TIMELINE
+
+START_SECONDS = 60.0
+
+
+def connect(process: subprocess.Popen[bytes], port: int) -> tuple[Any, Any]:
+    """A client of the viewer and what it says of the recording, once it has loaded it.
+
+    Raises:
+        TimeoutError: the viewer ended, or did not answer in time.
+    """
+    from rerun.experimental import ViewerClient
+
+    deadline = time.monotonic() + START_SECONDS
+    client: Any = None
+    while time.monotonic() < deadline and process.poll() is None:
+        try:
+            client = client or ViewerClient.connect(f"rerun+http://{LOCAL}:{port}/proxy")
+            state = client.get_state()
+            if state.recordings and state.active_recording and not state.loading:
+                return client, state.recordings[0]
+        except ConnectionError:
+            client = None
+        time.sleep(0.1)
+    raise TimeoutError(f"no answer within {START_SECONDS:.0f} seconds")
+
+
+def go_to(client: Any, recording: Any, step: int | None) -> None:
+    """Set the time cursor to ``step``, or to the last one, of the timeline that the layout chose."""
+    timelines = {timeline.name: timeline for timeline in recording.timelines}
+    timeline = timelines.get(recording.current_timeline)
+    if timeline is None or timeline.end is None:
+        return
+    if step is None:  # an episode's success and reward stand one step after its last row
+        step = max(timeline.end - 1 if timeline.name == EPISODE_TIMELINE else timeline.end, timeline.start)
+    client.set_time(timeline.name, sequence=step, play_state="paused")
+
+
+def request(step: int) -> bytes:
+    """What asks a viewer in a page for ``step`` of the timeline in force, paused: a ``ViewerControlRequest``.
+
+    Source: what :meth:`rerun.experimental.ViewerClient.set_time` of rerun 0.41 sends.
+    """
+    time, paused = b"\x08" + _varint(step), b"\x28\x01"
+    cursor = b"\x1a" + _varint(len(time)) + time + paused
+    return b"\x32" + _varint(len(cursor)) + cursor
+
+
+def _varint(number: int) -> bytes:
+    high, low = divmod(number, 128)
+    return bytes([low | 128]) + _varint(high) if high else bytes([low])
