@@ -5,6 +5,7 @@ from __future__ import annotations
 import atexit
 import os
 import threading
+import uuid
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -63,7 +64,8 @@ class RerunLogger(Logger):
         connect: the address of a viewer that shows the recording as it grows, "127.0.0.1:9876" or
             "rerun+http://127.0.0.1:9876/proxy"; start it with ``rerun``.
         exp_name: the name of the run; None takes the file's, without ".rrd".
-        application_id: recordings of one application share their layout in rerun's viewer.
+        application_id: recordings of one application share their layout in rerun's viewer, the last one's; None takes
+            one of its own, made of ``exp_name`` and chance.
 
     Attributes:
         path: the file, as a Path, or None.
@@ -94,13 +96,14 @@ class RerunLogger(Logger):
         *,
         connect: str | None = None,
         exp_name: str | None = None,
-        application_id: str = "lw_torchrl",
+        application_id: str | None = None,
     ) -> None:
         if path is None and connect is None:
             raise ValueError("give path, a file to write, or connect, a viewer to show it in, or both; got neither")
         self.path = None if path is None else check_path(path)
         self.connect = None if connect is None else check_address(connect)[0]
-        self.application_id = application_id
+        name = exp_name or (self.path.stem if self.path else "lw_torchrl")
+        self.application_id = application_id or f"{name}-{uuid.uuid4().hex[:8]}"
         self._lock = threading.Lock()
         self._scalars: dict[str, tuple[list[int], list[list[float]]]] = {}
         self._curves: dict[str, int] = {}
@@ -112,7 +115,7 @@ class RerunLogger(Logger):
         self._tabs = MetricTabs()
         self._shown = (0, 0)
         super().__init__(
-            exp_name=exp_name or (self.path.stem if self.path else application_id),
+            exp_name=name,
             log_dir=str(self.path.parent) if self.path else os.curdir,
         )
 

@@ -221,3 +221,11 @@ def test_episodes_are_compared_before_their_own_tabs(tmp_path):
     tabs = Tabs(reader.stream(store=reader.blueprints()[-1]).to_chunks())
     assert tabs.names() == ["Side by side", "reach", "reach-2"]
     assert tabs.episodes() == {"reach", "reach-2"}
+
+
+def test_two_recordings_in_one_viewer_keep_a_layout_each(tmp_path):
+    for name in ("a", "b"):
+        write(tmp_path / f"{name}.rrd")
+    a, b = (RrdReader(tmp_path / f"{name}.rrd").recordings()[0].application_id for name in ("a", "b"))
+    assert a.startswith("a-")
+    assert a[2:] != b[2:]
