@@ -228,10 +228,17 @@ def explain(
         step = int(torch.bincount(ours[where]).argmax()) if where.any() else stuck
         steps["plan"], at["plan"] = step, stay(departs & (ours == step)) if departs.any() else at["undecided"]
         other = int(torch.bincount(theirs[where & (ours == step)]).argmax()) if where.any() else 0
+        asked = reference[seen.task].steps[other].skill
+        if where.any() and none[where].float().mean() > 0.5:
+            said = f"no condition of the plan holds, where the reference says '{asked}'"
+        else:
+            said = (
+                f"the plan asks for something else than the reference, as step {step + 1}, "
+                f"'{plan.steps[step].skill}', where the reference says '{asked}'"
+            )
+        often = int(departs[-late:].sum())
         why["plan"] = (
-            f"in {int(departs[-late:].sum())} of the last {late} states the plan asks for something else than the "
-            f"reference, as step {step + 1}, '{plan.steps[step].skill}', where the reference says "
-            f"'{reference[seen.task].steps[other].skill}'"
+            f"in {f'{often} of the last {late}' if often else f'{int(departs.sum())} of {length}'} states {said}"
         )
     else:
         steps["plan"], at["plan"] = stuck, stay(none) if none.any() else at["undecided"]
