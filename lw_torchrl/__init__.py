@@ -20,6 +20,7 @@ if TYPE_CHECKING:  # the table below, for type checkers and editors
     from lw_torchrl.evaluation import EvaluationResult as EvaluationResult
     from lw_torchrl.evaluation import attribute_failures as attribute_failures
     from lw_torchrl.evaluation import evaluate as evaluate
+    from lw_torchrl.evaluation import evaluate_plans as evaluate_plans
     from lw_torchrl.evaluation import plot_success as plot_success
     from lw_torchrl.language.decoded import DecodedPlan as DecodedPlan
     from lw_torchrl.language.decoded import DecodedStep as DecodedStep
@@ -85,7 +86,7 @@ _NAMES = {
     "lw_torchrl.data": "Behaviour CoLearningSampler EpisodeFilter LanguageWorldExperienceReplay TaskBalancedSampler "
     "collect_demonstrations",
     "lw_torchrl.envs": "ExpertActor LanguageWorldEnv",
-    "lw_torchrl.evaluation": "EvaluationResult attribute_failures evaluate plot_success",
+    "lw_torchrl.evaluation": "EvaluationResult attribute_failures evaluate evaluate_plans plot_success",
     "lw_torchrl.language.decoded": "DecodedPlan DecodedStep",
     "lw_torchrl.language.decoding": "decode_plan",
     "lw_torchrl.language.formats": "PLAN_FORMATS encode_plan",

@@ -101,6 +101,7 @@ def run_episodes(
     noise_hold: int = 1,
     after_success: int | None = None,
     clean_action: NestedKey | None = None,
+    place: NestedKey | None = None,
     on_progress: Callable[[int], object] | None = None,
 ) -> Iterator[FinishedEpisode]:
     """Run each task's listed episodes once and yield them as they finish.
@@ -110,13 +111,14 @@ def run_episodes(
     Args:
         env: a LanguageWorldEnv, with transforms or without.
         policy: called on all N rows, with a ``_step`` mask of those that count.
-        episodes: task name to episode indices.
+        episodes: task name to episode indices; one that is listed several times is run as often.
         keys: what to record of each step, ``("next", "success")`` say; ``action`` is the executed one.
         noise: episode index to the four standard deviations of the noise added to the action, from the same
             (task, seed, episode) as the episode itself; None for none.
         noise_hold: the steps for which each draw of the noise is kept.
         after_success: end an episode so many steps after its first successful one; None for never.
         clean_action: where to write the action before the noise.
+        place: where to write, for the policy, which in its task's list the episode of each row is, (N,) int64.
         on_progress: told after each step how many more of all the steps are done with; what an early stop saves
             counts as done.
 
@@ -125,10 +127,11 @@ def run_episodes(
     """
     base = _base(env)
     rows = len(base.row_tasks)
-    waiting = {task: deque(listed) for task, listed in episodes.items()}
+    waiting = {task: deque(enumerate(listed)) for task, listed in episodes.items()}
     if unknown := set(waiting) - set(base.tasks):
         raise ValueError(f"episodes names {', '.join(sorted(unknown))}, which env does not have")
     episode = torch.zeros(rows, dtype=torch.int64)
+    listed_at = torch.zeros(rows, dtype=torch.int64)
     active = torch.zeros(rows, dtype=torch.bool)
     steps = np.zeros(rows, dtype=np.int64)
     last = np.zeros(rows, dtype=np.int64)  # the step after which an episode ends early
@@ -141,7 +144,7 @@ def run_episodes(
         starting = torch.zeros(rows, dtype=torch.bool)
         for row in torch.nonzero(idle).flatten().tolist():
             if queue := waiting.get(base.row_tasks[row]):
-                number = queue.popleft()
+                listed_at[row], number = queue.popleft()
                 episode[row], starting[row], steps[row], last[row] = number, True, 0, base.max_steps
                 if noise is not None:
                     scale = np.asarray(noise(number), dtype=np.float32)
@@ -154,6 +157,8 @@ def run_episodes(
             anew = torch.ones_like(starting) if fresh else starting
             state, fresh = env.reset(state.set("_reset", anew), episode=episode).exclude("_reset"), False
         state.set("_step", active)
+        if place is not None:
+            state.set(place, listed_at.clone())
         state = policy(state)
         action = state.get("action")
         if clean_action is not None:

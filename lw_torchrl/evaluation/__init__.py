@@ -7,6 +7,7 @@ from lw_torchrl.evaluation.failure_figure import plot_failures
 from lw_torchrl.evaluation.failures import CAUSES, Failure
 from lw_torchrl.evaluation.figures import plot_sorted_tasks, plot_success
 from lw_torchrl.evaluation.learning_curves import plot_learning_curves
+from lw_torchrl.evaluation.many_plans import evaluate_plans
 from lw_torchrl.evaluation.method_figure import plot_methods
 from lw_torchrl.evaluation.plan_use import PlanUse
 from lw_torchrl.evaluation.protocol import evaluate
@@ -38,6 +39,7 @@ __all__ = [
     "attribute_failures",
     "count_solved",
     "evaluate",
+    "evaluate_plans",
     "interquartile_mean",
     "mean_difference",
     "mean_rate",

@@ -1,0 +1,216 @@
+"""evaluate_plans: many plans of the same tasks, carried out by scripted skills in one batched simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from lw_torchrl._checks import check_choice, check_int, check_scale
+from lw_torchrl._progress import Progress
+from lw_torchrl.envs.episodes import FinishedEpisode, policy_of, run_episodes
+from lw_torchrl.envs.language_world_env import LanguageWorldEnv
+from lw_torchrl.language.plans import ConditionalPlan, Plans
+from lw_torchrl.language.query_program import QueryProgram
+from lw_torchrl.language.skill_program import SkillProgram
+from lw_torchrl.language.skills import ScriptedSkill
+from lw_torchrl.language.task_index import TaskIndex
+from lw_torchrl.language.tasks import TASKS
+
+_ROWS = 256
+_PLACE = "place"
+
+
+def evaluate_plans(
+    plans: Sequence[ConditionalPlan],
+    *,
+    episodes: int = 20,
+    seed: int,
+    choose: Literal["random", "first"] = "random",
+    skills: Mapping[str, ScriptedSkill] | None = None,
+    noise_scale: float = 0.0,
+    max_steps: int = 500,
+    num_envs: int = _ROWS,
+    num_threads: int | None = None,
+    progress: bool = True,
+    on_plan: Callable[[int, tuple[bool, ...]], object] | None = None,
+) -> list[tuple[bool, ...]]:
+    """Carry out many plans, several of a task too, by scripted skills: the success of each in episodes 0 to k - 1.
+
+    All run in one environment, whose rows take the next episode of any plan of their task. Every plan meets the same
+    initial states. The result depends neither on ``num_envs`` nor on the plans beside: plans that are equal fare
+    equally. Where no condition holds, the last step's skill acts.
+
+    Args:
+        plans: every step's skill is the text of a scripted one, as ``DecodedPlan.scripted`` has them.
+        episodes: k, of each plan; each ends at its first success.
+        seed: of the environment, and of the choice.
+        choose: of several true steps, a "random" one in every state, the paper's rule, or the "first".
+        skills: the scripted skills by text, as from :func:`~lw_torchrl.load_skills`; None for the shipped ones.
+        noise_scale: standard deviation of the noise on the executed action.
+        max_steps: of an episode.
+        num_envs: rows of the environment.
+        num_threads: of the simulation, which changes no result.
+        progress: show a progress bar.
+        on_plan: told the index of a plan, and how it fared, once all its episodes are done.
+
+    Returns:
+        For each plan whether it succeeded in each episode.
+
+    Raises:
+        ValueError: there is no plan, a wrong option, a skill that is no scripted one, or two plans that mean different
+            tasks by one name.
+
+    Example:
+        >>> import lw_torchrl as lw
+        >>> plan = lw.load_plans("MT10")["reach"]
+        >>> lw.evaluate_plans([plan, plan], episodes=2, seed=1_000)
+        [(True, True), (True, True)]
+
+    Source: paper section 'LLM Experiments', 'Scripted Skills'.
+    """
+    if not plans:
+        raise ValueError("plans must be one at least, got none")
+    check_int("episodes", episodes, minimum=1)
+    check_int("seed", seed)
+    check_choice("choose", choose, ("random", "first"))
+    check_scale("noise_scale", noise_scale)
+    check_int("num_envs", num_envs, minimum=1)
+    by_task: dict[str, dict[str, list[int]]] = {}  # fingerprint to the plans of it
+    for index, plan in enumerate(plans):
+        by_task.setdefault(plan.task, {}).setdefault(Plans([plan]).fingerprint, []).append(index)
+    different = {task: [plans[same[0]] for same in found.values()] for task, found in by_task.items()}
+    policy = _PlanOfRow(different, episodes, seed, choose, skills)
+    most = max(len(listed) for listed in different.values()) * episodes
+    env = LanguageWorldEnv(
+        [TASKS.get(task, listed[0].definition) for task, listed in different.items()],
+        num_envs=len(different) * max(1, min(most, num_envs // len(different))),
+        seed=seed,
+        max_steps=max_steps,
+        num_threads=num_threads,
+        strict=True,
+    )
+    listed = {task: list(range(episodes)) * len(found) for task, found in different.items()}
+    total = sum(map(len, listed.values()))
+    bar = Progress("carrying out plans", total * max_steps, "step", show=progress)
+    won: dict[int, dict[int, bool]] = {}
+    try:
+        with bar, torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            for one in run_episodes(
+                env,
+                policy_of(policy),
+                listed,
+                keys=[_PLACE, ("next", "success")],
+                noise=(lambda _: (noise_scale,) * 4) if noise_scale else None,
+                after_success=0,
+                place=_PLACE,
+                on_progress=bar.update,
+            ):
+                same = list(by_task[one.task].values())[int(one.steps.get(_PLACE)[0]) // episodes]
+                _note(won, same, one, episodes, on_plan)
+    finally:
+        env.close()
+    return [_in_order(won[index]) for index in range(len(plans))]
+
+
+def _note(
+    won: dict[int, dict[int, bool]],
+    same: Sequence[int],
+    one: FinishedEpisode,
+    episodes: int,
+    on_plan: Callable[[int, tuple[bool, ...]], object] | None,
+) -> None:
+    for index in same:
+        won.setdefault(index, {})[one.episode] = one.first_success is not None
+        if len(won[index]) == episodes and on_plan is not None:
+            on_plan(index, _in_order(won[index]))
+
+
+def _in_order(found: Mapping[int, bool]) -> tuple[bool, ...]:
+    return tuple(found[episode] for episode in sorted(found))
+
+
+class _PlanOfRow(nn.Module):
+    """Acts in each row by the plan whose episode it runs, which ``place`` tells: plans of a task one after another."""
+
+    row_by_row = True
+
+    def __init__(
+        self,
+        plans: Mapping[str, Sequence[ConditionalPlan]],
+        episodes: int,
+        seed: int,
+        choose: str,
+        skills: Mapping[str, ScriptedSkill] | None,
+    ) -> None:
+        super().__init__()
+        self.episodes, self.seed, self.random = episodes, seed, choose == "random"
+        self._index = TaskIndex(plans)
+        conditions: dict[Any, list[Any]] = {}
+        texts: dict[Any, list[str]] = {}
+        width = max(len(plan.steps) for listed in plans.values() for plan in listed)
+        first: dict[str, int] = {}
+        rows: list[list[tuple[int, int, bool]]] = []
+        for task, listed in plans.items():
+            definition, first[task] = _one_definition(task, listed), len(rows)
+            asked = list(dict.fromkeys(step.condition for plan in listed for step in plan.steps))
+            done = list(dict.fromkeys(step.skill for plan in listed for step in plan.steps))
+            conditions[definition], texts[definition] = asked, done
+            for plan in listed:
+                steps = [(asked.index(step.condition), done.index(step.skill), True) for step in plan.steps]
+                rows.append(steps + [(0, 0, False)] * (width - len(steps)))
+        table = torch.tensor(rows)
+        self._condition, self._skill, self._step = table[..., 0], table[..., 1], table[..., 2].bool()
+        self._last = self._step.sum(-1) - 1
+        self._first = torch.tensor([first[task] for task in self._index.tasks])
+        numbers = [Plans([plan]).numbers[task] for task, listed in plans.items() for plan in listed]
+        self._number = np.array(numbers, dtype=np.uint64)
+        self.queries, self.skills = QueryProgram(conditions), SkillProgram(texts, skills)
+        self._before = self._steps_done = torch.zeros(0, dtype=torch.int64)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        observation, task_id, place = (tensordict.get(key) for key in ("observation", "task_id", _PLACE))
+        plan = self._first[self._index.rows(task_id, "tasks without a plan")] + place // self.episodes
+        truth = self.queries(observation, task_id).gather(-1, self._condition[plan]) & self._step[plan]
+        chosen = self._choose(truth, plan, place)
+        chosen = torch.where(truth.any(-1), chosen, self._last[plan])
+        skill = self._skill[plan].gather(-1, chosen.unsqueeze(-1))
+        actions = self.skills(observation, task_id)
+        action = actions.gather(-2, skill.unsqueeze(-1).expand(*skill.shape, actions.shape[-1])).squeeze(-2)
+        return tensordict.set("action", action)
+
+    def _choose(self, truth: Tensor, plan: Tensor, place: Tensor) -> Tensor:
+        if not self.random:
+            return truth.int().argmax(-1)
+        if len(self._before) != len(place):
+            self._before, self._steps_done = torch.full_like(place, -1), torch.zeros_like(place)
+        self._steps_done = torch.where(place == self._before, self._steps_done + 1, 0)
+        self._before = place.clone()
+        episode = (place % self.episodes).numpy().astype(np.uint64)
+        found = _drawn(self.seed, self._number[plan.numpy()], episode, self._steps_done.numpy().astype(np.uint64))
+        ranks = _drawn(found[:, None], np.arange(truth.shape[-1], dtype=np.uint64)[None])
+        return (torch.from_numpy((ranks >> np.uint64(12)).astype(np.int64)) + 1).masked_fill(~truth, 0).argmax(-1)
+
+
+def _one_definition(task: str, listed: Sequence[ConditionalPlan]) -> Any:
+    if any(plan.definition != listed[0].definition for plan in listed):
+        raise ValueError(f"plans of {task!r} must mean one task, got different definitions of it")
+    return listed[0].definition
+
+
+def _drawn(*keys: int | NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Numbers that hang on the keys alone, (N,) uint64 or what they broadcast to: splitmix64 after each."""
+    found = np.zeros(1, dtype=np.uint64)
+    for key in keys:
+        found = found ^ (np.uint64(key % 2**64) if isinstance(key, int) else key)
+        found = found + np.uint64(0x9E3779B97F4A7C15)
+        for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
+            found = (found ^ (found >> np.uint64(shift))) * np.uint64(factor)
+        found = found ^ (found >> np.uint64(31))
+    return found
