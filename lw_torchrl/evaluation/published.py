@@ -15,8 +15,8 @@ WHICH = {"last": "published, last", "best": "published, best of the last 10 eval
 
 
 @cache
-def _table() -> dict[str, Any]:
-    return json.loads((files("lw_torchrl.evaluation") / "data/published.json").read_text(encoding="utf-8"))
+def _table(name: str = "published") -> dict[str, Any]:
+    return json.loads((files("lw_torchrl.evaluation") / f"data/{name}.json").read_text(encoding="utf-8"))
 
 
 def published(setting: str, method: str = "PCBC", which: Literal["last", "best"] = "last") -> dict[str, float]:
@@ -74,19 +74,18 @@ def published_curves(setting: str, methods: str | Iterable[str] = ("PCBC",)) -> 
     }
 
 
-def published_plans(model: str = "PaLM 2") -> dict[str, tuple[float, ...]]:
+def published_plans(model: str = "PaLM 2", format: str = "chain_py") -> dict[str, tuple[float, ...]]:
     """The published success rate of each of a model's 5 generated plans per task, run with scripted skills.
-
-    The plans are in the format "chain_py", each model's best.
 
     Args:
         model: "PaLM 2", "GPT-3.5" or "GPT-3".
+        format: of the plans, a name in :data:`~lw_torchrl.PLAN_FORMATS`.
 
     Returns:
         Task to the rates of its 5 plans, in [0, 1], sorted by name.
 
     Raises:
-        ValueError: another model.
+        ValueError: another model or format.
 
     Example:
         >>> published_plans()["window-open"]
@@ -94,6 +93,7 @@ def published_plans(model: str = "PaLM 2") -> dict[str, tuple[float, ...]]:
 
     Source: the authors' published result files; paper section 'LLM Experiments'.
     """
-    models = _table()["scripted"]
-    columns = zip(*models[check_choice("model", model, models)], strict=True)
-    return dict(zip(_table()["tasks"], columns, strict=True))
+    models = _table("published_plans")["rates"]
+    formats = models[check_choice("model", model, models)]
+    columns = zip(*formats[check_choice("format", format, formats)], strict=True)
+    return {task: tuple(map(float, rates)) for task, rates in zip(_table()["tasks"], columns, strict=True)}

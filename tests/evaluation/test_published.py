@@ -35,9 +35,10 @@ def test_the_default_is_the_last_evaluation_of_pcbc():
     assert published("few-shot") == published("few-shot", "PCBC", "last")
 
 
+@pytest.mark.parametrize("format", lw.PLAN_FORMATS)
 @pytest.mark.parametrize("model", ["PaLM 2", "GPT-3.5", "GPT-3"])
-def test_the_generated_plans_rates(model):
-    found = published_plans(model)
+def test_the_generated_plans_rates(model, format):
+    found = published_plans(model, format)
     assert tuple(found) == lw.MT50
     assert all(len(rates) == 5 and all(0 <= rate <= 1 for rate in rates) for rates in found.values())
 
@@ -81,3 +82,5 @@ def test_what_was_not_published_is_refused(arguments, message):
 def test_another_model_is_refused():
     with pytest.raises(ValueError, match=r"model must be one of 'PaLM 2', 'GPT-3.5', 'GPT-3', got 'GPT-4'"):
         published_plans("GPT-4")
+    with pytest.raises(ValueError, match="format must be one of 'basic_py', .*, got 'py'"):
+        published_plans(format="py")

@@ -1,0 +1,59 @@
+"""``lw-torchrl plan compare``: what scripted skills make of the plans that models wrote."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from lw_torchrl.cli.outputs import check_folder
+from lw_torchrl.cli.sources import read_tasks
+from lw_torchrl.cli.threads import use_one_thread
+
+
+def compare(
+    source: Positional[Annotated[Path, arg(metavar="DIR|FILE")]],
+    /,
+    episodes: int = 20,
+    seed: int = 1000,
+    choose: Literal["random", "first"] = "random",
+    noise: float = 0.0,
+    max_steps: int = 500,
+    task_file: Path | None = None,
+    out: Path = Path("runs/compare"),
+) -> None:
+    """Compare models by the plans they wrote: decode every answer, carry all of them out by scripted skills, at once.
+
+    Stopped and started again it carries on.
+
+    Example: lw-torchrl plan compare runs/plans --out runs/compare
+
+    Args:
+        source: a folder MODEL/FORMAT/TASK-ATTEMPT.EXT, as plan generate writes it, or a .jsonl file of answers.
+        episodes: of each plan, the same initial states for all plans of a task.
+        seed: fixes initial states, goals and what is chosen.
+        choose: of several true steps a random one, as in the paper, or the first.
+        noise: standard deviation of the noise on the executed action.
+        max_steps: of an episode.
+        task_file: tasks of yours, instead of ours of the same name or beside ours.
+        out: folder for results.json, summary.md, models.png and formats.png.
+    """
+    check_folder("--out", out)
+    from lw_torchrl.planners.comparing import compare_plans
+    from lw_torchrl.planners.comparison_report import write_report
+
+    use_one_thread()
+    found = compare_plans(
+        source,
+        episodes=episodes,
+        seed=seed,
+        choose=choose,
+        noise_scale=noise,
+        max_steps=max_steps,
+        tasks=read_tasks(task_file),
+        resume=out / "fared.json",
+    )
+    print(f"{found.table()}\n\n{found.task_table()}\n")
+    for file in write_report(found, out):
+        print(f"written to {file}")

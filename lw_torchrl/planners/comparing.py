@@ -1,0 +1,249 @@
+"""compare_plans: recorded answers of models, decoded, and carried out by scripted skills."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from time import monotonic
+from typing import Any, Literal
+
+from lw_torchrl._checks import shown
+from lw_torchrl._files import read_json, write_json
+from lw_torchrl._progress import Progress
+from lw_torchrl.evaluation.comparison import markdown_table
+from lw_torchrl.evaluation.many_plans import evaluate_plans
+from lw_torchrl.evaluation.statistics import mean_rate
+from lw_torchrl.language.decoding import decode_plan
+from lw_torchrl.language.plans import ConditionalPlan, Plans
+from lw_torchrl.language.tasks import TASKS, Task
+from lw_torchrl.planners.file_planner import answer_text, recorded_answers
+
+_SAVE_SECONDS = 5.0
+Group = tuple[str, str]  # model, format
+
+
+@dataclass(frozen=True)
+class ComparedAnswer:
+    """How an answer fared.
+
+    Attributes:
+        model, format, task, attempt: which answer it is.
+        steps: of the plan that scripted skills can carry out; 0 where nothing is left of it.
+        dropped: clauses for the task that were left out.
+        reason: why there is no plan; "" if there is one.
+        success: of each episode; all False where there is no plan.
+    """
+
+    model: str
+    format: str
+    task: str
+    attempt: int
+    steps: int
+    dropped: int
+    reason: str
+    success: tuple[bool, ...]
+
+    @property
+    def rate(self) -> float:
+        """The share of its episodes that succeeded."""
+        return sum(self.success) / len(self.success)
+
+
+class PlanComparison:
+    """Answers of models, compared by what scripted skills make of them.
+
+    Attributes:
+        answers: each with how it fared; sorted by model, format, task and attempt.
+        settings: of the episodes.
+    """
+
+    def __init__(self, answers: Sequence[ComparedAnswer], settings: Mapping[str, Any]) -> None:
+        self.answers = tuple(sorted(answers, key=lambda one: (one.model, one.format, one.task, one.attempt)))
+        self.settings = dict(settings)
+
+    @property
+    def groups(self) -> tuple[Group, ...]:
+        """(model, format) of the answers."""
+        return tuple(dict.fromkeys((one.model, one.format) for one in self.answers))
+
+    @property
+    def models(self) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(one.model for one in self.answers))
+
+    def rates(self, model: str, format: str) -> dict[str, list[float]]:
+        """Task to the success rate of each of its answers."""
+        found: dict[str, list[float]] = {}
+        for one in self.answers:
+            if (one.model, one.format) == (model, format):
+                found.setdefault(one.task, []).append(one.rate)
+        return found
+
+    def mean(self, model: str, format: str) -> float:
+        """The mean success rate, of each task over its answers, then over tasks."""
+        return _mean([_mean(rates) for rates in self.rates(model, format).values()])
+
+    def best_format(self, model: str) -> str:
+        """The model's format of the highest mean."""
+        return max((format for name, format in self.groups if name == model), key=lambda one: self.mean(model, one))
+
+    def best_of(self, model: str, format: str) -> float:
+        """What choosing among the answers gives: of each task the answer that does best in the even episodes, by its
+        success in the odd ones; then the mean over tasks. NaN with one episode."""
+        chosen: dict[str, tuple[float, float]] = {}
+        for one in self.answers:
+            if (one.model, one.format) == (model, format):
+                tried, fresh = one.success[::2], one.success[1::2]
+                if one.task not in chosen or _mean(tried) > chosen[one.task][0]:
+                    chosen[one.task] = _mean(tried), _mean(fresh)
+        return _mean([fresh for _, fresh in chosen.values()])
+
+    def table(self) -> str:
+        """Markdown: a line for each model and format."""
+        rows = []
+        for model, format in self.groups:
+            found = [one for one in self.answers if (one.model, one.format) == (model, format)]
+            rates = self.rates(model, format)
+            runs = sum(bool(one.steps) for one in found)
+            rows.append(
+                [
+                    model,
+                    format,
+                    str(len(rates)),
+                    str(len(found)),
+                    str(runs),
+                    str(mean_rate([[_mean(one) for one in rates.values()]], resample_tasks=True)),
+                    f"{self.best_of(model, format):.3f}",
+                ]
+            )
+        head = ["model", "format", "tasks", "answers", "with a plan that runs", "success", "best answer of a task"]
+        return markdown_table(head, rows)
+
+    def task_table(self) -> str:
+        """Markdown: a line for each task, a column for each model, the mean over all its formats and answers."""
+        rows = []
+        for task in sorted({one.task for one in self.answers}):
+            cells = []
+            for model in self.models:
+                rates = [one.rate for one in self.answers if (one.model, one.task) == (model, task)]
+                cells.append(f"{_mean(rates):.2f}" if rates else "")
+            rows.append([task, *cells])
+        return markdown_table(["task", *self.models], rows)
+
+    def to_json(self) -> dict[str, Any]:
+        """Settings and answers, with the success of each episode as 0 and 1."""
+        answers = [asdict(one) | {"success": "".join(map(str, map(int, one.success)))} for one in self.answers]
+        return {"format_version": 1, "settings": self.settings, "answers": answers}
+
+
+def compare_plans(
+    source: str | os.PathLike[str],
+    *,
+    episodes: int = 20,
+    seed: int = 1000,
+    choose: Literal["random", "first"] = "random",
+    noise_scale: float = 0.0,
+    max_steps: int = 500,
+    num_envs: int = 256,
+    num_threads: int | None = None,
+    tasks: Mapping[str, Task] = TASKS,
+    resume: str | os.PathLike[str] | None = None,
+    progress: bool = True,
+) -> PlanComparison:
+    """Decode recorded answers, and carry out all their plans by scripted skills in one simulation.
+
+    Args:
+        source: a folder ``<model>/<format>/<task>-<attempt>.<ext>``, as planners write it, or a .jsonl file as for
+            :class:`~lw_torchrl.FilePlanner`.
+        episodes, seed, choose, noise_scale, max_steps, num_envs, num_threads: as for
+            :func:`~lw_torchrl.evaluate_plans`.
+        tasks: where tasks' names are looked up, as from :func:`~lw_torchrl.load_tasks`.
+        resume: a file that keeps how plans fared, every few seconds; what it has is not run again.
+        progress: show progress bars.
+
+    Returns:
+        Each answer with how it fared.
+
+    Raises:
+        FileNotFoundError: there is no such folder.
+        ValueError: there are no answers in it, one is of an unknown task, a wrong option, or ``resume`` is of other
+            settings or damaged.
+
+    Example:
+        >>> import tempfile, lw_torchrl as lw
+        >>> folder = tempfile.TemporaryDirectory()
+        >>> path = lw.planners.answer_path(folder.name, "by hand", "chain_py", "reach", 0)
+        >>> path.parent.mkdir(parents=True)
+        >>> _ = path.write_text(lw.encode_plan(lw.load_plans("MT10")["reach"], "chain_py"))
+        >>> compare_plans(folder.name, episodes=2).mean("by hand", "chain_py")
+        1.0
+
+    Source: paper section 'LLM Experiments'.
+    """
+    found = recorded_answers(source)
+    settings = {
+        "episodes": episodes,
+        "seed": seed,
+        "choose": choose,
+        "noise_scale": noise_scale,
+        "max_steps": max_steps,
+    }
+    fared = _read(resume, settings)
+    listed = [(model, *place, text) for model, answers in found.items() for place, text in answers.items()]
+    decoded = []
+    with Progress("decoding", len(listed), "answer", show=progress) as bar:
+        for _, format, task, _, text in listed:
+            decoded.append(decode_plan(answer_text(text), task, format, tasks=tasks))
+            bar.update(1)
+    plans = {_key(one.scripted): one.scripted for one in decoded if one.scripted is not None}
+    to_do = {key: plan for key, plan in plans.items() if key not in fared}
+    if to_do:
+        keys, saved = list(to_do), [monotonic()]
+
+        def note(index: int, success: tuple[bool, ...]) -> None:
+            fared[keys[index]] = success
+            if resume is not None and monotonic() - saved[0] > _SAVE_SECONDS:
+                _write(resume, settings, fared)
+                saved[0] = monotonic()
+
+        options: dict[str, Any] = {**settings, "num_envs": num_envs, "num_threads": num_threads, "progress": progress}
+        evaluate_plans(list(to_do.values()), on_plan=note, **options)
+        if resume is not None:
+            _write(resume, settings, fared)
+    answers = []
+    for (model, format, task, attempt, _), one in zip(listed, decoded, strict=True):
+        reason = one.reason or ("" if one.scripted is not None else "no step has a skill near a scripted one")
+        steps = 0 if one.scripted is None else len(one.scripted.steps)
+        success = (False,) * episodes if one.scripted is None else fared[_key(one.scripted)]
+        answers.append(ComparedAnswer(model, format, task, attempt, steps, len(one.steps) - steps, reason, success))
+    return PlanComparison(answers, settings)
+
+
+def _key(plan: ConditionalPlan) -> str:
+    return f"{plan.task} {Plans([plan]).fingerprint}"
+
+
+def _mean(numbers: Sequence[float]) -> float:
+    return sum(numbers) / len(numbers) if numbers else float("nan")
+
+
+def _read(file: str | os.PathLike[str] | None, settings: Mapping[str, Any]) -> dict[str, tuple[bool, ...]]:
+    if file is None or not Path(file).exists():
+        return {}
+    found = read_json(file, "resume")
+    if found.get("settings") != settings:
+        raise ValueError(
+            f"resume: {str(file)!r} is of {shown(found.get('settings'))}, and this run of {settings}; choose another "
+            "folder, or delete it"
+        )
+    fared = found.get("fared")
+    said = fared.values() if isinstance(fared, dict) else [None]
+    if not all(isinstance(one, str) and len(one) == settings["episodes"] and not set(one) - {*"01"} for one in said):
+        raise ValueError(f"resume: {str(file)!r} is damaged; delete it to run all plans again")
+    return {key: tuple(one == "1" for one in found["fared"][key]) for key in found["fared"]}
+
+
+def _write(file: str | os.PathLike[str], settings: Mapping[str, Any], fared: Mapping[str, Sequence[bool]]) -> None:
+    shortened = {key: "".join(map(str, map(int, success))) for key, success in fared.items()}
+    write_json(Path(file), {"settings": dict(settings), "fared": shortened})

@@ -1,0 +1,68 @@
+"""What a comparison of models is shown as: the paper's two figures, and a page of tables."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from lw_torchrl._files import write_json, write_text
+from lw_torchrl.evaluation.figures import plot_sorted_tasks
+from lw_torchrl.evaluation.published import published_plans
+from lw_torchrl.planners.comparing import Group, PlanComparison
+
+
+def write_report(comparison: PlanComparison, folder: Path) -> list[Path]:
+    """Write results.json, summary.md, models.png (each model in its best format) and formats.png (of the model that
+    does best) to a folder; the figures leave out tasks that some of their curves lack.
+
+    Returns:
+        What was written.
+
+    Source: the paper's figures of section 'LLM Experiments'.
+    """
+    best = {model: comparison.best_format(model) for model in comparison.models}
+    first = max(best, key=lambda model: comparison.mean(model, best[model]))
+    formats = [group for group in comparison.groups if group[0] == first]
+    settings = ", ".join(f"{name} {value}" for name, value in comparison.settings.items())
+    words = f"""# Plans of {", ".join(comparison.models)}, by scripted skills
+
+{comparison.table()}
+
+Success is the mean over tasks, each over its answers; an answer without a plan that runs fails. Brackets are 95 % intervals over
+tasks. The best answer of a task is chosen by the even episodes and counted in the odd ones.
+
+{comparison.task_table()}
+
+{settings}
+"""
+    written = [folder / name for name in ("results.json", "summary.md", "models.png", "formats.png")]
+    write_json(written[0], comparison.to_json())
+    write_text(written[1], words)
+    title = "each model in its best format"
+    _draw(comparison, list(best.items()), written[2], title, lambda model, format: f"{model}, {format}")
+    _draw(comparison, formats, written[3], f"formats of {first}", lambda _, format: format)
+    return written
+
+
+def _draw(comparison: PlanComparison, groups: Sequence[Group], file: Path, title: str, label) -> None:  # type: ignore[no-untyped-def]
+    rates = {label(*group): comparison.rates(*group) for group in groups}
+    common = set.intersection(*(set(found) for found in rates.values()))
+    if not common:
+        return
+    curves = {name: {task: found[task] for task in sorted(common)} for name, found in rates.items()}
+    least = min(len(one) for found in curves.values() for one in found.values())
+    even = {name: {task: one[:least] for task, one in found.items()} for name, found in curves.items()}
+    plot_sorted_tasks(even, file, published=_published(groups, common), order="own", title=title)
+
+
+def _published(groups: Sequence[Group], tasks: set[str]) -> dict[str, dict[str, float]]:
+    """Of those groups that the paper has."""
+    found = {}
+    for model, format in groups:
+        try:
+            rates = published_plans(model, format)
+        except ValueError:
+            continue
+        if tasks <= set(rates):
+            found[f"{model}, {format}, published"] = {task: sum(rates[task]) / len(rates[task]) for task in tasks}
+    return found
