@@ -172,7 +172,7 @@ def load_skills(
 
 @lru_cache(maxsize=256)
 def _foreign_words(task: Task) -> frozenset[str]:
-    """The words for things of the 50 tasks that this one lacks; points of things are no things, "front" and "center"."""
+    """The words for things of the 50 tasks that this one lacks. Points of things are none: "front", "center"."""
     own = {word for name in task.object_names for word in name.split()}
     return frozenset(thing.name.split()[-1] for one in TASKS.values() for thing in one.published.objects) - own
 

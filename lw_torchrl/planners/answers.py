@@ -34,6 +34,9 @@ class Tokens:
         return Tokens(self.prompt + other.prompt, self.completion + other.completion)
 
 
+NO_TOKENS = Tokens()
+
+
 @dataclass(frozen=True)
 class Answer:
     """What a planner answered to one question.
@@ -56,7 +59,7 @@ class Answer:
     text: str
     raw: str
     decoded: DecodedPlan
-    tokens: Tokens = Tokens()
+    tokens: Tokens = NO_TOKENS
     cached: bool = False
     notes: tuple[str, ...] = ()
 
@@ -82,7 +85,7 @@ class Answers(Sequence[Answer]):
     @property
     def tokens(self) -> Tokens:
         """Of all answers, whether they were cached or not."""
-        return sum((answer.tokens for answer in self), Tokens())
+        return sum((answer.tokens for answer in self), NO_TOKENS)
 
     def __repr__(self) -> str:
         plans = sum(answer.decoded.plan is not None for answer in self)

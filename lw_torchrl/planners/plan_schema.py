@@ -1,8 +1,8 @@
 """A JSON Schema that only plans of one task pass: its base queries as conditions, its scripted skills.
 
 It keeps to what the strict mode of OpenAI, vLLM, Ollama, llama.cpp and llama-cpp-python all know: objects whose names
-are all required, anyOf, enum, pattern, a least and a greatest number of items. A clause is three words, not one sentence
-of hundreds: so the largest task has some 350 words to choose from, where OpenAI takes 1,000 at most.
+are all required, anyOf, enum, pattern, a least and a greatest number of items. A clause is three choices, not one of
+hundreds of sentences: OpenAI takes 1,000 words to choose from at most, and the largest task has 170, with goals 330.
 """
 
 from __future__ import annotations
@@ -72,8 +72,8 @@ def _clauses(task: Task) -> list[dict[str, Any]]:
         said = f"not {clause.predicate}" if clause.negated else clause.predicate
         others.setdefault((clause.subject, said), []).append(clause.object)
     alike: dict[tuple[str, tuple[str | None, ...]], list[str]] = {}
-    for (subject, said), objects in others.items():
-        alike.setdefault((subject, tuple(objects)), []).append(said)
+    for (subject, said), listed in others.items():
+        alike.setdefault((subject, tuple(listed)), []).append(said)
     found = []
     for (subject, objects), words in alike.items():
         clause_of = {"first": _one_of([f"the {subject}"]), "is": _one_of(words)}
