@@ -20,7 +20,7 @@ from lw_torchrl.language.tasks import TASKS, Task, check_task
 MOST_STEPS, MOST_CLAUSES = 8, 5
 """So that a model that repeats itself comes to an end; the longest shipped plan has 6 steps, its conditions up to 5."""
 _SKILL = "^[a-z]+( [a-z'-]+){1,12}$"
-_BECAUSE = "^[A-Za-z,'-]+( [A-Za-z,'-]+){1,24}$"
+_BECAUSE = "^[A-Za-z0-9,.:;'-]+( [A-Za-z0-9,.:;'-]+){1,29}$"
 
 
 def plan_schema(
