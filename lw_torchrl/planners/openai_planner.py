@@ -199,9 +199,7 @@ class OpenAIPlanner:
                     kept.append((question, reply))
 
         def take(question: _Question, reply: Reply, cached: bool, note: str = "") -> None:
-            answer = read_reply(
-                reply, question.task, format, question.attempt, self.skills, self.constrain, self.free_skills
-            )
+            answer = read_reply(reply, question.task, format, question.attempt, self.skills, question.request["schema"])
             answer = replace(answer, cached=cached, notes=(note, *answer.notes) if note else answer.notes)
             if out is not None:
                 write_answer(out, self.name, answer)

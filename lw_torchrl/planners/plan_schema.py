@@ -7,6 +7,7 @@ hundreds of sentences: OpenAI takes 1,000 words to choose from at most, and the 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -60,9 +61,26 @@ def plan_schema(
     step: dict[str, Any] = {"because": {"type": "string", "pattern": _BECAUSE}} if style.explains else {}
     step["condition"] = _listed({"anyOf": _clauses(owner)}, MOST_CLAUSES)
     if style.goals:
-        step["goal"] = step["condition"]
+        step["goal"] = {**step["condition"], "minItems": 0}  # the language has no words for some
     step["skill"] = {"type": "string", "pattern": _SKILL} if free_skills else _one_of(offered)
     return _object({"steps": _listed(_object(step), MOST_STEPS)})
+
+
+def passes(value: Any, schema: Mapping[str, Any]) -> bool:
+    """Whether JSON passes a schema of :func:`plan_schema`, whatever a server claims of it."""
+    if "anyOf" in schema:
+        return any(passes(value, one) for one in schema["anyOf"])
+    if "enum" in schema:
+        return value in schema["enum"]
+    if schema["type"] == "object":
+        known = schema["properties"]
+        return (
+            isinstance(value, dict) and {*value} == {*known} and all(passes(value[name], known[name]) for name in known)
+        )
+    if schema["type"] == "array":
+        fits = isinstance(value, list) and schema["minItems"] <= len(value) <= schema["maxItems"]
+        return fits and all(passes(one, schema["items"]) for one in value)
+    return isinstance(value, str) and re.search(schema["pattern"], value) is not None
 
 
 def _clauses(task: Task) -> list[dict[str, Any]]:

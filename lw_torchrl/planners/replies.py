@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
+from typing import Any
 
 from lw_torchrl._checks import shown
-from lw_torchrl.language.decoded import DecodedPlan
 from lw_torchrl.language.decoding import LIMIT, SKILL_LIMIT, decode_as
 from lw_torchrl.language.formats import PLAN_FORMATS, encode_plan
 from lw_torchrl.language.formats.structured import read_structured
@@ -14,6 +15,7 @@ from lw_torchrl.language.step_mapping import StepMapper
 from lw_torchrl.language.tasks import Task
 from lw_torchrl.planners.answer_cache import Reply
 from lw_torchrl.planners.answers import Answer
+from lw_torchrl.planners.plan_schema import passes
 
 
 def read_reply(
@@ -22,8 +24,7 @@ def read_reply(
     format: str,
     attempt: int = 0,
     skills: Mapping[str, ScriptedSkill] | None = None,
-    constrained: bool = False,
-    free_skills: bool = False,
+    schema: Mapping[str, Any] | None = None,
 ) -> Answer:
     """The answer in a reply; whatever the server claims, it is read as any text is.
 
@@ -33,12 +34,11 @@ def read_reply(
         format: the format that was asked for.
         attempt: which of several answers it is.
         skills: the scripted skills to choose from; None for the shipped ones.
-        constrained: the model was to be held to a schema, so JSON is expected; it becomes a text in the format.
-        free_skills: the schema took skills in any words.
+        schema: what the model was to be held to; JSON is expected then, and becomes a text in the format.
     """
-    read = read_structured if constrained else PLAN_FORMATS[format].read
+    read = PLAN_FORMATS[format].read if schema is None else read_structured
     decoded = decode_as(reply.text, read, StepMapper(task, skills, "edit", LIMIT, SKILL_LIMIT))
-    text = encode_plan(decoded.plan, format) if constrained and decoded.plan is not None else reply.text
+    text = encode_plan(decoded.plan, format) if schema and decoded.plan is not None else reply.text
     notes = []
     if reply.finish == "length":
         notes.append("it was cut off at max_tokens")
@@ -48,7 +48,7 @@ def read_reply(
         notes.append(f"the model refused: {shown(reply.refusal)}")
     elif not reply.text.strip():
         notes.append("it is empty")
-    elif constrained and not _kept_to_it(decoded, reply.text, free_skills):
+    elif schema and reply.finish != "length" and not _passes(reply.text, schema):
         notes.append("the server did not keep to the schema")
     return Answer(
         task.name, format, attempt, text.encode("utf-8", "replace").decode(), reply.text, decoded, reply.tokens,
@@ -56,7 +56,8 @@ def read_reply(
     )  # fmt: skip
 
 
-def _kept_to_it(decoded: DecodedPlan, text: str, free_skills: bool) -> bool:
-    """Whether an answer says only what the schema has."""
-    exact = all(step.condition_distance == 0 and (free_skills or step.skill_distance == 0) for step in decoded.steps)
-    return bool(decoded.steps) and exact and '"steps"' in text
+def _passes(text: str, schema: Mapping[str, Any]) -> bool:
+    try:
+        return passes(json.loads(text), schema)
+    except (ValueError, RecursionError):
+        return False

@@ -5,8 +5,8 @@
                 "goal": [{"first": "the robot's gripper", "is": "above", "second": "the puck"}],
                 "skill": "place the gripper above the puck"}]}
 
-"because" is there in the styles that explain, "goal" in the goal style. Names are in the order of the alphabet, since
-some servers write them so.
+"because" is there in the styles that explain, "goal" in the goal style, empty where there is none. Names are in the
+order of the alphabet, since some servers write them so.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def write_structured(plan: ConditionalPlan, style: Style) -> str:
         said: dict[str, Any] = {"because": one_line(step.reason) or "It comes next"} if style.explains else {}
         said["condition"] = _clauses(step.condition)
         if style.goals:
-            said["goal"] = _clauses(goal or step.condition)
+            said["goal"] = _clauses(goal) if goal else []
         steps.append({**said, "skill": step.skill})
     return json.dumps({"steps": steps})
 
