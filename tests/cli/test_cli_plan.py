@@ -55,6 +55,12 @@ def generate(address, folder, *more):
     return ("plan", "generate", *more, "--model", "a/model", "--base-url", address, "--attempts", 2, *where)
 
 
+def table(printed):
+    """The rows of the table, by task and format."""
+    cells = [line.split() for line in printed.splitlines()]
+    return {tuple(row[:2]): row[2:] for row in cells if row[:1] in (["push"], ["reach"])}
+
+
 @pytest.mark.usefixtures("_no_key")
 def test_generate_writes_answers_and_says_what_became_of_them(capsys, tmp_path):
     server = FakeServer(
@@ -64,7 +70,7 @@ def test_generate_writes_answers_and_says_what_became_of_them(capsys, tmp_path):
         asked = generate(address, tmp_path, "push", "reach", "--format", "chain_py", "basic_md")
         first, second = run(capsys, *asked), run(capsys, *asked)
         constrained = run(capsys, *generate(address, tmp_path, "push", "--format", "basic_py", "--constrain"))
-    rows = {tuple(line.split()[:2]): line.split()[2:] for line in first.splitlines() if line[:5] in ("push ", "reach")}
+    rows = table(first)
     assert rows["push", "chain_py"] == ["2", "2", "2", "2", "200", "20"]
     assert rows["reach", "basic_md"] == ["2", "0", "0", "2", "200", "20"]
     assert "4 answers: it was cut off at max_tokens" in first

@@ -133,7 +133,7 @@ SHAPED = st.tuples(st.sampled_from(lw.MT50), st.sampled_from(FORMATS), st.boolea
 )
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(SHAPED)
 def test_whatever_passes_the_schema_is_a_plan_that_runs(found):
     (task, format, free), answer, cut = found
@@ -163,7 +163,7 @@ ANY_JSON = st.recursive(
 )
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(SHAPED, ANY_JSON, st.randoms(use_true_random=False))
 def test_answers_are_validated_as_the_standard_says(found, value, draw):
     """An answer that passes, and the same with something in it exchanged."""
