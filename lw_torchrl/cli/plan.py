@@ -134,7 +134,7 @@ def generate(
         noted.update(note for answer in answers for note in answer.notes)
         for task in dict.fromkeys(answer.task for answer in answers):
             rows.append((task, one, *_counts([answer for answer in answers if answer.task == task])))
-    columns = ("task", "format", "answers", "plans", "all steps scripted", "asked now", "tokens read", "tokens written")
+    columns = ("task", "format", "answers", "plans", "all scripted", "asked now", "tokens read", "tokens written")
     print_table(f"{planner.model} at {planner.address}", columns, rows)
     for note, times in noted.most_common():
         print(f"{counted(times, 'answer')}: {note}")

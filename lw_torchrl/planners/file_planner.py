@@ -38,12 +38,11 @@ class FilePlanner:
         ValueError: no answers in it, or of several models and none is named; or a line that is no answer.
 
     Example:
-        >>> import tempfile, lw_torchrl as lw
-        >>> folder = tempfile.TemporaryDirectory()
-        >>> path = answer_path(folder.name, "by hand", "chain_py", "push", 0)
-        >>> path.parent.mkdir(parents=True)
-        >>> _ = path.write_text(lw.encode_plan(lw.load_plans("MT10")["push"], "chain_py"))
-        >>> planner = FilePlanner(folder.name)
+        >>> import json, lw_torchrl as lw
+        >>> row = {"llm": "by hand", "format": "chain_py", "task": "push", "attempt": 0}
+        >>> row["completion"] = lw.encode_plan(lw.load_plans("MT10")["push"], "chain_py")
+        >>> _ = Path("answers.jsonl").write_text(json.dumps(row))
+        >>> planner = FilePlanner("answers.jsonl")
         >>> planner.name, planner.recorded
         ('by hand', (('chain_py', 'push', 0),))
         >>> planner.plans("push", format="chain_py")[0].decoded.plan == lw.load_plans("MT10")["push"]

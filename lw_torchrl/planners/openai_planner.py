@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Generator, Iterable, Mapping
+from collections.abc import Generator, Iterable, Mapping
 from contextlib import closing
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -159,7 +159,6 @@ class OpenAIPlanner:
         attempts: int = 1,
         out: str | os.PathLike[str] | None = None,
         progress: bool = True,
-        on_answer: Callable[[Answer], None] | None = None,
     ) -> Answers:
         """Ask for plans; several questions at a time.
 
@@ -170,7 +169,6 @@ class OpenAIPlanner:
             out: a folder; each answer is written to ``out/<name>/<format>/<task>-<attempt>.<ext>`` as it comes, the
                 JSON of a constrained one beside it.
             progress: show how many have come.
-            on_answer: called with each answer as it comes.
 
         Returns:
             An answer for each task and attempt.
@@ -204,8 +202,6 @@ class OpenAIPlanner:
             if out is not None:
                 write_answer(out, self.name, answer)
             found.append(answer)
-            if on_answer is not None:
-                on_answer(answer)
 
         total, errors = len(kept) + len(missing), []
         with Progress("asking", total, "answer", initial=len(kept), show=progress) as bar:

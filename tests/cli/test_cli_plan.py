@@ -62,7 +62,8 @@ def table(printed):
 
 
 @pytest.mark.usefixtures("_no_key")
-def test_generate_writes_answers_and_says_what_became_of_them(capsys, tmp_path):
+def test_generate_writes_answers_and_says_what_became_of_them(capsys, tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "160")
     server = FakeServer(
         lambda body: completion("I will not", "length") if asked_for(body) == "reach" else shipped(body)
     )
@@ -75,9 +76,7 @@ def test_generate_writes_answers_and_says_what_became_of_them(capsys, tmp_path):
     assert rows["reach", "basic_md"] == ["2", "0", "0", "2", "200", "20"]
     assert "4 answers: it was cut off at max_tokens" in first
     assert f"880 tokens; written to {tmp_path / 'plans' / 'a_model'}" in first
-    again = {
-        tuple(line.split()[:2]): line.split()[2:] for line in second.splitlines() if line[:5] in ("push ", "reach")
-    }
+    again = table(second)
     assert again["push", "chain_py"] == ["2", "2", "2", "0", "200", "20"]
     assert len(server.requests) == 10
     plan = lw.load_plans("MT10")["push"]

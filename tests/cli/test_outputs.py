@@ -31,12 +31,7 @@ def _no_work(monkeypatch):
     working = ("lw_torchrl.data", "lw_torchrl.experiments.demo", "lw_torchrl.experiments.runs", "openai")
 
     def refuse(name, *args, **kwargs):
-        assert name not in (
-            "lw_torchrl.data",
-            "lw_torchrl.experiments.demo",
-            "lw_torchrl.experiments.runs",
-            "openai",
-        ), name
+        assert name not in working, name
         return original(name, *args, **kwargs)
 
     monkeypatch.setattr(builtins, "__import__", refuse)
