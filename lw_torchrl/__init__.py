@@ -63,6 +63,10 @@ if TYPE_CHECKING:  # the table below, for type checkers and editors
     from lw_torchrl.objectives import ExpectileValueLoss as ExpectileValueLoss
     from lw_torchrl.objectives import SkillLatentLoss as SkillLatentLoss
     from lw_torchrl.objectives import standardize_by_task as standardize_by_task
+    from lw_torchrl.planners import FilePlanner as FilePlanner
+    from lw_torchrl.planners import OpenAIPlanner as OpenAIPlanner
+    from lw_torchrl.planners import Planner as Planner
+    from lw_torchrl.planners import PlannerError as PlannerError
     from lw_torchrl.planners import plan_prompt as plan_prompt
     from lw_torchrl.record import RerunLogger as RerunLogger
     from lw_torchrl.record import RolloutRecorder as RolloutRecorder
@@ -102,7 +106,7 @@ _NAMES = {
     "PlanConditionedValue Policy QueryEvaluator ResidualActor ScriptedSkillActor plan_actor_value",
     "lw_torchrl.objectives": "AdvantageWeightedLoss DemonstratedSACLoss DemonstratedTD3Loss ExpectileValueLoss "
     "SkillLatentLoss standardize_by_task",
-    "lw_torchrl.planners": "plan_prompt",
+    "lw_torchrl.planners": "FilePlanner OpenAIPlanner Planner PlannerError plan_prompt",
     "lw_torchrl.record": "RerunLogger RolloutRecorder log_rollout",
     "lw_torchrl.trainers": "BehavioralCloningConfig BehavioralCloningTrainer OfflineConfig OfflineTrainer OnlineConfig "
     "OnlineTrainer "

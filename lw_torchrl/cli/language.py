@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import sys
-from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -12,24 +9,7 @@ from tyro.conf import Positional, arg
 
 from lw_torchrl._checks import counted
 from lw_torchrl.cli.sources import one_or_many, read_plans, read_tasks
-
-
-def _print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    from rich.box import SIMPLE_HEAD
-    from rich.console import Console
-    from rich.table import Table
-
-    class Printer(Console):
-        def on_broken_pipe(self) -> None:  # rich's own exits with status 1
-            raise
-
-    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
-    for number, column in enumerate(columns):
-        table.add_column(column, no_wrap=number == 0)
-    for row in rows:
-        table.add_row(*row)
-    wide = None if sys.stdout.isatty() or "COLUMNS" in os.environ else 160
-    Printer(highlight=False, markup=False, width=wide).print(table)
+from lw_torchrl.cli.tables import print_table
 
 
 def tasks(
@@ -53,7 +33,7 @@ def tasks(
         task = known[name]
         objects = ", ".join(o.name + (" (ours)" if getattr(o, "ours", False) else "") for o in task.objects[1:])
         rows.append((name, "yes" if name in lw.MT10 else "", task.description, objects))
-    _print_table(counted(len(rows), "task"), ("task", "MT10", "description", "objects beside the gripper"), rows)
+    print_table(counted(len(rows), "task"), ("task", "MT10", "description", "objects beside the gripper"), rows)
 
 
 def skills(
@@ -93,7 +73,7 @@ def skills(
         gain = f"{shown.gain[0]:g}" if len(set(shown.gain)) == 1 else " ".join(f"{x:g}" for x in shown.gain)
         rows.append((skill.text, shown.target, moved, offset, gain, f"{shown.gripper:g}"))
     columns = ("skill", "target", "moved", "offset, m", "gain", "gripper")
-    _print_table(counted(len(rows), "scripted skill"), columns, rows)
+    print_table(counted(len(rows), "scripted skill"), columns, rows)
 
 
 def plans(
@@ -127,7 +107,7 @@ def plans(
         (name, str(len(plan.steps)), "; ".join(dict.fromkeys(step.skill for step in plan.steps)))
         for name, plan in loaded.items()
     ]
-    _print_table(counted(len(rows), "plan"), ("task", "steps", "skills"), rows)
+    print_table(counted(len(rows), "plan"), ("task", "steps", "skills"), rows)
 
 
 def queries(

@@ -50,7 +50,7 @@ GROUPS: dict[str, dict[str, Any]] = {"plan": cli_plan.COMMANDS}
 """Commands that have commands of their own."""
 
 
-RESUMABLE = ("demo", "collect", "train", "reproduce", "offline", "online")
+RESUMABLE = ("demo", "collect", "train", "plan generate", "reproduce", "offline", "online")
 
 
 def main(args: Sequence[str] | None = None) -> None:
@@ -122,6 +122,7 @@ def _noting(interrupts: list[int]) -> Iterator[None]:
 
 
 def _stop(given: Sequence[str]) -> NoReturn:
-    resumed = "; the same command carries on from here" if given and given[0] in RESUMABLE else ""
+    named = {" ".join(given[:1]), " ".join(given[:2])}
+    resumed = "; the same command carries on from here" if named & {*RESUMABLE} else ""
     complain(f"\nlw-torchrl: stopped{resumed}")
     sys.exit(130)

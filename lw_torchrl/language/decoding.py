@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -83,17 +83,21 @@ def decode_plan(
     read = PLAN_FORMATS[check_choice("format", format, PLAN_FORMATS)].read
     check_choice("by", by, ("edit", "embedding"))
     limits = check_probability("limit", limit), check_probability("skill_limit", skill_limit)
-    mapper = StepMapper(owner, skills, by, *limits)
-    notes = []
+    return decode_as(text, read, StepMapper(owner, skills, by, *limits))
+
+
+def decode_as(text: str, read: Callable[[str], Reading], mapper: StepMapper) -> DecodedPlan:
+    """As :func:`decode_plan`, by the reader of any form; a text in another form is read as what it is."""
+    owner, notes = mapper.task, []
     if len(text) > _LONGEST:
         notes.append(Note(text.count("\n", 0, _LONGEST) + 1, f"the rest of {len(text)} characters is not read"))
     reading, section = _read(text[:_LONGEST], owner, read)
     steps = [_mapped(clause, mapper, notes) for clause in _named(section)]
     notes += _about(reading, section, owner)
-    plan = _plan(owner, [(step, step.written_skill) for step in steps], section)
+    plan = _plan(owner, steps, [step.written_skill for step in steps], section)
     return DecodedPlan(
         plan,
-        _plan(owner, [(step, step.scripted) for step in steps], section),
+        _plan(owner, steps, [step.scripted for step in steps], section),
         "" if plan is not None else _why_none(reading, section, steps, owner, text),
         tuple(sorted(notes, key=lambda note: note.line)),
         tuple(steps),
@@ -179,12 +183,13 @@ def _mapped(clause: Clause, mapper: StepMapper, notes: list[Note]) -> DecodedSte
     )  # fmt: skip
 
 
-def _plan(task: Task, steps: list[tuple[DecodedStep, str | None]], section: Section) -> ConditionalPlan | None:
+def _plan(
+    task: Task, steps: Sequence[DecodedStep], skills: Sequence[str | None], section: Section
+) -> ConditionalPlan | None:
     """The plan of the steps that are not dropped and have a skill."""
-    reasons = {clause.line: clause.reason for clause in section.clauses}
     kept = tuple(
-        PlanStep(step.condition, skill, reasons[step.line], step.goal)
-        for step, skill in steps
+        PlanStep(step.condition, skill, clause.reason, step.goal)
+        for step, skill, clause in zip(steps, skills, section.clauses, strict=True)
         if not step.dropped and step.condition is not None and skill is not None
     )
     return ConditionalPlan(task.name, kept, task) if kept else None

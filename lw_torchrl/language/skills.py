@@ -172,14 +172,14 @@ def load_skills(
 
 @lru_cache(maxsize=256)
 def _foreign_words(task: Task) -> frozenset[str]:
-    """The words for things of the 50 tasks that this one lacks."""
+    """The words for things of the 50 tasks that this one lacks. Points of things are none: "front", "center"."""
     own = {word for name in task.object_names for word in name.split()}
-    return frozenset(name.split()[-1] for one in TASKS.values() for name in one.object_names) - own
+    return frozenset(thing.name.split()[-1] for one in TASKS.values() for thing in one.published.objects) - own
 
 
 def skills_for(task: Task, skills: Mapping[str, ScriptedSkill] | None = None) -> Mapping[str, ScriptedSkill]:
     """The skills that a task may use, of the shipped ones if none are given: it has the objects that they speak of, and
-    their texts name nothing that other tasks have and it has not."""
+    their texts name nothing that other tasks have and it has not, or they have a variant for it."""
     return _shipped_for(task) if skills is None else _for(task, skills)
 
 
@@ -190,7 +190,11 @@ def _shipped_for(task: Task) -> Mapping[str, ScriptedSkill]:
 
 def _for(task: Task, skills: Mapping[str, ScriptedSkill]) -> dict[str, ScriptedSkill]:
     foreign = _foreign_words(task)
-    return {text: skill for text, skill in skills.items() if skill.suits(task) and not foreign & set(text.split())}
+    return {
+        text: skill
+        for text, skill in skills.items()
+        if skill.suits(task) and (task.name in skill.variants or not foreign & set(text.split()))
+    }
 
 
 @lru_cache(maxsize=64)

@@ -1,5 +1,25 @@
-"""Plans from language models: how they are asked for."""
+"""Plans from language models: how they are asked for, and who answers."""
 
+from lw_torchrl.planners.answers import Answer, Answers, Tokens, answer_path, folder_name, write_answer
+from lw_torchrl.planners.errors import PlannerError
+from lw_torchrl.planners.file_planner import FilePlanner
+from lw_torchrl.planners.openai_planner import OpenAIPlanner
+from lw_torchrl.planners.plan_schema import plan_schema
+from lw_torchrl.planners.planner import Planner
 from lw_torchrl.planners.prompts import plan_prompt, prompt_examples
 
-__all__ = ["plan_prompt", "prompt_examples"]
+__all__ = [
+    "Answer",
+    "Answers",
+    "FilePlanner",
+    "OpenAIPlanner",
+    "Planner",
+    "PlannerError",
+    "Tokens",
+    "answer_path",
+    "folder_name",
+    "plan_prompt",
+    "plan_schema",
+    "prompt_examples",
+    "write_answer",
+]

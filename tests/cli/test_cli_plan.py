@@ -1,7 +1,13 @@
-"""``lw-torchrl plan``: the prompt that asks a language model for a plan."""
+"""``lw-torchrl plan``: the prompt that asks a language model for a plan, and asking one."""
+
+import signal
+import subprocess
+import sys
+import time
 
 import pytest
 from commands import fails, run
+from fake_server import FakeServer, asked_for, completion, error, serving, shipped
 
 import lw_torchrl as lw
 from lw_torchrl.cli.main import main
@@ -32,3 +38,86 @@ def test_errors_are_in_its_words(capsys):
     assert "error: --format must be one of" in fails(capsys, "plan", "prompt", "reach", "--format", "chain")
     assert "drawer-open" in fails(capsys, "plan", "prompt", "drawer-opne")
     assert "--plans must name" in fails(capsys, "plan", "prompt", "reach", "--plans")
+
+
+# ---- generate
+
+
+@pytest.fixture
+def _no_key(monkeypatch):
+    for name in ("OPENAI_API_KEY", "OPENAI_BASE_URL"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("NO_PROXY", "*")
+
+
+def generate(address, folder, *more):
+    where = ("--out", folder / "plans", "--cache", folder / "kept")
+    return ("plan", "generate", *more, "--model", "a/model", "--base-url", address, "--attempts", 2, *where)
+
+
+def table(printed):
+    """The rows of the table, by task and format."""
+    cells = [line.split() for line in printed.splitlines()]
+    return {tuple(row[:2]): row[2:] for row in cells if row[:1] in (["push"], ["reach"])}
+
+
+@pytest.mark.usefixtures("_no_key")
+def test_generate_writes_answers_and_says_what_became_of_them(capsys, tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "160")
+    server = FakeServer(
+        lambda body: completion("I will not", "length") if asked_for(body) == "reach" else shipped(body)
+    )
+    with serving(server) as address:
+        asked = generate(address, tmp_path, "push", "reach", "--format", "chain_py", "basic_md")
+        first, second = run(capsys, *asked), run(capsys, *asked)
+        constrained = run(capsys, *generate(address, tmp_path, "push", "--format", "basic_py", "--constrain"))
+    rows = table(first)
+    assert rows["push", "chain_py"] == ["2", "2", "2", "2", "200", "20"]
+    assert rows["reach", "basic_md"] == ["2", "0", "0", "2", "200", "20"]
+    assert "4 answers: it was cut off at max_tokens" in first
+    assert f"880 tokens; written to {tmp_path / 'plans' / 'a_model'}" in first
+    again = table(second)
+    assert again["push", "chain_py"] == ["2", "2", "2", "0", "200", "20"]
+    assert len(server.requests) == 10
+    plan = lw.load_plans("MT10")["push"]
+    assert (tmp_path / "plans/a_model/chain_py/push-1.py").read_text() == lw.encode_plan(plan, "chain_py")
+    assert "a_model-constrained" not in first
+    assert (tmp_path / "plans/a_model-constrained/basic_py/push-0.json").exists()
+    assert "220 tokens" in constrained
+
+
+@pytest.mark.usefixtures("_no_key")
+def test_generate_fails_in_one_line(capsys, tmp_path):
+    with serving(FakeServer(lambda body: error(404, "no such model"))) as address:
+        message = fails(capsys, *generate(address, tmp_path, "push"))
+    assert f"'a/model' at {address}, push, attempt" in message
+    assert "--base-url must be an address" in fails(capsys, *generate("nowhere", tmp_path, "push"))
+    assert "TASKS must be one of" in fails(capsys, *generate("http://x/v1", tmp_path, "psuh"))
+    assert "--format must be one of" in fails(capsys, *generate("http://x/v1", tmp_path, "push", "--format", "chain"))
+    assert "OPENAI_API_KEY" in fails(capsys, "plan", "generate", "push", "--model", "m", "--cache", tmp_path / "kept")
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no such signal there")
+@pytest.mark.usefixtures("_no_key")
+def test_a_killed_run_asks_only_for_what_is_missing(capsys, tmp_path):
+    server = FakeServer(wait=0.05)
+    with serving(server) as address:
+        asked = [str(part) for part in generate(address, tmp_path, "MT10", "--concurrency", 2)]
+        process = subprocess.Popen([sys.executable, "-m", "lw_torchrl", *asked], stdout=subprocess.DEVNULL)
+        try:
+            deadline = time.monotonic() + 120
+            while server.served < 7 and time.monotonic() < deadline:
+                time.sleep(0.01)
+        finally:
+            process.kill()
+            process.wait()
+        time.sleep(0.3)  # what was under way when it was killed
+        before = len(server.requests)
+        kept = len(list((tmp_path / "kept").rglob("*.json")))
+        assert 3 <= kept <= before < 20
+        printed = run(capsys, *asked)
+    assert len(server.requests) == before + 20 - kept
+    assert before - kept <= 4  # those under way
+    assert "2200 tokens" in printed
+    assert len(list((tmp_path / "plans/a_model/chain_py").glob("*.py"))) == 20
+    assert not list(tmp_path.rglob(".*tmp*"))

@@ -7,7 +7,7 @@ import os
 import pytest
 from commands import fails
 
-from lw_torchrl.cli.main import COMMANDS
+from lw_torchrl.cli.main import COMMANDS, GROUPS
 
 FOLDERS = {
     "demo": ["--quick", "--out"],
@@ -17,6 +17,7 @@ FOLDERS = {
     "reproduce": ["few-shot", "--out"],
     "offline": ["quick", "--out"],
     "online": ["reach", "--out"],
+    "plan generate": ["reach", "--model", "m", "--out"],
 }
 FILES = {"train": ["demos", "--out"], "record": ["reach", "--out"], "view": ["x.rrd", "--screenshot"]}
 
@@ -27,17 +28,21 @@ def _no_work(monkeypatch):
     import builtins
 
     original = builtins.__import__
+    working = ("lw_torchrl.data", "lw_torchrl.experiments.demo", "lw_torchrl.experiments.runs", "openai")
 
     def refuse(name, *args, **kwargs):
-        assert name not in ("lw_torchrl.data", "lw_torchrl.experiments.demo", "lw_torchrl.experiments.runs"), name
+        assert name not in working, name
         return original(name, *args, **kwargs)
 
     monkeypatch.setattr(builtins, "__import__", refuse)
 
 
 def test_these_are_all_commands_that_write():
+    inner = {f"{group} {name}": function for group, commands in GROUPS.items() for name, function in commands.items()}
     writing = {
-        name for name, function in COMMANDS.items() if {"out", "screenshot", "html"} & {*function.__annotations__}
+        name
+        for name, function in {**COMMANDS, **inner}.items()
+        if {"out", "screenshot", "html"} & {*function.__annotations__}
     }
     assert writing == {*FOLDERS, *FILES}
 
@@ -46,9 +51,11 @@ def test_these_are_all_commands_that_write():
 def test_a_folder_that_is_none(capsys, tmp_path, command):
     file = tmp_path / "file"
     file.write_text("mine")
-    assert fails(capsys, command, *FOLDERS[command], file).endswith(f"--out must be a folder, '{file}' is none\n")
+    assert fails(capsys, *command.split(), *FOLDERS[command], file).endswith(
+        f"--out must be a folder, '{file}' is none\n"
+    )
     below = file / "a" / "b"
-    error = fails(capsys, command, *FOLDERS[command], below)
+    error = fails(capsys, *command.split(), *FOLDERS[command], below)
     assert error.endswith(f"--out must be a folder, '{below}' lies below the file '{file}'\n")
     assert file.read_text() == "mine"
 
@@ -58,8 +65,10 @@ def test_a_file_that_is_none(capsys, tmp_path, command):
     option = FILES[command][-1]
     file = tmp_path / "file"
     file.write_text("mine")
-    assert f"{option} must be a file, '{tmp_path}' is a folder" in fails(capsys, command, *FILES[command], tmp_path)
-    error = fails(capsys, command, *FILES[command], file / "a.png")
+    assert f"{option} must be a file, '{tmp_path}' is a folder" in fails(
+        capsys, *command.split(), *FILES[command], tmp_path
+    )
+    error = fails(capsys, *command.split(), *FILES[command], file / "a.png")
     assert f"{option}'s folder must be a folder, '{file}' is none" in error
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
@@ -68,7 +77,7 @@ def test_a_file_that_is_none(capsys, tmp_path, command):
 @pytest.mark.parametrize("command", [*FOLDERS, *FILES])
 def test_a_place_that_cannot_be_written_to(capsys, command):
     given = (FOLDERS | FILES)[command]
-    error = fails(capsys, command, *given, "/proc/self/new/out.png")
+    error = fails(capsys, *command.split(), *given, "/proc/self/new/out.png")
     assert given[-1] in error
     assert "'/proc/self' cannot be written to" in error
 

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 import lw_torchrl as lw
 from lw_torchrl.language.named_objects import GRIPPER
-from lw_torchrl.language.skills import ScriptedSkill, SkillError, load_skills, nearest_skill
+from lw_torchrl.language.skills import ScriptedSkill, SkillError, load_skills, nearest_skill, skills_for
 
 
 def written(tmp_path, text):
@@ -155,3 +155,11 @@ def test_a_byte_order_mark_before_skills(tmp_path):
 def test_numbers_that_python_cannot_write():
     with pytest.raises(SkillError, match="gain of skill 'wait'"):
         ScriptedSkill("wait", "puck", gain=(10**5000, 0, 0))
+
+
+def test_a_task_can_use_the_skills_of_its_shipped_plan():
+    """Also those whose texts say "front" or "hole", which are things of other tasks."""
+    for name, plan in lw.load_plans("MT50").items():
+        assert {step.skill for step in plan.steps} <= set(skills_for(lw.TASKS[name])), name
+    assert "place the gripper above the wrench" not in skills_for(lw.TASKS["push"])
+    assert "lower the puck into the hole" not in skills_for(lw.TASKS["push"])

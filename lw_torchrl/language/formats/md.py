@@ -22,7 +22,7 @@ def md(style: Style) -> PlanFormat:
         said = "".join(f"{line}\n" for line in hints)
         return "\n".join([about, *(_write(plan, style) for plan in examples), said + _opening(task)])
 
-    return PlanFormat("md", lambda plan: _write(plan, style), read_prose, prompt)
+    return PlanFormat("md", lambda plan: _write(plan, style), read_prose, prompt, style)
 
 
 def _opening(task: Task) -> str:

@@ -11,24 +11,6 @@ from lw_torchrl.language.tasks import Task
 
 
 @dataclass(frozen=True)
-class PlanFormat:
-    """A way to write a plan.
-
-    Attributes:
-        extension: of files that hold such texts, "py" or "md".
-        encode: a plan to its text.
-        read: any text to what it says, clause by clause; it never raises. ``decode_plan`` makes a plan of it.
-        prompt: ``(examples, task, hints)`` to the text that asks a model for a plan of the task: the plans of other
-            tasks, lines of hints, then the task's name and description.
-    """
-
-    extension: str
-    encode: Callable[[ConditionalPlan], str]
-    read: Callable[[str], Reading]
-    prompt: Callable[[Sequence[ConditionalPlan], Task, Sequence[str]], str]
-
-
-@dataclass(frozen=True)
 class Style:
     """What is said of each step, whatever contains it.
 
@@ -39,6 +21,26 @@ class Style:
 
     explains: bool = False
     goals: bool = False
+
+
+@dataclass(frozen=True)
+class PlanFormat:
+    """A way to write a plan.
+
+    Attributes:
+        extension: of files that hold such texts, "py" or "md".
+        encode: a plan to its text.
+        read: any text to what it says, clause by clause; it never raises. ``decode_plan`` makes a plan of it.
+        prompt: ``(examples, task, hints)`` to the text that asks a model for a plan of the task: the plans of other
+            tasks, lines of hints, then the task's name and description.
+        style: what it says of each step, for models that are held to a schema.
+    """
+
+    extension: str
+    encode: Callable[[ConditionalPlan], str]
+    read: Callable[[str], Reading]
+    prompt: Callable[[Sequence[ConditionalPlan], Task, Sequence[str]], str]
+    style: Style = Style()
 
 
 STYLES = {"basic": Style(), "chain": Style(explains=True), "goal": Style(explains=True, goals=True)}

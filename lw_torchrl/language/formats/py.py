@@ -26,7 +26,7 @@ def py(style: Style) -> PlanFormat:
         said = "".join(f"# {line}\n" for line in hints)
         return "\n".join([*(write(plan, style) for plan in examples), said + opening(task)])
 
-    return PlanFormat("py", lambda plan: write(plan, style), read_python, prompt)
+    return PlanFormat("py", lambda plan: write(plan, style), read_python, prompt, style)
 
 
 def opening(task: Task) -> str:

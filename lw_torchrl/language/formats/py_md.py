@@ -28,7 +28,7 @@ def py_md(style: Style) -> PlanFormat:
             + _fenced(opening(task))
         )
 
-    return PlanFormat("md", encode, read_python, prompt)
+    return PlanFormat("md", encode, read_python, prompt, style)
 
 
 def _fenced(code: str) -> str:

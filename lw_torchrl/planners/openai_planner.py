@@ -1,0 +1,255 @@
+"""OpenAIPlanner: plans of any model behind an OpenAI-compatible server."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Generator, Iterable, Mapping
+from contextlib import closing
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+from lw_torchrl._checks import check_choice, check_int, check_scale, counted, shown
+from lw_torchrl._progress import Progress
+from lw_torchrl.language.formats import PLAN_FORMATS
+from lw_torchrl.language.plans import ConditionalPlan, Plans
+from lw_torchrl.language.skills import ScriptedSkill
+from lw_torchrl.language.tasks import Task, named_tasks
+from lw_torchrl.planners.answer_cache import AnswerCache, Reply
+from lw_torchrl.planners.answers import Answer, Answers, folder_name, write_answer
+from lw_torchrl.planners.asking import ask_at_once
+from lw_torchrl.planners.chat_server import ChatServer, Dialect, server_address
+from lw_torchrl.planners.errors import PlannerError
+from lw_torchrl.planners.plan_schema import plan_schema
+from lw_torchrl.planners.questions import chat_messages
+from lw_torchrl.planners.replies import read_reply
+
+_OWN_FIELDS = frozenset(
+    [
+        "max_completion_tokens",
+        "max_tokens",
+        "messages",
+        "model",
+        "n",
+        "response_format",
+        "seed",
+        "stream",
+        "temperature",
+    ]
+)
+
+
+class _Question(NamedTuple):
+    task: Task
+    attempt: int
+    request: dict[str, Any]  # all that determines the answer
+
+    def __str__(self) -> str:
+        return f"{self.task.name}, attempt {self.attempt}"
+
+
+class OpenAIPlanner:
+    """Asks a model behind an OpenAI-compatible server: OpenAI's own, vLLM, Ollama, llama.cpp's.
+
+    A key is taken from the environment variable OPENAI_API_KEY alone, when something is asked; a server of your own
+    wants none. Every answer is kept in ``cache``, under a key of all that determines it: the server, the model, the
+    messages, the schema, ``max_tokens``, ``temperature``, ``seed``, ``options`` and the attempt. What is there is not
+    asked for again.
+
+    Args:
+        model: the model's name at the server.
+        base_url: the server, "http://127.0.0.1:8000/v1"; None for what OPENAI_BASE_URL says, or OpenAI's.
+        constrain: hold the model to a schema that only plans of the task pass (:func:`plan_schema`). The answer is
+            JSON, and becomes a text in the format.
+        free_skills: with ``constrain``, skills in any words instead of the scripted ones.
+        skills: the scripted skills to choose from; None for the shipped ones.
+        plans: the plans that prompts show examples of; None for the hand-written ones of MT10.
+        vocabulary: prompts also say which things the task has, and what can be asked of them.
+        temperature: None for the server's own.
+        max_tokens: of an answer, at most; models that think first want more.
+        seed: attempt k is sent ``seed + k``; None sends none.
+        options: further fields of the request, ``{"top_p": 0.9}``.
+        name: of the folder for its answers; None for the model's, with "-constrained" behind it where it is.
+        cache: the folder where answers are kept.
+        concurrency: questions at once.
+        retries: how often a question is asked again after a rate limit, a fault of the server or of the connection,
+            after a wait that doubles from half a second to 8, or as long as the server says, up to two minutes.
+        timeout: seconds that an answer may take.
+
+    Raises:
+        ValueError: a number that is too small, or ``base_url`` is no address.
+        TypeError: an argument of another type.
+
+    Example:
+        >>> planner = OpenAIPlanner("meta-llama/Llama-3.1-8B", base_url="http://127.0.0.1:8000/v1", constrain=True)
+        >>> planner
+        OpenAIPlanner('meta-llama/Llama-3.1-8B', base_url='http://127.0.0.1:8000/v1', constrain=True)
+        >>> planner.name
+        'meta-llama_Llama-3.1-8B-constrained'
+
+    Source: paper section 'LLM Experiments'.
+    """
+
+    def __init__(
+        self,
+        model: str,
+        *,
+        base_url: str | None = None,
+        constrain: bool = False,
+        free_skills: bool = False,
+        skills: Mapping[str, ScriptedSkill] | None = None,
+        plans: Plans | Mapping[str, ConditionalPlan] | None = None,
+        vocabulary: bool = False,
+        temperature: float | None = None,
+        max_tokens: int = 1024,
+        seed: int | None = None,
+        options: Mapping[str, Any] | None = None,
+        name: str | None = None,
+        cache: str | os.PathLike[str] = "runs/answers",
+        concurrency: int = 4,
+        retries: int = 6,
+        timeout: float = 300.0,
+    ) -> None:
+        if not isinstance(model, str) or not model.strip():
+            raise TypeError(f"model must be a model's name, got {shown(model)}")
+        for argument, given in (("constrain", constrain), ("free_skills", free_skills), ("vocabulary", vocabulary)):
+            if not isinstance(given, bool):
+                raise TypeError(f"{argument} must be True or False, got {shown(given)}")
+        self.model, self.base_url, self.constrain, self.free_skills = model, base_url, constrain, free_skills
+        self.skills, self.examples, self.vocabulary = skills, plans, vocabulary
+        self.address = server_address(base_url)
+        self.temperature = None if temperature is None else check_scale("temperature", temperature)
+        self.max_tokens = check_int("max_tokens", max_tokens, minimum=1)
+        self.seed = None if seed is None else check_int("seed", seed)
+        self.options = _plain(options)
+        self.name = folder_name(name or (f"{model}-constrained" if constrain else model))
+        self.cache = AnswerCache(cache)
+        self.concurrency = check_int("concurrency", concurrency, minimum=1)
+        self.retries = check_int("retries", retries, minimum=0)
+        self.timeout = check_scale("timeout", timeout)
+        if not self.timeout:
+            raise ValueError("timeout must be above 0 s, got 0")
+        self._dialect: Dialect | None = None
+
+    def __repr__(self) -> str:
+        return f"OpenAIPlanner({self.model!r}, base_url={self.address!r}, constrain={self.constrain})"
+
+    def request(self, task: Task, format: str, attempt: int = 0) -> dict[str, Any]:
+        """All that determines an answer, as JSON has it."""
+        schema = plan_schema(task, format, skills=self.skills, free_skills=self.free_skills) if self.constrain else None
+        return {
+            "server": self.address,
+            "model": self.model,
+            "messages": chat_messages(
+                task, format, plans=self.examples, vocabulary=self.vocabulary, constrain=self.constrain
+            ),
+            "schema": schema,
+            "max_tokens": self.max_tokens,
+            "temperature": self.temperature,
+            "seed": None if self.seed is None else self.seed + attempt,
+            "options": self.options,
+            "attempt": attempt,
+        }
+
+    def plans(
+        self,
+        tasks: str | Task | Iterable[str | Task],
+        *,
+        format: str = "chain_py",
+        attempts: int = 1,
+        out: str | os.PathLike[str] | None = None,
+        progress: bool = True,
+    ) -> Answers:
+        """Ask for plans; several questions at a time.
+
+        Args:
+            tasks: "MT10", "MT50", a task's name, a :class:`~lw_torchrl.Task`, or a list of names and tasks.
+            format: a name in :data:`~lw_torchrl.PLAN_FORMATS`.
+            attempts: answers to each question.
+            out: a folder; each answer is written to ``out/<name>/<format>/<task>-<attempt>.<ext>`` as it comes, the
+                JSON of a constrained one beside it.
+            progress: show how many have come.
+
+        Returns:
+            An answer for each task and attempt.
+
+        Raises:
+            PlannerError: an answer did not come. Those that came are kept; called again it asks for those that are
+                missing.
+            ImportError: something is to be asked, and the extra ``[llm]`` is absent.
+            ValueError: an unknown task or format, or no scripted skill suits a task.
+        """
+        check_choice("format", format, PLAN_FORMATS)
+        count = check_int("attempts", attempts, minimum=1)
+        found: list[Answer] = []
+        kept: list[tuple[_Question, Reply]] = []
+        missing: dict[str, tuple[_Question, str]] = {}
+        for task in named_tasks(tasks).values():
+            for attempt in range(count):
+                question = _Question(task, attempt, self.request(task, format, attempt))
+                try:
+                    reply, note = self.cache.read(question.request), ""
+                except ValueError as error:
+                    reply, note = None, f"it was asked for again, since {error}"
+                if reply is None:
+                    missing[str(question)] = question, note
+                else:
+                    kept.append((question, reply))
+
+        def take(question: _Question, reply: Reply, cached: bool, note: str = "") -> None:
+            answer = read_reply(reply, question.task, format, question.attempt, self.skills, question.request["schema"])
+            answer = replace(answer, cached=cached, notes=(note, *answer.notes) if note else answer.notes)
+            if out is not None:
+                write_answer(out, self.name, answer)
+            found.append(answer)
+
+        total, errors = len(kept) + len(missing), []
+        with Progress("asking", total, "answer", initial=len(kept), show=progress) as bar:
+            for question, reply in kept:
+                take(question, reply, cached=True)
+            with closing(self._ask([question for question, _ in missing.values()])) as replies:
+                for question, came in replies:
+                    if isinstance(came, Exception):
+                        errors.append(came)
+                    else:
+                        take(question, came, cached=False, note=missing[str(question)][1])
+                        bar.update()
+        if errors:
+            raise self._failed(errors, len(found), total)
+        return Answers(found)
+
+    def _ask(self, questions: list[_Question]) -> Generator[tuple[_Question, Reply | Exception], None, None]:
+        if not questions:
+            return
+        with ChatServer(self.model, self.base_url, self.timeout, self.retries, self._dialect) as server:
+
+            def ask(question: _Question) -> Reply:
+                reply = server.ask(question.request, str(question))
+                self.cache.write(question.request, reply)
+                return reply
+
+            yield from ask_at_once(ask, questions, self.concurrency)
+            self._dialect = server.dialect
+
+    def _failed(self, errors: list[Exception], came: int, total: int) -> Exception:
+        first = next((error for error in errors if not isinstance(error, PlannerError)), errors[0])
+        if not isinstance(first, PlannerError):
+            return first
+        others = f" So did {counted(len(errors) - 1, 'other question')}." if len(errors) > 1 else ""
+        kept = (
+            f"{came} of {counted(total, 'answer')} are kept in {str(self.cache.folder)!r}; the same again asks the rest"
+        )
+        return PlannerError(f"{first}{others} {kept}.", fatal=first.fatal)
+
+
+def _plain(options: Mapping[str, Any] | None) -> dict[str, Any] | None:
+    """Options as JSON has them, since the name of an answer is made of them."""
+    if options is None:
+        return None
+    try:
+        found = json.loads(json.dumps(dict(options), allow_nan=False))
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"options must be fields of a request, as JSON has them, got {shown(options)}") from error
+    if taken := sorted(_OWN_FIELDS & set(found)):
+        raise ValueError(f"options must be other fields than {', '.join(sorted(_OWN_FIELDS))}, got {', '.join(taken)}")
+    return found or None
