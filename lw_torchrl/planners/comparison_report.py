@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from lw_torchrl._files import write_json, write_text
@@ -28,8 +28,8 @@ def write_report(comparison: PlanComparison, folder: Path) -> list[Path]:
 
 {comparison.table()}
 
-Success is the mean over tasks, each over its answers; an answer without a plan that runs fails. Brackets are 95 % intervals over
-tasks. The best answer of a task is chosen by the even episodes and counted in the odd ones.
+Success is the mean over tasks, each over its answers; an answer without a plan that runs fails. Brackets
+are 95 % intervals over tasks. The best answer of a task is chosen by the even episodes and counted in the odd ones.
 
 {comparison.task_table()}
 
@@ -41,13 +41,16 @@ tasks. The best answer of a task is chosen by the even episodes and counted in t
     title = "each model in its best format"
     _draw(comparison, list(best.items()), written[2], title, lambda model, format: f"{model}, {format}")
     _draw(comparison, formats, written[3], f"formats of {first}", lambda _, format: format)
-    return written
+    return [file for file in written if file.is_file()]
 
 
-def _draw(comparison: PlanComparison, groups: Sequence[Group], file: Path, title: str, label) -> None:  # type: ignore[no-untyped-def]
+def _draw(
+    comparison: PlanComparison, groups: Sequence[Group], file: Path, title: str, label: Callable[[str, str], str]
+) -> None:
     rates = {label(*group): comparison.rates(*group) for group in groups}
     common = set.intersection(*(set(found) for found in rates.values()))
     if not common:
+        file.unlink(missing_ok=True)
         return
     curves = {name: {task: found[task] for task in sorted(common)} for name, found in rates.items()}
     least = min(len(one) for found in curves.values() for one in found.values())

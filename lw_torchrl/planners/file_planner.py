@@ -50,14 +50,9 @@ class FilePlanner:
     """
 
     def __init__(self, source: str | os.PathLike[str], model: str | None = None) -> None:
-        path = Path(source)
-        if not path.exists():
-            raise FileNotFoundError(f"source: there is no file or folder {str(path)!r}")
-        found = _of_folder(path) if path.is_dir() else _of_lines(path)
-        if not found:
-            raise ValueError(f"source: {str(path)!r} holds no answers, <model>/<format>/<task>-<attempt>.<ext>")
+        found = recorded_answers(source)
         if model is None and len(found) > 1:
-            raise ValueError(f"model must be given, since {str(path)!r} has answers of {', '.join(sorted(found))}")
+            raise ValueError(f"model must be given, since {str(source)!r} has answers of {', '.join(sorted(found))}")
         name = next(iter(found)) if model is None else folder_name(model)
         if name not in found:
             raise unknown_name("model", model, sorted(found))
@@ -94,11 +89,27 @@ class FilePlanner:
                         f"no answer of {self.name!r} is recorded for {name} in {format}, attempt {attempt}; of {name} "
                         f"there are {known}"
                     )
-                said = read_text(text, ValueError) if isinstance(text, Path) else text
+                said = answer_text(text)
                 found.append(Answer(name, format, attempt, said, said, decode_plan(said, task, format), cached=True))
                 if out is not None:
                     write_answer(out, self.name, found[-1])
         return Answers(found)
+
+
+def recorded_answers(source: str | os.PathLike[str]) -> dict[str, dict[_Place, str | Path]]:
+    """Models to their answers, or files of these, by format, task and attempt; errors as of :class:`FilePlanner`."""
+    path = Path(source)
+    if not path.exists():
+        raise FileNotFoundError(f"source: there is no file or folder {str(path)!r}")
+    found = _of_folder(path) if path.is_dir() else _of_lines(path)
+    if not found:
+        raise ValueError(f"source: {str(path)!r} holds no answers, <model>/<format>/<task>-<attempt>.<ext>")
+    return found
+
+
+def answer_text(found: str | Path) -> str:
+    """The text of an answer that :func:`recorded_answers` gives."""
+    return read_text(found, ValueError) if isinstance(found, Path) else found
 
 
 def _of_folder(root: Path) -> dict[str, dict[_Place, str | Path]]:

@@ -121,3 +121,20 @@ def test_a_killed_run_asks_only_for_what_is_missing(capsys, tmp_path):
     assert "2200 tokens" in printed
     assert len(list((tmp_path / "plans/a_model/chain_py").glob("*.py"))) == 20
     assert not list(tmp_path.rglob(".*tmp*"))
+
+
+# ---- compare
+
+
+def test_compare_runs_what_generate_wrote(capsys, tmp_path):
+    path = tmp_path / "plans" / "mine" / "chain_py" / "reach-0.py"
+    path.parent.mkdir(parents=True)
+    path.write_text(lw.encode_plan(lw.load_plans("MT10")["reach"], "chain_py"))
+    command = ("plan", "compare", tmp_path / "plans", "--episodes", 2, "--max-steps", 80, "--out", tmp_path / "out")
+    printed = run(capsys, *command)
+    assert "| mine  | chain_py | 1     | 1       | 1                     | 1.000   |" in printed
+    assert "written to" in printed
+    names = ["fared.json", "formats.png", "models.png", "results.json", "summary.md"]
+    assert sorted(file.name for file in (tmp_path / "out").iterdir()) == names
+    assert run(capsys, *command) == printed
+    assert "--choose" in fails(capsys, *command, "--choose", "best")

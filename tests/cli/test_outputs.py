@@ -18,6 +18,7 @@ FOLDERS = {
     "offline": ["quick", "--out"],
     "online": ["reach", "--out"],
     "plan generate": ["reach", "--model", "m", "--out"],
+    "plan compare": ["plans", "--out"],
 }
 FILES = {"train": ["demos", "--out"], "record": ["reach", "--out"], "view": ["x.rrd", "--screenshot"]}
 

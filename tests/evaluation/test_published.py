@@ -82,5 +82,5 @@ def test_what_was_not_published_is_refused(arguments, message):
 def test_another_model_is_refused():
     with pytest.raises(ValueError, match=r"model must be one of 'PaLM 2', 'GPT-3.5', 'GPT-3', got 'GPT-4'"):
         published_plans("GPT-4")
-    with pytest.raises(ValueError, match="format must be one of 'basic_py', .*, got 'py'"):
+    with pytest.raises(ValueError, match=r"format must be one of 'basic_py', .*, got 'py'"):
         published_plans(format="py")

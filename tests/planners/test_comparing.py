@@ -1,0 +1,123 @@
+"""compare_plans: every answer decoded and carried out, whatever it is, and none twice."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+import lw_torchrl as lw
+from lw_torchrl.planners import answer_path, compare_plans
+from lw_torchrl.planners import comparing as module
+from lw_torchrl.planners.comparison_report import write_report
+
+PLANS = lw.load_plans("MT10")
+SHORT = {"episodes": 4, "max_steps": 60, "progress": False}
+
+
+def write(folder, model, format, task, attempt, text):
+    path = answer_path(folder, model, format, task, attempt)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, "utf-8")
+
+
+@pytest.fixture
+def answers(tmp_path):
+    """One model whose plans are good in one format, and say nothing in another; and one that speaks of other things."""
+    folder = tmp_path / "plans"
+    for task in ("reach", "drawer-open"):
+        write(folder, "good", "chain_py", task, 0, lw.encode_plan(PLANS[task], "chain_py"))
+        write(folder, "good", "chain_py", task, 1, "I cannot do that.")
+        write(folder, "good", "basic_md", task, 0, lw.encode_plan(PLANS[task], "basic_md"))
+        write(folder, "other", "chain_py", task, 0, "def bake_a_cake(robot):\n    pass\n")
+    return folder
+
+
+def test_how_each_answer_fared(answers):
+    found = compare_plans(answers, choose="first", **SHORT)
+    assert found.groups == (("good", "basic_md"), ("good", "chain_py"), ("other", "chain_py"))
+    actor = lw.ScriptedSkillActor({task: PLANS[task] for task in ("reach", "drawer-open")})
+    options = {"episodes_per_task": 4, "seed": 1000, "max_steps": 60, "noise_scale": 0.0, "progress": False}
+    rates = lw.evaluate(actor, tasks=["reach", "drawer-open"], **options).success_once
+    assert found.rates("good", "basic_md") == {task: [rate] for task, rate in rates.items()}
+    assert found.rates("good", "chain_py") == {task: [rate, 0.0] for task, rate in rates.items()}
+    assert found.mean("good", "chain_py") == pytest.approx(sum(rates.values()) / 4)
+    assert found.mean("other", "chain_py") == 0.0
+    assert found.best_format("good") == "basic_md"
+    (refusal,) = (one for one in found.answers if (one.format, one.task, one.attempt) == ("chain_py", "reach", 1))
+    assert refusal.reason
+    assert refusal.steps == 0
+    assert "| good  | chain_py | 2     | 4       | 2 " in found.table()
+    assert "| reach       | " in found.task_table()
+
+
+def test_the_best_answer_is_chosen_and_counted_in_different_episodes():
+    def answer(attempt, success):
+        return module.ComparedAnswer("m", "chain_py", "reach", attempt, 1, 0, "", success)
+
+    lucky = answer(0, (True, False, True, False))  # in all of those that choose, in none of the others
+    sound = answer(1, (True, True, False, True))
+    assert module.PlanComparison([lucky, sound], {}).best_of("m", "chain_py") == 0.0
+    assert module.PlanComparison([sound], {}).best_of("m", "chain_py") == 1.0
+
+
+def test_stopped_it_goes_on_with_the_plans_that_are_left(answers, tmp_path, monkeypatch):
+    kept = tmp_path / "fared.json"
+    whole = compare_plans(answers, **SHORT).to_json()
+    monkeypatch.setattr(module, "_SAVE_SECONDS", 0.0)
+    real = module.evaluate_plans
+    asked = []
+
+    def stopped(plans, *, on_plan, **options):
+        asked.append(len(plans))
+
+        def after_one(index, success):
+            on_plan(index, success)
+            raise KeyboardInterrupt
+
+        return real(plans, on_plan=after_one if len(asked) == 1 else on_plan, **options)
+
+    monkeypatch.setattr(module, "evaluate_plans", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        compare_plans(answers, resume=kept, **SHORT)
+    assert compare_plans(answers, resume=kept, **SHORT).to_json() == whole
+    assert compare_plans(answers, resume=kept, **SHORT).to_json() == whole
+    assert asked == [2, 1], "equal plans run once, and those that are done not again"
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ('{"settings": {}, "fared": {}}', "is of {}, and this run of"),
+        ('{"settings": ', "resume 'fared.json' cannot be read"),
+        ('{"settings": SETTINGS, "fared": {"a": "01"}}', "is damaged"),
+        ('{"settings": SETTINGS, "fared": [1]}', "is damaged"),
+        ('{"settings": SETTINGS, "fared": {"a": "0121"}}', "is damaged"),
+    ],
+)
+def test_what_was_kept_is_checked(answers, tmp_path, monkeypatch, content, message):
+    monkeypatch.chdir(tmp_path)
+    settings = {"episodes": 4, "seed": 1000, "choose": "random", "noise_scale": 0.0, "max_steps": 60}
+    (tmp_path / "fared.json").write_text(content.replace("SETTINGS", json.dumps(settings)))
+    with pytest.raises(ValueError, match=message.replace("{}", r"\{\}")):
+        compare_plans(answers, resume="fared.json", **SHORT)
+
+
+def test_a_folder_without_answers_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="holds no answers"):
+        compare_plans(tmp_path, **SHORT)
+
+
+def test_the_report(answers, tmp_path):
+    found = compare_plans(answers, **SHORT)
+    written = write_report(found, tmp_path / "out")
+    assert [file.name for file in written] == ["results.json", "summary.md", "models.png", "formats.png"]
+    assert json.loads(written[0].read_text()) == found.to_json()
+    assert "Plans of good, other" in written[1].read_text("utf-8")
+
+
+def test_models_without_a_task_in_common_have_no_figure(tmp_path):
+    for model, task in (("a", "reach"), ("b", "push")):
+        write(tmp_path / "plans", model, "chain_py", task, 0, "nothing")
+    written = write_report(compare_plans(tmp_path / "plans", **SHORT), tmp_path / "out")
+    assert [file.name for file in written] == ["results.json", "summary.md", "formats.png"]
