@@ -11,6 +11,7 @@ from tyro.conf import Positional, arg
 
 from lw_torchrl._checks import counted
 from lw_torchrl.cli.outputs import check_folder
+from lw_torchrl.cli.plan_check import check
 from lw_torchrl.cli.plan_compare import compare
 from lw_torchrl.cli.sources import one_or_many, read_plans, read_tasks
 from lw_torchrl.cli.tables import print_table
@@ -157,8 +158,13 @@ def _counts(answers: Sequence[Answer]) -> tuple[str, ...]:
     return tuple(map(str, numbers))
 
 
-COMMANDS: dict[str, Callable[..., None]] = {"prompt": prompt, "generate": generate, "compare": compare}
+COMMANDS: dict[str, Callable[..., None]] = {
+    "prompt": prompt,
+    "generate": generate,
+    "check": check,
+    "compare": compare,
+}
 
 
 def plan() -> None:
-    """Plans from language models: the prompt that asks for one, asking a model, and comparing what models wrote."""
+    """Plans from language models: the prompt, asking a model, and checking and comparing what models wrote."""

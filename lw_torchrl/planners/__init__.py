@@ -1,7 +1,9 @@
-"""Plans from language models: how they are asked for, who answers, and how the answers fare."""
+"""Plans from language models: how they are asked for, and who answers.
+
+How answers fare needs the simulator: :mod:`~lw_torchrl.planners.checking`, :mod:`~lw_torchrl.planners.comparing`.
+"""
 
 from lw_torchrl.planners.answers import Answer, Answers, Tokens, answer_path, folder_name, write_answer
-from lw_torchrl.planners.comparing import ComparedAnswer, PlanComparison, compare_plans
 from lw_torchrl.planners.errors import PlannerError
 from lw_torchrl.planners.file_planner import FilePlanner
 from lw_torchrl.planners.openai_planner import OpenAIPlanner
@@ -12,15 +14,12 @@ from lw_torchrl.planners.prompts import plan_prompt, prompt_examples
 __all__ = [
     "Answer",
     "Answers",
-    "ComparedAnswer",
     "FilePlanner",
     "OpenAIPlanner",
-    "PlanComparison",
     "Planner",
     "PlannerError",
     "Tokens",
     "answer_path",
-    "compare_plans",
     "folder_name",
     "plan_prompt",
     "plan_schema",

@@ -138,3 +138,25 @@ def test_compare_runs_what_generate_wrote(capsys, tmp_path):
     assert sorted(file.name for file in (tmp_path / "out").iterdir()) == names
     assert run(capsys, *command) == printed
     assert "--choose" in fails(capsys, *command, "--choose", "best")
+
+
+# ---- check
+
+
+def test_check_takes_task_and_format_from_where_the_file_lies(capsys, tmp_path):
+    text = lw.encode_plan(lw.load_plans("MT10")["reach"], "chain_py")
+    answer = tmp_path / "mine" / "chain_py" / "reach-3.py"
+    answer.parent.mkdir(parents=True)
+    answer.write_text(text)
+    printed = run(capsys, "plan", "check", answer, "--episodes", 1)
+    assert printed.startswith("reach, ")
+    assert "succeeds in 100% of episodes" in printed
+    other = tmp_path / "answer.txt"
+    other.write_text(text)
+    assert "--task must be given" in fails(capsys, "plan", "check", other)
+    assert "--format must be given, one of basic_py, " in fails(capsys, "plan", "check", other, "--task", "reach")
+    told = ("--task", "reach", "--format", "chain_py", "--episodes", 1)
+    assert run(capsys, "plan", "check", other, *told) == printed
+    (tmp_path / "reach.plan").write_text(lw.encode_plan(lw.load_plans("MT10")["reach"], "basic_py"))
+    assert run(capsys, "plan", "check", tmp_path / "reach.plan", "--episodes", 1) == printed
+    assert "nowhere.plan" in fails(capsys, "plan", "check", "nowhere.plan", "--task", "reach")

@@ -7,8 +7,9 @@ import json
 import pytest
 
 import lw_torchrl as lw
-from lw_torchrl.planners import answer_path, compare_plans
+from lw_torchrl.planners import answer_path
 from lw_torchrl.planners import comparing as module
+from lw_torchrl.planners.comparing import compare_plans
 from lw_torchrl.planners.comparison_report import write_report
 
 PLANS = lw.load_plans("MT10")

@@ -1,0 +1,120 @@
+"""check_plan: what a plan was taken for, and which of its steps hold in states that were really visited."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from lw_torchrl.evaluation.plan_use import PlanUse, TaskUse, expert_use
+from lw_torchrl.evaluation.protocol import evaluate
+from lw_torchrl.language.decoded import DecodedPlan
+from lw_torchrl.language.decoding import decode_plan
+from lw_torchrl.language.skills import ScriptedSkill
+from lw_torchrl.language.tasks import TASKS, Task, check_task
+from lw_torchrl.modules.scripted_skill_actor import ScriptedSkillActor
+
+
+@dataclass(frozen=True)
+class PlanCheck:
+    """What there is to say of a plan.
+
+    Attributes:
+        task: the task's name.
+        decoded: what the text was taken for.
+        expert: how its conditions fare in the states that Meta-World's expert visits; None without a plan.
+        own: how its steps fare where scripted skills carry it out, the first true one in each state; None without one
+            that they can.
+        success: of these episodes.
+    """
+
+    task: str
+    decoded: DecodedPlan
+    expert: TaskUse | None = None
+    own: TaskUse | None = None
+    success: float = 0.0
+
+    @property
+    def never(self) -> tuple[int, ...]:
+        """The steps whose condition held in no state, neither the expert's nor its own, from 0."""
+        if self.expert is None:
+            return ()
+        own = [0.0] * len(self.expert.true) if self.own is None else self.own.true
+        return tuple(k for k, (a, b) in enumerate(zip(self.expert.true, own, strict=True)) if a == 0.0 and b == 0.0)
+
+    def __str__(self) -> str:
+        if self.decoded.plan is None:
+            return "\n".join([f"{self.task}: no plan: {self.decoded.reason}", *map(str, self.decoded.notes)])
+        assert self.expert is not None
+        lines = [f"{self.task}, {len(self.decoded.plan.steps)} steps"]
+        kept = [step for step in self.decoded.steps if not step.dropped]
+        for k, step in enumerate(kept):
+            lines += [
+                f"{k + 1}  when {step.condition}{_said(step.written_condition, step.condition_distance)}",
+                f"   {step.scripted or 'no scripted skill'}{_said(step.written_skill, step.skill_distance)}",
+                f"   holds in {self.expert.true[k]:.0%} of the expert's states{self._in_force(k)}",
+            ]
+        lines += [f"left out, {note}" for note in self.decoded.notes]
+        lines.append(f"Some condition holds in {self.expert.covered:.0%} of the states up to the expert's success.")
+        for k in self.never:
+            lines.append(f"Step {k + 1} never fires: its condition held in no state that was visited.")
+        if self.own is None:
+            lines.append("Scripted skills cannot carry it out: a step's skill is near none of them.")
+        else:
+            lines.append(f"Carried out by scripted skills it succeeds in {self.success:.0%} of episodes.")
+        return "\n".join(lines)
+
+    def _in_force(self, step: int) -> str:
+        return (
+            "" if self.own is None else f", {self.own.true[step]:.0%} of its own; acts in {self.own.chosen[step]:.0%}"
+        )
+
+
+def _said(written: str, distance: float) -> str:
+    return f"   <- {written!r} ({distance:.2f})" if distance else ""
+
+
+def check_plan(
+    text: str,
+    task: str | Task,
+    format: str,
+    *,
+    episodes: int = 5,
+    seed: int = 0,
+    skills: Mapping[str, ScriptedSkill] | None = None,
+    tasks: Mapping[str, Task] = TASKS,
+) -> PlanCheck:
+    """Decode a text, and look where its plan's conditions hold.
+
+    Args:
+        text, task, format, skills, tasks: as for :func:`~lw_torchrl.decode_plan`; the task is one of Meta-World's.
+        episodes: of the expert, and of the plan by scripted skills.
+        seed: of these.
+
+    Raises:
+        ValueError: an unknown task or format.
+
+    Example:
+        >>> import lw_torchrl as lw
+        >>> found = check_plan(lw.encode_plan(lw.load_plans("MT10")["reach"], "basic_md"), "reach", "basic_md")
+        >>> found.never, found.expert.covered, found.success
+        ((), 1.0, 1.0)
+    """
+    owner = task if isinstance(task, Task) else tasks[check_task(task, tasks)]
+    decoded = decode_plan(text, owner, format, skills=skills, tasks=tasks)
+    if decoded.plan is None:
+        return PlanCheck(owner.name, decoded)
+    expert = expert_use({owner.name: decoded.plan}, owner.name, episodes_per_task=episodes, seed=seed)[owner.name]
+    if decoded.scripted is None or len(decoded.scripted.steps) < len(decoded.plan.steps):
+        return PlanCheck(owner.name, decoded, expert)
+    use = PlanUse({owner.name: decoded.scripted})
+    result = evaluate(
+        ScriptedSkillActor({owner.name: decoded.scripted}, skills=skills),
+        tasks=owner.name,
+        episodes_per_task=episodes,
+        seed=seed,
+        noise_scale=0.0,
+        stop_at_success=True,
+        also_record=["qaf", "skill_weights"],
+        on_episode=use,
+    )
+    return PlanCheck(owner.name, decoded, expert, use.tasks()[owner.name], result.success_once[owner.name] or 0.0)
