@@ -172,11 +172,11 @@ def compare_plans(
 
     Example:
         >>> import tempfile, lw_torchrl as lw
-        >>> folder = tempfile.TemporaryDirectory()
-        >>> path = lw.planners.answer_path(folder.name, "by hand", "chain_py", "reach", 0)
-        >>> path.parent.mkdir(parents=True)
-        >>> _ = path.write_text(lw.encode_plan(lw.load_plans("MT10")["reach"], "chain_py"))
-        >>> compare_plans(folder.name, episodes=2).mean("by hand", "chain_py")
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = lw.planners.answer_path(folder, "by hand", "chain_py", "reach", 0)
+        ...     path.parent.mkdir(parents=True)
+        ...     _ = path.write_text(lw.encode_plan(lw.load_plans("MT10")["reach"], "chain_py"))
+        ...     compare_plans(folder, episodes=2).mean("by hand", "chain_py")
         1.0
 
     Source: paper section 'LLM Experiments'.
