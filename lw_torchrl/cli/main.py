@@ -50,7 +50,17 @@ GROUPS: dict[str, dict[str, Any]] = {"plan": cli_plan.COMMANDS}
 """Commands that have commands of their own."""
 
 
-RESUMABLE = ("demo", "collect", "train", "plan generate", "reproduce", "offline", "online")
+RESUMABLE = (
+    "demo",
+    "collect",
+    "train",
+    "plan generate",
+    "plan compare",
+    "plan repair",
+    "reproduce",
+    "offline",
+    "online",
+)
 
 
 def main(args: Sequence[str] | None = None) -> None:

@@ -13,6 +13,7 @@ from lw_torchrl._checks import counted
 from lw_torchrl.cli.outputs import check_folder
 from lw_torchrl.cli.plan_check import check
 from lw_torchrl.cli.plan_compare import compare
+from lw_torchrl.cli.plan_repair import repair
 from lw_torchrl.cli.sources import one_or_many, read_plans, read_tasks
 from lw_torchrl.cli.tables import print_table
 
@@ -163,8 +164,9 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "generate": generate,
     "check": check,
     "compare": compare,
+    "repair": repair,
 }
 
 
 def plan() -> None:
-    """Plans from language models: the prompt, asking a model, and checking and comparing what models wrote."""
+    """Plans from language models: the prompt, asking a model, and checking, comparing and repairing what it wrote."""

@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from torch import Tensor
+
+from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.evaluation.plan_use import PlanUse, TaskUse, expert_use
 from lw_torchrl.evaluation.protocol import evaluate
 from lw_torchrl.language.decoded import DecodedPlan
@@ -25,6 +28,7 @@ class PlanCheck:
         own: how its steps fare where scripted skills carry it out, the first true one in each state; None without one
             that they can.
         success: of these episodes.
+        failed: the observations of each of these that failed, (T, 39) float32.
     """
 
     task: str
@@ -32,6 +36,7 @@ class PlanCheck:
     expert: TaskUse | None = None
     own: TaskUse | None = None
     success: float = 0.0
+    failed: tuple[Tensor, ...] = ()
 
     @property
     def never(self) -> tuple[int, ...]:
@@ -106,7 +111,13 @@ def check_plan(
     expert = expert_use({owner.name: decoded.plan}, owner.name, episodes_per_task=episodes, seed=seed)[owner.name]
     if decoded.scripted is None or len(decoded.scripted.steps) < len(decoded.plan.steps):
         return PlanCheck(owner.name, decoded, expert)
-    use = PlanUse({owner.name: decoded.scripted})
+    use, failed = PlanUse({owner.name: decoded.scripted}), []
+
+    def note(episode: FinishedEpisode) -> None:
+        use(episode)
+        if episode.first_success is None:
+            failed.append(episode.steps.get("observation"))
+
     result = evaluate(
         ScriptedSkillActor({owner.name: decoded.scripted}, skills=skills),
         tasks=owner.name,
@@ -114,7 +125,9 @@ def check_plan(
         seed=seed,
         noise_scale=0.0,
         stop_at_success=True,
-        also_record=["qaf", "skill_weights"],
-        on_episode=use,
+        also_record=["observation", "qaf", "skill_weights"],
+        on_episode=note,
+        progress=False,
     )
-    return PlanCheck(owner.name, decoded, expert, use.tasks()[owner.name], result.success_once[owner.name] or 0.0)
+    rate = result.success_once[owner.name] or 0.0
+    return PlanCheck(owner.name, decoded, expert, use.tasks()[owner.name], rate, tuple(failed))

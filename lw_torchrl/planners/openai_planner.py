@@ -14,7 +14,7 @@ from lw_torchrl._progress import Progress
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.language.skills import ScriptedSkill
-from lw_torchrl.language.tasks import Task, named_tasks
+from lw_torchrl.language.tasks import TASKS, Task, check_task, named_tasks
 from lw_torchrl.planners.answer_cache import AnswerCache, Reply
 from lw_torchrl.planners.answers import Answer, Answers, folder_name, write_answer
 from lw_torchrl.planners.asking import ask_at_once
@@ -181,26 +181,87 @@ class OpenAIPlanner:
         """
         check_choice("format", format, PLAN_FORMATS)
         count = check_int("attempts", attempts, minimum=1)
+        questions = [
+            _Question(task, attempt, self.request(task, format, attempt))
+            for task in named_tasks(tasks).values()
+            for attempt in range(count)
+        ]
+        return self._answers(questions, format, self.name, out, progress)
+
+    def revise(
+        self,
+        answers: Iterable[Answer],
+        facts: Iterable[str],
+        *,
+        round: int = 1,
+        tasks: Mapping[str, Task] = TASKS,
+        out: str | os.PathLike[str] | None = None,
+        progress: bool = True,
+    ) -> Answers:
+        """Ask for other plans in the place of answers of this planner, which are told what became of them.
+
+        Args:
+            answers: of one format.
+            facts: for each, what became of it, as :func:`~lw_torchrl.planners.repairing.plan_facts` says it.
+            round: of several; the name of the folder ends with it.
+            tasks: where the tasks' names are looked up.
+            out: a folder; answers are written to ``out/<name>-round<round>/<format>/<task>-<attempt>.<ext>``.
+            progress: as for :meth:`plans`.
+
+        Returns:
+            An answer in the place of each.
+
+        Raises:
+            ValueError: answers of several formats, or not as many facts.
+            PlannerError, ImportError: as for :meth:`plans`.
+        """
+        before, told = list(answers), list(facts)
+        formats = {answer.format for answer in before}
+        if len(formats) != 1 or len(told) != len(before):
+            raise ValueError(
+                f"answers must be of one format, each with its facts, got {counted(len(before), 'answer')} of "
+                f"{', '.join(sorted(formats)) or 'none'} and {len(told)} facts"
+            )
+        (format,) = formats
+        questions = []
+        for answer, fact in zip(before, told, strict=True):
+            task = tasks[check_task(answer.task, tasks)]
+            request = self.request(task, format, answer.attempt)
+            request["messages"] = [
+                *request["messages"],
+                {"role": "assistant", "content": answer.raw},
+                {"role": "user", "content": fact},
+            ]
+            questions.append(_Question(task, answer.attempt, request))
+        name = f"{self.name}-round{check_int('round', round, minimum=1)}"
+        return self._answers(questions, format, name, out, progress)
+
+    def _answers(
+        self,
+        questions: Iterable[_Question],
+        format: str,
+        name: str,
+        out: str | os.PathLike[str] | None,
+        progress: bool,
+    ) -> Answers:
         found: list[Answer] = []
         kept: list[tuple[_Question, Reply]] = []
         missing: dict[str, tuple[_Question, str]] = {}
-        for task in named_tasks(tasks).values():
-            for attempt in range(count):
-                question = _Question(task, attempt, self.request(task, format, attempt))
-                try:
-                    reply, note = self.cache.read(question.request), ""
-                except ValueError as error:
-                    reply, note = None, f"it was asked for again, since {error}"
-                if reply is None:
-                    missing[str(question)] = question, note
-                else:
-                    kept.append((question, reply))
+        for question in questions:
+            try:
+                reply, note = self.cache.read(question.request), ""
+            except ValueError as error:
+                reply, note = None, f"it was asked for again, since {error}"
+            if reply is None:
+                missing[str(question)] = question, note
+            else:
+                kept.append((question, reply))
 
         def take(question: _Question, reply: Reply, cached: bool, note: str = "") -> None:
             answer = read_reply(reply, question.task, format, question.attempt, self.skills, question.request["schema"])
             answer = replace(answer, cached=cached, notes=(note, *answer.notes) if note else answer.notes)
             if out is not None:
-                write_answer(out, self.name, answer)
+                write_answer(out, name, answer)
             found.append(answer)
 
         total, errors = len(kept) + len(missing), []

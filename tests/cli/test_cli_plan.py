@@ -137,7 +137,6 @@ def test_compare_runs_what_generate_wrote(capsys, tmp_path):
     names = ["fared.json", "formats.png", "models.png", "results.json", "summary.md"]
     assert sorted(file.name for file in (tmp_path / "out").iterdir()) == names
     assert run(capsys, *command) == printed
-    assert "--choose" in fails(capsys, *command, "--choose", "best")
 
 
 # ---- check
@@ -160,3 +159,20 @@ def test_check_takes_task_and_format_from_where_the_file_lies(capsys, tmp_path):
     (tmp_path / "reach.plan").write_text(lw.encode_plan(lw.load_plans("MT10")["reach"], "basic_py"))
     assert run(capsys, "plan", "check", tmp_path / "reach.plan", "--episodes", 1) == printed
     assert "nowhere.plan" in fails(capsys, "plan", "check", "nowhere.plan", "--task", "reach")
+
+
+# ---- repair
+
+
+@pytest.mark.usefixtures("_no_key")
+def test_repair_tells_the_model_and_shows_how_each_round_fared(capsys, tmp_path):
+    def learns(body):
+        told = any(message["role"] == "assistant" for message in body["messages"])
+        return shipped(body) if told else completion("I would rather not.")
+
+    with serving(FakeServer(learns)) as address:
+        where = ("--out", tmp_path / "plans", "--cache", tmp_path / "kept", "--episodes", 1)
+        command = ("plan", "repair", "reach", "--model", "m", "--base-url", address, "--rounds", 2, *where)
+        printed = run(capsys, *command)
+    assert ["reach", "0", "0%", "100%"] in [line.split() for line in printed.splitlines()]
+    assert (tmp_path / "plans/m-round1/chain_py/reach-0.py").is_file()

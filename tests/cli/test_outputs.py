@@ -19,6 +19,7 @@ FOLDERS = {
     "online": ["reach", "--out"],
     "plan generate": ["reach", "--model", "m", "--out"],
     "plan compare": ["plans", "--out"],
+    "plan repair": ["reach", "--model", "m", "--out"],
 }
 FILES = {"train": ["demos", "--out"], "record": ["reach", "--out"], "view": ["x.rrd", "--screenshot"]}
 

@@ -1,0 +1,148 @@
+"""repair_plans: what became of a plan goes back to the model that wrote it, and it writes another."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lw_torchrl._checks import check_int
+from lw_torchrl.language.named_objects import GRIPPER
+from lw_torchrl.language.tasks import TASKS, Task
+from lw_torchrl.planners.answers import Answer
+from lw_torchrl.planners.checking import PlanCheck, check_plan
+from lw_torchrl.planners.openai_planner import OpenAIPlanner
+
+
+@dataclass(frozen=True)
+class Repair:
+    """An answer and those that came in its place.
+
+    Attributes:
+        answers: the first, then one of each round.
+        checks: what became of each.
+    """
+
+    answers: tuple[Answer, ...]
+    checks: tuple[PlanCheck, ...]
+
+    @property
+    def best(self) -> int:
+        """The round whose plan succeeds most, the earliest of equals; 0 is the first answer."""
+        rates = [check.success for check in self.checks]
+        return rates.index(max(rates))
+
+
+def plan_facts(check: PlanCheck, task: Task) -> str:
+    """What became of a plan, in words for the model that wrote it.
+
+    Args:
+        check: of the plan, with how near things came.
+        task: the task, whose points are named.
+
+    Example:
+        >>> from lw_torchrl.language.tasks import TASKS
+        >>> print(plan_facts(check_plan("I cannot.", "reach", "basic_py"), TASKS["reach"]))
+        The answer was read, and no plan was found in it: there is no clause for 'reach'.
+        Write the plan for `reach` again, the whole of it, in the same form, with this mended.
+    """
+    again = f"Write the plan for `{task.name}` again, the whole of it, in the same form, with this mended."
+    if check.decoded.plan is None:
+        return f"The answer was read, and no plan was found in it: {check.decoded.reason}.\n{again}"
+    lines = [f"The plan was carried out, and succeeded in {check.success:.0%} of episodes."]
+    if check.own is None:
+        lines = ["The plan was not carried out: the robot has no skill that is near one of its steps."]
+    lines += [f"In the answer, {note}" for note in check.decoded.notes]
+    lines += [
+        f"The condition of step {step + 1}, '{check.decoded.plan.steps[step].condition}', held at no time."
+        for step in check.never
+    ]
+    if check.own is not None and check.own.failed:
+        stuck = max(range(len(check.own.stuck)), key=lambda step: check.own.stuck[step])  # type: ignore[union-attr]
+        lines.append(
+            f"It got stuck in step {stuck + 1}, '{check.decoded.plan.steps[stuck].skill}', in {check.own.stuck[stuck]} "
+            f"of {check.own.failed} failed episodes."
+        )
+        lines += _distances(task, check.failed)
+    return "\n".join([*lines, again])
+
+
+def _distances(task: Task, failed: Iterable[Tensor]) -> list[str]:
+    """How near things came to one another in failed episodes, the median over these: the gripper to each, and things
+    that move to those that stay."""
+    episodes = [task.published.positions(observation) for observation in failed]
+    if not episodes:
+        return []
+    names = list(task.published.object_names)
+    moved = [name for name in names if any((one[name] - one[name][0]).norm(dim=-1).max() > 0.02 for one in episodes)]
+    pairs = [(GRIPPER, name) for name in names if name != GRIPPER]
+    pairs += [(a, b) for a in moved for b in names if GRIPPER not in (a, b) and b not in moved]
+    lines = []
+    for a, b in pairs:
+        far = [(one[a] - one[b]).norm(dim=-1) for one in episodes]
+        least = torch.stack([distance.min() for distance in far]).median()
+        last = torch.stack([distance[-1] for distance in far]).median()
+        lines.append(
+            f"The {a} came within {100 * float(least):.0f} cm of the {b}, and ended {100 * float(last):.0f} cm from it."
+        )
+    return lines
+
+
+def repair_plans(
+    planner: OpenAIPlanner,
+    answers: Iterable[Answer],
+    *,
+    rounds: int = 3,
+    enough: float = 0.8,
+    episodes: int = 10,
+    seed: int = 0,
+    tasks: Mapping[str, Task] = TASKS,
+    out: str | os.PathLike[str] | None = None,
+    progress: bool = True,
+) -> list[Repair]:
+    """Carry out plans, tell the model what became of those that fail, and ask for others, round by round.
+
+    Every answer of every round is kept: ``out`` is a folder for :func:`~lw_torchrl.planners.comparing.compare_plans`,
+    in which rounds are models of their own.
+
+    Args:
+        planner: who wrote the answers.
+        answers: its answers, of one format.
+        rounds: at most.
+        enough: the success rate from which a plan is left as it is.
+        episodes, seed: in which plans are carried out by scripted skills. Compare repaired plans on another seed.
+        tasks: where tasks' names are looked up.
+        out: as for :meth:`OpenAIPlanner.revise`.
+        progress: show progress bars.
+
+    Returns:
+        For each answer what came of it.
+
+    Raises:
+        ValueError: a wrong option, or answers of several formats.
+        PlannerError: an answer did not come; those that came are kept.
+    """
+    check_int("rounds", rounds, minimum=1)
+    first = list(answers)
+    options: dict[str, Any] = {"episodes": episodes, "seed": seed, "tasks": tasks, "skills": planner.skills}
+
+    def check(answer: Answer) -> PlanCheck:
+        return check_plan(answer.text, answer.task, answer.format, **options)
+
+    found = [Repair((answer,), (check(answer),)) for answer in first]
+    for number in range(1, rounds + 1):
+        open_ = [k for k, one in enumerate(found) if one.checks[-1].success < enough]
+        if not open_:
+            break
+        facts = [plan_facts(found[k].checks[-1], tasks[found[k].answers[-1].task]) for k in open_]
+        before = [found[k].answers[-1] for k in open_]
+        came = planner.revise(before, facts, round=number, tasks=tasks, out=out, progress=progress)
+        of = {(answer.task, answer.attempt): answer for answer in came}
+        for k in open_:
+            answer = of[found[k].answers[-1].task, found[k].answers[-1].attempt]
+            found[k] = Repair((*found[k].answers, answer), (*found[k].checks, check(answer)))
+    return found
