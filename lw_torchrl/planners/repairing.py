@@ -47,7 +47,7 @@ def plan_facts(check: PlanCheck, task: Task) -> str:
     Example:
         >>> from lw_torchrl.language.tasks import TASKS
         >>> print(plan_facts(check_plan("I cannot.", "reach", "basic_py"), TASKS["reach"]))
-        The answer was read, and no plan was found in it: there is no clause for 'reach'.
+        The answer was read, and no plan was found in it: it has no steps, neither for reach nor for another task.
         Write the plan for `reach` again, the whole of it, in the same form, with this mended.
     """
     again = f"Write the plan for `{task.name}` again, the whole of it, in the same form, with this mended."
