@@ -77,9 +77,7 @@ def test_the_facts_say_what_is_needed_to_mend_a_plan():
     pairs[1] = ("the robot's gripper is open and the robot's gripper is closed", pairs[1][1])
     text = lw.encode_plan(lw.ConditionalPlan.from_pairs("push", pairs), "basic_py")
     facts = plan_facts(check_plan(text, "push", "basic_py", episodes=2), TASKS["push"])
-    assert (
-        f"step 2, 'the robot's gripper is open and the robot's gripper is closed', held at no time" in facts
-    )
+    assert "step 2, 'the robot's gripper is open and the robot's gripper is closed', held at no time" in facts
     assert "of 2 failed episodes" in facts
     assert "The robot's gripper came within " in facts
     assert "cm of the puck, and ended" in facts
