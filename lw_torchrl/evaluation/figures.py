@@ -100,6 +100,7 @@ def plot_sorted_tasks(
     *,
     published: Mapping[str, Mapping[str, float]] | None = None,
     order: Literal["shared", "own"] = "shared",
+    of: str = "seed",
     title: str = "",
 ) -> Figure:
     """Draw the paper's figure: tasks sorted by success rate on x, success on y, a line per method.
@@ -114,6 +115,7 @@ def plot_sorted_tasks(
         published: label to (task to rate), of the same tasks at least; :func:`published_curves` gives them.
         order: "shared" sorts the tasks by the first method, so that each place on x is one named task; "own" sorts
             every curve for itself, as the paper does: x is then a rank.
+        of: what a rate is of, for the legend: "seed", "plan".
         title: above the figure.
 
     Returns:
@@ -150,7 +152,7 @@ def plot_sorted_tasks(
     figure = Figure(figsize=(max(7.0, 3.5 + 0.21 * len(tasks)), 6.4), layout="constrained")
     axes = figure.subplots()
     for k, (method, rates) in enumerate(named.items()):
-        _draw_method(axes, method, np.stack([rates[task] for task in tasks]), COLORS[k % len(COLORS)], order)
+        _draw_method(axes, method, np.stack([rates[task] for task in tasks]), COLORS[k % len(COLORS)], order, of)
     for k, (label, rates) in enumerate(dashed.items()):
         _draw_published(axes, label, np.array([rates[task].mean() for task in tasks]), k, order)
     shown = [*tasks] if order == "shared" else [str(rank) for rank in range(1, len(tasks) + 1)]
@@ -193,12 +195,12 @@ def _add_legend(figure: Figure, axes: Axes, methods: int) -> None:
     figure.legend(handles=handles, loc="outside lower center", ncols=len(columns), frameon=False, fontsize=9)
 
 
-def _draw_method(axes: Axes, method: str, rates: Array, color: str, order: str) -> None:
+def _draw_method(axes: Axes, method: str, rates: Array, color: str, order: str, of: str) -> None:
     """A line, a band and the mean of rates (tasks, seeds)."""
     if order == "own":
         rates = rates[np.argsort(rates.mean(1), kind="stable")]
     mean, x, seeds = rates.mean(1), range(len(rates)), rates.shape[1]
-    spread = "1 seed" if seeds == 1 else f"{seeds} seeds, min–max shaded"
+    spread = f"1 {of}" if seeds == 1 else f"{seeds} {of}s, min–max shaded"
     axes.fill_between(x, rates.min(1), rates.max(1), color=color, alpha=0.16, linewidth=0)
     axes.plot(
         x, mean, color=color, linewidth=2, marker=".", zorder=3, label=f"{method}: mean {mean.mean():.2f} ({spread})"

@@ -113,7 +113,7 @@ class PlanComparison:
                     str(len(rates)),
                     str(len(found)),
                     str(runs),
-                    str(mean_rate([[_mean(one) for one in rates.values()]], resample_tasks=True)),
+                    str(mean_rate([[_mean(one)] for one in rates.values()])),
                     f"{self.best_of(model, format):.3f}",
                 ]
             )

@@ -55,7 +55,7 @@ def _draw(
     curves = {name: {task: found[task] for task in sorted(common)} for name, found in rates.items()}
     least = min(len(one) for found in curves.values() for one in found.values())
     even = {name: {task: one[:least] for task, one in found.items()} for name, found in curves.items()}
-    plot_sorted_tasks(even, file, published=_published(groups, common), order="own", title=title)
+    plot_sorted_tasks(even, file, published=_published(groups, common), order="own", of="answer", title=title)
 
 
 def _published(groups: Sequence[Group], tasks: set[str]) -> dict[str, dict[str, float]]:
