@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from lw_torchrl._checks import check_int
+from lw_torchrl._progress import Progress
 from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.language.tasks import TASKS, Task
 from lw_torchrl.planners.answers import Answer
@@ -130,10 +131,15 @@ def repair_plans(
     first = list(answers)
     options: dict[str, Any] = {"episodes": episodes, "seed": seed, "tasks": tasks, "skills": planner.skills}
 
-    def check(answer: Answer) -> PlanCheck:
-        return check_plan(answer.text, answer.task, answer.format, **options)
+    def check(answers: Sequence[Answer]) -> list[PlanCheck]:
+        with Progress("carrying out", len(answers), "plan", show=progress) as bar:
+            checks = []
+            for answer in answers:
+                checks.append(check_plan(answer.text, answer.task, answer.format, **options))
+                bar.update()
+        return checks
 
-    found = [Repair((answer,), (check(answer),)) for answer in first]
+    found = [Repair((answer,), (checked,)) for answer, checked in zip(first, check(first), strict=True)]
     for number in range(1, rounds + 1):
         open_ = [k for k, one in enumerate(found) if one.checks[-1].success < enough]
         if not open_:
@@ -142,7 +148,7 @@ def repair_plans(
         before = [found[k].answers[-1] for k in open_]
         came = planner.revise(before, facts, round=number, tasks=tasks, out=out, progress=progress)
         of = {(answer.task, answer.attempt): answer for answer in came}
-        for k in open_:
-            answer = of[found[k].answers[-1].task, found[k].answers[-1].attempt]
-            found[k] = Repair((*found[k].answers, answer), (*found[k].checks, check(answer)))
+        others = [of[answer.task, answer.attempt] for answer in before]
+        for k, other, checked in zip(open_, others, check(others), strict=True):
+            found[k] = Repair((*found[k].answers, other), (*found[k].checks, checked))
     return found

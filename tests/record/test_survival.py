@@ -237,6 +237,15 @@ def receiver(tmp_path):
     process.wait()
 
 
+def wait_until_it_rests(file):
+    """What was received is written a little later."""
+    size, deadline = -1, time.monotonic() + 30
+    while (now := file.stat().st_size if file.exists() else 0) != size:
+        assert time.monotonic() < deadline
+        size = now
+        time.sleep(1.5)
+
+
 @pytest.mark.parametrize("beside", [True, False])
 def test_a_viewer_gets_everything(tmp_path, receiver, beside):
     process, address, file = receiver
@@ -247,6 +256,7 @@ def test_a_viewer_gets_everything(tmp_path, receiver, beside):
     logger.flush()
     logger.log_hparams({"lr": 1})
     logger.shutdown(timeout=30)
+    wait_until_it_rests(file)
     process.send_signal(signal.SIGINT)
     process.wait(30)
     recording, tabs = copy_of(file)
