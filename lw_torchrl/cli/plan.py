@@ -147,11 +147,10 @@ def generate(
 def _counts(answers: Sequence[Answer]) -> tuple[str, ...]:
     """What a row of the table says of the answers to one question."""
     plans = [answer.decoded for answer in answers if answer.decoded.plan is not None]
-    scripted = [d for d in plans if d.scripted is not None and d.plan and len(d.scripted.steps) == len(d.plan.steps)]
     numbers = (
         len(answers),
         len(plans),
-        len(scripted),
+        sum(decoded.all_scripted for decoded in plans),
         sum(not answer.cached for answer in answers),
         sum(answer.tokens.prompt for answer in answers),
         sum(answer.tokens.completion for answer in answers),

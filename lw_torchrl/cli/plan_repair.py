@@ -74,9 +74,10 @@ def repair(
         cache=cache,
     )
     first = planner.plans(chosen, format=format, attempts=attempts, out=out)
-    options = {"rounds": rounds, "enough": enough, "episodes": episodes, "seed": seed}
-    found = repair_plans(planner, first, tasks=known, out=out, **options)  # type: ignore[arg-type]
-    columns = ("task", "attempt", *("first", *(f"round {k}" for k in range(1, rounds + 1))))
+    found = repair_plans(
+        planner, first, rounds=rounds, enough=enough, episodes=episodes, seed=seed, tasks=known, out=out
+    )
+    columns = ("task", "attempt", "first", *(f"round {k}" for k in range(1, rounds + 1)))
     rows = []
     for one in found:
         rates = [f"{check.success:.0%}" for check in one.checks]

@@ -85,7 +85,8 @@ def evaluate_plans(
     by_task: dict[str, dict[str, list[int]]] = {}  # fingerprint to the plans of it
     for index, plan in enumerate(plans):
         by_task.setdefault(plan.task, {}).setdefault(Plans([plan]).fingerprint, []).append(index)
-    different = {task: [plans[same[0]] for same in found.values()] for task, found in by_task.items()}
+    equal = {task: list(found.values()) for task, found in by_task.items()}
+    different = {task: [plans[same[0]] for same in found] for task, found in equal.items()}
     policy = _PlanOfRow(different, episodes, seed, choose, skills)
     most = max(len(listed) for listed in different.values()) * episodes
     env = LanguageWorldEnv(
@@ -112,7 +113,7 @@ def evaluate_plans(
                 place=_PLACE,
                 on_progress=bar.update,
             ):
-                same = list(by_task[one.task].values())[int(one.steps.get(_PLACE)[0]) // episodes]
+                same = equal[one.task][int(one.steps.get(_PLACE)[0]) // episodes]
                 _note(won, same, one, episodes, on_plan)
     finally:
         env.close()

@@ -61,3 +61,8 @@ class DecodedPlan:
     reason: str
     notes: tuple[Note, ...]
     steps: tuple[DecodedStep, ...]
+
+    @property
+    def all_scripted(self) -> bool:
+        """Whether there is a plan, and every step of it has a scripted skill."""
+        return self.plan is not None and self.scripted is not None and len(self.scripted.steps) == len(self.plan.steps)

@@ -109,7 +109,7 @@ def check_plan(
     if decoded.plan is None:
         return PlanCheck(owner.name, decoded)
     expert = expert_use({owner.name: decoded.plan}, owner.name, episodes_per_task=episodes, seed=seed)[owner.name]
-    if decoded.scripted is None or len(decoded.scripted.steps) < len(decoded.plan.steps):
+    if decoded.scripted is None or not decoded.all_scripted:
         return PlanCheck(owner.name, decoded, expert)
     use, failed = PlanUse({owner.name: decoded.scripted}), []
 

@@ -63,7 +63,7 @@ def plan_facts(check: PlanCheck, task: Task) -> str:
         for step in check.never
     ]
     if check.own is not None and check.own.failed:
-        stuck = max(range(len(check.own.stuck)), key=lambda step: check.own.stuck[step])  # type: ignore[union-attr]
+        stuck = check.own.stuck.index(max(check.own.stuck))
         lines.append(
             f"It got stuck in step {stuck + 1}, '{check.decoded.plan.steps[stuck].skill}', in {check.own.stuck[stuck]} "
             f"of {check.own.failed} failed episodes."
