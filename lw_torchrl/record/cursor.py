@@ -50,9 +50,20 @@ def request(step: int) -> bytes:
 
     Source: what :meth:`rerun.experimental.ViewerClient.set_time` of rerun 0.41 sends.
     """
-    time, paused = b"\x08" + _varint(step), b"\x28\x01"
-    cursor = b"\x1a" + _varint(len(time)) + time + paused
-    return b"\x32" + _varint(len(cursor)) + cursor
+    paused = b"\x28\x01"
+    cursor = b"\x1a" + _sized(b"\x08" + _varint(step)) + paused
+    return b"\x32" + _sized(cursor)
+
+
+def sign(step: int) -> bytes:
+    """What the state of a viewer in a page, a ``GetStateResponse``, holds when its cursor stands at ``step``."""
+    timeline = b"\n" + _sized(EPISODE_TIMELINE.encode())
+    time = b"\x08" + _varint(step) if step else b""
+    return b"\n" + _sized(timeline) + b"\x10\x01\x1a" + _sized(time)
+
+
+def _sized(message: bytes) -> bytes:
+    return _varint(len(message)) + message
 
 
 def _varint(number: int) -> bytes:

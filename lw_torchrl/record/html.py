@@ -16,7 +16,7 @@ from string import Template
 from urllib.error import URLError
 
 from lw_torchrl._files import replacing
-from lw_torchrl.record.cursor import request
+from lw_torchrl.record.cursor import request, sign
 from lw_torchrl.record.opening import find_recording, opened
 from lw_torchrl.record.opening_step import opening_step
 from lw_torchrl.record.rerun_binary import LOCAL, failure, free_port, running
@@ -79,7 +79,7 @@ def page_of(title: str, data: str, load: str, step: int | None) -> str:
     """The page of the viewer, which gets its parts by the JavaScript function ``load`` and opens at ``step``."""
     template = Template((Path(__file__).with_name("viewer_page.html")).read_text(encoding="utf-8"))
     quoted = json.dumps(title).replace("<", "\\u003c")
-    cursor = json.dumps(None if step is None else list(request(step)))
+    cursor = json.dumps(None if step is None else {"request": list(request(step)), "sign": list(sign(step))})
     return template.substitute(title=html.escape(title), title_json=quoted, data=data, load=load, cursor=cursor)
 
 
