@@ -133,7 +133,7 @@ def test_two_processes_give_what_one_gives(capsys, forks, tmp_path):
 @pytest.mark.slow
 def test_killed_at_five_random_moments_it_ends_the_same(forks, tmp_path):
     def command(out):
-        return "offline", "quick", "--steps", 1500, "--episodes", 1, "--seeds", 0, "--out", out
+        return "offline", "quick", "--steps", 500, "--episodes", 1, "--seeds", 0, "--out", out
 
     whole, killed = forks.whole_and_killed(command, tmp_path, TINY)
     assert results(killed) == results(whole)
