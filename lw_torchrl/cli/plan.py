@@ -14,6 +14,7 @@ from lw_torchrl.cli.outputs import check_folder
 from lw_torchrl.cli.plan_check import check
 from lw_torchrl.cli.plan_compare import compare
 from lw_torchrl.cli.plan_repair import repair
+from lw_torchrl.cli.plan_serve import serve
 from lw_torchrl.cli.sources import one_or_many, read_plans, read_tasks
 from lw_torchrl.cli.tables import print_table
 
@@ -161,6 +162,7 @@ def _counts(answers: Sequence[Answer]) -> tuple[str, ...]:
 COMMANDS: dict[str, Callable[..., None]] = {
     "prompt": prompt,
     "generate": generate,
+    "serve": serve,
     "check": check,
     "compare": compare,
     "repair": repair,

@@ -25,7 +25,8 @@ def compare(
 ) -> None:
     """Compare models by the plans they wrote: decode every answer, carry all of them out by scripted skills, at once.
 
-    Stopped and started again it carries on.
+    The plan of each task that did best is kept in OUT/best/MODEL/FORMAT, for --plans of any other command. Stopped and
+    started again it carries on.
 
     Example: lw-torchrl plan compare runs/plans --out runs/compare
 
@@ -37,7 +38,7 @@ def compare(
         noise: standard deviation of the noise on the executed action.
         max_steps: of an episode.
         task_file: tasks of yours, instead of ours of the same name or beside ours.
-        out: folder for results.json, summary.md, models.png and formats.png.
+        out: folder for results.json, summary.md, models.png, formats.png and best/.
     """
     check_folder("--out", out)
     from lw_torchrl.planners.comparing import compare_plans

@@ -65,7 +65,10 @@ def load_plans(
     # A name with a dot in front is what a killed save_plans leaves.
     listed = [path] if path.is_file() else sorted(p for p in path.glob("*.plan") if p.name[0] != ".")
     if not listed:
-        raise FileNotFoundError(f"the folder {str(path)!r} holds no .plan files")
+        raise FileNotFoundError(
+            f"the folder {str(path)!r} holds no .plan files; of a folder of models' answers `lw-torchrl plan compare` "
+            "makes them"
+        )
     return _read_all(list[Traversable](listed), tasks)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from time import monotonic
 from typing import Any, Literal
@@ -34,6 +34,7 @@ class ComparedAnswer:
         dropped: clauses for the task that were left out.
         reason: why there is no plan; "" if there is one.
         success: of each episode; all False where there is no plan.
+        plan: what was carried out, with scripted skills; None where there is no plan.
     """
 
     model: str
@@ -44,6 +45,7 @@ class ComparedAnswer:
     dropped: int
     reason: str
     success: tuple[bool, ...]
+    plan: ConditionalPlan | None = field(default=None, repr=False)
 
     @property
     def rate(self) -> float:
@@ -99,6 +101,16 @@ class PlanComparison:
                     chosen[one.task] = _mean(tried), _mean(fresh)
         return _mean([fresh for _, fresh in chosen.values()])
 
+    def best_plans(self, model: str, format: str) -> dict[str, ConditionalPlan]:
+        """Of each task the plan that succeeded most often, of equals the first; a task without any is left out."""
+        best: dict[str, tuple[float, ConditionalPlan]] = {}
+        for one in self.answers:
+            if (one.model, one.format) != (model, format) or one.plan is None:
+                continue
+            if one.task not in best or one.rate > best[one.task][0]:
+                best[one.task] = one.rate, one.plan
+        return {task: plan for task, (_, plan) in best.items()}
+
     def table(self) -> str:
         """Markdown: a line for each model and format."""
         rows = []
@@ -133,7 +145,11 @@ class PlanComparison:
 
     def to_json(self) -> dict[str, Any]:
         """Settings and answers, with the success of each episode as 0 and 1."""
-        answers = [asdict(one) | {"success": "".join(map(str, map(int, one.success)))} for one in self.answers]
+        names = [one.name for one in fields(ComparedAnswer) if one.name not in ("success", "plan")]
+        answers = [
+            {name: getattr(one, name) for name in names} | {"success": "".join(map(str, map(int, one.success)))}
+            for one in self.answers
+        ]
         return {"format_version": 1, "settings": self.settings, "answers": answers}
 
 
@@ -216,7 +232,8 @@ def compare_plans(
         reason = one.reason or ("" if one.scripted is not None else "no step has a skill near a scripted one")
         steps = 0 if one.scripted is None else len(one.scripted.steps)
         success = (False,) * episodes if one.scripted is None else fared[_key(one.scripted)]
-        answers.append(ComparedAnswer(model, format, task, attempt, steps, len(one.steps) - steps, reason, success))
+        dropped = len(one.steps) - steps
+        answers.append(ComparedAnswer(model, format, task, attempt, steps, dropped, reason, success, one.scripted))
     return PlanComparison(answers, settings)
 
 

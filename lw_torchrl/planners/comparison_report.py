@@ -8,12 +8,16 @@ from pathlib import Path
 from lw_torchrl._files import write_json, write_text
 from lw_torchrl.evaluation.figures import plot_sorted_tasks
 from lw_torchrl.evaluation.published import published_plans
+from lw_torchrl.language.plan_files import save_plans
+from lw_torchrl.language.plans import ConditionalPlan
 from lw_torchrl.planners.comparing import Group, PlanComparison
 
 
 def write_report(comparison: PlanComparison, folder: Path) -> list[Path]:
     """Write results.json, summary.md, models.png (each model in its best format) and formats.png (of the model that
-    does best) to a folder; the figures leave out tasks that some of their curves lack.
+    does best) to a folder, and the best plan of each task to best/<model>/<format>/<task>.plan.
+
+    The figures leave out tasks that some of their curves lack.
 
     Returns:
         What was written.
@@ -41,7 +45,15 @@ are 95 % intervals over tasks. The best answer of a task is chosen by the even e
     title = "each model in its best format"
     _draw(comparison, list(best.items()), written[2], title, lambda model, format: f"{model}, {format}")
     _draw(comparison, formats, written[3], f"formats of {first}", lambda _, format: format)
-    return [file for file in written if file.is_file()]
+    for model, format in comparison.groups:
+        _write_best(comparison.best_plans(model, format), folder / "best" / model / format)
+    return [*(file for file in written if file.is_file()), folder / "best"]
+
+
+def _write_best(plans: dict[str, ConditionalPlan], folder: Path) -> None:
+    written = save_plans(plans, folder) if plans else []
+    for old in set(folder.glob("*.plan")).difference(written):
+        old.unlink()
 
 
 def _draw(

@@ -134,7 +134,7 @@ def test_compare_runs_what_generate_wrote(capsys, tmp_path):
     printed = run(capsys, *command)
     assert "| mine  | chain_py | 1     | 1       | 1                     | 1.000   |" in printed
     assert "written to" in printed
-    names = ["fared.json", "formats.png", "models.png", "results.json", "summary.md"]
+    names = ["best", "fared.json", "formats.png", "models.png", "results.json", "summary.md"]
     assert sorted(file.name for file in (tmp_path / "out").iterdir()) == names
     assert run(capsys, *command) == printed
 

@@ -112,7 +112,7 @@ def test_a_folder_without_answers_is_refused(tmp_path):
 def test_the_report(answers, tmp_path):
     found = compare_plans(answers, **SHORT)
     written = write_report(found, tmp_path / "out")
-    assert [file.name for file in written] == ["results.json", "summary.md", "models.png", "formats.png"]
+    assert [file.name for file in written] == ["results.json", "summary.md", "models.png", "formats.png", "best"]
     assert json.loads(written[0].read_text()) == found.to_json()
     assert "Plans of good, other" in written[1].read_text("utf-8")
 
@@ -121,4 +121,18 @@ def test_models_without_a_task_in_common_have_no_figure(tmp_path):
     for model, task in (("a", "reach"), ("b", "push")):
         write(tmp_path / "plans", model, "chain_py", task, 0, "nothing")
     written = write_report(compare_plans(tmp_path / "plans", **SHORT), tmp_path / "out")
-    assert [file.name for file in written] == ["results.json", "summary.md", "formats.png"]
+    assert [file.name for file in written] == ["results.json", "summary.md", "formats.png", "best"]
+    assert not list(written[-1].glob("*/*"))
+
+
+def test_the_best_plan_of_each_task_is_kept_for_other_commands(tmp_path):
+    good = PLANS["drawer-open"]
+    bad = lw.ConditionalPlan("drawer-open", good.steps[:1])  # it stays above the handle
+    for attempt, plan in enumerate((bad, good, good, bad)):
+        write(tmp_path / "plans", "m", "chain_py", "drawer-open", attempt, lw.encode_plan(plan, "chain_py"))
+    write(tmp_path / "plans", "m", "chain_py", "push", 0, "nothing")
+    stale = tmp_path / "out/best/m/chain_py/window-open.plan"
+    stale.parent.mkdir(parents=True)
+    stale.write_text("of an earlier run")
+    write_report(compare_plans(tmp_path / "plans", **SHORT | {"max_steps": 150}), tmp_path / "out")
+    assert dict(lw.load_plans(stale.parent)) == {"drawer-open": good}

