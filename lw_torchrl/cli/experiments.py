@@ -13,7 +13,8 @@ from lw_torchrl.cli.sources import read_encoder, read_plans, read_tasks
 from lw_torchrl.cli.units import check_asked, elsewhere, report
 
 if TYPE_CHECKING:
-    from lw_torchrl.experiments.runs import Run
+    from lw_torchrl.language.formats import PLAN_FORMATS
+from lw_torchrl.experiments.runs import Run
     from lw_torchrl.language.plans import Plans
     from lw_torchrl.language.text import TextEncoder
 
@@ -91,7 +92,7 @@ def reproduce(
     if experiment == SCRIPTED:
         methods = (SCRIPTED,)  # type: ignore[assignment]
     assert methods is not None
-    plans_name = "+".join(Path(source).stem for source in plans)
+    plans_name = "+".join(map(_plans_name, plans))
     runs = [
         Run(SETTINGS[name], method, seed, recipes[name], episodes, plans_name, text_encoder or "")
         for name in (["few-shot"] if experiment == "scripted" else SETTINGS)
@@ -129,6 +130,13 @@ def reproduce(
             for stage in (datasets, named):
                 report(len(stage), elsewhere(stage, ["reproduce", *given], launcher, jobs))
         _summarize(runs, load, out)
+
+
+def _plans_name(source: str) -> str:
+    """What plans are called in the folder of a run: their file or folder, of a folder named after a format the model
+    too."""
+    path = Path(source)
+    return f"{path.parent.name}-{path.name}" if path.name in PLAN_FORMATS and path.parent.name else path.stem
 
 
 class _Plans:

@@ -89,6 +89,11 @@ def test_plans_of_ones_own(capsys, tmp_path, tiny):
     own = ("--plans", tmp_path / "mine.json")
     out = run(capsys, "reproduce", "few-shot", "--seeds", 0, "--list", "--out", tmp_path, *own).split()
     assert out[1:] == [f"few-shot/strong-mine/{method}/seed0" for method in ("pcbc", "dc", "one-hot")]
+    kept = "runs/compare/best/llama3.1/chain_py"  # as `plan compare` leaves them
+    (name,) = run(capsys, *arguments(tmp_path, "--plans", "MT50", kept, "--list", methods=["pcbc"], seeds=[0])).split()[
+        1:
+    ]
+    assert name == "few-shot/strong-MT50+llama3.1-chain_py/pcbc/seed0"
     run(capsys, *arguments(tmp_path / "out", "--run", out[1], *own, methods=["pcbc"], seeds=[0]))
     actor = lw.load_actor(tmp_path / "out" / out[1] / "policy.zip")
     assert actor.skills == ("move the gripper to the target",)

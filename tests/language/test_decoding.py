@@ -53,6 +53,25 @@ def test_a_step_tells_what_was_written_and_what_became_of_it():
     assert "green cheese" in dropped.dropped
 
 
+@pytest.mark.parametrize("opening", ["<think>", "<Thinking>", ""])
+def test_what_a_model_thinks_first_is_left_out_though_it_be_longer(opening):
+    plans = lw.load_plans("MT10")
+    draft, final = (lw.encode_plan(lw.ConditionalPlan("push", plans["push"].steps[:n]), "chain_py") for n in (3, 2))
+    text = f"{opening}\nFirst I thought:\n{draft}\nNo.</think>\n{final}"
+    found = lw.decode_plan(text, "push", "chain_py")
+    assert found.plan.steps == plans["push"].steps[:2]
+    assert [str(note) for note in found.notes] == ["line 1: thinks aloud; that is left out"]
+    assert found.steps[0].line > text[: text.index("</think>")].count("\n")
+
+
+def test_thoughts_without_an_answer_are_no_plan():
+    draft = lw.encode_plan(lw.load_plans("MT10")["push"], "chain_py")
+    found = lw.decode_plan(f"Well.\n<think>\n{draft}", "push", "chain_py")
+    assert found.plan is None
+    assert "no steps" in found.reason
+    assert [str(note) for note in found.notes][1:] == ["line 2: thinks aloud; that is left out, and is cut off there"]
+
+
 def test_a_text_in_the_language_has_no_distance_and_no_note():
     plan = lw.load_plans("MT50")["stick-pull"]
     found = lw.decode_plan(lw.encode_plan(plan, "goal_md"), "stick-pull", "goal_md")
