@@ -13,8 +13,7 @@ from lw_torchrl.cli.sources import read_encoder, read_plans, read_tasks
 from lw_torchrl.cli.units import check_asked, elsewhere, report
 
 if TYPE_CHECKING:
-    from lw_torchrl.language.formats import PLAN_FORMATS
-from lw_torchrl.experiments.runs import Run
+    from lw_torchrl.experiments.runs import Run
     from lw_torchrl.language.plans import Plans
     from lw_torchrl.language.text import TextEncoder
 
@@ -135,6 +134,8 @@ def reproduce(
 def _plans_name(source: str) -> str:
     """What plans are called in the folder of a run: their file or folder, of a folder named after a format the model
     too."""
+    from lw_torchrl.language.formats import PLAN_FORMATS
+
     path = Path(source)
     return f"{path.parent.name}-{path.name}" if path.name in PLAN_FORMATS and path.parent.name else path.stem
 
