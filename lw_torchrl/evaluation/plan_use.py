@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from statistics import median
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -34,6 +34,7 @@ class TaskUse:
         true: per step of the plan, the share of states in which its condition held.
         chosen: per step, the share of states in which it had the greatest weight; empty if no policy chose.
         covered: the share of the states before the first success in which some condition held.
+        gaps: the others, as stretches: episode, first and last step, of each.
         num_true: the median number of conditions that held, before the first success.
         stuck: per step, in how many failed episodes it was the one chosen (or true) most in the last 50 steps.
         furthest: per step, in how many failed episodes it was the plan's last that was chosen (or true) in 5 states.
@@ -44,6 +45,7 @@ class TaskUse:
     true: list[float] = field(default_factory=list)
     chosen: list[float] = field(default_factory=list)
     covered: float = 0.0
+    gaps: list[tuple[int, int, int]] = field(default_factory=list)
     num_true: float = 0.0
     stuck: list[int] = field(default_factory=list)
     furthest: list[int] = field(default_factory=list)
@@ -54,12 +56,27 @@ class TaskUse:
         return asdict(self)
 
 
+class _Episode(NamedTuple):
+    number: int
+    qaf: Tensor
+    chosen: Tensor | None
+    before: int  # states before the first success
+    success: bool
+
+    def gaps(self) -> Iterator[tuple[int, int, int]]:
+        zero = torch.zeros(1, dtype=torch.int32)
+        none_holds = ~self.qaf[: self.before].any(-1)
+        edges = torch.diff(none_holds.int(), prepend=zero, append=zero)
+        for first, after in zip(*((edges == sign).nonzero().flatten().tolist() for sign in (1, -1)), strict=True):
+            yield self.number, first, after - 1
+
+
 class PlanUse:
     """Collects how plans are used from finished episodes: pass it to :func:`evaluate` as ``on_episode``."""
 
     def __init__(self, plans: Plans | Mapping[str, ConditionalPlan]) -> None:
         self.plans = as_plans(plans)
-        self._seen: dict[str, list[tuple[Tensor, Tensor | None, int, bool]]] = {}
+        self._seen: dict[str, list[_Episode]] = {}
 
     def __call__(self, episode: FinishedEpisode) -> None:
         success = episode.first_success
@@ -68,38 +85,42 @@ class PlanUse:
         qaf = episode.steps.get("qaf")[: before + _AFTER, :steps]
         weights = episode.steps.get("skill_weights", None)
         chosen = None if weights is None else weights[: before + _AFTER, :steps].argmax(-1)
-        self._seen.setdefault(episode.task, []).append((qaf, chosen, before, success is not None))
+        self._seen.setdefault(episode.task, []).append(
+            _Episode(episode.episode, qaf, chosen, before, success is not None)
+        )
 
     def tasks(self) -> dict[str, TaskUse]:
         """What was seen of each task."""
         return {task: _summed(seen) for task, seen in sorted(self._seen.items())}
 
 
-def _summed(seen: list[tuple[Tensor, Tensor | None, int, bool]]) -> TaskUse:
-    qaf = torch.cat([q for q, _, _, _ in seen])
+def _summed(seen: list[_Episode]) -> TaskUse:
+    qaf = torch.cat([one.qaf for one in seen])
     steps = qaf.shape[1]
-    before = torch.cat([q[:length] for q, _, length, _ in seen])
+    before = torch.cat([one.qaf[: one.before] for one in seen])
     stuck, furthest = [0] * steps, [0] * steps
-    for q, chosen, _, success in seen:
-        if not success:
-            in_charge = q.long() if chosen is None else one_hot(chosen, steps)
+    for one in seen:
+        if not one.success:
+            in_charge = one.qaf.long() if one.chosen is None else one_hot(one.chosen, steps)
             stuck[int(in_charge[-_STUCK:].sum(0).argmax())] += 1
             states = in_charge.sum(0)
             reached = (states >= states.max().clamp(1, _A_WHILE)).nonzero()
             furthest[int(reached[-1]) if len(reached) else 0] += 1
     shares: list[float] = []
-    if all(c is not None for _, c, _, _ in seen):
-        counts = torch.bincount(torch.cat([c for _, c, _, _ in seen if c is not None]), minlength=steps)
+    chosen = [one.chosen for one in seen if one.chosen is not None]
+    if len(chosen) == len(seen):
+        counts = torch.bincount(torch.cat(chosen), minlength=steps)
         shares = (counts / len(qaf)).tolist()
     return TaskUse(
         states=len(qaf),
         true=qaf.float().mean(0).tolist(),
         chosen=shares,
         covered=float(before.any(-1).float().mean()),
+        gaps=sorted(gap for one in seen for gap in one.gaps()),
         num_true=float(median(before.sum(-1).tolist())),
         stuck=stuck,
         furthest=furthest,
-        failed=sum(not success for _, _, _, success in seen),
+        failed=sum(not one.success for one in seen),
     )
 
 

@@ -16,6 +16,8 @@ from lw_torchrl.language.skills import ScriptedSkill
 from lw_torchrl.language.tasks import TASKS, Task, check_task
 from lw_torchrl.modules.scripted_skill_actor import ScriptedSkillActor
 
+_GAPS = 3  # the longest are told of
+
 
 @dataclass(frozen=True)
 class PlanCheck:
@@ -60,6 +62,9 @@ class PlanCheck:
             ]
         lines += [f"left out, {note}" for note in self.decoded.notes]
         lines.append(f"Some condition holds in {self.expert.covered:.0%} of the states up to the expert's success.")
+        for episode, first, last in sorted(self.expert.gaps, key=lambda gap: gap[1] - gap[2])[:_GAPS]:
+            steps = f"step {first}" if first == last else f"steps {first} to {last}"
+            lines.append(f"No condition holds in {steps} of the expert's episode {episode}.")
         for k in self.never:
             lines.append(f"Step {k + 1} never fires: its condition held in no state that was visited.")
         if self.own is None:

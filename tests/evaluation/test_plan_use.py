@@ -39,10 +39,12 @@ def test_uncovered_states_and_where_failures_end():
     use = PlanUse(PLANS)
     use(episode(0, [0] * 30 + [1] * 60 + [-1] * 10))
     use(episode(1, [2] * 200))
+    use(episode(2, [-1] * 3 + [0] * 4 + [-1] + [0] * 12 + [-1] * 30, success_at=29))
     found = use.tasks()["reach"]
     assert found.failed == 2
     assert found.stuck == [0, 1, 1]
-    assert found.covered == 290 / 300 or abs(found.covered - 290 / 300) < 1e-6
+    assert found.gaps == [(0, 90, 99), (2, 0, 2), (2, 7, 7), (2, 20, 29)]
+    assert abs(found.covered - 306 / 330) < 1e-6
 
 
 def test_without_a_policy_that_chooses():

@@ -32,6 +32,14 @@ def test_a_step_that_never_fires_is_named():
     assert "succeeds in 100% of episodes" in printed
 
 
+def test_states_where_no_condition_holds_are_named():
+    plan = lw.ConditionalPlan("push", lw.load_plans("MT10")["push"].steps[:2])
+    found = check_plan(lw.encode_plan(plan, "basic_py"), "push", "basic_py", episodes=2)
+    episode, first, last = max(found.expert.gaps, key=lambda gap: gap[2] - gap[1])
+    assert 0 < first < last
+    assert f"No condition holds in steps {first} to {last} of the expert's episode {episode}." in str(found)
+
+
 def test_mappings_and_what_was_left_out_are_told():
     found = check_plan(ANSWER, "reach", "basic_py", episodes=1)
     printed = str(found)
