@@ -38,8 +38,7 @@ def serve(
     def ready(name: str, address: str) -> None:
         print(f"{name} is served at {address}; Ctrl-C ends it. In another terminal:")
         print(
-            f"lw-torchrl plan generate MT10 --model {name} --base-url {address} --constrain --format basic_py "
-            "--concurrency 1 --vocabulary",
+            f"lw-torchrl plan generate MT10 --model {name} --base-url {address} --constrain --format basic_py",
             flush=True,
         )
 

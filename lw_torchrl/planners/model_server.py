@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import os
 import socket
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 from lw_torchrl._checks import check_int, unknown_name
 
@@ -91,7 +93,38 @@ def serve_model(
         except ValueError as error:
             raise ValueError(f"model {str(file)!r} cannot be loaded: {error}") from error
         ready(name, f"http://{host}:{listener.getsockname()[1]}/v1")
-        uvicorn.Server(uvicorn.Config(app, log_level="warning")).run(sockets=[listener])
+        uvicorn.Server(uvicorn.Config(_with_json_schema(app), log_level="warning")).run(sockets=[listener])
+
+
+def _with_json_schema(app: Any) -> Any:
+    """A server that takes a schema as OpenAI's does; llama-cpp-python's knows it by another name alone."""
+
+    async def asked(scope: Any, receive: Any, send: Any) -> None:
+        if scope["type"] != "http" or scope["path"] != "/v1/chat/completions":
+            return await app(scope, receive, send)
+        message = await receive()
+        while message.get("more_body"):
+            more = await receive()
+            message = {**more, "body": message.get("body", b"") + more.get("body", b"")}
+
+        async def whole() -> Any:
+            nonlocal message
+            now, message = message, {"type": "http.disconnect"}
+            return now if now["type"] == "http.request" else await receive()
+
+        message["body"] = _renamed(message.get("body", b""))
+        await app(scope, whole, send)
+
+    return asked
+
+
+def _renamed(body: bytes) -> bytes:
+    try:
+        request = json.loads(body)
+        schema = request["response_format"]["json_schema"]["schema"]
+    except (ValueError, RecursionError, KeyError, TypeError):
+        return body
+    return json.dumps(request | {"response_format": {"type": "json_object", "schema": schema}}).encode()
 
 
 def _checked(file: Path) -> Path:

@@ -83,6 +83,7 @@ def test_from_the_prompt_to_the_robot_with_a_real_model(served, tmp_path):
         assert answer.decoded.all_scripted, answer.raw
         assert not answer.decoded.notes, answer.decoded.notes
         assert answer.tokens.completion > 0
+        assert answer.notes == (), "the server takes a schema as OpenAI's does"
     again = lw.OpenAIPlanner(name, **options).plans(TASKS, format="basic_py")
     assert [one.text for one in again] == [one.text for one in answers]
     assert all(one.cached for one in again)
