@@ -197,7 +197,7 @@ def summary(found: list[dict[str, Any]]) -> str:
     text = markdown_table(("planted", "failed", *CAUSES, "right", "by the rule alone", "minutes"), single)
     if pairs:
         head = ("planted", "failed", *CAUSES, "one of the two named", "both", "by the rule alone", "minutes")
-        text += "\n" + markdown_table(head, pairs)
+        text += "\n\n" + markdown_table(head, pairs)
     for name, wanted in (("single faults", 1), ("two faults", 2)):
         every = [
             (failure["cause"], {SINGLE[fault] for fault in one["unit"][1]})
@@ -208,8 +208,8 @@ def summary(found: list[dict[str, Any]]) -> str:
         if every:
             right = sum(cause in planted for cause, planted in every) / len(every)
             undecided = sum(cause == "undecided" for cause, _ in every) / len(every)
-            text += f"\n{name}: {len(every)} failures, right {right:.3f}, undecided {undecided:.3f}\n"
-    return text
+            text += f"\n\n{name}: {len(every)} failures, right {right:.3f}, undecided {undecided:.3f}"
+    return f"{text}\n"
 
 
 def planted(args: Arguments) -> None:
@@ -229,7 +229,7 @@ def planted(args: Arguments) -> None:
         counts = ", ".join(f"{causes.count(cause)} {cause}" for cause in CAUSES if cause in causes)
         print(f"[{number}/{len(listed)}] {unit.name}: {counts or 'none failed'}", flush=True)
         write_text(args.out / "table.md", summary(found))
-    print(f"\n{summary(found)}\nwritten to {args.out / 'table.md'}")
+    print(f"\n{summary(found)}written to {args.out / 'table.md'}")
 
 
 def own_failures(args: Arguments) -> None:
