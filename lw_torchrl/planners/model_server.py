@@ -85,7 +85,7 @@ def serve_model(
         try:
             listener.bind((host, port))
         except (OSError, OverflowError) as error:
-            raise OSError(f"port {port} of {host} cannot be had ({error}); give another port") from error
+            raise OSError(f"port {port} of {host} cannot be had ({error}); give another port or host") from error
         chosen = {} if threads is None else {"n_threads": threads, "n_threads_batch": threads}
         settings = ModelSettings(model=str(file), model_alias=name, n_ctx=context, verbose=False, **chosen)
         try:

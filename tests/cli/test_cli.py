@@ -7,6 +7,7 @@ import json
 import re
 import signal
 import time
+from dataclasses import replace
 from functools import partial
 from importlib.metadata import entry_points
 
@@ -320,17 +321,22 @@ def kill_when(forks, ready, timeout=120):
 
 @pytest.mark.slow
 def test_the_quick_demo_killed_twice_ends_and_then_does_nothing_twice(forks, tmp_path):
-    out = tmp_path / "demo"
+    config, out = replace(QUICK, training_steps=200, episodes_per_task=2), tmp_path / "demo"
+    shorter = f"""
+from dataclasses import replace
+from lw_torchrl.experiments import demo
+demo.QUICK = replace(demo.QUICK, training_steps={config.training_steps}, episodes_per_task={config.episodes_per_task})
+"""
     demonstrations = out / "demonstrations"
     demo = ("demo", "--quick", "--out", out)
-    forks.start(*demo)
+    forks.start(*demo, before=shorter)
     kill_when(forks, lambda: len(list(demonstrations.glob(".partial/*.npz"))) >= 2)
     assert not (demonstrations / "metadata.json").exists()
-    forks.start(*demo)
+    forks.start(*demo, before=shorter)
     kill_when(forks, (out / "checkpoint.zip").exists)
     assert not (out / "results.json").exists()
 
-    forks.start(*demo)
+    forks.start(*demo, before=shorter)
     status, printed, errors = forks.end()
     assert status == 0, errors
     assert {path.name for path in out.iterdir() if path.name[0] != "."} == {
@@ -341,20 +347,19 @@ def test_the_quick_demo_killed_twice_ends_and_then_does_nothing_twice(forks, tmp
         "success.png",
         "rollout.rrd",
     }
-    config = json.loads((out / "config.json").read_text())
-    assert config == json.loads(json.dumps(vars(QUICK)))
+    assert json.loads((out / "config.json").read_text()) == json.loads(json.dumps(vars(config)))
     result = lw.EvaluationResult.load(out / "results.json")
-    assert result.config["tasks"] == list(QUICK.tasks)
-    assert result.config["episodes_per_task"] == QUICK.episodes_per_task
+    assert result.config["tasks"] == list(config.tasks)
+    assert result.config["episodes_per_task"] == config.episodes_per_task
     assert result.config["noise_scale"] == 0.1
-    assert result.config["seed"] != config["demonstration_seed"]
+    assert result.config["seed"] != config.demonstration_seed
     assert result.table() in printed
     assert (out / "success.png").read_bytes()[-8:-4] == b"IEND"
     assert (out / "rollout.rrd").read_bytes().startswith(b"RRF")
     actor = lw.load_actor(out / "checkpoint.zip")
     plans = lw.load_plans("MT10")
     assert actor.plans == plans
-    for task in QUICK.tasks:
+    for task in config.tasks:
         (line,) = [line for line in printed.splitlines() if line.strip().startswith(f"{task}: ")]
         assert any(f"{step.skill} (" in line for step in plans[task].steps)
     assert f"lw-torchrl view {out / 'rollout.rrd'}" in printed
@@ -367,7 +372,7 @@ def test_the_quick_demo_killed_twice_ends_and_then_does_nothing_twice(forks, tmp
         "demonstrations/data/action.memmap",
     ]
     before = {name: (out / name).stat().st_mtime_ns for name in kept}
-    forks.start(*demo)
+    forks.start(*demo, before=shorter)
     status, again, errors = forks.end()
     assert status == 0, errors
     assert {name: (out / name).stat().st_mtime_ns for name in kept} == before
