@@ -44,14 +44,13 @@ def preset(setting: str, option: str, weight: float) -> Preset:
 
 
 def main(arguments: Arguments) -> None:
-    plans = lw.load_plans("MT50")
     asked = [("latent_consistency", weight) for weight in arguments.consistency]
     asked += [("latent_contrast", weight) for weight in arguments.contrast]
     lines = []
     for option, weight in asked:
         recipe = preset(arguments.setting, option, weight)
         runs = [Run(SETTINGS[arguments.setting], "pcbc", seed, recipe) for seed in arguments.seeds]
-        results = [execute_run(run, plans, arguments.out) for run in runs]
+        results = [execute_run(run, lw.load_plans("MT50", skills=run.skills), arguments.out) for run in runs]
         means = ", ".join(f"{result.mean_success:.3f}" for result in results)
         solved = ", ".join(str(count_solved([list(result.success_once.values())])) for result in results)
         lines.append((f"{option} {weight:g}", means, solved))

@@ -150,18 +150,16 @@ class _Plans:
     def __call__(self, run: Run) -> Plans:
         from lw_torchrl.language.tasks import MT50
 
-        zero_shot = run.setting.name == "zero-shot" and run.method != "scripted"
-        skills: Literal["MT10", "own"] = "MT10" if zero_shot else "own"
-        if skills not in self.known:
-            found = read_plans(self.sources or ["MT50"], self.tasks, skills)
+        if run.skills not in self.known:
+            found = read_plans(self.sources or ["MT50"], self.tasks, run.skills)
             if missing := [task for task in MT50 if task not in found]:
                 raise ValueError(
                     f"--plans must have a plan for each of the 50 tasks, they lack {len(missing)}: "
                     f"{', '.join(missing[:5])}{', ...' if len(missing) > 5 else ''}; --plans MT50 "
                     f"{' '.join(self.sources)} takes ours for these"
                 )
-            self.known[skills] = found
-        return self.known[skills]
+            self.known[run.skills] = found
+        return self.known[run.skills]
 
 
 def _here(

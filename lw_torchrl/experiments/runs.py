@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from filelock import FileLock
 
@@ -109,6 +109,12 @@ class Run:
         """Of one of its policy's actors."""
         more = member.plan_actor if policy_class(METHODS[self.method].policy).plan_options else {}
         return {**member.actor, **more}
+
+    @property
+    def skills(self) -> Literal["own", "MT10"]:
+        """Whose skills its plans speak of, as for :func:`~lw_torchrl.load_plans`: what is trained on MT10 and never saw
+        another task knows those of MT10 alone."""
+        return "MT10" if self.setting.name == "zero-shot" and self.method != SCRIPTED else "own"
 
     def describe(self, plans: Plans) -> dict[str, Any]:
         """Everything that its result hangs on, as JSON."""
