@@ -115,10 +115,13 @@ class RolloutRecorder(Transform):
         return tensordict_reset
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        for row in _named(tensordict.get("_step", None), self.rows):
+        # All at once: to get them one by one takes as long as the rest.
+        before, after = dict(tensordict.items()), dict(next_tensordict.items())
+        done = _array(after["done"]).reshape(-1)
+        for row in _named(before.get("_step"), self.rows):
             running = self._running[row]
-            running.take(tensordict, next_tensordict)
-            if bool(next_tensordict.get("done").reshape(-1)[row]):
+            running.take(before, after)
+            if done[row]:
                 self._end(running)
         return next_tensordict
 
@@ -152,7 +155,7 @@ class _Row:
         self.task = env.task_of_row[row]
         self.ended = 0
         self.seed = env.seed
-        self._env, self._row = env, row
+        self._env, self._row, self._batched = env, row, bool(env.batch_size)
         # An engine of one's own may have no bodies.
         engine: Any = env.engine
         self._engine = engine if hasattr(engine, "poses") else None
@@ -170,16 +173,16 @@ class _Row:
         self._recorded, self._stepped = recorded, False
         self._look()
 
-    def take(self, before: TensorDictBase, after: TensorDictBase) -> None:
+    def take(self, before: Mapping[str, Tensor], after: Mapping[str, Tensor]) -> None:
         """Note a step: what it was decided on and what it led to."""
         self._stepped = True
         if not self._recorded:
             return
         if not self._steps:
             self._read = [key for key in _BEFORE if key in before], [key for key in _AFTER if key in after]
-            self._fixed = {key: self._of(before.get(key)) for key in _FIXED if key in before}
+            self._fixed = {key: self._of(before[key]) for key in _FIXED if key in before}
         now, then = self._read
-        self._steps.append([self._of(before.get(key)) for key in now] + [self._of(after.get(key)) for key in then])
+        self._steps.append([self._of(before[key]) for key in now] + [self._of(after[key]) for key in then])
         self._look()
 
     def finish(self) -> tuple[TensorDict | None, Motion | None]:
@@ -204,12 +207,17 @@ class _Row:
 
     def _of(self, values: Tensor) -> NDArray[Any]:
         """This row's part of a tensor of all rows, as a copy: some environments write into theirs again."""
-        array = values.numpy(force=True)
-        return np.array(array[self._row] if self._env.batch_size else array)
+        array = _array(values)
+        return np.array(array[self._row] if self._batched else array)
 
     def _look(self) -> None:
         if self._recorded and self._engine is not None:
             self._poses.append(self._engine.poses(self._row))
+
+
+def _array(values: Tensor) -> NDArray[Any]:
+    """The values, on the CPU; shared where they are there."""
+    return values.detach().numpy() if values.is_cpu else values.numpy(force=True)
 
 
 def _named(mask: Tensor | None, rows: Sequence[int]) -> list[int]:
