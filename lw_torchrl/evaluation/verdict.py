@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 
 from lw_torchrl.evaluation.exchanges import Exchanges
 from lw_torchrl.evaluation.failures import Cause, Failure
-from lw_torchrl.evaluation.visited import Explanation, Visited, in_charge, stay
+from lw_torchrl.evaluation.visited import Explanation, Visited, in_charge, settled
 
 MARGIN = 0.3
 """By how much of a task's failed episodes an exchange must mend more than a smaller one to count before it."""
@@ -113,7 +113,7 @@ def by_exchanges(
     step, at, why = told.steps[cause], told.at[cause], told.why[cause]
     if best == "skill" and cause == "skill":
         step = exchanges.step[which]
-        at, why = stay(one.in_force == step), in_charge(one, exchanges.plans[one.task], step)
+        at, why = settled(one, step), in_charge(one, exchanges.plans[one.task], step)
     evidence = {
         **told.evidence,
         **{f"mended_by_{name.replace(' + ', '_and_')}": share for name, share in shares.items()},

@@ -14,6 +14,7 @@ from torch.nn.functional import one_hot
 
 from lw_torchrl.evaluation.failures import Cause
 from lw_torchrl.language.named_objects import GRIPPER
+from lw_torchrl.language.observation import HAND
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.language.skill_program import SkillProgram
 from lw_torchrl.language.skills import ScriptedSkill
@@ -21,6 +22,7 @@ from lw_torchrl.transforms.qaf import plan_program
 
 LATE = 100  # the last states, in which a failed episode got nowhere
 A_WHILE = 5  # states in which a step was in force that the episode came to
+_AHEAD, _STILL = 10, 0.01  # a hand that within so many states comes less than a centimetre further
 _AWAY = 25  # states that a stay in a step may be left for: two steps that alternate are one stay
 WRONG = 0.01  # the share of states with wrong answers from which they count
 OTHER = 0.3  # how far two actions differ, on some axis, that are not meant to do the same
@@ -180,6 +182,15 @@ def stay(states: Tensor) -> int:
     return begin
 
 
+def settled(seen: Visited, step: int) -> int:
+    """Where the last stay in a step shows: the first state in it after which the hand gets no further, else its
+    beginning."""
+    begin = stay(seen.in_force == step)
+    hand = seen.steps.get("observation")[begin:, HAND]
+    still = (hand[_AHEAD:] - hand[:-_AHEAD]).norm(dim=-1) < _STILL
+    return begin + (int(still.int().argmax()) if still.any() else 0)
+
+
 def in_charge(seen: Visited, plan: ConditionalPlan, step: int) -> str:
     """How long a step was in force, in words."""
     late = min(LATE, len(seen.in_force))
@@ -200,7 +211,7 @@ def explain(
     late = min(LATE, length)
     stuck = next(iter(candidates(seen)), len(plan.steps) - 1)
     steps: dict[str, int | None] = {"out of time": stuck, "undecided": stuck}
-    at = {"out of time": length - 1, "undecided": stay(seen.in_force == stuck)}
+    at = {"out of time": length - 1, "undecided": settled(seen, stuck)}
     why, evidence = {}, {"states": float(length)}
 
     wrong = seen.given != seen.truth
@@ -246,7 +257,7 @@ def explain(
 
     inside = seen.in_force == stuck
     evidence["in_step_late"] = float(inside[-late:].float().mean())
-    steps["skill"], at["skill"] = stuck, stay(inside)
+    steps["skill"], at["skill"] = stuck, settled(seen, stuck)
     told = in_charge(seen, plan, stuck)
     if scripts.known[seen.task][stuck]:
         far = float(scripts.distance(observation[-1:], task_id[-1:], stuck))

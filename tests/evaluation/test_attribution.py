@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -14,7 +15,7 @@ from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.evaluation import attribute_failures
 from lw_torchrl.evaluation.swaps import own_evaluators, with_true_answers
 from lw_torchrl.evaluation.verdict import decide, decide_pair
-from lw_torchrl.evaluation.visited import attended, chosen, stay
+from lw_torchrl.evaluation.visited import attended, chosen, settled, stay
 from lw_torchrl.transforms.qaf import plan_program
 
 TASK, SEED, STEPS = "drawer-open", 7, 80
@@ -237,6 +238,15 @@ def test_the_step_in_force():
     answers = torch.tensor([[False, True, True], [False, False, False], [False, False, True]])
     assert chosen(answers, 3).tolist() == [1, 2, 2]
     assert chosen(answers, 2).tolist() == [1, 1, 1], "what is beyond the last step is none"
+
+
+def test_a_stay_is_seen_where_the_hand_gets_no_further():
+    observation = torch.zeros(60, 39)
+    observation[:, 0] = torch.cat((torch.arange(25) * 0.01, torch.full((35,), 0.25)))  # at rest from state 25 on
+    in_force = torch.cat((torch.zeros(20), torch.ones(40))).long()
+    seen = SimpleNamespace(in_force=in_force, steps=TensorDict(observation=observation, batch_size=[60]))
+    assert settled(seen, 1) == 25
+    assert settled(seen, 0) == 0, "it moves all the while"
 
 
 def test_a_stay_may_be_left_for_a_while():
