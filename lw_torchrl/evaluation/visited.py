@@ -185,9 +185,10 @@ def stay(states: Tensor) -> int:
 def settled(seen: Visited, step: int) -> int:
     """Where the last stay in a step shows: the first state in it after which the hand gets no further, else its
     beginning."""
-    begin = stay(seen.in_force == step)
+    inside = seen.in_force == step
+    begin = stay(inside)
     hand = seen.steps.get("observation")[begin:, HAND]
-    still = (hand[_AHEAD:] - hand[:-_AHEAD]).norm(dim=-1) < _STILL
+    still = ((hand[_AHEAD:] - hand[:-_AHEAD]).norm(dim=-1) < _STILL) & inside[begin : begin + len(hand[_AHEAD:])]
     return begin + (int(still.int().argmax()) if still.any() else 0)
 
 

@@ -242,7 +242,7 @@ def test_the_step_in_force():
 
 def test_a_stay_is_seen_where_the_hand_gets_no_further():
     observation = torch.zeros(60, 39)
-    observation[:, 0] = torch.cat((torch.arange(25) * 0.01, torch.full((35,), 0.25)))  # at rest from state 25 on
+    observation[:, 0] = torch.cat((torch.arange(25) * 0.02, torch.full((35,), 0.5)))  # at rest from state 25 on
     in_force = torch.cat((torch.zeros(20), torch.ones(40))).long()
     seen = SimpleNamespace(in_force=in_force, steps=TensorDict(observation=observation, batch_size=[60]))
     assert settled(seen, 1) == 25
