@@ -286,3 +286,22 @@ def test_a_replay_buffer_is_refused():
     replay.extend(rows)
     with pytest.raises(ValueError, match="rows of a replay buffer do not tell: put it into the environment"):
         replay.sample()
+
+
+def test_a_failure_for_want_of_answers_is_the_querys_also_beside_other_plans():
+    plans = lw.Plans({"button-press-topdown": lw.load_plans("MT50")["button-press-topdown"]})
+    steps = plans["button-press-topdown"].steps
+    reference = lw.Plans([lw.ConditionalPlan("button-press-topdown", steps[:1])])
+    result = lw.evaluate(
+        lw.ScriptedSkillActor(plans),
+        tasks="button-press-topdown",
+        episodes_per_task=1,
+        seed=7,
+        max_steps=150,
+        evaluator=lw.CorruptQAF(plans, flip=1.0),
+        attribute=True,
+        reference=reference,
+    )
+    [failure] = result.failures
+    assert failure.cause == "query"
+    assert set(failure.swaps) >= {"query", "plan"}
