@@ -14,9 +14,10 @@ import tyro
 
 import lw_torchrl as lw
 from lw_torchrl._files import write_text
-from lw_torchrl.evaluation import EvaluationResult, count_solved, mean_rate
+from lw_torchrl.evaluation import EvaluationResult, count_solved
 from lw_torchrl.evaluation.comparison import markdown_table
-from lw_torchrl.evaluation.figures import COLORS, check_image, saved
+from lw_torchrl.evaluation.figures import COLORS, check_image, saved, wilson_interval
+from lw_torchrl.evaluation.statistics import Estimate
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -42,7 +43,7 @@ class Cell(NamedTuple):
     def name(self) -> str:
         if self.exact:
             return "exact"
-        return f"every {self.value:g} steps" if self.kind == "every" else f"{self.value:.0%} flipped"
+        return f"every {self.value:g} steps" if self.kind == "every" else f"{100 * self.value:g}% flipped"
 
     def evaluator(self, plans: lw.Plans, seed: int) -> Any:
         """What answers in the query answering function's place; None for itself."""
@@ -166,12 +167,18 @@ def _hits(result: EvaluationResult) -> np.ndarray:
     return np.array(list(by_task.values()), dtype=np.float64).T
 
 
+def _rate(hits: np.ndarray) -> Estimate:
+    """The mean of the tasks, which have as many episodes each, with Wilson's interval of all episodes: a little wide,
+    since tasks differ, and no mere point where all succeed. It is of these policies, not of others trained alike."""
+    return Estimate(float(hits.mean()), *wilson_interval(int(hits.sum()), hits.size))
+
+
 def table(found: Found, cells: Sequence[Cell]) -> str:
     """Means with intervals, what that asks of an evaluator, and each task's rates."""
     head, rows = ["answers", *found.curves, *(f"tasks >= 0.8, {curve}" for curve in found.curves)], []
     for cell in cells:
         hits = [found.hits(curve, cell) for curve in found.curves]
-        means = ["" if one is None else str(mean_rate(one)) for one in hits]
+        means = ["" if one is None else str(_rate(one)) for one in hits]
         solved = ["" if one is None else str(count_solved(one)) for one in hits]
         rows.append([cell.name, *means, *solved])
     text = markdown_table(head, rows) + "\n\n"
@@ -194,14 +201,14 @@ def within(found: Found, curve: str, cells: Sequence[Cell]) -> str:
         return "exact answers were not asked for"
     least = exact.mean() - CLOSE
     told = []
-    for kind, words in (("every", "answers every {:g} steps"), ("flip", "{:.0%} flipped")):
+    for kind, words in (("every", "answers every {:g} steps"), ("flip", "{:g}% flipped")):
         far: float | None = None
         for cell in sorted((cell for cell in cells if cell.kind == kind or cell.exact), key=lambda cell: cell.value):
             hits = found.hits(curve, cell)
             if hits is None or hits.mean() < least - 1e-9:
                 break
             far = cell.value if cell.kind == kind and not cell.exact else far
-        told.append("exact ones alone" if far is None else words.format(far))
+        told.append("exact ones alone" if far is None else words.format(100 * far if kind == "flip" else far))
     return f"within {CLOSE:g} of exact answers up to {told[0]}; up to {told[1]}"
 
 
@@ -212,19 +219,19 @@ def figure(found: Found, args: Arguments, path: Path | None = None) -> Figure:
     check_image(path)
     drawn = Figure(figsize=(10.0, 4.4), layout="constrained")
     left, right = drawn.subplots(1, 2, sharey=True)
-    _panel(left, found, [Cell("every", k) for k in args.every], "steps between answers", "{:g}")
-    _panel(right, found, [Cell("flip", p) for p in args.flip], "answers flipped in each step", "{:.0%}")
+    _panel(left, found, [Cell("every", k) for k in args.every], "steps from one answer to the next")
+    _panel(right, found, [Cell("flip", p) for p in args.flip], "answers flipped in each step, %")
     left.set_ylabel("episodes with success")
     lines, labels = left.get_legend_handles_labels()
     drawn.legend(lines, labels, loc="outside lower center", ncols=4, frameon=False, fontsize=9)
     return saved(drawn, path)
 
 
-def _panel(axes: Axes, found: Found, cells: Sequence[Cell], label: str, ticks: str) -> None:
+def _panel(axes: Axes, found: Found, cells: Sequence[Cell], label: str) -> None:
     for k, curve in enumerate(found.curves):
         known = {place: hits for place, cell in enumerate(cells) if (hits := found.hits(curve, cell)) is not None}
         _curve(axes, known, curve, COLORS[k % len(COLORS)])
-    axes.set_xticks(range(len(cells)), [ticks.format(cell.value) for cell in cells])
+    axes.set_xticks(range(len(cells)), [f"{cell.value * (100 if cell.kind == 'flip' else 1):g}" for cell in cells])
     axes.set_xlabel(label)
     axes.set_ylim(-0.02, 1.02)
     axes.grid(axis="y", color="#dddddd", linewidth=0.6)
@@ -234,11 +241,10 @@ def _panel(axes: Axes, found: Found, cells: Sequence[Cell], label: str, ticks: s
 
 def _curve(axes: Axes, known: Mapping[int, np.ndarray], label: str, color: str) -> None:
     places = list(known)
-    means = [mean_rate(hits) for hits in known.values()]
-    low = [one.value if one.low is None else one.low for one in means]
-    high = [one.value if one.high is None else one.high for one in means]
+    rates = [_rate(hits) for hits in known.values()]
+    low, high = [one.low for one in rates], [one.high for one in rates]
     axes.fill_between(places, low, high, color=color, alpha=0.16, linewidth=0)
-    axes.plot(places, [one.value for one in means], color=color, linewidth=2, marker=".", label=label)
+    axes.plot(places, [one.value for one in rates], color=color, linewidth=2, marker=".", label=label)
 
 
 def main(args: Arguments) -> None:

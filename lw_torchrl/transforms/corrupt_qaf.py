@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -53,12 +54,12 @@ class CorruptQAF(Transform):
         ValueError: a probability or number out of range, a query that no plan has (with the nearest); in use, ``qaf``
             that is absent, of another shape or dtype, or of other plans, or a replay buffer, whose rows do not tell the
             steps of their episodes.
-        RuntimeError: a step of an environment that was never reset.
+        RuntimeError: a step of an environment that was never reset, or not since ``load_state_dict``.
 
     Example:
         >>> import lw_torchrl as lw
         >>> plans = lw.load_plans("MT10")
-        >>> spoilt = lw.CorruptQAF(plans, flip=0.05, drop=["the gripper is near the puck"])
+        >>> spoilt = lw.CorruptQAF(plans, flip=0.05, drop=["the gripper is near the reach target"])
         >>> actor = lw.ScriptedSkillActor(plans)
         >>> lw.evaluate(actor, tasks="reach", episodes_per_task=2, seed=1_000, evaluator=spoilt).success_once
         {'reach': 1.0}
@@ -105,6 +106,11 @@ class CorruptQAF(Transform):
         other: CorruptQAF = super().clone()
         other._start()
         return other
+
+    def _load_from_state_dict(self, *args: Any) -> None:
+        """A step wants a reset first: episodes that were under way are no part of an environment's state."""
+        super()._load_from_state_dict(*args)
+        self._late.forget()
 
     def with_plans(self, plans: Plans | Mapping[str, ConditionalPlan]) -> CorruptQAF:
         """One that spoils the answers of other plans alike; queries that these lack are not dropped."""

@@ -192,7 +192,7 @@ def test_the_specs_know_it():
     env.close()
 
 
-def test_a_collector_that_is_resumed_goes_on_with_the_same_errors():
+def test_an_environment_that_is_resumed_goes_on_with_the_same_errors():
     def make() -> TransformedEnv:
         return both(lw.LanguageWorldEnv(["push", "reach"], seed=3, max_steps=9), flip=0.3, stick=0.2, lag=1)
 
@@ -205,6 +205,15 @@ def test_a_collector_that_is_resumed_goes_on_with_the_same_errors():
     assert not torch.equal(found["qaf"], found["exact"])
     for env in (whole, first, second):
         env.close()
+
+
+def test_errors_under_way_do_not_outlive_a_loaded_state():
+    """Also over an environment that does not ask for a reset itself."""
+    env = TransformedEnv(RandomStates(2), Compose(lw.QAFTransform(PLANS), lw.CorruptQAF(PLANS, lag=1)))
+    state = env.reset()
+    env.load_state_dict(env.state_dict())
+    with pytest.raises(RuntimeError, match=r"not since load_state_dict.*reset the environment"):
+        env.step(state.set("action", torch.zeros(2, 4)))
 
 
 @pytest.mark.parametrize("kind", ["scripted", "pcbc"])
