@@ -80,6 +80,7 @@ if TYPE_CHECKING:  # the table below, for type checkers and editors
     from lw_torchrl.trainers import StackedBehavioralCloning as StackedBehavioralCloning
     from lw_torchrl.trainers import load_actor as load_actor
     from lw_torchrl.trainers import save_actor as save_actor
+    from lw_torchrl.transforms import CorruptQAF as CorruptQAF
     from lw_torchrl.transforms import EnvState as EnvState
     from lw_torchrl.transforms import QAFTransform as QAFTransform
     from lw_torchrl.transforms import RandomYaw as RandomYaw
@@ -111,7 +112,7 @@ _NAMES = {
     "lw_torchrl.trainers": "BehavioralCloningConfig BehavioralCloningTrainer OfflineConfig OfflineTrainer OnlineConfig "
     "OnlineTrainer "
     "StackedBehavioralCloning load_actor save_actor",
-    "lw_torchrl.transforms": "EnvState QAFTransform RandomYaw",
+    "lw_torchrl.transforms": "CorruptQAF EnvState QAFTransform RandomYaw",
 }
 _ROOM = {name: room for room, names in _NAMES.items() for name in names.split()}
 _PACKAGES = (

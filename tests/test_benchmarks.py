@@ -11,9 +11,11 @@ from types import SimpleNamespace
 
 import pytest
 
+import lw_torchrl as lw
 from benchmarks import __main__ as cli
-from benchmarks import ablations, latents
+from benchmarks import ablations, latents, truth
 from benchmarks.report import Row, Skipped, compare, part_of, times_as_long, under
+from lw_torchrl.evaluation import EpisodeResult, EvaluationResult
 
 ROOT = Path(__file__).parent.parent
 
@@ -135,3 +137,49 @@ def test_latents_writes_a_table_of_what_was_run(monkeypatch, tmp_path):
         ("one-shot/strong-latent-contrast-2/pcbc/seed0", 0.0, 2.0),
     ]
     assert "latent_contrast 2" in (tmp_path / "one-shot" / "latents.md").read_text("utf-8")
+
+
+def test_truth_writes_a_table_and_a_figure_and_carries_on(tmp_path, monkeypatch, capsys):
+    plans = lw.Plans({task: lw.load_plans("MT10")[task] for task in ("push", "reach")})
+    file = tmp_path / "untrained.zip"
+    lw.save_actor(lw.PlanConditionedActor(plans, width=8), file)
+    args = truth.Arguments(
+        policy=(file,), tasks=("push", "reach"), every=(1, 4), flip=(0.0, 0.5), episodes=2, max_steps=30, out=tmp_path,
+    )  # fmt: skip
+    truth.main(args)
+    table = (tmp_path / "table.md").read_text("utf-8")
+    head, _, *rows = table.partition("\n\n")[0].splitlines()
+    assert [cell.strip() for cell in head.split("|")[1:4]] == ["answers", "PlanConditionedActor", "scripted skills"]
+    assert [row.split("|")[1].strip() for row in rows] == ["exact", "every 4 steps", "50% flipped"]
+    assert (tmp_path / "truth.png").stat().st_size > 10_000
+    assert table in capsys.readouterr().out
+
+    def again(*given, **options):
+        raise AssertionError("a unit that is done is not done again")
+
+    monkeypatch.setattr(truth.lw, "evaluate", again)
+    truth.main(args)
+    assert (tmp_path / "table.md").read_text("utf-8") == table
+
+
+def test_truth_says_what_an_evaluator_must_reach():
+    cells = [truth.Cell("every", k) for k in (1, 2, 5, 10)] + [truth.Cell("flip", 0.1)]
+    found = truth.Found()
+    for cell, rate in zip(cells, (0.9, 0.9, 0.85, 0.6, 0.5), strict=True):
+        config = {"tasks": ["reach"], "episodes_per_task": 20, "max_steps": 500, "seed": 0}
+        episodes = [
+            EpisodeResult("reach", n, n < 20 * rate, 1 if n < 20 * rate else None, None, None) for n in range(20)
+        ]
+        found.add("a", cell, EvaluationResult(config, tuple(episodes)))
+    said = truth.within(found, "a", cells)
+    assert said == "within 0.05 of exact answers up to answers every 5 steps; up to exact ones alone"
+    assert "| exact          | 0.900 [" in truth.table(found, cells)
+    hits = found.hits("a", cells[2])
+    assert hits is not None
+    assert hits.shape == (20, 1)
+
+
+def test_truth_refuses_a_policy_that_reads_no_answers(tmp_path):
+    lw.save_actor(lw.DescriptorConditionedActor(["reach"], width=8), tmp_path / "dc.zip")
+    with pytest.raises(SystemExit, match=r"dc\.zip does not read qaf"):
+        truth.main(truth.Arguments(policy=(tmp_path / "dc.zip",), out=tmp_path))

@@ -8,8 +8,8 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
+from lw_torchrl._seeding import episode_generator
 from lw_torchrl.data.behaviours import Behaviour
-from lw_torchrl.envs.seeding import episode_generator
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.tasks import task_id
 from lw_torchrl.modules.scripted_skill_actor import ScriptedSkillActor

@@ -2,19 +2,11 @@
 
 from __future__ import annotations
 
-from hashlib import blake2b
-
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl._checks import check_int
-from lw_torchrl.language.tasks import Task, get_task
-
-
-def _hash(purpose: str, task: str | Task, seed: int, episode: int) -> int:
-    name = get_task(task).name
-    text = f"lw_torchrl/{purpose}/{name}/{check_int('seed', seed)}/{check_int('episode', episode, minimum=0)}"
-    return int.from_bytes(blake2b(text.encode(), digest_size=8).digest(), "little") >> 1
+from lw_torchrl._seeding import episode_generator, episode_hash
+from lw_torchrl.language.tasks import Task
 
 
 def episode_seed(task: str | Task, seed: int, episode: int) -> int:
@@ -37,12 +29,7 @@ def episode_seed(task: str | Task, seed: int, episode: int) -> int:
         >>> episode_seed("reach", 0, 1) == episode_seed("reach", 1, 0)
         False
     """
-    return _hash("episode", task, seed, episode)
-
-
-def episode_generator(purpose: str, task: str | Task, seed: int, episode: int) -> np.random.Generator:
-    """A generator of an episode's own for a purpose, at its beginning; other purposes draw from others."""
-    return np.random.Generator(np.random.Philox(_hash(purpose, task, seed, episode)))
+    return episode_hash("episode", task, seed, episode)
 
 
 def action_noise(task: str | Task, seed: int, episode: int, steps: int, hold: int = 1) -> NDArray[np.float32]:

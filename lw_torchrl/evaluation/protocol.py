@@ -136,7 +136,8 @@ def evaluate(
         device: where the actor works: "cpu", "cuda", "cuda:1", "mps", or "auto"; it is moved there, and stays. None for
             where it is. The environment and its queries are always on the CPU.
         evaluator: answers the conditions in the query answering function's place, between it and the actor, as for
-            :func:`attribute_failures`; None for exact truth.
+            :func:`attribute_failures`: a :class:`~lw_torchrl.CorruptQAF` say, or ``QAFTransform(plans, every=5)``; None
+            for exact truth at every step.
         attribute: say of each failed episode why it failed, see :func:`attribute_failures`; these are run again a few
             times.
         reference: trusted plans for the same tasks, with which failed episodes are run again.

@@ -13,7 +13,7 @@ from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase, Transform
 from torchrl.envs.batched_envs import BatchedEnvBase
 
-from lw_torchrl._checks import missing_keys
+from lw_torchrl._checks import check_int, missing_keys
 from lw_torchrl._keys import as_keys, check_apart, key_beside
 from lw_torchrl.language.plan_tables import PlanTables
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
@@ -21,6 +21,7 @@ from lw_torchrl.language.query_program import QueryProgram
 from lw_torchrl.language.task_index import TaskTables
 from lw_torchrl.transforms.containers import base_env, refuse_changed, transforms_beside
 from lw_torchrl.transforms.env_state import KeepsEnvState
+from lw_torchrl.transforms.held_truth import HeldTruth, kept
 
 _HALF = (torch.float16, torch.bfloat16)  # in which metres are not told apart as conditions do
 
@@ -53,15 +54,26 @@ class QAFTransform(KeepsEnvState):
     cannot see it answers wrongly: a transform that changes the observation without naming it among its keys, and one
     in the processes of a ParallelEnv; put it into each worker, before them.
 
+    What answers may be slow. With ``every`` the answers of a row are taken at its reset and then every so many steps of
+    its episode, and held in between; with ``delay`` they come so many steps late: in step t, 0 at the reset, a row is
+    shown those of step every · ⌊max(t - delay, 0) / every⌋. Steps are those of the environment; a ``_step`` or
+    ``_reset`` mask counts for its rows alone. Answers of episodes under way are no part of ``state_dict``, nor are
+    their physics: after ``load_state_dict`` the environment must be reset. Rows of a replay buffer have no such steps:
+    a ``QAFTransform`` with either is refused there.
+
     Args:
         plans: a plan for each task that will be seen.
+        every: steps of a row's episode from one taking of its answers to the next.
+        delay: steps until answers are shown; until then a row is shown those of its reset.
         in_keys: where observation and task_id are, in this order; a key may be nested.
         out_keys: where the truth goes; the plan's number goes beside it, under that name and ``_plan``.
 
     Raises:
         PlanError: (a ValueError) the environment has a task without a plan.
         ValueError: a task_id without a plan, a malformed observation, one of half precision, or a transform before it
-            that changes it.
+            that changes it; ``every`` under 1 or ``delay`` under 0, or either on a replay buffer.
+        RuntimeError: with ``every`` or ``delay``, a step of an environment that was never reset, or not since
+            ``load_state_dict``.
 
     Example:
         >>> from torchrl.envs import TransformedEnv
@@ -78,9 +90,12 @@ class QAFTransform(KeepsEnvState):
         self,
         plans: Plans | Mapping[str, ConditionalPlan],
         *,
+        every: int = 1,
+        delay: int = 0,
         in_keys: Sequence[NestedKey] | None = None,
         out_keys: Sequence[NestedKey] | None = None,
     ) -> None:
+        self.every, self.delay = check_int("every", every, minimum=1), check_int("delay", delay, minimum=0)
         truth = as_keys("out_keys", out_keys, ("qaf",))
         super().__init__(
             in_keys=as_keys("in_keys", in_keys, ("observation", "task_id")),
@@ -91,8 +106,27 @@ class QAFTransform(KeepsEnvState):
         self.program = plan_program(self.plans)
         tables = PlanTables(self.plans)
         self._number = TaskTables(tables.index, _Number(tables.number), f"tasks without a plan in {self.plans!r}")
+        self._held = HeldTruth(self.every, self.delay) if self.every > 1 or self.delay else None
+        self._task: Tensor | None = None  # of each row, since its last reset
         self._beside = 0
         self._saw_workers = False
+
+    def with_plans(self, plans: Plans | Mapping[str, ConditionalPlan]) -> QAFTransform:
+        """One that answers the conditions of other plans as often and as late."""
+        return QAFTransform(plans, every=self.every, delay=self.delay, in_keys=self.in_keys, out_keys=self.out_keys[:1])
+
+    def clone(self) -> QAFTransform:
+        """One for another environment, in which no episode has begun."""
+        other: QAFTransform = super().clone()
+        if self._held is not None:
+            other._held = HeldTruth(self.every, self.delay)
+        return other
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """As :class:`EnvState`; a step wants a reset first."""
+        super().set_extra_state(state)
+        if self._held is not None:
+            self._held.forget()
 
     def _write(self, tensordict: TensorDictBase, task_id: Tensor | None) -> None:
         observation = tensordict.get(self.in_keys[0], None)
@@ -115,10 +149,29 @@ class QAFTransform(KeepsEnvState):
         if not self._saw_workers:  # which a SerialEnv has since its first reset
             refuse_changed(self, self.in_keys[0])
             self._saw_workers = True
-        return self._call(tensordict_reset)
+        begun, task = tensordict.get("_reset", None), tensordict_reset.get(self.in_keys[1], None)
+        self._task = task if task is None else kept(self._task, task, begun)
+        self._write(tensordict_reset, self._task)
+        if self._held is not None:
+            truth = tensordict_reset.get(self.out_keys[0])
+            tensordict_reset.set(self.out_keys[0], self._held.begin(truth, begun))
+        return tensordict_reset
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        next_tensordict = self._call(next_tensordict)
+        if self._held is not None:
+            truth = next_tensordict.get(self.out_keys[0])
+            next_tensordict.set(self.out_keys[0], self._held.go_on(truth, tensordict.get("_step", None)))
+        return next_tensordict
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write both keys, and those of ``next`` where there is a next observation."""
+        if self._held is not None:
+            raise ValueError(
+                f"QAFTransform(every={self.every}, delay={self.delay}) counts the steps of an environment's episodes, "
+                "which rows of a replay buffer do not tell: put it into the environment, whose rows then carry qaf, or "
+                "take QAFTransform(plans) here, which answers each row in its own state"
+            )
         if (beside := transforms_beside(self)) != self._beside:  # something was put there later
             refuse_changed(self, self.in_keys[0])
             self._beside = beside

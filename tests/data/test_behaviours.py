@@ -15,13 +15,13 @@ from mutations import mutated
 from tensordict import TensorDict
 
 import lw_torchrl as lw
+from lw_torchrl._seeding import episode_generator
 from lw_torchrl.data import BEHAVIOURS, Behaviour, CollectConfig, DatasetError, missing_episodes
 from lw_torchrl.data.behaviours import behaviour_of, policy_fingerprint, segment_plans
 from lw_torchrl.data.metadata import parse_config, read_metadata
 from lw_torchrl.data.rows import load_rows
 from lw_torchrl.data.segment_actor import SegmentActor
 from lw_torchrl.envs.episodes import run_episodes
-from lw_torchrl.envs.seeding import episode_generator
 from lw_torchrl.language.tasks import task_id
 from lw_torchrl.trainers import BehavioralCloningConfig, BehavioralCloningTrainer
 from lw_torchrl.trainers.checkpoint import demonstrated_tasks, demonstration_seeds

@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, LazyTensorStorage, SamplerWithoutReplacement, TensorDictReplayBuffer
-from torchrl.envs import Compose, InitTracker, StepCounter, TransformedEnv
+from torchrl.envs import Compose, InitTracker, SerialEnv, StepCounter, TransformedEnv
 
 import lw_torchrl as lw
 
@@ -111,6 +111,18 @@ def test_masked_rows_keep_their_answers(env):
     assert not torch.equal(state["qaf"][mask], first["qaf"][mask])
     assert torch.equal(fresh["qaf"][~mask], state["qaf"][~mask])
     assert torch.equal(fresh["qaf"], answers(fresh["observation"], fresh["task_id"]))
+
+
+def test_some_rows_of_a_worker_are_reset(few_plans):
+    def make() -> lw.LanguageWorldEnv:
+        return lw.LanguageWorldEnv(["push", "reach"], seed=0, max_steps=9)
+
+    env = TransformedEnv(SerialEnv(2, make), lw.QAFTransform(few_plans))
+    state = env.step(env.reset().set("action", torch.zeros(2, 2, 4)))["next"]
+    fresh = env.reset(state.clone().set("_reset", torch.tensor([[False, True], [False, False]])))
+    assert fresh["episode"].tolist() == [[0, 2], [1, 1]]
+    assert torch.equal(fresh["qaf"], answers(fresh["observation"], fresh["task_id"]))
+    env.close()
 
 
 def test_other_transforms_go_beside_it(few_plans):

@@ -1,0 +1,273 @@
+"""python -m benchmarks.truth: success against how seldom the conditions are answered, and against wrong answers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from hashlib import sha256
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import torch
+import tyro
+
+import lw_torchrl as lw
+from lw_torchrl._files import write_text
+from lw_torchrl.evaluation import EvaluationResult, count_solved
+from lw_torchrl.evaluation.comparison import markdown_table
+from lw_torchrl.evaluation.figures import COLORS, check_image, saved, wilson_interval
+from lw_torchrl.evaluation.statistics import Estimate
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+CLOSE = 0.05
+"""What success may be lost for an evaluator still to be useful."""
+
+
+class Cell(NamedTuple):
+    """How the conditions are answered."""
+
+    kind: str
+    """"every" so many steps, or each answer's "flip" with this probability."""
+    value: float
+
+    @property
+    def exact(self) -> bool:
+        """Whether they are answered as they are without anything."""
+        return self == ("every", 1) or self == ("flip", 0)
+
+    @property
+    def name(self) -> str:
+        if self.exact:
+            return "exact"
+        return f"every {self.value:g} steps" if self.kind == "every" else f"{100 * self.value:g}% flipped"
+
+    def evaluator(self, plans: lw.Plans, seed: int) -> Any:
+        """What answers in the query answering function's place; None for itself."""
+        if self.exact:
+            return None
+        if self.kind == "every":
+            return lw.QAFTransform(plans, every=int(self.value))
+        return lw.CorruptQAF(plans, flip=self.value, seed=seed)
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Evaluate policies whose conditions are answered now and then, or wrongly. Stopped and started again it carries
+    on. All see the same episodes, with the same noise.
+    """
+
+    policy: tuple[Path, ...] = ()
+    """Policies' files; those of one kind, of several training seeds say, are one curve."""
+    scripted: bool = True
+    """Evaluate scripted skills too."""
+    plans: str = "MT50"
+    """Of the scripted skills: MT10, MT50, a file or a folder."""
+    tasks: tuple[str, ...] = lw.MT10
+    """Tasks; of a policy, those that it knows."""
+    every: tuple[int, ...] = (1, 2, 5, 10, 25, 50)
+    """Steps from one answer to the next."""
+    flip: tuple[float, ...] = (0.0, 0.01, 0.05, 0.1, 0.2)
+    """Probability that an answer is flipped, in each step anew."""
+    episodes: int = 20
+    """Of each task and seed."""
+    seeds: tuple[int, ...] = (2000,)
+    """Of the episodes; none that demonstrations were collected with."""
+    max_steps: int = 500
+    """Steps of an episode."""
+    noise: float = 0.1
+    """Standard deviation of the action noise."""
+    quick: bool = False
+    """Two tasks, two short episodes, two points a curve: it runs, its figures mean nothing."""
+    out: Path = Path("runs/truth")
+    """Folder for the result of each unit, table.md and truth.png."""
+
+    @property
+    def cells(self) -> list[Cell]:
+        """All that is done, exact answers first and once."""
+        found = [Cell("every", k) for k in self.every] + [Cell("flip", p) for p in self.flip]
+        return sorted({cell.name: cell for cell in found}.values(), key=lambda cell: not cell.exact)
+
+
+class Acting(NamedTuple):
+    """Who acts: the curve it belongs to, a name of its own, and the actor."""
+
+    curve: str
+    name: str
+    actor: Any
+
+
+def acting(args: Arguments) -> list[Acting]:
+    """Policies by their files, and scripted skills."""
+    found = []
+    for file in args.policy:
+        actor = lw.load_actor(file)
+        if "qaf" not in actor.in_keys:
+            raise SystemExit(f"--policy: {file} does not read qaf, so it feels no answers: {actor.in_keys}")
+        name = f"{file.stem}-{sha256(file.read_bytes()).hexdigest()[:8]}"
+        found.append(Acting(str(actor.describe()["kind"]), name, actor))
+    if args.scripted:
+        loaded = lw.load_plans(args.plans)
+        loaded.require(args.tasks)
+        plans = lw.Plans({task: loaded[task] for task in args.tasks})
+        found.append(Acting("scripted skills", f"scripted-{plans.fingerprint[:8]}", lw.ScriptedSkillActor(plans)))
+    return found
+
+
+def run_unit(one: Acting, cell: Cell, seed: int, args: Arguments) -> EvaluationResult:
+    """One actor under one kind of answers, read if it was done before."""
+    folder = f"seed-{seed}-{args.episodes}-episodes-{args.max_steps}-steps-noise-{args.noise:g}"
+    file = args.out / folder / f"{one.name}, {cell.name}.json"
+    tasks = [task for task in args.tasks if task in one.actor.tasks]
+    if file.is_file() and (found := EvaluationResult.load(file)).config["tasks"] == tasks:
+        return found
+    result = lw.evaluate(
+        one.actor,
+        tasks=tasks,
+        episodes_per_task=args.episodes,
+        seed=seed,
+        noise_scale=args.noise,
+        max_steps=args.max_steps,
+        stop_at_success=True,
+        evaluator=cell.evaluator(one.actor.plans, seed),
+        progress=False,
+    )
+    file.parent.mkdir(parents=True, exist_ok=True)
+    result.save(file)
+    return result
+
+
+class Found:
+    """The results of each curve and cell, which are of the same tasks."""
+
+    def __init__(self) -> None:
+        self._by: dict[str, dict[str, list[EvaluationResult]]] = {}
+
+    def add(self, curve: str, cell: Cell, result: EvaluationResult) -> None:
+        self._by.setdefault(curve, {}).setdefault(cell.name, []).append(result)
+
+    @property
+    def curves(self) -> list[str]:
+        return list(self._by)
+
+    def hits(self, curve: str, cell: Cell) -> np.ndarray | None:
+        """(episodes, tasks) of 0 and 1, of all policies and seeds; None where nothing was done yet."""
+        results = self._by[curve].get(cell.name)
+        return None if results is None else np.concatenate([_hits(result) for result in results])
+
+    def tasks(self, curve: str) -> list[str]:
+        return list(next(iter(self._by[curve].values()))[0].config["tasks"])
+
+
+def _hits(result: EvaluationResult) -> np.ndarray:
+    by_task = {task: [e.success for e in result.episodes if e.task == task] for task in result.config["tasks"]}
+    return np.array(list(by_task.values()), dtype=np.float64).T
+
+
+def _rate(hits: np.ndarray) -> Estimate:
+    """The mean of the tasks, which have as many episodes each, with Wilson's interval of all episodes: a little wide,
+    since tasks differ, and no mere point where all succeed. It is of these policies, not of others trained alike."""
+    return Estimate(float(hits.mean()), *wilson_interval(int(hits.sum()), hits.size))
+
+
+def table(found: Found, cells: Sequence[Cell]) -> str:
+    """Means with intervals, what that asks of an evaluator, and each task's rates."""
+    head, rows = ["answers", *found.curves, *(f"tasks >= 0.8, {curve}" for curve in found.curves)], []
+    for cell in cells:
+        hits = [found.hits(curve, cell) for curve in found.curves]
+        means = ["" if one is None else str(_rate(one)) for one in hits]
+        solved = ["" if one is None else str(count_solved(one)) for one in hits]
+        rows.append([cell.name, *means, *solved])
+    text = markdown_table(head, rows) + "\n\n"
+    for curve in found.curves:
+        text += f"{curve}: {within(found, curve, cells)}  \n"
+    for curve in found.curves:
+        done = [(cell, hits) for cell in cells if (hits := found.hits(curve, cell)) is not None]
+        rates = [
+            [task, *(f"{hits[:, place].mean():.2f}" for _, hits in done)]
+            for place, task in enumerate(found.tasks(curve))
+        ]
+        text += "\n" + markdown_table([curve, *(cell.name for cell, _ in done)], rates) + "\n"
+    return text
+
+
+def within(found: Found, curve: str, cells: Sequence[Cell]) -> str:
+    """How seldom and how wrong the answers may be for little to be lost, in words."""
+    exact = next((found.hits(curve, cell) for cell in cells if cell.exact), None)
+    if exact is None:
+        return "exact answers were not asked for"
+    least = exact.mean() - CLOSE
+    told = []
+    for kind, words in (("every", "answers every {:g} steps"), ("flip", "{:g}% flipped")):
+        far: float | None = None
+        for cell in sorted((cell for cell in cells if cell.kind == kind or cell.exact), key=lambda cell: cell.value):
+            hits = found.hits(curve, cell)
+            if hits is None or hits.mean() < least - 1e-9:
+                break
+            far = cell.value if cell.kind == kind and not cell.exact else far
+        told.append("exact ones alone" if far is None else words.format(100 * far if kind == "flip" else far))
+    return f"within {CLOSE:g} of exact answers up to {told[0]}; up to {told[1]}"
+
+
+def figure(found: Found, args: Arguments, path: Path | None = None) -> Figure:
+    """Success against both, a line for each curve, its 95 % interval shaded."""
+    from matplotlib.figure import Figure
+
+    check_image(path)
+    drawn = Figure(figsize=(10.0, 4.4), layout="constrained")
+    left, right = drawn.subplots(1, 2, sharey=True)
+    _panel(left, found, [Cell("every", k) for k in args.every], "steps from one answer to the next")
+    _panel(right, found, [Cell("flip", p) for p in args.flip], "answers flipped in each step, %")
+    left.set_ylabel("episodes with success")
+    lines, labels = left.get_legend_handles_labels()
+    drawn.legend(lines, labels, loc="outside lower center", ncols=4, frameon=False, fontsize=9)
+    return saved(drawn, path)
+
+
+def _panel(axes: Axes, found: Found, cells: Sequence[Cell], label: str) -> None:
+    for k, curve in enumerate(found.curves):
+        known = {place: hits for place, cell in enumerate(cells) if (hits := found.hits(curve, cell)) is not None}
+        _curve(axes, known, curve, COLORS[k % len(COLORS)])
+    axes.set_xticks(range(len(cells)), [f"{cell.value * (100 if cell.kind == 'flip' else 1):g}" for cell in cells])
+    axes.set_xlabel(label)
+    axes.set_ylim(-0.02, 1.02)
+    axes.grid(axis="y", color="#dddddd", linewidth=0.6)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def _curve(axes: Axes, known: Mapping[int, np.ndarray], label: str, color: str) -> None:
+    places = list(known)
+    rates = [_rate(hits) for hits in known.values()]
+    low, high = [one.low for one in rates], [one.high for one in rates]
+    axes.fill_between(places, low, high, color=color, alpha=0.16, linewidth=0)
+    axes.plot(places, [one.value for one in rates], color=color, linewidth=2, marker=".", label=label)
+
+
+def main(args: Arguments) -> None:
+    if args.quick:
+        args = replace(
+            args, tasks=args.tasks[:2], every=(1, 5), flip=(0.0, 0.2), episodes=2, seeds=args.seeds[:1], max_steps=150,
+        )  # fmt: skip
+    everyone, found = acting(args), Found()
+    if not everyone:
+        raise SystemExit("nobody acts: give --policy FILE, or leave out --no-scripted")
+    total, done = len(args.cells) * len(everyone) * len(args.seeds), 0
+    for cell in args.cells:
+        for one in everyone:
+            for seed in args.seeds:
+                result = run_unit(one, cell, seed, args)
+                found.add(one.curve, cell, result)
+                done += 1
+                print(f"[{done}/{total}] {one.name}, {cell.name}, seed {seed}: {result.mean_success:.3f}", flush=True)
+        write_text(args.out / "table.md", table(found, args.cells))
+    figure(found, args, args.out / "truth.png")
+    print(f"\n{table(found, args.cells)}\nwritten to {args.out / 'table.md'} and {args.out / 'truth.png'}")
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    main(tyro.cli(Arguments))

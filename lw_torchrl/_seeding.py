@@ -1,0 +1,22 @@
+"""What is drawn for an episode: a function of (purpose, task, seed, episode), for every room."""
+
+from __future__ import annotations
+
+from hashlib import blake2b
+
+import numpy as np
+
+from lw_torchrl._checks import check_int
+from lw_torchrl.language.tasks import Task, get_task
+
+
+def episode_hash(purpose: str, task: str | Task, seed: int, episode: int) -> int:
+    """A number in [0, 2**63), stable, another for each purpose, task, seed and episode."""
+    name = get_task(task).name
+    text = f"lw_torchrl/{purpose}/{name}/{check_int('seed', seed)}/{check_int('episode', episode, minimum=0)}"
+    return int.from_bytes(blake2b(text.encode(), digest_size=8).digest(), "little") >> 1
+
+
+def episode_generator(purpose: str, task: str | Task, seed: int, episode: int) -> np.random.Generator:
+    """A generator of an episode's own for a purpose, at its beginning; other purposes draw from others."""
+    return np.random.Generator(np.random.Philox(episode_hash(purpose, task, seed, episode)))

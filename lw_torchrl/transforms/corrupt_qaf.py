@@ -1,0 +1,239 @@
+"""CorruptQAF: answers that are wrong on purpose, as a bad evaluator's are."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.data import Composite, TensorSpec
+from torchrl.envs import Transform
+
+from lw_torchrl._checks import check_int, check_probability, missing_keys, shown, unknown_name
+from lw_torchrl._keys import as_keys, read
+from lw_torchrl._seeding import episode_generator
+from lw_torchrl.language.plan_tables import PlanTables
+from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
+from lw_torchrl.language.queries import Query, read_query
+from lw_torchrl.transforms.held_truth import HeldTruth, kept
+from lw_torchrl.transforms.qaf import plan_number_key
+
+_BLOCK = 64  # steps of an episode whose draws are made at once
+
+
+class CorruptQAF(Transform):
+    """Spoils ``qaf`` in an environment, behind a :class:`QAFTransform`, to measure what wrong answers cost.
+
+    Reads ``qaf`` (B, S) bool, ``task_id`` (B,) and ``episode`` (B,) int64, and ``qaf_plan`` (B,) int64 where it is;
+    writes ``qaf`` alone. What is asked for is done in this order:
+
+    - **lag**: a row is shown the answers of ``lag`` steps ago, until then those of its reset;
+    - **stick**: in each step each answer stays, with this probability, what it was the step before;
+    - **flip**: in each step, the reset's state included, each answer is shown as its opposite, with this probability;
+      what sticks is the answer itself, not its opposite;
+    - **drop**: the answers to these queries are always false.
+
+    Padding stays false. What is drawn for an answer hangs on (task, seed, episode, step) and the answer's place in its
+    plan, not on the number of environments nor on the tasks beside; of two probabilities the greater one spoils what
+    the smaller one spoils, and more. In :func:`lw_torchrl.evaluate` it is an ``evaluator``. A policy with a
+    :class:`QueryEvaluator` of its own does not read ``qaf``, and feels nothing.
+
+    Args:
+        plans: whose conditions ``qaf`` answers.
+        flip: probability, from 0 to 1.
+        stick: probability, from 0 to 1.
+        lag: steps.
+        drop: conditions of the plans in any spelling, each dropped in all plans that have it.
+        seed: any integer, of what is drawn.
+        in_keys: where qaf, task_id and episode are, in this order; qaf is written where it was.
+
+    Raises:
+        ValueError: a probability or number out of range, a query that no plan has (with the nearest); in use, ``qaf``
+            that is absent, of another shape or dtype, or of other plans, or a replay buffer, whose rows do not tell the
+            steps of their episodes.
+        RuntimeError: a step of an environment that was never reset, or not since ``load_state_dict``.
+
+    Example:
+        >>> import lw_torchrl as lw
+        >>> plans = lw.load_plans("MT10")
+        >>> spoilt = lw.CorruptQAF(plans, flip=0.05, drop=["the gripper is near the reach target"])
+        >>> actor = lw.ScriptedSkillActor(plans)
+        >>> lw.evaluate(actor, tasks="reach", episodes_per_task=2, seed=1_000, evaluator=spoilt).success_once
+        {'reach': 1.0}
+
+    Source: the paper names a visual question answering model as a query answering function; such a one errs.
+    """
+
+    def __init__(
+        self,
+        plans: Plans | Mapping[str, ConditionalPlan],
+        *,
+        flip: float = 0.0,
+        stick: float = 0.0,
+        lag: int = 0,
+        drop: Iterable[str | Query] = (),
+        seed: int = 0,
+        in_keys: Sequence[NestedKey] | None = None,
+    ) -> None:
+        keys = as_keys("in_keys", in_keys, ("qaf", "task_id", "episode"))
+        super().__init__(in_keys=keys, out_keys=keys[:1])
+        self.plans = as_plans(plans)
+        self.flip, self.stick = check_probability("flip", flip), check_probability("stick", stick)
+        self.lag, self.seed = check_int("lag", lag, minimum=0), check_int("seed", seed)
+        self.drop = _as_texts(drop)
+        self._tables = PlanTables(self.plans)
+        self._answered = self._tables.mask.clone()
+        for text in self.drop:
+            if not (dropped := _steps_with(text, self._tables, self.plans)).any():
+                conditions = {str(step.condition) for plan in self.plans.values() for step in plan.steps}
+                raise unknown_name("drop", text, sorted(conditions))
+            self._answered &= ~dropped
+        self._start()
+
+    def _start(self) -> None:
+        self._late = HeldTruth(delay=self.lag)
+        self._before: Tensor | None = None  # (B, S) bool, what sticks
+        self._task: Tensor | None = None  # B int64, of the rows' episodes
+        self._episode: Tensor | None = None
+        self._rows: Tensor | None = None  # B int64, where their plans are in the tables
+        self._draws = {purpose: _Draws(purpose, self.seed, self._tables, self.plans) for purpose in ("stick", "flip")}
+
+    def clone(self) -> CorruptQAF:
+        """One for another environment, in which no episode has begun."""
+        other: CorruptQAF = super().clone()
+        other._start()
+        return other
+
+    def _load_from_state_dict(self, *args: Any) -> None:
+        """A step wants a reset first: episodes that were under way are no part of an environment's state."""
+        super()._load_from_state_dict(*args)
+        self._late.forget()
+
+    def with_plans(self, plans: Plans | Mapping[str, ConditionalPlan]) -> CorruptQAF:
+        """One that spoils the answers of other plans alike; queries that these lack are not dropped."""
+        other = as_plans(plans)
+        dropped = [text for text in self.drop if _steps_with(text, PlanTables(other), other).any()]
+        return CorruptQAF(
+            other, flip=self.flip, stick=self.stick, lag=self.lag, drop=dropped, seed=self.seed, in_keys=self.in_keys
+        )
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        truth, task, episode = read(tensordict_reset, self.in_keys)
+        begun = tensordict.get("_reset", None)
+        self._task, self._episode = kept(self._task, task, begun), kept(self._episode, episode, begun)
+        self._rows = self._tables.rows(self._task)
+        number = tensordict_reset.get(plan_number_key(self.in_keys[0]), None)
+        if number is not None and bool(((number != self._tables.number[self._rows]) & (number != 0)).any()):
+            raise ValueError("qaf answers other plans than CorruptQAF was given: give both the same plans")
+        self._check(truth)
+        shown = self._late.begin(truth, begun)
+        if begun is not None and self._before is not None and self._before.shape == shown.shape:
+            shown = torch.where(begun.reshape(task.shape).unsqueeze(-1), shown, self._before)
+        self._before = shown
+        return tensordict_reset.set(self.in_keys[0], self._spoilt(shown))
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        truth, moved = next_tensordict.get(self.in_keys[0]), tensordict.get("_step", None)
+        now = self._late.go_on(truth, moved)
+        if self.stick:
+            assert self._before is not None
+            sticks = self._drawn("stick") < self.stick
+            if moved is not None:
+                sticks |= ~moved.reshape(sticks.shape[:-1]).unsqueeze(-1)
+            now = torch.where(sticks, self._before, now)
+        self._before = now
+        return next_tensordict.set(self.in_keys[0], self._spoilt(now))
+
+    def _check(self, truth: Tensor) -> None:
+        assert self._rows is not None
+        shape = (*self._rows.shape, self.plans.num_steps)
+        if truth.dtype != torch.bool or truth.shape != shape:
+            raise ValueError(
+                f"qaf must be bool of shape {shape}, a column for each step of the longest of plans, got {truth.dtype} "
+                f"of shape {tuple(truth.shape)}"
+            )
+
+    def _drawn(self, purpose: str) -> Tensor:
+        assert self._rows is not None
+        assert self._episode is not None
+        return self._draws[purpose](self._rows, self._episode, self._late.step)
+
+    def _spoilt(self, answers: Tensor) -> Tensor:
+        if self.flip:
+            answers = answers ^ (self._drawn("flip") < self.flip)
+        return answers & self._answered[self._rows]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Refused: rows of a buffer do not tell the steps of their episodes."""
+        raise ValueError(
+            "CorruptQAF counts the steps of an environment's episodes, which rows of a replay buffer do not tell: put "
+            "it into the environment, behind QAFTransform, or give it to evaluate(evaluator=...)"
+        )
+
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        """Leaves the specs as they are, which must have what is read."""
+        assert isinstance(observation_spec, Composite)
+        found = list(observation_spec.keys(True, True))
+        if any(key not in found for key in self.in_keys):
+            raise missing_keys(found, *map(str, self.in_keys))
+        return observation_spec
+
+
+class _Draws:
+    """Uniform numbers for the answers of rows, in blocks of steps: (task, seed, episode, block) says which.
+
+    Args:
+        purpose: what they are for.
+        seed: of them.
+        tables: of the plans.
+        plans: the plans.
+    """
+
+    def __init__(self, purpose: str, seed: int, tables: PlanTables, plans: Plans) -> None:
+        self._purpose, self._seed = purpose, seed
+        self._plans = [plans[task] for task in tables.index.tasks]
+        self._width = plans.num_steps
+        self._which = torch.empty(0, 3, dtype=torch.int64)  # the row of the tables, episode and block of each row
+        self._drawn = torch.empty(0, _BLOCK, self._width)
+
+    def __call__(self, rows: Tensor, episode: Tensor, step: Tensor) -> Tensor:
+        """Rows of the tables, their episodes and their steps, each B int64, to (B, S) float64 in [0, 1)."""
+        which = torch.stack([one.reshape(-1).cpu() for one in (rows, episode, step // _BLOCK)], -1)
+        if which.shape != self._which.shape:
+            self._which = torch.full_like(which, -1)
+            self._drawn = torch.ones(len(which), _BLOCK, self._width, dtype=torch.float64)
+        if not torch.equal(which, self._which):
+            for place in (which != self._which).any(-1).nonzero().flatten().tolist():
+                row, number, block = which[place].tolist()
+                if number < 0:  # never reset
+                    continue
+                plan = self._plans[row]
+                purpose = f"answers/{self._purpose}/{block}"
+                drawn = episode_generator(purpose, plan.definition, self._seed, number)
+                steps = len(plan.steps)
+                self._drawn[place, :, :steps] = torch.from_numpy(drawn.random((_BLOCK, steps)))
+            self._which = which
+        found = self._drawn[torch.arange(len(which)), step.reshape(-1).cpu() % _BLOCK]
+        return found.reshape(*step.shape, -1).to(step.device)
+
+
+def _as_texts(drop: Iterable[str | Query]) -> tuple[str, ...]:
+    if isinstance(drop, (str, Query)) or not isinstance(drop, Iterable):
+        raise TypeError(f"drop must be a list of queries, got {shown(drop)}")
+    texts = tuple(str(one) if isinstance(one, (str, Query)) else one for one in drop)
+    if wrong := [text for text in texts if not isinstance(text, str)]:
+        raise TypeError(f"drop must be a list of queries, got {shown(wrong[0])} in it")
+    return texts
+
+
+def _steps_with(text: str, tables: PlanTables, plans: Plans) -> Tensor:
+    """(T, S) bool, the steps of the tables that have the condition."""
+    found = torch.zeros_like(tables.mask)
+    for row, task in enumerate(tables.index.tasks):
+        query = read_query(text, plans[task].definition)
+        for column, step in enumerate(plans[task].steps):
+            found[row, column] = step.condition == query
+    return found
