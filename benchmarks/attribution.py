@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from random import Random
 from time import perf_counter
@@ -15,6 +15,7 @@ import tyro
 
 import lw_torchrl as lw
 from benchmarks.faults import Clumsy, Liar, denied, spoilt_skills, without
+from lw_torchrl._checks import check_choice
 from lw_torchrl._files import write_json, write_text
 from lw_torchrl.data import collect_demonstrations
 from lw_torchrl.evaluation import CAUSES, attribute_failures, plot_failures
@@ -23,6 +24,7 @@ from lw_torchrl.evaluation.comparison import markdown_table
 REFERENCE = Path(__file__).parent / "data" / "attribution_plans.json"
 SINGLE = {"wrong condition": "plan", "missing step": "plan", "wrong offset": "skill", "lying evaluator": "query"}
 """What is planted, and its cause."""
+PLANTED = ("button-press-topdown", "drawer-open", "handle-press", "plate-slide", "push")
 PAIRS = (
     ("lying evaluator", "wrong condition"),
     ("lying evaluator", "wrong offset"),
@@ -51,8 +53,9 @@ class Arguments:
     With --policy it plants nothing: it prints the causes of a policy's own failures, and some of them to look at.
     """
 
-    tasks: tuple[str, ...] = ("button-press-topdown", "drawer-open", "handle-press", "plate-slide", "push")
-    """Tasks; for planted faults, of those that benchmarks/data/attribution_plans.json has."""
+    tasks: tuple[str, ...] = ()
+    """Tasks, of those that benchmarks/data/attribution_plans.json has, for planted faults five of them if none is named;
+    with --policy of the policy's, all if none is."""
     episodes: int = 20
     """Of each task, fault and step."""
     seed: int = 2000
@@ -236,7 +239,7 @@ def own_failures(args: Arguments) -> None:
     """The causes of a policy's failures that nobody planted."""
     assert args.policy is not None
     actor = lw.load_actor(args.policy)
-    tasks = [task for task in actor.tasks if task in args.tasks] or list(actor.tasks)
+    tasks = [check_choice("tasks", task, actor.tasks) for task in args.tasks] or list(actor.tasks)
     start = perf_counter()
     result = lw.evaluate(
         actor,
@@ -261,11 +264,10 @@ def own_failures(args: Arguments) -> None:
 
 
 def main(args: Arguments) -> None:
+    if args.policy is None and not args.tasks:
+        args = replace(args, tasks=PLANTED)
     if args.quick:
-        args = Arguments(
-            tasks=args.tasks[:2], episodes=2, seed=args.seed, max_steps=100, policies=args.policies, quick=True,
-            out=args.out, policy=args.policy, reference=args.reference, look_at=args.look_at,
-        )  # fmt: skip
+        args = replace(args, tasks=args.tasks[:2], episodes=2, max_steps=100)
     planted(args) if args.policy is None else own_failures(args)
 
 
