@@ -54,8 +54,8 @@ class Arguments:
     """
 
     tasks: tuple[str, ...] = ()
-    """Tasks, of those that benchmarks/data/attribution_plans.json has, for planted faults five of them if none is named;
-    with --policy of the policy's, all if none is."""
+    """Tasks, of those that benchmarks/data/attribution_plans.json has: five if none is named for planted
+    faults. With --policy of the policy's, all of them if none is named."""
     episodes: int = 20
     """Of each task, fault and step."""
     seed: int = 2000
