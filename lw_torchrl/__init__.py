@@ -115,9 +115,9 @@ _NAMES = {
     "SkillLatentLoss standardize_by_task",
     "lw_torchrl.planners": "FilePlanner OpenAIPlanner Planner PlannerError plan_prompt",
     "lw_torchrl.record": "RerunLogger RolloutRecorder log_rollout",
-    "lw_torchrl.trainers": "BehavioralCloningConfig BehavioralCloningTrainer LabelledQueries OfflineConfig OfflineTrainer "
-    "OnlineConfig OnlineTrainer QueryEvaluatorConfig QueryEvaluatorTrainer StackedBehavioralCloning load_actor "
-    "load_evaluator save_actor save_evaluator",
+    "lw_torchrl.trainers": "BehavioralCloningConfig BehavioralCloningTrainer LabelledQueries OfflineConfig "
+    "OfflineTrainer OnlineConfig OnlineTrainer QueryEvaluatorConfig QueryEvaluatorTrainer StackedBehavioralCloning "
+    "load_actor load_evaluator save_actor save_evaluator",
     "lw_torchrl.transforms": "EnvState QAFTransform RandomYaw",
 }
 _ROOM = {name: room for room, names in _NAMES.items() for name in names.split()}

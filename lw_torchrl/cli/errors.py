@@ -19,6 +19,7 @@ OWN_NAMES = {
     },
     "data": {"root": "folders"},
     "train": {"root": "data", "checkpoint": "out", "task": "tasks"},
+    "train-evaluator": {"episodes_per_task": "episodes", "root": "out", "checkpoint": "out", "task": "tasks"},
     "evaluate": {"episodes_per_task": "episodes", "noise_scale": "noise", "task": "tasks"},
     "view": {"path": "recording"},
     "scripted": {"episodes_per_task": "episodes", "noise_scale": "noise", "tasks": "names", "task": "names"},

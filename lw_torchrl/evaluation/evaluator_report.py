@@ -51,8 +51,8 @@ class PartScore:
         return sum(sum(self.right[name]) for name in names) / sum(sum(self.asked[name]) for name in names)
 
     def balanced_accuracy(self, predicate: str | None = None) -> float:
-        """The mean of the shares of right answers where the predicate holds and where it does not; of a truth that never
-        comes there is none."""
+        """The mean of the shares of right answers where the predicate holds and where it does not; of a truth that
+        never comes there is none."""
         names = list(self.asked) if predicate is None else [predicate]
         pairs = [[sum(table[name][truth] for name in names) for table in (self.right, self.asked)] for truth in (0, 1)]
         shares = [right / asked for right, asked in pairs if asked]

@@ -12,10 +12,10 @@ from lw_torchrl._checks import check_int
 from lw_torchrl.language.observation import OPENING, POSITIONS
 from lw_torchrl.modules.clauses import Clauses
 from lw_torchrl.modules.networks import text_to_latent
-from lw_torchrl.modules.observation_features import squash
 
 MOST = 30.0
 """The size of the largest logit of a clause: a probability of 1e-13."""
+_SCALES = (0.005, 0.02, 0.1, 0.5)  # metres: where the squashed copies of d bend
 _SLOTS = len(POSITIONS) + 2  # the opening, and nothing, beside the positions
 
 
@@ -66,7 +66,7 @@ class ClauseNetwork(nn.Module):
         check_int("depth", depth, minimum=1)
         self.width, self.reads_text = width, not predicates
         self.trunk = MLP(
-            in_features=9,
+            in_features=3 * len(_SCALES),
             out_features=width,
             num_cells=[width] * (depth - 1),
             activation_class=nn.ReLU,
@@ -93,7 +93,7 @@ class ClauseNetwork(nn.Module):
             d, asked = self._from_text(observation, self.texts(text_vectors)[clauses.text])
         else:
             d, asked = _difference(observation, clauses), self.predicates.weight[clauses.predicate]
-        features = torch.cat((d, *squash(d)), -1)
+        features = torch.cat([torch.tanh(d / scale) for scale in _SCALES], -1)
         logits = (self.trunk(features) * asked[..., :-1]).sum(-1) / sqrt(self.width) + asked[..., -1]
         if not self.reads_text:
             logits = torch.where(clauses.negated, -logits, logits)

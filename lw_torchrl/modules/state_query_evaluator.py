@@ -68,7 +68,7 @@ class StateQueryEvaluator(QueryEvaluator):
         *,
         structure: bool = True,
         width: int = 128,
-        depth: int = 2,
+        depth: int = 3,
         predicates: Sequence[str] | None = None,
         text_encoder: TextEncoder | None = None,
     ) -> None:

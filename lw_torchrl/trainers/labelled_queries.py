@@ -1,4 +1,4 @@
-"""LabelledQueries: the base queries of tasks in the states of a dataset, with the query answering function's answers."""
+"""LabelledQueries: the base queries of tasks in a dataset's states, with the query answering function's answers."""
 
 from __future__ import annotations
 
@@ -162,10 +162,9 @@ def _drawn_tasks(asked: int | tuple[str, ...], names: Sequence[str], generator: 
     if number >= len(names):
         raise ValueError(f"held_out_tasks must leave tasks to train on, got {number} of {len(names)}")
     if isinstance(asked, int):
-        return tuple(
-            sorted(names[place] for place in torch.randperm(len(names), generator=generator)[:number].tolist())
-        )
-    return tuple(sorted(check_choice("held_out_tasks", name, names) for name in asked))
+        drawn = torch.randperm(len(names), generator=generator)[:number].tolist()
+        return tuple(sorted(names[place] for place in drawn))
+    return tuple(sorted({check_choice("held_out_tasks", name, names) for name in asked}))
 
 
 def _drawn_pairs(share: float, tasks: Sequence[Task], generator: torch.Generator) -> tuple[tuple[str, str], ...]:

@@ -23,6 +23,7 @@ COMMANDS = (
     "collect",
     "data",
     "train",
+    "train-evaluator",
     "evaluate",
     "record",
     "view",
