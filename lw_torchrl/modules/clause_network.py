@@ -112,7 +112,8 @@ class ClauseNetwork(nn.Module):
             ],
             -2,
         )
-        return (first.softmax(-1) - second.softmax(-1)) @ slots + 0.1 * shift, asked
+        chosen = (first.softmax(-1) - second.softmax(-1)).unsqueeze(-1) * slots.unsqueeze(-3)
+        return chosen.sum(-2) + 0.1 * shift, asked
 
 
 def _difference(observation: Tensor, clauses: Clauses) -> Tensor:

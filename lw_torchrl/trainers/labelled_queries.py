@@ -28,7 +28,7 @@ class QueryEvaluatorConfig:
         learning_rate: AdamW's at the start; a cosine brings it to 0.
         weight_decay: AdamW's.
         states_per_task: at most so many of each task are labelled to train on, drawn from its rows.
-        held_out_states: the share of each dataset's episodes of a task whose states are not trained on.
+        held_out_states: the share of a task's episodes, by their numbers, whose states are not trained on.
         held_out_pairs: the share of pairs of objects of which nothing is trained, by their names, in all tasks alike.
         held_out_tasks: of which nothing is trained: names, or a number of tasks to draw.
         seed: of what is held out, the states and the minibatches.
@@ -89,8 +89,7 @@ class LabelledQueries:
             held-out pairs, in these states; "tasks", all clauses of held-out tasks. One may be empty.
 
     Args:
-        replay: its rows hold ``observation`` (R, 39) float32, ``task_id`` (R,) int64 and, of trajectories,
-            ``("collector", "traj_ids")`` (R,) int64.
+        replay: its rows hold ``observation`` (R, 39) float32, ``task_id`` and ``episode`` (R,) int64.
         config: what is held out.
         tasks: what is known of its tasks; the shipped ones by default.
 
@@ -112,7 +111,7 @@ class LabelledQueries:
         trained = [task for task in found if task.name not in self.held_out_tasks]
         self.tasks = tuple(task.name for task in trained)
         self.held_out_pairs = _drawn_pairs(config.held_out_pairs, trained, generator)
-        kept = _held_out_rows(rows.get(("collector", "traj_ids")), ids, config.held_out_states)
+        kept = _held_out_rows(rows.get("episode"), ids, config.held_out_states)
         self.parts: dict[str, list[Asked]] = {"training": [], "states": [], "queries": [], "tasks": []}
         for task in found:
             own = ids == task_id(task.name)
@@ -175,13 +174,13 @@ def _drawn_pairs(share: float, tasks: Sequence[Task], generator: torch.Generator
     return tuple(sorted(pairs[place] for place in torch.randperm(len(pairs), generator=generator)[:number].tolist()))
 
 
-def _held_out_rows(trajectory: Tensor, ids: Tensor, share: float) -> Tensor:
+def _held_out_rows(episode: Tensor, ids: Tensor, share: float) -> Tensor:
     """(R,) bool, the rows of some episodes of each task, spread over all of them: so large a share, at least one if any
-    are asked for and another is left."""
+    are asked for and another is left. Episodes of one number begin alike, whoever acts: they go together."""
     held = torch.zeros_like(ids, dtype=torch.bool)
     for number in ids.unique().tolist():
-        own = trajectory[ids == number].unique()
+        own = episode[ids == number].unique()
         many = min(len(own) - 1, max(1, round(share * len(own)))) if share else 0
         places = ((torch.arange(many) + 0.5) * len(own) / max(1, many)).long()
-        held |= torch.isin(trajectory, own[places]) & (ids == number)
+        held |= torch.isin(episode, own[places]) & (ids == number)
     return held
