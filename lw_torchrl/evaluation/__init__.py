@@ -3,6 +3,7 @@
 import lw_torchrl._torchrl  # noqa: F401
 from lw_torchrl.evaluation.attribution import attribute_failures
 from lw_torchrl.evaluation.comparison import MethodComparison, Pair
+from lw_torchrl.evaluation.drift import Drift, condition_drift, drift_table
 from lw_torchrl.evaluation.evaluator_report import EvaluatorReport, score_evaluator
 from lw_torchrl.evaluation.failure_figure import plot_failures
 from lw_torchrl.evaluation.failures import CAUSES, Failure
@@ -28,6 +29,7 @@ from lw_torchrl.evaluation.summary import Summary, TaskSummary, summarize, summa
 
 __all__ = [
     "CAUSES",
+    "Drift",
     "EpisodeResult",
     "Estimate",
     "EvaluationResult",
@@ -40,7 +42,9 @@ __all__ = [
     "Summary",
     "TaskSummary",
     "attribute_failures",
+    "condition_drift",
     "count_solved",
+    "drift_table",
     "evaluate",
     "evaluate_plans",
     "interquartile_mean",

@@ -125,10 +125,10 @@ def test_two_tasks_are_learned_quickly(replay):
     lw.QueryEvaluatorTrainer(evaluator, data, config, progress=False).train()
     found = score_evaluator(evaluator, data).parts
     assert before < 0.7
-    assert found["states"].accuracy() > 0.96
-    assert found["states"].balanced_accuracy() > 0.96
-    assert found["queries"].balanced_accuracy() > 0.93
-    assert found["tasks"].balanced_accuracy() > 0.9
+    assert found["states"].accuracy() > 0.98
+    assert found["states"].balanced_accuracy() > 0.98
+    assert found["queries"].accuracy() > 0.9
+    assert found["tasks"].accuracy() > 0.87
 
 
 def test_from_texts_alone_it_learns_too_and_what_not_means(replay):
@@ -136,7 +136,7 @@ def test_from_texts_alone_it_learns_too_and_what_not_means(replay):
     data = lw.LabelledQueries(replay, config)
     evaluator = make(width=64, depth=2, structure=False, text_encoder=words)
     lw.QueryEvaluatorTrainer(evaluator, data, config, progress=False).train()
-    assert score_evaluator(evaluator, data).parts["states"].accuracy() > 0.9
+    assert score_evaluator(evaluator, data).parts["states"].accuracy() > 0.85
 
 
 def test_a_report_counts_every_answer_once(replay, tmp_path):
