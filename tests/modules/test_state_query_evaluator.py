@@ -242,7 +242,7 @@ def test_a_relation_that_it_was_not_made_for_is_refused(monkeypatch):
     plans = lw.Plans([lw.ConditionalPlan("push", (step,))])
     with pytest.raises(ValueError, match=r"predicate of .*beside the puck\", in push.*make and train one that has it"):
         made.with_plans(plans)
-    assert make("structure", plans).predicates[3] == "beside"
+    assert "beside" in make("structure", plans).predicates
 
 
 def test_texts_without_vectors_name_the_mend(monkeypatch):
