@@ -56,6 +56,7 @@ if TYPE_CHECKING:  # the table below, for type checkers and editors
     from lw_torchrl.modules import QueryEvaluator as QueryEvaluator
     from lw_torchrl.modules import ResidualActor as ResidualActor
     from lw_torchrl.modules import ScriptedSkillActor as ScriptedSkillActor
+    from lw_torchrl.modules import StateQueryEvaluator as StateQueryEvaluator
     from lw_torchrl.modules import plan_actor_value as plan_actor_value
     from lw_torchrl.objectives import AdvantageWeightedLoss as AdvantageWeightedLoss
     from lw_torchrl.objectives import DemonstratedSACLoss as DemonstratedSACLoss
@@ -73,13 +74,18 @@ if TYPE_CHECKING:  # the table below, for type checkers and editors
     from lw_torchrl.record import log_rollout as log_rollout
     from lw_torchrl.trainers import BehavioralCloningConfig as BehavioralCloningConfig
     from lw_torchrl.trainers import BehavioralCloningTrainer as BehavioralCloningTrainer
+    from lw_torchrl.trainers import LabelledQueries as LabelledQueries
     from lw_torchrl.trainers import OfflineConfig as OfflineConfig
     from lw_torchrl.trainers import OfflineTrainer as OfflineTrainer
     from lw_torchrl.trainers import OnlineConfig as OnlineConfig
     from lw_torchrl.trainers import OnlineTrainer as OnlineTrainer
+    from lw_torchrl.trainers import QueryEvaluatorConfig as QueryEvaluatorConfig
+    from lw_torchrl.trainers import QueryEvaluatorTrainer as QueryEvaluatorTrainer
     from lw_torchrl.trainers import StackedBehavioralCloning as StackedBehavioralCloning
     from lw_torchrl.trainers import load_actor as load_actor
+    from lw_torchrl.trainers import load_evaluator as load_evaluator
     from lw_torchrl.trainers import save_actor as save_actor
+    from lw_torchrl.trainers import save_evaluator as save_evaluator
     from lw_torchrl.transforms import CorruptQAF as CorruptQAF
     from lw_torchrl.transforms import EnvState as EnvState
     from lw_torchrl.transforms import QAFTransform as QAFTransform
@@ -104,14 +110,15 @@ _NAMES = {
     "lw_torchrl.language.task_files": "load_tasks",
     "lw_torchrl.language.tasks": "MT10 MT50 TASKS Task resolve_tasks task_id",
     "lw_torchrl.modules": "ActorEnsemble DescriptorConditionedActor PlanConditionedActor PlanConditionedQValue "
-    "PlanConditionedValue Policy QueryEvaluator ResidualActor ScriptedSkillActor plan_actor_value",
+    "PlanConditionedValue Policy QueryEvaluator ResidualActor ScriptedSkillActor StateQueryEvaluator "
+    "plan_actor_value",
     "lw_torchrl.objectives": "AdvantageWeightedLoss DemonstratedSACLoss DemonstratedTD3Loss ExpectileValueLoss "
     "SkillLatentLoss standardize_by_task",
     "lw_torchrl.planners": "FilePlanner OpenAIPlanner Planner PlannerError plan_prompt",
     "lw_torchrl.record": "RerunLogger RolloutRecorder log_rollout",
-    "lw_torchrl.trainers": "BehavioralCloningConfig BehavioralCloningTrainer OfflineConfig OfflineTrainer OnlineConfig "
-    "OnlineTrainer "
-    "StackedBehavioralCloning load_actor save_actor",
+    "lw_torchrl.trainers": "BehavioralCloningConfig BehavioralCloningTrainer LabelledQueries OfflineConfig "
+    "OfflineTrainer OnlineConfig OnlineTrainer QueryEvaluatorConfig QueryEvaluatorTrainer StackedBehavioralCloning "
+    "load_actor load_evaluator save_actor save_evaluator",
     "lw_torchrl.transforms": "CorruptQAF EnvState QAFTransform RandomYaw",
 }
 _ROOM = {name: room for room, names in _NAMES.items() for name in names.split()}

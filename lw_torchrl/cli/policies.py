@@ -19,6 +19,7 @@ from lw_torchrl.cli.sources import (
     simulated,
 )
 from lw_torchrl.cli.threads import use_one_thread
+from lw_torchrl.cli.train_evaluator import with_evaluator
 
 if TYPE_CHECKING:
     from lw_torchrl.language.tasks import Task
@@ -209,6 +210,7 @@ def evaluate(
     num_envs: int | None = None,
     attribute: bool = False,
     reference: tuple[str, ...] = (),
+    evaluator: Path | None = None,
     out: Path | None = None,
     device: str = "cpu",
 ) -> None:
@@ -233,6 +235,7 @@ def evaluate(
             again a few times.
         reference: with --attribute, plans that are trusted, for failed episodes to be run again with: MT10, MT50, .plan
             or .json files, or folders.
+        evaluator: a network that answers the conditions, of `lw-torchrl train-evaluator`.
         out: folder for results.json, success.png and rollout.rrd; with --attribute also failures.png.
         device: where the networks work: cpu; cuda, or cuda:1 for the second of several; mps, a Mac's; or auto, the GPU
             where there is one. The simulation is always on the CPU.
@@ -241,6 +244,8 @@ def evaluate(
         check_folder("--out", out)
     if reference and not attribute:
         raise ValueError("--reference is for --attribute, which runs failed episodes again with these plans")
+    if evaluator is not None and str(checkpoint) == "expert":
+        raise ValueError("--evaluator is for a policy with plans, the scripted experts ask no conditions")
     import lw_torchrl as lw
     from lw_torchrl._devices import check_device
     from lw_torchrl.evaluation import plot_failures
@@ -253,6 +258,8 @@ def evaluate(
     policy = None
     if str(checkpoint) != "expert":
         policy = load_policy(checkpoint, seed, given, text_encoder)
+        if evaluator is not None:
+            policy = with_evaluator(policy, evaluator, text_encoder)
         known.update({task: found for task in policy.tasks if (found := policy.definition(task)) is not None})
     if tasks or policy is None:
         chosen = simulated("tasks", one_or_many(tasks) or "MT10", known)
@@ -281,6 +288,8 @@ def evaluate(
         told: dict[str, Any] = {} if policy is None else {"checkpoint": checkpoint}
         if policy is not None and policy.plans is not None:
             told["plans"] = policy.plans.fingerprint
+        if evaluator is not None:
+            told["evaluator"] = evaluator
         result.save(out / "results.json", **told)
         lw.plot_success(result, out / "success.png", title=f"{checkpoint}, {episodes} episodes a task")
         if attribute:

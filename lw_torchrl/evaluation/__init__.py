@@ -3,6 +3,8 @@
 import lw_torchrl._torchrl  # noqa: F401
 from lw_torchrl.evaluation.attribution import attribute_failures
 from lw_torchrl.evaluation.comparison import MethodComparison, Pair
+from lw_torchrl.evaluation.drift import Drift, condition_drift, drift_table
+from lw_torchrl.evaluation.evaluator_report import EvaluatorReport, score_evaluator
 from lw_torchrl.evaluation.failure_figure import plot_failures
 from lw_torchrl.evaluation.failures import CAUSES, Failure
 from lw_torchrl.evaluation.figures import plot_sorted_tasks, plot_success
@@ -12,6 +14,7 @@ from lw_torchrl.evaluation.method_figure import plot_methods
 from lw_torchrl.evaluation.plan_use import PlanUse
 from lw_torchrl.evaluation.protocol import evaluate
 from lw_torchrl.evaluation.published import published, published_curves, published_plans
+from lw_torchrl.evaluation.reliability_figure import plot_reliability
 from lw_torchrl.evaluation.result import EpisodeResult, EvaluationResult
 from lw_torchrl.evaluation.statistics import (
     Estimate,
@@ -26,9 +29,11 @@ from lw_torchrl.evaluation.summary import Summary, TaskSummary, summarize, summa
 
 __all__ = [
     "CAUSES",
+    "Drift",
     "EpisodeResult",
     "Estimate",
     "EvaluationResult",
+    "EvaluatorReport",
     "Failure",
     "MethodComparison",
     "Pair",
@@ -37,7 +42,9 @@ __all__ = [
     "Summary",
     "TaskSummary",
     "attribute_failures",
+    "condition_drift",
     "count_solved",
+    "drift_table",
     "evaluate",
     "evaluate_plans",
     "interquartile_mean",
@@ -46,12 +53,14 @@ __all__ = [
     "plot_failures",
     "plot_learning_curves",
     "plot_methods",
+    "plot_reliability",
     "plot_sorted_tasks",
     "plot_success",
     "probability_of_improvement",
     "published",
     "published_curves",
     "published_plans",
+    "score_evaluator",
     "stuck_steps",
     "stuck_table",
     "summarize",

@@ -72,8 +72,9 @@ def attribute_failures(
             for the rule alone. One that draws its actions cannot be run again alike; its exchanges tell less.
         reference: other plans for the same tasks, which are trusted. Tasks that they lack have no reference.
         evaluator: what answered in the query answering function's place, between it and the actor: a module or
-            function that writes ``qaf`` into the tensordict (read with ``observation`` and ``task_id``), or a
-            :class:`torchrl.envs.Transform` that does. An evaluator inside the policy is found there.
+            function that writes ``qaf`` into the tensordict (read with ``observation`` and ``task_id``), a
+            :class:`QueryEvaluator`, or a :class:`torchrl.envs.Transform` that writes ``qaf``. An evaluator inside the
+            policy is found there.
         skills: the scripted skills by text that are trusted, as from :func:`load_skills`; None for the shipped ones.
         seed, noise_scale, max_steps, engine: with which the episodes were run.
         num_envs, num_threads, device: as for :func:`evaluate`; the result depends on none of them.

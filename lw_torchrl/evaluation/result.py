@@ -103,6 +103,7 @@ class EvaluationResult:
         *,
         checkpoint: str | os.PathLike[str] | None = None,
         plans: str | None = None,
+        evaluator: str | os.PathLike[str] | None = None,
     ) -> None:
         """Write the result as JSON; a file is replaced whole or not at all.
 
@@ -110,16 +111,18 @@ class EvaluationResult:
             path: the file.
             checkpoint: the file that the actor was made of; its path and SHA-256 are noted.
             plans: the fingerprint of the plans.
+            evaluator: the file of what answered the conditions; noted likewise.
 
         Raises:
-            FileNotFoundError: there is no such checkpoint.
+            FileNotFoundError: there is no such checkpoint or evaluator.
             ValueError: a number is NaN or infinite.
         """
         made = {"date": datetime.now(UTC).isoformat(timespec="seconds"), "versions": package_versions()}
         origin: dict[str, Any] = dict(self.origin) or made
-        if checkpoint is not None:
-            with open(checkpoint, "rb") as file:
-                origin["checkpoint"] = {"path": str(checkpoint), "sha256": file_digest(file, "sha256").hexdigest()}
+        for name, given in (("checkpoint", checkpoint), ("evaluator", evaluator)):
+            if given is not None:
+                with open(given, "rb") as file:
+                    origin[name] = {"path": str(given), "sha256": file_digest(file, "sha256").hexdigest()}
         if plans is not None:
             origin["plans"] = plans
         episodes = [{k: v for k, v in asdict(e).items() if k != "actions"} for e in self.episodes]

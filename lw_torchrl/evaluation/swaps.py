@@ -60,6 +60,8 @@ def with_true_answers(actor: Any) -> Any:
         for name, child in list(module.named_children()):
             if isinstance(child, QueryEvaluator):
                 setattr(module, name, TrueAnswers(child.plans))
+                if "answers" in (config := getattr(module, "config", {})):
+                    module.config = {**config, "answers": "logit"}  # exact truth is worth what it is
     return other
 
 
@@ -80,7 +82,10 @@ class AnsweredBy(nn.Module):
         self.actor, self.evaluator = actor, evaluator
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return self.actor(self.evaluator(tensordict))
+        answered = self.evaluator(tensordict)
+        if isinstance(self.evaluator, QueryEvaluator):
+            answered.set("qaf", answered.get("qaf_logits") > 0)
+        return self.actor(answered)
 
 
 def answered_by(actor: Any, evaluator: Any) -> Any:

@@ -15,6 +15,7 @@ from lw_torchrl.modules.policy import METHODS, POLICIES, Method, Policy, make_po
 from lw_torchrl.modules.query_evaluator import EVALUATORS, QueryEvaluator
 from lw_torchrl.modules.residual_actor import ResidualActor
 from lw_torchrl.modules.scripted_skill_actor import ScriptedSkillActor
+from lw_torchrl.modules.state_query_evaluator import StateQueryEvaluator
 
 __all__ = [
     "EVALUATORS",
@@ -37,6 +38,7 @@ __all__ = [
     "QueryEvaluator",
     "ResidualActor",
     "ScriptedSkillActor",
+    "StateQueryEvaluator",
     "Value",
     "make_policy",
     "plan_actor_value",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Literal
 
 import torch
 from tensordict import TensorDictBase
@@ -16,10 +17,30 @@ from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.value_checks import check_values
 from lw_torchrl.transforms.qaf import plan_number_key
 
+Answers = Literal["logit", "tanh", "hard"]
+
 
 def attend(logits: Tensor, steps: Tensor) -> Tensor:
     """Softmax of logits (B, S) over the steps that there are, (B, S) bool; 0 on the others."""
     return logits.masked_fill(~steps, -torch.inf).softmax(-1)
+
+
+def strength(logits: Tensor, answers: Answers, scale: float) -> Tensor:
+    """What an evaluator's logits (...,) count in the softmax, where exact truth counts 5 and -5.
+
+    "logit": what they are. "tanh": 5·tanh(scale·logit), which at 0.5 is the paper's 10·p - 5 of the probability p.
+    "hard": 5 above 0 and else -5; its gradient is that of "tanh", straight through.
+
+    Example:
+        >>> strength(torch.tensor([0.4, -8.0]), "hard", 0.5)
+        tensor([ 5., -5.])
+    """
+    if answers == "logit":
+        return logits
+    soft = 5.0 * torch.tanh(scale * logits)
+    if answers == "tanh":
+        return soft
+    return torch.where(logits > 0, 5.0, -5.0) + (soft - soft.detach())
 
 
 def check_truth(qaf: Tensor, shape: tuple[int, ...]) -> None:

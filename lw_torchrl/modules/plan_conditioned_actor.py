@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
+import torch
 from tensordict.utils import NestedKey
 from torch import Tensor
 
@@ -15,6 +16,7 @@ from lw_torchrl.modules.action_head import DistributionName
 from lw_torchrl.modules.conditioned_actor import ConditionedActor, noise_of_features
 from lw_torchrl.modules.encoder import Encoding
 from lw_torchrl.modules.observation_features import Features
+from lw_torchrl.modules.plan_attention import Answers
 from lw_torchrl.modules.plan_encoder import PlanEncoder
 from lw_torchrl.modules.query_evaluator import QueryEvaluator, evaluator_from_description
 
@@ -48,6 +50,10 @@ class PlanConditionedActor(ConditionedActor):
             ``set_exploration_type(ExplorationType.RANDOM)``, as collectors do, and its mode otherwise.
         init_std: the Normal's standard deviation at first, in every state.
         evaluator: answers the conditions in the place of ``qaf``, which is then not read; see :class:`QueryEvaluator`.
+        answers: what an evaluator's logit counts in the attention's softmax, where exact truth counts 5 and -5:
+            "logit", what it is; "tanh", 5·tanh(answer_scale·logit); "hard", 5 or -5 by its sign, with the gradient of
+            "tanh".
+        answer_scale: of these; 0.5 makes "tanh" the paper's 10·p - 5 of the probability p.
         text_encoder: texts to vectors (n, E) float32; None for the shipped sentence encoder.
         in_keys, out_keys: other names for what it reads and writes, in the order above; nested ones too.
 
@@ -94,6 +100,8 @@ class PlanConditionedActor(ConditionedActor):
         distribution: DistributionName | None = None,
         init_std: float = 0.3,
         evaluator: QueryEvaluator | None = None,
+        answers: Answers = "logit",
+        answer_scale: float = 0.5,
         text_encoder: TextEncoder | None = None,
         in_keys: Sequence[NestedKey] | None = None,
         out_keys: Sequence[NestedKey] | None = None,
@@ -111,6 +119,8 @@ class PlanConditionedActor(ConditionedActor):
             encoder_width=encoder_width,
             encoder_depth=encoder_depth,
             evaluator=evaluator,
+            answers=answers,
+            answer_scale=answer_scale,
             text_encoder=text_encoder,
             in_keys=in_keys,
         )
@@ -159,8 +169,32 @@ class PlanConditionedActor(ConditionedActor):
     ) -> PlanConditionedActor:
         plans = Plans.from_json(found["plans"])
         asked = found.get("evaluator")
-        evaluator = None if asked is None else evaluator_from_description(asked, plans)
+        evaluator = None if asked is None else evaluator_from_description(asked, plans, text_encoder)
         return cls(plans, evaluator=evaluator, text_encoder=text_encoder, **found["options"])
+
+    def with_evaluator(
+        self, evaluator: QueryEvaluator, *, answers: Answers = "hard", answer_scale: float = 0.5
+    ) -> PlanConditionedActor:
+        """An actor with the same weights that reads its conditions from an evaluator in the place of ``qaf``: training
+        either trains both.
+
+        Args:
+            evaluator: of its plans; the actor's own is replaced.
+            answers, answer_scale: as for the class; "hard", since the weights know truth of 5 and -5 alone.
+
+        Example:
+            >>> import lw_torchrl as lw
+            >>> plans = lw.load_plans("MT10")
+            >>> lw.PlanConditionedActor(plans).with_evaluator(lw.StateQueryEvaluator(plans)).in_keys
+            ['observation', 'task_id']
+        """
+        options = self.config | {"answers": answers, "answer_scale": answer_scale, "in_keys": self.in_keys[:2]}
+        with torch.random.fork_rng(devices=[]):
+            other = PlanConditionedActor(
+                self.plans, evaluator=evaluator, text_encoder=self.encoder.text_encoder, **options
+            )
+        other.encoder.texts, other.encoder.features, other.head = self.encoder.texts, self.encoder.features, self.head
+        return other.train(self.training)
 
     def with_plans(self, plans: Plans | Mapping[str, ConditionalPlan]) -> PlanConditionedActor:
         """An actor that carries out other plans with the same weights: training either trains both."""

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, get_args
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from lw_torchrl._checks import check_probability
+from lw_torchrl._checks import check_choice, check_probability, check_scale
 from lw_torchrl._keys import as_keys, check_apart
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.text import TextEncoder, encoded
@@ -18,7 +18,7 @@ from lw_torchrl.modules.encoder import Encoder, Encoding
 from lw_torchrl.modules.mentions import mentioned, swap_unmentioned
 from lw_torchrl.modules.networks import text_to_latent, unit_scale
 from lw_torchrl.modules.observation_features import Features, ObservationFeatures
-from lw_torchrl.modules.plan_attention import PlanAttention, attend
+from lw_torchrl.modules.plan_attention import Answers, PlanAttention, attend, strength
 from lw_torchrl.modules.plan_focus import PlanFocus
 from lw_torchrl.modules.query_evaluator import QueryEvaluator
 from lw_torchrl.transforms.qaf import QAFTransform, plan_number_key
@@ -26,14 +26,13 @@ from lw_torchrl.transforms.qaf import QAFTransform, plan_number_key
 IN_FORCE = 0.01  # a step whose condition does not hold beside one that does has a weight of 1e-4
 
 
-def _check_evaluator(evaluator: QueryEvaluator | None, plans: Plans, reads_truth: float) -> QueryEvaluator | None:
+def check_evaluator(evaluator: Any, plans: Plans) -> QueryEvaluator | None:
+    """Return what is given as an actor's evaluator, if it is one of the actor's plans, or None."""
     if evaluator is None:
         return None
     if not isinstance(evaluator, QueryEvaluator):
         given = f"the class {evaluator.__name__}" if isinstance(evaluator, type) else type(evaluator).__name__
         raise TypeError(f"evaluator must be a QueryEvaluator, made for the plans: MyEvaluator(plans); got {given}")
-    if reads_truth:
-        raise ValueError("focus and swap_unmentioned read the queries' exact truth, which an evaluator takes away")
     if evaluator.plans.fingerprint != plans.fingerprint:
         raise ValueError("evaluator must be of the actor's plans, it answers the conditions of others")
     return evaluator
@@ -48,8 +47,8 @@ class PlanEncoder(Encoder):
 
     Args:
         plans: a plan for each task that will be seen.
-        features, focus, swap_unmentioned, latent_size, encoder_width, encoder_depth, evaluator, text_encoder, in_keys:
-            as for :class:`PlanConditionedActor`.
+        features, focus, swap_unmentioned, latent_size, encoder_width, encoder_depth, evaluator, answers,
+            answer_scale, text_encoder, in_keys: as for :class:`PlanConditionedActor`.
         feature_noise: standard deviation of the noise on the normalised features while training.
         out_keys: another name for what it writes.
 
@@ -89,13 +88,20 @@ class PlanEncoder(Encoder):
         encoder_width: int = 128,
         encoder_depth: int = 1,
         evaluator: QueryEvaluator | None = None,
+        answers: Answers = "logit",
+        answer_scale: float = 0.5,
         text_encoder: TextEncoder | None = None,
         in_keys: Sequence[NestedKey] | None = None,
         out_keys: Sequence[NestedKey] | None = None,
     ) -> None:
         super().__init__()
         self.plans = as_plans(plans)
-        self.evaluator = _check_evaluator(evaluator, self.plans, focus or swap_unmentioned)
+        self.evaluator = check_evaluator(evaluator, self.plans)
+        if evaluator is not None and (focus or swap_unmentioned):
+            raise ValueError("focus and swap_unmentioned read the queries' exact truth, which an evaluator takes away")
+        check_choice("answers", answers, get_args(Answers))
+        if evaluator is None and (answers, answer_scale) != ("logit", 0.5):
+            raise ValueError("answers and answer_scale are of an evaluator's logits, and evaluator is None")
         self.tasks = tuple(self.plans)
         read = ("observation", "task_id") if evaluator is not None else ("observation", "task_id", "qaf")
         own = as_keys("in_keys", in_keys, read)
@@ -113,6 +119,8 @@ class PlanEncoder(Encoder):
             "encoder_depth": encoder_depth,
             "in_keys": own,
         }
+        if evaluator is not None:
+            self.config |= {"answers": answers, "answer_scale": check_scale("answer_scale", answer_scale)}
         self.text_encoder = text_encoder
         self.skills = self.plans.skills
         vectors = encoded(self.skills, text_encoder)
@@ -166,7 +174,7 @@ class PlanEncoder(Encoder):
                 f"logits of {type(self.evaluator).__name__} must be {tuple(steps.shape)}, a row for each observation, "
                 f"got shape {tuple(logits.shape)}"
             )
-        return attend(logits, steps)
+        return attend(strength(logits, self.config["answers"], self.config["answer_scale"]), steps)
 
     def encode(self, *prepared: Tensor) -> Encoding:
         """From what :meth:`prepare` gives."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
@@ -20,6 +20,9 @@ from lw_torchrl.language.tasks import TASKS, Task
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.networks import ACTION_SIZE
 from lw_torchrl.transforms.qaf import QAFTransform
+
+if TYPE_CHECKING:
+    from lw_torchrl.modules.query_evaluator import QueryEvaluator
 
 POLICIES: dict[str, str | type[Policy]] = {
     "ActorEnsemble": "lw_torchrl.modules.actor_ensemble",
@@ -157,6 +160,17 @@ class Policy(TensorDictModuleBase):
     def from_description(cls, found: Mapping[str, Any], text_encoder: TextEncoder | None = None) -> Policy:
         """Make what :meth:`describe` described, with fresh weights."""
         return cls(**found["options"])
+
+    def with_evaluator(self, evaluator: QueryEvaluator) -> Policy:
+        """The same weights, with the conditions answered by an evaluator.
+
+        Raises:
+            TypeError: the policy reads no conditions, or not so.
+        """
+        raise TypeError(
+            f"with_evaluator is for PlanConditionedActor and ScriptedSkillActor, {type(self).__name__} has none; "
+            "evaluate(..., evaluator=) answers any policy's conditions"
+        )
 
     def with_plans(self, plans: Plans | Mapping[str, ConditionalPlan]) -> Policy:
         """The same weights under other plans.

@@ -14,8 +14,11 @@ from torch import Tensor
 
 from lw_torchrl._checks import check_choice
 from lw_torchrl.language.plans import Plans
+from lw_torchrl.language.text import TextEncoder
 
-EVALUATORS: dict[str, str | type[QueryEvaluator]] = {}
+EVALUATORS: dict[str, str | type[QueryEvaluator]] = {
+    "StateQueryEvaluator": "lw_torchrl.modules.state_query_evaluator",
+}
 """The class's name, as policy files say it, to the module that has the class, or to the class itself."""
 
 
@@ -26,7 +29,8 @@ class QueryEvaluator(TensorDictModuleBase):
 
     Reads ``in_keys``, ``observation`` (B, 39) float32 and ``task_id`` (B,) int64 unless it says otherwise; writes
     ``qaf_logits`` (B, S) float32, positive where a condition of the row's plan holds, in the order of its steps. The
-    policy's attention is a softmax of the logits over the steps that there are; exact truth is worth 5 and -5.
+    policy's attention is a softmax of the logits over the steps that there are, or of what ``answers`` of
+    :class:`PlanConditionedActor` makes of them; exact truth is worth 5 and -5.
 
     Args:
         plans: whose conditions it answers.
@@ -87,7 +91,7 @@ class QueryEvaluator(TensorDictModuleBase):
         Raises:
             RuntimeError: the weights have other names or shapes there.
         """
-        other = type(self)(plans, **self.config)
+        other = self.made_for(plans)
         other.load_state_dict(self.state_dict())
         for name, module in other.named_modules():
             own, passing = self.get_submodule(name), module._non_persistent_buffers_set
@@ -95,12 +99,21 @@ class QueryEvaluator(TensorDictModuleBase):
             module._buffers.update({key: kept for key, kept in own._buffers.items() if key not in passing})
         return other.train(self.training)
 
+    def made_for(self, plans: Plans) -> QueryEvaluator:
+        """Another of the same options for other plans, with fresh weights."""
+        return type(self)(plans, **self.config)
+
+    @classmethod
+    def from_options(cls, plans: Plans, options: Mapping[str, Any], text_encoder: TextEncoder | None) -> QueryEvaluator:
+        """One of the options in ``config``; one that reads texts hands on the text encoder."""
+        return cls(plans, **options)
+
     def describe(self) -> dict[str, Any]:
         """All that :func:`evaluator_from_description` needs beside the plans, as JSON."""
         return {"kind": type(self).__name__, "options": self.config}
 
 
-def evaluator_from_description(found: Any, plans: Plans) -> QueryEvaluator:
+def evaluator_from_description(found: Any, plans: Plans, text_encoder: TextEncoder | None = None) -> QueryEvaluator:
     """Make the evaluator that :meth:`QueryEvaluator.describe` described, with fresh weights.
 
     Raises:
@@ -111,4 +124,4 @@ def evaluator_from_description(found: Any, plans: Plans) -> QueryEvaluator:
     kind: str = check_choice("kind of evaluator", found.get("kind"), EVALUATORS)
     entry = EVALUATORS[kind]
     made = getattr(import_module(entry), kind) if isinstance(entry, str) else entry
-    return made(plans, **found["options"])
+    return made.from_options(plans, found["options"], text_encoder)

@@ -18,7 +18,9 @@ from lw_torchrl.language.skill_program import SkillProgram
 from lw_torchrl.language.skills import ScriptedSkill
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.plan_attention import check_truth
+from lw_torchrl.modules.plan_encoder import check_evaluator
 from lw_torchrl.modules.policy import Policy
+from lw_torchrl.modules.query_evaluator import QueryEvaluator, evaluator_from_description
 from lw_torchrl.transforms.qaf import QAFTransform, plan_number_key
 
 
@@ -36,6 +38,8 @@ class ScriptedSkillActor(Policy):
             them, in equal parts.
         skills: the scripted skills by text, as from :func:`load_skills`; None for the shipped ones.
         seed: of the random choice, from 0 to 2**64 - 1, or down to -2**63.
+        evaluator: answers the conditions in the place of ``qaf``, which is then not read: a step is true where its
+            logit is positive; see :class:`QueryEvaluator`.
         in_keys, out_keys: other names for what it reads and writes, in the order above; nested ones too.
 
     Raises:
@@ -59,16 +63,20 @@ class ScriptedSkillActor(Policy):
         *,
         skills: Mapping[str, ScriptedSkill] | None = None,
         seed: int = 0,
+        evaluator: QueryEvaluator | None = None,
         in_keys: Sequence[NestedKey] | None = None,
         out_keys: Sequence[NestedKey] | None = None,
     ) -> None:
         super().__init__()
         self.plans: Plans = as_plans(plans)
         self.tasks = tuple(self.plans)
-        self.in_keys = as_keys("in_keys", in_keys, ("observation", "task_id", "qaf"))
+        self.evaluator = check_evaluator(evaluator, self.plans)
+        read = ("observation", "task_id") if evaluator is not None else ("observation", "task_id", "qaf")
+        own = as_keys("in_keys", in_keys, read)
+        self.in_keys = list(dict.fromkeys([*own, *([] if evaluator is None else evaluator.in_keys)]))
         self.out_keys = as_keys("out_keys", out_keys, ("action", "skill_weights"))
         check_apart(self.in_keys, self.out_keys)
-        self.config = {"select": select, "seed": seed, "in_keys": self.in_keys, "out_keys": self.out_keys}
+        self.config = {"select": select, "seed": seed, "in_keys": own, "out_keys": self.out_keys}
         if not -(2**63) <= check_int("seed", seed) < 2**64:
             raise ValueError(f"seed must be from -2**63 to 2**64 - 1, got {shown(seed)}")
         self.select = check_choice("select", select, ("first", "random", "mix"))
@@ -85,23 +93,35 @@ class ScriptedSkillActor(Policy):
     def for_plans(cls, plans: Plans, *, text_encoder: TextEncoder | None = None, **options: Any) -> ScriptedSkillActor:
         return cls(plans, **options)
 
-    def transform(self) -> QAFTransform:
-        """Query answers."""
+    def transform(self) -> QAFTransform | None:
+        """Query answers, unless an evaluator gives them."""
+        if self.evaluator is not None:
+            return None
         return QAFTransform(self.plans, in_keys=self.in_keys[:2], out_keys=self.in_keys[2:])
 
     def with_plans(self, plans: Plans | Mapping[str, ConditionalPlan]) -> ScriptedSkillActor:
         """The same skills under other plans."""
-        return ScriptedSkillActor(plans, skills=self._skills, **self.config)
+        evaluator = None if self.evaluator is None else self.evaluator.with_plans(as_plans(plans))
+        return ScriptedSkillActor(plans, skills=self._skills, evaluator=evaluator, **self.config)
+
+    def with_evaluator(self, evaluator: QueryEvaluator) -> ScriptedSkillActor:
+        """The same skills, with the conditions answered by an evaluator."""
+        options = {**self.config, "in_keys": self.in_keys[:2]}
+        return ScriptedSkillActor(self.plans, skills=self._skills, evaluator=evaluator, **options)
 
     def describe(self) -> dict[str, Any]:
         """As :meth:`Policy.describe`; :class:`TypeError` with skills of one's own, which no policy file holds."""
         if self._skills is not None:
             raise TypeError("a ScriptedSkillActor with skills of your own cannot be saved: keep their file instead")
-        return super().describe() | {"plans": self.plans.to_json()}
+        found = super().describe() | {"plans": self.plans.to_json()}
+        return found if self.evaluator is None else found | {"evaluator": self.evaluator.describe()}
 
     @classmethod
     def from_description(cls, found: Mapping[str, Any], text_encoder: TextEncoder | None = None) -> ScriptedSkillActor:
-        return cls(Plans.from_json(found["plans"]), **found["options"])
+        plans = Plans.from_json(found["plans"])
+        asked = found.get("evaluator")
+        evaluator = None if asked is None else evaluator_from_description(asked, plans, text_encoder)
+        return cls(plans, evaluator=evaluator, **found["options"])
 
     def _weights(self, qaf: Tensor, rows: Tensor) -> Tensor:
         check_truth(qaf, (*rows.shape, self.tables.mask.shape[-1]))
@@ -119,13 +139,20 @@ class ScriptedSkillActor(Policy):
         return torch.nn.functional.one_hot(chosen, qaf.shape[-1]).float()
 
     def prepare(self, tensordict: TensorDictBase) -> tuple[Tensor, ...]:
-        """The weights (B, S), and the action of each step's skill (B, S, 4)."""
-        observation, given, qaf = self.read(tensordict)
+        """The weights (B, S), and the action of each step's skill (B, S, 4). With an evaluator, in the weights' place
+        the plans' rows (B,) int64, and behind the actions what it reads."""
+        observation, given, *rest = self.read(tensordict)
         rows = self.tables.rows(given)
+        if self.evaluator is not None:
+            asked = [tensordict.get(key) for key in self.evaluator.in_keys]
+            return rows, self.program(observation, given), *asked
+        qaf = rest[0]
         self.tables.refuse_others(tensordict.get(plan_number_key(self.in_keys[2]), None), rows)
         return self._weights(qaf, rows), self.program(observation, given)
 
     def act(self, *prepared: Tensor) -> tuple[Tensor, Tensor]:
         """From what :meth:`prepare` gives: action (B, 4), and the weights."""
-        weights, actions = prepared
+        weights, actions, *asked = prepared
+        if self.evaluator is not None:
+            weights = self._weights(self.evaluator.answers(*asked) > 0, weights)
         return (weights.unsqueeze(-1) * actions).sum(-2), weights

@@ -19,6 +19,7 @@ from lw_torchrl._progress import Progress
 from lw_torchrl.modules.policy import Policy
 from lw_torchrl.trainers.checkpoint import describe_data, describe_replay, write
 from lw_torchrl.trainers.config import BehavioralCloningConfig, make_optimizer
+from lw_torchrl.trainers.evaluator_anchor import EvaluatorAnchor
 from lw_torchrl.trainers.interrupts import interrupts_between_steps
 from lw_torchrl.trainers.latent_terms import LatentTerms
 from lw_torchrl.trainers.loss_state import bc_loss
@@ -61,7 +62,8 @@ class BehavioralCloningTrainer:
 
     Raises:
         ValueError: the checkpoint is damaged, of another architecture, configuration or data; the actor writes no
-            ``action``, or has no plans and the configuration has a term on skills' latents; or, in :meth:`train`, the
+            ``action``, or has no plans and the configuration has a term on skills' latents, or no evaluator and
+            it has an anchor; or, in :meth:`train`, the
             loss or the weights are no numbers.
         TypeError: a checkpoint for an actor that is no :class:`Policy`.
         OSError: the checkpoint cannot be written; the earlier one stays.
@@ -98,6 +100,7 @@ class BehavioralCloningTrainer:
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
         check_replay(actor, replay, config.batch_size)
         self._latent_terms = LatentTerms(actor, config)
+        self._anchor = EvaluatorAnchor(actor) if config.qaf_anchor else None
         self._policy = None if self.checkpoint is None else check_can_be_saved(actor)
         self._described: dict[str, Any] = {}
         if self.checkpoint is not None and self._policy is not None:
@@ -137,6 +140,8 @@ class BehavioralCloningTrainer:
             self.state.torch_generator = torch.get_rng_state()
         if self._latent_terms.weights:
             loss = loss + self._latent_terms()
+        if self._anchor is not None:
+            loss = loss + self.config.qaf_anchor * self._anchor(batch)
         if self.device == CPU:
             self._losses.check(loss, self.state.step)
         self.optimizer.zero_grad()

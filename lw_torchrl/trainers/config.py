@@ -12,7 +12,7 @@ from torch import Tensor
 from lw_torchrl._checks import check_choice, check_int, check_scale
 
 LOSSES = ("l1", "l2", "smooth_l1")
-_LATER = {"latent_consistency", "latent_contrast"}
+_LATER = {"latent_consistency", "latent_contrast", "qaf_anchor"}
 """Options that files did not say at first: at 0, training is what it was before them."""
 
 
@@ -36,6 +36,8 @@ class BehavioralCloningConfig:
         latent_consistency: weight of :class:`SkillLatentLoss` "consistency" in the loss, of a policy with plans: skills
             whose texts are near stay near.
         latent_contrast: weight of the "contrastive" one: different skills keep apart.
+        qaf_anchor: weight of the cross entropy of an evaluator's answers with the query answering function's, of a
+            policy with an evaluator: its conditions keep to their words.
     """
 
     steps: int = 8000
@@ -52,6 +54,7 @@ class BehavioralCloningConfig:
     checkpoint_every: int = 500
     latent_consistency: float = 0.0
     latent_contrast: float = 0.0
+    qaf_anchor: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("steps", "batch_size", "checkpoint_every"):

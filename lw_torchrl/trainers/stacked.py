@@ -149,6 +149,8 @@ class StackedBehavioralCloning:
             raise ValueError(f"actors must be of one architecture ({error})") from error
         self._parameters = {name: nn.Parameter(value.detach()) for name, value in parameters.items()}
         shared = modules[0]
+        if config.qaf_anchor:
+            raise ValueError("qaf_anchor is for BehavioralCloningTrainer, which trains one policy at a time")
         terms = LatentTerms(actors[0], config)
         self._latent_terms = vmap(lambda p, b: functional_call(terms, (p, b), ())) if terms.weights else None
         self._act = vmap(lambda p, b, prepared: functional_call(shared, (p, b), prepared))

@@ -24,6 +24,7 @@ COMMANDS = (
     "collect",
     "data",
     "train",
+    "train-evaluator",
     "evaluate",
     "record",
     "view",

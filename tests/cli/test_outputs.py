@@ -12,6 +12,7 @@ from lw_torchrl.cli.main import COMMANDS, GROUPS
 FOLDERS = {
     "demo": ["--quick", "--out"],
     "collect": ["reach", "--out"],
+    "train-evaluator": ["reach", "--out"],
     "evaluate": ["expert", "--out"],
     "scripted": ["reach", "--out"],
     "reproduce": ["few-shot", "--out"],

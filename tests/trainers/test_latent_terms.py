@@ -112,7 +112,7 @@ def test_without_it_files_say_what_they_said_and_no_term_is_taken(demos, tmp_pat
     with pytest.raises(KeyboardInterrupt):
         make_trainer(demos, path, stop_at=7).train()
     assert set(read_description(path)["training"]) == BEFORE
-    assert set(asdict(CONFIG)) == {*BEFORE, "latent_consistency", "latent_contrast"}
+    assert set(asdict(CONFIG)) == {*BEFORE, "latent_consistency", "latent_contrast", "qaf_anchor"}
     monkeypatch.setattr("lw_torchrl.trainers.latent_terms.latent_term", None)  # it is never asked
     never = make_trainer(demos)
     never.train()

@@ -1,0 +1,153 @@
+"""``lw-torchrl train-evaluator``: a network in the query answering function's place."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from tyro.conf import Positional, arg
+
+from lw_torchrl.cli.outputs import check_folder
+from lw_torchrl.cli.sources import one_or_many, read_encoder, simulated
+from lw_torchrl.cli.threads import use_one_thread
+
+if TYPE_CHECKING:
+    from lw_torchrl.modules.policy import Policy
+    from lw_torchrl.modules.query_evaluator import QueryEvaluator
+
+WHO = ("expert", "scripted", "spoilt-30", "random")
+
+
+def train_evaluator(
+    tasks: Positional[Annotated[tuple[str, ...], arg(metavar="TASKS ...")]],
+    /,
+    out: Path,
+    data: tuple[Path, ...] = (),
+    behaviours: tuple[str, ...] = WHO,
+    episodes: int = 5,
+    noise: tuple[float, ...] = (0.0, 0.1, 0.2),
+    held_out_tasks: tuple[str, ...] = (),
+    held_out_pairs: float = 0.1,
+    held_out_states: float = 0.2,
+    structure: bool = True,
+    text_encoder: str | None = None,
+    width: int = 128,
+    depth: int = 3,
+    steps: int = 6000,
+    batch_size: int = 1024,
+    learning_rate: float = 3e-3,
+    states_per_task: int = 2000,
+    seed: int = 0,
+    num_envs: int | None = None,
+) -> None:
+    """Train a network to answer conditions, on all base queries of tasks, and say how well it does. Stopped and started
+    again it carries on.
+
+    Example: lw-torchrl train-evaluator MT10 --out runs/evaluator --held-out-tasks push reach
+
+    Args:
+        tasks: MT10, MT50, or names of tasks, the held-out ones among them.
+        out: folder for evaluator.zip, report.json, reliability.png, and the episodes that were run.
+        data: datasets of yours, of `lw-torchrl collect`, in the place of running episodes.
+        behaviours: who acts in the episodes that are run, as for `lw-torchrl collect`.
+        episodes: of each task and behaviour.
+        noise: standard deviations of the execution noise of the expert, gone through in turn.
+        held_out_tasks: names, or a number of tasks to draw: none of their queries is trained.
+        held_out_pairs: the share of pairs of objects none of whose queries is trained.
+        held_out_states: the share of episodes whose states are not trained on.
+        structure: read clauses as they parse, and objects' positions where the tasks' table says; else texts alone.
+        text_encoder: with --no-structure, a function of yours that turns texts into vectors, as my_texts:encode.
+        width: of the hidden layers.
+        depth: number of them.
+        steps: minibatches.
+        batch_size: pairs of a state and a clause in a minibatch.
+        learning_rate: at the start; a cosine brings it to 0.
+        states_per_task: at most so many of each task are labelled.
+        seed: of the episodes, of what is held out, the initial weights and the minibatches.
+        num_envs: environments stepped together; the result does not depend on it.
+    """
+    check_folder("--out", out)
+    if text_encoder is not None and structure:
+        raise ValueError("--text-encoder is for --no-structure; with structure no text is read")
+    from lw_torchrl.language.tasks import TASKS
+
+    names = simulated("tasks", one_or_many(tasks), TASKS)
+    import torch
+
+    import lw_torchrl as lw
+    from lw_torchrl.evaluation.evaluator_report import score_evaluator
+    from lw_torchrl.evaluation.reliability_figure import plot_reliability
+
+    use_one_thread()
+    drawn = len(held_out_tasks) == 1 and held_out_tasks[0].isdigit()
+    config = lw.QueryEvaluatorConfig(
+        steps=steps,
+        batch_size=batch_size,
+        learning_rate=learning_rate,
+        states_per_task=states_per_task,
+        held_out_states=held_out_states,
+        held_out_pairs=held_out_pairs,
+        held_out_tasks=int(held_out_tasks[0]) if drawn else held_out_tasks,
+        seed=seed,
+    )
+    torch.manual_seed(seed)
+    options: dict[str, Any] = {"structure": structure, "width": width, "depth": depth}
+    evaluator = lw.StateQueryEvaluator(lw.load_plans("MT10"), text_encoder=read_encoder(text_encoder), **options)
+    roots = list(data) or [_collected(out, who, names, episodes, noise, seed, num_envs) for who in behaviours]
+    replay = lw.LanguageWorldExperienceReplay(roots, label="executed", episodes=_of_tasks(roots, names))
+    labelled = lw.LabelledQueries(replay, config)
+    loss = lw.QueryEvaluatorTrainer(evaluator, labelled, config, checkpoint=out / "evaluator.zip").train()
+    print(f"trained to step {steps}" + ("" if loss != loss else f", loss {loss:.4f}"))
+    report = score_evaluator(evaluator, labelled)
+    print(report.table())
+    report.save(out / "report.json")
+    plot_reliability(report, out / "reliability.png")
+    print(f"written to {out}")
+
+
+def _collected(
+    out: Path,
+    who: str,
+    tasks: tuple[str, ...],
+    episodes: int,
+    noise: tuple[float, ...],
+    seed: int,
+    num_envs: int | None,
+) -> Path:
+    from lw_torchrl.data import collect_demonstrations
+
+    root = out / "data" / who
+    collect_demonstrations(
+        tasks,
+        episodes_per_task=episodes,
+        root=root,
+        policy=who,
+        noise_scale=noise if who == "expert" else 0.0,
+        seed=seed,
+        num_envs=num_envs,
+    )
+    return root
+
+
+def _of_tasks(roots: list[Path], tasks: tuple[str, ...]) -> list[dict[str, list[int]]]:
+    """For each dataset every episode of these tasks."""
+    from lw_torchrl.data.metadata import read_metadata
+
+    chosen = []
+    for root in roots:
+        found = read_metadata(root)
+        there = [task for task in tasks if task in found.config.tasks]
+        if not there:
+            raise ValueError(f"--data {root} holds none of the tasks; it holds {', '.join(found.config.tasks)}")
+        chosen.append({task: [one.episode for one in found.episodes if one.task == task] for task in there})
+    return chosen
+
+
+def with_evaluator(policy: Policy, path: Path, text_encoder: str | None) -> Policy:
+    """A policy whose conditions the evaluator of a file answers."""
+    from lw_torchrl.trainers.evaluator_files import load_evaluator
+
+    if policy.plans is None:
+        raise ValueError(f"--evaluator is for a policy with plans, {type(policy).__name__} has none")
+    evaluator: QueryEvaluator = load_evaluator(path, policy.plans, text_encoder=read_encoder(text_encoder))
+    return policy.with_evaluator(evaluator)

@@ -1,0 +1,184 @@
+"""EvaluatorReport: how often a query evaluator is right, where it is worst, and whether its doubts are true."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lw_torchrl._files import write_json
+from lw_torchrl.language.queries import Clause
+from lw_torchrl.language.tasks import Task
+from lw_torchrl.modules.networks import evaluating
+from lw_torchrl.modules.state_query_evaluator import StateQueryEvaluator
+from lw_torchrl.trainers.labelled_queries import LabelledQueries
+
+BINS = 15
+PARTS = {
+    "states": "trained queries, held-out states",
+    "queries": "held-out queries, held-out states",
+    "tasks": "held-out tasks",
+}
+_ROWS = 512
+
+
+@dataclass(frozen=True)
+class PartScore:
+    """How an evaluator answers one part of :class:`LabelledQueries`.
+
+    Attributes:
+        right, asked: by predicate, how often it was right and asked where the predicate does not hold, and where it
+            holds. A negation counts with what it negates.
+        reliability: (15, 3) float64, of the answers by their probability that the predicate holds, in bins of equal
+            width: how many there are, the sum of their probabilities, and how often the predicate holds.
+    """
+
+    right: dict[str, tuple[int, int]]
+    asked: dict[str, tuple[int, int]]
+    reliability: Tensor
+
+    @property
+    def answers(self) -> int:
+        """How many answers there are."""
+        return sum(map(sum, self.asked.values()))
+
+    def accuracy(self, predicate: str | None = None) -> float:
+        """The share of right answers, to one predicate or to all."""
+        names = list(self.asked) if predicate is None else [predicate]
+        return sum(sum(self.right[name]) for name in names) / sum(sum(self.asked[name]) for name in names)
+
+    def balanced_accuracy(self, predicate: str | None = None) -> float:
+        """The mean of the shares of right answers where the predicate holds and where it does not; of a truth that
+        never comes there is none."""
+        names = list(self.asked) if predicate is None else [predicate]
+        pairs = [[sum(table[name][truth] for name in names) for table in (self.right, self.asked)] for truth in (0, 1)]
+        shares = [right / asked for right, asked in pairs if asked]
+        return sum(shares) / len(shares)
+
+    @property
+    def calibration_error(self) -> float:
+        """The expected calibration error: how far the probabilities are from the shares, on average."""
+        number, told, true = self.reliability.unbind(-1)
+        return ((told - true).abs().sum() / number.sum()).item()
+
+    @property
+    def worst(self) -> list[str]:
+        """The predicates, the one of the least balanced accuracy first."""
+        return sorted(self.asked, key=lambda name: (self.balanced_accuracy(name), name))
+
+    def to_json(self) -> dict[str, Any]:
+        """The numbers, and those they are made of."""
+        return {
+            "answers": self.answers,
+            "accuracy": self.accuracy(),
+            "balanced_accuracy": self.balanced_accuracy(),
+            "calibration_error": self.calibration_error,
+            "predicates": {
+                name: {
+                    "accuracy": self.accuracy(name),
+                    "balanced_accuracy": self.balanced_accuracy(name),
+                    "false_and_true": list(self.asked[name]),
+                    "right": list(self.right[name]),
+                }
+                for name in self.worst
+            },
+            "reliability": self.reliability.tolist(),
+        }
+
+
+@dataclass(frozen=True)
+class EvaluatorReport:
+    """How an evaluator answers what was held out.
+
+    Attributes:
+        parts: by name, "states", "queries" and "tasks", as far as there are any.
+        about: what was trained and held out, as JSON.
+    """
+
+    parts: dict[str, PartScore]
+    about: dict[str, Any]
+
+    def table(self, most: int = 4) -> str:
+        """The numbers as text, with so many of the worst predicates of each part."""
+        lines = [f"{'':36}{'answers':>10}{'accuracy':>10}{'balanced':>10}{'calibration error':>19}"]
+        for part, score in self.parts.items():
+            lines.append(
+                f"{PARTS[part]:36}{score.answers:10}{score.accuracy():10.4f}{score.balanced_accuracy():10.4f}"
+                f"{score.calibration_error:19.4f}"
+            )
+            for name in score.worst[:most]:
+                asked = sum(score.asked[name])
+                lines.append(f"  {name:34}{asked:10}{score.accuracy(name):10.4f}{score.balanced_accuracy(name):10.4f}")
+        return "\n".join(lines)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write it as JSON."""
+        write_json(path, {"about": self.about, "parts": {name: one.to_json() for name, one in self.parts.items()}})
+
+
+def score_evaluator(evaluator: StateQueryEvaluator, data: LabelledQueries) -> EvaluatorReport:
+    """Ask an evaluator what was held out.
+
+    Args:
+        evaluator: any, of whatever plans.
+        data: with the answers.
+
+    Raises:
+        ValueError: nothing was held out.
+
+    Example:
+        >>> import lw_torchrl as lw, tempfile
+        >>> with tempfile.TemporaryDirectory() as root:
+        ...     _ = lw.collect_demonstrations("push", episodes_per_task=2, root=root + "/demos", max_steps=40)
+        ...     replay = lw.LanguageWorldExperienceReplay(root + "/demos", label="executed")
+        ...     data = lw.LabelledQueries(replay, lw.QueryEvaluatorConfig())
+        >>> untrained = lw.StateQueryEvaluator(lw.load_plans("MT10"))
+        >>> list(score_evaluator(untrained, data).parts)
+        ['states', 'queries']
+    """
+    parts = {part: _score(evaluator, data, part) for part in PARTS if data.parts[part]}
+    if not parts:
+        raise ValueError("data must hold out states, queries or tasks, for an evaluator to be asked")
+    return EvaluatorReport(parts, data.describe())
+
+
+@torch.no_grad()
+def _score(evaluator: StateQueryEvaluator, data: LabelledQueries, part: str) -> PartScore:
+    right: dict[str, tuple[int, int]] = {}
+    asked: dict[str, tuple[int, int]] = {}
+    reliability = torch.zeros(BINS, 3, dtype=torch.float64)
+    with evaluating(evaluator):
+        for one in data.parts[part]:
+            for logits, truth in _told(evaluator, one.task, one.clauses, one.observation, one.truth):
+                correct = (logits > 0) == truth
+                for column, clause in enumerate(one.clauses):
+                    found = [(truth[:, column] == bool(value)) for value in (0, 1)]
+                    _add(asked, clause.predicate, [int(rows.sum()) for rows in found])
+                    _add(right, clause.predicate, [int(correct[rows, column].sum()) for rows in found])
+                told = logits.double().sigmoid().reshape(-1)
+                place = (told * BINS).long().clamp(max=BINS - 1)
+                entries = torch.stack((torch.ones_like(told), told, truth.reshape(-1).double()), -1)
+                reliability.index_add_(0, place, entries)
+    return PartScore(right, asked, reliability)
+
+
+def _told(
+    evaluator: StateQueryEvaluator, task: Task, clauses: tuple[Clause, ...], observation: Tensor, truth: Tensor
+) -> list[tuple[Tensor, Tensor]]:
+    """Logits (R, Q) that the predicates hold, and their truth; of an evaluator that reads texts also as it answers the
+    negations."""
+    coded, vectors = evaluator.code([(task, clause) for clause in clauses])
+    every = [
+        evaluator.network(rows, coded.pick(torch.arange(len(coded.predicate)).expand(len(rows), -1)), vectors)
+        for rows in observation.split(_ROWS)
+    ]
+    found = torch.cat(every).split(len(clauses), -1)
+    return [(logits if number == 0 else -logits, truth) for number, logits in enumerate(found)]
+
+
+def _add(table: dict[str, tuple[int, int]], name: str, more: list[int]) -> None:
+    false, true = table.get(name, (0, 0))
+    table[name] = (false + more[0], true + more[1])

@@ -1,0 +1,186 @@
+"""LabelledQueries: the base queries of tasks in a dataset's states, with the query answering function's answers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import chain
+from typing import Any
+
+import torch
+from torch import Tensor
+from torchrl.data import TensorDictReplayBuffer
+
+from lw_torchrl._checks import check_choice, check_int, check_probability, check_scale, shown
+from lw_torchrl.language.queries import Clause, Query, base_clauses
+from lw_torchrl.language.query_program import QueryProgram
+from lw_torchrl.language.relations import RELATIONS
+from lw_torchrl.language.tasks import TASKS, Task, task_id
+
+
+@dataclass(frozen=True)
+class QueryEvaluatorConfig:
+    """How a query evaluator is trained, and what is held out.
+
+    Attributes:
+        steps: minibatches.
+        batch_size: pairs of a state and a clause in a minibatch.
+        learning_rate: AdamW's at the start; a cosine brings it to 0.
+        weight_decay: AdamW's.
+        states_per_task: at most so many of each task are labelled to train on, drawn from its rows.
+        held_out_states: the share of a task's episodes, by their numbers, whose states are not trained on.
+        held_out_pairs: the share of pairs of objects of which nothing is trained, by their names, in all tasks alike.
+        held_out_tasks: of which nothing is trained: names, or a number of tasks to draw.
+        seed: of what is held out, the states and the minibatches.
+        checkpoint_every: steps between checkpoints; the last step always makes one.
+    """
+
+    steps: int = 4000
+    batch_size: int = 1024
+    learning_rate: float = 3e-3
+    weight_decay: float = 1e-4
+    states_per_task: int = 2000
+    held_out_states: float = 0.2
+    held_out_pairs: float = 0.1
+    held_out_tasks: int | tuple[str, ...] = 0
+    seed: int = 0
+    checkpoint_every: int = 500
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "batch_size", "states_per_task", "checkpoint_every"):
+            check_int(name, getattr(self, name), minimum=1)
+        for name in ("learning_rate", "weight_decay"):
+            check_scale(name, getattr(self, name))
+        for name in ("held_out_states", "held_out_pairs"):
+            if check_probability(name, getattr(self, name)) > 0.9:
+                raise ValueError(f"{name} must leave a tenth to train on, got {getattr(self, name)}")
+        check_int("seed", self.seed)
+        if isinstance(self.held_out_tasks, (int, str)):
+            check_int("held_out_tasks", self.held_out_tasks, minimum=0)
+        else:
+            object.__setattr__(self, "held_out_tasks", tuple(self.held_out_tasks))
+
+
+@dataclass(frozen=True)
+class Asked:
+    """Clauses that are asked of the states of a task.
+
+    Attributes:
+        task: whose objects they name.
+        clauses: Q of them, none negated.
+        observation: (R, 39) float32.
+        truth: (R, Q) bool, the query answering function's.
+    """
+
+    task: Task
+    clauses: tuple[Clause, ...]
+    observation: Tensor
+    truth: Tensor
+
+
+class LabelledQueries:
+    """All base queries of a dataset's tasks, not only those of plans, and which of them are trained.
+
+    Attributes:
+        tasks: those that are trained.
+        held_out_tasks: those that are not.
+        held_out_pairs: pairs of names, each sorted, of which nothing is trained.
+        parts: what is asked, by name: "training"; "states", the same clauses in held-out states; "queries", clauses on
+            held-out pairs, in these states; "tasks", all clauses of held-out tasks. One may be empty.
+
+    Args:
+        replay: its rows hold ``observation`` (R, 39) float32, ``task_id`` and ``episode`` (R,) int64.
+        config: what is held out.
+        tasks: what is known of its tasks; the shipped ones by default.
+
+    Raises:
+        ValueError: a row of a task that is not among ``tasks``, held-out tasks that it lacks, or all of them.
+    """
+
+    def __init__(
+        self, replay: TensorDictReplayBuffer, config: QueryEvaluatorConfig, tasks: Iterable[Task] | None = None
+    ) -> None:
+        known = {task_id(task.name): task for task in (TASKS.values() if tasks is None else tasks)}
+        rows = replay[:]
+        observation, ids = rows.get("observation").float(), rows.get("task_id")
+        if other := sorted({*ids.unique().tolist()} - {*known}):
+            raise ValueError(f"tasks must have all tasks of the rows, they lack those of the ids {shown(other)}")
+        found = [known[number] for number in ids.unique().tolist()]
+        generator = torch.Generator().manual_seed(config.seed)
+        self.held_out_tasks = _drawn_tasks(config.held_out_tasks, [task.name for task in found], generator)
+        trained = [task for task in found if task.name not in self.held_out_tasks]
+        self.tasks = tuple(task.name for task in trained)
+        self.held_out_pairs = _drawn_pairs(config.held_out_pairs, trained, generator)
+        kept = _held_out_rows(rows.get("episode"), ids, config.held_out_states)
+        self.parts: dict[str, list[Asked]] = {"training": [], "states": [], "queries": [], "tasks": []}
+        for task in found:
+            own = ids == task_id(task.name)
+            clauses = [clause for clause in base_clauses(task, tuple(RELATIONS)) if not clause.negated]
+            train = _some(observation[own & ~kept], config.states_per_task, generator)
+            test = _some(observation[own & kept], config.states_per_task, generator)
+            if task.name in self.held_out_tasks:
+                self._ask("tasks", task, clauses, torch.cat((train, test)))
+                continue
+            new = [clause for clause in clauses if _pair(clause) in self.held_out_pairs]
+            old = [clause for clause in clauses if _pair(clause) not in self.held_out_pairs]
+            self._ask("training", task, old, train)
+            self._ask("states", task, old, test)
+            self._ask("queries", task, new, test)
+
+    def _ask(self, part: str, task: Task, clauses: Sequence[Clause], observation: Tensor) -> None:
+        if not clauses or not len(observation):
+            return
+        program = QueryProgram({task: [Query((clause,)) for clause in clauses]})
+        truth = program(observation, torch.full((len(observation),), task_id(task.name)))
+        self.parts[part].append(Asked(task, tuple(clauses), observation, truth))
+
+    def describe(self) -> dict[str, Any]:
+        """What is trained and what is held out, as JSON."""
+        return {
+            "tasks": list(self.tasks),
+            "held_out_tasks": list(self.held_out_tasks),
+            "held_out_pairs": [list(pair) for pair in self.held_out_pairs],
+            "states": {part: sum(len(asked.observation) for asked in found) for part, found in self.parts.items()},
+            "queries": {part: sum(len(asked.clauses) for asked in found) for part, found in self.parts.items()},
+        }
+
+
+def _pair(clause: Clause) -> tuple[str, str]:
+    first, second = sorted((clause.subject, clause.object or ""))
+    return first, second
+
+
+def _some(observation: Tensor, most: int, generator: torch.Generator) -> Tensor:
+    if len(observation) <= most:
+        return observation
+    return observation[torch.randperm(len(observation), generator=generator)[:most].sort().values]
+
+
+def _drawn_tasks(asked: int | tuple[str, ...], names: Sequence[str], generator: torch.Generator) -> tuple[str, ...]:
+    number = asked if isinstance(asked, int) else len(asked)
+    if number >= len(names):
+        raise ValueError(f"held_out_tasks must leave tasks to train on, got {number} of {len(names)}")
+    if isinstance(asked, int):
+        drawn = torch.randperm(len(names), generator=generator)[:number].tolist()
+        return tuple(sorted(names[place] for place in drawn))
+    return tuple(sorted({check_choice("held_out_tasks", name, names) for name in asked}))
+
+
+def _drawn_pairs(share: float, tasks: Sequence[Task], generator: torch.Generator) -> tuple[tuple[str, str], ...]:
+    """Of the pairs of different objects so large a share, and at least one if any are asked for."""
+    clauses = chain.from_iterable(base_clauses(task, ("near",)) for task in tasks)
+    pairs = sorted({_pair(clause) for clause in clauses if clause.object is not None})
+    number = min(len(pairs) - 1, max(1, round(share * len(pairs)))) if share else 0
+    return tuple(sorted(pairs[place] for place in torch.randperm(len(pairs), generator=generator)[:number].tolist()))
+
+
+def _held_out_rows(episode: Tensor, ids: Tensor, share: float) -> Tensor:
+    """(R,) bool, the rows of some episodes of each task, spread over all of them: so large a share, at least one if any
+    are asked for and another is left. Episodes of one number begin alike, whoever acts: they go together."""
+    held = torch.zeros_like(ids, dtype=torch.bool)
+    for number in ids.unique().tolist():
+        own = episode[ids == number].unique()
+        many = min(len(own) - 1, max(1, round(share * len(own)))) if share else 0
+        places = ((torch.arange(many) + 0.5) * len(own) / max(1, many)).long()
+        held |= torch.isin(episode, own[places]) & (ids == number)
+    return held

@@ -1,0 +1,59 @@
+"""``lw-torchrl train-evaluator``, and what it leaves in an evaluation."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from commands import fails, run
+
+import lw_torchrl as lw
+
+SMALL = ["--steps", 20, "--batch-size", 64, "--width", 16, "--depth", 1, "--episodes", 2, "--behaviours", "random"]
+
+
+@pytest.fixture(scope="module")
+def policy(tmp_path_factory):
+    path = tmp_path_factory.mktemp("policy") / "scripted.zip"
+    plans = lw.load_plans("MT10")
+    lw.save_actor(lw.ScriptedSkillActor(lw.Plans([plans["push"], plans["reach"]])), path)
+    return path
+
+
+def test_it_is_trained_reported_and_used(capsys, tmp_path, policy):
+    out = tmp_path / "evaluator"
+    args = ["train-evaluator", "push", "reach", "--out", out, "--held-out-tasks", "reach", *SMALL]
+    printed = run(capsys, *args)
+    assert "trained to step 20, loss 0." in printed
+    assert "held-out tasks" in printed
+    report = json.loads((out / "report.json").read_text())
+    assert report["about"]["held_out_tasks"] == ["reach"]
+    assert set(report["parts"]) == {"states", "queries", "tasks"}
+    assert (out / "reliability.png").stat().st_size > 1000
+    before = (out / "evaluator.zip").read_bytes()
+    assert "trained to step 20\n" in run(capsys, *args)
+    assert (out / "evaluator.zip").read_bytes() == before
+    found = run(
+        capsys, "evaluate", policy, "--evaluator", out / "evaluator.zip", "--episodes", 1, "--tasks", "reach",
+        "--out", tmp_path / "result",
+    )  # fmt: skip
+    assert "reach" in found
+    saved = json.loads((tmp_path / "result" / "results.json").read_text())
+    assert saved["origin"]["evaluator"]["path"] == str(out / "evaluator.zip")
+    rows = run(capsys, "train-evaluator", "push", "--out", tmp_path / "b", "--data", out / "data" / "random", *SMALL)
+    assert "trained queries" in rows
+    assert not (tmp_path / "b" / "data").exists()
+
+
+def test_what_cannot_be_is_refused(capsys, tmp_path, policy):
+    out = ["--out", tmp_path / "x"]
+    assert "--text-encoder is for --no-structure" in fails(
+        capsys, "train-evaluator", "reach", *out, "--text-encoder", "my:f"
+    )
+    assert "TASKS" in fails(capsys, "train-evaluator", "reech", *out)
+    assert "--steps must be at least 1" in fails(capsys, "train-evaluator", "reach", *out, "--steps", 0)
+    assert "--behaviours must be one of" in fails(capsys, "train-evaluator", "reach", *out, "--behaviours", "bold")
+    assert "--evaluator is for a policy with plans" in fails(capsys, "evaluate", "expert", "--evaluator", policy)
+    assert "it is a policy's, give the evaluator's" in fails(capsys, "evaluate", policy, "--evaluator", policy)
+    assert "no file" in fails(capsys, "evaluate", policy, "--evaluator", tmp_path / "none.zip")
+    assert not (tmp_path / "x").exists()

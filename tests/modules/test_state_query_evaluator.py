@@ -1,0 +1,256 @@
+"""StateQueryEvaluator: what it reads, how clauses become conditions, and that it is part of a policy like any other."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.objectives import BCLoss
+
+import lw_torchrl as lw
+from lw_torchrl.evaluation.swaps import with_true_answers
+from lw_torchrl.language.plans import PlanStep
+from lw_torchrl.language.relations import RELATIONS, Comparison
+from lw_torchrl.modules.clause_network import conjunction
+
+PLANS = lw.load_plans("MT10")
+KINDS = {"structure": {}, "texts": {"structure": False}}
+
+
+def letters(texts):
+    return torch.tensor([[float(text.count(letter)) for letter in "abdefghilnoprstuw"] for text in texts])
+
+
+def make(kind, plans=PLANS, seed=0, **options):
+    torch.manual_seed(seed)
+    encoder = {} if kind == "structure" else {"text_encoder": letters}
+    return lw.StateQueryEvaluator(plans, width=8, depth=1, **KINDS[kind], **encoder, **options)
+
+
+def make_actor(kind, **options):
+    evaluator = make(kind)
+    return lw.PlanConditionedActor(PLANS, evaluator=evaluator, width=8, text_encoder=letters, **options).eval()
+
+
+def states(rows=20, plans=PLANS):
+    generator = torch.Generator().manual_seed(0)
+    ids = torch.tensor([lw.task_id(task) for task in plans]).repeat(rows)[:rows]
+    return TensorDict(
+        observation=torch.rand(rows, 39, generator=generator) * 0.3,
+        task_id=ids,
+        action=torch.rand(rows, 4, generator=generator),
+        batch_size=rows,
+    )
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_logit_for_each_step_whatever_the_order_and_shape_of_rows(kind):
+    evaluator, found = make(kind), states(64)  # as many rows as evaluation's blocks have
+    logits = evaluator(found.clone())["qaf_logits"]
+    assert logits.shape == (64, PLANS.num_steps)
+    assert logits.dtype == torch.float32
+    for row, task in enumerate(found["task_id"].tolist()):
+        steps = len(PLANS[lw.MT50[task]].steps)
+        assert (logits[row, :steps].abs() <= 31).all()
+        assert (logits[row, steps:] == -1e4).all()
+    order = torch.randperm(64, generator=torch.Generator().manual_seed(1))
+    assert torch.equal(evaluator(found[order])["qaf_logits"], logits[order])
+    assert torch.equal(evaluator(found.reshape(4, 16))["qaf_logits"].reshape(64, -1), logits)
+
+
+def test_structure_sees_only_the_difference_of_the_two_positions():
+    evaluator, found = make("structure"), states()
+    logits = evaluator(found.clone())["qaf_logits"]
+    moved = found.clone()
+    moved["observation"][:, 7:11] += 1.0  # a quaternion, which no relation compares
+    assert torch.equal(evaluator(moved)["qaf_logits"], logits)
+
+
+def test_not_is_the_opposite_with_structure():
+    texts = ["the gripper is above the puck", "the gripper is not above the puck"]
+    steps = [PlanStep(lw.parse_query(text, "push"), "grasp the puck") for text in texts]
+    plans = lw.Plans([lw.ConditionalPlan("push", tuple(steps))])
+    logits = make("structure", plans)(states(6, plans))["qaf_logits"]
+    assert torch.allclose(logits[:, 0], -logits[:, 1], atol=1e-5)
+    assert (logits[:, 0] != 0).all()
+
+
+def test_a_conjunction_is_the_product_of_its_parts():
+    logits = torch.tensor([[0.3, -1.2, 2.0], [29.0, 30.0, -30.0], [4.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    said = torch.tensor([[True, True, True], [True, True, False], [True, False, False], [False, False, False]])
+    found = conjunction(logits, said)
+    p = torch.where(said, logits.double().sigmoid(), 1.0).prod(-1)
+    assert torch.allclose(found[:3].double(), p[:3].logit(), atol=1e-4)
+    assert found[3] > 29
+    assert torch.allclose(conjunction(logits[:, :1], said[:, :1])[:3], logits[:3, 0], atol=1e-5)
+
+
+def test_a_conjunction_has_a_gradient_everywhere():
+    logits = torch.tensor([[30.0, 30.0], [-30.0, -30.0], [0.0, 1.0]], requires_grad=True)
+    conjunction(logits, torch.tensor([[True, True], [True, True], [False, False]])).sum().backward()
+    assert logits.grad.isfinite().all()
+    assert (logits.grad[2] == 0).all()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("answers", ["logit", "tanh", "hard"])
+@pytest.mark.filterwarnings("ignore:.*target_actor_network_params")
+def test_the_loss_of_imitation_reaches_the_evaluator(kind, answers):
+    actor = make_actor(kind, answers=answers).train()
+    loss = BCLoss(actor, loss_function="l2")
+    loss(states())["loss_bc"].backward()
+    found = dict(actor.evaluator.named_parameters())
+    assert len(found) >= 3
+    for name, parameter in found.items():
+        assert parameter.grad is not None, name
+        assert parameter.grad.abs().sum() > 0, name
+
+
+def test_hard_answers_act_as_exact_truth_does():
+    class Truth(lw.QueryEvaluator):
+        def __init__(self, plans):
+            super().__init__(plans)
+            self.qaf = lw.QAFTransform(plans)
+
+        def logits(self, observation, task_id):
+            told = self.qaf(TensorDict(observation=observation, task_id=task_id, batch_size=task_id.shape))
+            return torch.where(told["qaf"], 0.3, -12.0)
+
+    actor = lw.PlanConditionedActor(PLANS, width=8).eval()
+    found = states()
+    with_qaf = actor(lw.QAFTransform(PLANS)(found.clone()))
+    hard = actor.with_evaluator(Truth(PLANS))(found.clone())
+    assert torch.equal(hard["skill_weights"], with_qaf["skill_weights"])
+    assert torch.equal(hard["action"], with_qaf["action"])
+    soft = actor.with_evaluator(Truth(PLANS), answers="tanh")(found.clone())
+    assert not torch.equal(soft["skill_weights"], with_qaf["skill_weights"])
+
+
+def test_tanh_is_the_papers_ten_times_the_probability_less_five():
+    from lw_torchrl.modules.plan_attention import strength
+
+    logits = torch.linspace(-8, 8, 33)
+    assert torch.allclose(strength(logits, "tanh", 0.5), 10 * logits.sigmoid() - 5, atol=1e-5)
+    assert torch.equal(strength(logits, "logit", 0.5), logits)
+
+
+def test_with_evaluator_shares_the_weights():
+    actor = lw.PlanConditionedActor(PLANS, width=8)
+    other = actor.with_evaluator(make("structure"))
+    own = {id(one) for one in other.evaluator.parameters()}
+    assert {id(one) for one in actor.parameters()} == {id(one) for one in other.parameters()} - own
+    assert other.config["answers"] == "hard"
+    with pytest.raises(TypeError, match="DescriptorConditionedActor has none"):
+        lw.DescriptorConditionedActor("MT10").with_evaluator(make("structure"))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_with_plans_shares_the_network_alone(kind):
+    actor, other = make_actor(kind), lw.Plans([PLANS["push"]])
+    found = actor.with_plans(other)
+    assert {id(one) for one in actor.evaluator.parameters()} == {id(one) for one in found.evaluator.parameters()}
+    rows = states(4, other)
+    assert torch.allclose(found(rows.clone())["action"], actor(rows.clone())["action"], atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_saved_and_loaded_with_the_policy_to_the_bit(kind, tmp_path):
+    actor = make_actor(kind, answers="tanh", answer_scale=0.7)
+    lw.save_actor(actor, tmp_path / "policy.zip")
+    loaded = lw.load_actor(tmp_path / "policy.zip", text_encoder=letters)
+    assert loaded.config["answer_scale"] == 0.7
+    for key in actor.out_keys:
+        assert torch.equal(loaded(states())[key], actor(states())[key]), key
+
+
+def test_scripted_skills_act_on_its_answers(tmp_path):
+    plans = lw.load_plans("MT10")
+    evaluator = make("structure", plans)
+    actor = lw.ScriptedSkillActor(plans, evaluator=evaluator)
+    assert actor.in_keys == ["observation", "task_id"]
+    assert actor.transform() is None
+    found = actor(states())
+    told = evaluator(states())["qaf_logits"] > 0
+    by_truth = lw.ScriptedSkillActor(plans)(states().set("qaf", told))
+    for key in ("action", "skill_weights"):
+        assert torch.equal(found[key], by_truth[key])
+    assert found["skill_weights"][:, 1:].any()
+    lw.save_actor(actor, tmp_path / "policy.zip")
+    assert torch.equal(lw.load_actor(tmp_path / "policy.zip")(states())["action"], found["action"])
+    other = actor.with_plans(lw.Plans([PLANS["push"]]))
+    assert other.evaluator.network.predicates.weight is evaluator.network.predicates.weight
+    assert lw.ScriptedSkillActor(plans).with_evaluator(evaluator)(states())["action"].equal(found["action"])
+
+
+def test_true_answers_in_its_place_are_worth_what_exact_truth_is():
+    actor = make_actor("structure", answers="tanh")
+    plain = lw.PlanConditionedActor(PLANS, width=8, text_encoder=letters).eval()
+    plain.encoder.texts, plain.encoder.features, plain.head = actor.encoder.texts, actor.encoder.features, actor.head
+    found = with_true_answers(actor)(states())
+    assert torch.equal(found["skill_weights"], plain(lw.QAFTransform(PLANS)(states()))["skill_weights"])
+    assert actor.encoder.config["answers"] == "tanh"
+
+
+def test_as_an_evaluator_of_an_evaluation_its_sign_counts():
+    class Never(lw.QueryEvaluator):
+        def logits(self, observation, task_id):
+            return torch.full((*task_id.shape, self.plans.num_steps), -1.0)
+
+    seen = []
+    plans = lw.Plans([PLANS["reach"]])
+    lw.evaluate(
+        lw.ScriptedSkillActor(plans),
+        tasks="reach",
+        episodes_per_task=1,
+        seed=1_000,
+        max_steps=5,
+        evaluator=Never(plans),
+        also_record=["qaf"],
+        on_episode=seen.append,
+    )
+    assert not seen[0].steps["qaf"].any()
+
+
+# ---- refusals
+
+
+def test_what_cannot_be_is_named():
+    with pytest.raises(ValueError, match=r"float32 of shape .*39.*got torch.float32 of shape .2, 38"):
+        make("structure")(TensorDict(observation=torch.rand(2, 38), task_id=torch.zeros(2).long(), batch_size=2))
+    with pytest.raises(ValueError, match=r"task_id must be of shape .2,., one per observation"):
+        make("structure").logits(torch.rand(2, 39), torch.zeros(3).long())
+    with pytest.raises(ValueError, match="tasks without a plan"):
+        make("structure").logits(torch.rand(1, 39), torch.tensor([lw.task_id("hammer")]))
+    with pytest.raises(ValueError, match="answers must be one of"):
+        make_actor("structure", answers="soft")
+    with pytest.raises(ValueError, match="answers and answer_scale are of an evaluator's logits"):
+        lw.PlanConditionedActor(PLANS, answers="tanh")
+    with pytest.raises(TypeError, match="structure must be True or False, got 'no'"):
+        lw.StateQueryEvaluator(PLANS, structure="no")
+    with pytest.raises(ValueError, match="predicates is for structure=True"):
+        lw.StateQueryEvaluator(PLANS, structure=False, predicates=["near"], text_encoder=letters)
+    with pytest.raises(ValueError, match="predicates must be different names"):
+        lw.StateQueryEvaluator(PLANS, predicates=["near", "near"])
+    with pytest.raises(TypeError, match="evaluator must be a QueryEvaluator"):
+        lw.ScriptedSkillActor(PLANS, evaluator=torch.nn.Linear(1, 1))
+
+
+def test_a_relation_that_it_was_not_made_for_is_refused(monkeypatch):
+    made = make("structure")
+    monkeypatch.setitem(RELATIONS, "beside", (Comparison("xyz", "<", 0.05),))
+    step = PlanStep(lw.parse_query("the gripper is beside the puck", "push"), "grasp the puck")
+    plans = lw.Plans([lw.ConditionalPlan("push", (step,))])
+    with pytest.raises(ValueError, match=r"predicate of .*beside the puck\", in push.*make and train one that has it"):
+        made.with_plans(plans)
+    assert "beside" in make("structure", plans).predicates
+
+
+def test_texts_without_vectors_name_the_mend(monkeypatch):
+    import lw_torchrl.language.text as text
+
+    def absent():
+        raise ImportError("no sentence_transformers")
+
+    monkeypatch.setattr(text, "_sentence_transformer", absent)
+    with pytest.raises(ImportError, match=r"clauses' texts.*lw_torchrl\[text\].*text_encoder.*structure=True"):
+        lw.StateQueryEvaluator(PLANS, structure=False)

@@ -1,0 +1,260 @@
+"""A StateQueryEvaluator learns what the query answering function answers, from what is not held out."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+from small_training import flat
+
+import lw_torchrl as lw
+from lw_torchrl._tensor_archive import TensorArchive, write_archive
+from lw_torchrl.evaluation import plot_reliability, score_evaluator
+
+PLANS = lw.load_plans("MT10")
+SMALL = lw.QueryEvaluatorConfig(steps=12, batch_size=64, checkpoint_every=5)
+PARTS = ("training", "states", "queries", "tasks")
+
+
+def words(texts):
+    """Bags of words; "not" and the order of two names among them."""
+    vocabulary = sorted({word for task in PLANS for word in " ".join(lw.supported_queries(task)).split()})
+    vectors = torch.zeros(len(texts), 2 * len(vocabulary))
+    for row, text in enumerate(texts):
+        for place, word in enumerate(text.split()):
+            vectors[row, vocabulary.index(word) + (place > 4) * len(vocabulary)] += 1.0
+    return vectors
+
+
+@pytest.fixture(scope="module")
+def replay(tmp_path_factory):
+    root = tmp_path_factory.mktemp("states")
+    for who in ("scripted", "random"):
+        lw.collect_demonstrations(
+            ["drawer-open", "push", "reach"],
+            episodes_per_task=8,
+            root=root / who,
+            policy=who,
+            max_steps=50,
+            progress=False,
+        )
+    return lw.LanguageWorldExperienceReplay([root / "scripted", root / "random"], label="executed")
+
+
+def make(seed=0, **options):
+    torch.manual_seed(seed)
+    return lw.StateQueryEvaluator(PLANS, **{"width": 16, "depth": 1, **options})
+
+
+def make_trainer(replay, path=None, *, config=SMALL, **options):
+    data = lw.LabelledQueries(replay, config)
+    return lw.QueryEvaluatorTrainer(make(**options), data, config, checkpoint=path, progress=False)
+
+
+def everything(trainer):
+    return flat({"weights": dict(trainer.evaluator.state_dict()), "optimizer": trainer.optimizer.state_dict()})
+
+
+def assert_same(found, expected):
+    assert found.keys() == expected.keys()
+    for key, value in expected.items():
+        assert torch.equal(found[key], value) if isinstance(value, torch.Tensor) else found[key] == value, key
+
+
+# ---- what is trained, and what is not
+
+
+def test_what_is_held_out_is_nowhere_trained(replay):
+    config = lw.QueryEvaluatorConfig(held_out_tasks=("reach",), held_out_pairs=0.3, seed=3)
+    data = lw.LabelledQueries(replay, config)
+    assert (data.tasks, data.held_out_tasks) == (("drawer-open", "push"), ("reach",))
+    assert all(data.parts[part] for part in PARTS)
+    assert {asked.task.name for asked in data.parts["tasks"]} == {"reach"}
+    trained = {(asked.task.name, clause) for asked in data.parts["training"] for clause in asked.clauses}
+    pairs = {tuple(sorted((clause.subject, clause.object or ""))) for _, clause in trained}
+    held = {tuple(sorted((c.subject, c.object or ""))) for asked in data.parts["queries"] for c in asked.clauses}
+    assert held == {*data.held_out_pairs}
+    assert held.isdisjoint(pairs)
+    assert {c.predicate for asked in data.parts["queries"] for c in asked.clauses} <= {c.predicate for _, c in trained}
+    seen = {tuple(row) for asked in data.parts["training"] for row in asked.observation.tolist()}
+    for part in ("states", "queries"):
+        for asked in data.parts[part]:
+            assert not any(tuple(row) in seen for row in asked.observation.tolist())
+
+
+def test_labels_are_the_query_answering_functions(replay):
+    data = lw.LabelledQueries(replay, SMALL)
+    asked = data.parts["training"][0]
+    program = lw.QueryProgram({asked.task: [str(clause) for clause in asked.clauses]})
+    ids = torch.full((len(asked.observation),), lw.task_id(asked.task.name))
+    assert torch.equal(asked.truth, program(asked.observation, ids))
+    assert 0 < asked.truth.float().mean() < 1
+
+
+def test_the_seed_says_what_is_held_out(replay):
+    def drawn(seed):
+        found = lw.LabelledQueries(replay, lw.QueryEvaluatorConfig(held_out_tasks=1, seed=seed))
+        return found.held_out_tasks, found.held_out_pairs
+
+    assert drawn(0) == drawn(0)
+    assert len({drawn(seed) for seed in range(6)}) > 1
+    none = lw.LabelledQueries(replay, lw.QueryEvaluatorConfig(held_out_pairs=0.0, held_out_states=0.0))
+    assert not any(none.parts[part] for part in PARTS[1:])
+
+
+def test_a_minibatch_has_equally_many_of_each_predicate_and_truth(replay):
+    trainer = make_trainer(replay)
+    groups = len(trainer._sizes)
+    trainer.config = lw.QueryEvaluatorConfig(batch_size=groups * 7)
+    _, clauses, truth = trainer._draw()
+    kinds = torch.stack((clauses.predicate[:, 0], truth[:, 0].long()), -1)
+    _, counts = kinds.unique(dim=0, return_counts=True)
+    assert len(counts) == groups >= 24
+    assert (counts == 7).all()
+
+
+# ---- learning
+
+
+def test_two_tasks_are_learned_quickly(replay):
+    config = lw.QueryEvaluatorConfig(steps=400, batch_size=512, learning_rate=1e-2, held_out_tasks=("reach",))
+    data = lw.LabelledQueries(replay, config)
+    evaluator = make(width=64, depth=2)
+    before = score_evaluator(evaluator, data).parts["states"].balanced_accuracy()
+    lw.QueryEvaluatorTrainer(evaluator, data, config, progress=False).train()
+    found = score_evaluator(evaluator, data).parts
+    assert before < 0.7
+    assert found["states"].accuracy() > 0.98
+    assert found["states"].balanced_accuracy() > 0.98
+    assert found["queries"].accuracy() > 0.9
+    assert found["tasks"].accuracy() > 0.87
+
+
+def test_from_texts_alone_it_learns_too_and_what_not_means(replay):
+    config = lw.QueryEvaluatorConfig(steps=400, batch_size=512, learning_rate=1e-2, held_out_tasks=("reach",))
+    data = lw.LabelledQueries(replay, config)
+    evaluator = make(width=64, depth=2, structure=False, text_encoder=words)
+    lw.QueryEvaluatorTrainer(evaluator, data, config, progress=False).train()
+    assert score_evaluator(evaluator, data).parts["states"].accuracy() > 0.85
+
+
+def test_a_report_counts_every_answer_once(replay, tmp_path):
+    data = lw.LabelledQueries(replay, SMALL)
+    report = score_evaluator(make(), data)
+    asked = data.parts["states"]
+    states = report.parts["states"]
+    assert states.answers == sum(one.truth.numel() for one in asked)
+    assert states.answers == int(states.reliability[:, 0].sum())
+    assert sum(true for _, true in states.asked.values()) == int(sum(one.truth.sum() for one in asked))
+    assert states.balanced_accuracy(states.worst[0]) == min(map(states.balanced_accuracy, states.asked))
+    assert 0 < states.calibration_error < 1
+    report.save(tmp_path / "report.json")
+    assert json.loads((tmp_path / "report.json").read_text())["parts"]["states"]["accuracy"] == states.accuracy()
+    plot_reliability(report, tmp_path / "reliability.png")
+    assert (tmp_path / "reliability.png").read_bytes().startswith(b"\x89PNG")
+    assert "held-out queries" in report.table()
+
+
+# ---- files
+
+
+@pytest.mark.parametrize("kind", ["structure", "texts"])
+def test_training_that_was_stopped_goes_on_to_the_bit(replay, tmp_path, kind):
+    options = {} if kind == "structure" else {"structure": False, "text_encoder": words}
+    whole = make_trainer(replay, **options)
+    loss = whole.train()
+    first = make_trainer(replay, tmp_path / "e.zip", **options)
+    for _ in range(7):
+        first.step()
+    first.save()
+    second = make_trainer(replay, tmp_path / "e.zip", seed=1, **options)
+    assert second.done == 7
+    assert second.train() == pytest.approx(loss, abs=1.0)
+    assert_same(everything(second), everything(whole))
+    again = make_trainer(replay, tmp_path / "e.zip", **options)
+    assert again.done == SMALL.steps
+    loaded = lw.load_evaluator(tmp_path / "e.zip", PLANS, **({"text_encoder": words} if options else {}))
+    assert not loaded.training
+    assert_same(flat(dict(loaded.state_dict())), flat(dict(whole.evaluator.state_dict())))
+
+
+def test_another_training_does_not_go_on(replay, tmp_path):
+    make_trainer(replay, tmp_path / "e.zip").train()
+    with pytest.raises(ValueError, match=r"of another training, which differs in .*batch_size"):
+        make_trainer(replay, tmp_path / "e.zip", config=lw.QueryEvaluatorConfig(steps=12, batch_size=32))
+    with pytest.raises(ValueError, match=r"of another evaluator, which differs in .*width"):
+        make_trainer(replay, tmp_path / "e.zip", width=17)
+
+
+def test_it_is_loaded_for_any_plans(tmp_path):
+    evaluator = make()
+    lw.save_evaluator(evaluator, tmp_path / "e.zip", note="mine")
+    other = lw.load_evaluator(tmp_path / "e.zip", lw.load_plans("MT50"))
+    assert other.plans.fingerprint == lw.load_plans("MT50").fingerprint
+    actor = lw.PlanConditionedActor(PLANS, evaluator=lw.load_evaluator(tmp_path / "e.zip", PLANS), width=8)
+    assert torch.equal(actor.evaluator.network.trunk[0].weight, evaluator.network.trunk[0].weight)
+    with pytest.raises(ValueError, match="about must not be named state"):
+        lw.save_evaluator(evaluator, tmp_path / "e.zip", state=1)
+
+
+def test_what_is_no_evaluators_file_is_refused(tmp_path):
+    path = tmp_path / "e.zip"
+    with pytest.raises(FileNotFoundError, match="train-evaluator` writes one"):
+        lw.load_evaluator(path, PLANS)
+    lw.save_actor(lw.PlanConditionedActor(PLANS, width=8), path)
+    with pytest.raises(ValueError, match="it is a policy's, give the evaluator's"):
+        lw.load_evaluator(path, PLANS)
+    path.write_bytes(b"PK")
+    with pytest.raises(ValueError, match="is damaged or no evaluator's file"):
+        lw.load_evaluator(path, PLANS)
+
+    class Mine(lw.QueryEvaluator):
+        pass
+
+    with pytest.raises(ValueError, match=r"cannot be kept in a file.*kind of evaluator must be one of"):
+        lw.save_evaluator(Mine(PLANS), path)
+    with pytest.raises(TypeError, match="must be a QueryEvaluator to be kept"):
+        lw.save_evaluator(torch.nn.Linear(1, 1), path)
+
+
+@pytest.mark.parametrize(
+    ("part", "value"),
+    [("width", 10**6), ("width", 8), ("depth", 10**5), ("predicates", ["near"]), ("structure", False), ("own", 1)],
+)
+def test_options_that_the_weights_do_not_have_are_refused(tmp_path, part, value):
+    path = tmp_path / "e.zip"
+    lw.save_evaluator(make(), path)
+    found = TensorArchive(path)
+    found.description["evaluator"]["options"][part] = value
+    groups = {name: found.tensors(name) for name in found.groups}
+    write_archive(path, {k: v for k, v in found.description.items() if k != "sha256"}, groups)
+    with pytest.raises(ValueError, match=r"evaluator: that of .* cannot be made"):
+        lw.load_evaluator(path, PLANS)
+
+
+def test_another_text_encoder_is_found_out(tmp_path):
+    lw.save_evaluator(make(structure=False, text_encoder=words), tmp_path / "e.zip")
+    with pytest.raises(ValueError, match="text_encoder"):
+        lw.load_evaluator(tmp_path / "e.zip", PLANS, text_encoder=lambda texts: words(texts).flip(-1))
+
+
+# ---- refusals
+
+
+def test_what_cannot_be_is_named(replay):
+    with pytest.raises(ValueError, match="held_out_tasks must leave tasks to train on, got 3 of 3"):
+        lw.LabelledQueries(replay, lw.QueryEvaluatorConfig(held_out_tasks=3))
+    with pytest.raises(ValueError, match=r"held_out_tasks must be one of .*'reach'.*got 'reech'; did you mean 'reach'"):
+        lw.LabelledQueries(replay, lw.QueryEvaluatorConfig(held_out_tasks=("reech",)))
+    with pytest.raises(ValueError, match="held_out_states must leave a tenth"):
+        lw.QueryEvaluatorConfig(held_out_states=0.95)
+    with pytest.raises(ValueError, match="tasks must have all tasks of the rows"):
+        lw.LabelledQueries(replay, SMALL, [lw.TASKS["reach"]])
+    data = lw.LabelledQueries(replay, SMALL)
+    with pytest.raises(TypeError, match="must be a StateQueryEvaluator, got QueryEvaluator"):
+        lw.QueryEvaluatorTrainer(lw.QueryEvaluator(PLANS), data)
+    with pytest.raises(ValueError, match="must hold out states, queries or tasks"):
+        score_evaluator(
+            make(), lw.LabelledQueries(replay, lw.QueryEvaluatorConfig(held_out_pairs=0.0, held_out_states=0.0))
+        )
