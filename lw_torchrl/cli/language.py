@@ -81,26 +81,40 @@ def plans(
     /,
     plans: tuple[str, ...] = ("MT50",),
     skill_set: Literal["own", "MT10"] = "own",
+    roles: bool = False,
     task_file: Path | None = None,
 ) -> None:
-    """Show plans: the whole text of those named, or a list of all.
+    """Show plans: the whole text of those named, or a list of all; or which thing each of their steps brings where.
 
-    Example: lw-torchrl plans drawer-open
+    Example: lw-torchrl plans drawer-open --roles
 
     Args:
         names: MT10, MT50, or names of tasks.
         plans: MT10 or MT50 for the shipped plans, .plan files, .json files of pairs, or folders; where several have a
             plan for a task, the last one's counts.
         skill_set: of the shipped plans, those with scripted skills of their own, or those worded as MT10's are.
+        roles: a table of the steps, what each moves and what it goes to, and what told: "skill", the text is a scripted
+            skill's; "reworded", the text speaks of other tasks' things, and the shipped plan has a scripted skill under
+            the same condition; "words", the text's; "condition", the things that it compares; "nothing".
         task_file: tasks of yours, instead of ours of the same name or beside ours.
     """
     import lw_torchrl as lw
 
     known = read_tasks(task_file)
     loaded = read_plans(plans, known, skill_set)
+    chosen = lw.resolve_tasks(one_or_many(names), tasks=known) if names else tuple(loaded)
+    loaded.require(chosen)
+    if roles:
+        from lw_torchrl.language.roles import plan_roles
+
+        told = [
+            (name, step.skill, one.moved or "?", one.target or "?", one.source)
+            for name in chosen
+            for step, one in zip(loaded[name].steps, plan_roles(loaded[name]), strict=True)
+        ]
+        print_table(counted(len(told), "step"), ("task", "skill", "moved", "target", "told by"), told)
+        return
     if names:
-        chosen = lw.resolve_tasks(one_or_many(names), tasks=known)
-        loaded.require(chosen)
         print("\n".join(str(loaded[name]) for name in chosen))
         return
     rows = [

@@ -1,6 +1,7 @@
 """The subcommands about words: what they print, and every fault of a file at once."""
 
 import json
+import re
 
 import pytest
 from commands import fails, run
@@ -104,6 +105,30 @@ def test_a_plan_beyond_repair(capsys, tmp_path, text, message):
         run(capsys, "check", path)
     assert caught.value.code == 2
     assert message in capsys.readouterr().out
+
+
+def test_roles_of_plans(capsys, tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "160")
+
+    def told(*arguments):
+        lines = run(capsys, "plans", *arguments, "--roles").splitlines()
+        return [re.split(r" {2,}", line.strip()) for line in lines[4:] if line.strip()]
+
+    assert told("coffee-pull")[-1] == [
+        "coffee-pull",
+        "move the mug to the target location",
+        "mug",
+        "target location",
+        "skill",
+    ]
+    assert {row[-1] for row in told("coffee-pull", "--skill-set", "MT10")} == {"reworded"}
+    assert len(told()) == 186
+    path = tmp_path / "push.plan"
+    path.write_text(
+        PLAN.replace("not near the puck", "open").replace('place("the gripper above the puck', 'wait("here')
+    )
+    rows = told("push", "--plans", path)
+    assert [row[-3:] for row in rows] == [["?", "?", "nothing"], ["robot's gripper", "puck", "words"]]
 
 
 def test_the_shipped_files_are_valid(capsys, request):

@@ -1,0 +1,171 @@
+"""Roles: which thing each step of a plan is to bring where.
+
+A step has a *target*, the object or point to go to, and a thing that is *moved* there: the robot's gripper, or what it
+holds or pushes. Who knows them knows where a step leads without knowing the task.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Literal
+
+from lw_torchrl.language.named_objects import GRIPPER, typed
+from lw_torchrl.language.plan_files import load_plans
+from lw_torchrl.language.plans import ConditionalPlan, PlanStep
+from lw_torchrl.language.skills import ScriptedSkill, skills_for
+from lw_torchrl.language.tasks import TASKS, Task
+
+Source = Literal["skill", "reworded", "words", "condition", "nothing"]
+_TOOL = re.compile(r"(?<!in line )(?<!level )(?<!aligned )\bwith (the )?(?=<)")
+
+
+@dataclass(frozen=True)
+class Roles:
+    """What a step is about.
+
+    Attributes:
+        target: the object or point to go to; None where nothing tells.
+        moved: what is to arrive there, the robot's gripper or a thing; None where nothing tells.
+        source: what told: "skill", the text is a scripted skill's; "reworded", it speaks of things that the task lacks,
+            and the shipped plan has a scripted skill under the same condition; "words", those of the text; "condition",
+            the things that the condition compares; "nothing".
+    """
+
+    target: str | None
+    moved: str | None
+    source: Source
+
+
+_NOTHING = Roles(None, None, "nothing")
+
+
+def plan_roles(plan: ConditionalPlan, skills: Mapping[str, ScriptedSkill] | None = None) -> tuple[Roles, ...]:
+    """The roles of each step of a plan.
+
+    A scripted skill's ``target`` and ``moved`` count where the text is one's that the task may use; of skills nothing
+    else is read, neither offsets nor gains nor efforts. A text about things of other tasks ("close the gripper around
+    the puck" for a mug) is taken for a rewording of the shipped plan's step under the same condition. Otherwise the
+    text's own words tell, and where they name nothing of the task, its condition. Where the gripper goes to a thing and
+    the condition compares it with a point on that thing, the point is the target.
+
+    Args:
+        plan: a shipped one or yours; its ``definition`` says which objects and points there are.
+        skills: the scripted skills by their text; None for the shipped ones, an empty mapping for words alone.
+
+    Example:
+        >>> from lw_torchrl.language.plan_files import load_plans
+        >>> for roles in plan_roles(load_plans("MT50")["coffee-pull"])[1:]:
+        ...     print(roles.moved, "->", roles.target)
+        robot's gripper -> mug rim
+        robot's gripper -> mug rim
+        mug -> target location
+    """
+    allowed = skills_for(plan.definition, skills)
+    return tuple(_roles(step, plan.definition, allowed) for step in plan.steps)
+
+
+def _roles(step: PlanStep, task: Task, skills: Mapping[str, ScriptedSkill]) -> Roles:
+    found = _of_skill(step, task, skills) or _of_shipped(step, task, skills) or _of_words(step, task)
+    found = found or _of_condition(step) or _NOTHING
+    return replace(found, target=_point(found, step, task))
+
+
+def _of_skill(step: PlanStep, task: Task, skills: Mapping[str, ScriptedSkill]) -> Roles | None:
+    if step.skill not in skills:
+        return None
+    skill = skills[step.skill].for_task(task)
+    if skill.target == skill.moved:  # a move from where it is: away from what it was at
+        way = _compared(step, gripper=True)
+        return Roles(way[-1], GRIPPER, "skill") if way else None
+    return Roles(skill.target, skill.moved, "skill")
+
+
+@cache
+def _shipped() -> Mapping[str, ConditionalPlan]:
+    return load_plans("MT50")
+
+
+def _of_shipped(step: PlanStep, task: Task, skills: Mapping[str, ScriptedSkill]) -> Roles | None:
+    if not skills or task.name not in _shipped() or not _names_others(step.skill, task):
+        return None
+    for shipped in _shipped()[task.name].steps:
+        if str(shipped.condition) == str(step.condition):
+            found = _of_skill(shipped, task, skills)
+            return None if found is None else replace(found, source="reworded")
+    return None
+
+
+@cache
+def _things() -> frozenset[str]:
+    return frozenset(thing.name for task in TASKS.values() for thing in task.published.objects)
+
+
+def _names_others(skill: str, task: Task) -> bool:
+    """Whether a text names a thing of the 50 tasks that this one lacks."""
+    return any(re.search(rf"(?<![\w-]){re.escape(name)}(?![\w-])", skill) for name in _things() - {*task.object_names})
+
+
+def _of_words(step: PlanStep, task: Task) -> Roles | None:
+    text, tool = _marked(step.skill, task)
+    named = re.findall(r"<([^>]*)>", text)
+    if not named or named == [GRIPPER]:
+        return None
+    direct = re.match(r"\w+ (?:the )?<([^>]*)>", text)
+    target, moved = named[-1], direct[1] if direct else tool
+    if moved == target:  # "push the button down", "lift the cube": alone, it is where the gripper goes, or is moved
+        moved = tool or GRIPPER
+        if tool is None and (others := _partners(target, step, task)):
+            target, moved = others[-1], target
+    elif moved is None:  # "move the puck to the target location" of a mug: what it holds
+        held = [name for name in _compared(step, gripper=True) if not _same_thing(name, target, task)]
+        moved = held[-1] if held else GRIPPER
+    return Roles(target, moved, "words")
+
+
+def _marked(skill: str, task: Task) -> tuple[str, str | None]:
+    """The text with each of the task's things in <>, without the tool at its end, and the tool."""
+    things = {**{name: name for name in task.object_names}, "gripper": GRIPPER}
+    for word in sorted(things, key=len, reverse=True):  # "drawer handle" is no "drawer"
+        pattern = rf"(?<![\w<-]){re.escape(word)}(?![\w-])(?![^<]*>)"
+        skill = re.sub(pattern, f"<{things[word]}>", skill)
+    if found := _TOOL.search(skill):
+        return skill[: found.start()], re.findall(r"<([^>]*)>", skill[found.end() :])[0]
+    return skill, None
+
+
+def _pairs(step: PlanStep) -> list[tuple[str, str]]:
+    return [(clause.subject, clause.object) for clause in step.condition.clauses if clause.object is not None]
+
+
+def _compared(step: PlanStep, *, gripper: bool) -> list[str]:
+    """The things that the condition compares with the gripper, or the subjects of those without it."""
+    return [b if a == GRIPPER else a for a, b in _pairs(step) if (GRIPPER in (a, b)) == gripper]
+
+
+def _partners(name: str, step: PlanStep, task: Task) -> list[str]:
+    """What the condition compares a thing, or a point on it, with, the gripper aside."""
+    return [b for a, b in _pairs(step) if GRIPPER not in (a, b) and _same_thing(a, name, task)]
+
+
+def _of_condition(step: PlanStep) -> Roles | None:
+    apart = [(b, a) for a, b in _pairs(step) if GRIPPER not in (a, b)]
+    if apart and "gripper" not in step.skill.split():
+        return Roles(*apart[-1], "condition")
+    near = _compared(step, gripper=True)
+    return Roles(near[-1], GRIPPER, "condition") if near else None
+
+
+def _same_thing(first: str, second: str, task: Task) -> bool:
+    return typed(task.object(first).position) == typed(task.object(second).position)
+
+
+def _point(roles: Roles, step: PlanStep, task: Task) -> str | None:
+    """The target, or the point on it that the condition compares with the gripper."""
+    named = {name for pair in _pairs(step) for name in pair}
+    if roles.target is None or roles.moved != GRIPPER or roles.target in named:
+        return roles.target
+    points = [name for name in _compared(step, gripper=True) if _same_thing(name, roles.target, task)]
+    return points[-1] if points else roles.target

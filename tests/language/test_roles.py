@@ -1,0 +1,119 @@
+"""Roles: which thing a step brings where, from scripted skills, words and conditions."""
+
+from dataclasses import replace
+
+import pytest
+
+import lw_torchrl as lw
+from lw_torchrl.language.plans import ConditionalPlan
+from lw_torchrl.language.roles import Roles, plan_roles
+
+OWN, MT10_SKILLS = lw.load_plans("MT50"), lw.load_plans("MT50", skills="MT10")
+G = "robot's gripper"
+
+BY_EYE = [
+    ("drawer-open", 2, "drawer handle", G),
+    ("coffee-pull", 0, "mug rim", G),
+    ("coffee-pull", 3, "target location", "mug"),
+    ("assembly", 3, "peg", "wrench ring"),
+    ("basketball", 1, "ball top", G),  # the skill goes to the ball, the condition names its top
+    ("basketball", 3, "hoop", "ball"),
+    ("disassemble", 2, "peg foot", "wrench"),
+    ("disassemble", 4, "wrench handle", G),  # its skill is a move from where it is
+    ("button-press-wall", 0, "button center", G),
+    ("door-close", 1, "target location", G),
+    ("hammer", 4, "nail", "hammer head"),
+    ("stick-pull", 5, "target location", "thermos"),
+    ("plate-slide", 2, "target location", "plate"),
+    ("peg-insert-side", 0, "peg", G),
+    ("pick-place", 3, "target location", "puck"),
+    ("reach-wall", 0, "target location", G),
+]
+
+
+@pytest.mark.parametrize("plans", [OWN, MT10_SKILLS], ids=["own", "MT10"])
+@pytest.mark.parametrize(("task", "step", "target", "moved"), BY_EYE)
+def test_roles_by_eye_are_those_of_both_sets(plans, task, step, target, moved):
+    found = plan_roles(plans[task])[step]
+    assert (found.target, found.moved) == (target, moved)
+    assert found.source == ("skill" if plans[task].steps[step].skill == OWN[task].steps[step].skill else "reworded")
+
+
+@pytest.mark.parametrize("plans", [OWN, MT10_SKILLS], ids=["own", "MT10"])
+def test_every_shipped_step_has_two_things_of_its_task(plans):
+    for task, plan in plans.items():
+        for own, found in zip(plan_roles(OWN[task]), plan_roles(plan), strict=True):
+            assert {found.target, found.moved} <= set(plan.definition.object_names)
+            assert found.target != found.moved
+            assert (own.target, own.moved) == (found.target, found.moved)
+
+
+def of(task, *steps, skills=None):
+    return plan_roles(ConditionalPlan.from_pairs(task, steps), skills)
+
+
+@pytest.mark.parametrize(
+    ("task", "condition", "text", "target", "moved", "source"),
+    [
+        ("push", "gripper is open", "carry the puck over to the target location", "target location", "puck", "words"),
+        ("push", "gripper is open", "nudge the puck forward", "puck", G, "words"),
+        ("push", "the puck is not near the target location", "nudge the puck", "target location", "puck", "words"),
+        ("push", "gripper is near the puck", "shove it onwards", "puck", G, "condition"),
+        ("push", "the puck is right of the target location", "shove it", "target location", "puck", "condition"),
+        ("push", "the puck is right of the target location", "hold the gripper still", None, None, "nothing"),
+        ("push", "gripper is open", "wait", None, None, "nothing"),
+        ("stick-push", "gripper is open", "shove the thermos away with the stick", "thermos", "stick", "words"),
+        ("stick-push", "gripper is open", "bring the stick in line with the thermos", "thermos", "stick", "words"),
+        ("hand-insert", "gripper is above the puck top", "reach down to the puck", "puck top", G, "words"),
+        # Words of other tasks, under a condition that no shipped plan has.
+        ("coffee-pull", "gripper is near the mug rim", "move the puck to the target location", "target location",
+         "mug rim", "words"),
+        ("coffee-pull", "gripper is near the mug rim", "close the gripper around the puck", "mug rim", G, "condition"),
+    ],
+)  # fmt: skip
+def test_words_and_conditions_tell_where_no_skill_does(task, condition, text, target, moved, source):
+    assert of(task, (condition, text)) == (Roles(target, moved, source),)
+
+
+def test_of_skills_nothing_but_target_and_moved_is_read():
+    plan = OWN["coffee-push"]
+    changed = {
+        text: replace(skill, offset=(1.0, 2.0, 3.0), gain=(0.0, 0.0, 0.0), gripper=-0.5, variants={})
+        for text, skill in lw.load_skills().items()
+    }
+    assert plan_roles(plan, changed) == plan_roles(plan)
+    text = plan.steps[3].skill
+    changed[text] = replace(changed[text], moved=G)
+    assert plan_roles(plan, changed)[3].moved == G
+
+
+def test_words_alone_give_most_shipped_roles():
+    pairs = [
+        (one, other) for plan in OWN.values() for one, other in zip(plan_roles(plan), plan_roles(plan, {}), strict=True)
+    ]
+    same = sum((one.target, one.moved) == (other.target, other.moved) for one, other in pairs)
+    assert all(other.source not in ("skill", "reworded") for _, other in pairs)
+    assert (same, len(pairs)) == (172, 186)
+
+
+def test_ones_own_task_has_its_own_things(tmp_path):
+    (tmp_path / "tasks.toml").write_text("""
+[stack-cup]
+description = "Put the cup on the saucer."
+objects.cup = "obs[4:7]"
+objects.saucer = "obs[36:39]"
+points."cup rim" = { object = "cup", offset = [0.0, 0.0, 0.05] }
+[push]
+description = "Push the disc to the target."
+objects.disc = "obs[4:7]"
+""")
+    tasks = lw.load_tasks(tmp_path / "tasks.toml")
+    steps = [
+        ("gripper is not near the cup rim", "lower the gripper around the cup"),
+        ("gripper is near the cup rim", "lift the cup onto the saucer"),
+        ("gripper is near the cup rim", "place the gripper above the puck"),
+    ]
+    found = of(tasks["stack-cup"], *steps)
+    assert [(one.target, one.moved) for one in found] == [("cup rim", G), ("saucer", "cup"), ("cup rim", G)]
+    # A shipped skill's text does not name things that the task of this name lacks.
+    assert of(tasks["push"], ("gripper is open", "place the gripper above the puck")) == (Roles(None, None, "nothing"),)
