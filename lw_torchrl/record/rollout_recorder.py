@@ -15,7 +15,6 @@ from torch import Tensor
 from torchrl.envs import EnvBase, Transform
 
 from lw_torchrl._checks import check_int
-from lw_torchrl.envs.engine import BodyPoses
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.record.mujoco_scene import Motion, model_geometry
@@ -25,6 +24,7 @@ from lw_torchrl.transforms.containers import base_env, refuse_changed
 if TYPE_CHECKING:
     from lw_torchrl.record.rerun_logger import RerunLogger
 
+_ROOM = 512  # steps, at first
 _FIXED = ("task_id", "episode", "qaf_plan")
 _BEFORE = ("observation", "qaf", "qaf_logits", "skill_weights", "action_corrected")
 _AFTER = ("executed_action", "success", "reward")
@@ -164,8 +164,7 @@ class _Row:
             model_geometry(self._model)
         self._fixed: dict[str, NDArray[Any]] = {}
         self._read: tuple[list[str], list[str]] = [], []
-        self._steps: list[list[NDArray[Any]]] = []
-        self._poses: list[BodyPoses] = []
+        self._steps, self._poses = _Rows(), _Rows()
         self._recorded = self._stepped = False
 
     def begin(self, *, recorded: bool) -> None:
@@ -178,41 +177,61 @@ class _Row:
         self._stepped = True
         if not self._recorded:
             return
-        if not self._steps:
+        if not self._steps.length:
             self._read = [key for key in _BEFORE if key in before], [key for key in _AFTER if key in after]
-            self._fixed = {key: self._of(before[key]) for key in _FIXED if key in before}
+            self._fixed = {key: np.array(self._of(before[key])) for key in _FIXED if key in before}
         now, then = self._read
-        self._steps.append([self._of(before[key]) for key in now] + [self._of(after[key]) for key in then])
+        self._steps.add([self._of(before[key]) for key in now] + [self._of(after[key]) for key in then])
         self._look()
 
     def finish(self) -> tuple[TensorDict | None, Motion | None]:
         """The episode so far, (T,), and its motion; afterwards none runs. None where no step was noted."""
         self.ended += self._stepped
         steps, poses = self._steps, self._poses
-        self._steps, self._poses = [], []
+        self._steps, self._poses = _Rows(), _Rows()
         self._recorded = self._stepped = False
-        if not steps:
+        length, (now, then) = steps.length, self._read
+        if not length:
             return None, None
-        length, (now, then) = len(steps), self._read
         names: list[NestedKey] = [*now, *(("next", key) for key in then)]
         columns: dict[NestedKey, Any] = {
-            name: torch.from_numpy(np.stack(parts)) for name, parts in zip(names, zip(*steps, strict=True), strict=True)
+            name: torch.from_numpy(column) for name, column in zip(names, steps.columns(), strict=True)
         }
         columns |= {key: torch.from_numpy(value).reshape(-1).expand(length) for key, value in self._fixed.items()}
         rollout = TensorDict(columns, [length])
         if self._model is None:
             return rollout, None
-        positions, quaternions = (np.stack(parts).astype(np.float32) for parts in zip(*poses, strict=True))
+        positions, quaternions = (column.astype(np.float32) for column in poses.columns())
         return rollout, Motion(self._model, positions, quaternions)
 
     def _of(self, values: Tensor) -> NDArray[Any]:
-        """This row's part of a tensor of all rows, as a copy: some environments write into theirs again."""
+        """This row's part of a tensor of all rows."""
         array = _array(values)
-        return np.array(array[self._row] if self._batched else array)
+        return array[self._row] if self._batched else array
 
     def _look(self) -> None:
         if self._recorded and self._engine is not None:
-            self._poses.append(self._engine.poses(self._row))
+            self._poses.add(self._engine.poses(self._row))
+
+
+class _Rows:
+    """Rows of some arrays each, as copies: some environments write into theirs again."""
+
+    def __init__(self) -> None:
+        self.length = 0
+        self._columns: list[NDArray[Any]] = []
+
+    def add(self, values: Sequence[NDArray[Any]]) -> None:
+        if not self.length:
+            self._columns = [np.empty((_ROOM, *value.shape), value.dtype) for value in values]
+        elif self.length == len(self._columns[0]):
+            self._columns = [np.concatenate((column, np.empty_like(column))) for column in self._columns]
+        for column, value in zip(self._columns, values, strict=True):
+            column[self.length] = value
+        self.length += 1
+
+    def columns(self) -> list[NDArray[Any]]:
+        return [column[: self.length] for column in self._columns]
 
 
 def _array(values: Tensor) -> NDArray[Any]:

@@ -10,7 +10,7 @@ from torchrl.envs import Compose, SerialEnv, TransformedEnv
 from torchrl.envs.transforms import ObservationNorm
 
 import lw_torchrl as lw
-from lw_torchrl.record import RolloutRecorder
+from lw_torchrl.record import RolloutRecorder, rollout_recorder
 
 PLANS = lw.load_plans("MT10")
 
@@ -31,7 +31,9 @@ def content(path):
     }
 
 
-def test_live_is_what_is_logged_afterwards(tmp_path):
+@pytest.mark.parametrize("room", [512, 3])
+def test_live_is_what_is_logged_afterwards(tmp_path, monkeypatch, room):
+    monkeypatch.setattr(rollout_recorder, "_ROOM", room)
     live = lw.RerunLogger(tmp_path / "live.rrd")
     env = make(live, num_envs=3, rows=(1, 2), policy="scripted")
     rollout = env.rollout(8, lw.ScriptedSkillActor(PLANS))
