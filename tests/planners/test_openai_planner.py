@@ -46,7 +46,7 @@ def test_answers_become_plans(ask, tmp_path):
     assert (found.tokens.prompt, found.tokens.completion, found.tokens.total) == (2000, 200, 2200)
     assert server.most_at_once == 3
     files = {str(path.relative_to(tmp_path / "out")) for path in (tmp_path / "out").rglob("*.*")}
-    assert files == {f"a_model/chain_py/{task}-{k}.py" for task in lw.MT10 for k in (0, 1)}
+    assert files == {"a_model/settings.json"} | {f"a_model/chain_py/{task}-{k}.py" for task in lw.MT10 for k in (0, 1)}
     assert (tmp_path / "out/a_model/chain_py/push-1.py").read_text() == lw.encode_plan(PLANS["push"], "chain_py")
     assert isinstance(lw.OpenAIPlanner("m"), lw.Planner)
 
