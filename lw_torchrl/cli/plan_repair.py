@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 from typing import Annotated
 
@@ -113,6 +114,9 @@ def repair(
         rates = [f"{check.success:.0%}" for check in one.checks]
         rows.append((one.answers[0].task, str(one.answers[0].attempt), *rates, *[""] * (rounds + 1 - len(rates))))
     print_table(f"success by scripted skills, {planner.model} in {format}", columns, rows)
+    noted = Counter(note for one in found for answer in one.answers for note in answer.notes)
+    for note, times in noted.most_common():
+        print(f"{counted(times, 'answer')}: {note}")
     asked = sum(not answer.cached for answer in first)
     print(f"{counted(len(first), 'answer')} to begin with, {asked} asked now")
     done = max(len(one.checks) for one in found) - 1

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from lw_torchrl._files import write_json, write_text
 from lw_torchrl.evaluation.figures import plot_sorted_tasks
 from lw_torchrl.evaluation.published import published_plans
+from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.plan_files import save_plans
-from lw_torchrl.language.plans import ConditionalPlan
 from lw_torchrl.planners.comparing import Group, PlanComparison
 
 
@@ -45,15 +46,22 @@ are 95 % intervals over tasks. The best answer of a task is chosen by the even e
     title = "each model in its best format"
     _draw(comparison, list(best.items()), written[2], title, lambda model, format: f"{model}, {format}")
     _draw(comparison, formats, written[3], f"formats of {first}", lambda _, format: format)
-    for model, format in comparison.groups:
-        _write_best(comparison.best_plans(model, format), folder / "best" / model / format)
+    _write_best(comparison, folder / "best")
     return [*(file for file in written if file.is_file()), folder / "best"]
 
 
-def _write_best(plans: dict[str, ConditionalPlan], folder: Path) -> None:
-    written = save_plans(plans, folder) if plans else []
-    for old in set(folder.glob("*.plan")).difference(written):
-        old.unlink()
+def _write_best(comparison: PlanComparison, folder: Path) -> None:
+    """The best plans in place of those of an earlier report; files of other kinds stay."""
+    written: list[Path] = []
+    for model, format in comparison.groups:
+        if plans := comparison.best_plans(model, format):
+            written += save_plans(plans, folder / model / format)
+    old = [path for format in PLAN_FORMATS for path in folder.glob(f"*/{format}/*.plan")]
+    for path in set(old).difference(written):
+        path.unlink()
+        for empty in (path.parent, path.parent.parent):
+            with suppress(OSError):  # it is not empty, or gone
+                empty.rmdir()
 
 
 def _draw(

@@ -57,7 +57,7 @@ class OpenAIPlanner:
         timeout: seconds that an answer may take.
 
     Raises:
-        ValueError: a number that is too small, or ``base_url`` is no address.
+        ValueError: a number that is too small, ``base_url`` is no address, or ``free_skills`` without ``constrain``.
         TypeError: an argument of another type.
 
     Example:
@@ -95,6 +95,8 @@ class OpenAIPlanner:
         for argument, given in (("constrain", constrain), ("free_skills", free_skills), ("vocabulary", vocabulary)):
             if not isinstance(given, bool):
                 raise TypeError(f"{argument} must be True or False, got {shown(given)}")
+        if free_skills and not constrain:
+            raise ValueError("free_skills=True is for constrain alone: without, skills are in any words")
         self.model, self.base_url, self.constrain, self.free_skills = model, base_url, constrain, free_skills
         self.skills, self.examples, self.vocabulary = skills, plans, vocabulary
         self.address = server_address(base_url)

@@ -92,6 +92,12 @@ def test_generate_fails_in_one_line(capsys, tmp_path):
     with serving(FakeServer(lambda body: error(404, "no such model"))) as address:
         message = fails(capsys, *generate(address, tmp_path, "push"))
     assert f"'a/model' at {address}, push, attempt" in message
+    assert "--free-skills is for constrain" in fails(
+        capsys, *generate("http://x/v1", tmp_path, "push", "--free-skills")
+    )
+    message = fails(capsys, *generate("http://x/v1", tmp_path, "push", "--format", "all", "basic_py"))
+    assert "--format must be one of 'all', 'basic_py'" in message
+    assert "'all' alone" in message
     assert "--base-url must be an address" in fails(capsys, *generate("nowhere", tmp_path, "push"))
     assert "TASKS must be one of" in fails(capsys, *generate("http://x/v1", tmp_path, "psuh"))
     assert "--format must be one of" in fails(capsys, *generate("http://x/v1", tmp_path, "push", "--format", "chain"))
@@ -169,13 +175,14 @@ def test_check_takes_task_and_format_from_where_the_file_lies(capsys, tmp_path):
 def test_repair_tells_the_model_and_shows_how_each_round_fared(capsys, tmp_path):
     def learns(body):
         told = any(message["role"] == "assistant" for message in body["messages"])
-        return shipped(body) if told else completion("I would rather not.")
+        return shipped(body) if told else completion("I would rather", "length")
 
     with serving(FakeServer(learns)) as address:
         where = ("--out", tmp_path / "plans", "--cache", tmp_path / "kept", "--episodes", 1)
         command = ("plan", "repair", "reach", "--model", "m", "--base-url", address, "--rounds", 2, *where)
         printed = run(capsys, *command)
     assert ["reach", "0", "0%", "100%"] in [line.split() for line in printed.splitlines()]
+    assert "1 answer: it was cut off at max_tokens" in printed
     assert (tmp_path / "plans/m-round1/chain_py/reach-0.py").is_file()
 
 

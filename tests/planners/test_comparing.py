@@ -136,3 +136,23 @@ def test_the_best_plan_of_each_task_is_kept_for_other_commands(tmp_path):
     stale.write_text("of an earlier run")
     write_report(compare_plans(tmp_path / "plans", **SHORT | {"max_steps": 150}), tmp_path / "out")
     assert dict(lw.load_plans(stale.parent)) == {"drawer-open": good}
+
+
+def test_best_forgets_a_model_that_is_gone_and_nothing_else(tmp_path):
+    for model in ("old", "mine"):
+        write(tmp_path / "plans", model, "chain_py", "reach", 0, lw.encode_plan(PLANS["reach"], "chain_py"))
+    write_report(compare_plans(tmp_path / "plans", **SHORT), tmp_path / "out")
+    best = tmp_path / "out/best"
+    (best / "mine/notes.plan").write_text("mine")
+    (best / "old/chain_py/notes.txt").write_text("mine")
+    (tmp_path / "plans/old").rename(tmp_path / "plans/new")
+    write_report(compare_plans(tmp_path / "plans", **SHORT), tmp_path / "out")
+    files = {str(path.relative_to(best)) for path in best.rglob("*") if path.is_file()}
+    plans = {"mine/chain_py/reach.plan", "new/chain_py/reach.plan"}
+    assert files == plans | {"mine/notes.plan", "old/chain_py/notes.txt"}
+    (best / "old/chain_py/notes.txt").unlink()
+    (tmp_path / "plans/mine").rename(tmp_path / "plans/old")
+    write_report(compare_plans(tmp_path / "plans", **SHORT), tmp_path / "out")
+    (tmp_path / "plans/old").rename(tmp_path / "plans/mine")
+    write_report(compare_plans(tmp_path / "plans", **SHORT), tmp_path / "out")
+    assert not (best / "old").exists()
