@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
+from lw_torchrl._checks import counted
 from lw_torchrl._files import write_json, write_text
 from lw_torchrl.evaluation.figures import plot_sorted_tasks
 from lw_torchrl.evaluation.published import published_plans
@@ -13,10 +15,13 @@ from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.plan_files import save_plans
 from lw_torchrl.planners.comparing import Group, PlanComparison
 
+_REASONS = 3  # the commonest are told of
+
 
 def write_report(comparison: PlanComparison, folder: Path) -> list[Path]:
     """Write results.json, summary.md, models.png (each model in its best format) and formats.png (of the model that
-    does best) to a folder, and the best plan of each task to best/<model>/<format>/<task>.plan.
+    does best) to a folder, and the best plan of each task to best/<model>/<format>/<task>.plan, also one that never
+    succeeds.
 
     The figures leave out tasks that some of their curves lack.
 
@@ -48,6 +53,15 @@ are 95 % intervals over tasks. The best answer of a task is chosen by the even e
     _draw(comparison, formats, written[3], f"formats of {first}", lambda _, format: format)
     _write_best(comparison, folder / "best")
     return [*(file for file in written if file.is_file()), folder / "best"]
+
+
+def no_plans(comparison: PlanComparison) -> list[str]:
+    """Lines that say how many answers have no plan, and the commonest reasons; none if all have one."""
+    reasons = [one.reason.replace(f" for {one.task}", " for the task") for one in comparison.answers if one.reason]
+    if not reasons:
+        return []
+    head = f"{counted(len(reasons), 'answer')} {'has' if len(reasons) == 1 else 'have'} no plan:"
+    return [head, *(f"{times}: {reason}" for reason, times in Counter(reasons).most_common(_REASONS))]
 
 
 def _write_best(comparison: PlanComparison, folder: Path) -> None:

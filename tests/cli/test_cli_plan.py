@@ -144,6 +144,16 @@ def test_compare_runs_what_generate_wrote(capsys, tmp_path):
     names = ["best", "fared.json", "formats.png", "models.png", "results.json", "summary.md"]
     assert sorted(file.name for file in (tmp_path / "out").iterdir()) == names
     assert run(capsys, *command) == printed
+    assert f"{tmp_path / 'out/best'}: of each task the plan that did best, be it one that never succeeds" in printed
+    assert "not read" not in printed
+    path.with_name("reach_1.py").write_text("?")
+    path.with_name("reach-1.py").write_text("No.")
+    printed = run(capsys, *command)
+    assert "1 answer has no plan:\n1: it has no steps, neither for the task" in printed
+    assert f"not read, since no answer is named so (<task>-<attempt>.<ext>): {path.with_name('reach_1.py')}" in printed
+    message = fails(capsys, *command, "--episodes", 3)
+    assert "--out: " in message
+    assert "of other settings: episodes (2, now 3); choose another folder" in message
 
 
 # ---- check

@@ -10,7 +10,8 @@ import lw_torchrl as lw
 from lw_torchrl.planners import answer_path
 from lw_torchrl.planners import comparing as module
 from lw_torchrl.planners.comparing import compare_plans
-from lw_torchrl.planners.comparison_report import write_report
+from lw_torchrl.planners.comparison_report import no_plans, write_report
+from lw_torchrl.planners.file_planner import ignored_files
 
 PLANS = lw.load_plans("MT10")
 SHORT = {"episodes": 4, "max_steps": 60, "progress": False}
@@ -89,8 +90,8 @@ def test_stopped_it_goes_on_with_the_plans_that_are_left(answers, tmp_path, monk
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ('{"settings": {}, "fared": {}}', "is of {}, and this run of"),
-        ('{"settings": ', "resume 'fared.json' cannot be read"),
+        ('{"settings": {}, "fared": {}}', r"of other settings: choose \(None, now 'random'\), episodes"),
+        ('{"settings": ', "resume: the kept results 'fared.json' cannot be read"),
         ('{"settings": SETTINGS, "fared": {"a": "01"}}', "is damaged"),
         ('{"settings": SETTINGS, "fared": [1]}', "is damaged"),
         ('{"settings": SETTINGS, "fared": {"a": "0121"}}', "is damaged"),
@@ -100,13 +101,27 @@ def test_what_was_kept_is_checked(answers, tmp_path, monkeypatch, content, messa
     monkeypatch.chdir(tmp_path)
     settings = {"episodes": 4, "seed": 1000, "choose": "random", "noise_scale": 0.0, "max_steps": 60}
     (tmp_path / "fared.json").write_text(content.replace("SETTINGS", json.dumps(settings)))
-    with pytest.raises(ValueError, match=message.replace("{}", r"\{\}")):
+    with pytest.raises(ValueError, match=message):
         compare_plans(answers, resume="fared.json", **SHORT)
 
 
 def test_a_folder_without_answers_is_refused(tmp_path):
     with pytest.raises(ValueError, match="holds no answers"):
         compare_plans(tmp_path, **SHORT)
+
+
+def test_why_answers_have_no_plan(answers):
+    write(answers, "other", "chain_py", "push", 0, "I cannot do that.")
+    (answers / "good/chain_py/push_2.py").write_text("?")
+    (answers / "good/chain_py/push-3.txt").write_text("?")
+    (answers / "good/chain_py/push-3.json").write_text("?")
+    found = no_plans(compare_plans(answers, **SHORT))
+    assert found == [
+        "5 answers have no plan:",
+        "5: it has no steps, neither for the task nor for another task",
+    ]
+    assert [path.name for path in ignored_files(answers)] == ["push-3.txt", "push_2.py"]
+    assert no_plans(module.PlanComparison([], {})) == []
 
 
 def test_the_report(answers, tmp_path):
