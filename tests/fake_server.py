@@ -23,7 +23,6 @@ def completion(text, finish="stop", **message):
         "id": "1",
         "object": "chat.completion",
         "created": 0,
-        "model": "fake",
         "choices": [
             {"index": 0, "message": {"role": "assistant", "content": text, **message}, "finish_reason": finish}
         ],
@@ -88,6 +87,8 @@ class FakeServer:
                 return found
             with self.lock:
                 self.served += 1
+            if isinstance(found, dict) and "choices" in found:
+                found = {"model": body["model"], **found}
             return Failure(200, found)
         finally:
             with self.lock:

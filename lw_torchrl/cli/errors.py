@@ -34,6 +34,7 @@ OWN_NAMES = {
     "plans": {"tasks": "names", "task": "names"},
     "skills": {"skills": "skill_file"},
     "check": {"plans": "file"},
+    "compare": {"resume": "out"},
     "generate": {"task": "tasks", "source": "plans"},
     "online": {"episodes_per_task": "episodes", "root": "out", "checkpoint": "out", "task": "tasks"},
     "reproduce": {"episodes_per_task": "episodes", "root": "out", "checkpoint": "out"},

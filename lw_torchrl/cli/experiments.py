@@ -101,13 +101,13 @@ def reproduce(
     ]
     datasets = {str(dataset.folder): dataset for one in runs for dataset in one.datasets}
     named = {str(one.folder): one for one in runs}
+    load = _Plans(plans, task_file)
+    for one in runs:  # before any work
+        load(one)
     if list:
         print("\n".join([*datasets, *named]))
         return
-    there = check_device("device", device)
-    load, encoder = _Plans(plans, task_file), read_encoder(text_encoder)
-    for one in runs:  # before any work
-        load(one)
+    there, encoder = check_device("device", device), read_encoder(text_encoder)
     use_one_thread()
     if run in datasets:
         datasets[run].collect(out, progress=True)

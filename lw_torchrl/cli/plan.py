@@ -113,7 +113,9 @@ def generate(
     chosen = list(named_tasks(one_or_many(tasks), known=known).values())
     formats = [*lw.PLAN_FORMATS] if format == ("all",) else list(dict.fromkeys(format))
     for one in formats:
-        check_choice("format", one, lw.PLAN_FORMATS)
+        if one == "all":
+            raise ValueError(f"--format must be one of 'all', {', '.join(map(repr, lw.PLAN_FORMATS))}, and 'all' alone")
+        check_choice("format", one, ["all", *lw.PLAN_FORMATS])
     planner = lw.OpenAIPlanner(
         model,
         base_url=base_url,

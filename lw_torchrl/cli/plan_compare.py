@@ -11,6 +11,8 @@ from lw_torchrl.cli.outputs import check_folder
 from lw_torchrl.cli.sources import read_tasks
 from lw_torchrl.cli.threads import use_one_thread
 
+_BEST = ": of each task the plan that did best, be it one that never succeeds"
+
 
 def compare(
     source: Positional[Annotated[Path, arg(metavar="DIR|FILE")]],
@@ -25,8 +27,8 @@ def compare(
 ) -> None:
     """Compare models by the plans they wrote: decode every answer, carry all of them out by scripted skills, at once.
 
-    The plan of each task that did best is kept in OUT/best/MODEL/FORMAT, for --plans of any other command. Stopped and
-    started again it carries on.
+    The plan of each task that did best, be it one that never succeeds, is kept in OUT/best/MODEL/FORMAT, for --plans of
+    any other command. Stopped and started again it carries on.
 
     Example: lw-torchrl plan compare runs/plans --out runs/compare
 
@@ -42,7 +44,8 @@ def compare(
     """
     check_folder("--out", out)
     from lw_torchrl.planners.comparing import compare_plans
-    from lw_torchrl.planners.comparison_report import write_report
+    from lw_torchrl.planners.comparison_report import no_plans, write_report
+    from lw_torchrl.planners.file_planner import ignored_files
 
     use_one_thread()
     found = compare_plans(
@@ -56,5 +59,10 @@ def compare(
         resume=out / "fared.json",
     )
     print(f"{found.table()}\n\n{found.task_table()}\n")
+    if lines := no_plans(found):
+        print("\n".join(lines), end="\n\n")
+    if strays := ignored_files(source):
+        names = ", ".join(map(str, strays[:5])) + (", ..." if len(strays) > 5 else "")
+        print(f"not read, since no answer is named so (<task>-<attempt>.<ext>): {names}\n")
     for file in write_report(found, out):
-        print(f"written to {file}")
+        print(f"written to {file}{_BEST if file.name == 'best' else ''}")

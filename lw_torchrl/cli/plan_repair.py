@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from lw_torchrl._checks import counted
 from lw_torchrl.cli.outputs import check_folder
-from lw_torchrl.cli.sources import one_or_many, read_tasks
+from lw_torchrl.cli.sources import one_or_many, read_plans, read_tasks
 from lw_torchrl.cli.threads import use_one_thread
 
 
 def repair(
     tasks: Positional[Annotated[tuple[str, ...], arg(metavar="TASK ...")]],
     /,
+    *,
     model: str,
     base_url: str | None = None,
     format: str = "chain_py",
@@ -22,19 +25,29 @@ def repair(
     rounds: int = 3,
     enough: float = 0.8,
     episodes: int = 10,
-    seed: int = 0,
+    episode_seed: int = 0,
     constrain: bool = False,
+    free_skills: bool = False,
+    vocabulary: bool = False,
     temperature: float | None = None,
     max_tokens: int = 1024,
+    seed: int | None = None,
+    name: str | None = None,
+    plans: tuple[str, ...] = ("MT10",),
+    skill_file: Path | None = None,
     task_file: Path | None = None,
+    concurrency: int = 4,
+    retries: int = 6,
+    timeout: float = 300.0,
     cache: Path = Path("runs/answers"),
     out: Path = Path("runs/plans"),
 ) -> None:
     """Ask a model for plans, carry them out by scripted skills, tell it what became of those that fail, and ask again.
 
     What it is told: the step where the robot got stuck, conditions that never held, how near things came, what could
-    not be read. Answers that plan generate got are not asked for again; each round's are kept as those of a model of
-    its own, MODEL-round1 and so on, for plan compare. Stopped and started again it carries on.
+    not be read. It begins with the answers in OUT/<name>, as plan generate wrote them, and asks only for those that are
+    missing; none is replaced. Each round's are kept as those of a model of its own, <name>-round1 and so on, for plan
+    compare. Stopped and started again it carries on.
 
     Example: lw-torchrl plan repair MT10 --model llama3.1 --base-url http://127.0.0.1:11434/v1 --rounds 3
 
@@ -47,13 +60,22 @@ def repair(
         rounds: how often the model is told, at most.
         enough: the success rate from which a plan is left as it is.
         episodes: of each plan.
-        seed: of these; compare on another one.
+        episode_seed: of these; compare on another one.
         constrain: hold the model to a schema, so that it can only write plans that run.
+        free_skills: with --constrain, skills in any words instead of the scripted ones.
+        vocabulary: prompts also say which things the task has, and what can be asked of them.
         temperature: the server's own if none is given.
         max_tokens: of an answer, at most.
+        seed: attempt k is sent SEED + k, as by plan generate; without, none is sent.
+        name: of the folder for its answers; the model's, with "-constrained" behind it where it is, if none is given.
+        plans: where the prompts' examples come from: MT10 or MT50, .plan files, .json files or folders.
+        skill_file: skills of yours that join ours, or replace those of the same text.
         task_file: tasks of yours, instead of ours of the same name or beside ours.
-        cache: folder where answers are kept.
-        out: folder for the answers as texts.
+        concurrency: questions at once.
+        retries: how often a question is asked again after a rate limit or a fault, with growing waits.
+        timeout: seconds that an answer may take.
+        cache: folder where answers are kept, each under a key of all that determines it.
+        out: folder for the answers as texts, OUT/<name>/<format>/<task>-<attempt>.py or .md.
     """
     check_folder("--out", out)
     check_folder("--cache", cache)
@@ -69,13 +91,22 @@ def repair(
         model,
         base_url=base_url,
         constrain=constrain,
+        free_skills=free_skills,
+        skills=lw.load_skills(skill_file, tasks=known) if skill_file else None,
+        plans=read_plans(plans, known),
+        vocabulary=vocabulary,
         temperature=temperature,
         max_tokens=max_tokens,
+        seed=seed,
+        name=name,
         cache=cache,
+        concurrency=concurrency,
+        retries=retries,
+        timeout=timeout,
     )
-    first = planner.plans(chosen, format=format, attempts=attempts, out=out)
+    first = planner.plans(chosen, format=format, attempts=attempts, out=out, recorded=True)
     found = repair_plans(
-        planner, first, rounds=rounds, enough=enough, episodes=episodes, seed=seed, tasks=known, out=out
+        planner, first, rounds=rounds, enough=enough, episodes=episodes, seed=episode_seed, tasks=known, out=out
     )
     columns = ("task", "attempt", "first", *(f"round {k}" for k in range(1, rounds + 1)))
     rows = []
@@ -83,4 +114,11 @@ def repair(
         rates = [f"{check.success:.0%}" for check in one.checks]
         rows.append((one.answers[0].task, str(one.answers[0].attempt), *rates, *[""] * (rounds + 1 - len(rates))))
     print_table(f"success by scripted skills, {planner.model} in {format}", columns, rows)
-    print(f"written to {out / planner.name} and {out / planner.name}-round1 to -round{rounds}")
+    noted = Counter(note for one in found for answer in one.answers for note in answer.notes)
+    for note, times in noted.most_common():
+        print(f"{counted(times, 'answer')}: {note}")
+    asked = sum(not answer.cached for answer in first)
+    print(f"{counted(len(first), 'answer')} to begin with, {asked} asked now")
+    done = max(len(one.checks) for one in found) - 1
+    folders = [planner.name, *(f"{planner.name}-round{k}" for k in range(1, done + 1))]
+    print(f"written to {', '.join(str(out / folder) for folder in folders)}")

@@ -30,9 +30,9 @@ def serve(
         context: tokens of a question and its answer, at most.
         threads: of the processor; half of its cores if none is given.
     """
-    from lw_torchrl.planners.model_server import serve_model, small_model
+    from lw_torchrl.planners.model_server import model_file, serve_model
 
-    file = model or small_model()
+    file = model_file(model)
     print(f"loading {file}", flush=True)
 
     def ready(name: str, address: str) -> None:

@@ -19,11 +19,11 @@ from lw_torchrl.language.skill_text import canonical_skill
 from lw_torchrl.language.skills import ScriptedSkill
 from lw_torchrl.language.step_mapping import StepMapper
 from lw_torchrl.language.tasks import TASKS, Task, check_task
+from lw_torchrl.language.thoughts import without_thoughts
 
 LIMIT, SKILL_LIMIT = 0.4, 0.7
 """Distances beyond which a condition and a skill are taken for nothing; docs/planners.md says what that leaves out."""
 _LONGEST = 65_536  # characters of a text that are read
-_THINKS, _THOUGHT = re.compile(r"<think(?:ing)?>", re.IGNORECASE), re.compile(r"</think(?:ing)?>", re.IGNORECASE)
 
 
 def decode_plan(
@@ -40,9 +40,9 @@ def decode_plan(
     """Read a plan from whatever a language model wrote. No text is an error, and none is executed.
 
     Only clauses for ``task`` count: those of functions and headings of its name, and those before any other name, which
-    go on from where the prompt ended. What a model thinks first, up to ``</think>``, is left out. Where a text has
-    several versions the longest counts, of equals the first. A text in Python where prose was asked for, or the other
-    way round, is read as what it is.
+    go on from where the prompt ended. What a model thinks first, up to ``</think>`` or as others mark it, is left out.
+    Where a text has several versions the longest counts, of equals the first. A text in Python where prose was asked
+    for, or the other way round, is read as what it is.
 
     A condition outside the query language is taken for the nearest query, clause by clause, and one beyond ``limit`` is
     dropped with its step. Skills stay as they are written in ``plan``; ``scripted`` has the nearest scripted ones.
@@ -91,7 +91,7 @@ def decode_plan(
 def decode_as(text: str, read: Callable[[str], Reading], mapper: StepMapper) -> DecodedPlan:
     """As :func:`decode_plan`, by the reader of any form; a text in another form is read as what it is."""
     owner, notes = mapper.task, list[Note]()
-    text = _answer(text, notes)
+    text = without_thoughts(text, notes)
     if len(text) > _LONGEST:
         notes.append(Note(text.count("\n", 0, _LONGEST) + 1, f"the rest of {len(text)} characters is not read"))
     reading, section = _read(text[:_LONGEST], owner, read)
@@ -105,20 +105,6 @@ def decode_as(text: str, read: Callable[[str], Reading], mapper: StepMapper) -> 
         tuple(sorted(notes, key=lambda note: note.line)),
         tuple(steps),
     )
-
-
-def _answer(text: str, notes: list[Note]) -> str:
-    """The text without what a model thought before it answered, which may hold drafts; every line keeps its number."""
-    start = end = 0
-    if closed := list(_THOUGHT.finditer(text)):
-        end = closed[-1].end()
-    elif opened := _THINKS.search(text):
-        start, end = opened.start(), len(text)
-    if not end:
-        return text
-    how = "" if closed else ", and is cut off there"
-    notes.append(Note(text.count("\n", 0, start) + 1, f"thinks aloud; that is left out{how}"))
-    return text[:start] + "\n" * text.count("\n", start, end) + text[end:]
 
 
 def _same(name: str, task: Task) -> bool:

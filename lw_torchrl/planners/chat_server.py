@@ -145,8 +145,8 @@ class ChatServer:
                 fault = error
             else:
                 self._settled = True
-                notes = ("the schema was sent as json_object, since the server takes no json_schema",)
-                return self._reply(found, notes if dialect.refused and request["schema"] else (), question)
+                notes = ["the schema was sent as json_object, since the server takes no json_schema"]
+                return self._reply(found, notes if dialect.refused and request["schema"] else [], question)
             if settled or not request["schema"]:
                 break
             self._settled = True  # it is not the dialect: again, with all retries
@@ -161,7 +161,7 @@ class ChatServer:
             model=self.model, messages=request["messages"], extra_body=request["options"], **fields
         )
 
-    def _reply(self, found: Any, notes: tuple[str, ...], question: str) -> Reply:
+    def _reply(self, found: Any, notes: list[str], question: str) -> Reply:
         choices = getattr(found, "choices", None)
         choice = choices[0] if isinstance(choices, list) and choices else None
         message = getattr(choice, "message", None)
@@ -172,13 +172,15 @@ class ChatServer:
                 "See that base_url is the address of an OpenAI-compatible server; it usually ends in /v1",
                 fatal=True,
             )
-        usage = getattr(found, "usage", None)
+        usage, answered = getattr(found, "usage", None), self._clean(_text(getattr(found, "model", None)))
+        if not (answered.startswith(self.model) or self.model.startswith(answered)):  # a date may stand behind
+            notes = [*notes, f"the server says that the model {answered!r} answered, not {self.model!r}"]
         return Reply(
             _text(getattr(message, "content", None)),
             _text(getattr(choice, "finish_reason", None)),
             _text(getattr(message, "refusal", None)),
             Tokens(_count(usage, "prompt_tokens"), _count(usage, "completion_tokens")),
-            notes,
+            tuple(notes),
         )
 
     def _error(self, question: str, what: str, hint: str, fatal: bool = False) -> PlannerError:

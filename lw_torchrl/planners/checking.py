@@ -111,6 +111,18 @@ def check_plan(
     """
     owner = task if isinstance(task, Task) else tasks[check_task(task, tasks)]
     decoded = decode_plan(text, owner, format, skills=skills, tasks=tasks)
+    return check_decoded(decoded, owner, episodes=episodes, seed=seed, skills=skills)
+
+
+def check_decoded(
+    decoded: DecodedPlan,
+    owner: Task,
+    *,
+    episodes: int = 5,
+    seed: int = 0,
+    skills: Mapping[str, ScriptedSkill] | None = None,
+) -> PlanCheck:
+    """As :func:`check_plan`, of what was made of a text; the task is ``owner``."""
     if decoded.plan is None:
         return PlanCheck(owner.name, decoded)
     expert = expert_use({owner.name: decoded.plan}, owner.name, episodes_per_task=episodes, seed=seed)[owner.name]

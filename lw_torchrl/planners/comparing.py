@@ -9,7 +9,7 @@ from pathlib import Path
 from time import monotonic
 from typing import Any, Literal
 
-from lw_torchrl._checks import shown
+from lw_torchrl._checks import differences
 from lw_torchrl._files import read_json, write_json
 from lw_torchrl._progress import Progress
 from lw_torchrl.evaluation.comparison import markdown_table
@@ -248,12 +248,11 @@ def _mean(numbers: Sequence[float]) -> float:
 def _read(file: str | os.PathLike[str] | None, settings: Mapping[str, Any]) -> dict[str, tuple[bool, ...]]:
     if file is None or not Path(file).exists():
         return {}
-    found = read_json(file, "resume")
-    if found.get("settings") != settings:
-        raise ValueError(
-            f"resume: {str(file)!r} is of {shown(found.get('settings'))}, and this run of {settings}; choose another "
-            "folder, or delete it"
-        )
+    found = read_json(file, "resume: the kept results")
+    was = found.get("settings")
+    if was != settings:
+        differ = ", ".join(differences(was if isinstance(was, dict) else {}, settings))
+        raise ValueError(f"resume: {str(file)!r} is of other settings: {differ}; choose another folder, or delete it")
     fared = found.get("fared")
     said = fared.values() if isinstance(fared, dict) else [None]
     if not all(isinstance(one, str) and len(one) == settings["episodes"] and not set(one) - {*"01"} for one in said):

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 
+from lw_torchrl._checks import counted
 from lw_torchrl._files import write_json, write_text
 from lw_torchrl.evaluation.figures import plot_sorted_tasks
 from lw_torchrl.evaluation.published import published_plans
+from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.plan_files import save_plans
-from lw_torchrl.language.plans import ConditionalPlan
 from lw_torchrl.planners.comparing import Group, PlanComparison
+
+_REASONS = 3  # the commonest are told of
 
 
 def write_report(comparison: PlanComparison, folder: Path) -> list[Path]:
     """Write results.json, summary.md, models.png (each model in its best format) and formats.png (of the model that
-    does best) to a folder, and the best plan of each task to best/<model>/<format>/<task>.plan.
+    does best) to a folder, and the best plan of each task to best/<model>/<format>/<task>.plan, also one that never
+    succeeds.
 
     The figures leave out tasks that some of their curves lack.
 
@@ -45,15 +51,31 @@ are 95 % intervals over tasks. The best answer of a task is chosen by the even e
     title = "each model in its best format"
     _draw(comparison, list(best.items()), written[2], title, lambda model, format: f"{model}, {format}")
     _draw(comparison, formats, written[3], f"formats of {first}", lambda _, format: format)
-    for model, format in comparison.groups:
-        _write_best(comparison.best_plans(model, format), folder / "best" / model / format)
+    _write_best(comparison, folder / "best")
     return [*(file for file in written if file.is_file()), folder / "best"]
 
 
-def _write_best(plans: dict[str, ConditionalPlan], folder: Path) -> None:
-    written = save_plans(plans, folder) if plans else []
-    for old in set(folder.glob("*.plan")).difference(written):
-        old.unlink()
+def no_plans(comparison: PlanComparison) -> list[str]:
+    """Lines that say how many answers have no plan, and the commonest reasons; none if all have one."""
+    reasons = [one.reason.replace(f" for {one.task}", " for the task") for one in comparison.answers if one.reason]
+    if not reasons:
+        return []
+    head = f"{counted(len(reasons), 'answer')} {'has' if len(reasons) == 1 else 'have'} no plan:"
+    return [head, *(f"{times}: {reason}" for reason, times in Counter(reasons).most_common(_REASONS))]
+
+
+def _write_best(comparison: PlanComparison, folder: Path) -> None:
+    """The best plans in place of those of an earlier report; files of other kinds stay."""
+    written: list[Path] = []
+    for model, format in comparison.groups:
+        if plans := comparison.best_plans(model, format):
+            written += save_plans(plans, folder / model / format)
+    old = [path for format in PLAN_FORMATS for path in folder.glob(f"*/{format}/*.plan")]
+    for path in set(old).difference(written):
+        path.unlink()
+        for empty in (path.parent, path.parent.parent):
+            with suppress(OSError):  # it is not empty, or gone
+                empty.rmdir()
 
 
 def _draw(

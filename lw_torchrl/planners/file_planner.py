@@ -35,7 +35,8 @@ class FilePlanner:
 
     Raises:
         FileNotFoundError: there is no such file or folder.
-        ValueError: no answers in it, or of several models and none is named; or a line that is no answer.
+        ValueError: no answers in it, or of several models and none is named; a line that is no answer; or two models
+            whose names differ in what no folder's name can have.
 
     Example:
         >>> import json, lw_torchrl as lw
@@ -107,6 +108,21 @@ def recorded_answers(source: str | os.PathLike[str]) -> dict[str, dict[_Place, s
     return found
 
 
+def ignored_files(source: str | os.PathLike[str]) -> list[Path]:
+    """Files of a folder that lie where answers do and look like some, but have another name or ending."""
+    root = Path(source)
+    if not root.is_dir():
+        return []
+    read = {path for answers in _of_folder(root).values() for path in answers.values()}
+    endings = {f".{known.extension}" for known in PLAN_FORMATS.values()} | {".txt"}
+    return sorted(
+        path
+        for format in PLAN_FORMATS
+        for path in root.glob(f"*/{format}/*")
+        if path.suffix in endings and path not in read and path.name[0] != "." and path.parts[-3][0] != "."
+    )
+
+
 def answer_text(found: str | Path) -> str:
     """The text of an answer that :func:`recorded_answers` gives."""
     return read_text(found, ValueError) if isinstance(found, Path) else found
@@ -125,11 +141,18 @@ def _of_folder(root: Path) -> dict[str, dict[_Place, str | Path]]:
 
 def _of_lines(file: Path) -> dict[str, dict[_Place, str | Path]]:
     found: dict[str, dict[_Place, str | Path]] = {}
+    named: dict[str, str] = {}
     for number, line in enumerate(read_text(file, ValueError).split("\n"), 1):
         if not line.strip():
             continue
         row = _row(line, f"{file.name}, line {number}")
-        found.setdefault(folder_name(row["llm"]), {})[row["format"], row["task"], row["attempt"]] = row["completion"]
+        name = folder_name(row["llm"])
+        if named.setdefault(name, row["llm"]) != row["llm"]:
+            raise ValueError(
+                f"{file.name}, line {number}: the models {named[name]!r} and {row['llm']!r} would both be {name!r}; "
+                "give one of them another name"
+            )
+        found.setdefault(name, {})[row["format"], row["task"], row["attempt"]] = row["completion"]
     return found
 
 

@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from lw_torchrl._checks import check_int, unknown_name
+from lw_torchrl._checks import check_int, shown, unknown_name
 
 INSTALL = (
     "serving a model needs the extra [serve]: pip install 'lw_torchrl[serve]'; llama.cpp is built from its source, "
@@ -72,7 +72,7 @@ def serve_model(
     check_int("context", context, minimum=512)
     if threads is not None:
         check_int("threads", threads, minimum=1)
-    file = small_model() if model is None else _checked(Path(model))
+    file = model_file(model)
     try:
         import uvicorn
         from llama_cpp.server.app import create_app
@@ -93,11 +93,12 @@ def serve_model(
         except ValueError as error:
             raise ValueError(f"model {str(file)!r} cannot be loaded: {error}") from error
         ready(name, f"http://{host}:{listener.getsockname()[1]}/v1")
-        uvicorn.Server(uvicorn.Config(_with_json_schema(app), log_level="warning")).run(sockets=[listener])
+        uvicorn.Server(uvicorn.Config(as_openai(app, name), log_level="warning")).run(sockets=[listener])
 
 
-def _with_json_schema(app: Any) -> Any:
-    """A server that takes a schema as OpenAI's does; llama-cpp-python's knows it by another name alone."""
+def as_openai(app: Any, name: str) -> Any:
+    """A server that takes a schema as OpenAI's does, which llama-cpp-python's knows by another name alone, and has no
+    other model than ``name``, where that answers for any."""
 
     async def asked(scope: Any, receive: Any, send: Any) -> None:
         if scope["type"] != "http" or scope["path"] != "/v1/chat/completions":
@@ -112,10 +113,29 @@ def _with_json_schema(app: Any) -> Any:
             now, message = message, {"type": "http.disconnect"}
             return now if now["type"] == "http.request" else await receive()
 
-        message["body"] = _renamed(message.get("body", b""))
+        body = message.get("body", b"")
+        if (wanted := _wanted(body)) not in (None, name):
+            return await _refuse(send, f"the model {shown(wanted)} does not exist here; {name!r} is served")
+        message["body"] = _renamed(body)
         await app(scope, whole, send)
 
     return asked
+
+
+def _wanted(body: bytes) -> Any:
+    try:
+        found = json.loads(body)
+    except (ValueError, RecursionError):
+        return None
+    return found.get("model") if isinstance(found, dict) else None
+
+
+async def _refuse(send: Any, message: str) -> None:
+    """As OpenAI's server refuses a model."""
+    error = {"message": message, "type": "invalid_request_error", "param": "model", "code": "model_not_found"}
+    headers = [(b"content-type", b"application/json")]
+    await send({"type": "http.response.start", "status": 404, "headers": headers})
+    await send({"type": "http.response.body", "body": json.dumps({"error": error}).encode()})
 
 
 def _renamed(body: bytes) -> bytes:
@@ -127,7 +147,11 @@ def _renamed(body: bytes) -> bytes:
     return json.dumps(request | {"response_format": {"type": "json_object", "schema": schema}}).encode()
 
 
-def _checked(file: Path) -> Path:
+def model_file(model: str | os.PathLike[str] | None) -> Path:
+    """The GGUF file of a model, the small one's for None; errors as of :func:`serve_model`."""
+    if model is None:
+        return small_model()
+    file = Path(model)
     if not file.is_file():
         beside = [path.name for path in file.parent.glob("*.gguf")] if file.parent.is_dir() else []
         if beside:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Generator, Iterable, Mapping
 from contextlib import closing
 from dataclasses import replace
-from typing import Any, NamedTuple
+from hashlib import sha256
+from pathlib import Path
+from typing import Any, Literal
 
 from lw_torchrl._checks import check_choice, check_int, check_scale, counted, shown
 from lw_torchrl._progress import Progress
@@ -16,36 +17,15 @@ from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.language.skills import ScriptedSkill
 from lw_torchrl.language.tasks import TASKS, Task, check_task, named_tasks
 from lw_torchrl.planners.answer_cache import AnswerCache, Reply
+from lw_torchrl.planners.answer_folder import already_answered, recorded_answer, settle_folder
 from lw_torchrl.planners.answers import Answer, Answers, folder_name, write_answer
 from lw_torchrl.planners.asking import ask_at_once
 from lw_torchrl.planners.chat_server import ChatServer, Dialect, server_address
-from lw_torchrl.planners.errors import PlannerError
+from lw_torchrl.planners.errors import unanswered
 from lw_torchrl.planners.plan_schema import plan_schema
-from lw_torchrl.planners.questions import chat_messages
+from lw_torchrl.planners.prompts import example_plans
+from lw_torchrl.planners.questions import Question, chat_messages, request_options
 from lw_torchrl.planners.replies import read_reply
-
-_OWN_FIELDS = frozenset(
-    [
-        "max_completion_tokens",
-        "max_tokens",
-        "messages",
-        "model",
-        "n",
-        "response_format",
-        "seed",
-        "stream",
-        "temperature",
-    ]
-)
-
-
-class _Question(NamedTuple):
-    task: Task
-    attempt: int
-    request: dict[str, Any]  # all that determines the answer
-
-    def __str__(self) -> str:
-        return f"{self.task.name}, attempt {self.attempt}"
 
 
 class OpenAIPlanner:
@@ -77,7 +57,7 @@ class OpenAIPlanner:
         timeout: seconds that an answer may take.
 
     Raises:
-        ValueError: a number that is too small, or ``base_url`` is no address.
+        ValueError: a number that is too small, ``base_url`` is no address, or ``free_skills`` without ``constrain``.
         TypeError: an argument of another type.
 
     Example:
@@ -115,13 +95,15 @@ class OpenAIPlanner:
         for argument, given in (("constrain", constrain), ("free_skills", free_skills), ("vocabulary", vocabulary)):
             if not isinstance(given, bool):
                 raise TypeError(f"{argument} must be True or False, got {shown(given)}")
+        if free_skills and not constrain:
+            raise ValueError("free_skills=True is for constrain alone: without, skills are in any words")
         self.model, self.base_url, self.constrain, self.free_skills = model, base_url, constrain, free_skills
         self.skills, self.examples, self.vocabulary = skills, plans, vocabulary
         self.address = server_address(base_url)
         self.temperature = None if temperature is None else check_scale("temperature", temperature)
         self.max_tokens = check_int("max_tokens", max_tokens, minimum=1)
         self.seed = None if seed is None else check_int("seed", seed)
-        self.options = _plain(options)
+        self.options = request_options(options)
         self.name = folder_name(name or (f"{model}-constrained" if constrain else model))
         self.cache = AnswerCache(cache)
         self.concurrency = check_int("concurrency", concurrency, minimum=1)
@@ -151,6 +133,23 @@ class OpenAIPlanner:
             "attempt": attempt,
         }
 
+    def settings(self) -> dict[str, Any]:
+        """What determines all its answers beside the question, as JSON has it; it is written beside them."""
+        skills = None if self.skills is None else sha256("\n".join(sorted(self.skills)).encode()).hexdigest()[:32]
+        return {
+            "model": self.model,
+            "server": self.address,
+            "constrain": self.constrain,
+            "free_skills": self.free_skills,
+            "skills": skills,
+            "plans": example_plans(self.examples).fingerprint,
+            "vocabulary": self.vocabulary,
+            "temperature": self.temperature,
+            "max_tokens": self.max_tokens,
+            "seed": self.seed,
+            "options": self.options,
+        }
+
     def plans(
         self,
         tasks: str | Task | Iterable[str | Task],
@@ -158,6 +157,7 @@ class OpenAIPlanner:
         format: str = "chain_py",
         attempts: int = 1,
         out: str | os.PathLike[str] | None = None,
+        recorded: bool = False,
         progress: bool = True,
     ) -> Answers:
         """Ask for plans; several questions at a time.
@@ -167,7 +167,8 @@ class OpenAIPlanner:
             format: a name in :data:`~lw_torchrl.PLAN_FORMATS`.
             attempts: answers to each question.
             out: a folder; each answer is written to ``out/<name>/<format>/<task>-<attempt>.<ext>`` as it comes, the
-                JSON of a constrained one beside it.
+                JSON of a constrained one beside it, and in ``out/<name>/settings.json`` what determines them all.
+            recorded: take the answers that ``out`` has as they are, and ask only for the others.
             progress: show how many have come.
 
         Returns:
@@ -177,16 +178,17 @@ class OpenAIPlanner:
             PlannerError: an answer did not come. Those that came are kept; called again it asks for those that are
                 missing.
             ImportError: something is to be asked, and the extra ``[llm]`` is absent.
-            ValueError: an unknown task or format, or no scripted skill suits a task.
+            ValueError: an unknown task or format, no scripted skill suits a task, or the folder has answers of other
+                settings.
         """
         check_choice("format", format, PLAN_FORMATS)
         count = check_int("attempts", attempts, minimum=1)
         questions = [
-            _Question(task, attempt, self.request(task, format, attempt))
+            Question(task, attempt, self.request(task, format, attempt))
             for task in named_tasks(tasks).values()
             for attempt in range(count)
         ]
-        return self._answers(questions, format, self.name, out, progress)
+        return self._answers(questions, format, self.name, out, progress, "taken" if recorded else "replaced")
 
     def revise(
         self,
@@ -212,7 +214,7 @@ class OpenAIPlanner:
             An answer in the place of each.
 
         Raises:
-            ValueError: answers of several formats, or not as many facts.
+            ValueError: answers of several formats, not as many facts, or one is in ``out`` already, and another.
             PlannerError, ImportError: as for :meth:`plans`.
         """
         before, told = list(answers), list(facts)
@@ -232,40 +234,50 @@ class OpenAIPlanner:
                 {"role": "assistant", "content": answer.raw},
                 {"role": "user", "content": fact},
             ]
-            questions.append(_Question(task, answer.attempt, request))
+            questions.append(Question(task, answer.attempt, request))
         name = f"{self.name}-round{check_int('round', round, minimum=1)}"
-        return self._answers(questions, format, name, out, progress)
+        return self._answers(questions, format, name, out, progress, "refused")
 
     def _answers(
         self,
-        questions: Iterable[_Question],
+        questions: Iterable[Question],
         format: str,
         name: str,
         out: str | os.PathLike[str] | None,
         progress: bool,
+        recorded: Literal["taken", "replaced", "refused"],
     ) -> Answers:
         found: list[Answer] = []
-        kept: list[tuple[_Question, Reply]] = []
-        missing: dict[str, tuple[_Question, str]] = {}
+        kept: list[tuple[Question, Reply]] = []
+        missing: dict[str, tuple[Question, str]] = {}
         for question in questions:
             try:
                 reply, note = self.cache.read(question.request), ""
             except ValueError as error:
                 reply, note = None, f"it was asked for again, since {error}"
+            if out is not None and recorded != "replaced":
+                there = recorded_answer(out, name, question, format, reply, self.skills)
+                if there is not None and recorded == "taken":
+                    found.append(there)
+                    continue
+                if there is not None and (reply is None or self._read(reply, question, format).text != there.text):
+                    raise already_answered(out, name, there)
             if reply is None:
                 missing[str(question)] = question, note
             else:
                 kept.append((question, reply))
+        if out is not None:
+            settle_folder(Path(out) / folder_name(name), self.settings(), reading=not kept and not missing)
 
-        def take(question: _Question, reply: Reply, cached: bool, note: str = "") -> None:
-            answer = read_reply(reply, question.task, format, question.attempt, self.skills, question.request["schema"])
+        def take(question: Question, reply: Reply, cached: bool, note: str = "") -> None:
+            answer = self._read(reply, question, format)
             answer = replace(answer, cached=cached, notes=(note, *answer.notes) if note else answer.notes)
             if out is not None:
                 write_answer(out, name, answer)
             found.append(answer)
 
-        total, errors = len(kept) + len(missing), []
-        with Progress("asking", total, "answer", initial=len(kept), show=progress) as bar:
+        total, errors = len(found) + len(kept) + len(missing), []
+        with Progress("asking", total, "answer", initial=total - len(missing), show=progress) as bar:
             for question, reply in kept:
                 take(question, reply, cached=True)
             with closing(self._ask([question for question, _ in missing.values()])) as replies:
@@ -276,41 +288,21 @@ class OpenAIPlanner:
                         take(question, came, cached=False, note=missing[str(question)][1])
                         bar.update()
         if errors:
-            raise self._failed(errors, len(found), total)
+            raise unanswered(errors, len(found), total, self.cache.folder)
         return Answers(found)
 
-    def _ask(self, questions: list[_Question]) -> Generator[tuple[_Question, Reply | Exception], None, None]:
+    def _read(self, reply: Reply, question: Question, format: str) -> Answer:
+        return read_reply(reply, question.task, format, question.attempt, self.skills, question.request["schema"])
+
+    def _ask(self, questions: list[Question]) -> Generator[tuple[Question, Reply | Exception], None, None]:
         if not questions:
             return
         with ChatServer(self.model, self.base_url, self.timeout, self.retries, self._dialect) as server:
 
-            def ask(question: _Question) -> Reply:
+            def ask(question: Question) -> Reply:
                 reply = server.ask(question.request, str(question))
                 self.cache.write(question.request, reply)
                 return reply
 
             yield from ask_at_once(ask, questions, self.concurrency)
             self._dialect = server.dialect
-
-    def _failed(self, errors: list[Exception], came: int, total: int) -> Exception:
-        first = next((error for error in errors if not isinstance(error, PlannerError)), errors[0])
-        if not isinstance(first, PlannerError):
-            return first
-        others = f" So did {counted(len(errors) - 1, 'other question')}." if len(errors) > 1 else ""
-        kept = (
-            f"{came} of {counted(total, 'answer')} are kept in {str(self.cache.folder)!r}; the same again asks the rest"
-        )
-        return PlannerError(f"{first}{others} {kept}.", fatal=first.fatal)
-
-
-def _plain(options: Mapping[str, Any] | None) -> dict[str, Any] | None:
-    """Options as JSON has them, since the name of an answer is made of them."""
-    if options is None:
-        return None
-    try:
-        found = json.loads(json.dumps(dict(options), allow_nan=False))
-    except (TypeError, ValueError) as error:
-        raise TypeError(f"options must be fields of a request, as JSON has them, got {shown(options)}") from error
-    if taken := sorted(_OWN_FIELDS & set(found)):
-        raise ValueError(f"options must be other fields than {', '.join(sorted(_OWN_FIELDS))}, got {', '.join(taken)}")
-    return found or None

@@ -42,7 +42,7 @@ def prompt_examples(
         ['pick-place', 'reach', 'push']
     """
     owner = task if isinstance(task, Task) else tasks[check_task(task, tasks)]
-    known = _hand_written() if plans is None else as_plans(plans)
+    known = example_plans(plans)
     others = [plan for name, plan in known.items() if name != owner.name]
     if not others:
         raise ValueError(f"plans must hold one of another task than {owner.name!r}, got none")
@@ -52,6 +52,11 @@ def prompt_examples(
 
     first, *nearest = sorted(others, key=distance)[:_EXAMPLES]
     return (first, *reversed(nearest)) if first.task == _ALWAYS else (*reversed(nearest), first)
+
+
+def example_plans(plans: Plans | Mapping[str, ConditionalPlan] | None) -> Plans:
+    """The plans that examples are chosen from; None for the hand-written ones of MT10."""
+    return _hand_written() if plans is None else as_plans(plans)
 
 
 @cache

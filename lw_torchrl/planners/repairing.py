@@ -13,10 +13,11 @@ from torch import Tensor
 from lw_torchrl._checks import check_int
 from lw_torchrl._progress import Progress
 from lw_torchrl.language.named_objects import GRIPPER
-from lw_torchrl.language.tasks import TASKS, Task
+from lw_torchrl.language.tasks import TASKS, Task, check_task
 from lw_torchrl.planners.answers import Answer
-from lw_torchrl.planners.checking import PlanCheck, check_plan
+from lw_torchrl.planners.checking import PlanCheck, check_decoded
 from lw_torchrl.planners.openai_planner import OpenAIPlanner
+from lw_torchrl.planners.replies import CUT_OFF
 
 
 @dataclass(frozen=True)
@@ -38,26 +39,31 @@ class Repair:
         return rates.index(max(rates))
 
 
-def plan_facts(check: PlanCheck, task: Task) -> str:
+def plan_facts(check: PlanCheck, task: Task, notes: Sequence[str] = ()) -> str:
     """What became of a plan, in words for the model that wrote it.
 
     Args:
         check: of the plan, with how near things came.
         task: the task, whose points are named.
+        notes: of the answer; the model is told of those that it can mend: that it was cut off.
 
     Example:
         >>> from lw_torchrl.language.tasks import TASKS
+        >>> from lw_torchrl.planners.checking import check_plan
         >>> print(plan_facts(check_plan("I cannot.", "reach", "basic_py"), TASKS["reach"]))
         The answer was read, and no plan was found in it: it has no steps, neither for reach nor for another task.
         Write the plan for `reach` again, the whole of it, in the same form, with this mended.
     """
     again = f"Write the plan for `{task.name}` again, the whole of it, in the same form, with this mended."
+    unread = [f"The answer is too long: {note}." for note in notes if note == CUT_OFF]
+    unread += [f"In the answer, {note}" for note in check.decoded.notes]
     if check.decoded.plan is None:
-        return f"The answer was read, and no plan was found in it: {check.decoded.reason}.\n{again}"
+        none = f"The answer was read, and no plan was found in it: {check.decoded.reason}."
+        return "\n".join([none, *unread, again])
     lines = [f"The plan was carried out, and succeeded in {check.success:.0%} of episodes."]
     if check.own is None:
         lines = ["The plan was not carried out: the robot has no skill that is near one of its steps."]
-    lines += [f"In the answer, {note}" for note in check.decoded.notes]
+    lines += unread
     lines += [
         f"The condition of step {step + 1}, '{check.decoded.plan.steps[step].condition}', held at no time."
         for step in check.never
@@ -129,13 +135,14 @@ def repair_plans(
     """
     check_int("rounds", rounds, minimum=1)
     first = list(answers)
-    options: dict[str, Any] = {"episodes": episodes, "seed": seed, "tasks": tasks, "skills": planner.skills}
+    options: dict[str, Any] = {"episodes": episodes, "seed": seed, "skills": planner.skills}
 
     def check(answers: Sequence[Answer]) -> list[PlanCheck]:
         with Progress("carrying out", len(answers), "plan", show=progress) as bar:
             checks = []
             for answer in answers:
-                checks.append(check_plan(answer.text, answer.task, answer.format, **options))
+                owner = tasks[check_task(answer.task, tasks)]
+                checks.append(check_decoded(answer.decoded, owner, **options))
                 bar.update()
         return checks
 
@@ -144,8 +151,11 @@ def repair_plans(
         open_ = [k for k, one in enumerate(found) if one.checks[-1].success < enough]
         if not open_:
             break
-        facts = [plan_facts(found[k].checks[-1], tasks[found[k].answers[-1].task]) for k in open_]
         before = [found[k].answers[-1] for k in open_]
+        facts = [
+            plan_facts(found[k].checks[-1], tasks[answer.task], answer.notes)
+            for k, answer in zip(open_, before, strict=True)
+        ]
         came = planner.revise(before, facts, round=number, tasks=tasks, out=out, progress=progress)
         of = {(answer.task, answer.attempt): answer for answer in came}
         others = [of[answer.task, answer.attempt] for answer in before]

@@ -17,6 +17,8 @@ from lw_torchrl.planners.answer_cache import Reply
 from lw_torchrl.planners.answers import Answer
 from lw_torchrl.planners.plan_schema import passes
 
+CUT_OFF = "it was cut off at max_tokens"
+
 
 def read_reply(
     reply: Reply,
@@ -41,7 +43,7 @@ def read_reply(
     text = encode_plan(decoded.plan, format) if schema and decoded.plan is not None else reply.text
     notes = []
     if reply.finish == "length":
-        notes.append("it was cut off at max_tokens")
+        notes.append(CUT_OFF)
     elif reply.finish == "content_filter":
         notes.append("a filter of the server cut it off")
     if reply.refusal:

@@ -89,7 +89,9 @@ def test_plans_of_ones_own(capsys, tmp_path, tiny):
     own = ("--plans", tmp_path / "mine.json")
     out = run(capsys, "reproduce", "few-shot", "--seeds", 0, "--list", "--out", tmp_path, *own).split()
     assert out[1:] == [f"few-shot/strong-mine/{method}/seed0" for method in ("pcbc", "dc", "one-hot")]
-    kept = "runs/compare/best/llama3.1/chain_py"  # as `plan compare` leaves them
+    kept = tmp_path / "runs/compare/best/llama3.1/chain_py"  # as `plan compare` leaves them
+    kept.mkdir(parents=True)
+    (kept / "push.plan").write_text(str(lw.load_plans("MT10")["push"]))
     (name,) = run(capsys, *arguments(tmp_path, "--plans", "MT50", kept, "--list", methods=["pcbc"], seeds=[0])).split()[
         1:
     ]
@@ -109,11 +111,11 @@ def test_what_it_refuses(capsys, tmp_path, tiny):
     assert "jobs must be at least 1" in fails(capsys, *arguments(tmp_path, "--jobs", 0))
 
 
-@pytest.mark.parametrize("chosen", [(), ("--run", 1), ("--run", 0)])
+@pytest.mark.parametrize("chosen", [(), ("--run", 1), ("--run", 0), ("--list",)])
 def test_plans_of_some_tasks_are_refused_before_any_work(capsys, tmp_path, tiny, chosen):
     (tmp_path / "push.plan").write_text(str(lw.load_plans("MT10")["push"]))
     own, out = ("--plans", tmp_path / "push.plan"), tmp_path / "out"
-    names = run(capsys, *arguments(out, *own, "--list")).split()
+    names = run(capsys, *arguments(out, "--list")).replace("/strong/", "/strong-push/").split()
     message = fails(capsys, *arguments(out, *own, *(names[2 * arg] if arg in (0, 1) else arg for arg in chosen)))
     assert "--plans must have a plan for each of the 50 tasks, they lack 49: assembly, basketball, " in message
     assert f"--plans MT50 {tmp_path / 'push.plan'} takes ours" in message

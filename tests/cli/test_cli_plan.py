@@ -1,5 +1,6 @@
 """``lw-torchrl plan``: the prompt that asks a language model for a plan, and asking one."""
 
+import json
 import signal
 import subprocess
 import sys
@@ -91,6 +92,12 @@ def test_generate_fails_in_one_line(capsys, tmp_path):
     with serving(FakeServer(lambda body: error(404, "no such model"))) as address:
         message = fails(capsys, *generate(address, tmp_path, "push"))
     assert f"'a/model' at {address}, push, attempt" in message
+    assert "--free-skills is for constrain" in fails(
+        capsys, *generate("http://x/v1", tmp_path, "push", "--free-skills")
+    )
+    message = fails(capsys, *generate("http://x/v1", tmp_path, "push", "--format", "all", "basic_py"))
+    assert "--format must be one of 'all', 'basic_py'" in message
+    assert "'all' alone" in message
     assert "--base-url must be an address" in fails(capsys, *generate("nowhere", tmp_path, "push"))
     assert "TASKS must be one of" in fails(capsys, *generate("http://x/v1", tmp_path, "psuh"))
     assert "--format must be one of" in fails(capsys, *generate("http://x/v1", tmp_path, "push", "--format", "chain"))
@@ -137,6 +144,16 @@ def test_compare_runs_what_generate_wrote(capsys, tmp_path):
     names = ["best", "fared.json", "formats.png", "models.png", "results.json", "summary.md"]
     assert sorted(file.name for file in (tmp_path / "out").iterdir()) == names
     assert run(capsys, *command) == printed
+    assert f"{tmp_path / 'out/best'}: of each task the plan that did best, be it one that never succeeds" in printed
+    assert "not read" not in printed
+    path.with_name("reach_1.py").write_text("?")
+    path.with_name("reach-1.py").write_text("No.")
+    printed = run(capsys, *command)
+    assert "1 answer has no plan:\n1: it has no steps, neither for the task" in printed
+    assert f"not read, since no answer is named so (<task>-<attempt>.<ext>): {path.with_name('reach_1.py')}" in printed
+    message = fails(capsys, *command, "--episodes", 3)
+    assert "--out: " in message
+    assert "of other settings: episodes (2, now 3); choose another folder" in message
 
 
 # ---- check
@@ -168,11 +185,97 @@ def test_check_takes_task_and_format_from_where_the_file_lies(capsys, tmp_path):
 def test_repair_tells_the_model_and_shows_how_each_round_fared(capsys, tmp_path):
     def learns(body):
         told = any(message["role"] == "assistant" for message in body["messages"])
-        return shipped(body) if told else completion("I would rather not.")
+        return shipped(body) if told else completion("I would rather", "length")
 
     with serving(FakeServer(learns)) as address:
         where = ("--out", tmp_path / "plans", "--cache", tmp_path / "kept", "--episodes", 1)
         command = ("plan", "repair", "reach", "--model", "m", "--base-url", address, "--rounds", 2, *where)
         printed = run(capsys, *command)
     assert ["reach", "0", "0%", "100%"] in [line.split() for line in printed.splitlines()]
+    assert "1 answer: it was cut off at max_tokens" in printed
     assert (tmp_path / "plans/m-round1/chain_py/reach-0.py").is_file()
+
+
+@pytest.mark.usefixtures("_no_key")
+def test_repair_begins_with_the_answers_that_generate_wrote_and_replaces_none(capsys, tmp_path):
+    """Whatever --seed generate had; asked for are those that are missing, with the model's seed."""
+    server = FakeServer(lambda body: completion(f"I cannot, for the {len(server.requests)}th time."))
+    where = ("--out", tmp_path / "plans", "--cache", tmp_path / "kept", "--model", "m")
+    options = ("--episodes", 1, "--rounds", 1, *where)
+    with serving(server) as address:
+        run(capsys, "plan", "generate", "reach", "--seed", 7, "--base-url", address, *where)
+        first = tmp_path / "plans/m/chain_py/reach-0.py"
+        text = first.read_text()
+        printed = run(capsys, "plan", "repair", "reach", "--base-url", address, *options)
+        assert len(server.requests) == 2
+        assert [message["content"] for message in server.requests[1]["messages"]][2] == text
+        assert first.read_text() == text
+        assert "1 answer to begin with, 0 asked now" in printed
+        assert printed.endswith(f"written to {tmp_path / 'plans/m'}, {tmp_path / 'plans/m-round1'}\n")
+        more = ("plan", "repair", "reach", "--base-url", address, "--attempts", 2, *options)
+        assert "seed (7, now None)" in fails(capsys, *more)
+        run(capsys, *more, "--seed", 7, "--name", "other")
+        assert [body.get("seed") for body in server.requests[:3]] == [7, None, 8]
+        assert sorted(body["seed"] for body in server.requests[3:]) == [7, 8]
+        assert first.read_text() == text
+
+
+@pytest.mark.usefixtures("_no_key")
+def test_repair_names_no_folder_that_is_not_there(capsys, tmp_path):
+    with serving(FakeServer()) as address:
+        where = ("--out", tmp_path / "plans", "--cache", tmp_path / "kept", "--episodes", 1)
+        printed = run(capsys, "plan", "repair", "reach", "--model", "m", "--base-url", address, *where)
+    assert printed.endswith(f"written to {tmp_path / 'plans/m'}\n")
+
+
+@pytest.mark.usefixtures("_no_key")
+def test_repair_replaces_no_answer_of_an_earlier_repair(capsys, tmp_path):
+    server = FakeServer(lambda body: completion(f"No, for the {len(server.requests)}th time."))
+    with serving(server) as address:
+        where = ("--out", tmp_path / "plans", "--episodes", 1, "--rounds", 1)
+        command = ("plan", "repair", "reach", "--model", "m", "--base-url", address, *where)
+        run(capsys, *command, "--cache", tmp_path / "kept")
+        before = (tmp_path / "plans/m-round1/chain_py/reach-0.py").read_text()
+        assert "it is not replaced" in fails(capsys, *command, "--cache", tmp_path / "emptied")
+    assert len(server.requests) == 2
+    assert (tmp_path / "plans/m-round1/chain_py/reach-0.py").read_text() == before
+
+
+# ---- whose answers a folder holds
+
+
+@pytest.mark.usefixtures("_no_key")
+def test_answers_of_other_settings_are_not_mixed(capsys, tmp_path):
+    server = FakeServer()
+    with serving(server) as address:
+        for model in ("a/b", "a_b"):
+            command = ("plan", "generate", "push", "--model", model, "--base-url", address, "--out", tmp_path / "plans")
+            command = (*command, "--cache", tmp_path / "kept")
+            if model == "a/b":
+                run(capsys, *command, "--seed", 0)
+                settings = json.loads((tmp_path / "plans/a_b/settings.json").read_text())
+                assert {name: settings[name] for name in ("model", "server", "seed", "temperature")} == {
+                    "model": "a/b", "server": address, "seed": 0, "temperature": None,
+                }  # fmt: skip
+                run(capsys, *command, "--seed", 0, "--attempts", 2)
+                message = fails(capsys, *command, "--seed", 100, "--vocabulary", "--plans", "MT50")
+                assert "plans" in message
+                assert "seed (0, now 100)" in message
+                assert "vocabulary (False, now True)" in message
+                assert "--name" in message
+                run(capsys, *command, "--seed", 100, "--name", "hundred")
+            else:
+                assert "model ('a/b', now 'a_b')" in fails(capsys, *command, "--seed", 0)
+                repair = ("repair", *command[2:], "--seed", 0, "--episodes", 1)
+                assert "model ('a/b', now 'a_b')" in fails(capsys, "plan", *repair)
+    assert [body["seed"] for body in server.requests] == [0, 1, 100]
+    assert lw.FilePlanner(tmp_path / "plans", "a_b").recorded == (("chain_py", "push", 0), ("chain_py", "push", 1))
+
+
+@pytest.mark.usefixtures("_no_key")
+def test_a_folder_without_an_answer_takes_any_settings(capsys, tmp_path):
+    with serving(FakeServer(failures=[error(404, "none")])) as address:
+        assert "no such model" in fails(capsys, *generate(address, tmp_path, "push", "--concurrency", 1))
+        run(capsys, *generate(address, tmp_path, "push", "--seed", 3))
+    (tmp_path / "plans/a_model/settings.json").unlink()
+    assert "no settings.json" in fails(capsys, *generate("http://x/v1", tmp_path, "push", "--seed", 3))

@@ -16,7 +16,12 @@ import lw_torchrl as lw
 from benchmarks.decoding import mutated
 from lw_torchrl.language import query_search, skills, step_mapping
 from lw_torchrl.language import text as text_encoders
+from lw_torchrl.language.decoding import decode_as
+from lw_torchrl.language.formats import PLAN_FORMATS
+from lw_torchrl.language.formats.structured import read_structured, write_structured
 from lw_torchrl.language.skills import ScriptedSkill
+from lw_torchrl.language.step_mapping import StepMapper
+from lw_torchrl.language.thoughts import without_thoughts
 
 formats = st.sampled_from(list(lw.PLAN_FORMATS))
 
@@ -70,6 +75,62 @@ def test_thoughts_without_an_answer_are_no_plan():
     assert found.plan is None
     assert "no steps" in found.reason
     assert [str(note) for note in found.notes][1:] == ["line 2: thinks aloud; that is left out, and is cut off there"]
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ("[THINK]{}\nNo.[/THINK]", ""),
+        ("<|channel|>analysis<|message|>{}<|end|><|start|>assistant<|channel|>final<|message|>", ""),
+        ("<|channel|>analysis<|message|>{}\n<|channel|>final <|constrain|>json<|message|>", ""),
+        ("<think>one</think>\n<think>{}</think>\n", ""),
+        ("<think>Is </think> the end? <think>{}\n</think>\n", ""),
+        ("{}\nSo be it. [/THINK]\n", ""),
+        ('{}\nThat is #2, "push it".</think>\n', ""),
+        ("", "\n<think>\n{}\n</think>\n"),
+    ],
+)
+def test_thoughts_are_marked_in_many_ways(before, after):
+    plans = lw.load_plans("MT10")
+    draft, final = (lw.encode_plan(lw.ConditionalPlan("push", plans["push"].steps[:n]), "chain_py") for n in (3, 2))
+    found = lw.decode_plan(f"{before.format(draft)}{final}{after.format(draft)}", "push", "chain_py")
+    assert found.plan.steps == plans["push"].steps[:2]
+    assert "thinks aloud" in str(found.notes[0])
+
+
+@pytest.mark.parametrize("tag", ["</think>", "# </think>", "# <think>", "# done </think>", "# [/THINK]"])
+@pytest.mark.parametrize("place", [0, 3, 6, -1])
+def test_a_tag_within_a_plan_deletes_no_step(tag, place):
+    plan = lw.load_plans("MT10")["push"]
+    lines = lw.encode_plan(plan, "basic_py").splitlines()
+    if tag == "</think>":
+        lines[place] += f"  # {tag}"
+    else:
+        lines.insert(place if place >= 0 else len(lines), f"    {tag}")
+    assert lw.decode_plan("\n".join(lines), "push", "basic_py").plan == plan
+
+
+def test_tags_in_json_are_its_words():
+    plan = lw.load_plans("MT10")["push"]
+    for tag in ("</think>", "<think>", "[THINK] x [/THINK]"):
+        said = json.loads(write_structured(plan, PLAN_FORMATS["chain_py"].style))
+        said["steps"][2]["because"] = f"Because. {tag}"
+        for text in (
+            json.dumps(said),
+            f"<think>Or {{}}?</think>{json.dumps(said)}",
+            f"```json\n{json.dumps(said)}\n```",
+        ):
+            found = decode_as(text, read_structured, StepMapper(lw.TASKS["push"], None, "edit", 0.4, 0.7))
+            assert found.plan == plan
+
+
+@pytest.mark.parametrize(
+    "tag", ["<think>", "</think>", "<think></think>", "<|channel|>final", "</think>\n", "# </think>"]
+)
+def test_many_tags_cost_little(tag):
+    began = thread_time()
+    without_thoughts(tag * 50_000, [])
+    assert thread_time() - began < 5.0
 
 
 def test_a_text_in_the_language_has_no_distance_and_no_note():

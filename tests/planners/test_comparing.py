@@ -10,7 +10,8 @@ import lw_torchrl as lw
 from lw_torchrl.planners import answer_path
 from lw_torchrl.planners import comparing as module
 from lw_torchrl.planners.comparing import compare_plans
-from lw_torchrl.planners.comparison_report import write_report
+from lw_torchrl.planners.comparison_report import no_plans, write_report
+from lw_torchrl.planners.file_planner import ignored_files
 
 PLANS = lw.load_plans("MT10")
 SHORT = {"episodes": 4, "max_steps": 60, "progress": False}
@@ -89,8 +90,8 @@ def test_stopped_it_goes_on_with_the_plans_that_are_left(answers, tmp_path, monk
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ('{"settings": {}, "fared": {}}', "is of {}, and this run of"),
-        ('{"settings": ', "resume 'fared.json' cannot be read"),
+        ('{"settings": {}, "fared": {}}', r"of other settings: choose \(None, now 'random'\), episodes"),
+        ('{"settings": ', "resume: the kept results 'fared.json' cannot be read"),
         ('{"settings": SETTINGS, "fared": {"a": "01"}}', "is damaged"),
         ('{"settings": SETTINGS, "fared": [1]}', "is damaged"),
         ('{"settings": SETTINGS, "fared": {"a": "0121"}}', "is damaged"),
@@ -100,13 +101,27 @@ def test_what_was_kept_is_checked(answers, tmp_path, monkeypatch, content, messa
     monkeypatch.chdir(tmp_path)
     settings = {"episodes": 4, "seed": 1000, "choose": "random", "noise_scale": 0.0, "max_steps": 60}
     (tmp_path / "fared.json").write_text(content.replace("SETTINGS", json.dumps(settings)))
-    with pytest.raises(ValueError, match=message.replace("{}", r"\{\}")):
+    with pytest.raises(ValueError, match=message):
         compare_plans(answers, resume="fared.json", **SHORT)
 
 
 def test_a_folder_without_answers_is_refused(tmp_path):
     with pytest.raises(ValueError, match="holds no answers"):
         compare_plans(tmp_path, **SHORT)
+
+
+def test_why_answers_have_no_plan(answers):
+    write(answers, "other", "chain_py", "push", 0, "I cannot do that.")
+    (answers / "good/chain_py/push_2.py").write_text("?")
+    (answers / "good/chain_py/push-3.txt").write_text("?")
+    (answers / "good/chain_py/push-3.json").write_text("?")
+    found = no_plans(compare_plans(answers, **SHORT))
+    assert found == [
+        "5 answers have no plan:",
+        "5: it has no steps, neither for the task nor for another task",
+    ]
+    assert [path.name for path in ignored_files(answers)] == ["push-3.txt", "push_2.py"]
+    assert no_plans(module.PlanComparison([], {})) == []
 
 
 def test_the_report(answers, tmp_path):
@@ -136,3 +151,23 @@ def test_the_best_plan_of_each_task_is_kept_for_other_commands(tmp_path):
     stale.write_text("of an earlier run")
     write_report(compare_plans(tmp_path / "plans", **SHORT | {"max_steps": 150}), tmp_path / "out")
     assert dict(lw.load_plans(stale.parent)) == {"drawer-open": good}
+
+
+def test_best_forgets_a_model_that_is_gone_and_nothing_else(tmp_path):
+    for model in ("old", "mine"):
+        write(tmp_path / "plans", model, "chain_py", "reach", 0, lw.encode_plan(PLANS["reach"], "chain_py"))
+    write_report(compare_plans(tmp_path / "plans", **SHORT), tmp_path / "out")
+    best = tmp_path / "out/best"
+    (best / "mine/notes.plan").write_text("mine")
+    (best / "old/chain_py/notes.txt").write_text("mine")
+    (tmp_path / "plans/old").rename(tmp_path / "plans/new")
+    write_report(compare_plans(tmp_path / "plans", **SHORT), tmp_path / "out")
+    files = {str(path.relative_to(best)) for path in best.rglob("*") if path.is_file()}
+    plans = {"mine/chain_py/reach.plan", "new/chain_py/reach.plan"}
+    assert files == plans | {"mine/notes.plan", "old/chain_py/notes.txt"}
+    (best / "old/chain_py/notes.txt").unlink()
+    (tmp_path / "plans/mine").rename(tmp_path / "plans/old")
+    write_report(compare_plans(tmp_path / "plans", **SHORT), tmp_path / "out")
+    (tmp_path / "plans/old").rename(tmp_path / "plans/mine")
+    write_report(compare_plans(tmp_path / "plans", **SHORT), tmp_path / "out")
+    assert not (best / "old").exists()

@@ -31,6 +31,7 @@ def ask(monkeypatch, tmp_path):
             planner = lw.OpenAIPlanner(
                 "m", base_url=address, constrain=True, cache=tmp_path / "kept", retries=1, concurrency=1, **options
             )
+            planner.address = "http://fake/v1"  # the port is another each time
             return planner.plans(tasks, format=format, out=tmp_path / "out", progress=False)
 
     return asked

@@ -94,6 +94,13 @@ def test_lines_that_are_none(tmp_path, line, says):
         lw.FilePlanner(tmp_path / "answers.jsonl")
 
 
+def test_two_models_of_one_folders_name_are_not_taken_for_one(tmp_path):
+    rows = [{**ROW, "llm": name} for name in ("a/b", "c", "a/b", "a_b")]
+    (tmp_path / "answers.jsonl").write_text("\n".join(map(json.dumps, rows)))
+    with pytest.raises(ValueError, match="line 4: the models 'a/b' and 'a_b' would both be 'a_b'"):
+        lw.FilePlanner(tmp_path / "answers.jsonl", "c")
+
+
 @pytest.mark.parametrize("name", ["..", "/", "", "a/../b", "x" * 500, "ä ö", ".hidden", "con:stream?*"])
 def test_a_models_name_is_a_folders(tmp_path, name):
     found = folder_name(name)

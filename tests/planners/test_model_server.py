@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import json
 import re
 import signal
 import socket
@@ -9,11 +11,12 @@ import subprocess
 import sys
 
 import pytest
+from commands import fails
 
 import lw_torchrl as lw
 from lw_torchrl.planners import model_server
 from lw_torchrl.planners.comparing import compare_plans
-from lw_torchrl.planners.model_server import serve_model
+from lw_torchrl.planners.model_server import as_openai, serve_model
 
 TASKS = [*lw.MT10]
 
@@ -45,6 +48,40 @@ def test_what_is_no_model_is_refused(tmp_path):
 def test_numbers_that_are_too_small_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         serve_model(**options)
+
+
+def posted(body, path="/v1/chat/completions"):
+    """What a server of the model "mine" does with a request: its own answer, and what reached the one behind it."""
+    reached, said = [], []
+
+    async def behind(scope, receive, send):
+        reached.append((await receive())["body"])
+
+    async def receive():
+        return {"type": "http.request", "body": body}
+
+    async def send(message):
+        said.append(message)
+
+    asyncio.run(as_openai(behind, "mine")({"type": "http", "path": path}, receive, send))
+    return said, reached
+
+
+def test_another_model_is_not_found():
+    (start, content), reached = posted(json.dumps({"model": "gpt-4o", "messages": []}).encode())
+    assert (start["status"], reached) == (404, [])
+    error = json.loads(content["body"])["error"]
+    assert error["code"] == "model_not_found"
+    assert error["message"] == "the model 'gpt-4o' does not exist here; 'mine' is served"
+
+
+@pytest.mark.parametrize("body", [b'{"model": "mine"}', b'{"messages": []}', b"[1]", b"{", b'{"model": null}'])
+def test_what_asks_for_the_model_or_none_goes_on(body):
+    assert posted(body) == ([], [body])
+
+
+def test_serve_looks_at_the_file_before_it_says_that_it_loads(capsys, tmp_path):
+    assert "does not exist" in fails(capsys, "plan", "serve", tmp_path / "nope.gguf")
 
 
 @pytest.fixture(scope="module")
@@ -89,6 +126,14 @@ def test_from_the_prompt_to_the_robot_with_a_real_model(served, tmp_path):
     assert all(one.cached for one in again)
     found = compare_plans(tmp_path / "plans", episodes=1, max_steps=50, progress=False)
     assert all(one.steps and not one.reason for one in found.answers)
+
+
+@pytest.mark.slow
+def test_it_answers_for_its_own_model_alone(served, tmp_path):
+    name, address = served
+    other = lw.OpenAIPlanner("gpt-4o", base_url=address, cache=tmp_path / "cache")
+    with pytest.raises(lw.PlannerError, match=f"no such model or address.*'{name}' is served"):
+        other.plans("reach", progress=False)
 
 
 @pytest.mark.slow

@@ -46,7 +46,7 @@ def test_answers_become_plans(ask, tmp_path):
     assert (found.tokens.prompt, found.tokens.completion, found.tokens.total) == (2000, 200, 2200)
     assert server.most_at_once == 3
     files = {str(path.relative_to(tmp_path / "out")) for path in (tmp_path / "out").rglob("*.*")}
-    assert files == {f"a_model/chain_py/{task}-{k}.py" for task in lw.MT10 for k in (0, 1)}
+    assert files == {"a_model/settings.json"} | {f"a_model/chain_py/{task}-{k}.py" for task in lw.MT10 for k in (0, 1)}
     assert (tmp_path / "out/a_model/chain_py/push-1.py").read_text() == lw.encode_plan(PLANS["push"], "chain_py")
     assert isinstance(lw.OpenAIPlanner("m"), lw.Planner)
 
@@ -252,6 +252,17 @@ def test_odd_answers_are_answers(ask, tmp_path, body, note):
     assert (again.cached, again.text, again.notes) == (True, answer.text, answer.notes)
 
 
+@pytest.mark.parametrize(
+    ("answered", "noted"),
+    [("smollm2-135m", True), ("a/model-2024-08-06", False), ("a/mo", False), ("", False), (None, False), (3, False)],
+)
+def test_another_model_that_answers_is_noted(ask, answered, noted):
+    (answer,) = ask(FakeServer(lambda body: {**shipped(body), "model": answered}), "push")
+    note = "the server says that the model 'smollm2-135m' answered, not 'a/model'"
+    assert answer.notes == ((note,) if noted else ())
+    assert answer.decoded.plan == PLANS["push"]
+
+
 def test_a_server_that_wants_another_name_for_the_limit(ask):
     def modern(body):
         if "max_tokens" in body:
@@ -327,6 +338,7 @@ def test_skills_and_examples_count_where_they_are_sent():
         ({"base_url": "http://[x"}, ValueError, "base_url"),
         ({"base_url": 3}, (TypeError, ValueError), "base_url"),
         ({"constrain": "yes"}, TypeError, "constrain"),
+        ({"free_skills": True}, ValueError, "free_skills=True is for constrain alone"),
         ({"max_tokens": 0}, ValueError, "max_tokens must be at least 1"),
         ({"concurrency": 0}, ValueError, "concurrency"),
         ({"retries": -1}, ValueError, "retries"),

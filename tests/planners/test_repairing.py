@@ -6,6 +6,8 @@ import pytest
 from fake_server import PLANS, FakeServer, asked_for, completion, serving
 
 import lw_torchrl as lw
+from lw_torchrl.language.formats import PLAN_FORMATS
+from lw_torchrl.language.formats.structured import write_structured
 from lw_torchrl.language.tasks import TASKS
 from lw_torchrl.planners.checking import check_plan
 from lw_torchrl.planners.comparing import compare_plans
@@ -69,6 +71,24 @@ def test_a_model_that_learns_nothing_is_asked_so_many_times(planner):
     assert len(found.answers) == 3
     assert found.best == 0
     assert "no plan was found" in server.requests[-1]["messages"][-1]["content"]
+
+
+def test_a_model_is_told_where_its_json_was_cut_off(planner):
+    """The text in the format, made of the JSON, has no trace of it."""
+    whole = write_structured(PLANS["push"], PLAN_FORMATS["chain_py"].style)
+    server = FakeServer(lambda body: completion(whole[: whole.index('"skill"', 900)], "length"))
+    with serving(server) as address:
+        asked = planner(address, constrain=True)
+        (found,) = repair_plans(
+            asked, asked.plans("push", progress=False), rounds=1, episodes=1, enough=1.0, progress=False
+        )
+    told = server.requests[1]["messages"][-1]["content"]
+    assert "The answer is too long: it was cut off at max_tokens." in told
+    assert "In the answer, line 1: the answer ends or is no JSON from here" in told
+    assert "ends or is no JSON from here" in str(found.checks[0])
+    assert "it was cut off at max_tokens" in plan_facts(
+        check_plan("", "push", "basic_py"), TASKS["push"], ["it was cut off at max_tokens", "the server lies"]
+    )
 
 
 def test_the_facts_say_what_is_needed_to_mend_a_plan():
