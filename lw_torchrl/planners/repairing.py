@@ -52,6 +52,7 @@ def plan_facts(check: PlanCheck, task: Task, notes: Sequence[str] = ()) -> str:
         >>> from lw_torchrl.planners.checking import check_plan
         >>> print(plan_facts(check_plan("I cannot.", "reach", "basic_py"), TASKS["reach"]))
         The answer was read, and no plan was found in it: it has no steps, neither for reach nor for another task.
+        In the answer, line 1: is no part of a plan: 'I cannot.'
         Write the plan for `reach` again, the whole of it, in the same form, with this mended.
     """
     again = f"Write the plan for `{task.name}` again, the whole of it, in the same form, with this mended."
