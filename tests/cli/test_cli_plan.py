@@ -118,8 +118,10 @@ def test_a_killed_run_asks_only_for_what_is_missing(capsys, tmp_path):
         finally:
             process.kill()
             process.wait()
-        time.sleep(0.3)  # what was under way when it was killed
-        before = len(server.requests)
+        before = -1
+        while before != len(server.requests):  # what was under way when it was killed
+            before = len(server.requests)
+            time.sleep(1.0)
         kept = len(list((tmp_path / "kept").rglob("*.json")))
         assert 3 <= kept <= before < 20
         printed = run(capsys, *asked)
