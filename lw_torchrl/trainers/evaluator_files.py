@@ -19,15 +19,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lw_torchrl._state_tree import check_like, split
+from lw_torchrl._state_tree import split
 from lw_torchrl._tensor_archive import ArchiveError, TensorArchive, write_archive
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.text import TextEncoder, encoded
 from lw_torchrl.modules.query_evaluator import QueryEvaluator, evaluator_from_description
 from lw_torchrl.trainers.policy_checks import (
     at_most,
-    check_finite,
     check_options,
+    check_remade,
     check_texts,
     copy_weights,
     first_line,
@@ -74,9 +74,7 @@ def check_evaluator_can_be_saved(evaluator: Any) -> QueryEvaluator:
         encoder = getattr(evaluator, "text_encoder", None)
         with torch.random.fork_rng(devices=[]):
             again = evaluator_from_description(described, evaluator.plans, encoder)
-        weights = evaluator.state_dict(keep_vars=True)
-        check_like(weights, again.state_dict(), "weights")
-        check_finite(weights, weights)
+        check_remade(evaluator, again)
     except Exception as error:
         raise ValueError(
             f"evaluator cannot be kept in a file, which would not make it again from its description "

@@ -37,14 +37,19 @@ def check_can_be_saved(actor: Any) -> Policy:
             again = from_description(
                 json.loads(json.dumps(described)), (lambda found: torch.ones(len(found), size)) if texts else None
             )
-        weights = actor.state_dict(keep_vars=True)
-        check_like(weights, again.state_dict(), "weights")
-        check_finite(weights, weights)
+        check_remade(actor, again)
     except Exception as error:
         raise ValueError(
             f"actor cannot be kept in a file, which would not make it again from its description ({first_line(error)})"
         ) from error
     return actor
+
+
+def check_remade(module: nn.Module, again: nn.Module) -> None:
+    """Raise :class:`ValueError` unless what was made again of a description can hold the weights, all finite."""
+    weights = module.state_dict(keep_vars=True)
+    check_like(weights, again.state_dict(), "weights")
+    check_finite(weights, weights)
 
 
 def check_finite(weights: Mapping[str, Tensor], live: Mapping[str, Tensor]) -> None:
