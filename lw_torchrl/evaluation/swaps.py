@@ -67,10 +67,14 @@ def with_true_answers(actor: Any) -> Any:
 
 def make_env(actor: Any, plans: Plans | None, base: LanguageWorldEnv, evaluator: Any = None) -> EnvBase:
     """The environment with what must run before the actor, and the answers to the plans' queries beside it; behind it
-    an evaluator that is a transform."""
-    before = [one for one in (transform_of(actor, plans),) if one is not None]
+    an evaluator that is a transform, or what a module reads."""
     if isinstance(evaluator, Transform):
-        before.append(evaluator.clone())  # a transform has one environment
+        evaluator = evaluator.clone()  # a transform has one environment
+    elif isinstance(evaluator, QueryEvaluator):
+        evaluator = evaluator.transform()
+    else:
+        evaluator = None
+    before = [one for one in (transform_of(actor, plans), evaluator) if one is not None]
     return TransformedEnv(base, before[0] if len(before) == 1 else Compose(*before)) if before else base
 
 

@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
+from torchrl.envs import Transform
 
 from lw_torchrl._checks import check_choice, check_probability, check_scale
 from lw_torchrl._keys import as_keys, check_apart
@@ -138,10 +139,10 @@ class PlanEncoder(Encoder):
     def width(self) -> int:
         return super().width + (0 if self.focus is None else self.focus.width)
 
-    def transform(self) -> QAFTransform | None:
-        """Query answers, unless an evaluator gives them."""
+    def transform(self) -> Transform | None:
+        """Query answers, or what the evaluator reads."""
         if self.evaluator is not None:
-            return None
+            return self.evaluator.transform()
         return QAFTransform(self.plans, in_keys=self.in_keys[:2], out_keys=self.in_keys[2:])
 
     def prepare(self, tensordict: TensorDictBase) -> tuple[Tensor, ...]:

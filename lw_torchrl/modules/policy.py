@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor
 from torchrl.data import Bounded, Composite
-from torchrl.envs import Transform
+from torchrl.envs import Compose, Transform
 
 from lw_torchrl._checks import check_choice
 from lw_torchrl._keys import read
@@ -235,4 +235,7 @@ def plans_of(actor: Any) -> Plans | None:
 def transform_of(actor: Any, plans: Plans | None) -> Transform | None:
     """What must run before an actor: what it asks for itself, or else the answers to the queries of ``plans``."""
     own = actor.transform() if isinstance(actor, Policy) else None
-    return QAFTransform(plans) if own is None and plans is not None else own
+    parts = own.transforms if isinstance(own, Compose) else [own]
+    if plans is None or any(isinstance(part, QAFTransform) for part in parts):
+        return own
+    return QAFTransform(plans) if own is None else Compose(QAFTransform(plans), own)

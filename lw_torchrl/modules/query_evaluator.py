@@ -11,6 +11,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
+from torchrl.envs import Transform
 
 from lw_torchrl._checks import check_choice
 from lw_torchrl.language.plans import Plans
@@ -80,6 +81,10 @@ class QueryEvaluator(TensorDictModuleBase):
                 f"longest plan, got shape {tuple(found.shape)}"
             )
         return found.to(torch.float32)
+
+    def transform(self) -> Transform | None:
+        """A new transform that writes what it reads and the environment does not give, pictures say; None for none."""
+        return None
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``qaf_logits``."""

@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
+from torchrl.envs import Transform
 
 from lw_torchrl._checks import check_choice, check_int, shown
 from lw_torchrl._keys import as_keys, check_apart
@@ -93,10 +94,10 @@ class ScriptedSkillActor(Policy):
     def for_plans(cls, plans: Plans, *, text_encoder: TextEncoder | None = None, **options: Any) -> ScriptedSkillActor:
         return cls(plans, **options)
 
-    def transform(self) -> QAFTransform | None:
-        """Query answers, unless an evaluator gives them."""
+    def transform(self) -> Transform | None:
+        """Query answers, or what the evaluator reads."""
         if self.evaluator is not None:
-            return None
+            return self.evaluator.transform()
         return QAFTransform(self.plans, in_keys=self.in_keys[:2], out_keys=self.in_keys[2:])
 
     def with_plans(self, plans: Plans | Mapping[str, ConditionalPlan]) -> ScriptedSkillActor:

@@ -1,0 +1,187 @@
+"""python -m benchmarks.evaluators: what a learned query evaluator in a policy costs, and what tuning it end to end gives."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+
+import lw_torchrl as lw
+from lw_torchrl._files import write_text
+from lw_torchrl.evaluation import EvaluationResult, condition_drift, drift_table, score_evaluator
+from lw_torchrl.evaluation.comparison import markdown_table
+from lw_torchrl.experiments.demo import DemoConfig
+
+RECIPE = DemoConfig()
+WHO = ("expert", "scripted", "spoilt-30", "random")
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Few-shot policies of MT10, with the query answering function, with evaluators in its place, and tuned with them.
+    Stopped and started again it carries on.
+    """
+
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Of demonstrations, labelled states, weights and minibatches, all of them."""
+    labels: tuple[float, ...] = (1.0, 0.01)
+    """Shares of the labelled states that evaluators are trained on."""
+    tasks: tuple[str, ...] = lw.MT10
+    steps: int = 6000
+    """Minibatches of an evaluator."""
+    tuning_steps: int = 2000
+    """Minibatches of the tuning."""
+    tuning_rate: float = 3e-4
+    """The tuning's learning rate at the start."""
+    anchors: tuple[float, ...] = (0.0, 0.1)
+    """Weights of `qaf_anchor` in the tuning, each by itself."""
+    episodes: int = 20
+    """Of each task, evaluated."""
+    evaluation_seed: int = 1000
+    """Of these; none that demonstrations or labels were made with."""
+    quick: bool = False
+    """Two tasks, few steps, one seed: it runs, its figures mean nothing."""
+    out: Path = Path("runs/evaluators")
+
+
+class Bench:
+    """The parts of one seed, each kept in files and done once."""
+
+    def __init__(self, args: Arguments, seed: int) -> None:
+        self.args, self.seed, self.folder = args, seed, args.out / f"seed{seed}"
+        self.plans = lw.load_plans("MT10")
+
+    def demonstrations(self) -> lw.LanguageWorldExperienceReplay:
+        root = self.folder / "demonstrations"
+        lw.collect_demonstrations(
+            self.args.tasks,
+            episodes_per_task=RECIPE.demonstrations_per_task,
+            root=root,
+            seed=self.seed,
+            noise_scale=RECIPE.demonstration_noise,
+            noise_hold=RECIPE.noise_hold,
+            redraw_failures=True,
+        )
+        return lw.LanguageWorldExperienceReplay(
+            root, sampler=lw.TaskBalancedSampler(), after_success=RECIPE.after_success
+        )
+
+    def policy(self) -> Any:
+        """The few-shot policy, trained on exact answers."""
+        replay = self.demonstrations()
+        replay.append_transform(lw.QAFTransform(self.plans))
+        torch.manual_seed(self.seed)
+        actor = lw.PlanConditionedActor(self.plans)
+        steps = 300 if self.args.quick else RECIPE.training_steps
+        config = lw.BehavioralCloningConfig(steps=steps, batch_size=RECIPE.batch_size, seed=self.seed)
+        lw.BehavioralCloningTrainer(actor, replay, config, checkpoint=self.folder / "policy.zip").train()
+        return lw.load_actor(self.folder / "policy.zip")
+
+    def evaluator(self, share: float) -> Any:
+        """One trained on the answers in so large a share of the states; its report is printed."""
+        roots = [self.folder / "states" / who for who in WHO]
+        for who, root in zip(WHO, roots, strict=True):
+            noise = (0.0, 0.1, 0.2) if who == "expert" else 0.0
+            lw.collect_demonstrations(
+                self.args.tasks, episodes_per_task=5, root=root, policy=who, noise_scale=noise, seed=self.seed
+            )
+        most = lw.QueryEvaluatorConfig(held_out_pairs=0.0, seed=self.seed, steps=self.args.steps)
+        config = replace(most, states_per_task=max(1, round(share * most.states_per_task)))
+        states = lw.LanguageWorldExperienceReplay(roots, label="executed")
+        labelled = lw.LabelledQueries(states, config)
+        torch.manual_seed(self.seed)
+        evaluator = lw.StateQueryEvaluator(self.plans)
+        file = self.folder / f"evaluator-{share:g}.zip"
+        lw.QueryEvaluatorTrainer(evaluator, labelled, config, checkpoint=file).train()
+        report = score_evaluator(evaluator, lw.LabelledQueries(states, most))
+        report.save(file.with_suffix(".json"))
+        number = labelled.describe()["states"]["training"]
+        print(f"seed {self.seed}, {number} labelled states:\n{report.table(most=2)}", flush=True)
+        return lw.load_evaluator(file, self.plans)
+
+    def tuned(self, name: str, actor: Any, anchor: float) -> Any:
+        """A policy tuned by its demonstrations' loss, its evaluator too if it has one."""
+        replay = self.demonstrations()
+        if (transform := actor.transform()) is not None:
+            replay.append_transform(transform)
+        config = lw.BehavioralCloningConfig(
+            steps=50 if self.args.quick else self.args.tuning_steps,
+            batch_size=RECIPE.batch_size,
+            learning_rate=self.args.tuning_rate,
+            normalize=False,
+            seed=self.seed,
+            qaf_anchor=anchor,
+        )
+        file = self.folder / f"{name}.zip"
+        lw.BehavioralCloningTrainer(actor, replay, config, checkpoint=file).train()
+        if getattr(actor, "evaluator", None) is not None:
+            drifts = condition_drift(actor, replay[:])
+            table = drift_table(drifts, most=8)
+            write_text(file.with_suffix(".txt"), table)
+            print(f"seed {self.seed}, {name}, conditions in the demonstrations' states:\n{table}", flush=True)
+        return lw.load_actor(file)
+
+    def success(self, name: str, actor: Any) -> EvaluationResult:
+        file = self.folder / "results" / f"{name}.json"
+        if file.is_file():
+            return EvaluationResult.load(file)
+        result = lw.evaluate(
+            actor,
+            tasks=self.args.tasks,
+            episodes_per_task=self.args.episodes,
+            seed=self.args.evaluation_seed,
+            noise_scale=RECIPE.evaluation_noise,
+            stop_at_success=True,
+        )
+        file.parent.mkdir(parents=True, exist_ok=True)
+        result.save(file)
+        return result
+
+    def run(self) -> Iterable[tuple[str, EvaluationResult]]:
+        """Each row of the table: what answers, and how it went."""
+        policy = self.policy()
+        yield "query answering function", self.success("qaf", policy)
+        yield "the same, tuned as long", self.success("qaf-tuned", self.tuned("qaf-tuned", self.policy(), 0.0))
+        for share in self.args.labels:
+            evaluator = self.evaluator(share)
+            told = f"evaluator, {100 * share:g}% of the labels"
+            yield told, self.success(f"evaluator-{share:g}", policy.with_evaluator(evaluator))
+            for anchor in self.args.anchors:
+                name = f"evaluator-{share:g}-tuned-{anchor:g}"
+                begun = self.policy().with_evaluator(
+                    lw.load_evaluator(self.folder / f"evaluator-{share:g}.zip", self.plans)
+                )
+                yield f"{told}, tuned, anchor {anchor:g}", self.success(name, self.tuned(name, begun, anchor))
+
+
+def table(found: dict[str, list[EvaluationResult]]) -> str:
+    """A line for each kind of answers: mean over the seeds, and the difference from exact ones, seed by seed."""
+    exact = np.array([result.mean_success for result in found["query answering function"]])
+    rows = []
+    for name, results in found.items():
+        means = np.array([result.mean_success for result in results])
+        by_seed = ", ".join(f"{mean:.3f}" for mean in means)
+        rows.append([name, f"{means.mean():.3f}", by_seed, f"{(means - exact[: len(means)]).mean():+.3f}"])
+    return markdown_table(["answers", "mean", "by seed", "to exact answers"], rows)
+
+
+def main(args: Arguments) -> None:
+    if args.quick:
+        args = replace(args, tasks=args.tasks[:2], seeds=args.seeds[:1], steps=200, episodes=2)
+    found: dict[str, list[EvaluationResult]] = {}
+    for seed in args.seeds:
+        for name, result in Bench(args, seed).run():
+            found.setdefault(name, []).append(result)
+            print(f"seed {seed}, {name}: {result.mean_success:.3f}", flush=True)
+        write_text(args.out / "table.md", table(found))
+    print(f"\n{table(found)}\nwritten to {args.out / 'table.md'}")
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    main(tyro.cli(Arguments))
