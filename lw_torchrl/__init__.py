@@ -14,7 +14,9 @@ if TYPE_CHECKING:  # the table below, for type checkers and editors
     from lw_torchrl.data import EpisodeFilter as EpisodeFilter
     from lw_torchrl.data import LanguageWorldExperienceReplay as LanguageWorldExperienceReplay
     from lw_torchrl.data import TaskBalancedSampler as TaskBalancedSampler
+    from lw_torchrl.data import add_pictures as add_pictures
     from lw_torchrl.data import collect_demonstrations as collect_demonstrations
+    from lw_torchrl.data import load_pictures as load_pictures
     from lw_torchrl.envs import ExpertActor as ExpertActor
     from lw_torchrl.envs import LanguageWorldEnv as LanguageWorldEnv
     from lw_torchrl.evaluation import EvaluationResult as EvaluationResult
@@ -86,6 +88,7 @@ if TYPE_CHECKING:  # the table below, for type checkers and editors
     from lw_torchrl.trainers import load_evaluator as load_evaluator
     from lw_torchrl.trainers import save_actor as save_actor
     from lw_torchrl.trainers import save_evaluator as save_evaluator
+    from lw_torchrl.transforms import CameraTransform as CameraTransform
     from lw_torchrl.transforms import CorruptQAF as CorruptQAF
     from lw_torchrl.transforms import EnvState as EnvState
     from lw_torchrl.transforms import QAFTransform as QAFTransform
@@ -95,7 +98,7 @@ __version__ = "0.2.0"
 
 _NAMES = {
     "lw_torchrl.data": "Behaviour CoLearningSampler EpisodeFilter LanguageWorldExperienceReplay TaskBalancedSampler "
-    "collect_demonstrations",
+    "add_pictures collect_demonstrations load_pictures",
     "lw_torchrl.envs": "ExpertActor LanguageWorldEnv",
     "lw_torchrl.evaluation": "EvaluationResult attribute_failures evaluate evaluate_plans plot_success",
     "lw_torchrl.language.decoded": "DecodedPlan DecodedStep",
@@ -119,7 +122,7 @@ _NAMES = {
     "lw_torchrl.trainers": "BehavioralCloningConfig BehavioralCloningTrainer LabelledQueries OfflineConfig "
     "OfflineTrainer OnlineConfig OnlineTrainer QueryEvaluatorConfig QueryEvaluatorTrainer StackedBehavioralCloning "
     "load_actor load_evaluator save_actor save_evaluator",
-    "lw_torchrl.transforms": "CorruptQAF EnvState QAFTransform RandomYaw",
+    "lw_torchrl.transforms": "CameraTransform CorruptQAF EnvState QAFTransform RandomYaw",
 }
 _ROOM = {name: room for room, names in _NAMES.items() for name in names.split()}
 _PACKAGES = (

@@ -1,15 +1,41 @@
-"""Names a rendering library that is absent; TorchRL loads MuJoCo, and with it that library, wherever it is imported."""
+"""Which pictures there are, and a name for a rendering library that is absent: TorchRL loads MuJoCo, and with it that
+library, wherever it is imported.
+"""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+
+from lw_torchrl._checks import check_choice, check_int
 
 RENDER_LIBRARIES = {
     "egl": "libEGL (Debian: apt-get install libegl1)",
     "osmesa": "OSMesa (Debian: apt-get install libosmesa6)",
 }
+CAMERAS = ("corner2", "corner", "corner3", "corner4", "topview", "behindGripper", "gripperPOV")
+"""Meta-World's."""
+_LARGEST = 4096  # pixels along a side
+
+
+def check_picture(camera: str, height: int, width: int) -> None:
+    """Raise :class:`ValueError` for an unknown camera or a size that no picture has."""
+    check_choice("camera", camera, CAMERAS)
+    for name, size in (("height", height), ("width", width)):
+        if check_int(name, size, minimum=1) > _LARGEST:
+            raise ValueError(f"{name} must be at most {_LARGEST} pixels, got {size}")
+
+
+def check_cameras(cameras: str | Sequence[str], height: int, width: int) -> tuple[str, ...]:
+    """The cameras' names; :class:`ValueError` for an unknown one, one that comes twice, none, or a size that no picture
+    has."""
+    names = (cameras,) if isinstance(cameras, str) else tuple(cameras)
+    if not names or len({*names}) < len(names):
+        raise ValueError(f"cameras must be different names, at least one, got {cameras!r}")
+    for name in names:
+        check_picture(name, height, width)
+    return names
 
 
 @contextmanager

@@ -8,6 +8,7 @@ from lw_torchrl.data.dataset import CollectConfig, DatasetError, Demonstrations
 from lw_torchrl.data.filters import EpisodeFilter
 from lw_torchrl.data.growing import GrowingStorage
 from lw_torchrl.data.growing_writer import GrowingWriter
+from lw_torchrl.data.pictures import add_pictures, load_pictures
 from lw_torchrl.data.replay import LanguageWorldExperienceReplay
 from lw_torchrl.data.selection import JoinedDemonstrations
 from lw_torchrl.data.storage import JoinedStorage
@@ -27,5 +28,7 @@ __all__ = [
     "JoinedStorage",
     "LanguageWorldExperienceReplay",
     "TaskBalancedSampler",
+    "add_pictures",
     "collect_demonstrations",
+    "load_pictures",
 ]

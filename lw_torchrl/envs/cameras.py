@@ -12,22 +12,11 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl._checks import check_choice, check_int
 from lw_torchrl._rendering import RENDER_LIBRARIES
 
-CAMERAS = ("corner2", "corner", "corner3", "corner4", "topview", "behindGripper", "gripperPOV")
 _ROLLED = ("corner", "corner2", "corner3", "corner4")  # Meta-World hangs them upside down
-_LARGEST = 4096  # pixels along a side
 _MOST_GEOMS = 2000
 _LOOKS = (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION)  # a software renderer's time, fourfold
-
-
-def check_picture(camera: str, height: int, width: int) -> None:
-    """Raise :class:`ValueError` for an unknown camera or a size that no picture has."""
-    check_choice("camera", camera, CAMERAS)
-    for name, size in (("height", height), ("width", width)):
-        if check_int(name, size, minimum=1) > _LARGEST:
-            raise ValueError(f"{name} must be at most {_LARGEST} pixels, got {size}")
 
 
 def _open_gl() -> Any:
@@ -102,7 +91,7 @@ class Cameras:
         Args:
             scene: a name that models of the same meshes and textures share.
             model, data: the state, which stays as it is.
-            camera: one of :data:`CAMERAS`.
+            camera: one of ``_rendering.CAMERAS``.
             height, width: pixels.
         """
         self._gl.make_current()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Literal, NoReturn
 
 import numpy as np
@@ -16,7 +16,7 @@ from torchrl._utils import seed_generator
 from torchrl.envs import EnvBase
 
 from lw_torchrl._checks import check_choice, check_int
-from lw_torchrl.envs.cameras import check_picture
+from lw_torchrl._rendering import check_picture
 from lw_torchrl.envs.engine import ACTION_SIZE, Engine
 from lw_torchrl.envs.engines import make_engine
 from lw_torchrl.envs.episode_counter import EpisodeCounter, check_worker, stated_episode
@@ -281,8 +281,11 @@ class LanguageWorldEnv(EnvBase):
         self._rows.fault |= rows
         warnings.warn(f"{message}; the row is truncated and flagged, the others go on", stacklevel=3)
 
-    def render(self, *, camera: str = "corner2", height: int = 240, width: int = 320) -> Tensor:
-        """Pictures of all rows as they are now, for TorchRL's PixelRenderTransform and VideoRecorder.
+    def render(
+        self, *, camera: str = "corner2", height: int = 240, width: int = 320, rows: Sequence[int] | None = None
+    ) -> Tensor:
+        """Pictures of rows as they are now, for TorchRL's PixelRenderTransform and VideoRecorder, and
+        :class:`CameraTransform`.
 
         They are drawn by OpenGL, without shadows; on Linux without a display and MUJOCO_GL it is EGL. A picture changes
         nothing in the simulation. A PixelRenderTransform does: ask for its environment's ``observation_spec`` before
@@ -291,12 +294,13 @@ class LanguageWorldEnv(EnvBase):
         Args:
             camera: "corner2", "corner", "corner3", "corner4", "topview", "behindGripper" or "gripperPOV".
             height, width: pixels.
+            rows: which to draw, by their numbers; None for all.
 
         Returns:
-            (N, height, width, 3) uint8, (height, width, 3) with ``batch_size=()``.
+            (len(rows), height, width, 3) uint8, (height, width, 3) with ``batch_size=()``.
 
         Raises:
-            ValueError: an unknown camera or size.
+            ValueError: an unknown camera or size, or no such row.
             RuntimeError: a row that was never reset; or the process was forked from one that took pictures.
             ImportError: there is no OpenGL; it names what to install.
             NotImplementedError: the engine is one of your own and has no ``render``.
@@ -310,12 +314,16 @@ class LanguageWorldEnv(EnvBase):
         """
         self._check_usable()
         check_picture(camera, height, width)
-        if (self._rows.episode < 0).any():
+        asked = range(len(self.row_tasks)) if rows is None else [check_int("rows", row, minimum=0) for row in rows]
+        if asked and max(asked) >= len(self.row_tasks):
+            raise ValueError(f"rows must be below {len(self.row_tasks)}, got {max(asked)}")
+        if (self._rows.episode[list(asked)] < 0).any():
             raise RuntimeError("there is nothing to see before a reset: call env.reset()")
         if not hasattr(self._engine, "render"):
             raise NotImplementedError(f"engine {type(self._engine).__name__} has no render; see lw_torchrl.envs.engine")
-        rows = range(len(self.row_tasks))
-        pictures = torch.from_numpy(self._engine.render(rows, camera=camera, height=height, width=width))
+        if not asked:
+            return torch.zeros(0, height, width, 3, dtype=torch.uint8)
+        pictures = torch.from_numpy(self._engine.render(asked, camera=camera, height=height, width=width))
         return pictures if self.batch_size else pictures[0]
 
     def close(self, *, raise_if_closed: bool = True) -> None:

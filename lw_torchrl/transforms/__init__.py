@@ -1,9 +1,10 @@
-"""TorchRL transforms: query answers for environments and replay buffers, wrong ones too, and augmentation."""
+"""TorchRL transforms: query answers for environments and replay buffers, wrong ones too, pictures, and augmentation."""
 
 import lw_torchrl._torchrl  # noqa: F401
+from lw_torchrl.transforms.camera import CameraTransform
 from lw_torchrl.transforms.corrupt_qaf import CorruptQAF
 from lw_torchrl.transforms.env_state import EnvState
 from lw_torchrl.transforms.qaf import QAFTransform
 from lw_torchrl.transforms.random_yaw import RandomYaw
 
-__all__ = ["CorruptQAF", "EnvState", "QAFTransform", "RandomYaw"]
+__all__ = ["CameraTransform", "CorruptQAF", "EnvState", "QAFTransform", "RandomYaw"]

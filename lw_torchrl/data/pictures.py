@@ -1,0 +1,227 @@
+"""Pictures of a dataset's rows: its episodes are run again, action by action, and drawn; a file of PNGs an episode.
+
+root/pictures/<cameras>-<height>x<width>-every<k>/<task>.<episode>.zip    "0.png", "1.png", ...: of steps 0, k, 2k, ...
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import zipfile
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import TransformedEnv, step_mdp
+
+from lw_torchrl._checks import check_int
+from lw_torchrl._files import replacing
+from lw_torchrl._progress import Progress
+from lw_torchrl._rendering import check_cameras
+from lw_torchrl.data.dataset import DatasetError, Demonstrations, EpisodeInfo
+from lw_torchrl.data.metadata import read_metadata
+from lw_torchrl.data.replay import LanguageWorldExperienceReplay
+from lw_torchrl.data.rows import load_rows
+from lw_torchrl.envs.language_world_env import LanguageWorldEnv
+from lw_torchrl.transforms.camera import CameraTransform
+
+_TOGETHER = 8  # episodes run again at once
+_LARGEST = 64 * 2**20  # bytes of a file of pictures
+
+
+@dataclass(frozen=True)
+class _Wanted:
+    """Which pictures, as for :class:`CameraTransform`."""
+
+    cameras: tuple[str, ...]
+    height: int
+    width: int
+    every: int
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        return self.height, self.width * len(self.cameras), 3
+
+    def file(self, root: Path, episode: EpisodeInfo) -> Path:
+        folder = f"{'+'.join(self.cameras)}-{self.height}x{self.width}-every{self.every}"
+        return root / "pictures" / folder / f"{episode.task}.{episode.episode}.zip"
+
+    def count(self, episode: EpisodeInfo) -> int:
+        """Pictures of an episode."""
+        return -(-episode.length // self.every)
+
+
+def _wanted(cameras: str | Sequence[str], height: int, width: int, every: int) -> _Wanted:
+    return _Wanted(check_cameras(cameras, height, width), height, width, check_int("every", every, minimum=1))
+
+
+def add_pictures(
+    root: str | os.PathLike[str],
+    cameras: str | Sequence[str] = "corner",
+    *,
+    height: int = 64,
+    width: int = 64,
+    every: int = 1,
+    progress: bool = True,
+) -> None:
+    """Draw the rows of a dataset, as :class:`CameraTransform` would have while it was collected.
+
+    Each episode is run again with its actions; that its observations are the stored ones, bit for bit, is checked. The
+    pictures are kept beside the rows as PNGs, losslessly compressed. Killed and called again it carries on.
+
+    Args:
+        root: the dataset's folder, of :func:`collect_demonstrations`.
+        cameras, height, width, every: as for :class:`CameraTransform`.
+        progress: show a progress bar when it takes longer than a second.
+
+    Raises:
+        ValueError: a wrong argument; DatasetError where the folder holds no dataset, or episodes that go otherwise
+            today, by another version of MuJoCo or Meta-World.
+        ImportError: there is no OpenGL; it names what to install.
+        OSError: there is no room; nothing is lost.
+
+    Example:
+        >>> import tempfile, lw_torchrl as lw
+        >>> with tempfile.TemporaryDirectory() as root:
+        ...     _ = lw.collect_demonstrations("reach", episodes_per_task=1, root=root + "/demos", max_steps=20)
+        ...     lw.add_pictures(root + "/demos", "corner", every=10)
+        ...     replay = lw.LanguageWorldExperienceReplay(root + "/demos", batch_size=8)
+        ...     replay.add_column("pixels", lw.load_pictures(replay, "corner", every=10))
+        ...     replay.sample()["pixels"].shape
+        torch.Size([8, 64, 64, 3])
+    """
+    wanted, found = _wanted(cameras, height, width, every), read_metadata(Path(root))
+    rows = load_rows(found)
+    missing = [one for one in found.episodes if not _whole(wanted.file(found.root, one), wanted, wanted.count(one))]
+    bar = Progress("taking pictures", sum(map(wanted.count, missing)), "picture", show=progress)
+    with bar:
+        for task in found.config.tasks:
+            own = [one for one in missing if one.task == task]
+            for some in (own[first : first + _TOGETHER] for first in range(0, len(own), _TOGETHER)):
+                for episode, taken in zip(some, _taken(found, rows, some, wanted), strict=True):
+                    _write(wanted.file(found.root, episode), taken)
+                    bar.update(len(taken))
+
+
+def _taken(
+    found: Demonstrations, rows: TensorDictBase, episodes: Sequence[EpisodeInfo], wanted: _Wanted
+) -> list[list[np.ndarray[Any, Any]]]:
+    """The pictures of some episodes of a task."""
+    base = LanguageWorldEnv(
+        episodes[0].task, num_envs=len(episodes), seed=found.config.seed, max_steps=found.config.max_steps
+    )
+    camera = CameraTransform(wanted.cameras, height=wanted.height, width=wanted.width, every=wanted.every)
+    taken: list[list[np.ndarray[Any, Any]]] = [[] for _ in episodes]
+    starts = torch.tensor([one.start for one in episodes])
+    lengths = torch.tensor([one.length for one in episodes])
+    with closing(TransformedEnv(base, camera)) as env:
+        state = env.reset(episode=torch.tensor([one.episode for one in episodes]))
+        for step in range(int(lengths.max())):
+            going = step < lengths
+            here = rows[starts + torch.minimum(torch.tensor(step), lengths - 1)]
+            if not torch.equal(state.get("observation")[going], here.get("observation")[going]):
+                raise DatasetError(
+                    f"root: episodes of {episodes[0].task!r} in {str(found.root)!r} go otherwise when they are run "
+                    f"again, from step {step} on: they were made by {_versions(found)}"
+                )
+            if step % wanted.every == 0:
+                for place in going.nonzero().flatten().tolist():
+                    taken[place].append(state.get("pixels")[place].numpy())
+            state.set("action", here.get("action")).set("_step", going)
+            state = step_mdp(env.step(state), exclude_action=True).exclude("_step")
+    return taken
+
+
+def _versions(found: Demonstrations) -> str:
+    return ", ".join(f"{name} {version}" for name, version in found.versions.items())
+
+
+def _write(path: Path, pictures: Sequence[np.ndarray[Any, Any]]) -> None:
+    from PIL import Image
+
+    with replacing(path, sync=False) as file, zipfile.ZipFile(file, "w") as archive:
+        for number, picture in enumerate(pictures):
+            stream = io.BytesIO()
+            Image.fromarray(picture).save(stream, "PNG")
+            archive.writestr(f"{number}.png", stream.getvalue())
+
+
+def _whole(path: Path, wanted: _Wanted, count: int) -> bool:
+    """Whether a file has all its pictures; one that is damaged is made anew."""
+    if not path.is_file():
+        return False
+    try:
+        _read(path, wanted, count)
+    except DatasetError:
+        return False
+    return True
+
+
+def _read(path: Path, wanted: _Wanted, count: int) -> Tensor:
+    """(count, height, width·C, 3) uint8."""
+    from PIL import Image
+
+    try:
+        if path.stat().st_size > _LARGEST:
+            raise ValueError("it is larger than an episode's pictures can be")
+        with zipfile.ZipFile(path) as archive:
+            names = [f"{number}.png" for number in range(count)]
+            if archive.namelist() != names or any(one.compress_type for one in archive.infolist()):
+                raise ValueError(f"it must hold {count} pictures, stored")
+            pictures = np.empty((count, *wanted.shape), dtype=np.uint8)
+            for number, name in enumerate(names):
+                with Image.open(io.BytesIO(archive.read(name)), formats=["PNG"]) as picture:
+                    if picture.mode != "RGB" or picture.size != (wanted.shape[1], wanted.shape[0]):
+                        raise ValueError(f"{name} is {picture.mode} of {picture.size} pixels")
+                    pictures[number] = np.asarray(picture)
+    except Exception as error:  # a file from a stranger may be anything
+        raise DatasetError(f"root: {str(path)!r} is damaged ({error}); add_pictures makes it anew") from error
+    return torch.from_numpy(pictures)
+
+
+def load_pictures(
+    replay: LanguageWorldExperienceReplay,
+    cameras: str | Sequence[str] = "corner",
+    *,
+    height: int = 64,
+    width: int = 64,
+    every: int = 1,
+) -> Tensor:
+    """The pictures of a buffer's rows, for ``replay.add_column("pixels", ...)``, in memory.
+
+    Args:
+        replay: a buffer of datasets that :func:`add_pictures` drew so.
+        cameras, height, width, every: as they were given there.
+
+    Returns:
+        (R, height, width·C, 3) uint8, in the order of ``replay[:]``; between two pictures of an episode, the earlier
+        one. They are of ``observation``; ``("next", "observation")`` has none.
+
+    Raises:
+        ValueError: a wrong argument; DatasetError where a dataset has no such pictures, or they are damaged.
+    """
+    wanted = _wanted(cameras, height, width, every)
+    shown = replay.demonstrations
+    parts = (shown,) if isinstance(shown, Demonstrations) else shown.parts
+    _, lengths = torch.unique_consecutive(replay.storage[:].get(("collector", "traj_ids")), return_counts=True)
+    listed = [(part.root, episode) for part in parts for episode in part.episodes]
+    found = torch.empty((int(lengths.sum()), *wanted.shape), dtype=torch.uint8)
+    row = 0
+    for (root, episode), length in zip(listed, lengths.tolist(), strict=True):
+        path = wanted.file(root, episode)
+        if not path.is_file():
+            raise DatasetError(
+                f"root: {str(root)!r} has no pictures of {episode.task}, episode {episode.episode}, by "
+                f"{', '.join(wanted.cameras)}, {height} times {width} pixels, every {every}; "
+                f"lw.add_pictures({str(root)!r}, ...) takes them"
+            )
+        taken = _read(path, wanted, wanted.count(episode))
+        found[row : row + length] = taken[torch.arange(length) // every]
+        row += length
+    return found

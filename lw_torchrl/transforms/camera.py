@@ -1,0 +1,148 @@
+"""CameraTransform: pictures of an environment's rows, taken by Meta-World's cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.data import Composite, TensorSpec, UnboundedDiscrete
+from torchrl.envs import EnvBase, Transform
+from torchrl.envs.batched_envs import BatchedEnvBase
+
+from lw_torchrl._checks import check_int
+from lw_torchrl._keys import as_keys
+from lw_torchrl._rendering import check_cameras
+from lw_torchrl.transforms.containers import base_env
+from lw_torchrl.transforms.env_state import KeepsEnvState
+
+
+class CameraTransform(KeepsEnvState):
+    """Writes ``pixels`` (B, height, width·C, 3) uint8, pictures by C cameras side by side, the first on the left.
+
+    A picture of a row is taken at its reset and then every so many steps of its episode, and held in between; rows that
+    a ``_step`` or ``_reset`` mask leaves out are not drawn. It is of the state that the row is in, as ``observation``
+    is, and changes nothing in the simulation. In an environment its ``state_dict`` holds the environment's, as
+    :class:`EnvState` does; after ``load_state_dict`` the environment must be reset. With SerialEnv and ParallelEnv put
+    it into each worker. A replay buffer has no simulation to draw: :func:`add_pictures` draws a dataset's rows.
+
+    Args:
+        cameras: "corner2", "corner", "corner3", "corner4", "topview", "behindGripper" or "gripperPOV", or several.
+        height, width: pixels of each picture.
+        every: steps of a row's episode from one picture to the next.
+        out_keys: where the pictures go.
+
+    Raises:
+        ValueError: an unknown camera or size, ``every`` under 1; or on a replay buffer.
+        TypeError: there is no LanguageWorldEnv right under it.
+        RuntimeError: a step of an environment that was never reset, or not since ``load_state_dict``.
+        ImportError: there is no OpenGL; it names what to install.
+
+    Example:
+        >>> from torchrl.envs import TransformedEnv
+        >>> import lw_torchrl as lw
+        >>> env = TransformedEnv(lw.LanguageWorldEnv("reach"), lw.CameraTransform(("corner", "corner3")))
+        >>> env.reset()["pixels"].shape
+        torch.Size([1, 64, 128, 3])
+        >>> env.close()
+
+    Source: mirrors ``torchrl.record.PixelRenderTransform``, for some rows and some steps.
+    """
+
+    def __init__(
+        self,
+        cameras: str | Sequence[str] = "corner",
+        *,
+        height: int = 64,
+        width: int = 64,
+        every: int = 1,
+        out_keys: Sequence[NestedKey] | None = None,
+    ) -> None:
+        self.cameras = check_cameras(cameras, height, width)
+        self.height, self.width, self.every = height, width, check_int("every", every, minimum=1)
+        super().__init__(in_keys=[], out_keys=as_keys("out_keys", out_keys, ("pixels",)))
+        self._taken: Tensor | None = None  # (N, height, width·C, 3) uint8
+        self._steps: Tensor | None = None  # (N,) int64, of each row's episode
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Of a row's pictures."""
+        return self.height, self.width * len(self.cameras), 3
+
+    def clone(self) -> CameraTransform:
+        """One for another environment, in which no picture was taken."""
+        other: CameraTransform = super().clone()
+        other._taken = other._steps = None
+        return other
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """As :class:`EnvState`; a step wants a reset first."""
+        super().set_extra_state(state)
+        self._taken = self._steps = None
+
+    def set_container(self, container: Transform | EnvBase) -> None:
+        """Join an environment."""
+        super().set_container(container)
+        env = base_env(self)
+        if isinstance(env, BatchedEnvBase):
+            raise TypeError(
+                f"CameraTransform cannot see into the workers of a {type(env).__name__}: put it into each of them, "
+                "lambda: TransformedEnv(LanguageWorldEnv(...), CameraTransform(...))"
+            )
+        if env is not None and not hasattr(env, "row_tasks"):
+            raise TypeError(f"CameraTransform must be around a LanguageWorldEnv, got {type(env).__name__}")
+
+    def _take(self, which: Tensor) -> None:
+        """Draw rows, (N,) bool."""
+        env: Any = base_env(self)
+        rows = which.nonzero().flatten()
+        if self._taken is None:
+            self._taken = torch.zeros(len(env.row_tasks), *self.shape, dtype=torch.uint8)
+        if len(rows):
+            size = {"height": self.height, "width": self.width, "rows": rows.tolist()}
+            drawn = [env.render(camera=camera, **size) for camera in self.cameras]
+            self._taken[rows] = torch.cat([one if one.dim() == 4 else one[None] for one in drawn], -2)
+
+    def _show(self, tensordict: TensorDictBase) -> TensorDictBase:
+        assert self._taken is not None
+        return tensordict.set(self.out_keys[0], self._taken.clone().reshape(*tensordict.batch_size, *self.shape))
+
+    def _rows(self, mask: Tensor | None) -> Tensor:
+        env: Any = base_env(self)
+        count = len(env.row_tasks)
+        return torch.ones(count, dtype=torch.bool) if mask is None else mask.reshape(count)
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        begun = self._rows(tensordict.get("_reset", None))
+        steps = torch.zeros(len(begun), dtype=torch.int64) if self._steps is None else self._steps
+        self._steps = torch.where(begun, 0, steps)
+        self._take(begun)
+        return self._show(tensordict_reset)
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        if self._steps is None:
+            raise RuntimeError(
+                "no picture was taken of these episodes: reset the environment (env.reset(), collector.reset()) "
+                "before the next step"
+            )
+        moved = self._rows(tensordict.get("_step", None))
+        self._steps = self._steps + moved
+        self._take(moved & (self._steps % self.every == 0))
+        return self._show(next_tensordict)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Raise: rows of a replay buffer are in no simulation."""
+        raise ValueError(
+            "CameraTransform draws an environment's rows; a dataset's are drawn by lw.add_pictures(root, ...), and "
+            "replay.add_column('pixels', lw.load_pictures(replay, ...)) shows them"
+        )
+
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        """Add ``pixels`` to the specs."""
+        assert isinstance(observation_spec, Composite)
+        shape = (*observation_spec.shape, *self.shape)
+        observation_spec[self.out_keys[0]] = UnboundedDiscrete(shape, dtype=torch.uint8, device=observation_spec.device)
+        return observation_spec
