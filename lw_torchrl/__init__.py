@@ -51,6 +51,7 @@ if TYPE_CHECKING:  # the table below, for type checkers and editors
     from lw_torchrl.language.tasks import task_id as task_id
     from lw_torchrl.modules import ActorEnsemble as ActorEnsemble
     from lw_torchrl.modules import DescriptorConditionedActor as DescriptorConditionedActor
+    from lw_torchrl.modules import ImageQueryEvaluator as ImageQueryEvaluator
     from lw_torchrl.modules import PlanConditionedActor as PlanConditionedActor
     from lw_torchrl.modules import PlanConditionedQValue as PlanConditionedQValue
     from lw_torchrl.modules import PlanConditionedValue as PlanConditionedValue
@@ -76,6 +77,8 @@ if TYPE_CHECKING:  # the table below, for type checkers and editors
     from lw_torchrl.record import log_rollout as log_rollout
     from lw_torchrl.trainers import BehavioralCloningConfig as BehavioralCloningConfig
     from lw_torchrl.trainers import BehavioralCloningTrainer as BehavioralCloningTrainer
+    from lw_torchrl.trainers import ImageQueryEvaluatorConfig as ImageQueryEvaluatorConfig
+    from lw_torchrl.trainers import ImageQueryEvaluatorTrainer as ImageQueryEvaluatorTrainer
     from lw_torchrl.trainers import LabelledQueries as LabelledQueries
     from lw_torchrl.trainers import OfflineConfig as OfflineConfig
     from lw_torchrl.trainers import OfflineTrainer as OfflineTrainer
@@ -112,16 +115,16 @@ _NAMES = {
     "lw_torchrl.language.skills": "load_skills nearest_skill",
     "lw_torchrl.language.task_files": "load_tasks",
     "lw_torchrl.language.tasks": "MT10 MT50 TASKS Task resolve_tasks task_id",
-    "lw_torchrl.modules": "ActorEnsemble DescriptorConditionedActor PlanConditionedActor PlanConditionedQValue "
-    "PlanConditionedValue Policy QueryEvaluator ResidualActor ScriptedSkillActor StateQueryEvaluator "
-    "plan_actor_value",
+    "lw_torchrl.modules": "ActorEnsemble DescriptorConditionedActor ImageQueryEvaluator PlanConditionedActor "
+    "PlanConditionedQValue PlanConditionedValue Policy QueryEvaluator ResidualActor ScriptedSkillActor "
+    "StateQueryEvaluator plan_actor_value",
     "lw_torchrl.objectives": "AdvantageWeightedLoss DemonstratedSACLoss DemonstratedTD3Loss ExpectileValueLoss "
     "SkillLatentLoss standardize_by_task",
     "lw_torchrl.planners": "FilePlanner OpenAIPlanner Planner PlannerError plan_prompt",
     "lw_torchrl.record": "RerunLogger RolloutRecorder log_rollout",
-    "lw_torchrl.trainers": "BehavioralCloningConfig BehavioralCloningTrainer LabelledQueries OfflineConfig "
-    "OfflineTrainer OnlineConfig OnlineTrainer QueryEvaluatorConfig QueryEvaluatorTrainer StackedBehavioralCloning "
-    "load_actor load_evaluator save_actor save_evaluator",
+    "lw_torchrl.trainers": "BehavioralCloningConfig BehavioralCloningTrainer ImageQueryEvaluatorConfig "
+    "ImageQueryEvaluatorTrainer LabelledQueries OfflineConfig OfflineTrainer OnlineConfig OnlineTrainer "
+    "QueryEvaluatorConfig QueryEvaluatorTrainer StackedBehavioralCloning load_actor load_evaluator save_actor save_evaluator",
     "lw_torchrl.transforms": "CameraTransform CorruptQAF EnvState QAFTransform RandomYaw",
 }
 _ROOM = {name: room for room, names in _NAMES.items() for name in names.split()}

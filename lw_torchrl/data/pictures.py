@@ -149,7 +149,7 @@ def _write(path: Path, pictures: Sequence[np.ndarray[Any, Any]]) -> None:
         for number, picture in enumerate(pictures):
             stream = io.BytesIO()
             Image.fromarray(picture).save(stream, "PNG")
-            archive.writestr(f"{number}.png", stream.getvalue())
+            archive.writestr(zipfile.ZipInfo(f"{number}.png"), stream.getvalue())  # of no date
 
 
 def _whole(path: Path, wanted: _Wanted, count: int) -> bool:

@@ -10,11 +10,9 @@ import torch
 from torch import Tensor
 
 from lw_torchrl._files import write_json
-from lw_torchrl.language.queries import Clause
-from lw_torchrl.language.tasks import Task
+from lw_torchrl.modules.clause_evaluator import ClauseEvaluator
 from lw_torchrl.modules.networks import evaluating
-from lw_torchrl.modules.state_query_evaluator import StateQueryEvaluator
-from lw_torchrl.trainers.labelled_queries import LabelledQueries
+from lw_torchrl.trainers.labelled_queries import Asked, LabelledQueries
 
 BINS = 15
 PARTS = {
@@ -22,7 +20,7 @@ PARTS = {
     "queries": "held-out queries, held-out states",
     "tasks": "held-out tasks",
 }
-_ROWS = 512
+_ROWS = 256
 
 
 @dataclass(frozen=True)
@@ -119,7 +117,7 @@ class EvaluatorReport:
         write_json(path, {"about": self.about, "parts": {name: one.to_json() for name, one in self.parts.items()}})
 
 
-def score_evaluator(evaluator: StateQueryEvaluator, data: LabelledQueries) -> EvaluatorReport:
+def score_evaluator(evaluator: ClauseEvaluator, data: LabelledQueries) -> EvaluatorReport:
     """Ask an evaluator what was held out.
 
     Args:
@@ -146,13 +144,13 @@ def score_evaluator(evaluator: StateQueryEvaluator, data: LabelledQueries) -> Ev
 
 
 @torch.no_grad()
-def _score(evaluator: StateQueryEvaluator, data: LabelledQueries, part: str) -> PartScore:
+def _score(evaluator: ClauseEvaluator, data: LabelledQueries, part: str) -> PartScore:
     right: dict[str, tuple[int, int]] = {}
     asked: dict[str, tuple[int, int]] = {}
     reliability = torch.zeros(BINS, 3, dtype=torch.float64)
     with evaluating(evaluator):
         for one in data.parts[part]:
-            for logits, truth in _told(evaluator, one.task, one.clauses, one.observation, one.truth):
+            for logits, truth in _told(evaluator, one):
                 correct = (logits > 0) == truth
                 for column, clause in enumerate(one.clauses):
                     found = [(truth[:, column] == bool(value)) for value in (0, 1)]
@@ -165,18 +163,16 @@ def _score(evaluator: StateQueryEvaluator, data: LabelledQueries, part: str) -> 
     return PartScore(right, asked, reliability)
 
 
-def _told(
-    evaluator: StateQueryEvaluator, task: Task, clauses: tuple[Clause, ...], observation: Tensor, truth: Tensor
-) -> list[tuple[Tensor, Tensor]]:
+def _told(evaluator: ClauseEvaluator, asked: Asked) -> list[tuple[Tensor, Tensor]]:
     """Logits (R, Q) that the predicates hold, and their truth; of an evaluator that reads texts also as it answers the
     negations."""
-    coded, vectors = evaluator.code([(task, clause) for clause in clauses])
+    coded, vectors = evaluator.code([(asked.task, clause) for clause in asked.clauses])
     every = [
         evaluator.network(rows, coded.pick(torch.arange(len(coded.predicate)).expand(len(rows), -1)), vectors)
-        for rows in observation.split(_ROWS)
+        for rows in asked.seen(str(evaluator.in_keys[0])).split(_ROWS)
     ]
-    found = torch.cat(every).split(len(clauses), -1)
-    return [(logits if number == 0 else -logits, truth) for number, logits in enumerate(found)]
+    found = torch.cat(every).split(len(asked.clauses), -1)
+    return [(logits if number == 0 else -logits, asked.truth) for number, logits in enumerate(found)]
 
 
 def _add(table: dict[str, tuple[int, int]], name: str, more: list[int]) -> None:

@@ -6,6 +6,7 @@ from lw_torchrl.modules.critics import PlanConditionedQValue, PlanConditionedVal
 from lw_torchrl.modules.descriptor_conditioned_actor import DescriptorConditionedActor
 from lw_torchrl.modules.descriptor_encoder import DescriptorEncoder
 from lw_torchrl.modules.encoder import Encoder
+from lw_torchrl.modules.image_query_evaluator import IMAGE_ENCODERS, ImageQueryEvaluator
 from lw_torchrl.modules.observation_features import ObservationFeatures
 from lw_torchrl.modules.plan_attention import PlanAttention
 from lw_torchrl.modules.plan_conditioned_actor import PlanConditionedActor
@@ -19,12 +20,14 @@ from lw_torchrl.modules.state_query_evaluator import StateQueryEvaluator
 
 __all__ = [
     "EVALUATORS",
+    "IMAGE_ENCODERS",
     "METHODS",
     "POLICIES",
     "ActorEnsemble",
     "DescriptorConditionedActor",
     "DescriptorEncoder",
     "Encoder",
+    "ImageQueryEvaluator",
     "Method",
     "ObservationFeatures",
     "PlanAttention",

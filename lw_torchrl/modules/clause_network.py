@@ -15,7 +15,7 @@ from lw_torchrl.modules.networks import text_to_latent
 
 MOST = 30.0
 """The size of the largest logit of a clause: a probability of 1e-13."""
-_SCALES = (0.005, 0.02, 0.1, 0.5)  # metres: where the squashed copies of d bend
+SCALES = (0.005, 0.02, 0.1, 0.5)  # metres: where the squashed copies of d bend
 _SLOTS = len(POSITIONS) + 2  # the opening, and nothing, beside the positions
 
 
@@ -60,13 +60,16 @@ class ClauseNetwork(nn.Module):
         text_size: E, the numbers of a text's vector, where it reads texts.
     """
 
+    numbers: int = 3  # of a difference
+    ends: int = 2 * _SLOTS  # numbers of a text's vector that say which two things it is about
+
     def __init__(self, width: int, depth: int, *, predicates: int = 0, text_size: int = 0) -> None:
         super().__init__()
         check_int("width", width, minimum=1)
         check_int("depth", depth, minimum=1)
         self.width, self.reads_text = width, not predicates
         self.trunk = MLP(
-            in_features=3 * len(_SCALES),
+            in_features=self.numbers * len(SCALES),
             out_features=width,
             num_cells=[width] * (depth - 1),
             activation_class=nn.ReLU,
@@ -75,7 +78,7 @@ class ClauseNetwork(nn.Module):
         if predicates:
             self.predicates = nn.Embedding(predicates, width + 1)
         else:
-            self.texts = text_to_latent(text_size, 2 * _SLOTS + 3 + width + 1, width, 1)
+            self.texts = text_to_latent(text_size, self.ends + self.numbers + width + 1, width, 1)
 
     def forward(self, observation: Tensor, clauses: Clauses, text_vectors: Tensor | None = None) -> Tensor:
         """Answer.
@@ -93,10 +96,15 @@ class ClauseNetwork(nn.Module):
             d, asked = self._from_text(observation, self.texts(text_vectors)[clauses.text])
         else:
             d, asked = _difference(observation, clauses), self.predicates.weight[clauses.predicate]
-        features = torch.cat([torch.tanh(d / scale) for scale in _SCALES], -1)
+        return self.judge(d, asked, None if self.reads_text else clauses.negated)
+
+    def judge(self, d: Tensor, asked: Tensor, negated: Tensor | None) -> Tensor:
+        """The logits (B, C) of differences d (B, C, 3) and what is asked of them (B, C, W + 1); ``negated`` (B, C) bool
+        turns some around."""
+        features = torch.cat([torch.tanh(d / scale) for scale in SCALES], -1)
         logits = (self.trunk(features) * asked[..., :-1]).sum(-1) / sqrt(self.width) + asked[..., -1]
-        if not self.reads_text:
-            logits = torch.where(clauses.negated, -logits, logits)
+        if negated is not None:
+            logits = torch.where(negated, -logits, logits)
         return logits.clamp(-MOST, MOST)
 
     def _from_text(self, observation: Tensor, told: Tensor) -> tuple[Tensor, Tensor]:

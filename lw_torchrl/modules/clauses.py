@@ -28,6 +28,8 @@ class Clauses(NamedTuple):
     predicate: Tensor  # (...) int64, its number in the list of predicates
     negated: Tensor  # (...) bool
     text: Tensor  # (...) int64, its number in the list of texts
+    subject: Tensor  # (...) int64, its name's number in the list of names
+    object: Tensor  # (...) int64, likewise; the number behind the last for none
 
     def pick(self, which: Tensor) -> Clauses:
         """Of (G,) clauses those of these numbers, (...) int64."""
@@ -35,8 +37,8 @@ class Clauses(NamedTuple):
 
 
 class PlanClauses(NamedTuple):
-    """The clauses (T, C) of T tasks' plans, each once, and which of them make up each condition; the first six are
-    those of :class:`Clauses`."""
+    """The clauses (T, C) of T tasks' plans, each once, and which of them make up each condition; the first eight
+    are those of :class:`Clauses`."""
 
     first: Tensor
     second: Tensor
@@ -44,12 +46,14 @@ class PlanClauses(NamedTuple):
     predicate: Tensor
     negated: Tensor
     text: Tensor
+    subject: Tensor
+    object: Tensor
     parts: Tensor  # (T, S, K) int64, which of its task's clauses
     said: Tensor  # (T, S, K) bool, those that there are
 
     @property
     def clauses(self) -> Clauses:
-        return Clauses(*self[:6])
+        return Clauses(*self[:8])
 
 
 def _position(task: Task, name: str) -> tuple[list[int], list[float]]:
@@ -72,7 +76,10 @@ def _ends(clause: Clause, task: Task) -> tuple[list[int], list[int], list[float]
 
 
 def code_clauses(
-    clauses: Sequence[tuple[Task, Clause]], predicates: Sequence[str], texts: Sequence[str] | None
+    clauses: Sequence[tuple[Task, Clause]],
+    predicates: Sequence[str],
+    texts: Sequence[str] | None,
+    names: Sequence[str] = (),
 ) -> Clauses:
     """Clauses as tensors, (G,).
 
@@ -80,16 +87,22 @@ def code_clauses(
         clauses: each of a task.
         predicates: the list that ``predicate`` numbers; empty for none, and all are number 0.
         texts: the list that ``text`` numbers; None for none, and all are number 0.
+        names: the list that ``subject`` and ``object`` number; empty for none, and all are number 0.
 
     Raises:
-        ValueError: a predicate is none of the list.
+        ValueError: a predicate, or a thing's name, is none of the list.
     """
     number = {name: place for place, name in enumerate(predicates)}
     place = {} if texts is None else {text: where for where, text in enumerate(texts)}
+    called = {name: where for where, name in enumerate(names)}
     for task, clause in clauses:
         if predicates and clause.predicate not in number:
             error = unknown_name(f"predicate of {str(clause)!r}, in {task.name}", clause.predicate, predicates)
             raise ValueError(f"{error}; an evaluator answers what it was made for: make and train one that has it")
+        for thing in (clause.subject, clause.object):
+            if names and thing is not None and thing not in called:
+                error = unknown_name(f"thing in {str(clause)!r}, in {task.name}", thing, names)
+                raise ValueError(f"{error}; an evaluator sees what it was made for: make and train one that has it")
     ends = [_ends(clause, task) for task, clause in clauses]
     return Clauses(
         first=torch.tensor([first for first, _, _ in ends]),
@@ -98,6 +111,8 @@ def code_clauses(
         predicate=torch.tensor([number.get(clause.predicate, 0) for _, clause in clauses]),
         negated=torch.tensor([clause.negated for _, clause in clauses]),
         text=torch.tensor([place.get(str(clause), 0) for _, clause in clauses]),
+        subject=torch.tensor([called.get(clause.subject, 0) for _, clause in clauses]),
+        object=torch.tensor([called.get(clause.object or "", len(names)) for _, clause in clauses]),
     )
 
 
@@ -116,7 +131,11 @@ def _clauses_of(plan: ConditionalPlan) -> list[Clause]:
 
 
 def code_plans(
-    plans: Plans, tasks: Sequence[str], predicates: Sequence[str], texts: Sequence[str] | None
+    plans: Plans,
+    tasks: Sequence[str],
+    predicates: Sequence[str],
+    texts: Sequence[str] | None,
+    names: Sequence[str] = (),
 ) -> PlanClauses:
     """The clauses of plans as tensors, with a row for each of ``tasks``; errors as of :func:`code_clauses`."""
     listed = [_clauses_of(plans[task]) for task in tasks]
@@ -134,4 +153,4 @@ def code_plans(
             own = [found.index(clause) for clause in dict.fromkeys(step.condition.clauses)]
             parts[row, column, : len(own)] = torch.tensor(own)
             said[row, column, : len(own)] = True
-    return PlanClauses(*code_clauses(flat, predicates, texts).pick(number), parts, said)
+    return PlanClauses(*code_clauses(flat, predicates, texts, names).pick(number), parts, said)

@@ -6,6 +6,7 @@ from lw_torchrl.trainers.checkpoint import load_actor, save_actor
 from lw_torchrl.trainers.config import BehavioralCloningConfig
 from lw_torchrl.trainers.evaluator_files import load_evaluator, save_evaluator
 from lw_torchrl.trainers.evaluator_training import QueryEvaluatorTrainer
+from lw_torchrl.trainers.image_evaluator_training import ImageQueryEvaluatorConfig, ImageQueryEvaluatorTrainer
 from lw_torchrl.trainers.labelled_queries import LabelledQueries, QueryEvaluatorConfig
 from lw_torchrl.trainers.normalization import fit_normalization
 from lw_torchrl.trainers.offline import OfflineConfig, OfflineTrainer
@@ -17,6 +18,8 @@ __all__ = [
     "LEARNERS",
     "BehavioralCloningConfig",
     "BehavioralCloningTrainer",
+    "ImageQueryEvaluatorConfig",
+    "ImageQueryEvaluatorTrainer",
     "LabelledQueries",
     "OfflineConfig",
     "OfflineTrainer",

@@ -8,6 +8,7 @@ from itertools import chain
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import TensorDictReplayBuffer
 
@@ -16,6 +17,8 @@ from lw_torchrl.language.queries import Clause, Query, base_clauses
 from lw_torchrl.language.query_program import QueryProgram
 from lw_torchrl.language.relations import RELATIONS
 from lw_torchrl.language.tasks import TASKS, Task, task_id
+
+_FAR = 0.02  # metres that a hand does not move unseen
 
 
 @dataclass(frozen=True)
@@ -28,6 +31,7 @@ class QueryEvaluatorConfig:
         learning_rate: AdamW's at the start; a cosine brings it to 0.
         weight_decay: AdamW's.
         states_per_task: at most so many of each task are labelled to train on, drawn from its rows.
+        every: of each episode, only each so-many-th state is asked: as many steps as pictures are apart.
         held_out_states: the share of a task's episodes, by their numbers, whose states are not trained on.
         held_out_pairs: the share of pairs of objects of which nothing is trained, by their names, in all tasks alike.
         held_out_tasks: of which nothing is trained: names, or a number of tasks to draw.
@@ -40,6 +44,7 @@ class QueryEvaluatorConfig:
     learning_rate: float = 3e-3
     weight_decay: float = 1e-4
     states_per_task: int = 2000
+    every: int = 1
     held_out_states: float = 0.2
     held_out_pairs: float = 0.1
     held_out_tasks: int | tuple[str, ...] = 0
@@ -47,7 +52,7 @@ class QueryEvaluatorConfig:
     checkpoint_every: int = 500
 
     def __post_init__(self) -> None:
-        for name in ("steps", "batch_size", "states_per_task", "checkpoint_every"):
+        for name in ("steps", "batch_size", "states_per_task", "every", "checkpoint_every"):
             check_int(name, getattr(self, name), minimum=1)
         for name in ("learning_rate", "weight_decay"):
             check_scale(name, getattr(self, name))
@@ -70,12 +75,25 @@ class Asked:
         clauses: Q of them, none negated.
         observation: (R, 39) float32.
         truth: (R, Q) bool, the query answering function's.
+        pixels: (R, H, W, 3) uint8, pictures of the states, where the rows have them.
     """
 
     task: Task
     clauses: tuple[Clause, ...]
     observation: Tensor
     truth: Tensor
+    pixels: Tensor | None = None
+
+    def seen(self, key: str) -> Tensor:
+        """What an evaluator sees of the states, by what it reads; :class:`ValueError` without pictures."""
+        if key == "observation":
+            return self.observation
+        if key != "pixels" or self.pixels is None:
+            raise ValueError(
+                f"data must have the column {key!r}, which the evaluator reads: lw.add_pictures(root, ...) draws a "
+                "dataset's rows, replay.add_column('pixels', lw.load_pictures(replay, ...)) shows them"
+            )
+        return self.pixels
 
 
 class LabelledQueries:
@@ -89,12 +107,14 @@ class LabelledQueries:
             held-out pairs, in these states; "tasks", all clauses of held-out tasks. One may be empty.
 
     Args:
-        replay: its rows hold ``observation`` (R, 39) float32, ``task_id`` and ``episode`` (R,) int64.
+        replay: its rows hold ``observation`` (R, 39) float32, ``task_id`` and ``episode`` (R,) int64, and, for an
+            evaluator of pictures, ``pixels`` (R, H, W, 3) uint8.
         config: what is held out.
         tasks: what is known of its tasks; the shipped ones by default.
 
     Raises:
-        ValueError: a row of a task that is not among ``tasks``, held-out tasks that it lacks, or all of them.
+        ValueError: a row of a task that is not among ``tasks``, held-out tasks that it lacks, or all of them; pictures
+            that are held while the hand moves on.
     """
 
     def __init__(
@@ -102,7 +122,11 @@ class LabelledQueries:
     ) -> None:
         known = {task_id(task.name): task for task in (TASKS.values() if tasks is None else tasks)}
         rows = replay[:]
-        observation, ids = rows.get("observation").float(), rows.get("task_id")
+        if config.every > 1:
+            rows = rows[_places(rows.get(("collector", "traj_ids"))) % config.every == 0]
+        _check_pictures(rows)
+        self._rows = rows
+        ids = rows.get("task_id")
         if other := sorted({*ids.unique().tolist()} - {*known}):
             raise ValueError(f"tasks must have all tasks of the rows, they lack those of the ids {shown(other)}")
         found = [known[number] for number in ids.unique().tolist()]
@@ -116,8 +140,8 @@ class LabelledQueries:
         for task in found:
             own = ids == task_id(task.name)
             clauses = [clause for clause in base_clauses(task, tuple(RELATIONS)) if not clause.negated]
-            train = _some(observation[own & ~kept], config.states_per_task, generator)
-            test = _some(observation[own & kept], config.states_per_task, generator)
+            train = _some((own & ~kept).nonzero().flatten(), config.states_per_task, generator)
+            test = _some((own & kept).nonzero().flatten(), config.states_per_task, generator)
             if task.name in self.held_out_tasks:
                 self._ask("tasks", task, clauses, torch.cat((train, test)))
                 continue
@@ -127,12 +151,16 @@ class LabelledQueries:
             self._ask("states", task, old, test)
             self._ask("queries", task, new, test)
 
-    def _ask(self, part: str, task: Task, clauses: Sequence[Clause], observation: Tensor) -> None:
-        if not clauses or not len(observation):
+        del self._rows
+
+    def _ask(self, part: str, task: Task, clauses: Sequence[Clause], which: Tensor) -> None:
+        if not clauses or not len(which):
             return
+        observation, pixels = self._rows.get("observation")[which].float(), self._rows.get("pixels", None)
         program = QueryProgram({task: [Query((clause,)) for clause in clauses]})
         truth = program(observation, torch.full((len(observation),), task_id(task.name)))
-        self.parts[part].append(Asked(task, tuple(clauses), observation, truth))
+        seen = None if pixels is None else pixels[which]
+        self.parts[part].append(Asked(task, tuple(clauses), observation, truth, seen))
 
     def describe(self) -> dict[str, Any]:
         """What is trained and what is held out, as JSON."""
@@ -150,10 +178,31 @@ def _pair(clause: Clause) -> tuple[str, str]:
     return first, second
 
 
-def _some(observation: Tensor, most: int, generator: torch.Generator) -> Tensor:
-    if len(observation) <= most:
-        return observation
-    return observation[torch.randperm(len(observation), generator=generator)[:most].sort().values]
+def _some(rows: Tensor, most: int, generator: torch.Generator) -> Tensor:
+    if len(rows) <= most:
+        return rows
+    return rows[torch.randperm(len(rows), generator=generator)[:most].sort().values]
+
+
+def _places(trajectory: Tensor) -> Tensor:
+    """(R,) int64, of each row its step in its trajectory, whose rows follow one another."""
+    _, lengths = torch.unique_consecutive(trajectory, return_counts=True)
+    first = (lengths.cumsum(0) - lengths).repeat_interleave(lengths)
+    return torch.arange(len(trajectory)) - first
+
+
+def _check_pictures(rows: TensorDictBase) -> None:
+    """Raise where a picture stays while the hand moves on: it is of an earlier state, whose answers are others."""
+    pixels, hand = rows.get("pixels", None), rows.get("observation")[:, :3]
+    if pixels is None or len(rows) < 2:
+        return
+    far = (hand[1:] - hand[:-1]).norm(dim=-1) > _FAR
+    same = rows.get(("collector", "traj_ids"))[1:] == rows.get(("collector", "traj_ids"))[:-1]
+    for row in (far & same).nonzero().flatten().tolist():
+        if torch.equal(pixels[row], pixels[row + 1]):
+            raise ValueError(
+                "every must be as many steps as the pictures are apart: one stays while the hand moves by 2 cm and more"
+            )
 
 
 def _drawn_tasks(asked: int | tuple[str, ...], names: Sequence[str], generator: torch.Generator) -> tuple[str, ...]:

@@ -217,7 +217,7 @@ def test_as_an_evaluator_of_an_evaluation_its_sign_counts():
 def test_what_cannot_be_is_named():
     with pytest.raises(ValueError, match=r"float32 of shape .*39.*got torch.float32 of shape .2, 38"):
         make("structure")(TensorDict(observation=torch.rand(2, 38), task_id=torch.zeros(2).long(), batch_size=2))
-    with pytest.raises(ValueError, match=r"task_id must be of shape .2,., one per observation"):
+    with pytest.raises(ValueError, match=r"task_id must be of shape .2,., one for each row of .observation."):
         make("structure").logits(torch.rand(2, 39), torch.zeros(3).long())
     with pytest.raises(ValueError, match="tasks without a plan"):
         make("structure").logits(torch.rand(1, 39), torch.tensor([lw.task_id("hammer")]))

@@ -1,0 +1,166 @@
+"""CameraTransform: pictures of the rows that moved, at the steps that are asked for, whatever is around."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from pictures import why_no_pictures
+from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl.envs import Compose, SerialEnv, TransformedEnv, check_env_specs
+
+import lw_torchrl as lw
+
+SIZE = {"height": 24, "width": 32}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _needs_open_gl():
+    if missing := why_no_pictures():
+        pytest.skip(missing)
+
+
+def opened(tasks=("reach", "drawer-open"), cameras="corner", every=1, **options):
+    camera = lw.CameraTransform(cameras, every=every, **SIZE)
+    return TransformedEnv(lw.LanguageWorldEnv(list(tasks), seed=5, **options), camera)
+
+
+def drawn(env, camera="corner"):
+    return env.base_env.render(camera=camera, **SIZE)
+
+
+def moving(tensordict):
+    rows = torch.arange(len(tensordict)).float().unsqueeze(-1)
+    return tensordict.set("action", torch.tensor([[0.8, -0.6, 0.4, 0.5]]) * (-1) ** rows)
+
+
+def test_a_picture_is_of_the_state_that_its_row_is_in():
+    env = opened(num_envs=3)
+    state = env.reset()
+    assert state["pixels"].shape == (3, 24, 32, 3)
+    assert torch.equal(state["pixels"], drawn(env))
+    for _ in range(3):
+        state = env.step(moving(state))["next"]
+        assert torch.equal(state["pixels"], drawn(env))
+    env.close()
+
+
+def test_specs_hold_and_several_cameras_stand_side_by_side():
+    env = opened(cameras=("corner", "topview"))
+    check_env_specs(env)
+    state = env.reset()
+    assert env.observation_spec["pixels"].shape == (2, 24, 64, 3)
+    assert torch.equal(state["pixels"], torch.cat([drawn(env), drawn(env, "topview")], -2))
+    env.close()
+
+
+def test_a_picture_is_held_between_two_and_begins_anew_with_its_row():
+    env = opened(every=3)
+    state, shown, drawings = env.reset(), [], []
+    for _ in range(7):
+        shown.append(state["pixels"])
+        drawings.append(drawn(env))
+        state = env.step(moving(state))["next"]
+    for step in range(7):
+        assert torch.equal(shown[step], drawings[step // 3 * 3])
+    assert not torch.equal(shown[0], shown[3])
+    again = env.reset(state.set("_reset", torch.tensor([True, False])))
+    assert torch.equal(again["pixels"][0], drawn(env)[0])
+    assert torch.equal(again["pixels"][1], shown[6][1])  # taken at its step 6, held at 7
+    env.close()
+
+
+def test_rows_that_a_mask_leaves_out_are_not_drawn(monkeypatch):
+    env = opened(num_envs=4)
+    state, asked = env.reset(), []
+    render = env.base_env.render
+    monkeypatch.setattr(env.base_env, "render", lambda **options: asked.append(options["rows"]) or render(**options))
+    before = state["pixels"].clone()
+    moved = torch.tensor([False, True, True, False])
+    after = env.step(moving(state).set("_step", moved))["next"]["pixels"]
+    assert asked == [[1, 2]]
+    assert torch.equal(after[~moved], before[~moved])
+    env.close()
+
+
+def test_pictures_do_not_depend_on_what_stands_beside():
+    many, alone = opened(["drawer-open"], num_envs=3), opened(["drawer-open"], batch_size=())
+    state, one = many.reset(), alone.reset(episode=1)
+    assert one["pixels"].shape == (24, 32, 3)
+    assert torch.equal(one["pixels"], state["pixels"][1])
+    many.close()
+    alone.close()
+
+
+def test_a_picture_changes_nothing():
+    seen, plain = opened(), lw.LanguageWorldEnv(["reach", "drawer-open"], seed=5)
+    rollouts = [env.rollout(6, moving) for env in (seen, plain)]
+    assert torch.equal(rollouts[0]["next", "observation"], rollouts[1]["next", "observation"])
+    seen.close()
+    plain.close()
+
+
+def test_its_state_is_the_environments_and_wants_a_reset():
+    env, other = opened(["reach"]), opened(["reach"])
+    env.reset()
+    state = env.state_dict()
+    expected = env.reset()
+    began = other.reset()
+    other.load_state_dict(state)
+    with pytest.raises(RuntimeError, match=r"reset"):
+        other.step(moving(began))
+    found = other.reset()
+    assert found["episode"] == expected["episode"] == 1
+    assert torch.equal(found["pixels"], expected["pixels"])
+    env.close()
+    other.close()
+
+
+def test_it_goes_into_each_worker():
+    env = SerialEnv(2, lambda: opened(["reach"]))
+    assert env.reset()["pixels"].shape == (2, 1, 24, 32, 3)
+    env.close()
+    with pytest.raises(TypeError, match=r"workers of a SerialEnv: put it into each of them"):
+        TransformedEnv(SerialEnv(2, lambda: lw.LanguageWorldEnv("reach")), lw.CameraTransform())
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"cameras": "corner5"}, "camera must be .*corner2.*got 'corner5'|did you mean"),
+        ({"cameras": ()}, "cameras must be different names, at least one"),
+        ({"cameras": ("corner", "corner")}, "cameras must be different names"),
+        ({"height": 0}, "height must be"),
+        ({"width": 5000}, "width must be at most 4096 pixels, got 5000"),
+        ({"every": 0}, "every must be"),
+    ],
+)
+def test_what_cannot_be_is_named(options, message):
+    with pytest.raises(ValueError, match=message):
+        lw.CameraTransform(**options)
+
+
+def test_a_replay_buffer_is_told_of_add_pictures():
+    buffer = ReplayBuffer(storage=LazyTensorStorage(4), transform=lw.CameraTransform(), batch_size=2)
+    env = lw.LanguageWorldEnv("reach")
+    buffer.extend(env.rollout(4).reshape(-1))
+    env.close()
+    with pytest.raises(ValueError, match=r"lw\.add_pictures.*load_pictures"):
+        buffer.sample()
+
+
+def test_it_stands_beside_query_answers():
+    env = TransformedEnv(
+        lw.LanguageWorldEnv("reach"), Compose(lw.QAFTransform(lw.load_plans("MT10")), lw.CameraTransform(**SIZE))
+    )
+    state = env.rollout(2)
+    assert {"qaf", "pixels"} <= {*state.keys()}
+    env.close()
+
+
+def test_rows_that_are_not_there_are_refused():
+    env = lw.LanguageWorldEnv("reach")
+    env.reset()
+    with pytest.raises(ValueError, match=r"rows must be below 1, got 3"):
+        env.render(rows=[0, 3])
+    assert env.render(rows=[]).shape == (0, 240, 320, 3)
+    env.close()
