@@ -1,4 +1,4 @@
-"""python -m benchmarks.evaluators: what a learned query evaluator in a policy costs, and what tuning it end to end gives."""
+"""python -m benchmarks.evaluators: what a learned query evaluator in a policy costs, and what tuning it gives."""
 
 from __future__ import annotations
 

@@ -124,7 +124,8 @@ _NAMES = {
     "lw_torchrl.record": "RerunLogger RolloutRecorder log_rollout",
     "lw_torchrl.trainers": "BehavioralCloningConfig BehavioralCloningTrainer ImageQueryEvaluatorConfig "
     "ImageQueryEvaluatorTrainer LabelledQueries OfflineConfig OfflineTrainer OnlineConfig OnlineTrainer "
-    "QueryEvaluatorConfig QueryEvaluatorTrainer StackedBehavioralCloning load_actor load_evaluator save_actor save_evaluator",
+    "QueryEvaluatorConfig QueryEvaluatorTrainer StackedBehavioralCloning load_actor load_evaluator "
+    "save_actor save_evaluator",
     "lw_torchrl.transforms": "CameraTransform CorruptQAF EnvState QAFTransform RandomYaw",
 }
 _ROOM = {name: room for room, names in _NAMES.items() for name in names.split()}

@@ -12,6 +12,7 @@ from lw_torchrl.cli.sources import one_or_many, read_encoder, simulated
 from lw_torchrl.cli.threads import use_one_thread
 
 if TYPE_CHECKING:
+    from lw_torchrl.modules.clause_evaluator import ClauseEvaluator
     from lw_torchrl.modules.policy import Policy
     from lw_torchrl.modules.query_evaluator import QueryEvaluator
 
@@ -25,7 +26,11 @@ def train_evaluator(
     data: tuple[Path, ...] = (),
     behaviours: tuple[str, ...] = WHO,
     episodes: int = 5,
+    max_steps: int = 500,
     noise: tuple[float, ...] = (0.0, 0.1, 0.2),
+    cameras: tuple[str, ...] = (),
+    picture: int = 64,
+    every: int | None = None,
     held_out_tasks: tuple[str, ...] = (),
     held_out_pairs: float = 0.1,
     held_out_states: float = 0.2,
@@ -33,9 +38,9 @@ def train_evaluator(
     text_encoder: str | None = None,
     width: int = 128,
     depth: int = 3,
-    steps: int = 6000,
-    batch_size: int = 1024,
-    learning_rate: float = 3e-3,
+    steps: int | None = None,
+    batch_size: int | None = None,
+    learning_rate: float | None = None,
     states_per_task: int = 2000,
     seed: int = 0,
     num_envs: int | None = None,
@@ -44,14 +49,21 @@ def train_evaluator(
     again it carries on.
 
     Example: lw-torchrl train-evaluator MT10 --out runs/evaluator --held-out-tasks push reach
+    Example: lw-torchrl train-evaluator drawer-open --out runs/eyes --cameras corner corner3 --episodes 20
 
     Args:
         tasks: MT10, MT50, or names of tasks, the held-out ones among them.
-        out: folder for evaluator.zip, report.json, reliability.png, and the episodes that were run.
+        out: folder for evaluator.zip, report.json, reliability.png, the episodes that were run, and, with --cameras,
+            wrong.png.
         data: datasets of yours, of `lw-torchrl collect`, in the place of running episodes.
         behaviours: who acts in the episodes that are run, as for `lw-torchrl collect`.
         episodes: of each task and behaviour.
+        max_steps: steps of an episode.
         noise: standard deviations of the execution noise of the expert, gone through in turn.
+        cameras: answer from these cameras' pictures instead of from the observation: corner, corner2, corner3, corner4,
+            topview, behindGripper, gripperPOV.
+        picture: with --cameras, pixels of a picture's height and width.
+        every: only each so-many-th state of an episode is asked, and drawn; by default 1, with --cameras 5.
         held_out_tasks: names, or a number of tasks to draw: none of their queries is trained.
         held_out_pairs: the share of pairs of objects none of whose queries is trained.
         held_out_states: the share of episodes whose states are not trained on.
@@ -59,9 +71,9 @@ def train_evaluator(
         text_encoder: with --no-structure, a function of yours that turns texts into vectors, as my_texts:encode.
         width: of the hidden layers.
         depth: number of them.
-        steps: minibatches.
-        batch_size: pairs of a state and a clause in a minibatch.
-        learning_rate: at the start; a cosine brings it to 0.
+        steps: minibatches; by default 6000, with --cameras 4000.
+        batch_size: pairs of a state and a clause in a minibatch, by default 1024; with --cameras states, 48.
+        learning_rate: at the start; a cosine brings it to 0. By default 0.003, with --cameras 0.002.
         states_per_task: at most so many of each task are labelled.
         seed: of the episodes, of what is held out, the initial weights and the minibatches.
         num_envs: environments stepped together; the result does not depend on it.
@@ -77,13 +89,16 @@ def train_evaluator(
     import lw_torchrl as lw
     from lw_torchrl.evaluation.evaluator_report import score_evaluator
     from lw_torchrl.evaluation.reliability_figure import plot_reliability
+    from lw_torchrl.evaluation.wrong_answers import plot_wrong_answers
 
     use_one_thread()
     drawn = len(held_out_tasks) == 1 and held_out_tasks[0].isdigit()
-    config = lw.QueryEvaluatorConfig(
-        steps=steps,
-        batch_size=batch_size,
-        learning_rate=learning_rate,
+    defaults = {"steps": 4000, "batch_size": 48, "learning_rate": 2e-3, "every": 5}
+    if not cameras:
+        defaults = {"steps": 6000, "batch_size": 1024, "learning_rate": 3e-3, "every": 1}
+    given = {"steps": steps, "batch_size": batch_size, "learning_rate": learning_rate, "every": every}
+    config = (lw.ImageQueryEvaluatorConfig if cameras else lw.QueryEvaluatorConfig)(
+        **defaults | {name: value for name, value in given.items() if value is not None},  # type: ignore[arg-type]
         states_per_task=states_per_task,
         held_out_states=held_out_states,
         held_out_pairs=held_out_pairs,
@@ -91,41 +106,44 @@ def train_evaluator(
         seed=seed,
     )
     torch.manual_seed(seed)
-    options: dict[str, Any] = {"structure": structure, "width": width, "depth": depth}
-    evaluator = lw.StateQueryEvaluator(lw.load_plans("MT10"), text_encoder=read_encoder(text_encoder), **options)
-    roots = list(data) or [_collected(out, who, names, episodes, noise, seed, num_envs) for who in behaviours]
+    options: dict[str, Any] = {
+        "structure": structure,
+        "depth": depth,
+        "text_encoder": read_encoder(text_encoder),
+        "hidden" if cameras else "width": width,
+    }
+    pictures: dict[str, Any] = {"cameras": cameras, "height": picture, "width": picture}
+    plans = lw.load_plans("MT50")
+    evaluator: ClauseEvaluator
+    if cameras:
+        evaluator = lw.ImageQueryEvaluator(lw.Plans({task: plans[task] for task in names}), **options, **pictures)
+    else:
+        evaluator = lw.StateQueryEvaluator(plans, **options)
+    run = {"episodes_per_task": episodes, "max_steps": max_steps, "seed": seed, "num_envs": num_envs}
+    roots = list(data) or [_collected(out, who, names, noise, run) for who in behaviours]
     replay = lw.LanguageWorldExperienceReplay(roots, label="executed", episodes=_of_tasks(roots, names))
+    if cameras:
+        for root in roots:
+            lw.add_pictures(root, **pictures, every=config.every)
+        replay.add_column("pixels", lw.load_pictures(replay, **pictures, every=config.every))
     labelled = lw.LabelledQueries(replay, config)
-    loss = lw.QueryEvaluatorTrainer(evaluator, labelled, config, checkpoint=out / "evaluator.zip").train()
-    print(f"trained to step {steps}" + ("" if loss != loss else f", loss {loss:.4f}"))
+    trainer = lw.ImageQueryEvaluatorTrainer if cameras else lw.QueryEvaluatorTrainer
+    loss = trainer(evaluator, labelled, config, checkpoint=out / "evaluator.zip").train()
+    print(f"trained to step {config.steps}" + ("" if loss != loss else f", loss {loss:.4f}"))
     report = score_evaluator(evaluator, labelled)
     print(report.table())
     report.save(out / "report.json")
     plot_reliability(report, out / "reliability.png")
+    if cameras:
+        plot_wrong_answers(evaluator, labelled, out / "wrong.png")
     print(f"written to {out}")
 
 
-def _collected(
-    out: Path,
-    who: str,
-    tasks: tuple[str, ...],
-    episodes: int,
-    noise: tuple[float, ...],
-    seed: int,
-    num_envs: int | None,
-) -> Path:
+def _collected(out: Path, who: str, tasks: tuple[str, ...], noise: tuple[float, ...], run: dict[str, Any]) -> Path:
     from lw_torchrl.data import collect_demonstrations
 
     root = out / "data" / who
-    collect_demonstrations(
-        tasks,
-        episodes_per_task=episodes,
-        root=root,
-        policy=who,
-        noise_scale=noise if who == "expert" else 0.0,
-        seed=seed,
-        num_envs=num_envs,
-    )
+    collect_demonstrations(tasks, root=root, policy=who, noise_scale=noise if who == "expert" else 0.0, **run)
     return root
 
 

@@ -26,6 +26,7 @@ from lw_torchrl.evaluation.statistics import (
 )
 from lw_torchrl.evaluation.stuck_steps import StuckStep, stuck_steps, stuck_table, weakest_step
 from lw_torchrl.evaluation.summary import Summary, TaskSummary, summarize, summarize_rates
+from lw_torchrl.evaluation.wrong_answers import WrongAnswer, plot_wrong_answers, wrong_answers
 
 __all__ = [
     "CAUSES",
@@ -41,6 +42,7 @@ __all__ = [
     "StuckStep",
     "Summary",
     "TaskSummary",
+    "WrongAnswer",
     "attribute_failures",
     "condition_drift",
     "count_solved",
@@ -56,6 +58,7 @@ __all__ = [
     "plot_reliability",
     "plot_sorted_tasks",
     "plot_success",
+    "plot_wrong_answers",
     "probability_of_improvement",
     "published",
     "published_curves",
@@ -66,4 +69,5 @@ __all__ = [
     "summarize",
     "summarize_rates",
     "weakest_step",
+    "wrong_answers",
 ]

@@ -13,6 +13,8 @@ from lw_torchrl.modules.clauses import Clauses
 
 KEYS = 32  # numbers by which a thing is found in a picture
 _KEPT = 16  # numbers of what is seen there that tell where it is
+_LANDMARKS = 32  # that are sought in a picture whatever is asked
+_SHARP = 30.0  # what scores count in the softmax over a picture's places: at 1 a fresh network looks everywhere at once
 
 
 class SmallImageEncoder(nn.Module):
@@ -40,8 +42,11 @@ class PointingNetwork(ClauseNetwork):
 
     A thing is a vector of its own, or, of a clause's text, two that the text gives. In each camera's picture it is
     compared with the features of every place; the softmax over the places is where it points. The places' mean
-    coordinates and features, of all cameras, give the thing's four numbers: its position in metres, and how far it is
-    open. What clauses are told of is the difference of the two things' numbers, as :class:`ClauseNetwork` does.
+    coordinates and features, and the mean coordinates of some landmarks, which are the same for all things, tell, of
+    all cameras, the thing's four numbers: its position in metres, and how far it is open. What clauses are told of is
+    the difference of the two things' numbers, as :class:`ClauseNetwork` does.
+
+    Source: the spatial softmax of 'Deep spatial autoencoders for visuomotor learning' (Finn et al., 2016).
 
     Args:
         encoder: pictures (n, 3, H, W) float32 in [0, 1] to a map of features (n, F, h, w).
@@ -70,10 +75,11 @@ class PointingNetwork(ClauseNetwork):
         self.encoder, self.cameras = encoder, cameras
         self.key = nn.Conv2d(features, KEYS, 1)
         self.seen = nn.Conv2d(features, _KEPT, 1)
+        self.landmarks = nn.Conv2d(features, _LANDMARKS, 1)
         if names:
             self.names = nn.Embedding(names, KEYS)
         self.place = MLP(
-            in_features=cameras * (2 + _KEPT) + KEYS,
+            in_features=cameras * (2 + _KEPT + 2 * _LANDMARKS) + KEYS,
             out_features=self.numbers,
             num_cells=[width, width],
             activation_class=nn.ReLU,
@@ -126,8 +132,8 @@ class PointingNetwork(ClauseNetwork):
         pictures = seen.unflatten(-2, (self.cameras, -1)).permute(0, 2, 4, 1, 3).flatten(0, 1)
         features = self.encoder(pictures.to(torch.float32) / 255.0)
         height, width = features.shape[-2:]
-        scores = torch.einsum("nk,bkp->bnp", things, self.key(features).flatten(-2)) / sqrt(KEYS)
-        pointed = scores.softmax(-1)
+        scores = torch.einsum("nk,bkp->bnp", things, self.key(features).flatten(-2))
+        pointed = (_SHARP / sqrt(KEYS) * scores).softmax(-1)
         grid = torch.stack(
             torch.meshgrid(
                 torch.linspace(-1.0, 1.0, height, device=seen.device),
@@ -138,5 +144,7 @@ class PointingNetwork(ClauseNetwork):
         told = torch.cat((grid.expand(len(features), -1, -1), self.seen(features).flatten(-2)), -2)
         there = torch.einsum("bnp,bfp->bnf", pointed, told)  # (B·C, N, 2 + 16)
         there = there.unflatten(0, (rows, self.cameras)).transpose(1, 2).flatten(-2)
-        places = self.place(torch.cat((there, things.expand(rows, -1, -1)), -1))
+        marks = (_SHARP * self.landmarks(features).flatten(-2)).softmax(-1) @ grid.T  # (B·C, 32, 2)
+        marks = marks.reshape(rows, 1, -1).expand(-1, len(things), -1)
+        places = self.place(torch.cat((there, marks, things.expand(rows, -1, -1)), -1))
         return places, pointed.unflatten(0, (rows, self.cameras)).unflatten(-1, (height, width))

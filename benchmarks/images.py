@@ -1,0 +1,183 @@
+"""python -m benchmarks.images: conditions answered from cameras' pictures, on two tasks, beside exact ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+
+import lw_torchrl as lw
+from benchmarks.evaluators import RECIPE, WHO
+from lw_torchrl._files import write_text
+from lw_torchrl.evaluation import EvaluationResult, plot_reliability, plot_wrong_answers, score_evaluator
+from lw_torchrl.evaluation.comparison import markdown_table
+from lw_torchrl.evaluation.figures import wilson_interval
+from lw_torchrl.evaluation.statistics import Estimate
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """An evaluator of pictures for two tasks; few-shot policies with it in the query answering function's place, and
+    tuned with it. The decoder keeps the state's features. Stopped and started again it carries on.
+    """
+
+    policy: tuple[Path, ...] = ()
+    """Few-shot policies of MT10, such as benchmarks.evaluators leaves, one for each seed; none for scripted skills
+    alone."""
+    tasks: tuple[str, ...] = ("button-press-topdown", "drawer-open")
+    cameras: tuple[str, ...] = ("corner", "corner3")
+    size: int = 64
+    """Pixels of a picture's height and width."""
+    every: int = 5
+    """Steps from one picture to the next, when states are drawn and when the evaluator acts."""
+    behaviours: tuple[int, ...] = (30, 30, 30, 15)
+    """Episodes of a task that are drawn, by experts, scripted skills, the same spoilt, and chance."""
+    max_steps: int = 150
+    """Of an episode that is drawn."""
+    steps: int = 4000
+    """Minibatches of the evaluator."""
+    tuning_steps: int = 500
+    """Minibatches, of 64, of the tuning."""
+    seed: int = 0
+    """Of the states, the demonstrations, the evaluator and the tuning."""
+    episodes: int = 20
+    """Of each task, evaluated."""
+    evaluation_seed: int = 1000
+    quick: bool = False
+    """Few steps and episodes: it runs, its figures mean nothing."""
+    out: Path = Path("runs/images")
+
+    @property
+    def pictures(self) -> dict[str, Any]:
+        return {"cameras": self.cameras, "height": self.size, "width": self.size}
+
+
+def frames_per_second(args: Arguments) -> float:
+    """Pictures that one core draws in a second."""
+    env = lw.LanguageWorldEnv(args.tasks)
+    env.reset()
+    for camera in args.cameras:
+        env.render(camera=camera, height=args.size, width=args.size)
+    count, start = 0, perf_counter()
+    while perf_counter() - start < 3.0:
+        for camera in args.cameras:
+            count += len(env.render(camera=camera, height=args.size, width=args.size))
+    env.close()
+    return count / (perf_counter() - start)
+
+
+def evaluator(args: Arguments, plans: lw.Plans) -> Any:
+    """One trained on the answers in the drawn states; report and pictures are left beside it."""
+    config = lw.ImageQueryEvaluatorConfig(
+        steps=args.steps,
+        every=args.every,
+        learning_rate=2e-3,
+        states_per_task=100_000,
+        held_out_pairs=0.0,
+        seed=args.seed,
+    )
+    roots = [args.out / "states" / who for who in WHO]
+    for who, root, episodes in zip(WHO, roots, args.behaviours, strict=True):
+        noise = (0.0, 0.1, 0.2) if who == "expert" else 0.0
+        options: dict[str, Any] = {"max_steps": args.max_steps, "seed": args.seed, "noise_scale": noise}
+        lw.collect_demonstrations(args.tasks, episodes_per_task=episodes, root=root, policy=who, **options)
+        lw.add_pictures(root, **args.pictures, every=config.every)
+    replay = lw.LanguageWorldExperienceReplay(roots, label="executed")
+    replay.add_column("pixels", lw.load_pictures(replay, **args.pictures, every=config.every))
+    labelled = lw.LabelledQueries(replay, config)
+    torch.manual_seed(args.seed)
+    made = lw.ImageQueryEvaluator(plans, **args.pictures, every=args.every)
+    file = args.out / "evaluator.zip"
+    lw.ImageQueryEvaluatorTrainer(made, labelled, config, checkpoint=file).train()
+    report = score_evaluator(made, labelled)
+    report.save(args.out / "report.json")
+    plot_reliability(report, args.out / "reliability.png")
+    plot_wrong_answers(made, labelled, args.out / "wrong.png")
+    print(f"{labelled.describe()['states']['training']} drawn states trained\n{report.table(most=20)}", flush=True)
+    return lw.load_evaluator(file, plans)
+
+
+def tuned(args: Arguments, name: str, actor: Any) -> Any:
+    """The policy and its evaluator, tuned by the loss of imitation through the softmax."""
+    root = args.out / "demonstrations"
+    lw.collect_demonstrations(
+        args.tasks,
+        episodes_per_task=RECIPE.demonstrations_per_task,
+        root=root,
+        seed=args.seed,
+        noise_scale=RECIPE.demonstration_noise,
+        noise_hold=RECIPE.noise_hold,
+        redraw_failures=True,
+        max_steps=args.max_steps,
+    )
+    lw.add_pictures(root, **args.pictures)
+    replay = lw.LanguageWorldExperienceReplay(
+        root, sampler=lw.TaskBalancedSampler(), after_success=RECIPE.after_success
+    )
+    replay.add_column("pixels", lw.load_pictures(replay, **args.pictures))
+    config = lw.BehavioralCloningConfig(
+        steps=args.tuning_steps, batch_size=64, learning_rate=3e-4, normalize=False, seed=args.seed
+    )
+    file = args.out / f"{name}.zip"
+    lw.BehavioralCloningTrainer(actor, replay, config, checkpoint=file).train()
+    return lw.load_actor(file)
+
+
+def success(args: Arguments, name: str, actor: Any) -> EvaluationResult:
+    file = args.out / "results" / f"{name}.json"
+    if file.is_file():
+        return EvaluationResult.load(file)
+    result = lw.evaluate(
+        actor,
+        tasks=args.tasks,
+        episodes_per_task=args.episodes,
+        seed=args.evaluation_seed,
+        noise_scale=RECIPE.evaluation_noise,
+        stop_at_success=True,
+    )
+    file.parent.mkdir(parents=True, exist_ok=True)
+    result.save(file)
+    return result
+
+
+def main(args: Arguments) -> None:
+    if args.quick:
+        args = replace(args, behaviours=(2, 1, 1, 1), steps=20, tuning_steps=5, episodes=1)
+    print(f"{frames_per_second(args):.0f} pictures of {args.size} times {args.size} pixels a second, on one core")
+    plans = lw.load_plans("MT10")
+    plans = lw.Plans({task: plans[task] for task in args.tasks})
+    eyes = evaluator(args, plans)
+    found: dict[str, list[EvaluationResult]] = {}
+
+    def note(row: str, name: str, actor: Any) -> None:
+        found.setdefault(row, []).append(result := success(args, name, actor))
+        print(f"{name}: {result.mean_success:.3f}", flush=True)
+
+    scripted = lw.ScriptedSkillActor(plans)
+    note("scripted skills, exact answers", "scripted", scripted)
+    note("scripted skills, pictures", "scripted-pictures", scripted.with_evaluator(eyes))
+    for number, file in enumerate(args.policy):
+        policy: Any = lw.load_actor(file).with_plans(plans)
+        note("PCBC, exact answers", f"pcbc-{number}", policy)
+        note("PCBC, pictures", f"pcbc-{number}-pictures", policy.with_evaluator(eyes))
+        begun = policy.with_evaluator(lw.load_evaluator(args.out / "evaluator.zip", plans))
+        name = f"pcbc-{number}-pictures-tuned"
+        note("PCBC, pictures, tuned", name, tuned(args, name, begun))
+    rows = []
+    for row, results in found.items():
+        hits = np.array([one.success for result in results for one in result.episodes])
+        each = [f"{np.mean([result.success_once[task] for result in results]):.2f}" for task in args.tasks]
+        rows.append([row, str(Estimate(float(hits.mean()), *wilson_interval(int(hits.sum()), hits.size))), *each])
+    table = markdown_table(["", "mean", *args.tasks], rows)
+    write_text(args.out / "table.md", table)
+    print(f"\n{table}\nwritten to {args.out / 'table.md'}, report.json, reliability.png and wrong.png")
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    main(tyro.cli(Arguments))

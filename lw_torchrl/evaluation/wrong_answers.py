@@ -1,0 +1,149 @@
+"""The picture of an ImageQueryEvaluator's wrong answers: what it saw, and where it pointed."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from textwrap import fill
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from lw_torchrl.evaluation.figures import check_image, saved
+from lw_torchrl.language.queries import Clause
+from lw_torchrl.modules.image_query_evaluator import ImageQueryEvaluator
+from lw_torchrl.modules.networks import evaluating
+from lw_torchrl.trainers.labelled_queries import Asked, LabelledQueries
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_ROWS = 256
+_ENDS = ("#4c78a8", "#f58518")  # of the subject, of the object
+
+
+@dataclass(frozen=True)
+class WrongAnswer:
+    """A state in which a clause was answered wrongly.
+
+    Attributes:
+        clause: what was asked.
+        holds: whether it holds.
+        believed: the probability that it was given.
+        pixels: (H, W·C, 3) uint8, what was seen.
+        pointed: for the subject and the object, as far as they are told by name, where it was seen: (C, 2) float32,
+            pixels from the left and from the top of each camera's picture.
+    """
+
+    clause: Clause
+    holds: bool
+    believed: float
+    pixels: Tensor
+    pointed: tuple[Tensor, ...]
+
+
+def wrong_answers(evaluator: ImageQueryEvaluator, data: LabelledQueries, most: int = 12) -> list[WrongAnswer]:
+    """The surest wrong answers in held-out states, at most one of each clause.
+
+    Args:
+        evaluator: of pictures.
+        data: with pictures, and states that are held out.
+        most: so many at most.
+    """
+    found: list[WrongAnswer] = []
+    for asked in data.parts["states"]:
+        found += _worst(evaluator, asked)
+    return sorted(found, key=lambda one: -abs(one.believed - one.holds))[:most]
+
+
+@torch.no_grad()
+def _worst(evaluator: ImageQueryEvaluator, asked: Asked) -> list[WrongAnswer]:
+    """Of each clause that was ever answered wrongly, the surest wrong answer."""
+    clauses, vectors = evaluator.code([(asked.task, clause) for clause in asked.clauses])
+    pixels = asked.seen("pixels")
+    with evaluating(evaluator):
+        told = torch.cat(
+            [
+                evaluator.network(rows, clauses.pick(torch.arange(len(asked.clauses)).expand(len(rows), -1)), vectors)
+                for rows in pixels.split(_ROWS)
+            ]
+        ).sigmoid()
+        off = (told - asked.truth.float()).abs()
+        rows = off.argmax(0)
+        wrong = [
+            (int(row), column)
+            for column, row in enumerate(rows.tolist())
+            if (told[row, column] > 0.5) != asked.truth[row, column]
+        ]
+        return [
+            WrongAnswer(
+                asked.clauses[column],
+                bool(asked.truth[row, column]),
+                float(told[row, column]),
+                pixels[row],
+                _pointed(evaluator, pixels[row], asked.clauses[column]),
+            )
+            for row, column in wrong
+        ]
+
+
+def _pointed(evaluator: ImageQueryEvaluator, pixels: Tensor, clause: Clause) -> tuple[Tensor, ...]:
+    if not evaluator.names:
+        return ()
+    _, seen = evaluator.network.places(pixels[None], evaluator.network.names.weight)
+    height, width = seen.shape[-2:]
+    across = (seen[0].sum(-2) * (torch.arange(width) + 0.5)).sum(-1) / width * evaluator.width  # (C, N)
+    down = (seen[0].sum(-1) * (torch.arange(height) + 0.5)).sum(-1) / height * evaluator.height
+    things = [clause.subject, *([clause.object] if clause.object else [])]
+    numbers = [evaluator.names.index(name) for name in things]
+    return tuple(torch.stack((across[:, number], down[:, number]), -1) for number in numbers)
+
+
+def plot_wrong_answers(
+    evaluator: ImageQueryEvaluator,
+    data: LabelledQueries,
+    path: str | os.PathLike[str] | None = None,
+    most: int = 12,
+) -> Figure:
+    """Draw the surest wrong answers in held-out states: the pictures, with a blue ring where it took the subject to be
+    and an orange one where the object.
+
+    Args:
+        evaluator, data, most: as for :func:`wrong_answers`.
+        path: an image file, .png, .svg, .pdf or .jpg; it is replaced whole. None for none.
+
+    Returns:
+        The figure.
+
+    Raises:
+        ValueError: another format; no state is held out.
+    """
+    from matplotlib.figure import Figure
+
+    check_image(path)
+    if not data.parts["states"]:
+        raise ValueError("data must hold out states, for an evaluator to be asked")
+    found = wrong_answers(evaluator, data, most)
+    columns = min(3, max(1, len(found)))
+    rows = max(1, -(-len(found) // columns))
+    figure = Figure(figsize=(3.9 * columns, 2.6 * rows), layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False).reshape(-1)
+    for axes in panels:
+        axes.axis("off")
+    for axes, one in zip(panels, found, strict=False):
+        _draw(axes, one, evaluator.width)
+    if not found:
+        panels[0].text(0.5, 0.5, "no answer was wrong", ha="center")
+    return saved(figure, path)
+
+
+def _draw(axes: Axes, one: WrongAnswer, width: int) -> None:
+    axes.imshow(one.pixels.numpy())
+    for color, places in zip(_ENDS, one.pointed, strict=False):
+        for camera, (x, y) in enumerate(places.tolist()):
+            ring: dict[str, Any] = {"s": 90, "facecolors": "none", "edgecolors": color, "linewidths": 1.6}
+            axes.scatter([x + camera * width - 0.5], [y - 0.5], **ring)
+    said = f"{one.clause}: {'holds' if one.holds else 'does not hold'}, believed with {one.believed:.2f}"
+    axes.set_title(fill(said, 44), fontsize=8)

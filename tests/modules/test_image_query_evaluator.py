@@ -1,0 +1,221 @@
+"""ImageQueryEvaluator: what it sees, what it can tell, and that it is part of a policy like any other."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from pictures import why_no_pictures
+from tensordict import TensorDict
+from torch import nn
+from torchrl.objectives import BCLoss
+
+import lw_torchrl as lw
+from lw_torchrl.language.plans import PlanStep
+from lw_torchrl.modules import IMAGE_ENCODERS
+
+TASKS = ("drawer-open", "reach")
+PLANS = lw.Plans({task: lw.load_plans("MT10")[task] for task in TASKS})
+SMALL = {"height": 16, "width": 24, "hidden": 8, "depth": 1}
+KINDS = {"structure": {}, "texts": {"structure": False}}
+
+
+def letters(texts):
+    return torch.tensor([[float(text.count(letter)) for letter in "abdefghilnoprstuw"] for text in texts])
+
+
+def make(kind="structure", plans=PLANS, seed=0, **options):
+    torch.manual_seed(seed)
+    encoder = {} if kind == "structure" else {"text_encoder": letters}
+    return lw.ImageQueryEvaluator(plans, **SMALL, **KINDS[kind], **encoder, **options)
+
+
+def states(rows=10, shape=(16, 48)):
+    generator = torch.Generator().manual_seed(0)
+    return TensorDict(
+        observation=torch.rand(rows, 39, generator=generator) * 0.3,
+        pixels=torch.randint(256, (rows, *shape, 3), generator=generator, dtype=torch.uint8),
+        task_id=torch.tensor([lw.task_id(task) for task in TASKS]).repeat(rows)[:rows],
+        action=torch.rand(rows, 4, generator=generator),
+        batch_size=rows,
+    )
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_logit_for_each_step_whatever_the_order_and_shape_of_rows(kind):
+    evaluator, found = make(kind), states(64)
+    logits = evaluator(found.clone())["qaf_logits"]
+    assert logits.shape == (64, PLANS.num_steps)
+    assert logits.dtype == torch.float32
+    for row, task in enumerate(found["task_id"].tolist()):
+        steps = len(PLANS[lw.MT50[task]].steps)
+        assert (logits[row, :steps].abs() <= 31).all()
+        assert (logits[row, steps:] == -1e4).all()
+    order = torch.randperm(64, generator=torch.Generator().manual_seed(1))
+    assert torch.equal(evaluator(found[order])["qaf_logits"], logits[order])
+    assert torch.equal(evaluator(found.reshape(4, 16))["qaf_logits"].reshape(64, -1), logits)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_it_sees_each_cameras_picture_and_nothing_of_the_observation(kind):
+    evaluator, found = make(kind), states()
+    logits = evaluator(found.clone())["qaf_logits"]
+    other = found.clone().set("observation", torch.zeros(10, 39))
+    assert torch.equal(evaluator(other)["qaf_logits"], logits)
+    for part in (slice(0, 24), slice(24, 48)):
+        other = found.clone()
+        other["pixels"][:, :, part] = 0
+        assert not torch.equal(evaluator(other)["qaf_logits"], logits)
+
+
+def test_it_points_within_each_picture():
+    evaluator, found = make(), states()
+    with torch.no_grad():
+        places, seen = evaluator.network.places(found["pixels"], evaluator.network.names.weight)
+    assert places.shape == (10, len(evaluator.names), 4)
+    assert seen.shape == (10, 2, len(evaluator.names), 8, 12)
+    assert torch.allclose(seen.sum((-1, -2)), torch.ones(()))
+    swapped = found["pixels"].unflatten(-2, (2, 24)).flip(-3).flatten(-3, -2)
+    with torch.no_grad():
+        _, other = evaluator.network.places(swapped, evaluator.network.names.weight)
+    assert torch.allclose(other, seen.flip(1), atol=1e-6)
+
+
+def test_a_thing_that_moves_in_the_picture_is_pointed_at():
+    """A key that answers to red alone: the mean of its softmax is where the red square is."""
+    evaluator = make(cameras="corner")
+    network = evaluator.network
+    IMAGE_ENCODERS["red"] = lambda: nn.AvgPool2d(2)
+    try:
+        torch.manual_seed(0)
+        red = lw.ImageQueryEvaluator(PLANS, cameras="corner", encoder="red", **SMALL)
+    finally:
+        del IMAGE_ENCODERS["red"]
+    assert network.key.weight.shape[1] == 32
+    with torch.no_grad():
+        red.network.key.weight.zero_()
+        red.network.key.weight[0, 0] = 50.0
+        things = torch.zeros(1, 32)
+        things[0, 0] = 10.0
+        pixels = torch.zeros(2, 16, 24, 3, dtype=torch.uint8)
+        pixels[0, 2:4, 4:6, 0] = 255
+        pixels[1, 12:14, 20:22, 0] = 255
+        _, seen = red.network.places(pixels, things)
+    assert seen[0, 0, 0].argmax() == 1 * 12 + 2
+    assert seen[1, 0, 0].argmax() == 6 * 12 + 10
+    assert (seen.amax((-1, -2)) > 0.99).all()
+
+
+def test_not_is_the_opposite_with_structure():
+    texts = ["the gripper is above the drawer handle", "the gripper is not above the drawer handle"]
+    steps = [PlanStep(lw.parse_query(text, "drawer-open"), "open the drawer") for text in texts]
+    plans = lw.Plans([lw.ConditionalPlan("drawer-open", tuple(steps))])
+    found = states()[::2].clone()
+    logits = make(plans=plans)(found)["qaf_logits"]
+    assert torch.allclose(logits[:, 0], -logits[:, 1], atol=1e-5)
+    assert (logits[:, 0] != 0).all()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.filterwarnings("ignore:.*target_actor_network_params")
+def test_imitation_reaches_it_through_the_softmax(kind):
+    actor = lw.PlanConditionedActor(PLANS, evaluator=make(kind), answers="hard", width=8, text_encoder=letters).train()
+    BCLoss(actor, loss_function="l2")(states())["loss_bc"].backward()
+    for name, weight in actor.evaluator.named_parameters():
+        assert weight.grad is not None, name
+        assert weight.grad.abs().sum() > 0 or name.endswith("bias"), name
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_policy_with_it_is_made_again_from_its_file(kind, tmp_path):
+    actor = lw.PlanConditionedActor(PLANS, evaluator=make(kind), width=8, text_encoder=letters).eval()
+    lw.save_actor(actor, tmp_path / "policy.zip")
+    again = lw.load_actor(tmp_path / "policy.zip", text_encoder=letters)
+    assert torch.equal(again(states())["action"], actor(states())["action"])
+    lw.save_evaluator(actor.evaluator, tmp_path / "evaluator.zip")
+    other = lw.load_evaluator(tmp_path / "evaluator.zip", PLANS, text_encoder=letters)
+    assert torch.equal(other(states())["qaf_logits"], actor.evaluator(states())["qaf_logits"])
+
+
+def test_other_plans_share_its_weights():
+    evaluator = make()
+    drawer = lw.Plans({"drawer-open": PLANS["drawer-open"]})
+    other = evaluator.with_plans(drawer)
+    assert {id(weight) for weight in other.parameters()} == {id(weight) for weight in evaluator.parameters()}
+    found = states()[::2].clone()
+    steps = len(drawer["drawer-open"].steps)
+    expected = evaluator(found.clone())["qaf_logits"][:, :steps]
+    assert torch.allclose(other(found)["qaf_logits"], expected, atol=1e-6)
+
+
+def test_what_cannot_be_is_named():
+    with pytest.raises(ValueError, match=r"pixels must be uint8 of shape .*16, 48, 3.*by corner, corner3 side by side"):
+        make()(states(shape=(16, 24)))
+    with pytest.raises(ValueError, match=r"pixels must be uint8 .* got torch.float32"):
+        make()(states().set("pixels", torch.zeros(10, 16, 48, 3)))
+    with pytest.raises(ValueError, match=r"task_id must be of shape .10,., one for each row of 'pixels'"):
+        make().answers(states()["pixels"], torch.zeros(3).long())
+    with pytest.raises(ValueError, match=r"thing in \"the robot's gripper .*drawer-open must be one of .*an evaluator"):
+        make(names=("robot's gripper",))
+    with pytest.raises(ValueError, match=r"encoder must be one of.*small"):
+        make(encoder="smal")
+    with pytest.raises(ValueError, match=r"names is for structure=True"):
+        make("texts", names=("puck",))
+    with pytest.raises(ValueError, match=r"camera must be"):
+        make(cameras="korner")
+    IMAGE_ENCODERS["flat"] = lambda: nn.Flatten()
+    try:
+        with pytest.raises(ValueError, match=r"encoder 'flat' must give a map of features"):
+            make(encoder="flat")
+    finally:
+        del IMAGE_ENCODERS["flat"]
+
+
+def test_an_encoder_of_ones_own_stays_frozen():
+    def frozen():
+        return nn.Sequential(nn.Conv2d(3, 4, 4, 4)).requires_grad_(False)
+
+    IMAGE_ENCODERS["frozen"] = frozen
+    try:
+        evaluator = make(encoder="frozen")
+        assert evaluator(states())["qaf_logits"].requires_grad
+        assert not any(weight.requires_grad for weight in evaluator.network.encoder.parameters())
+    finally:
+        del IMAGE_ENCODERS["frozen"]
+
+
+class TestActing:
+    @pytest.fixture(autouse=True)
+    def _needs_open_gl(self):
+        if missing := why_no_pictures():
+            pytest.skip(missing)
+
+    def evaluated(self, actor, **options):
+        settings = {"tasks": TASKS, "episodes_per_task": 2, "seed": 1000, "max_steps": 12, "progress": False}
+        result = lw.evaluate(actor, record_actions=True, **settings | options)
+        return [one.actions for one in result.episodes]
+
+    def test_results_do_not_depend_on_num_envs(self):
+        actor = lw.PlanConditionedActor(PLANS, evaluator=make(), width=8)
+        found = [self.evaluated(actor, num_envs=n, num_threads=t) for n, t in ((2, 1), (4, 2))]
+        for one, other in zip(*found, strict=True):
+            assert torch.equal(one, other)
+
+    def test_scripted_skills_on_it_and_any_policy_behind_it(self):
+        evaluator = make(every=4)
+        own = self.evaluated(lw.ScriptedSkillActor(PLANS, evaluator=evaluator))
+        behind = self.evaluated(lw.ScriptedSkillActor(PLANS), evaluator=evaluator)
+        for one, other in zip(own, behind, strict=True):
+            assert torch.equal(one, other)
+
+    def test_failures_are_told_with_true_answers_in_its_place(self):
+        result = lw.evaluate(
+            lw.ScriptedSkillActor(PLANS, evaluator=make()),
+            tasks="drawer-open",
+            episodes_per_task=1,
+            seed=1000,
+            max_steps=150,
+            attribute=True,
+            progress=False,
+        )
+        if not result.mean_success:
+            assert [failure.cause for failure in result.failures] == ["query"]

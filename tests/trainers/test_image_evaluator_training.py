@@ -1,0 +1,141 @@
+"""An ImageQueryEvaluator learns from pictures what the query answering function answers, and finds the things."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from pictures import why_no_pictures
+from small_training import flat
+
+import lw_torchrl as lw
+from lw_torchrl.evaluation import plot_wrong_answers, score_evaluator, wrong_answers
+
+PLANS = lw.Plans({task: lw.load_plans("MT10")[task] for task in ("drawer-open", "reach")})
+PICTURES = {"cameras": ("corner", "corner3"), "height": 24, "width": 24}
+CONFIG = lw.ImageQueryEvaluatorConfig(steps=6, batch_size=8, checkpoint_every=2, held_out_pairs=0.0)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _needs_open_gl():
+    if missing := why_no_pictures():
+        pytest.skip(missing)
+
+
+@pytest.fixture(scope="module")
+def replay(tmp_path_factory):
+    root = tmp_path_factory.mktemp("states") / "demos"
+    lw.collect_demonstrations([*PLANS], episodes_per_task=3, root=root, max_steps=60, progress=False)
+    lw.add_pictures(root, **PICTURES, every=5, progress=False)
+    replay = lw.LanguageWorldExperienceReplay(root, label="executed")
+    replay.add_column("pixels", lw.load_pictures(replay, **PICTURES, every=5))
+    return replay
+
+
+def letters(texts):
+    return torch.tensor([[float(text.count(letter)) for letter in "abdefghilnoprstuw"] for text in texts])
+
+
+def make(seed=0, **options):
+    torch.manual_seed(seed)
+    return lw.ImageQueryEvaluator(PLANS, **PICTURES, hidden=16, depth=1, **options)
+
+
+def make_trainer(replay, path=None, config=CONFIG, **options):
+    data = lw.LabelledQueries(replay, config)
+    return lw.ImageQueryEvaluatorTrainer(make(**options), data, config, checkpoint=path, progress=False)
+
+
+def everything(trainer):
+    return flat({"weights": dict(trainer.evaluator.state_dict()), "optimizer": trainer.optimizer.state_dict()})
+
+
+def test_training_that_was_stopped_goes_on_bit_for_bit(replay, tmp_path):
+    whole = make_trainer(replay, tmp_path / "whole.zip")
+    whole.train()
+    begun = make_trainer(replay, tmp_path / "begun.zip")
+    for _ in range(4):
+        begun.step()
+    begun.save()
+    resumed = make_trainer(replay, tmp_path / "begun.zip", seed=5)
+    assert resumed.done == 4
+    resumed.train()
+    found, expected = everything(resumed), everything(whole)
+    assert found.keys() == expected.keys()
+    for key, value in expected.items():
+        assert torch.equal(found[key], value) if isinstance(value, torch.Tensor) else found[key] == value, key
+
+
+@pytest.mark.slow
+def test_it_learns_where_things_are_and_what_holds(replay):
+    config = replace(CONFIG, steps=400, batch_size=16, learning_rate=3e-3, held_out_states=0.0)
+    data = lw.LabelledQueries(replay, config)
+    evaluator = make()
+    lw.ImageQueryEvaluatorTrainer(evaluator, data, config, progress=False).train()
+    for asked in data.parts["training"]:
+        with torch.no_grad():
+            places, _ = evaluator.network.places(asked.pixels, evaluator.network.names.weight)
+        hand = places[:, evaluator.names.index("robot's gripper"), :3]
+        true = asked.observation[:, :3]
+        assert (hand - true).norm(dim=-1).median() < 0.5 * (true.mean(0) - true).norm(dim=-1).median()
+        clauses, _ = evaluator.code([(asked.task, clause) for clause in asked.clauses])
+        with torch.no_grad():
+            told = evaluator.network(
+                asked.pixels, clauses.pick(torch.arange(len(asked.clauses)).expand(len(asked.pixels), -1))
+            )
+        assert ((told > 0) == asked.truth).float().mean() > 0.85
+
+
+def test_texts_alone_are_asked_both_ways(replay):
+    trainer = make_trainer(replay, structure=False, text_encoder=letters)
+    assert trainer.train() < 5.0
+    report = score_evaluator(trainer.evaluator, lw.LabelledQueries(replay, CONFIG))
+    clauses = sum(len(asked.clauses) * len(asked.truth) for asked in lw.LabelledQueries(replay, CONFIG).parts["states"])
+    assert report.parts["states"].answers == 2 * clauses
+
+
+def test_only_states_with_a_picture_of_their_own_are_asked(replay):
+    data = lw.LabelledQueries(replay, CONFIG)
+    states = sum(len(asked.observation) for part in ("training", "states") for asked in data.parts[part])
+    assert states == 2 * 3 * 12  # tasks, episodes, 60 steps at 5 apart
+    held = lw.LanguageWorldExperienceReplay(replay.root, label="executed")
+    pictures = lw.load_pictures(held, **PICTURES, every=5)
+    held.add_column("pixels", pictures[torch.arange(len(held)) // 20 * 20])
+    with pytest.raises(ValueError, match=r"every must be as many steps as the pictures are apart"):
+        lw.LabelledQueries(held, CONFIG)
+
+
+def test_wrong_answers_are_wrong_and_drawn(replay, tmp_path):
+    data, evaluator = lw.LabelledQueries(replay, CONFIG), make()
+    found = wrong_answers(evaluator, data, most=5)
+    assert 0 < len(found) <= 5
+    for one in found:
+        assert (one.believed > 0.5) != one.holds
+        for places in one.pointed:
+            assert places.shape == (2, 2)
+            assert ((places > 0) & (places < 24)).all()
+    sureness = [abs(one.believed - one.holds) for one in found]
+    assert sureness == sorted(sureness, reverse=True)
+    plot_wrong_answers(evaluator, data, tmp_path / "wrong.png", most=5)
+    assert (tmp_path / "wrong.png").stat().st_size > 5000
+
+
+def test_what_does_not_fit_is_named(replay, tmp_path):
+    plain = lw.LanguageWorldExperienceReplay(replay.root, label="executed")
+    with pytest.raises(ValueError, match=r"data must have the column 'pixels'.*lw\.add_pictures"):
+        make_trainer(plain)
+    with pytest.raises(TypeError, match=r"config must be an ImageQueryEvaluatorConfig"):
+        lw.ImageQueryEvaluatorTrainer(make(), lw.LabelledQueries(replay, CONFIG), lw.QueryEvaluatorConfig(every=5))
+    with pytest.raises(TypeError, match=r"evaluator must be of ImageQueryEvaluator"):
+        lw.ImageQueryEvaluatorTrainer(
+            lw.StateQueryEvaluator(PLANS, width=8), lw.LabelledQueries(replay, CONFIG), CONFIG, progress=False
+        )
+    with pytest.raises(ValueError, match=r"pixels must be uint8 of shape"):
+        lw.ImageQueryEvaluatorTrainer(
+            lw.ImageQueryEvaluator(PLANS, cameras="corner", height=24, width=24),
+            lw.LabelledQueries(replay, CONFIG),
+            CONFIG,
+        )
+    with pytest.raises(ValueError, match=r"position_weight must be"):
+        lw.ImageQueryEvaluatorConfig(position_weight=-1.0)
