@@ -26,7 +26,7 @@ def reproduce(
     /,
     seeds: tuple[int, ...] = (0, 1, 2),
     methods: tuple[Method, ...] | None = None,
-    preset: Literal["strong", "paper"] = "strong",
+    preset: Literal["strong", "paper", "evaluator"] = "strong",
     passes: int | None = None,
     plans: tuple[str, ...] = (),
     task_file: Path | None = None,
@@ -53,7 +53,8 @@ def reproduce(
         seeds: of the demonstrations, the initial weights and the minibatches.
         methods: conditioned on plans, on the task's description, on the task's number; plans with scripted skills. By
             default all; with --plans, those that are trained.
-        preset: ours, or the published recipe, which takes hours.
+        preset: ours; the published recipe, which takes hours; or, in few-shot, ours with conditions answered by a
+            network that is trained inside the policy.
         passes: over the rows, fewer than the 500 of the preset paper.
         plans: of all 50 tasks, instead of ours: .plan files, .json files of pairs, folders, or MT50; where several have
             a plan for a task, the last one's counts.
@@ -81,6 +82,12 @@ def reproduce(
     if launcher == "ray" and device != "cpu":
         raise ValueError(f"--device {device} is for the launcher local: the tasks of ray have a CPU core each")
     recipes = PRESETS[preset]
+    if preset == "evaluator":
+        if experiment not in recipes:
+            raise ValueError(f"--preset evaluator is for {', '.join(recipes)}, got {experiment}")
+        if methods not in (None, ("pcbc",)):
+            raise ValueError("--methods must be pcbc with --preset evaluator: others ask no conditions")
+        methods = ("pcbc",)
     if passes is not None:
         check_int("passes", passes, minimum=1)
         if preset != "paper":

@@ -25,13 +25,14 @@ from lw_torchrl.cli.online import online
 from lw_torchrl.cli.record import record
 from lw_torchrl.cli.scripted import scripted
 from lw_torchrl.cli.streams import check_arguments, complain, nobody_reads, sound_streams
+from lw_torchrl.cli.train import train
 from lw_torchrl.cli.train_evaluator import train_evaluator
 
 COMMANDS: dict[str, Any] = {
     "demo": show.demo,
     "collect": policies.collect,
     "data": data,
-    "train": policies.train,
+    "train": train,
     "train-evaluator": train_evaluator,
     "evaluate": policies.evaluate,
     "record": record,

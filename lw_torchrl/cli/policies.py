@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
 from lw_torchrl._checks import counted
-from lw_torchrl.cli.outputs import check_file, check_folder
+from lw_torchrl.cli.outputs import check_folder
 from lw_torchrl.cli.sources import (
     load_policy,
-    make_logger,
     one_or_many,
-    read_encoder,
     read_plans,
     read_tasks,
     simulated,
@@ -86,114 +84,6 @@ def collect(
     for task, rate in made.success_rate.items():
         print(f"{task:28} {rate:7.2f} {made.attempts[task]:13}")
     print(f"{counted(made.num_steps, 'step')} in {made.root}")
-
-
-def train(
-    data: Positional[Annotated[Path, arg(metavar="DATA")]],
-    /,
-    out: Path,
-    tasks: tuple[str, ...] = (),
-    plans: tuple[str, ...] = ("MT10",),
-    task_file: Path | None = None,
-    text_encoder: str | None = None,
-    method: str = "pcbc",
-    mix: Literal["latents", "actions"] | None = None,
-    features: Literal["raw", "differences", "relative", "both"] = "differences",
-    width: int = 256,
-    depth: int = 3,
-    steps: int = 8000,
-    batch_size: int = 500,
-    learning_rate: float = 1e-3,
-    after_success: int | None = 20,
-    latent_consistency: float = 0.0,
-    seed: int = 0,
-    logger: Literal["csv", "tensorboard", "wandb"] | None = None,
-    device: str = "cpu",
-) -> None:
-    """Train a policy on demonstrations. Stopped and started again it carries on from its checkpoint.
-
-    Example: lw-torchrl train demos/mt10 --out runs/mt10.zip
-
-    Args:
-        data: a dataset's folder, of `lw-torchrl collect`.
-        out: the policy, one file.
-        tasks: MT10, or names of tasks: only their demonstrations; all that the dataset has if none is given.
-        plans: MT10 or MT50 for the shipped plans, .plan files, .json files of pairs, or folders; where several have a
-            plan for a task, the last one's counts.
-        task_file: tasks of yours, whose objects and points the plans may name.
-        text_encoder: a function of yours that turns texts into vectors, as my_texts:encode; evaluate wants it again.
-        method: pcbc, conditioned on the plan; or a baseline: dc, on the task's description, one-hot, on its number.
-        mix: mix the skills' latents, as in the paper and by default, or their actions; of a policy with plans.
-        features: what the policy sees: the raw observation; differences between hand, objects and goal; relative, these
-            without the hand's height and the gripper's opening; or both the first and the second.
-        width: of the action decoder's hidden layers.
-        depth: number of them.
-        steps: minibatches.
-        batch_size: rows of a minibatch, equally many of each task.
-        learning_rate: at the start; a cosine brings it to 0.
-        after_success: leave out steps so long after an episode's first success; None keeps all.
-        latent_consistency: weight of a term that keeps skills near whose texts are near; of a policy with plans.
-        seed: of the initial weights and the minibatches.
-        logger: also write loss and learning rate there, below logs/ beside the policy.
-        device: where the networks work: cpu; cuda, or cuda:1 for the second of several; mps, a Mac's; or auto, the GPU
-            where there is one. Minibatches are the same everywhere, and the policy can be loaded
-            anywhere.
-    """
-    check_file("--out", out)
-    import torch
-
-    import lw_torchrl as lw
-    from lw_torchrl._checks import check_choice
-    from lw_torchrl._devices import check_device
-    from lw_torchrl.modules.policy import METHODS, make_policy, policy_class
-
-    use_one_thread()
-    there = check_device("device", device)
-    known = read_tasks(task_file)
-    encoder = read_encoder(text_encoder)
-    loaded = read_plans(plans, known)
-    options: dict[str, Any] = {"features": features, "width": width, "depth": depth}
-    reads_plans = policy_class(METHODS[check_choice("method", method, METHODS)].policy).plan_options
-    if mix is not None and not reads_plans:
-        raise ValueError(f"--mix is for a method that reads plans, --method {method} does not")
-    if latent_consistency and not reads_plans:
-        raise ValueError(f"--latent-consistency is for a method that reads plans, --method {method} does not")
-    if reads_plans:
-        options["mix"] = mix or "latents"
-    config = lw.BehavioralCloningConfig(
-        steps=steps,
-        batch_size=batch_size,
-        learning_rate=learning_rate,
-        latent_consistency=latent_consistency,
-        seed=seed,
-    )
-    replay = lw.LanguageWorldExperienceReplay(
-        data,
-        episodes=_all_of(data, lw.resolve_tasks(one_or_many(tasks), tasks=known)) if tasks else None,
-        sampler=lw.TaskBalancedSampler(),
-        after_success=after_success,
-        device=there,
-    )
-    loaded.require(replay.tasks)
-    torch.manual_seed(seed)
-    shown = loaded if reads_plans else {task: loaded[task] for task in replay.tasks}
-    actor = make_policy(method, shown, text_encoder=encoder, **options)
-    if (transform := actor.transform()) is not None:
-        replay.append_transform(transform)
-    writes = None if logger is None else make_logger(logger, out)
-    loss = lw.BehavioralCloningTrainer(actor, replay, config, checkpoint=out, logger=writes, device=there).train()
-    print(f"trained to step {steps}" + ("" if loss != loss else f", loss {loss:.4f}") + f": {out}")
-
-
-def _all_of(data: Path, tasks: tuple[str, ...]) -> dict[str, list[int]]:
-    """Every episode of these tasks in a dataset."""
-    from lw_torchrl._checks import check_choice
-    from lw_torchrl.data.metadata import read_metadata
-
-    found = read_metadata(data)
-    for task in tasks:
-        check_choice("tasks", task, found.config.tasks)
-    return {task: [one.episode for one in found.episodes if one.task == task] for task in tasks}
 
 
 def evaluate(

@@ -49,6 +49,7 @@ def train_evaluator(
     again it carries on.
 
     Example: lw-torchrl train-evaluator MT10 --out runs/evaluator --held-out-tasks push reach
+
     Example: lw-torchrl train-evaluator drawer-open --out runs/eyes --cameras corner corner3 --episodes 20
 
     Args:

