@@ -53,6 +53,17 @@ def rates(path):
     return found["episodes"], found["config"]
 
 
+EVALUATOR = replace(
+    PRESET,
+    name="evaluator",
+    members=(
+        Member(
+            {"features": "differences", "width": 32, "depth": 1},
+            {"evaluator": {"kind": "StateQueryEvaluator", "options": {"width": 16, "depth": 1}}, "answers": "tanh"},
+        ),
+    ),
+    training=replace(PRESET.training, qaf_anchor=1.0),
+)
 RUNS = [
     *(a_run(method) for method in (*METHODS, SCRIPTED)),
     *(a_run(method, setting=TINY_ONE_SHOT) for method in METHODS),
@@ -256,3 +267,16 @@ def test_a_text_encoder_of_ones_own(one, tmp_path):
         (tmp_path / own.folder / "results.json").unlink()
         with pytest.raises(ValueError, match="text"):  # a policy of other texts is no policy of these
             execute_run(own, PLANS, tmp_path, tasks=task_of(own), progress=False)
+
+
+def test_a_preset_may_put_an_evaluator_into_the_policy(tmp_path):
+    one = a_run(preset=replace(EVALUATOR, training=replace(EVALUATOR.training, steps=2)))
+    execute(one, tmp_path)
+    policy = lw.load_actor(tmp_path / one.folder / "policy.zip")
+    assert isinstance(policy.evaluator, lw.StateQueryEvaluator)
+    assert policy.evaluator.config["width"] == 16
+    assert "qaf" not in policy.in_keys
+    assert (
+        execute(one, tmp_path).mean_success
+        == lw.EvaluationResult.load(tmp_path / one.folder / "results.json").mean_success
+    )
