@@ -60,7 +60,7 @@ class HeldTruth:
         """Rows are at the beginning of an episode.
 
         Args:
-            truth: (B, S) bool, the answers in the rows' states.
+            truth: (B, S), the answers in the rows' states, bool or logits.
             rows: B bool, or with a last dimension of 1, those that begin; None for all.
 
         Returns:
