@@ -190,10 +190,16 @@ def _failed(
 
 
 def _answers(steps: TensorDictBase, actor: Any) -> Tensor | None:
-    """What the evaluators inside a policy answer in these states, the mean of several; None where that is not known."""
+    """What the evaluators inside a policy answer in these states, the mean of several; None of one without."""
     evaluators = own_evaluators(actor)
-    if not evaluators or any(steps.get(key, None) is None for one in evaluators for key in one.in_keys):
+    if not evaluators or "qaf_logits" in steps.keys():
         return None
+    read = dict.fromkeys(key for one in evaluators for key in one.in_keys)
+    if missing := [str(key) for key in read if steps.get(key, None) is None]:
+        raise ValueError(
+            f"rollouts must hold {', '.join(missing)}, which the policy's evaluator reads, or its answers, qaf_logits; "
+            "evaluate(..., attribute=True) records them"
+        )
     with torch.no_grad(), evaluating(actor):
         device = device_of(actor)
         logits = [one.answers(*(steps.get(key).to(device) for key in one.in_keys)) for one in evaluators]

@@ -46,9 +46,11 @@ class TrueAnswers(QueryEvaluator):
 
 
 def own_evaluators(actor: Any) -> list[QueryEvaluator]:
-    """The evaluators inside a policy."""
-    modules = actor.modules() if isinstance(actor, nn.Module) else ()
-    return [module for module in modules if isinstance(module, QueryEvaluator)]
+    """The evaluators that a policy reads; not what one holds inside."""
+    modules = list(actor.modules()) if isinstance(actor, nn.Module) else []
+    found = [module for module in modules if isinstance(module, QueryEvaluator)]
+    inside = {id(inner) for outer in found for inner in outer.modules() if inner is not outer}
+    return [module for module in found if id(module) not in inside]
 
 
 def with_true_answers(actor: Any) -> Any:

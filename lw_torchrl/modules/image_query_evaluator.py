@@ -20,6 +20,8 @@ IMAGE_ENCODERS: dict[str, Callable[[], nn.Module]] = {"small": SmallImageEncoder
 """What makes an encoder of pictures, by name: a module from (n, 3, H, W) float32 in [0, 1] to a map of features
 (n, F, h, w). Put yours here, one that is frozen with ``requires_grad_(False)`` too, to have it in files."""
 
+_LARGEST = 512
+
 
 class ImageQueryEvaluator(ClauseEvaluator):
     """Answers conditions from pictures, trained on the query answering function's answers, which it never asks.
@@ -32,7 +34,7 @@ class ImageQueryEvaluator(ClauseEvaluator):
 
     Args:
         plans: whose conditions it answers.
-        cameras, height, width: as for :class:`CameraTransform`.
+        cameras, height, width: as for :class:`CameraTransform`; at most 512 pixels.
         every: steps from one picture to the next when it acts; in between its answers stay.
         encoder: a name in :data:`IMAGE_ENCODERS`.
         structure: a clause is read as the query language parses it, its things by name. False: all that is known of a
@@ -86,6 +88,8 @@ class ImageQueryEvaluator(ClauseEvaluator):
             plans, structure=structure, predicates=predicates, names=names or (), text_encoder=text_encoder
         )
         self.cameras, self.every = check_cameras(cameras, height, width), check_int("every", every, minimum=1)
+        if max(height, width) > _LARGEST:
+            raise ValueError(f"height and width must be at most {_LARGEST} pixels, got {height} and {width}")
         self.height, self.width = height, width
         self.in_keys = ["pixels", "task_id"]
         check_choice("encoder", encoder, IMAGE_ENCODERS)

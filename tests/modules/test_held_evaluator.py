@@ -160,6 +160,7 @@ def test_true_answers_take_its_place():
         actor, tasks="drawer-open", episodes_per_task=1, seed=1000, max_steps=150, attribute=True, progress=False
     )
     assert [failure.cause for failure in result.failures] == ["query"]
+    assert result.failures[0].evidence["answers_wrong"] > 0.1
 
 
 def test_it_is_for_acting():
@@ -196,3 +197,19 @@ def test_what_cannot_be_is_named():
         lw.HeldEvaluator(learned(), every=0)
     with pytest.raises(ValueError, match=r"delay must be at least 0, got -1"):
         lw.HeldEvaluator(learned(), delay=-1)
+
+
+def test_rollouts_without_what_it_reads_are_refused():
+    actor = lw.ScriptedSkillActor(PLANS, evaluator=lw.HeldEvaluator(learned(), every=4))
+    found = []
+    settings = {"seed": 1000, "max_steps": 30, "progress": False}
+    lw.evaluate(
+        actor,
+        tasks="drawer-open",
+        episodes_per_task=1,
+        also_record=["observation", "task_id", "episode", "qaf"],
+        on_episode=found.append,
+        **settings,
+    )
+    with pytest.raises(ValueError, match=r"rollouts must hold qaf_held_logits, which the policy's evaluator reads"):
+        lw.attribute_failures([one.steps for one in found], PLANS, actor=actor, noise_scale=0.1, **settings)

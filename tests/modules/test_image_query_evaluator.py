@@ -160,6 +160,8 @@ def test_what_cannot_be_is_named():
         make(encoder="smal")
     with pytest.raises(ValueError, match=r"names is for structure=True"):
         make("texts", names=("puck",))
+    with pytest.raises(ValueError, match=r"height and width must be at most 512 pixels, got 513 and 8"):
+        lw.ImageQueryEvaluator(PLANS, height=513, width=8)
     with pytest.raises(ValueError, match=r"camera must be"):
         make(cameras="korner")
     IMAGE_ENCODERS["flat"] = lambda: nn.Flatten()

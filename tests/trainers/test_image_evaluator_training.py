@@ -67,6 +67,28 @@ def test_training_that_was_stopped_goes_on_bit_for_bit(replay, tmp_path):
         assert torch.equal(found[key], value) if isinstance(value, torch.Tensor) else found[key] == value, key
 
 
+def test_a_policy_that_sees_is_tuned_and_goes_on_bit_for_bit(replay, tmp_path):
+    def train(path, stop=None):
+        torch.manual_seed(1)
+        actor = lw.PlanConditionedActor(PLANS, evaluator=make(), answers="hard", width=8, depth=1)
+        config = lw.BehavioralCloningConfig(steps=6, batch_size=8, qaf_anchor=0.1, checkpoint_every=2)
+        buffer = lw.LanguageWorldExperienceReplay(replay.root, sampler=lw.TaskBalancedSampler())
+        buffer.add_column("pixels", lw.load_pictures(buffer, **PICTURES, every=5))
+        trainer = lw.BehavioralCloningTrainer(actor, buffer, config, checkpoint=path, progress=False)
+        for _ in range(stop or 0):
+            trainer.step()
+        trainer.save() if stop else trainer.train()
+        return lw.load_actor(path).state_dict()
+
+    whole = train(tmp_path / "whole.zip")
+    begun = train(tmp_path / "begun.zip", stop=4)
+    eye = next(name for name in whole if "encoder.evaluator.network.key" in name)
+    assert not torch.equal(begun[eye], whole[eye])
+    resumed = train(tmp_path / "begun.zip")
+    for name, value in whole.items():
+        assert torch.equal(resumed[name], value), name
+
+
 @pytest.mark.slow
 def test_it_learns_where_things_are_and_what_holds(replay):
     config = replace(CONFIG, steps=400, batch_size=16, learning_rate=3e-3, held_out_states=0.0)
