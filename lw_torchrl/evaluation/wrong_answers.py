@@ -1,11 +1,11 @@
-"""The picture of an ImageQueryEvaluator's wrong answers: what it saw, and where it pointed."""
+"""The picture of an ImageQueryEvaluator's wrong answers: what it saw, and how far off it took things to be."""
 
 from __future__ import annotations
 
 import os
 from dataclasses import dataclass
 from textwrap import fill
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _ROWS = 256
-_ENDS = ("#4c78a8", "#f58518")  # of the subject, of the object
 
 
 @dataclass(frozen=True)
@@ -33,15 +32,15 @@ class WrongAnswer:
         holds: whether it holds.
         believed: the probability that it was given.
         pixels: (H, W·C, 3) uint8, what was seen.
-        pointed: for the subject and the object, as far as they are told by name, where it was seen: (C, 2) float32,
-            pixels from the left and from the top of each camera's picture.
+        off: for the subject and the object, where they are told by name, how far they were taken to be from where they
+            are, metres.
     """
 
     clause: Clause
     holds: bool
     believed: float
     pixels: Tensor
-    pointed: tuple[Tensor, ...]
+    off: dict[str, float]
 
 
 def wrong_answers(evaluator: ImageQueryEvaluator, data: LabelledQueries, most: int = 12) -> list[WrongAnswer]:
@@ -83,22 +82,19 @@ def _worst(evaluator: ImageQueryEvaluator, asked: Asked) -> list[WrongAnswer]:
                 bool(asked.truth[row, column]),
                 float(told[row, column]),
                 pixels[row],
-                _pointed(evaluator, pixels[row], asked.clauses[column]),
+                _off(evaluator, asked, row, asked.clauses[column]),
             )
             for row, column in wrong
         ]
 
 
-def _pointed(evaluator: ImageQueryEvaluator, pixels: Tensor, clause: Clause) -> tuple[Tensor, ...]:
+def _off(evaluator: ImageQueryEvaluator, asked: Asked, row: int, clause: Clause) -> dict[str, float]:
     if not evaluator.names:
-        return ()
-    _, seen = evaluator.network.places(pixels[None], evaluator.network.names.weight)
-    height, width = seen.shape[-2:]
-    across = (seen[0].sum(-2) * (torch.arange(width) + 0.5)).sum(-1) / width * evaluator.width  # (C, N)
-    down = (seen[0].sum(-1) * (torch.arange(height) + 0.5)).sum(-1) / height * evaluator.height
+        return {}
+    places, _ = evaluator.network.places(asked.seen("pixels")[row : row + 1], evaluator.network.names.weight)
+    true = asked.task.positions(asked.observation[row])
     things = [clause.subject, *([clause.object] if clause.object else [])]
-    numbers = [evaluator.names.index(name) for name in things]
-    return tuple(torch.stack((across[:, number], down[:, number]), -1) for number in numbers)
+    return {name: float((places[0, evaluator.names.index(name), :3] - true[name]).norm()) for name in things}
 
 
 def plot_wrong_answers(
@@ -107,8 +103,8 @@ def plot_wrong_answers(
     path: str | os.PathLike[str] | None = None,
     most: int = 12,
 ) -> Figure:
-    """Draw the surest wrong answers in held-out states: the pictures, with a blue ring where it took the subject to be
-    and an orange one where the object.
+    """Draw the surest wrong answers in held-out states: the pictures, what was asked, and how far from where they are
+    the things were taken to be.
 
     Args:
         evaluator, data, most: as for :func:`wrong_answers`.
@@ -121,6 +117,7 @@ def plot_wrong_answers(
         ValueError: another format; no state is held out.
     """
     from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     check_image(path)
     if not data.parts["states"]:
@@ -128,22 +125,20 @@ def plot_wrong_answers(
     found = wrong_answers(evaluator, data, most)
     columns = min(3, max(1, len(found)))
     rows = max(1, -(-len(found) // columns))
-    figure = Figure(figsize=(3.9 * columns, 2.6 * rows), layout="constrained")
+    figure = Figure(figsize=(3.9 * columns, 2.7 * rows), layout=ConstrainedLayoutEngine(h_pad=0.12))
     panels = figure.subplots(rows, columns, squeeze=False).reshape(-1)
     for axes in panels:
         axes.axis("off")
     for axes, one in zip(panels, found, strict=False):
-        _draw(axes, one, evaluator.width)
+        _draw(axes, one)
     if not found:
         panels[0].text(0.5, 0.5, "no answer was wrong", ha="center")
     return saved(figure, path)
 
 
-def _draw(axes: Axes, one: WrongAnswer, width: int) -> None:
+def _draw(axes: Axes, one: WrongAnswer) -> None:
     axes.imshow(one.pixels.numpy())
-    for color, places in zip(_ENDS, one.pointed, strict=False):
-        for camera, (x, y) in enumerate(places.tolist()):
-            ring: dict[str, Any] = {"s": 90, "facecolors": "none", "edgecolors": color, "linewidths": 1.6}
-            axes.scatter([x + camera * width - 0.5], [y - 0.5], **ring)
     said = f"{one.clause}: {'holds' if one.holds else 'does not hold'}, believed with {one.believed:.2f}"
     axes.set_title(fill(said, 44), fontsize=8)
+    off = ", ".join(f"{name} {100 * far:.1f} cm off" for name, far in one.off.items())
+    axes.text(0.5, -0.03, off, transform=axes.transAxes, ha="center", va="top", fontsize=8, color="#b04a3a")

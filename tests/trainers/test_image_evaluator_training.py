@@ -134,9 +134,8 @@ def test_wrong_answers_are_wrong_and_drawn(replay, tmp_path):
     assert 0 < len(found) <= 5
     for one in found:
         assert (one.believed > 0.5) != one.holds
-        for places in one.pointed:
-            assert places.shape == (2, 2)
-            assert ((places > 0) & (places < 24)).all()
+        assert {*one.off} == {one.clause.subject, *([one.clause.object] if one.clause.object else [])}
+        assert all(0 < far < 3 for far in one.off.values())
     sureness = [abs(one.believed - one.holds) for one in found]
     assert sureness == sorted(sureness, reverse=True)
     plot_wrong_answers(evaluator, data, tmp_path / "wrong.png", most=5)
