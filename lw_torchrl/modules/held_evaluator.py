@@ -10,6 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import Compose, Transform
 
+from lw_torchrl._blocks import BLOCK
 from lw_torchrl._checks import check_int
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.text import TextEncoder
@@ -24,6 +25,7 @@ class _Ask:
 
     def __init__(self, evaluator: QueryEvaluator) -> None:
         self.evaluator = evaluator
+        self.rows_at_once = getattr(evaluator, "rows_at_once", BLOCK)
 
     @torch.no_grad()
     def __call__(self, tensordict: TensorDictBase) -> TensorDictBase:

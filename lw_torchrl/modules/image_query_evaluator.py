@@ -63,6 +63,8 @@ class ImageQueryEvaluator(ClauseEvaluator):
 
     network: PointingNetwork
     seen_dims = 3
+    rows_at_once = 4
+    """As many rows are evaluated together when it acts, whatever else there is, so that results hang on no other."""
 
     def __init__(
         self,

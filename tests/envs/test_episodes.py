@@ -351,3 +351,19 @@ def test_a_nan_raises_where_the_environment_is_strict():
     with pytest.raises(ValueError, match="action must hold numbers: row 0"):
         run(env, lambda td: td.set("action", torch.full((1, 4), float("nan"))), {"reach": [0]})
     env.close()
+
+
+def test_blocks_are_as_small_as_a_module_asks():
+    sizes = []
+
+    class Sees(torch.nn.Module):
+        rows_at_once = 4
+
+        def forward(self, tensordict):
+            sizes.append(len(tensordict))
+            return tensordict.set("seen", tensordict.get("observation") + 1)
+
+    states = TensorDict(observation=torch.rand(10, 3), batch_size=10)
+    found = in_blocks(torch.nn.Sequential(Sees()))(states.clone())
+    assert sizes == [4, 4, 4]
+    assert torch.equal(found["seen"], states["observation"] + 1)
