@@ -51,6 +51,7 @@ if TYPE_CHECKING:  # the table below, for type checkers and editors
     from lw_torchrl.language.tasks import task_id as task_id
     from lw_torchrl.modules import ActorEnsemble as ActorEnsemble
     from lw_torchrl.modules import DescriptorConditionedActor as DescriptorConditionedActor
+    from lw_torchrl.modules import HeldEvaluator as HeldEvaluator
     from lw_torchrl.modules import ImageQueryEvaluator as ImageQueryEvaluator
     from lw_torchrl.modules import PlanConditionedActor as PlanConditionedActor
     from lw_torchrl.modules import PlanConditionedQValue as PlanConditionedQValue
@@ -115,9 +116,9 @@ _NAMES = {
     "lw_torchrl.language.skills": "load_skills nearest_skill",
     "lw_torchrl.language.task_files": "load_tasks",
     "lw_torchrl.language.tasks": "MT10 MT50 TASKS Task resolve_tasks task_id",
-    "lw_torchrl.modules": "ActorEnsemble DescriptorConditionedActor ImageQueryEvaluator PlanConditionedActor "
-    "PlanConditionedQValue PlanConditionedValue Policy QueryEvaluator ResidualActor ScriptedSkillActor "
-    "StateQueryEvaluator plan_actor_value",
+    "lw_torchrl.modules": "ActorEnsemble DescriptorConditionedActor HeldEvaluator ImageQueryEvaluator "
+    "PlanConditionedActor PlanConditionedQValue PlanConditionedValue Policy QueryEvaluator ResidualActor "
+    "ScriptedSkillActor StateQueryEvaluator plan_actor_value",
     "lw_torchrl.objectives": "AdvantageWeightedLoss DemonstratedSACLoss DemonstratedTD3Loss ExpectileValueLoss "
     "SkillLatentLoss standardize_by_task",
     "lw_torchrl.planners": "FilePlanner OpenAIPlanner Planner PlannerError plan_prompt",

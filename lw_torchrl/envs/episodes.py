@@ -13,12 +13,11 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv, step_mdp
 
+from lw_torchrl._blocks import in_blocks
 from lw_torchrl._devices import CPU, place
 from lw_torchrl.envs.engine import ACTION_SIZE
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.envs.seeding import action_noise
-
-BLOCK = 64
 
 
 class FinishedEpisode(NamedTuple):
@@ -39,25 +38,6 @@ class FinishedEpisode(NamedTuple):
         """The first successful step, counted from 1; None without success. It wants ("next", "success") recorded."""
         hits = self.steps.get(("next", "success")).flatten().nonzero().flatten()
         return int(hits[0]) + 1 if len(hits) else None
-
-
-def in_blocks(
-    policy: Callable[[TensorDictBase], TensorDictBase],
-) -> Callable[[TensorDictBase], TensorDictBase]:
-    """``policy``, run on blocks of exactly 64 rows, the last one padded.
-
-    A matrix product of another number of rows rounds differently, and contact amplifies the last bits. With blocks
-    of one size a row's action depends on that row alone, whatever the number of environments.
-    """
-
-    def run(tensordict: TensorDictBase) -> TensorDictBase:
-        n = tensordict.batch_size[0]
-        padding = -n % BLOCK
-        padded = torch.cat([tensordict, tensordict[:1].expand(padding)]) if padding else tensordict
-        outputs = torch.cat([policy(block.copy()) for block in padded.split(BLOCK)])
-        return tensordict.update(outputs[:n])
-
-    return run
 
 
 def policy_of(actor: Any, device: str | torch.device | None = None) -> Callable[[TensorDictBase], TensorDictBase]:

@@ -6,6 +6,7 @@ from lw_torchrl.modules.critics import PlanConditionedQValue, PlanConditionedVal
 from lw_torchrl.modules.descriptor_conditioned_actor import DescriptorConditionedActor
 from lw_torchrl.modules.descriptor_encoder import DescriptorEncoder
 from lw_torchrl.modules.encoder import Encoder
+from lw_torchrl.modules.held_evaluator import HeldEvaluator
 from lw_torchrl.modules.image_query_evaluator import IMAGE_ENCODERS, ImageQueryEvaluator
 from lw_torchrl.modules.observation_features import ObservationFeatures
 from lw_torchrl.modules.plan_attention import PlanAttention
@@ -27,6 +28,7 @@ __all__ = [
     "DescriptorConditionedActor",
     "DescriptorEncoder",
     "Encoder",
+    "HeldEvaluator",
     "ImageQueryEvaluator",
     "Method",
     "ObservationFeatures",

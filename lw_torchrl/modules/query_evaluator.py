@@ -18,6 +18,7 @@ from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.text import TextEncoder
 
 EVALUATORS: dict[str, str | type[QueryEvaluator]] = {
+    "HeldEvaluator": "lw_torchrl.modules.held_evaluator",
     "ImageQueryEvaluator": "lw_torchrl.modules.image_query_evaluator",
     "StateQueryEvaluator": "lw_torchrl.modules.state_query_evaluator",
 }
