@@ -56,7 +56,7 @@ class ActorEnsemble(Policy):
             if any(of(one) != of(first) for one in members):
                 raise ValueError(f"members must have the same {name}")
         self.members = nn.ModuleList(members)
-        if any(isinstance(getattr(one, "evaluator", None), HeldEvaluator) for one in members):
+        if any(isinstance(part, HeldEvaluator) for one in members for part in one.modules()):
             raise ValueError(
                 "members must have no HeldEvaluator of their own, an environment holds one evaluator's answers: let "
                 "members read qaf, and give the HeldEvaluator to evaluate(..., evaluator=)"

@@ -212,7 +212,7 @@ def test_true_answers_take_its_place_and_nothing_inside_it():
     assert isinstance(true.evaluator, TrueAnswers)
     assert own_evaluators(true) == [true.evaluator]
     assert isinstance(actor.evaluator.evaluator, Spy)
-    expected, _ = evaluated(lw.PlanConditionedActor.with_plans(actor, PLANS).with_evaluator(TrueAnswers(PLANS)))
+    expected, _ = evaluated(actor.with_evaluator(TrueAnswers(PLANS), answers="logit"))
     assert same(evaluated(true)[0], expected)
 
 
@@ -352,8 +352,10 @@ def test_two_of_them_in_one_environment_are_refused():
     actor = lw.ScriptedSkillActor(PLANS, evaluator=held)
     with pytest.raises(ValueError, match="two HeldEvaluators write 'qaf_held_logits'"):
         evaluated(actor, evaluator=held)
-    with pytest.raises(ValueError, match="members must have no HeldEvaluator"):
-        lw.ActorEnsemble([actor, actor])
+    residual = lw.ResidualActor(lw.PlanConditionedActor(PLANS, evaluator=held, width=8))
+    for member in (actor, residual):
+        with pytest.raises(ValueError, match="members must have no HeldEvaluator"):
+            lw.ActorEnsemble([member, member])
 
 
 # --- pictures ------------------------------------------------------------------------------------------------------
