@@ -46,11 +46,11 @@ class TrueAnswers(QueryEvaluator):
 
 
 def own_evaluators(actor: Any) -> list[QueryEvaluator]:
-    """The evaluators that a policy reads; not what one holds inside."""
-    modules = list(actor.modules()) if isinstance(actor, nn.Module) else []
-    found = [module for module in modules if isinstance(module, QueryEvaluator)]
-    inside = {id(inner) for outer in found for inner in outer.modules() if inner is not outer}
-    return [module for module in found if id(module) not in inside]
+    """The evaluators that a policy asks itself; not those that these ask in their turn."""
+    if isinstance(actor, QueryEvaluator):
+        return [actor]
+    children = actor.children() if isinstance(actor, nn.Module) else ()
+    return list(dict.fromkeys(found for child in children for found in own_evaluators(child)))
 
 
 def with_true_answers(actor: Any) -> Any:
@@ -62,6 +62,8 @@ def with_true_answers(actor: Any) -> Any:
     for module in list(other.modules()):
         if hasattr(module, "in_keys"):
             module.in_keys = [key for key in module.in_keys if key not in read]  # pictures, say
+        if isinstance(module, QueryEvaluator):  # what it asks in its turn goes with it
+            continue
         for name, child in list(module.named_children()):
             if isinstance(child, QueryEvaluator):
                 setattr(module, name, TrueAnswers(child.plans))

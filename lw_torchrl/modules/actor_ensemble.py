@@ -13,6 +13,7 @@ from torchrl.envs import Transform
 
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.language.text import TextEncoder
+from lw_torchrl.modules.held_evaluator import HeldEvaluator
 from lw_torchrl.modules.policy import Policy, from_description
 
 
@@ -33,7 +34,7 @@ class ActorEnsemble(Policy):
         tasks: their tasks.
 
     Raises:
-        ValueError: no member, or members of different plans, tasks or keys.
+        ValueError: no member, members of different plans, tasks or keys, or one with a :class:`HeldEvaluator`.
 
     Example:
         >>> import lw_torchrl as lw
@@ -55,6 +56,11 @@ class ActorEnsemble(Policy):
             if any(of(one) != of(first) for one in members):
                 raise ValueError(f"members must have the same {name}")
         self.members = nn.ModuleList(members)
+        if any(isinstance(part, HeldEvaluator) for one in members for part in one.modules()):
+            raise ValueError(
+                "members must have no HeldEvaluator of their own, an environment holds one evaluator's answers: let "
+                "members read qaf, and give the HeldEvaluator to evaluate(..., evaluator=)"
+            )
         self.plans, self.tasks = first.plans, first.tasks
         self.in_keys = first.in_keys
         self.out_keys = first.out_keys[: 1 if first.plans is None else 2]

@@ -1,4 +1,4 @@
-"""HeldEvaluator: an evaluator that is asked every so many steps only, or whose answers come late."""
+"""HeldEvaluator: an evaluator that is asked every k steps of an episode, its answers held between, and shown late."""
 
 from __future__ import annotations
 
@@ -10,53 +10,52 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import Compose, Transform
 
-from lw_torchrl._blocks import BLOCK
+from lw_torchrl._blocks import in_blocks
 from lw_torchrl._checks import check_int
+from lw_torchrl._devices import device_of
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.networks import evaluating
 from lw_torchrl.modules.query_evaluator import QueryEvaluator, evaluator_from_description
 from lw_torchrl.transforms.camera import CameraTransform
-from lw_torchrl.transforms.held_answers import HELD, HeldAnswers
+from lw_torchrl.transforms.held_answers import HeldAnswers
 
-
-class _Ask:
-    """An evaluator as a transform asks it; no module, so that a transform's state does not hold its weights."""
-
-    def __init__(self, evaluator: QueryEvaluator) -> None:
-        self.evaluator = evaluator
-        self.rows_at_once = getattr(evaluator, "rows_at_once", BLOCK)
-
-    @torch.no_grad()
-    def __call__(self, tensordict: TensorDictBase) -> TensorDictBase:
-        with evaluating(self.evaluator):
-            return self.evaluator(tensordict)
+_MOST = 2**16  # steps; a policy file with more would be refused
 
 
 class HeldEvaluator(QueryEvaluator):
-    """Another evaluator, which is asked at a row's reset and then every so many steps of its episode; in between its
-    answers stay: for a model that is slow. With ``delay`` they come so many steps late: in step t, 0
-    at the reset, a row is shown the answers of step every · ⌊max(t - delay, 0) / every⌋.
+    """Another evaluator, asked now and then, as one acts with a costly one: in step t of its episode, 0 at the reset, a
+    row is given the answers of step every · ⌊max(t - delay, 0) / every⌋.
 
-    The evaluator runs in the environment, by ``transform()``, on the rows whose answers are due, without gradients; a
-    camera that it needs takes no other pictures. Here they are read: ``qaf_held_logits`` (B, S) float32 to
-    ``qaf_logits`` (B, S) float32. It is for acting: a policy is trained with the evaluator itself.
+    Reads ``qaf_held_logits`` (B, S) float32 and gives them as they are. ``transform()`` writes them: it runs the
+    evaluator, in eval mode and without gradients, on the rows of the environment whose answers are due, in blocks of
+    one size, so that results do not depend on the number of rows. Behind the evaluator's own transform, whose cameras
+    then draw no picture in vain. Steps are those of the environment; a ``_step`` or ``_reset`` mask counts for its rows
+    alone; after ``load_state_dict`` the environment must be reset.
+
+    Rows of a replay buffer have no such steps: train with the evaluator itself, and hold it when acting.
 
     Args:
-        evaluator: what is asked; its weights are shared.
-        every: steps from one asking to the next.
-        delay: steps until answers are shown; until then a row is shown those of its reset.
+        evaluator: what is asked; with :attr:`plans`, its plans.
+        every: steps of a row's episode from one asking to the next, from 1 to 65,536.
+        delay: steps until answers are shown, from 0 to 65,536; until then a row is given those of its reset.
+
+    Attributes:
+        evaluator: what is asked.
 
     Raises:
-        TypeError: ``evaluator`` is no :class:`QueryEvaluator`.
-        ValueError: it is held already; ``every`` under 1 or ``delay`` under 0.
+        TypeError: ``evaluator`` is no :class:`QueryEvaluator`, or a number is no integer.
+        ValueError: it is a HeldEvaluator, or a number is out of its range; at call time, there are no held answers.
 
     Example:
         >>> import lw_torchrl as lw
         >>> plans = lw.load_plans("MT10")
-        >>> seldom = lw.HeldEvaluator(lw.StateQueryEvaluator(plans), every=5)
-        >>> actor = lw.ScriptedSkillActor(plans, evaluator=seldom)
-        >>> result = lw.evaluate(actor, tasks="reach", episodes_per_task=1, seed=1_000, max_steps=8)
+        >>> held = lw.HeldEvaluator(lw.StateQueryEvaluator(plans), every=5, delay=2)
+        >>> actor = lw.ScriptedSkillActor(plans, evaluator=held)
+        >>> actor.in_keys
+        ['observation', 'task_id', 'qaf_held_logits']
+        >>> lw.evaluate(actor, tasks="reach", episodes_per_task=1, seed=1_000, max_steps=5).mean_success
+        0.0
 
     Source: paper section 'Differentiability and Optimization', which proposes to evaluate queries less often than at
     every step.
@@ -66,46 +65,80 @@ class HeldEvaluator(QueryEvaluator):
         if not isinstance(evaluator, QueryEvaluator):
             raise TypeError(f"evaluator must be a QueryEvaluator, got {type(evaluator).__name__}")
         if isinstance(evaluator, HeldEvaluator):
-            raise ValueError("evaluator must not be a HeldEvaluator itself: hold the one inside, .evaluator")
+            raise ValueError("evaluator must be no HeldEvaluator: hold the one inside it, its .evaluator")
         super().__init__(evaluator.plans)
         self.evaluator = evaluator
-        self.every, self.delay = check_int("every", every, minimum=1), check_int("delay", delay, minimum=0)
-        self.in_keys = [HELD]
-
-    def logits(self, *read: Tensor) -> Tensor:
-        return read[0]
-
-    def transform(self) -> Transform:
-        """A new one, which asks; behind what takes the pictures, where it needs any."""
-        inner = self.evaluator
-        asks = HeldAnswers(_Ask(inner), inner.in_keys, inner.plans.num_steps, self.every, self.delay)
-        before = inner.transform()
-        if isinstance(before, CameraTransform):
-            before.every = self.every
-        return asks if before is None else Compose(before, asks)
+        self.every, self.delay = _steps("every", every, 1), _steps("delay", delay, 0)
+        self.config = {"every": self.every, "delay": self.delay}
+        self.in_keys = ["qaf_held_logits"]
 
     @property
     def text_encoder(self) -> TextEncoder | None:
-        """Of the evaluator inside."""
+        """That of what is asked, if it reads texts; files are checked by it."""
         return getattr(self.evaluator, "text_encoder", None)
 
     @property
     def text_vectors(self) -> Tensor | None:
-        """Of the evaluator inside."""
+        """As :attr:`text_encoder`."""
         return getattr(self.evaluator, "text_vectors", None)
 
+    def logits(self, *read: Tensor) -> Tensor:
+        """The held logits (..., S), as they are."""
+        (held,) = read
+        if held is None:
+            raise ValueError(
+                "qaf_held_logits is needed, which HeldEvaluator.transform() writes in an environment; of rows of a "
+                "replay buffer ask the evaluator inside, its .evaluator"
+            )
+        return held
+
+    def ask(self, tensordict: TensorDictBase) -> Tensor:
+        """What the evaluator says of n rows with what it reads, (n, S) float32, of each whatever rows stand beside."""
+        with torch.no_grad(), evaluating(self.evaluator):
+            asked = in_blocks(self.evaluator)(tensordict.to(device_of(self.evaluator)))
+        found: Tensor = asked.get(self.evaluator.out_keys[0])
+        return found
+
+    def transform(self) -> Transform:
+        """A new one, which asks; behind that of the evaluator, if it has one."""
+        asks = HeldAnswers(
+            self.ask,
+            self.plans.num_steps,
+            every=self.every,
+            delay=self.delay,
+            in_keys=self.evaluator.in_keys,
+            out_key=self.in_keys[0],
+        )
+        own = self.evaluator.transform()
+        if own is None:
+            return asks
+        parts = list(own.transforms) if isinstance(own, Compose) else [own]
+        for part in parts:
+            if isinstance(part, CameraTransform) and self.every % part.every == 0:
+                part.every = self.every  # those between would not be looked at
+        return Compose(own, asks)
+
+    def made_for(self, plans: Plans) -> HeldEvaluator:
+        return HeldEvaluator(self.evaluator.made_for(plans), **self.config)
+
     def with_plans(self, plans: Plans) -> HeldEvaluator:
-        other = HeldEvaluator(self.evaluator.with_plans(plans), every=self.every, delay=self.delay)
-        return other.train(self.training)
+        """One that asks the same weights about other plans' conditions: training either trains both."""
+        return HeldEvaluator(self.evaluator.with_plans(plans), **self.config).train(self.training)
 
     def describe(self) -> dict[str, Any]:
-        options = {"evaluator": self.evaluator.describe(), "every": self.every, "delay": self.delay}
-        return {"kind": type(self).__name__, "options": options}
+        found = super().describe()
+        return found | {"options": {**found["options"], "evaluator": self.evaluator.describe()}}
 
     @classmethod
     def from_options(cls, plans: Plans, options: Mapping[str, Any], text_encoder: TextEncoder | None) -> HeldEvaluator:
-        inside = options.get("evaluator")
-        if isinstance(inside, Mapping) and inside.get("kind") == cls.__name__:  # however deep it says that it goes
-            raise ValueError("a HeldEvaluator cannot hold another")
-        evaluator = evaluator_from_description(inside, plans, text_encoder)
-        return cls(evaluator, every=options.get("every", 1), delay=options.get("delay", 0))
+        numbers = dict(options)
+        inside = numbers.pop("evaluator", None)
+        if isinstance(inside, Mapping) and inside.get("kind") == cls.__name__:  # before any of a long nest is made
+            raise ValueError("evaluator of a HeldEvaluator must be no HeldEvaluator")
+        return cls(evaluator_from_description(inside, plans, text_encoder), **numbers)
+
+
+def _steps(argument: str, given: Any, least: int) -> int:
+    if (value := check_int(argument, given, minimum=least)) > _MOST:
+        raise ValueError(f"{argument} must be at most {_MOST} steps, got {value}")
+    return value

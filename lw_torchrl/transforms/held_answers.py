@@ -1,4 +1,4 @@
-"""HeldAnswers: an evaluator's answers in an environment, asked now and then and held in between."""
+"""HeldAnswers: what a costly evaluator says of an environment's rows, asked now and then, and shown late."""
 
 from __future__ import annotations
 
@@ -10,42 +10,57 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 
-from lw_torchrl._blocks import in_blocks
-from lw_torchrl._keys import read
+from lw_torchrl._keys import check_apart, read
 from lw_torchrl.transforms.env_state import KeepsEnvState
 from lw_torchrl.transforms.held_truth import HeldTruth
 
-HELD = "qaf_held_logits"
-
 
 class HeldAnswers(KeepsEnvState):
-    """Writes ``qaf_held_logits`` (B, S) float32: in step t of its episode, 0 at the reset, a row is shown the answers
-    of step every · ⌊max(t - delay, 0) / every⌋.
+    """Writes logits (B, S) float32, asked for at a row's reset and then every so many steps of its episode, held in
+    between and shown so many steps late; :meth:`HeldEvaluator.transform` makes it.
 
-    Only the rows whose answers are due are asked, in blocks of one size. A ``_step`` or ``_reset`` mask counts for its
-    rows alone. Answers of episodes under way are no part of ``state_dict``, which holds the environment's, as
-    :class:`EnvState` does: after ``load_state_dict`` the environment must be reset. A replay buffer is refused.
+    Only the rows whose answers are due are asked about; rows that a ``_step`` or ``_reset`` mask leaves out are not. It
+    reads what is there where it stands: after a transform that changes the observation, the changed one. In an
+    environment its ``state_dict`` holds the environment's, as :class:`EnvState` does; after ``load_state_dict`` the
+    environment must be reset.
 
     Args:
-        ask: rows with ``in_keys`` to rows with ``qaf_logits`` (n, S) float32; pickled where the environment is.
-        in_keys: what it reads.
-        num_steps: S.
-        every: steps of a row's episode from one asking to the next.
-        delay: steps until answers are shown; until then a row is shown those of its reset.
+        ask: from a TensorDict of n rows with ``in_keys`` to their logits (n, S) float32.
+        columns: S.
+        every: steps of a row's episode from one asking to the next, at least 1.
+        delay: steps until answers are shown, at least 0; until then a row is shown those of its reset.
+        in_keys: what is read.
+        out_key: where the logits go.
+
+    Raises:
+        ValueError: on a replay buffer; something that is to be read is absent; something before it writes ``out_key``.
+        RuntimeError: a step of an environment that was never reset, or not since ``load_state_dict``.
     """
 
     def __init__(
         self,
-        ask: Callable[[TensorDictBase], TensorDictBase],
-        in_keys: Sequence[NestedKey],
-        num_steps: int,
+        ask: Callable[[TensorDictBase], Tensor],
+        columns: int,
+        *,
         every: int,
         delay: int,
+        in_keys: Sequence[NestedKey],
+        out_key: NestedKey,
     ) -> None:
-        super().__init__(in_keys=list(in_keys), out_keys=[HELD])
-        self.every, self.delay, self.num_steps = every, delay, num_steps
-        self._ask = ask
+        super().__init__(in_keys=list(in_keys), out_keys=[out_key])
+        check_apart(self.in_keys, self.out_keys)
+        self.ask, self.columns = ask, columns
         self._held = HeldTruth(every, delay)
+
+    @property
+    def every(self) -> int:
+        """Steps from one asking to the next."""
+        return self._held.every
+
+    @property
+    def delay(self) -> int:
+        """Steps until answers are shown."""
+        return self._held.delay
 
     def clone(self) -> HeldAnswers:
         """One for another environment, in which no episode has begun."""
@@ -59,39 +74,40 @@ class HeldAnswers(KeepsEnvState):
         self._held.forget()
 
     def _asked(self, tensordict: TensorDictBase, due: Tensor) -> Tensor:
-        """(..., S) float32, the answers of the rows that are due; 0 for the others."""
-        read(tensordict, self.in_keys)
-        shape = tensordict.batch_size
-        found = torch.zeros(shape.numel(), self.num_steps)
-        if (rows := due.reshape(-1).nonzero().flatten()).numel():
-            states = tensordict.select(*self.in_keys).reshape(-1)[rows]
-            found[rows] = in_blocks(self._ask)(states).get("qaf_logits").to(found)
-        return found.reshape(*shape, self.num_steps)
+        """(B, S) float32, the answers of the rows that are due, B bool; zeros of the others."""
+        first, *_ = read(tensordict, self.in_keys)
+        found = torch.zeros(due.numel(), self.columns, device=first.device)
+        rows = due.reshape(-1).nonzero().squeeze(-1)
+        if len(rows):
+            found[rows] = self.ask(tensordict.select(*self.in_keys).reshape(-1)[rows]).to(found.device)
+        return found.reshape(*due.shape, self.columns)
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        begun = tensordict.get("_reset", None)
-        shape = tensordict_reset.batch_size
+        begun, shape = tensordict.get("_reset", None), tensordict_reset.batch_size
         due = torch.ones(shape, dtype=torch.bool) if begun is None else begun.reshape(shape)
-        answers = self._asked(tensordict_reset, due)
-        return tensordict_reset.set(HELD, self._held.begin(answers, begun))
+        return tensordict_reset.set(self.out_keys[0], self._held.begin(self._asked(tensordict_reset, due), begun))
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        moved, step = tensordict.get("_step", None), self._held.step
-        which = torch.ones_like(step, dtype=torch.bool) if moved is None else moved.reshape(step.shape)
-        answers = self._asked(next_tensordict, which & ((step + 1) % self.every == 0))
-        return next_tensordict.set(HELD, self._held.go_on(answers, moved))
+        moved = tensordict.get("_step", None)
+        answers = self._asked(next_tensordict, self._held.due(moved))
+        return next_tensordict.set(self.out_keys[0], self._held.go_on(answers, moved))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Raise: rows of a replay buffer do not tell the steps of their episodes."""
+        """Raise: rows of a replay buffer are in no episode whose steps could be counted."""
         raise ValueError(
-            "HeldEvaluator counts the steps of an environment's episodes, which rows of a replay buffer do not tell: "
-            "train a policy with the evaluator itself, and hold it when the policy acts, "
-            "policy.with_evaluator(lw.HeldEvaluator(policy.evaluator, every=...))"
+            f"HeldEvaluator(every={self.every}, delay={self.delay}) counts the steps of an environment's episodes, "
+            "which rows of a replay buffer do not tell: train a policy with the evaluator inside it, and hold that "
+            "when acting, policy.with_evaluator(lw.HeldEvaluator(policy.evaluator, every=...))"
         )
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        """Add ``qaf_held_logits`` to the specs."""
+        """Add the logits to the specs."""
         assert isinstance(observation_spec, Composite)
-        shape = (*observation_spec.shape, self.num_steps)
-        observation_spec[HELD] = Unbounded(shape, dtype=torch.float32, device=observation_spec.device)
+        key, shape, device = self.out_keys[0], (*observation_spec.shape, self.columns), observation_spec.device
+        if key in observation_spec.keys(True, True):
+            raise ValueError(
+                f"two HeldEvaluators write {key!r}, the second over the first's answers: hold one, give the policy "
+                "qaf in the other's place"
+            )
+        observation_spec[key] = Unbounded(shape, dtype=torch.float32, device=device)
         return observation_spec

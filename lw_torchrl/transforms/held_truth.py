@@ -25,7 +25,7 @@ class HeldTruth:
     """Counts the steps of each row's episode and keeps the answers that it is still to be shown.
 
     In step t of its episode, 0 at the reset, a row is shown the answers of step
-    every · ⌊max(t - delay, 0) / every⌋.
+    every · ⌊max(t - delay, 0) / every⌋. Answers are truth, bool, or logits, float32: of one dtype from reset to reset.
 
     Args:
         every: steps from one taking of the answers to the next, at least 1.
@@ -36,7 +36,7 @@ class HeldTruth:
         self.every, self.delay = every, delay
         self._places = -(-delay // every) + 1  # for all that were taken and are still to be shown
         self._step: Tensor | None = None  # B int64
-        self._taken: Tensor | None = None  # (B, places, S) bool; answers that were taken n-th are in place n % places
+        self._taken: Tensor | None = None  # (B, places, S); answers that were taken n-th are in place n % places
 
     @property
     def step(self) -> Tensor:
@@ -60,11 +60,11 @@ class HeldTruth:
         """Rows are at the beginning of an episode.
 
         Args:
-            truth: (B, S), the answers in the rows' states, bool or logits.
+            truth: (B, S), the answers in the rows' states; only those of rows that begin are read, or of all at first.
             rows: B bool, or with a last dimension of 1, those that begin; None for all.
 
         Returns:
-            (B, S) bool, what each row is shown.
+            (B, S), what each row is shown, of the same dtype.
         """
         shape = truth.shape[:-1]
         if rows is None or self._step is None or self._taken is None:
@@ -76,13 +76,24 @@ class HeldTruth:
             self._taken = torch.where(begun[..., None, None], truth.unsqueeze(-2), self._taken)
         return self._shown()
 
+    def due(self, rows: Tensor | None) -> Tensor:
+        """B bool, of the rows that make the step to come those whose answers are taken after it; the others' are not
+        read by :meth:`go_on`.
+
+        Args:
+            rows: B bool, or with a last dimension of 1, those that make the step; None for all.
+
+        Raises:
+            RuntimeError: no episode has begun.
+        """
+        taken = (self.step + 1) % self.every == 0
+        return taken if rows is None else taken & rows.reshape(taken.shape)
+
     def go_on(self, truth: Tensor, rows: Tensor | None) -> Tensor:
         """Rows have made a step; arguments and result as for :meth:`begin`."""
-        step = self.step
-        moved = torch.ones_like(step, dtype=torch.bool) if rows is None else rows.reshape(step.shape)
-        self._step = step = step + moved
+        due = self.due(rows)
+        self._step = step = self.step + (1 if rows is None else rows.reshape(due.shape))
         assert self._taken is not None
-        due = moved & (step % self.every == 0)
         place = torch.arange(self._places, device=step.device) == (step // self.every % self._places).unsqueeze(-1)
         self._taken = torch.where((place & due.unsqueeze(-1)).unsqueeze(-1), truth.unsqueeze(-2), self._taken)
         return self._shown()

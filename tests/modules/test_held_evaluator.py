@@ -1,211 +1,419 @@
-"""HeldEvaluator: asked when answers are due and no more, held in between, late if asked; part of policies and files."""
+"""HeldEvaluator: what it asks when, that it holds answers as QAFTransform does, and that files keep it."""
 
 from __future__ import annotations
+
+import json
+import zipfile
 
 import pytest
 import torch
 from pictures import why_no_pictures
-from torchrl.data import LazyTensorStorage, ReplayBuffer
+from random_states import PLANS as STATES_PLANS
+from random_states import RandomStates
+from tensordict import TensorDict
+from torch import nn
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import Compose, SerialEnv, TransformedEnv, check_env_specs
 
 import lw_torchrl as lw
-from lw_torchrl.evaluation.swaps import TrueAnswers, with_true_answers
-from lw_torchrl.modules import EVALUATORS
-from lw_torchrl.trainers.evaluator_files import write_evaluator
+from lw_torchrl._blocks import BLOCK
+from lw_torchrl._tensor_archive import write_archive
+from lw_torchrl.evaluation.drift import condition_drift
+from lw_torchrl.evaluation.swaps import TrueAnswers, own_evaluators, with_true_answers
+from lw_torchrl.record.rollouts import run_recorded
+from lw_torchrl.trainers.evaluator_anchor import EvaluatorAnchor
 
 TASKS = ("drawer-open", "reach")
 PLANS = lw.Plans({task: lw.load_plans("MT10")[task] for task in TASKS})
+ROWS = 4
 
 
-def learned(seed=0):
-    torch.manual_seed(seed)
-    return lw.StateQueryEvaluator(PLANS, width=8, depth=1)
+def letters(texts):
+    return torch.tensor([[float(text.count(letter)) for letter in "abdefghilnoprstuw"] for text in texts])
 
 
-class Counting(lw.QueryEvaluator):
-    """The exact answers, with how many rows were asked for them."""
+def learned(plans=PLANS, **options):
+    torch.manual_seed(0)
+    return lw.StateQueryEvaluator(plans, width=8, depth=1, **options)
+
+
+def evaluated(actor, **options):
+    settings = {"tasks": TASKS, "episodes_per_task": 2, "seed": 1000, "max_steps": 12, "progress": False}
+    seen = {}
+    keep = lambda one: seen.__setitem__((one.task, one.episode), one.steps)  # noqa: E731
+    result = lw.evaluate(actor, record_actions=True, on_episode=keep, **settings | options)
+    return [one.actions for one in result.episodes], seen
+
+
+def same(found, expected):
+    return all(torch.equal(one, other) for one, other in zip(found, expected, strict=True))
+
+
+class Spy(lw.QueryEvaluator):
+    """Exact answers; keeps how many rows it was asked about, and in which mode."""
 
     def __init__(self, plans):
         super().__init__(plans)
-        self.exact, self.asked = TrueAnswers(plans), []
+        self.exact, self.seen = TrueAnswers(plans), []
+        self.weight = nn.Parameter(torch.ones(()))
 
-    def logits(self, observation, task_id):
-        self.asked.append(observation.clone())
-        return self.exact.logits(observation, task_id)
-
-
-def actions(actor, **options):
-    settings = {"tasks": TASKS, "episodes_per_task": 2, "seed": 1000, "max_steps": 40, "progress": False}
-    result = lw.evaluate(actor, record_actions=True, **settings | options)
-    return [one.actions for one in result.episodes]
+    def logits(self, *read):
+        self.seen.append((len(read[1]), self.training, torch.is_grad_enabled()))
+        return self.weight * self.exact.logits(*read)
 
 
-def assert_same(found, expected):
-    for one, other in zip(found, expected, strict=True):
-        assert torch.equal(one, other)
+# --- what it answers -----------------------------------------------------------------------------------------------
 
 
-def test_asked_at_every_step_it_is_the_one_inside():
-    policy = lw.PlanConditionedActor(PLANS, width=8, evaluator=learned())
-    held = policy.with_evaluator(lw.HeldEvaluator(policy.evaluator), answers="logit")
-    assert held.in_keys == ["observation", "task_id", "qaf_held_logits"]
-    assert_same(actions(held), actions(policy))
+@pytest.mark.parametrize("kind", ["pcbc", "scripted", "outside"])
+def test_at_every_step_it_is_what_it_holds(kind):
+    evaluator, actor = learned(), lw.PlanConditionedActor(PLANS, width=8)
+    if kind == "outside":
+        runs = [evaluated(actor, evaluator=one) for one in (evaluator, lw.HeldEvaluator(evaluator))]
+    elif kind == "scripted":
+        held = lw.HeldEvaluator(evaluator)
+        runs = [evaluated(lw.ScriptedSkillActor(PLANS, evaluator=one)) for one in (evaluator, held)]
+    else:
+        policy = actor.with_evaluator(evaluator, answers="tanh")
+        runs = [evaluated(one) for one in (policy, policy.with_evaluator(lw.HeldEvaluator(evaluator), answers="tanh"))]
+    assert same(runs[0][0], runs[1][0])
 
 
-@pytest.mark.parametrize(("every", "delay"), [(7, 0), (1, 3), (5, 8)])
-def test_exact_answers_are_held_as_qaf_transform_holds_them(every, delay):
-    scripted = lw.ScriptedSkillActor(PLANS)
-    expected = actions(scripted, evaluator=lw.QAFTransform(PLANS, every=every, delay=delay))
+@pytest.mark.parametrize(("every", "delay"), [(1, 0), (5, 0), (1, 3), (5, 2)])
+def test_exact_answers_are_held_as_those_of_qaf_transform(every, delay):
+    actor = lw.ScriptedSkillActor(PLANS)
+    transform = lw.QAFTransform(PLANS, every=every, delay=delay)
     held = lw.HeldEvaluator(TrueAnswers(PLANS), every=every, delay=delay)
-    assert_same(actions(scripted.with_evaluator(held)), expected)
-    assert_same(actions(scripted, evaluator=held), expected)
-    at_once = actions(scripted)
-    assert not all(torch.equal(one, other) for one, other in zip(at_once, expected, strict=True))
+    expected, truth = evaluated(actor, evaluator=transform, max_steps=30, also_record=["qaf"])
+    found, answers = evaluated(actor, evaluator=held, max_steps=30, also_record=["qaf", "qaf_held_logits"])
+    inside, _ = evaluated(actor.with_evaluator(held), max_steps=30)
+    assert same(found, expected)
+    assert same(inside, expected)
+    for which, steps in truth.items():
+        assert torch.equal(steps["qaf"], answers[which]["qaf"])
+        assert torch.equal(steps["qaf"], answers[which]["qaf_held_logits"] == 5.0)
+    exact, _ = evaluated(actor, max_steps=30)
+    assert same(found, exact) == ((every, delay) == (1, 0))
+
+
+def both(env, every, delay, evaluator=None):
+    """The environment with held answers of a transform and of an evaluator."""
+    held = lw.HeldEvaluator(evaluator or TrueAnswers(STATES_PLANS), every=every, delay=delay)
+    return TransformedEnv(
+        env, Compose(lw.QAFTransform(STATES_PLANS, every=every, delay=delay), held.transform().clone())
+    )
+
+
+@pytest.mark.parametrize(("every", "delay"), [(1, 0), (3, 0), (2, 3)])
+def test_any_masks_of_steps_and_resets(every, delay):
+    env, drawn = both(RandomStates(ROWS), every, delay), torch.Generator().manual_seed(every)
+    state = env.reset()
+    for step in range(40):
+        mask = torch.rand(ROWS, generator=drawn) < 0.6
+        if step % 7 == 6 and mask.any():
+            state = env.reset(state.set("_reset", mask))
+        else:
+            state = env.step(state.set("action", torch.zeros(ROWS, 4)).set("_step", mask))["next"]
+        assert torch.equal(state["qaf"], state["qaf_held_logits"] > 0)
+
+
+@pytest.mark.parametrize("place", ["inside", "outside"])
+def test_workers_of_a_serial_env(place):
+    if place == "inside":
+        env = SerialEnv(2, [lambda: both(RandomStates(2, 5), 3, 1), lambda: both(RandomStates(2, 6, first=2), 3, 1)])
+    else:
+        env = both(SerialEnv(2, [lambda: RandomStates(2, 5), lambda: RandomStates(2, 6, first=2)]), 3, 1)
+    rollout = env.rollout(25, break_when_any_done=False)
+    env.close()
+    for part in (rollout, rollout["next"]):
+        assert torch.equal(part["qaf"], part["qaf_held_logits"] > 0)
+
+
+def test_a_single_environment_and_its_specs():
+    held = lw.HeldEvaluator(learned(), every=3, delay=1)
+    env = TransformedEnv(lw.LanguageWorldEnv("reach", batch_size=(), max_steps=4), held.transform())
+    check_env_specs(env)
+    rollout = env.rollout(9, break_when_any_done=False)
+    env.close()
+    assert rollout["qaf_held_logits"].shape == (9, PLANS.num_steps)
+    assert rollout["qaf_held_logits"].dtype == torch.float32
+    assert torch.equal(rollout["qaf_held_logits"][1], rollout["qaf_held_logits"][0])
+
+
+# --- what it asks --------------------------------------------------------------------------------------------------
+
+
+def test_it_asks_about_the_rows_that_are_due_and_no_others():
+    spy = Spy(STATES_PLANS).train()
+    transform = lw.HeldEvaluator(spy, every=3).transform()
+    asked, ask = [], transform.ask
+    transform.ask = lambda rows: asked.append(len(rows)) or ask(rows)
+    env = TransformedEnv(RandomStates(ROWS), transform)
+    state = env.reset()
+    assert asked == [ROWS]
+    steps = torch.zeros(ROWS, dtype=torch.int64)
+    for mask in ([1, 1, 1, 0], [1, 1, 0, 0], [1, 1, 0, 0], [0, 0, 1, 0], [0, 0, 1, 1], [1, 0, 0, 1], [0, 0, 0, 1]):
+        moved, before = torch.tensor(mask, dtype=torch.bool), len(asked)
+        state = env.step(state.set("action", torch.zeros(ROWS, 4)).set("_step", moved))["next"]
+        steps += moved
+        due = int((moved & (steps % 3 == 0)).sum())
+        assert asked[before:] == ([due] if due else [])
+    env.reset(state.set("_reset", torch.tensor([False, True, True, False])))
+    assert asked == [ROWS, 2, 1, 1, 2]
+    assert spy.seen == [(BLOCK, False, False)] * len(asked), "padded blocks, in eval mode, without gradients"
+    assert spy.training
+    assert spy.exact.training
+
+
+def test_blocks_are_of_one_size_however_many_rows():
+    spy = Spy(STATES_PLANS)
+    env = TransformedEnv(RandomStates(BLOCK + 6), lw.HeldEvaluator(spy).transform())
+    env.reset()
+    assert [rows for rows, *_ in spy.seen] == [BLOCK, BLOCK]
 
 
 def test_results_do_not_depend_on_num_envs():
-    actor = lw.PlanConditionedActor(PLANS, width=8, evaluator=lw.HeldEvaluator(learned(), every=4))
-    assert_same(actions(actor, num_envs=4), actions(actor, num_envs=2))
-
-
-def test_only_rows_whose_answers_are_due_are_asked():
-    inside = Counting(PLANS)
-    held = lw.HeldEvaluator(inside, every=3)
-    env = TransformedEnv(lw.LanguageWorldEnv(TASKS, num_envs=4, seed=1), held.transform())
-    state = env.reset()
-    counts = []
-
-    def asked():
-        """Different rows since the last look; blocks are filled with copies."""
-        rows = torch.cat(inside.asked).unique(dim=0) if inside.asked else torch.zeros(0)
-        inside.asked.clear()
-        counts.append(len(rows))
-
-    asked()
-    for step in range(1, 7):
-        moved = torch.tensor([True, True, True, step != 2])  # the last row is a step behind from there on
-        state = env.step(env.rand_action(state).set("_step", moved))["next"]
-        asked()
-    assert counts == [4, 0, 0, 3, 1, 0, 3]
-    env.reset(state.set("_reset", torch.tensor([False, True, False, False])))
-    asked()
-    assert counts[-1] == 1
-    env.close()
-
-
-def test_specs_and_workers():
-    env = TransformedEnv(lw.LanguageWorldEnv(TASKS), lw.HeldEvaluator(learned(), every=2).transform())
-    check_env_specs(env)
-    env.close()
-    workers = SerialEnv(2, lambda: lw.LanguageWorldEnv("reach", max_steps=3))
-    env = TransformedEnv(workers, lw.HeldEvaluator(learned(), every=2).transform())
-    assert env.rollout(7, break_when_any_done=False)["qaf_held_logits"].shape == (2, 1, 7, PLANS.num_steps)
-    env.close()
-
-
-def test_after_load_state_dict_a_reset_is_wanted():
-    def make():
-        return TransformedEnv(lw.LanguageWorldEnv("reach"), lw.HeldEvaluator(learned(), every=2).transform())
-
-    env, other = make(), make()
-    env.reset()
-    began = other.reset()
-    other.load_state_dict(env.state_dict())
-    with pytest.raises(RuntimeError, match=r"since load_state_dict"):
-        other.step(other.rand_action(began))
-    assert other.reset()["episode"] == 1
-    env.close()
-    other.close()
-
-
-def test_policies_and_evaluators_with_it_are_made_again_from_files(tmp_path):
-    held = lw.HeldEvaluator(learned(), every=6, delay=2)
-    actor = lw.PlanConditionedActor(PLANS, width=8, evaluator=held).eval()
-    lw.save_actor(actor, tmp_path / "policy.zip")
-    again = lw.load_actor(tmp_path / "policy.zip")
-    assert (again.evaluator.every, again.evaluator.delay) == (6, 2)
-    assert_same(actions(again), actions(actor))
-    lw.save_evaluator(held, tmp_path / "evaluator.zip")
-    other = lw.load_evaluator(tmp_path / "evaluator.zip", PLANS)
-    scripted = lw.ScriptedSkillActor(PLANS)
-    assert_same(actions(scripted.with_evaluator(other)), actions(scripted.with_evaluator(held)))
-
-
-def test_a_file_that_goes_deeper_and_deeper_is_refused(tmp_path):
-    held = lw.HeldEvaluator(learned())
-
-    class Deep(lw.HeldEvaluator):
-        def describe(self):
-            return {"kind": "HeldEvaluator", "options": {"evaluator": super().describe(), "every": 1, "delay": 0}}
-
-    deep = Deep(learned())
-    deep.describe = lambda: {"kind": "HeldEvaluator", "options": {"evaluator": held.describe(), "every": 1}}
-    write_evaluator(deep, tmp_path / "deep.zip", {})
-    with pytest.raises(ValueError, match=r"a HeldEvaluator cannot hold another"):
-        lw.load_evaluator(tmp_path / "deep.zip", PLANS)
-    assert "HeldEvaluator" in EVALUATORS
-
-
-def test_other_plans_share_the_weights_of_the_one_inside():
     held = lw.HeldEvaluator(learned(), every=4, delay=1)
-    other = held.with_plans(lw.Plans({"reach": PLANS["reach"]}))
-    assert (other.every, other.delay) == (4, 1)
-    assert {id(weight) for weight in other.parameters()} == {id(weight) for weight in held.parameters()}
+    actor = lw.PlanConditionedActor(PLANS, width=8).with_evaluator(held, answers="logit")
+    runs = [evaluated(actor, num_envs=n, episodes_per_task=3, also_record=["qaf_held_logits"]) for n in (2, 4, 6)]
+    for actions, seen in runs[1:]:
+        assert same(actions, runs[0][0])
+        assert all(torch.equal(seen[one]["qaf_held_logits"], runs[0][1][one]["qaf_held_logits"]) for one in seen)
 
 
-def test_true_answers_take_its_place():
-    actor = lw.ScriptedSkillActor(PLANS, evaluator=lw.HeldEvaluator(learned(), every=4))
-    assert_same(actions(with_true_answers(actor)), actions(lw.ScriptedSkillActor(PLANS)))
-    result = lw.evaluate(
-        actor, tasks="drawer-open", episodes_per_task=1, seed=1000, max_steps=150, attribute=True, progress=False
-    )
-    assert [failure.cause for failure in result.failures] == ["query"]
-    assert result.failures[0].evidence["answers_wrong"] > 0.1
+def test_weights_that_change_are_asked_as_they_are():
+    spy = Spy(STATES_PLANS)
+    env = TransformedEnv(RandomStates(ROWS), lw.HeldEvaluator(spy).transform())
+    before = env.reset()["qaf_held_logits"]
+    with torch.no_grad():
+        spy.weight *= 2
+    assert before.abs().unique().tolist() == [5.0]
+    assert env.reset()["qaf_held_logits"].abs().unique().tolist() == [10.0]
+    assert not [name for name in env.transform.state_dict() if "weight" in name]
 
 
-def test_it_is_for_acting():
-    env = lw.LanguageWorldEnv("reach")
-    rows = env.rollout(3).reshape(-1)
-    env.close()
-    buffer = ReplayBuffer(storage=LazyTensorStorage(3), transform=lw.HeldEvaluator(learned()).transform(), batch_size=2)
-    buffer.extend(rows)
-    with pytest.raises(ValueError, match=r"train a policy with the evaluator itself"):
-        buffer.sample()
+# --- with the rest -------------------------------------------------------------------------------------------------
 
 
-def test_a_camera_takes_no_other_pictures():
-    if missing := why_no_pictures():
-        pytest.skip(missing)
-    torch.manual_seed(0)
-    eyes = lw.ImageQueryEvaluator(PLANS, cameras="corner", height=16, width=16, hidden=8, depth=1, every=2)
-    transform = lw.HeldEvaluator(eyes, every=4).transform()
-    assert isinstance(transform, Compose)
-    assert transform[0].every == 4
-    assert eyes.transform().every == 2
-    actor = lw.ScriptedSkillActor(PLANS, evaluator=lw.HeldEvaluator(eyes, every=4))
-    four = lw.ImageQueryEvaluator(PLANS, **{**eyes.config, "every": 4})
-    four.load_state_dict(eyes.state_dict())
-    assert_same(actions(actor, max_steps=10), actions(lw.ScriptedSkillActor(PLANS, evaluator=four), max_steps=10))
+def test_after_a_loaded_state_a_reset_is_wanted():
+    env = TransformedEnv(RandomStates(2), lw.HeldEvaluator(TrueAnswers(STATES_PLANS), every=2).transform())
+    state = env.reset()
+    env.load_state_dict(env.state_dict())
+    with pytest.raises(RuntimeError, match=r"not since load_state_dict.*reset the environment"):
+        env.step(state.set("action", torch.zeros(2, 4)))
 
 
-def test_what_cannot_be_is_named():
-    with pytest.raises(TypeError, match=r"evaluator must be a QueryEvaluator, got QAFTransform"):
-        lw.HeldEvaluator(lw.QAFTransform(PLANS))
-    with pytest.raises(ValueError, match=r"must not be a HeldEvaluator itself"):
-        lw.HeldEvaluator(lw.HeldEvaluator(learned()))
-    with pytest.raises(ValueError, match=r"every must be at least 1, got 0"):
-        lw.HeldEvaluator(learned(), every=0)
-    with pytest.raises(ValueError, match=r"delay must be at least 0, got -1"):
-        lw.HeldEvaluator(learned(), delay=-1)
+def test_true_answers_take_its_place_and_nothing_inside_it():
+    held = lw.HeldEvaluator(Spy(PLANS), every=20)
+    actor = lw.PlanConditionedActor(PLANS, width=8).with_evaluator(held, answers="hard")
+    assert own_evaluators(actor) == [held]
+    true = with_true_answers(actor)
+    assert true.in_keys == ["observation", "task_id"]
+    assert isinstance(true.evaluator, TrueAnswers)
+    assert own_evaluators(true) == [true.evaluator]
+    assert isinstance(actor.evaluator.evaluator, Spy)
+    expected, _ = evaluated(actor.with_evaluator(TrueAnswers(PLANS), answers="logit"))
+    assert same(evaluated(true)[0], expected)
+
+
+def test_late_answers_are_what_failed():
+    """A plan that is carried out with exact answers, and not with those of the reset."""
+    held = lw.HeldEvaluator(TrueAnswers(PLANS), every=500)
+    actor = lw.ScriptedSkillActor(PLANS, evaluator=held)
+    run = {"tasks": "drawer-open", "episodes_per_task": 1, "seed": 7, "max_steps": 80, "progress": False}
+    [failure] = lw.evaluate(actor, attribute=True, stop_at_success=True, **run).failures
+    assert failure.cause == "query"
+    assert failure.swaps["query"] is True
+
+
+def test_recordings_have_both_truths():
+    actor = lw.ScriptedSkillActor(PLANS, evaluator=lw.HeldEvaluator(TrueAnswers(PLANS), every=4))
+    [episode] = run_recorded(actor, "drawer-open", seed=7, max_steps=30)
+    exact = lw.QAFTransform(PLANS)(episode.steps.select("observation", "task_id"))["qaf"]
+    believed = episode.steps["qaf_logits"] > 0
+    assert torch.equal(believed, exact[torch.arange(30) // 4 * 4])
+    assert not torch.equal(believed, exact)
+    agreement = [one.agreement for one in condition_drift(actor, episode.steps)]
+    assert min(agreement) < 1.0
+
+
+def test_other_plans_share_its_weights():
+    drawer = lw.Plans({"drawer-open": PLANS["drawer-open"]})
+    actor = lw.ScriptedSkillActor(PLANS, evaluator=lw.HeldEvaluator(learned(), every=3, delay=1).eval())
+    other = actor.with_plans(drawer).evaluator
+    assert (other.every, other.delay, other.training) == (3, 1, False)
+    assert {id(one) for one in other.parameters()} == {id(one) for one in actor.parameters()}
+    made = actor.evaluator.made_for(drawer)
+    assert (made.every, made.evaluator.config) == (3, actor.evaluator.evaluator.config)
+    assert not {id(one) for one in made.parameters()} & {id(one) for one in actor.parameters()}
+
+
+# --- files ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("structure", [True, False])
+def test_files_keep_it(structure, tmp_path):
+    held = lw.HeldEvaluator(learned(structure=structure, text_encoder=letters), every=5, delay=2)
+    actor = lw.PlanConditionedActor(PLANS, width=8, text_encoder=letters).with_evaluator(held)
+    lw.save_actor(actor, tmp_path / "policy.zip")
+    again = lw.load_actor(tmp_path / "policy.zip", text_encoder=letters)
+    assert again.evaluator.describe() == held.describe()
+    assert same(evaluated(again)[0], evaluated(actor)[0])
+    lw.save_evaluator(held, tmp_path / "evaluator.zip")
+    other = lw.load_evaluator(tmp_path / "evaluator.zip", PLANS, text_encoder=letters)
+    assert (other.every, other.delay) == (5, 2)
+    assert same(other.state_dict().values(), held.state_dict().values())
+    if not structure:
+        with pytest.raises(ValueError, match="text_encoder is not the one"):
+            lw.load_evaluator(tmp_path / "evaluator.zip", PLANS, text_encoder=lambda texts: letters(texts).flip(-1))
+
+
+def hostile(options, nest=0):
+    found = {"kind": "StateQueryEvaluator", "options": {"width": 8, "depth": 1}}
+    for _ in range(nest):
+        found = {"kind": "HeldEvaluator", "options": {"evaluator": found}}
+    return {"kind": "HeldEvaluator", "options": {"evaluator": found, **options}}
+
+
+@pytest.mark.parametrize(
+    "described",
+    [
+        hostile({}, nest=1),
+        hostile({}, nest=150),
+        hostile({"every": 0}),
+        hostile({"every": "2"}),
+        hostile({"every": 2**16 + 1}),
+        hostile({"delay": 10**9}),
+        hostile({"delay": -1}),
+        hostile({"nonsense": 1}),
+        hostile({"evaluator": None}),
+        hostile({"evaluator": {"kind": "os", "options": {}}}),
+        hostile({"evaluator": [1]}),
+        {"kind": "HeldEvaluator", "options": {}},
+    ],
+    ids=lambda described: json.dumps(described)[-60:],
+)
+def test_a_strangers_file_is_refused(described, tmp_path):
+    held = lw.HeldEvaluator(learned())
+    lw.save_evaluator(held, tmp_path / "good.zip")
+    with zipfile.ZipFile(tmp_path / "good.zip") as archive:
+        description = json.loads(archive.read("description.json"))
+    groups = {"weights": held.state_dict(), "texts": {}}
+    for name, one in (("good", description["evaluator"]), ("bad", described)):
+        kept = {key: value for key, value in description.items() if key != "sha256"} | {"evaluator": one}
+        write_archive(tmp_path / f"{name}.zip", kept, groups)
+    assert lw.load_evaluator(tmp_path / "good.zip", PLANS).every == 1
+    with pytest.raises(ValueError, match="cannot be made"):
+        lw.load_evaluator(tmp_path / "bad.zip", PLANS)
+
+
+# --- bad input -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "message"),
+    [
+        (lambda: lw.HeldEvaluator(PLANS), TypeError, "evaluator must be a QueryEvaluator, got Plans"),
+        (lambda: lw.HeldEvaluator(lw.HeldEvaluator(learned())), ValueError, r"no HeldEvaluator: hold the one inside"),
+        (lambda: lw.HeldEvaluator(learned(), every=0), ValueError, "every must be at least 1, got 0"),
+        (lambda: lw.HeldEvaluator(learned(), every=2.5), TypeError, "every must be an integer, got 2.5"),
+        (lambda: lw.HeldEvaluator(learned(), delay=-1), ValueError, "delay must be at least 0, got -1"),
+        (lambda: lw.HeldEvaluator(learned(), delay=10**6), ValueError, "delay must be at most 65536 steps"),
+    ],
+)
+def test_wrong_arguments_are_named(make, error, message):
+    with pytest.raises(error, match=message):
+        make()
+
+
+def rows():
+    return TensorDict(observation=torch.rand(6, 39), task_id=torch.full((6,), lw.task_id("reach")), batch_size=6)
+
+
+def test_a_replay_buffer_is_refused():
+    held = lw.HeldEvaluator(learned(), every=2)
+    replay = TensorDictReplayBuffer(storage=LazyTensorStorage(6), transform=held.transform(), batch_size=6)
+    replay.extend(rows())
+    with pytest.raises(ValueError, match=r"HeldEvaluator\(every=2, delay=0\).*do not tell: train a policy with the"):
+        replay.sample()
+
+
+def test_rows_without_held_answers_say_what_writes_them():
+    actor = lw.ScriptedSkillActor(PLANS, evaluator=lw.HeldEvaluator(learned()))
+    with pytest.raises(ValueError, match=r"without qaf_held_logits: HeldEvaluator.transform\(\) writes it"):
+        actor(rows())
+    for ask in (actor.evaluator, lambda found: condition_drift(actor, found), EvaluatorAnchor(actor)):
+        with pytest.raises(ValueError, match=r"in an environment; of rows of a replay buffer ask the evaluator inside"):
+            ask(rows())
+
+
+def test_two_of_them_in_one_environment_are_refused():
+    held = lw.HeldEvaluator(learned())
+    actor = lw.ScriptedSkillActor(PLANS, evaluator=held)
+    with pytest.raises(ValueError, match="two HeldEvaluators write 'qaf_held_logits'"):
+        evaluated(actor, evaluator=held)
+    residual = lw.ResidualActor(lw.PlanConditionedActor(PLANS, evaluator=held, width=8))
+    for member in (actor, residual):
+        with pytest.raises(ValueError, match="members must have no HeldEvaluator"):
+            lw.ActorEnsemble([member, member])
+
+
+# --- pictures ------------------------------------------------------------------------------------------------------
+
+
+SMALL = {"height": 16, "width": 24, "hidden": 8, "depth": 1}
+
+
+@pytest.mark.parametrize(("own", "every", "drawn"), [(1, 4, 4), (2, 4, 4), (4, 4, 4), (8, 4, 8), (2, 3, 2)])
+def test_cameras_draw_what_is_looked_at(own, every, drawn):
+    eyes = lw.ImageQueryEvaluator(PLANS, every=own, **SMALL)
+    camera, asks = lw.HeldEvaluator(eyes, every=every, delay=1).transform().transforms
+    assert (camera.every, asks.every, asks.delay) == (drawn, every, 1)
+    assert asks.in_keys == ["pixels", "task_id"]
+    assert eyes.transform().every == own
+
+
+class TestPictures:
+    @pytest.fixture(autouse=True)
+    def _needs_open_gl(self):
+        if missing := why_no_pictures():
+            pytest.skip(missing)
+
+    @pytest.mark.parametrize("inside", [True, False])
+    def test_at_every_step_it_is_what_it_holds(self, inside):
+        torch.manual_seed(0)
+        eyes, actor = lw.ImageQueryEvaluator(PLANS, **SMALL), lw.PlanConditionedActor(PLANS, width=8)
+        settings = {"episodes_per_task": 1, "max_steps": 6}
+        runs = []
+        for one in (eyes, lw.HeldEvaluator(eyes)):
+            if inside:
+                runs.append(evaluated(actor.with_evaluator(one, answers="logit"), **settings)[0])
+            else:
+                runs.append(evaluated(actor, evaluator=one, **settings)[0])
+        assert same(*runs)
+
+    def test_the_answers_are_of_the_pictures_of_steps_that_are_due(self):
+        torch.manual_seed(0)
+        eyes, actor = lw.ImageQueryEvaluator(PLANS, **SMALL), lw.PlanConditionedActor(PLANS, width=8)
+        held = actor.with_evaluator(lw.HeldEvaluator(eyes, every=4), answers="logit")
+        keys = ["pixels", "task_id", "qaf_held_logits"]
+        _, seen = evaluated(held, episodes_per_task=1, also_record=keys)
+        for steps in seen.values():
+            logits = steps["qaf_held_logits"]
+            assert torch.equal(logits, logits[torch.arange(12) // 4 * 4])
+            assert not torch.equal(logits[0], logits[4])
+            with torch.no_grad():
+                assert torch.allclose(logits, eyes.eval()(steps)["qaf_logits"], atol=1e-4)
 
 
 def test_rollouts_without_what_it_reads_are_refused():
-    actor = lw.ScriptedSkillActor(PLANS, evaluator=lw.HeldEvaluator(learned(), every=4))
+    """They had been told by the exact answers: no failure was a query's."""
+    actor = lw.ScriptedSkillActor(PLANS, evaluator=lw.HeldEvaluator(lw.StateQueryEvaluator(PLANS, width=8), every=4))
     found = []
     settings = {"seed": 1000, "max_steps": 30, "progress": False}
     lw.evaluate(
         actor,
-        tasks="drawer-open",
+        tasks=PLANS,
         episodes_per_task=1,
         also_record=["observation", "task_id", "episode", "qaf"],
         on_episode=found.append,
