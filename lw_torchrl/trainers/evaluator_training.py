@@ -71,7 +71,7 @@ class QueryEvaluatorTrainer:
         progress: bool = True,
     ) -> None:
         if not isinstance(evaluator, self.trains):
-            raise TypeError(f"evaluator must be of {self.trains.__name__}, got {type(evaluator).__name__}")
+            raise TypeError(f"evaluator must be of class {self.trains.__name__}, got {type(evaluator).__name__}")
         self.evaluator, self.config, self.progress = evaluator, config or QueryEvaluatorConfig(), progress
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
         self._gather(data)

@@ -252,7 +252,7 @@ def test_what_cannot_be_is_named(replay):
     with pytest.raises(ValueError, match="tasks must have all tasks of the rows"):
         lw.LabelledQueries(replay, SMALL, [lw.TASKS["reach"]])
     data = lw.LabelledQueries(replay, SMALL)
-    with pytest.raises(TypeError, match="must be a StateQueryEvaluator, got QueryEvaluator"):
+    with pytest.raises(TypeError, match="must be of class StateQueryEvaluator, got QueryEvaluator"):
         lw.QueryEvaluatorTrainer(lw.QueryEvaluator(PLANS), data)
     with pytest.raises(ValueError, match="must hold out states, queries or tasks"):
         score_evaluator(
