@@ -83,6 +83,8 @@ def train(
             anywhere.
     """
     check_file("--out", out)
+    if begin is not None and out.resolve() == begin.resolve():
+        raise ValueError("--out must be another file than --begin, which is only read")
     import torch
 
     import lw_torchrl as lw
@@ -132,7 +134,7 @@ def train(
     )
     torch.manual_seed(seed)
     if begin is not None:
-        actor = lw.load_actor(begin, text_encoder=encoder)
+        actor = _begun(begin, encoder)
         loaded = actor.plans if actor.plans is not None else loaded
         if evaluator is not None:
             actor = _with_evaluator(actor, evaluator, encoder, answers or "hard")
@@ -145,6 +147,11 @@ def train(
         actor = make_policy(method, shown, text_encoder=encoder, **options)
     loaded.require(replay.tasks)
     inside = getattr(actor, "evaluator", None)
+    if isinstance(inside, lw.HeldEvaluator):
+        which, mend = "--begin must have", "give the one to train by --evaluator"
+        if evaluator is not None:
+            which, mend = "--evaluator must be", "train with the one inside it, lw.save_evaluator(held.evaluator, FILE)"
+        raise ValueError(f"{which} no HeldEvaluator, of whose steps a dataset's rows tell nothing: {mend}")
     if isinstance(inside, lw.ImageQueryEvaluator):
         pictures: dict[str, Any] = {"cameras": inside.cameras, "height": inside.height, "width": inside.width}
         lw.add_pictures(data, **pictures)
@@ -167,6 +174,16 @@ def _all_of(data: Path, tasks: tuple[str, ...]) -> dict[str, list[int]]:
     for task in tasks:
         check_choice("tasks", task, found.config.tasks)
     return {task: [one.episode for one in found.episodes if one.task == task] for task in tasks}
+
+
+def _begun(path: Path, encoder: TextEncoder | None) -> Policy:
+    """The policy that ``--begin`` names; a checkpoint is elsewhere ``--out``."""
+    import lw_torchrl as lw
+
+    try:
+        return lw.load_actor(path, text_encoder=encoder)
+    except (OSError, ValueError) as error:
+        raise ValueError(str(error).replace("checkpoint:", "--begin:", 1)) from error
 
 
 def _refuse_beside_begin(given: dict[str, Any]) -> None:

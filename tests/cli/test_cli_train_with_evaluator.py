@@ -88,6 +88,38 @@ def test_what_makes_no_sense_is_refused(capsys, demos, trained, tmp_path):
     assert "dc" not in listed
 
 
+def test_what_cannot_be_begun_with_is_named(capsys, demos, trained, tmp_path):
+    out = ["--out", tmp_path / "x.zip"]
+    missing = fails(capsys, "train", demos, *out, "--begin", tmp_path / "none.zip")
+    assert "error: --begin: no file" in missing
+    evaluator = fails(capsys, "train", demos, *out, "--begin", trained / "evaluator.zip")
+    assert "error: --begin: " in evaluator
+    assert "is of format 'lw_torchrl.evaluator'" in evaluator
+    policy = trained / "policy.zip"
+    before = policy.read_bytes()
+    same = fails(capsys, "train", demos, "--out", policy, "--begin", policy, *SMALL)
+    assert "--out must be another file than --begin" in same
+    assert "delete" not in same
+    assert policy.read_bytes() == before
+
+
+def test_held_answers_are_not_trained(capsys, demos, trained, tmp_path):
+    """Of pictures it was told to draw a dataset's, which could not mend it."""
+    actor = lw.load_actor(trained / "policy.zip")
+    eyes = lw.ImageQueryEvaluator(actor.plans, height=16, width=24, hidden=8, depth=1)
+    out = ["--out", tmp_path / "x.zip", *SMALL]
+    for name, inside in (("state", lw.StateQueryEvaluator(actor.plans, width=8)), ("eyes", eyes)):
+        held = lw.HeldEvaluator(inside, every=5)
+        lw.save_evaluator(held, tmp_path / f"{name}.zip")
+        refused = fails(capsys, "train", demos, *out, "--evaluator", tmp_path / f"{name}.zip", *NET)
+        assert "error: --evaluator must be no HeldEvaluator" in refused
+        lw.save_actor(actor.with_evaluator(held), tmp_path / f"{name}-policy.zip")
+        refused = fails(capsys, "train", demos, *out, "--begin", tmp_path / f"{name}-policy.zip")
+        assert "error: --begin must have no HeldEvaluator" in refused
+        assert "--evaluator" in refused
+    assert not (tmp_path / "x.zip").exists()
+
+
 def test_cameras(capsys, demos, tmp_path):
     if missing := why_no_pictures():
         pytest.skip(missing)
