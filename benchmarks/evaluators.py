@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -49,6 +49,40 @@ class Arguments:
     out: Path = Path("runs/evaluators")
 
 
+def demonstrations(
+    root: Path, tasks: Sequence[str], seed: int, max_steps: int = 500
+) -> lw.LanguageWorldExperienceReplay:
+    """The recipe's, collected or what is left of it."""
+    lw.collect_demonstrations(
+        tasks,
+        episodes_per_task=RECIPE.demonstrations_per_task,
+        root=root,
+        seed=seed,
+        noise_scale=RECIPE.demonstration_noise,
+        noise_hold=RECIPE.noise_hold,
+        redraw_failures=True,
+        max_steps=max_steps,
+    )
+    return lw.LanguageWorldExperienceReplay(root, sampler=lw.TaskBalancedSampler(), after_success=RECIPE.after_success)
+
+
+def evaluated(file: Path, actor: Any, tasks: Sequence[str], episodes: int, seed: int) -> EvaluationResult:
+    """How an actor does, read from the file if it was done before."""
+    if file.is_file():
+        return EvaluationResult.load(file)
+    result = lw.evaluate(
+        actor,
+        tasks=tasks,
+        episodes_per_task=episodes,
+        seed=seed,
+        noise_scale=RECIPE.evaluation_noise,
+        stop_at_success=True,
+    )
+    file.parent.mkdir(parents=True, exist_ok=True)
+    result.save(file)
+    return result
+
+
 class Bench:
     """The parts of one seed, each kept in files and done once."""
 
@@ -57,19 +91,7 @@ class Bench:
         self.plans = lw.load_plans("MT10")
 
     def demonstrations(self) -> lw.LanguageWorldExperienceReplay:
-        root = self.folder / "demonstrations"
-        lw.collect_demonstrations(
-            self.args.tasks,
-            episodes_per_task=RECIPE.demonstrations_per_task,
-            root=root,
-            seed=self.seed,
-            noise_scale=RECIPE.demonstration_noise,
-            noise_hold=RECIPE.noise_hold,
-            redraw_failures=True,
-        )
-        return lw.LanguageWorldExperienceReplay(
-            root, sampler=lw.TaskBalancedSampler(), after_success=RECIPE.after_success
-        )
+        return demonstrations(self.folder / "demonstrations", self.args.tasks, self.seed)
 
     def policy(self) -> Any:
         """The few-shot policy, trained on exact answers."""
@@ -98,7 +120,7 @@ class Bench:
         evaluator = lw.StateQueryEvaluator(self.plans)
         file = self.folder / f"evaluator-{share:g}.zip"
         lw.QueryEvaluatorTrainer(evaluator, labelled, config, checkpoint=file).train()
-        report = score_evaluator(evaluator, lw.LabelledQueries(states, most))
+        report = score_evaluator(evaluator, labelled if config == most else lw.LabelledQueries(states, most))
         report.save(file.with_suffix(".json"))
         number = labelled.describe()["states"]["training"]
         print(f"seed {self.seed}, {number} labelled states:\n{report.table(most=2)}", flush=True)
@@ -128,19 +150,7 @@ class Bench:
 
     def success(self, name: str, actor: Any) -> EvaluationResult:
         file = self.folder / "results" / f"{name}.json"
-        if file.is_file():
-            return EvaluationResult.load(file)
-        result = lw.evaluate(
-            actor,
-            tasks=self.args.tasks,
-            episodes_per_task=self.args.episodes,
-            seed=self.args.evaluation_seed,
-            noise_scale=RECIPE.evaluation_noise,
-            stop_at_success=True,
-        )
-        file.parent.mkdir(parents=True, exist_ok=True)
-        result.save(file)
-        return result
+        return evaluated(file, actor, self.args.tasks, self.args.episodes, self.args.evaluation_seed)
 
     def run(self) -> Iterable[tuple[str, EvaluationResult]]:
         """Each row of the table: what answers, and how it went."""

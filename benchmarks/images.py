@@ -12,7 +12,7 @@ import torch
 import tyro
 
 import lw_torchrl as lw
-from benchmarks.evaluators import RECIPE, WHO
+from benchmarks.evaluators import WHO, demonstrations, evaluated
 from lw_torchrl._files import write_text
 from lw_torchrl.evaluation import EvaluationResult, plot_reliability, plot_wrong_answers, score_evaluator
 from lw_torchrl.evaluation.comparison import markdown_table
@@ -105,20 +105,8 @@ def evaluator(args: Arguments, plans: lw.Plans) -> Any:
 def tuned(args: Arguments, name: str, actor: Any) -> Any:
     """The policy and its evaluator, tuned by the loss of imitation through the softmax."""
     root = args.out / "demonstrations"
-    lw.collect_demonstrations(
-        args.tasks,
-        episodes_per_task=RECIPE.demonstrations_per_task,
-        root=root,
-        seed=args.seed,
-        noise_scale=RECIPE.demonstration_noise,
-        noise_hold=RECIPE.noise_hold,
-        redraw_failures=True,
-        max_steps=args.max_steps,
-    )
+    replay = demonstrations(root, args.tasks, args.seed, args.max_steps)
     lw.add_pictures(root, **args.pictures)
-    replay = lw.LanguageWorldExperienceReplay(
-        root, sampler=lw.TaskBalancedSampler(), after_success=RECIPE.after_success
-    )
     replay.add_column("pixels", lw.load_pictures(replay, **args.pictures))
     config = lw.BehavioralCloningConfig(
         steps=args.tuning_steps, batch_size=64, learning_rate=3e-4, normalize=False, seed=args.seed
@@ -126,23 +114,6 @@ def tuned(args: Arguments, name: str, actor: Any) -> Any:
     file = args.out / f"{name}.zip"
     lw.BehavioralCloningTrainer(actor, replay, config, checkpoint=file).train()
     return lw.load_actor(file)
-
-
-def success(args: Arguments, name: str, actor: Any) -> EvaluationResult:
-    file = args.out / "results" / f"{name}.json"
-    if file.is_file():
-        return EvaluationResult.load(file)
-    result = lw.evaluate(
-        actor,
-        tasks=args.tasks,
-        episodes_per_task=args.episodes,
-        seed=args.evaluation_seed,
-        noise_scale=RECIPE.evaluation_noise,
-        stop_at_success=True,
-    )
-    file.parent.mkdir(parents=True, exist_ok=True)
-    result.save(file)
-    return result
 
 
 def main(args: Arguments) -> None:
@@ -155,7 +126,9 @@ def main(args: Arguments) -> None:
     found: dict[str, list[EvaluationResult]] = {}
 
     def note(row: str, name: str, actor: Any) -> None:
-        found.setdefault(row, []).append(result := success(args, name, actor))
+        file = args.out / "results" / f"{name}.json"
+        result = evaluated(file, actor, args.tasks, args.episodes, args.evaluation_seed)
+        found.setdefault(row, []).append(result)
         print(f"{name}: {result.mean_success:.3f}", flush=True)
 
     scripted = lw.ScriptedSkillActor(plans)

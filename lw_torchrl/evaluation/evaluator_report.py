@@ -150,7 +150,7 @@ def _score(evaluator: ClauseEvaluator, data: LabelledQueries, part: str) -> Part
     reliability = torch.zeros(BINS, 3, dtype=torch.float64)
     with evaluating(evaluator):
         for one in data.parts[part]:
-            for logits, truth in _told(evaluator, one):
+            for logits, truth in clause_logits(evaluator, one):
                 correct = (logits > 0) == truth
                 for column, clause in enumerate(one.clauses):
                     found = [(truth[:, column] == bool(value)) for value in (0, 1)]
@@ -163,7 +163,7 @@ def _score(evaluator: ClauseEvaluator, data: LabelledQueries, part: str) -> Part
     return PartScore(right, asked, reliability)
 
 
-def _told(evaluator: ClauseEvaluator, asked: Asked) -> list[tuple[Tensor, Tensor]]:
+def clause_logits(evaluator: ClauseEvaluator, asked: Asked) -> list[tuple[Tensor, Tensor]]:
     """Logits (R, Q) that the predicates hold, and their truth; of an evaluator that reads texts also as it answers the
     negations."""
     coded, vectors = evaluator.code([(asked.task, clause) for clause in asked.clauses])

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from lw_torchrl.evaluation.evaluator_report import clause_logits
 from lw_torchrl.evaluation.figures import check_image, saved
 from lw_torchrl.language.queries import Clause
 from lw_torchrl.modules.image_query_evaluator import ImageQueryEvaluator
@@ -19,8 +20,6 @@ from lw_torchrl.trainers.labelled_queries import Asked, LabelledQueries
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-_ROWS = 256
 
 
 @dataclass(frozen=True)
@@ -60,31 +59,20 @@ def wrong_answers(evaluator: ImageQueryEvaluator, data: LabelledQueries, most: i
 @torch.no_grad()
 def _worst(evaluator: ImageQueryEvaluator, asked: Asked) -> list[WrongAnswer]:
     """Of each clause that was ever answered wrongly, the surest wrong answer."""
-    clauses, vectors = evaluator.code([(asked.task, clause) for clause in asked.clauses])
-    pixels = asked.seen("pixels")
     with evaluating(evaluator):
-        told = torch.cat(
-            [
-                evaluator.network(rows, clauses.pick(torch.arange(len(asked.clauses)).expand(len(rows), -1)), vectors)
-                for rows in pixels.split(_ROWS)
-            ]
-        ).sigmoid()
-        off = (told - asked.truth.float()).abs()
-        rows = off.argmax(0)
-        wrong = [
-            (int(row), column)
-            for column, row in enumerate(rows.tolist())
-            if (told[row, column] > 0.5) != asked.truth[row, column]
-        ]
+        logits, truth = clause_logits(evaluator, asked)[0]
+        believed = logits.sigmoid()
+        off = (believed - truth.float()).abs()
         return [
             WrongAnswer(
                 asked.clauses[column],
-                bool(asked.truth[row, column]),
-                float(told[row, column]),
-                pixels[row],
+                bool(truth[row, column]),
+                float(believed[row, column]),
+                asked.seen("pixels")[row],
                 _off(evaluator, asked, row, asked.clauses[column]),
             )
-            for row, column in wrong
+            for column, row in enumerate(off.argmax(0).tolist())
+            if (believed[row, column] > 0.5) != truth[row, column]
         ]
 
 

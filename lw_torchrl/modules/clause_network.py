@@ -15,7 +15,7 @@ from lw_torchrl.modules.networks import text_to_latent
 
 MOST = 30.0
 """The size of the largest logit of a clause: a probability of 1e-13."""
-SCALES = (0.005, 0.02, 0.1, 0.5)  # metres: where the squashed copies of d bend
+_SCALES = (0.005, 0.02, 0.1, 0.5)  # metres: where the squashed copies of d bend
 _SLOTS = len(POSITIONS) + 2  # the opening, and nothing, beside the positions
 
 
@@ -69,7 +69,7 @@ class ClauseNetwork(nn.Module):
         check_int("depth", depth, minimum=1)
         self.width, self.reads_text = width, not predicates
         self.trunk = MLP(
-            in_features=self.numbers * len(SCALES),
+            in_features=self.numbers * len(_SCALES),
             out_features=width,
             num_cells=[width] * (depth - 1),
             activation_class=nn.ReLU,
@@ -101,7 +101,7 @@ class ClauseNetwork(nn.Module):
     def judge(self, d: Tensor, asked: Tensor, negated: Tensor | None) -> Tensor:
         """The logits (B, C) of differences d (B, C, 3) and what is asked of them (B, C, W + 1); ``negated`` (B, C) bool
         turns some around."""
-        features = torch.cat([torch.tanh(d / scale) for scale in SCALES], -1)
+        features = torch.cat([torch.tanh(d / scale) for scale in _SCALES], -1)
         logits = (self.trunk(features) * asked[..., :-1]).sum(-1) / sqrt(self.width) + asked[..., -1]
         if negated is not None:
             logits = torch.where(negated, -logits, logits)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from evaluator_rows import assert_a_logit_for_each_step
 from pictures import why_no_pictures
 from tensordict import TensorDict
 from torch import nn
@@ -43,16 +44,7 @@ def states(rows=10, shape=(16, 48)):
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_logit_for_each_step_whatever_the_order_and_shape_of_rows(kind):
     evaluator, found = make(kind), states(64)
-    logits = evaluator(found.clone())["qaf_logits"]
-    assert logits.shape == (64, PLANS.num_steps)
-    assert logits.dtype == torch.float32
-    for row, task in enumerate(found["task_id"].tolist()):
-        steps = len(PLANS[lw.MT50[task]].steps)
-        assert (logits[row, :steps].abs() <= 31).all()
-        assert (logits[row, steps:] == -1e4).all()
-    order = torch.randperm(64, generator=torch.Generator().manual_seed(1))
-    assert torch.equal(evaluator(found[order])["qaf_logits"], logits[order])
-    assert torch.equal(evaluator(found.reshape(4, 16))["qaf_logits"].reshape(64, -1), logits)
+    assert_a_logit_for_each_step(evaluator, found)
 
 
 @pytest.mark.parametrize("kind", KINDS)
