@@ -73,11 +73,13 @@ class Member:
         actor: its options.
         plan_actor: more options, of :class:`PlanConditionedActor` alone.
         yaw: scale of :class:`RandomYaw` on its demonstrations, in radians.
+        any_yaw: with plans, rows whose steps in force say no direction are turned by any angle.
     """
 
     actor: Mapping[str, Any] = field(hash=False)
     plan_actor: Mapping[str, Any] = field(default_factory=dict, hash=False)
     yaw: float = 0.0
+    any_yaw: bool = False
 
     def __post_init__(self) -> None:
         for name in ("actor", "plan_actor"):  # a frozen recipe's options are read-only, too
@@ -121,16 +123,18 @@ _STRONG = Preset(
 )
 _STRONG_ZERO_SHOT = replace(
     _STRONG,
-    # Each leans on something else in tasks that it was never shown: on the demonstrations as they are, on the hand's
-    # height and the gripper's opening, on neither.
+    # What the words are about, and little else: whatever else tells tasks apart is another thing in tasks that were
+    # never shown. Methods without plans cannot know it, and see all differences.
     members=(
-        *_STRONG.members,
-        *(
-            Member({"features": features, "width": 512, "feature_noise": 0.1}, {"swap_unmentioned": 0.5}, yaw=0.3)
-            for features in ("differences", "relative")
+        Member(
+            {"features": "relative", "width": 256, "feature_noise": 0.1},
+            {"features": "opening", "roles": True, "jitter": 0.03, "hide_opening": 1.0, "feature_noise": 0.05},
+            yaw=0.3,
+            any_yaw=True,
         ),
-    ),
-    training=BehavioralCloningConfig(steps=8_000, batch_size=200),
+    )
+    * 4,
+    training=BehavioralCloningConfig(steps=4_000, batch_size=200),
 )
 _STRONG_ONE_SHOT = replace(
     _STRONG,

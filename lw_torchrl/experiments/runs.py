@@ -110,6 +110,14 @@ class Run:
         more = member.plan_actor if policy_class(METHODS[self.method].policy).plan_options else {}
         return {**member.actor, **more}
 
+    def any_yaw(self, member: Member) -> bool:
+        """Whether it knows by its plans which rows of a member may be turned by any angle."""
+        return member.any_yaw and policy_class(METHODS[self.method].policy).plan_options
+
+    def _describe_member(self, member: Member) -> dict[str, Any]:
+        found = {"actor": self.actor_options(member), "yaw": member.yaw}
+        return found | {"any_yaw": True} if self.any_yaw(member) else found
+
     @property
     def skills(self) -> Literal["own", "MT10"]:
         """Whose skills its plans speak of, as for :func:`~lw_torchrl.load_plans`: what is trained on MT10 and never saw
@@ -126,7 +134,7 @@ class Run:
                 "setting": self.setting.name,
                 "preset": self.preset.name,
                 "datasets": [asdict(dataset) for dataset in self.datasets],
-                "members": [{"actor": self.actor_options(one), "yaw": one.yaw} for one in self.preset.members],
+                "members": [self._describe_member(one) for one in self.preset.members],
                 "training": self.preset.training.describe(),
                 "label": self.preset.label,
                 "after_success": self.preset.after_success,

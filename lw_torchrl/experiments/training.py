@@ -32,9 +32,10 @@ def _make_actor(run: Run, member: Member, plans: Plans, seed: int, text_encoder:
     return make_policy(run.method, plans, text_encoder=text_encoder, **run.actor_options(member))
 
 
-def _transform(actor: Policy, member: Member) -> Transform:
+def _transform(run: Run, actor: Policy, member: Member) -> Transform:
     queries = actor.transform()
-    return Compose(*([] if queries is None else [queries]), *([RandomYaw(member.yaw)] if member.yaw else []))
+    turned = RandomYaw(member.yaw, plans=actor.plans if run.any_yaw(member) else None)
+    return Compose(*([] if queries is None else [queries]), *([turned] if member.yaw else []))
 
 
 def _config(run: Run, rows: int, seed: int) -> BehavioralCloningConfig:
@@ -88,7 +89,7 @@ def train_one(
         )
         config = _config(run, len(replay), run.seed + 1_000 * number)
         actors.append(_make_actor(run, member, plans, config.seed, text_encoder))
-        replay.append_transform(_transform(actors[-1], member))
+        replay.append_transform(_transform(run, actors[-1], member))
         checkpoint = folder / f"checkpoint-{number}.zip"
         options: dict[str, Any] = {"checkpoint": checkpoint, "progress": progress, "device": device}
         BehavioralCloningTrainer(actors[-1], replay, config, **options).train()
@@ -129,7 +130,7 @@ def train_each(
                 roots,
                 episodes=[None, {target: 1}],
                 sampler=CoLearningSampler(target),
-                transform=_transform(actor, member),
+                transform=_transform(run, actor, member),
                 label=run.preset.label,
                 after_success=run.preset.after_success,
                 device=device,

@@ -12,13 +12,17 @@ from dataclasses import dataclass, replace
 from functools import cache
 from typing import Literal
 
-from lw_torchrl.language.named_objects import GRIPPER, typed
+from lw_torchrl.language.named_objects import GRIPPER, NamedObject, typed
+from lw_torchrl.language.observation import GOAL
 from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.plans import ConditionalPlan, PlanStep
 from lw_torchrl.language.skills import ScriptedSkill, skills_for
 from lw_torchrl.language.tasks import TASKS, Task
 
 Source = Literal["skill", "reworded", "words", "condition", "nothing"]
+_TARGET = "target location"
+_GOAL = NamedObject(_TARGET, (GOAL.start, GOAL.start + 1, GOAL.start + 2))
+_NAMES_OF_THE_GOAL = (_TARGET, "reach target")
 _TOOL = re.compile(r"(?<!in line )(?<!level )(?<!aligned )\bwith (the )?(?=<)")
 
 
@@ -42,6 +46,11 @@ class Roles:
 _NOTHING = Roles(None, None, "nothing")
 
 
+def role_object(task: Task, name: str) -> NamedObject:
+    """The object of a role: the task's, or the goal, which every observation tells, as "target location"."""
+    return _GOAL if name == _TARGET and name not in task.object_names else task.object(name)
+
+
 def plan_roles(plan: ConditionalPlan, skills: Mapping[str, ScriptedSkill] | None = None) -> tuple[Roles, ...]:
     """The roles of each step of a plan.
 
@@ -49,7 +58,9 @@ def plan_roles(plan: ConditionalPlan, skills: Mapping[str, ScriptedSkill] | None
     else is read, neither offsets nor gains nor efforts. A text about things of other tasks ("close the gripper around
     the puck" for a mug) is taken for a rewording of the shipped plan's step under the same condition. Otherwise the
     text's own words tell, and where they name nothing of the task, its condition. Where the gripper goes to a thing and
-    the condition compares it with a point on that thing, the point is the target.
+    the condition compares it with a point on that thing, the point is the target. Where the text moves a thing that the
+    condition says is held, the thing is moved, though a script steers the gripper. "the target location" is the goal in
+    every task, also in one that has no object there.
 
     Args:
         plan: a shipped one or yours; its ``definition`` says which objects and points there are.
@@ -69,7 +80,7 @@ def plan_roles(plan: ConditionalPlan, skills: Mapping[str, ScriptedSkill] | None
 
 def _roles(step: PlanStep, task: Task, skills: Mapping[str, ScriptedSkill]) -> Roles:
     found = _of_skill(step, task, skills) or _of_shipped(step, task, skills) or _of_words(step, task)
-    found = found or _of_condition(step) or _NOTHING
+    found = _carried(found or _of_condition(step) or _NOTHING, step, task)
     return replace(found, target=_point(found, step, task))
 
 
@@ -158,8 +169,30 @@ def _of_condition(step: PlanStep) -> Roles | None:
     return Roles(near[-1], GRIPPER, "condition") if near else None
 
 
+def _carried(roles: Roles, step: PlanStep, task: Task) -> Roles:
+    """The roles, or, where the gripper is at a thing already, what the text says is done with it: it is brought to the
+    goal, or, held, to the target."""
+    at = [name for name in _compared(step, gripper=True) if _holds(step, "near", name)]
+    if roles.moved != GRIPPER or roles.target is None or not at:
+        return roles
+    thing = next(one.name for one in task.objects if _same_thing(one.name, at[-1], task) and not any(one.offset))
+    if any(name in step.skill for name in _NAMES_OF_THE_GOAL) and _same_thing(at[-1], roles.target, task):
+        goal = next((one.name for one in task.objects if typed(one.position) == typed(_GOAL.position)), _TARGET)
+        return Roles(goal, GRIPPER if "gripper" in step.skill.split() else thing, "words")
+    held = _holds(step, "closed", GRIPPER) and re.match(rf"\w+ the {re.escape(thing)}\b", step.skill)
+    return replace(roles, moved=thing) if held and roles.target != thing else roles
+
+
+def _holds(step: PlanStep, relation: str, name: str) -> bool:
+    """Whether the condition says so of the gripper and a thing, or of the gripper."""
+    return any(
+        clause.predicate == relation and not clause.negated and name in (clause.subject, clause.object)
+        for clause in step.condition.clauses
+    )
+
+
 def _same_thing(first: str, second: str, task: Task) -> bool:
-    return typed(task.object(first).position) == typed(task.object(second).position)
+    return typed(role_object(task, first).position) == typed(role_object(task, second).position)
 
 
 def _point(roles: Roles, step: PlanStep, task: Task) -> str | None:

@@ -90,6 +90,11 @@ class ActorEnsemble(Policy):
         for member in self._each:
             member.fit_normalization(observation, weights)
 
+    def fit_contacts(self, observation: Tensor, task_id: Tensor) -> None:
+        """Those of each member."""
+        for member in self._each:
+            member.fit_contacts(observation, task_id)
+
     def describe(self) -> dict[str, Any]:
         return {"kind": "ActorEnsemble", "options": {}, "members": [member.describe() for member in self._each]}
 

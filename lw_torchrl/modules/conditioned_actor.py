@@ -180,3 +180,6 @@ class ConditionedActor(Policy):
 
     def fit_normalization(self, observation: Tensor, weights: Tensor | None = None) -> None:
         self.encoder.features.fit(observation, weights)
+
+    def fit_contacts(self, observation: Tensor, task_id: Tensor) -> None:
+        self.encoder.fit_contacts(observation, task_id)

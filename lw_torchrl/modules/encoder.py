@@ -91,6 +91,9 @@ class Encoder(TensorDictModuleBase):
         """Write ``encoding``."""
         return tensordict.set(self.out_keys[0], self.encode(*self.prepare(tensordict)).joined)
 
+    def fit_contacts(self, observation: Tensor, task_id: Tensor) -> None:
+        """Take from demonstrations where the hand touches things, in place; here there is nothing to take."""
+
     def describe(self) -> dict[str, Any]:
         """What a description of its actor needs beside the options, as JSON: the plans, say."""
         return {}

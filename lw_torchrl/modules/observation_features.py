@@ -13,9 +13,15 @@ from lw_torchrl._checks import check_choice, check_scale
 from lw_torchrl.language.observation import HAND, OBSERVATION_SIZE, OPENING, POSITIONS
 from lw_torchrl.language.value_checks import check_finite
 
-Features = Literal["raw", "differences", "relative", "both"]
+Features = Literal["raw", "differences", "relative", "opening", "both"]
 _FINE, _COARSE = 0.02, 0.1  # metres: where the two squashed copies of each difference bend
-_WIDTH = {"raw": OBSERVATION_SIZE, "differences": 54 + 2, "relative": 54, "both": OBSERVATION_SIZE + 54 + 2}
+_WIDTH = {
+    "raw": OBSERVATION_SIZE,
+    "differences": 54 + 2,
+    "relative": 54,
+    "opening": 1,
+    "both": OBSERVATION_SIZE + 54 + 2,
+}
 
 
 def relative(observation: Tensor) -> Tensor:
@@ -51,7 +57,8 @@ class ObservationFeatures(nn.Module):
 
     Args:
         kind: "raw", the 39 numbers; "differences", see :func:`differences`; "relative", these without the
-            hand's height and the gripper's opening; "both", the 39 numbers and the differences.
+            hand's height and the gripper's opening; "opening", the last alone; "both", the 39 numbers and the
+            differences.
         noise: standard deviation of the noise, in standard deviations of each feature.
 
     Attributes:
@@ -81,6 +88,8 @@ class ObservationFeatures(nn.Module):
             return observation
         if self.kind == "relative":
             return relative(observation)
+        if self.kind == "opening":
+            return observation[..., OPENING : OPENING + 1]
         made = differences(observation)
         return made if self.kind == "differences" else torch.cat((observation, made), -1)
 

@@ -35,12 +35,18 @@ class PlanConditionedActor(ConditionedActor):
             actions.
         features: what the decoder sees of the observation: "raw", the 39 numbers; "differences", the pairwise
             differences between hand, objects and goal, the hand's height and the gripper's opening; "relative", the
-            differences alone; "both", see :class:`ObservationFeatures`.
+            differences alone; "opening", the gripper's opening alone, for ``roles``; "both", see
+            :class:`ObservationFeatures`.
         feature_noise: standard deviation of the noise on the normalised features while training; None for 0.05, or 0
             with a distribution, whose likelihoods must not change from call to call.
         focus: the decoder also sees the way between the things that the steps in force compare, see :class:`PlanFocus`.
+        roles: the decoder also sees the way from the thing that the step in force moves to its target, see
+            :class:`PlanRoles`: for tasks that were not demonstrated.
+        jitter: metres by which that way is moved at random while training, where the gripper pushes.
         swap_unmentioned: the probability with which, in training, an object or the goal is put where it is in another
             row, where no step in force mentions it.
+        hide_opening: the probability with which, in training, the gripper's opening is another row's, where no step in
+            force closes it: it often tells which task this is.
         latent_size: D.
         width, depth: hidden layers of the action decoder; a tuple of widths says both.
         encoder_width, encoder_depth: hidden layers of the skill encoder.
@@ -90,7 +96,10 @@ class PlanConditionedActor(ConditionedActor):
         features: Features = "differences",
         feature_noise: float | None = None,
         focus: bool = False,
+        roles: bool = False,
+        jitter: float = 0.0,
         swap_unmentioned: float = 0.0,
+        hide_opening: float = 0.0,
         latent_size: int = 64,
         width: int | tuple[int, ...] = 256,
         depth: int = 3,
@@ -114,7 +123,10 @@ class PlanConditionedActor(ConditionedActor):
             features=features,
             feature_noise=noise_of_features(feature_noise, distribution),
             focus=focus,
+            roles=roles,
+            jitter=jitter,
             swap_unmentioned=swap_unmentioned,
+            hide_opening=hide_opening,
             latent_size=latent_size,
             encoder_width=encoder_width,
             encoder_depth=encoder_depth,

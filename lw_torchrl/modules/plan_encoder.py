@@ -13,7 +13,9 @@ from torchrl.envs import Transform
 
 from lw_torchrl._checks import check_choice, check_probability, check_scale
 from lw_torchrl._keys import as_keys, check_apart
+from lw_torchrl.language.observation import OPENING
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
+from lw_torchrl.language.skill_words import closes
 from lw_torchrl.language.text import TextEncoder, encoded
 from lw_torchrl.modules.encoder import Encoder, Encoding
 from lw_torchrl.modules.mentions import mentioned, swap_unmentioned
@@ -21,8 +23,11 @@ from lw_torchrl.modules.networks import text_to_latent, unit_scale
 from lw_torchrl.modules.observation_features import Features, ObservationFeatures
 from lw_torchrl.modules.plan_attention import Answers, PlanAttention, attend, strength
 from lw_torchrl.modules.plan_focus import PlanFocus
+from lw_torchrl.modules.plan_roles import PlanRoles
+from lw_torchrl.modules.plan_ways import PlanWays
 from lw_torchrl.modules.query_evaluator import QueryEvaluator
-from lw_torchrl.transforms.qaf import QAFTransform, plan_number_key
+from lw_torchrl.transforms.qaf import QAFTransform, plan_number_key, plan_program
+from lw_torchrl.transforms.random_yaw import yaw_key
 
 IN_FORCE = 0.01  # a step whose condition does not hold beside one that does has a weight of 1e-4
 
@@ -48,8 +53,8 @@ class PlanEncoder(Encoder):
 
     Args:
         plans: a plan for each task that will be seen.
-        features, focus, swap_unmentioned, latent_size, encoder_width, encoder_depth, evaluator, answers,
-            answer_scale, text_encoder, in_keys: as for :class:`PlanConditionedActor`.
+        features, focus, roles, jitter, swap_unmentioned, hide_opening, latent_size, encoder_width, encoder_depth,
+            evaluator, answers, answer_scale, text_encoder, in_keys: as for :class:`PlanConditionedActor`.
         feature_noise: standard deviation of the noise on the normalised features while training.
         out_keys: another name for what it writes.
 
@@ -75,6 +80,7 @@ class PlanEncoder(Encoder):
     text_vectors: Tensor
     skill_index: Tensor
     mentioned: Tensor
+    closing: Tensor
     plans: Plans
 
     def __init__(
@@ -84,7 +90,10 @@ class PlanEncoder(Encoder):
         features: Features = "differences",
         feature_noise: float = 0.0,
         focus: bool = False,
+        roles: bool = False,
+        jitter: float = 0.0,
         swap_unmentioned: float = 0.0,
+        hide_opening: float = 0.0,
         latent_size: int = 64,
         encoder_width: int = 128,
         encoder_depth: int = 1,
@@ -98,8 +107,13 @@ class PlanEncoder(Encoder):
         super().__init__()
         self.plans = as_plans(plans)
         self.evaluator = check_evaluator(evaluator, self.plans)
-        if evaluator is not None and (focus or swap_unmentioned):
-            raise ValueError("focus and swap_unmentioned read the queries' exact truth, which an evaluator takes away")
+        if evaluator is not None and (focus or roles or swap_unmentioned or hide_opening):
+            raise ValueError(
+                "focus, roles, swap_unmentioned and hide_opening read the queries' exact truth, which an evaluator "
+                "takes away"
+            )
+        if jitter and not roles:
+            raise ValueError(f"jitter moves the way of the roles, and roles is False; got jitter={jitter}")
         check_choice("answers", answers, get_args(Answers))
         if evaluator is None and (answers, answer_scale) != ("logit", 0.5):
             raise ValueError("answers and answer_scale are of an evaluator's logits, and evaluator is None")
@@ -114,7 +128,10 @@ class PlanEncoder(Encoder):
             "features": features,
             "feature_noise": feature_noise,
             "focus": focus,
+            "roles": roles,
+            "jitter": jitter,
             "swap_unmentioned": check_probability("swap_unmentioned", swap_unmentioned),
+            "hide_opening": check_probability("hide_opening", hide_opening),
             "latent_size": latent_size,
             "encoder_width": encoder_width,
             "encoder_depth": encoder_depth,
@@ -130,14 +147,21 @@ class PlanEncoder(Encoder):
         self.register_buffer("text_vectors", unit_scale(vectors), persistent=False)
         self.register_buffer("skill_index", self.attention.tables.skill_index, persistent=False)
         self.register_buffer("mentioned", mentioned(self.plans, self.attention.tables), persistent=False)
+        closing = torch.tensor([closes(skill) for skill in self.skills])
+        self.register_buffer("closing", closing[self.skill_index], persistent=False)
         self.latent_size = latent_size
         self.texts = text_to_latent(vectors.shape[1], latent_size, encoder_width, encoder_depth)
         self.focus = PlanFocus(self.plans, self.attention.tables, feature_noise) if focus else None
+        self.roles = PlanRoles(self.plans, self.attention.tables, feature_noise, jitter) if roles else None
         self.features = ObservationFeatures(features, feature_noise)
 
     @property
     def width(self) -> int:
-        return super().width + (0 if self.focus is None else self.focus.width)
+        return super().width + sum(part.width for part in self._ways)
+
+    @property
+    def _ways(self) -> list[PlanWays]:
+        return [part for part in (self.focus, self.roles) if part is not None]
 
     def transform(self) -> Transform | None:
         """Query answers, or what the evaluator reads."""
@@ -156,13 +180,34 @@ class PlanEncoder(Encoder):
             return self.attention.mask[rows], self.skill_index[rows], self.features(observation), *asked
         self.attention.tables.refuse_others(tensordict.get(self._answered, None), rows)
         weights = self.attention.over_steps(rest[0], rows)
-        if self.training and self.config["swap_unmentioned"]:
-            kept = ((weights > IN_FORCE).unsqueeze(-1) & self.mentioned[rows]).any(-2)
-            observation = swap_unmentioned(observation, kept, self.config["swap_unmentioned"])
-        seen = self.features(observation)
-        if self.focus is not None:
-            seen = torch.cat((seen, self.focus(observation, weights, rows)), -1)
+        if self.training:
+            observation = self._altered(observation, weights, rows)
+        yaw = tensordict.get(yaw_key(self.in_keys[0]), None)
+        ways = [part(observation, weights, rows, yaw) for part in self._ways]
+        seen = torch.cat((self.features(observation), *ways), -1) if ways else self.features(observation)
         return weights, self.skill_index[rows], seen
+
+    def _altered(self, observation: Tensor, weights: Tensor, rows: Tensor) -> Tensor:
+        """Training observations without what the steps in force say nothing of."""
+        in_force = weights > IN_FORCE
+        if probability := self.config["swap_unmentioned"]:
+            kept = (in_force.unsqueeze(-1) & self.mentioned[rows]).any(-2)
+            observation = swap_unmentioned(observation, kept, probability)
+        if probability := self.config["hide_opening"]:
+            opening = observation[..., OPENING]
+            others = opening.flatten()[torch.randint(opening.numel(), opening.shape, device=opening.device)]
+            hidden = torch.rand_like(opening) < probability
+            observation = observation.clone()
+            observation[..., OPENING] = torch.where(hidden & ~(in_force & self.closing[rows]).any(-1), others, opening)
+        return observation
+
+    def fit_contacts(self, observation: Tensor, task_id: Tensor) -> None:
+        """Take from demonstrations where the hand touches things, in place, see :meth:`PlanRoles.fit`."""
+        if self.roles is not None:
+            truth = plan_program(self.plans)(observation, task_id)
+            rows = self.attention.tables.rows(task_id)
+            observation, truth, rows = (found.to(self.closing.device) for found in (observation, truth, rows))
+            self.roles.fit(observation, self.attention.over_steps(truth, rows), rows)
 
     def weights(self, *prepared: Tensor) -> Tensor:
         """From what :meth:`prepare` gives to the attention (B, S)."""
@@ -196,4 +241,6 @@ class PlanEncoder(Encoder):
         evaluator = None if self.evaluator is None else self.evaluator.with_plans(as_plans(plans))
         other = PlanEncoder(plans, evaluator=evaluator, text_encoder=self.text_encoder, **self.config)
         other.texts, other.features = self.texts, self.features
+        if self.roles is not None and other.roles is not None:
+            other.roles.take_contact(self.roles)
         return other.train(self.training)

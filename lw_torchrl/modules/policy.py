@@ -152,6 +152,10 @@ class Policy(TensorDictModuleBase):
         """Take the statistics of observations (R, 39) float32, in place; ``weights`` (R,) float32, with the sum 1, tell
         how much each counts. Here: there is nothing to normalise."""
 
+    def fit_contacts(self, observation: Tensor, task_id: Tensor) -> None:
+        """Take from demonstrations where the hand touches things, in place: ``observation`` (R, 39) float32,
+        ``task_id`` (R,) int64. Here: there is nothing to take."""
+
     def describe(self) -> dict[str, Any]:
         """All that :meth:`from_description` needs to make it again, its weights aside, as JSON."""
         return {"kind": type(self).__name__, "options": self.config}

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import torch
@@ -13,6 +14,7 @@ from torchrl.objectives import LossModule
 
 from lw_torchrl.modules.critics import Value
 from lw_torchrl.modules.observation_features import ObservationFeatures
+from lw_torchrl.modules.plan_roles import PlanRoles
 from lw_torchrl.modules.policy import Policy
 
 
@@ -29,7 +31,8 @@ def fit_normalization(target: nn.Module, replay: TensorDictReplayBuffer) -> None
         replay: rows of ``observation`` (39,) float32.
 
     Raises:
-        ValueError: there is nothing in it to normalise, or a row holds NaN or infinity.
+        ValueError: there is nothing in it to normalise, or a row holds NaN or infinity; a loss has an actor with
+            ``roles`` that has taken no contacts yet, by this function.
 
     Example:
         >>> import lw_torchrl as lw, torch
@@ -50,10 +53,18 @@ def fit_normalization(target: nn.Module, replay: TensorDictReplayBuffer) -> None
     """
     weigh = getattr(replay.sampler, "row_weights", None)
     weights = None if weigh is None else weigh(replay.storage)
-    observation = replay.storage.get(slice(0, len(replay))).get("observation").cpu()  # the same sums on every device
+    rows = replay.storage.get(slice(0, len(replay)))
+    observation = rows.get("observation").cpu()  # the same sums on every device
     if isinstance(target, (Policy, Value)):
         target.fit_normalization(observation, weights)
+        if isinstance(target, Policy) and (task_id := rows.get("task_id", None)) is not None:
+            target.fit_contacts(observation, task_id.cpu())
         return
+    if any(not of("fitted") for _, of in _held(target, PlanRoles)):
+        raise ValueError(
+            "roles: where the hand touches things is taken from demonstrations by fit_normalization(actor, replay), "
+            "before the loss is made of the actor"
+        )
     known: dict[str, ObservationFeatures] = {}
     for kind, mean, std in _statistics(target):
         if kind not in known:
@@ -88,19 +99,28 @@ def fit_untrained(loss: LossModule, replay: TensorDictReplayBuffer) -> None:
 
 def _statistics(target: nn.Module) -> Iterator[tuple[str, Tensor, Tensor]]:
     """The kind of each :class:`ObservationFeatures`, its mean and its standard deviation; of a loss, every copy's."""
+    for module, of in _held(target, ObservationFeatures):
+        yield module.kind, of("mean"), of("std")
+
+
+def _held(target: nn.Module, kind: type[nn.Module]) -> Iterator[tuple[Any, Callable[[str], Tensor]]]:
+    """Each module of a kind, and what gives a buffer of it by name; of a loss, those of every copy."""
     if not isinstance(target, LossModule):
         for module in target.modules():
-            if isinstance(module, ObservationFeatures):
-                yield module.kind, module.mean, module.std
+            if isinstance(module, kind):
+                yield module, module.get_buffer
         return
     held = dict(target.named_children())  # asked for by name, targets warn where nothing moves them yet
     for name, network in vars(target).items():  # a loss keeps its networks there, without their parameters
         if not isinstance(network, nn.Module):
             continue
         for path, module in network.named_modules():
-            if isinstance(module, ObservationFeatures):
+            if isinstance(module, kind):
                 for copy in (f"{name}_params", f"target_{name}_params"):
                     params: Any = held.get(copy)
                     if isinstance(params, TensorDictBase):
-                        mean, std = (params.get((*path.split("."), buffer)) for buffer in ("mean", "std"))
-                        yield module.kind, mean.data, std.data
+                        yield module, partial(_buffer, params, path)
+
+
+def _buffer(params: TensorDictBase, path: str, name: str) -> Tensor:
+    return params.get((*path.split("."), name)).data

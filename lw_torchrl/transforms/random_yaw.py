@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from tensordict import TensorDictBase, unravel_key
@@ -11,8 +11,12 @@ from torch import Tensor
 from torchrl.envs import EnvBase, Transform
 
 from lw_torchrl._checks import check_scale, missing_keys
-from lw_torchrl._keys import as_keys, check_apart
+from lw_torchrl._keys import as_keys, check_apart, key_beside, read
 from lw_torchrl.language.observation import FIRST, HAND, POSITIONS, SECOND, a_step_before
+from lw_torchrl.language.plan_tables import PlanTables
+from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
+from lw_torchrl.language.skill_words import has_direction
+from lw_torchrl.transforms.qaf import plan_number_key
 
 _STARTS = tuple(part.start for part in (*POSITIONS, *map(a_step_before, (HAND, FIRST, SECOND))))
 _KEYS = ("observation", "action", "expert_action", "unclipped_action")
@@ -26,6 +30,21 @@ def _turned(values: Tensor, starts: tuple[int, ...], cos: Tensor, sin: Tensor) -
         turned[..., start] = cos * x - sin * y
         turned[..., start + 1] = sin * x + cos * y
     return turned
+
+
+def turn_observation(observation: Tensor, angle: Tensor) -> Tensor:
+    """The positions of observations (..., 39), turned about the vertical through the origin by (...) radians."""
+    return _turned(observation, _STARTS, angle.cos(), angle.sin())
+
+
+def turn_vectors(vectors: Tensor, angle: Tensor) -> Tensor:
+    """Vectors (..., 3), turned about the vertical by (...) radians."""
+    return _turned(vectors, (0,), angle.cos(), angle.sin())
+
+
+def yaw_key(observation: NestedKey) -> NestedKey:
+    """Where :class:`RandomYaw` writes the angle: beside ``observation``, ``observation_yaw``."""
+    return key_beside(observation, "_yaw")
 
 
 def _reach(action: Tensor) -> Tensor:
@@ -42,19 +61,24 @@ class RandomYaw(Transform):
     the scene as it was.
 
     Changes ``observation`` (B, 39) float32 and ``action`` (B, 4) float32, and, where they are, ``expert_action`` and
-    ``unclipped_action`` (B, 4) float32 and ``("next", "observation")``. An action's way in the plane is shortened where
+    ``unclipped_action`` (B, 4) float32 and ``("next", "observation")``; writes ``observation_yaw`` (B,) float32, the
+    angle in radians, and ``("next", "observation_yaw")``. An action's way in the plane is shortened where
     turning would lead it out of [-1, 1], its direction kept; one that was outside before keeps its length. Orientations
-    stay as they were, and so do fixed places: use it with features that hold neither, "differences" or "relative", and
-    without ``focus``. Angles are drawn from PyTorch's global generator; the trainers seed it.
+    stay as they were: use it with features that do not hold them, "differences" or "relative". ``focus`` and ``roles``
+    turn fixed places by the angle. Angles are drawn from PyTorch's global generator; the trainers seed it.
 
     Args:
         scale: standard deviation of the angle, in radians.
+        plans: the actor's plans: rows whose steps in force say no direction ("move the puck to the target location")
+            are then turned by any angle. It reads ``qaf`` (B, S) bool and ``task_id`` (B,) int64; None turns all rows
+            alike.
         in_keys: where observation, action, the expert's action and the unclipped one are, in this order; a key may be
             nested.
         out_keys: where they go, turned; None for the same places.
 
     Raises:
-        ValueError: a negative or infinite scale; a sample without observation or action.
+        ValueError: a negative or infinite scale; a sample without observation or action, or, with plans, without
+            qaf and task_id, or with those of other plans.
         TypeError: it is given to an environment.
 
     Example:
@@ -71,6 +95,7 @@ class RandomYaw(Transform):
         self,
         scale: float,
         *,
+        plans: Plans | Mapping[str, ConditionalPlan] | None = None,
         in_keys: Sequence[NestedKey] | None = None,
         out_keys: Sequence[NestedKey] | None = None,
     ) -> None:
@@ -82,6 +107,24 @@ class RandomYaw(Transform):
             if there != own:
                 check_apart(self.in_keys, [there])
         self.scale = check_scale("scale", scale)
+        self._tables: PlanTables | None = None
+        if plans is not None:
+            self._tables = PlanTables(as_plans(plans))
+            free = torch.tensor([not has_direction(skill) for skill in as_plans(plans).skills])
+            self.register_buffer("_free", free[self._tables.skill_index], persistent=False)
+
+    def _angle(self, tensordict: TensorDictBase, observation: Tensor) -> Tensor:
+        angle = self.scale * torch.randn(observation.shape[:-1], device=observation.device)
+        if self._tables is None:
+            return angle
+        qaf, task_id = read(tensordict, ["qaf", "task_id"])
+        rows = self._tables.rows(task_id)
+        self._tables.refuse_others(tensordict.get(plan_number_key("qaf"), None), rows)
+        if qaf.shape != (shape := (*rows.shape, self._free.shape[-1])):
+            raise ValueError(f"qaf must have shape {shape}, one column for each step of plans, got {tuple(qaf.shape)}")
+        any_angle = torch.pi * (2 * torch.rand_like(angle) - 1)
+        free = (self._free[rows] | (qaf < 0.5)).all(-1) & (qaf > 0.5).any(-1)
+        return torch.where(free, any_angle, angle)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Turn each row of a sample."""
@@ -90,11 +133,12 @@ class RandomYaw(Transform):
         observation = tensordict.get(seen[0], None)
         if observation is None or tensordict.get(actions[0][0], None) is None:
             raise missing_keys(tensordict.keys(True, True), *map(str, self.in_keys[:2]))
-        angle = self.scale * torch.randn(observation.shape[:-1], device=observation.device)
+        angle = self._angle(tensordict, observation)
         cos, sin = angle.cos(), angle.sin()
-        tensordict.set(seen[1], _turned(observation, _STARTS, cos, sin))
+        tensordict.set(seen[1], _turned(observation, _STARTS, cos, sin)).set(yaw_key(seen[1]), angle)
         if (following := tensordict.get(unravel_key(("next", seen[0])), None)) is not None:
-            tensordict.set(unravel_key(("next", seen[1])), _turned(following, _STARTS, cos, sin))
+            after = unravel_key(("next", seen[1]))
+            tensordict.set(after, _turned(following, _STARTS, cos, sin)).set(yaw_key(after), angle)
         for key, turned_key in actions:
             if (action := tensordict.get(key, None)) is None:
                 continue

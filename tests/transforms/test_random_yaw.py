@@ -8,6 +8,7 @@ from tensordict import TensorDict
 from torchrl.envs import Compose, TransformedEnv
 
 import lw_torchrl as lw
+from lw_torchrl.transforms.random_yaw import turn_observation, turn_vectors
 
 PLACES = [slice(start, start + 2) for start in (0, 4, 11, 18, 22, 29, 36)]
 OTHER = [n for n in range(39) if not any(n in range(place.start, place.stop) for place in PLACES)]
@@ -115,13 +116,74 @@ def test_the_next_observation_turns_with_its_row():
 
 def test_scale_0_changes_nothing_and_the_seed_fixes_the_rest():
     was = rows()
-    assert (lw.RandomYaw(0.0)(was.clone()) == was).all()
+    assert (lw.RandomYaw(0.0)(was.clone()).exclude("observation_yaw") == was).all()
     found = []
     for seed in (1, 1, 2):
         torch.manual_seed(seed)
         found.append(lw.RandomYaw(0.3)(was.clone())["observation"])
     assert torch.equal(found[0], found[1])
     assert not torch.equal(found[0], found[2])
+
+
+def test_the_angle_is_written_and_turns_back():
+    was = rows()
+    was["next", "observation"] = was["observation"].clone()
+    now = lw.RandomYaw(0.5)(was.clone())
+    angle_of = now["observation_yaw"]
+    assert torch.equal(angle_of, now["next", "observation_yaw"])
+    torch.testing.assert_close(turn_observation(now["observation"], -angle_of), was["observation"])
+    vectors = torch.stack([was["action"][:, 0], was["action"][:, 1], was["action"][:, 3]], -1)
+    torch.testing.assert_close(turn_vectors(vectors, angle_of)[:, :2], now["action"][:, :2])
+    assert torch.equal(turn_vectors(vectors, angle_of)[:, 2], vectors[:, 2])
+
+
+PLANS = lw.Plans(
+    [
+        lw.ConditionalPlan.from_pairs(
+            "push",
+            [
+                ("gripper is not near the puck", "move the puck to the target location"),
+                ("gripper is near the puck", "push the window handle to the left"),
+                ("gripper is open", "lower the gripper around the puck"),
+            ],
+        )
+    ]
+)
+
+
+@pytest.mark.parametrize(
+    ("truth", "any_angle"),
+    [((1, 0, 0), True), ((0, 1, 0), False), ((1, 1, 0), False), ((1, 0, 1), True), ((0, 0, 0), False)],
+)
+def test_rows_whose_steps_say_no_direction_are_turned_by_any_angle(truth, any_angle):
+    was = rows(2_000, reach=0.5)
+    was["qaf"] = torch.tensor(truth, dtype=torch.bool).expand(2_000, 3)
+    was["task_id"] = torch.full((2_000,), lw.task_id("push"))
+    torch.manual_seed(0)
+    now = lw.RandomYaw(0.1, plans=PLANS)(was)
+    turned = between(was["action"], now["action"])
+    if any_angle:
+        assert turned.std() == pytest.approx(torch.pi / 3**0.5, rel=0.05)
+        assert turned.abs().max() > 3
+    else:
+        assert turned.std() == pytest.approx(0.1, rel=0.1)
+
+
+def test_with_plans_it_needs_their_answers():
+    with pytest.raises(ValueError, match="qaf and task_id are needed"):
+        lw.RandomYaw(0.1, plans=PLANS)(rows())
+    was = rows()
+    was["task_id"] = torch.full((64,), lw.task_id("push"))
+    was["qaf"] = torch.zeros(64, 2, dtype=torch.bool)
+    with pytest.raises(ValueError, match=r"qaf must have shape \(64, 3\)"):
+        lw.RandomYaw(0.1, plans=PLANS)(was)
+    pairs = [(f"gripper is {state}", "wait") for state in ("open", "closed", "not open")]
+    other = lw.QAFTransform(lw.Plans([lw.ConditionalPlan.from_pairs("push", pairs)]))(was)
+    with pytest.raises(ValueError, match="qaf answers other plans"):
+        lw.RandomYaw(0.1, plans=PLANS)(other)
+    was["task_id"] = torch.full((64,), lw.task_id("reach"))
+    with pytest.raises(ValueError, match="tasks without a plan"):
+        lw.RandomYaw(0.1, plans=PLANS)(was)
 
 
 @pytest.mark.parametrize("scale", [-0.1, float("inf"), float("nan")])
