@@ -10,12 +10,15 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+import torch
 
 import lw_torchrl as lw
 from benchmarks import __main__ as cli
 from benchmarks import ablations, latents, truth
 from benchmarks.report import Row, Skipped, compare, part_of, times_as_long, under
 from lw_torchrl.evaluation import EpisodeResult, EvaluationResult
+from lw_torchrl.language.plan_tables import PlanTables
+from lw_torchrl.modules.plan_roles import PlanRoles
 
 ROOT = Path(__file__).parent.parent
 
@@ -94,16 +97,35 @@ def test_every_benchmark_is_explained():
     assert [name for name in cli.BENCHMARKS if f"`{name}`" not in page] == []
 
 
-def test_each_ablation_changes_one_ingredient_and_has_a_folder_of_its_own():
-    full = vars(ablations.FULL)
-    for change, preset in ablations.ABLATIONS.items():
+@pytest.mark.parametrize("setting", ["few-shot", "zero-shot"])
+def test_each_ablation_changes_one_ingredient_and_has_a_folder_of_its_own(setting):
+    full, presets = vars(ablations.FULL[setting]), ablations.ABLATIONS[setting]
+    for change, preset in presets.items():
         different = {key for key, value in vars(preset).items() if value != full[key]} - {"name"}
-        assert len(different) == (change != "the recipe"), change
-    names = [preset.name for preset in ablations.ABLATIONS.values()]
+        assert len(different) + (change in ablations.PATCHES) == (change != "the recipe"), change
+    names = [preset.name for preset in presets.values()]
     assert len(set(names)) == len(names)
 
 
-def test_ablations_write_a_table_of_what_was_run(monkeypatch, tmp_path, capsys):
+def test_patches_leave_out_what_they_say_and_are_undone():
+    plans = lw.load_plans("MT50", skills="MT10")
+    tables = PlanTables(plans)
+    seen = torch.rand(4, 39), torch.ones(4, plans.num_steps), torch.arange(4)
+    usual = PlanRoles(plans, tables)
+    with ablations.PATCHES["objects' own places instead of named points"]():
+        assert not PlanRoles(plans, tables).offset.any()
+    assert torch.equal(PlanRoles(plans, tables).offset, usual.offset)
+    assert usual.offset.any()
+    with ablations.PATCHES["no contacts"]():
+        usual.fit(*seen)
+        assert usual.fitted
+    assert not usual.contact.any()
+    usual.fit(*seen)
+    assert usual.contact.any()
+
+
+@pytest.mark.parametrize("setting", ["few-shot", "zero-shot"])
+def test_ablations_write_a_table_of_what_was_run(setting, monkeypatch, tmp_path, capsys):
     seen = []
 
     def run(unit, plans, out):
@@ -112,11 +134,11 @@ def test_ablations_write_a_table_of_what_was_run(monkeypatch, tmp_path, capsys):
         return SimpleNamespace(success_once=rates, mean_success=sum(rates.values()) / 2)
 
     monkeypatch.setattr(ablations, "execute_run", run)
-    ablations.main(ablations.Arguments(seeds=(0, 2), steps=3, out=tmp_path))
-    assert len(seen) == 2 * len(ablations.ABLATIONS)
+    ablations.main(ablations.Arguments(setting, seeds=(0, 2), steps=3, out=tmp_path))
+    assert len(seen) == 2 * len(ablations.ABLATIONS[setting])
     assert seen[:2] == [("strong-3-steps", 3, 0), ("strong-3-steps", 3, 2)]
-    table = (tmp_path / "few-shot" / "ablations-3-steps.md").read_text("utf-8")
-    assert [line.split("|")[1].strip() for line in table.splitlines()[2:]] == list(ablations.ABLATIONS)
+    table = (tmp_path / setting / "ablations-3-steps.md").read_text("utf-8")
+    assert [line.split("|")[1].strip() for line in table.splitlines()[2:]] == list(ablations.ABLATIONS[setting])
     assert "0.750, 1.000" in table
     assert table in capsys.readouterr().out
 
