@@ -21,6 +21,9 @@ from lw_torchrl.modules.encoder import Encoder, Encoding
 from lw_torchrl.modules.policy import Policy
 
 
+_RANDOM_IN_TRAINING = ("feature_noise", "jitter", "swap_unmentioned", "hide_opening")
+
+
 def noise_of_features(asked: float | None, distribution: str | None) -> float:
     """The noise asked for; by default none with a distribution, whose likelihoods it would change from call to call."""
     if asked is not None:
@@ -145,7 +148,8 @@ class ConditionedActor(Policy):
     def stochastic(self, distribution: DistributionName = "tanh_normal", init_std: float = 0.3) -> Self:
         """An actor with a distribution, whose mode is what this one does, as it is now: a copy, to be trained by RL.
 
-        Its features have no noise, which would change its likelihoods from call to call.
+        Its features have no noise, jitter, swaps nor hidden opening, which would change its likelihoods from call to
+        call.
 
         Args:
             distribution: "tanh_normal", or "normal", whose actions the environment clips.
@@ -166,7 +170,7 @@ class ConditionedActor(Policy):
         found["options"] = self.config | {
             "distribution": distribution,
             "init_std": init_std,
-            "feature_noise": 0.0,
+            **{name: 0.0 for name in _RANDOM_IN_TRAINING if name in self.config},
             "out_keys": [*self.out_keys, "loc", "scale", key_beside(self.out_keys[0], "_log_prob")],
         }
         with torch.random.fork_rng(devices=[]):

@@ -165,3 +165,10 @@ def test_a_trained_one_is_evaluated_and_collects(tmp_path):
         data = env.rollout(4, actor)
     env.close()
     assert data["action_log_prob"].shape == (2, 4)
+
+
+def test_nothing_random_is_left_in_the_likelihoods_of_one_made_of_a_trained_one():
+    trained = make("plan", None, roles=True, focus=True, jitter=0.03, swap_unmentioned=0.5, hide_opening=1.0)
+    actor, state = trained.stochastic().train(), make_state(50)
+    first, second = (actor.get_dist(state).log_prob(torch.zeros(50, 4)) for _ in range(2))
+    assert torch.equal(first, second)
