@@ -109,8 +109,10 @@ class RandomYaw(Transform):
         self.scale = check_scale("scale", scale)
         self._tables: PlanTables | None = None
         if plans is not None:
-            self._tables = PlanTables(as_plans(plans))
-            free = torch.tensor([not has_direction(skill) for skill in as_plans(plans).skills])
+            plans = as_plans(plans)
+            self.fingerprint = plans.fingerprint  # what checkpoints of trainers tell it by
+            self._tables = PlanTables(plans)
+            free = torch.tensor([not has_direction(skill) for skill in plans.skills])
             self.register_buffer("_free", free[self._tables.skill_index], persistent=False)
 
     def _angle(self, tensordict: TensorDictBase, observation: Tensor) -> Tensor:

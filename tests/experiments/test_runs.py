@@ -26,7 +26,8 @@ PRESET = replace(
     members=(MEMBER,),
     training=lw.BehavioralCloningConfig(steps=60, batch_size=20, checkpoint_every=20),
 )
-OTHER = Member({"features": "relative", "width": 16, "depth": 1}, yaw=0.3)
+ROLES = {"features": "opening", "roles": True, "jitter": 0.03, "hide_opening": 1.0}
+OTHER = Member({"features": "relative", "width": 16, "depth": 1}, ROLES, yaw=0.3, any_yaw=True)
 ENSEMBLE = replace(PRESET, name="ensemble", members=(MEMBER, OTHER))
 
 
@@ -116,6 +117,8 @@ def test_the_result_says_what_was_done(undisturbed, one):
         focus = {"focus": True, "swap_unmentioned": 0.5} if one.method == "pcbc" else {}
         assert first == {"actor": {"features": "differences", "width": 32, "depth": 1, **focus}, "yaw": 0.0}
         other = {"actor": {"features": "relative", "width": 16, "depth": 1}, "yaw": 0.3}
+        if one.method == "pcbc":
+            other = {"actor": {**other["actor"], **ROLES}, "yaw": 0.3, "any_yaw": True}
         assert more == ([other] if one.preset is ENSEMBLE else [])
         assert said["training"]["steps"] == 60
         assert said["datasets"][0]["execution"]["noise_scale"] == [0.0, 0.1, 0.2, 0.3, 0.4]

@@ -119,13 +119,14 @@ def test_a_checkpoint_of_other_demonstrations_is_refused(checkpoint, tmp_path):
         (dict(sampler=RandomSampler), "sampler"),
         (dict(yaw=0.2), "transforms"),
         (dict(yaw=None), "transforms"),
+        (dict(plans=PLANS), "transforms"),
     ],
 )
 def test_a_checkpoint_of_rows_shown_in_another_way_is_refused(root, tmp_path, change, differs):
     path = tmp_path / "c.zip"
 
-    def trainer(label="expert", after_success=None, sampler=TaskBalancedSampler, yaw=0.1):
-        turned = Compose(QAFTransform(PLANS), *([] if yaw is None else [RandomYaw(yaw)]))
+    def trainer(label="expert", after_success=None, sampler=TaskBalancedSampler, yaw=0.1, plans=None):
+        turned = Compose(QAFTransform(PLANS), *([] if yaw is None else [RandomYaw(yaw, plans=plans)]))
         replay = LanguageWorldExperienceReplay(
             root, label=label, after_success=after_success, sampler=sampler(), transform=turned
         )
