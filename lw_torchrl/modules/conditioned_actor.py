@@ -20,7 +20,6 @@ from lw_torchrl.modules.action_head import ActionHead, DistributionName
 from lw_torchrl.modules.encoder import Encoder, Encoding
 from lw_torchrl.modules.policy import Policy
 
-
 _RANDOM_IN_TRAINING = ("feature_noise", "jitter", "swap_unmentioned", "hide_opening")
 
 
