@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -10,18 +12,16 @@ from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.language.observation import FIRST, HAND, places
 from lw_torchrl.language.plan_tables import PlanTables
 from lw_torchrl.language.plans import ConditionalPlan, Plans
-from lw_torchrl.language.roles import plan_roles, role_object
+from lw_torchrl.language.roles import Roles, plan_roles, role_object
 from lw_torchrl.language.skill_words import closes, presses, pushes
+from lw_torchrl.language.tasks import Task
 from lw_torchrl.modules.plan_ways import Pair, PlanWays
 from lw_torchrl.transforms.random_yaw import turn_vectors
 
 
-def _moved_to_target(plan: ConditionalPlan) -> list[list[Pair]]:
-    of, task = role_object, plan.definition
-    return [
-        [(of(task, roles.moved), of(task, roles.target))] if roles.moved and roles.target else []
-        for roles in plan_roles(plan)
-    ]
+def _moved_to_target(task: Task, steps: Sequence[Roles]) -> list[list[Pair]]:
+    of = role_object
+    return [[(of(task, one.moved), of(task, one.target))] if one.moved and one.target else [] for one in steps]
 
 
 class PlanRoles(PlanWays):
@@ -57,12 +57,13 @@ class PlanRoles(PlanWays):
     pushes: Tensor
 
     def __init__(self, plans: Plans, tables: PlanTables, noise: float = 0.0, jitter: float = 0.0) -> None:
-        super().__init__(plans, tables, _moved_to_target, 1, noise)
+        told = {task: plan_roles(plan) for task, plan in plans.items()}
+        super().__init__(plans, tables, lambda plan: _moved_to_target(plan.definition, told[plan.task]), 1, noise)
         self.jitter = check_scale("jitter", jitter)
         self.tables = tables
         at_contact, acts, pushing = (torch.zeros(len(plans), plans.num_steps, dtype=torch.bool) for _ in range(3))
         for task, plan in plans.items():
-            for step, (said, roles) in enumerate(zip(plan.steps, plan_roles(plan), strict=True)):
+            for step, (said, roles) in enumerate(zip(plan.steps, told[task], strict=True)):
                 if not roles.moved or not roles.target:
                     continue
                 at = (tables.index.row(task), step)
