@@ -78,7 +78,7 @@ def make_optimizer(
     optimizer: torch.optim.Optimizer
     rate = float(config.learning_rate)  # as it is in a checkpoint
     if config.optimizer == "adamw":
-        optimizer = torch.optim.AdamW(parameters, lr=rate, weight_decay=config.weight_decay)
+        optimizer = torch.optim.AdamW(parameters, lr=rate, weight_decay=config.weight_decay, fused=True)
     else:
         optimizer = torch.optim.SGD(parameters, lr=rate, momentum=config.momentum, weight_decay=config.weight_decay)
     if config.schedule == "cosine":
