@@ -44,7 +44,7 @@ class PlanConditionedActor(ConditionedActor):
             :class:`PlanRoles`: for tasks that were not demonstrated.
         jitter: metres by which that way is moved at random while training, where the gripper pushes.
         swap_unmentioned: the probability with which, in training, an object or the goal is put where it is in another
-            row, where no step in force mentions it.
+            row, where no step in force mentions it, or with ``roles`` moves it or to it.
         hide_opening: the probability with which, in training, the gripper's opening is another row's, where no step in
             force closes it: it often tells which task this is.
         latent_size: D.

@@ -146,7 +146,7 @@ class PlanEncoder(Encoder):
         # The tables come from the plans, not from training: they are not part of the state that is saved.
         self.register_buffer("text_vectors", unit_scale(vectors), persistent=False)
         self.register_buffer("skill_index", self.attention.tables.skill_index, persistent=False)
-        self.register_buffer("mentioned", mentioned(self.plans, self.attention.tables), persistent=False)
+        self.register_buffer("mentioned", mentioned(self.plans, self.attention.tables, roles), persistent=False)
         closing = torch.tensor([closes(skill) for skill in self.skills])
         self.register_buffer("closing", closing[self.skill_index], persistent=False)
         self.latent_size = latent_size

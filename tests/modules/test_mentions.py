@@ -94,6 +94,22 @@ def test_a_policy_in_training_cannot_see_what_its_step_does_not_mention():
     assert differs(actor.eval().prepare(state)[2]).sum() == 0.0
 
 
+@pytest.mark.parametrize("skills", ["own", "MT10"])
+def test_what_an_actor_on_roles_moves_and_its_target_stay_where_they_are(skills):
+    """Also where the words do not speak of it: "lift the puck out of the hole" is on its way to the target location."""
+    plans = lw.load_plans("MT50", skills=skills)
+    options = {"features": "opening", "roles": True, "feature_noise": 0.0}
+    actor = lw.PlanConditionedActor(plans, swap_unmentioned=1.0, **options)
+    rows = [(lw.task_id(task), step) for task, plan in plans.items() for step in range(len(plan.steps))]
+    task_id, step = torch.tensor(rows).T
+    truth = torch.nn.functional.one_hot(step, plans.num_steps).bool()
+    generator = torch.Generator().manual_seed(0)
+    state = TensorDict(observation=torch.randn(len(rows), 39, generator=generator), task_id=task_id, qaf=truth)
+    ways = [mode.prepare(state)[2][:, 1:4] for mode in (actor.eval(), actor.train())]
+    mixed = 0.01  # of the other steps' ways: each has a weight of 1e-4
+    torch.testing.assert_close(*ways, atol=10 * mixed, rtol=0.0)
+
+
 def test_what_it_refuses():
     plans = lw.load_plans("MT10")
     with pytest.raises(ValueError, match=r"swap_unmentioned must be from 0 to 1, got 1\.5"):
