@@ -13,7 +13,7 @@ from functools import cache
 from typing import Literal
 
 from lw_torchrl.language.named_objects import GRIPPER, NamedObject, typed
-from lw_torchrl.language.observation import GOAL
+from lw_torchrl.language.observation import FIRST, GOAL, HAND, SECOND, places
 from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.plans import ConditionalPlan, PlanStep
 from lw_torchrl.language.skills import ScriptedSkill, skills_for
@@ -23,6 +23,7 @@ Source = Literal["skill", "reworded", "words", "condition", "nothing"]
 _TARGET = "target location"
 _GOAL = NamedObject(_TARGET, (GOAL.start, GOAL.start + 1, GOAL.start + 2))
 _NAMES_OF_THE_GOAL = (_TARGET, "reach target")
+_ACTED_ON = re.compile(r"(?:^|, |and |then )\w+ (?:the )?<([^>]*)>")
 _TOOL = re.compile(r"(?<!in line )(?<!level )(?<!aligned )\bwith (the )?(?=<)")
 
 
@@ -124,8 +125,8 @@ def _of_words(step: PlanStep, task: Task) -> Roles | None:
     named = re.findall(r"<([^>]*)>", text)
     if not named or named == [GRIPPER]:
         return None
-    direct = re.match(r"\w+ (?:the )?<([^>]*)>", text)
-    target, moved = named[-1], direct[1] if direct else tool
+    acted_on = [name for name in _ACTED_ON.findall(text) if _can_move(name, task)]
+    target, moved = named[-1], acted_on[0] if acted_on else tool
     if moved == target:  # "push the button down", "lift the cube": alone, it is where the gripper goes, or is moved
         moved = tool or GRIPPER
         if tool is None and (others := _partners(target, step, task)):
@@ -137,13 +138,14 @@ def _of_words(step: PlanStep, task: Task) -> Roles | None:
 
 
 def _marked(skill: str, task: Task) -> tuple[str, str | None]:
-    """The text with each of the task's things in <>, without the tool at its end, and the tool."""
+    """The text with each of the task's things in <>, without the tool that it is done with, and the tool."""
     things = {**{name: name for name in task.object_names}, "gripper": GRIPPER}
     for word in sorted(things, key=len, reverse=True):  # "drawer handle" is no "drawer"
         pattern = rf"(?<![\w<-]){re.escape(word)}(?![\w-])(?![^<]*>)"
         skill = re.sub(pattern, f"<{things[word]}>", skill)
     if found := _TOOL.search(skill):
-        return skill[: found.start()], re.findall(r"<([^>]*)>", skill[found.end() :])[0]
+        tool, rest = skill[found.end() + 1 :].split(">", 1)
+        return skill[: found.start()] + rest, tool
     return skill, None
 
 
@@ -193,6 +195,12 @@ def _holds(step: PlanStep, relation: str, name: str) -> bool:
 
 def _same_thing(first: str, second: str, task: Task) -> bool:
     return typed(role_object(task, first).position) == typed(role_object(task, second).position)
+
+
+def _can_move(name: str, task: Task) -> bool:
+    """Whether it is the gripper or an object: no wall, no hole, no goal."""
+    position = typed(role_object(task, name).position)
+    return any(position == typed(places(thing)) for thing in (HAND, FIRST, SECOND))
 
 
 def _point(roles: Roles, step: PlanStep, task: Task) -> str | None:

@@ -110,8 +110,12 @@ class PlanEncoder(Encoder):
         if evaluator is not None and (focus or roles or swap_unmentioned or hide_opening):
             raise ValueError(
                 "focus, roles, swap_unmentioned and hide_opening read the queries' exact truth, which an evaluator "
-                "takes away"
+                "takes away; what has learned with exact truth is evaluated by lw.evaluate(actor, evaluator=...)"
             )
+        if features == "opening" and not (focus or roles):
+            raise ValueError("features='opening' shows nothing of where things are; it needs roles=True or focus=True")
+        if features == "relative" and hide_opening:
+            raise ValueError(f"hide_opening: features='relative' do not show the opening; got {hide_opening}")
         if jitter and not roles:
             raise ValueError(f"jitter moves the way of the roles, and roles is False; got jitter={jitter}")
         check_choice("answers", answers, get_args(Answers))

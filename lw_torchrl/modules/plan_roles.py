@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
+from weakref import WeakSet
 
 import torch
 from torch import Tensor
@@ -78,6 +80,14 @@ class PlanRoles(PlanWays):
         self.register_buffer("pushes", pushing, persistent=False)
         self.register_buffer("contact", torch.zeros(len(plans), 3))
         self.register_buffer("fitted", torch.tensor(False))
+        self._kin: WeakSet[PlanRoles] = WeakSet([self])  # those of actors with the same weights
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_kin": None}  # a copy has weights of its own
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        self._kin = WeakSet([self])
 
     @torch.no_grad()
     def fit(self, observation: Tensor, weights: Tensor, rows: Tensor) -> None:
@@ -95,9 +105,18 @@ class PlanRoles(PlanWays):
         for row in rows[held].unique().tolist():
             self.contact[row] = away[held & (rows == row)].median(0).values
         self.fitted.fill_(True)
+        for one in self._kin:
+            if one is not self:
+                one._copy(self)
 
+    @torch.no_grad()
     def take_contact(self, other: PlanRoles) -> None:
-        """The contacts of the same tasks under other plans."""
+        """The contacts of the same tasks under other plans, now and whenever either is fitted."""
+        self._kin = other._kin
+        self._kin.add(self)
+        self._copy(other)
+
+    def _copy(self, other: PlanRoles) -> None:
         self.fitted.copy_(other.fitted)
         for task in self.tables.index.tasks:
             if task in other.tables.index.tasks:

@@ -24,7 +24,7 @@ from lw_torchrl.trainers.interrupts import interrupts_between_steps
 from lw_torchrl.trainers.latent_terms import LatentTerms
 from lw_torchrl.trainers.loss_state import bc_loss
 from lw_torchrl.trainers.minibatches import check_replay, draw_batch
-from lw_torchrl.trainers.normalization import fit_normalization
+from lw_torchrl.trainers.normalization import check_contacts, fit_normalization
 from lw_torchrl.trainers.policy_checks import check_can_be_saved, check_trained
 from lw_torchrl.trainers.recent_losses import READ_EVERY, RecentLosses
 from lw_torchrl.trainers.training_state import (
@@ -118,6 +118,8 @@ class BehavioralCloningTrainer:
             load_state(self.checkpoint, found, self.optimizer, self.schedule, [self.state], config.steps)
         elif config.normalize and isinstance(actor, Policy):
             fit_normalization(actor, replay)
+        else:
+            check_contacts(actor)
 
     def save(self) -> None:
         """Write the checkpoint, if there is to be one; an earlier one is replaced whole.

@@ -31,8 +31,8 @@ def fit_normalization(target: nn.Module, replay: TensorDictReplayBuffer) -> None
         replay: rows of ``observation`` (39,) float32.
 
     Raises:
-        ValueError: there is nothing in it to normalise, or a row holds NaN or infinity; a loss has an actor with
-            ``roles`` that has taken no contacts yet, by this function.
+        ValueError: there is nothing in it to normalise, or a row holds NaN or infinity, or no ``observation``; a loss
+            has an actor with ``roles`` that has taken no contacts yet, by this function.
 
     Example:
         >>> import lw_torchrl as lw, torch
@@ -54,7 +54,9 @@ def fit_normalization(target: nn.Module, replay: TensorDictReplayBuffer) -> None
     weigh = getattr(replay.sampler, "row_weights", None)
     weights = None if weigh is None else weigh(replay.storage)
     rows = replay.storage.get(slice(0, len(replay)))
-    observation = rows.get("observation").cpu()  # the same sums on every device
+    if (seen := rows.get("observation", None)) is None:
+        raise ValueError(f"replay must hold 'observation', its rows hold {', '.join(map(str, rows.keys(True, True)))}")
+    observation = seen.cpu()  # the same sums on every device
     if isinstance(target, (Policy, Value)):
         target.fit_normalization(observation, weights)
         if isinstance(target, Policy) and (task_id := rows.get("task_id", None)) is not None:
@@ -75,6 +77,15 @@ def fit_normalization(target: nn.Module, replay: TensorDictReplayBuffer) -> None
             std.copy_(known[kind].std)
     if not known:
         raise ValueError(f"{type(target).__name__} holds no ObservationFeatures: there is nothing to normalise")
+
+
+def check_contacts(actor: nn.Module) -> None:
+    """Raise :class:`ValueError` if an actor with ``roles`` would be trained without contacts."""
+    if any(not of("fitted") for _, of in _held(actor, PlanRoles)):
+        raise ValueError(
+            "normalize: False, but roles want to know where the demonstrations touch things; call "
+            "fit_normalization(actor, replay) of lw_torchrl.trainers first"
+        )
 
 
 def fit_untrained(loss: LossModule, replay: TensorDictReplayBuffer) -> None:

@@ -24,7 +24,7 @@ from lw_torchrl.trainers.config import BehavioralCloningConfig, make_optimizer
 from lw_torchrl.trainers.interrupts import interrupts_between_steps
 from lw_torchrl.trainers.latent_terms import LatentTerms
 from lw_torchrl.trainers.minibatches import check_replay, draw_batch
-from lw_torchrl.trainers.normalization import fit_normalization
+from lw_torchrl.trainers.normalization import check_contacts, fit_normalization
 from lw_torchrl.trainers.policy_checks import check_can_be_saved, check_trained
 from lw_torchrl.trainers.recent_losses import READ_EVERY, RecentLosses
 from lw_torchrl.trainers.training_state import (
@@ -141,6 +141,8 @@ class StackedBehavioralCloning:
             self.states.append(TrainingState(replay, config.seed + number))
             if config.normalize:
                 fit_normalization(actor, replay)
+            else:
+                check_contacts(actor)
             actor.train()
         modules: list[nn.Module] = [_Act(actor) for actor in actors]
         try:

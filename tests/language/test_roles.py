@@ -102,6 +102,12 @@ def of(task, *steps, skills=None):
         ("push", "gripper is open", "wait", None, None, "nothing"),
         ("stick-push", "gripper is open", "shove the thermos away with the stick", "thermos", "stick", "words"),
         ("stick-push", "gripper is open", "bring the stick in line with the thermos", "thermos", "stick", "words"),
+        ("stick-push", "gripper is open", "push the thermos with the stick to the target location", "target location",
+         "thermos", "words"),
+        ("push-wall", "gripper is open", "avoid the wall and bring the puck to the target location", "target location",
+         "puck", "words"),
+        ("push-wall", "gripper is open", "lift over the wall, then carry the puck to the target location",
+         "target location", "puck", "words"),
         ("hand-insert", "gripper is above the puck top", "reach down to the puck", "puck top", G, "words"),
         # Words of other tasks, under a condition that no shipped plan has.
         ("coffee-pull", "gripper is near the mug rim", "move the puck to the target location", "target location",

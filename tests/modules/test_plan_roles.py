@@ -1,5 +1,8 @@
 """PlanRoles: the way from what is moved to its target, to where demonstrations touch things, turned as the scene is."""
 
+import pickle
+from copy import deepcopy
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -152,6 +155,40 @@ def test_a_loss_of_an_actor_without_contacts_is_refused():
     fit_normalization(make_loss(), replay)
 
 
+def test_actors_with_the_same_weights_have_the_same_contacts_whichever_is_fitted():
+    replay, row = make_replay(), PlanTables(MT10).index.row("drawer-open")
+    actor = lw.PlanConditionedActor(MT10, **OPTIONS)
+    copies = [pickle.loads(pickle.dumps(actor)), deepcopy(actor)]
+    wider = actor.with_plans(ZERO_SHOT)
+    back = wider.with_plans(MT10)
+    fit_normalization(back, replay)
+    contact = back.encoder.roles.contact
+    assert contact[row].any()
+    assert torch.equal(actor.encoder.roles.contact, contact)
+    assert torch.equal(wider.encoder.roles.contact[PlanTables(ZERO_SHOT).index.row("drawer-open")], contact[row])
+    assert all(one.encoder.roles.fitted for one in (actor, wider, back))
+    for other in copies:
+        assert not other.encoder.roles.fitted
+        fit_normalization(other, replay)
+        assert torch.equal(other.encoder.roles.contact, contact)
+
+
+def test_training_without_statistics_wants_contacts_first():
+    config = lw.BehavioralCloningConfig(steps=1, batch_size=8, normalize=False)
+    actor, replay = lw.PlanConditionedActor(MT10, **OPTIONS), make_replay()
+    replay.append_transform(actor.transform())
+    for make in (
+        lambda: lw.BehavioralCloningTrainer(actor, replay, config, progress=False),
+        lambda: lw.StackedBehavioralCloning([actor], [replay], config, progress=False),
+    ):
+        with pytest.raises(
+            ValueError, match=r"normalize: False, but roles .*; call fit_normalization\(actor, replay\)"
+        ):
+            make()
+    fit_normalization(actor, replay)
+    lw.BehavioralCloningTrainer(actor, replay, config, progress=False).train()
+
+
 def test_the_opening_is_hidden_but_where_a_step_closes():
     actor = lw.PlanConditionedActor(MT10, hide_opening=1.0, **OPTIONS)
     row, number = lw.task_id("push"), 200
@@ -173,6 +210,12 @@ def test_the_opening_is_hidden_but_where_a_step_closes():
         ({"jitter": 0.1}, "jitter moves the way of the roles, and roles is False; got jitter=0.1"),
         ({"roles": True, "jitter": -1.0}, "jitter must be finite and at least 0"),
         ({"hide_opening": 1.5}, "hide_opening must be"),
+        ({"hide_opening": 0.5, "features": "relative"}, "hide_opening: features='relative' do not show the opening"),
+        ({"features": "opening"}, "features='opening' shows nothing of where things are; it needs roles=True or"),
+        *(
+            ({"roles": True, "distribution": "tanh_normal", name: 0.1}, "jitter, .* must be 0 with a distribution")
+            for name in ("jitter", "swap_unmentioned", "hide_opening")
+        ),
         ({"roles": True, "evaluator": lw.StateQueryEvaluator(MT10)}, "focus, roles, .* an evaluator takes away"),
     ],
 )

@@ -93,5 +93,9 @@ def test_of_modules(replay, expected):
         for module in target.modules():
             if isinstance(module, ObservationFeatures):
                 assert torch.equal(module.mean, expected["differences"].mean)
+    other = TensorDictReplayBuffer(storage=LazyTensorStorage(4), batch_size=2)
+    other.extend(TensorDict(seen=torch.rand(4, 39), batch_size=[4]))
+    with pytest.raises(ValueError, match="replay must hold 'observation', its rows hold seen"):
+        fit_normalization(nn.Linear(1, 1), other)
     with pytest.raises(ValueError, match="Linear holds no ObservationFeatures: there is nothing to normalise"):
         fit_normalization(nn.Linear(2, 2), replay)
