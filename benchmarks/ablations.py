@@ -33,6 +33,11 @@ def _without(setting: Setting, name: str, **changes: Any) -> Preset:
     return replace(FULL[setting], name=f"strong-without-{name}", **changes)
 
 
+def _without_plan_options(setting: Setting) -> Preset:
+    plain = tuple(replace(one, plan_actor={}, any_yaw=False) for one in FULL[setting].members)
+    return _without(setting, "roles", members=plain)
+
+
 def _members(**options: Any) -> tuple[Member, ...]:
     return tuple(replace(member, actor={**member.actor, **options}) for member in FULL["few-shot"].members)
 
@@ -62,9 +67,7 @@ ABLATIONS: Mapping[Setting, Mapping[str, Preset]] = MappingProxyType(
             "rows long after success kept": _few_shot("cutting", after_success=None),
             "the raw observation": _few_shot("differences", members=_members(features="raw")),
             "no feature noise": _few_shot("feature-noise", members=_members(feature_noise=0.0)),
-            "neither focus nor roles": _few_shot(
-                "roles", members=tuple(replace(one, plan_actor={}, any_yaw=False) for one in FULL["few-shot"].members)
-            ),
+            "neither focus nor roles": _without_plan_options("few-shot"),
             "the first member alone": _few_shot("members", members=FULL["few-shot"].members[:1]),
             "a constant learning rate": _few_shot(
                 "cosine", training=replace(FULL["few-shot"].training, schedule="constant")
@@ -72,11 +75,7 @@ ABLATIONS: Mapping[Setting, Mapping[str, Preset]] = MappingProxyType(
         },
         "zero-shot": {
             "the recipe": FULL["zero-shot"],
-            "all differences instead of roles": _without(
-                "zero-shot",
-                "roles",
-                members=tuple(replace(one, plan_actor={}, any_yaw=False) for one in FULL["zero-shot"].members),
-            ),
+            "all differences instead of roles": _without_plan_options("zero-shot"),
             "no contacts": _zero_shot("contacts"),
             "objects' own places instead of named points": _zero_shot("points"),
             "the opening shown": _zero_shot("hiding", plan_actor={"hide_opening": 0.0}),

@@ -20,7 +20,8 @@ from lw_torchrl.modules.action_head import ActionHead, DistributionName
 from lw_torchrl.modules.encoder import Encoder, Encoding
 from lw_torchrl.modules.policy import Policy
 
-_RANDOM_IN_TRAINING = ("feature_noise", "jitter", "swap_unmentioned", "hide_opening")
+_ALTERING = ("jitter", "swap_unmentioned", "hide_opening")
+_RANDOM_IN_TRAINING = ("feature_noise", *_ALTERING)
 
 
 def noise_of_features(asked: float | None, distribution: str | None) -> float:
@@ -59,6 +60,12 @@ class ConditionedActor(Policy):
         out_keys: Sequence[NestedKey] | None,
     ) -> None:
         super().__init__()
+        if distribution is not None and any(encoder.config.get(name) for name in _ALTERING):
+            raise ValueError(
+                f"{', '.join(_ALTERING[:-1])} and {_ALTERING[-1]} must be 0 with a distribution: in training mode they "
+                "would change its likelihoods from call to call; train an actor without one, and take "
+                "actor.stochastic()"
+            )
         self.encoder = encoder
         self.head = ActionHead(encoder.width, width, depth, squash, distribution, init_std)
         self.plans, self.tasks, self.in_keys = encoder.plans, encoder.tasks, encoder.in_keys

@@ -18,8 +18,8 @@ from lw_torchrl.language.observation import (
 )
 from lw_torchrl.language.plan_tables import PlanTables
 from lw_torchrl.language.plans import Plans, PlanStep
-from lw_torchrl.language.roles import plan_roles, role_object
 from lw_torchrl.language.tasks import Task
+from lw_torchrl.modules.plan_roles import PlanRoles
 
 # The numbers of each thing that an observation tells of, now and a step before: two objects, with their quaternions,
 # and the goal, which has no past.
@@ -38,19 +38,20 @@ def _names(step: PlanStep, task: Task) -> set[str]:
     return names
 
 
-def mentioned(plans: Plans, tables: PlanTables, roles: bool = False) -> Tensor:
+def mentioned(plans: Plans, tables: PlanTables, roles: PlanRoles | None = None) -> Tensor:
     """(T, S, 3) bool, a row for each task as in ``tables``: whether a step's condition or skill mentions the
     first object, the second, the goal, or a point beside it; with ``roles``, also whether it moves it or to it."""
     table = torch.zeros(len(plans), plans.num_steps, len(_PLACES), dtype=torch.bool)
     for task, plan in plans.items():
-        things = [[plan.definition.object(name) for name in _names(step, plan.definition)] for step in plan.steps]
-        if roles:
-            for found, said in zip(things, plan_roles(plan), strict=True):
-                found += [role_object(plan.definition, name) for name in (said.moved, said.target) if name]
-        for number, found in enumerate(things):
-            for thing, place in enumerate(_PLACES):
-                if any(place.intersection(one.position) for one in found):
-                    table[tables.index.row(task), number, thing] = True
+        for number, step in enumerate(plan.steps):
+            for name in _names(step, plan.definition):
+                for thing, place in enumerate(_PLACES):
+                    if place.intersection(plan.definition.object(name).position):
+                        table[tables.index.row(task), number, thing] = True
+    if roles is not None:
+        ends = torch.cat((roles.begin, roles.end), -1).flatten(2)  # (T, S, 6)
+        for thing, place in enumerate(_PLACES):
+            table[..., thing] |= torch.isin(ends, torch.tensor(sorted(place))).any(-1)
     return table
 
 

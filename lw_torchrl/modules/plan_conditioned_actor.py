@@ -118,11 +118,6 @@ class PlanConditionedActor(ConditionedActor):
         check_choice("mix", mix, ("latents", "actions"))
         if mix == "actions" and distribution is not None:
             raise ValueError("mix must be 'latents' with a distribution: a mean of several actions has no likelihood")
-        if distribution is not None and (jitter or swap_unmentioned or hide_opening):
-            raise ValueError(
-                "jitter, swap_unmentioned and hide_opening must be 0 with a distribution: in training mode they would "
-                "change its likelihoods from call to call; train an actor without one, and take actor.stochastic()"
-            )
         encoder = PlanEncoder(
             plans,
             features=features,

@@ -150,13 +150,14 @@ class PlanEncoder(Encoder):
         # The tables come from the plans, not from training: they are not part of the state that is saved.
         self.register_buffer("text_vectors", unit_scale(vectors), persistent=False)
         self.register_buffer("skill_index", self.attention.tables.skill_index, persistent=False)
-        self.register_buffer("mentioned", mentioned(self.plans, self.attention.tables, roles), persistent=False)
         closing = torch.tensor([closes(skill) for skill in self.skills])
         self.register_buffer("closing", closing[self.skill_index], persistent=False)
         self.latent_size = latent_size
         self.texts = text_to_latent(vectors.shape[1], latent_size, encoder_width, encoder_depth)
         self.focus = PlanFocus(self.plans, self.attention.tables, feature_noise) if focus else None
         self.roles = PlanRoles(self.plans, self.attention.tables, feature_noise, jitter) if roles else None
+        about = mentioned(self.plans, self.attention.tables, self.roles)
+        self.register_buffer("mentioned", about, persistent=False)
         self.features = ObservationFeatures(features, feature_noise)
 
     @property

@@ -62,7 +62,7 @@ def fit_normalization(target: nn.Module, replay: TensorDictReplayBuffer) -> None
         if isinstance(target, Policy) and (task_id := rows.get("task_id", None)) is not None:
             target.fit_contacts(observation, task_id.cpu())
         return
-    if any(not of("fitted") for _, of in _held(target, PlanRoles)):
+    if _lacks_contacts(target):
         raise ValueError(
             "roles: where the hand touches things is taken from demonstrations by fit_normalization(actor, replay), "
             "before the loss is made of the actor"
@@ -81,7 +81,7 @@ def fit_normalization(target: nn.Module, replay: TensorDictReplayBuffer) -> None
 
 def check_contacts(actor: nn.Module) -> None:
     """Raise :class:`ValueError` if an actor with ``roles`` would be trained without contacts."""
-    if any(not of("fitted") for _, of in _held(actor, PlanRoles)):
+    if _lacks_contacts(actor):
         raise ValueError(
             "normalize: False, but roles want to know where the demonstrations touch things; call "
             "fit_normalization(actor, replay) of lw_torchrl.trainers first"
@@ -106,6 +106,10 @@ def fit_untrained(loss: LossModule, replay: TensorDictReplayBuffer) -> None:
                 "OfflineConfig(normalize=False) to keep them, and fresh networks theirs by fit_normalization(network, "
                 "replay) before the loss is made"
             )
+
+
+def _lacks_contacts(target: nn.Module) -> bool:
+    return any(not of("fitted") for _, of in _held(target, PlanRoles))
 
 
 def _statistics(target: nn.Module) -> Iterator[tuple[str, Tensor, Tensor]]:
