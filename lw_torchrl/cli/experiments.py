@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, cast
@@ -13,6 +13,7 @@ from lw_torchrl.cli.sources import read_encoder, read_plans, read_tasks
 from lw_torchrl.cli.units import check_asked, elsewhere, report
 
 if TYPE_CHECKING:
+    from lw_torchrl.evaluation import EvaluationResult
     from lw_torchrl.experiments.runs import Run
     from lw_torchrl.language.plans import Plans
     from lw_torchrl.language.text import TextEncoder
@@ -179,10 +180,19 @@ def _here(
         yield f"{name}: mean success {result.mean_success:.3f}, {result.config['seconds']:.0f} s"
 
 
+def _best(method: str, results: Mapping[int, EvaluationResult]) -> dict[str, dict[str, float]]:
+    """A method's best rates of several evaluations, a mean over seeds, where its preset has several."""
+    found = [result.config["best"] for result in results.values() if "best" in result.config]
+    if not found:
+        return {}
+    rates = {task: sum(one["rates"][task] for one in found) / len(found) for task in found[0]["rates"]}
+    return {f"{method}, best of the last {min(one['of'] for one in found)} evaluations": rates}
+
+
 def _summarize(runs: list[Run], load: Callable[[Run], Plans], out: Path) -> None:
     """A summary, tables and a figure for each setting, from the results on disk."""
     from lw_torchrl._files import write_json, write_text
-    from lw_torchrl.evaluation import EvaluationResult, MethodComparison, plot_sorted_tasks, published_curves, summarize
+    from lw_torchrl.evaluation import MethodComparison, plot_sorted_tasks, published_curves, summarize
     from lw_torchrl.experiments.execution import load_result
 
     found: dict[Path, dict[str, dict[int, EvaluationResult]]] = {}
@@ -198,15 +208,16 @@ def _summarize(runs: list[Run], load: Callable[[Run], Plans], out: Path) -> None
         setting = settings[group]
         # One policy for all tasks can be good or bad at all of them alike; a policy for each task cannot.
         options = {"whole_seeds": setting is not None and setting.targets is None}
+        best = {label: rates for method, results in methods.items() for label, rates in _best(method, results).items()}
         published = {} if setting is None else published_curves(setting.name, ("PCBC", "DC"))
         comparison = MethodComparison(
-            {method: summarize(results, **options) for method, results in methods.items()}, published, **options
+            {method: summarize(results, **options) for method, results in methods.items()}, best | published, **options
         )
         folder = out / group
         print(f"\n{group}\n{comparison.headline()}")
         write_json(folder / "summary.json", comparison.to_json())
         write_text(folder / "summary.md", f"{comparison.headline()}\n\n{comparison.per_task()}\n")
-        curves = {} if setting is None else published_curves(setting.name)
+        curves = {} if setting is None else best | published_curves(setting.name)
         plot_sorted_tasks(
             comparison.summaries, folder / "tasks.png", published=curves, title=f"{group}, last checkpoint"
         )

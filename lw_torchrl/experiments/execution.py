@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -20,6 +20,7 @@ from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.tasks import resolve_tasks
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules import ScriptedSkillActor
+from lw_torchrl.modules.policy import Policy
 
 EVALUATION_SEED = 10_000
 """Training seeds count from 0; the evaluation of training seed k has seed 10000 + k."""
@@ -27,12 +28,10 @@ RESULTS = "results.json"
 
 
 def _evaluate(
+    policies: Policy | ScriptedSkillActor | Mapping[str, Policy],
     run: Run,
-    plans: Plans,
-    out: Path,
     tasks: tuple[str, ...],
     progress: bool,
-    text_encoder: TextEncoder | None,
     device: torch.device,
 ) -> EvaluationResult:
     options: dict[str, Any] = {
@@ -41,21 +40,24 @@ def _evaluate(
         "noise_scale": 0.1,
         "stop_at_success": True,
     }
-    if run.method == SCRIPTED:
-        return evaluate(ScriptedSkillActor(plans), tasks=tasks, progress=progress, **options)
-    options["device"] = device
-    if run.setting.targets is None:
-        policy = train_one(run, plans, out, progress, text_encoder, device)
-        return evaluate(policy, tasks=tasks, progress=progress, **options)
-    actors = train_each(run, plans, out, progress, text_encoder, device)
-    found = sorted({*tasks} & {*actors})
+    if run.method != SCRIPTED:
+        options["device"] = device
+    if not isinstance(policies, Mapping):
+        return evaluate(policies, tasks=tasks, progress=progress, **options)
+    found = sorted({*tasks} & {*policies})
     each = []
     with Progress("evaluating", len(found), "model", show=progress) as bar:
         for task in found:
-            each.append(evaluate(actors[task], tasks=task, progress=False, **options))
+            each.append(evaluate(policies[task], tasks=task, progress=False, **options))
             bar.update()
     shown = [task for one in each for task in one.config["tasks"]]
     return EvaluationResult(each[0].config | {"tasks": shown}, tuple(e for one in each for e in one.episodes))
+
+
+def _best(results: Sequence[EvaluationResult]) -> dict[str, Any]:
+    """How many evaluations there are, and each task's best success rate of them."""
+    rates = {task: max(one.success_once[task] or 0.0 for one in results) for task in results[0].success_once}
+    return {"of": len(results), "rates": rates}
 
 
 class Evaluated(Protocol):
@@ -76,7 +78,10 @@ def load_result(run: Evaluated, plans: Plans, out: Path) -> EvaluationResult | N
     Raises:
         ValueError: it is of another configuration.
     """
-    path = out / run.folder / RESULTS
+    return _load(out / run.folder / RESULTS, run, plans)
+
+
+def _load(path: Path, run: Evaluated, plans: Plans) -> EvaluationResult | None:
     if not path.is_file():
         return None
     result = EvaluationResult.load(path)
@@ -87,7 +92,7 @@ def load_result(run: Evaluated, plans: Plans, out: Path) -> EvaluationResult | N
     if different:
         raise ValueError(
             f"out: {str(path)!r} is of another configuration, it differs in {', '.join(different)}; choose another "
-            f"folder, or delete {str(path.parent)!r} to do the run again"
+            f"folder, or delete {run.folder} there to do the run again"
         )
     return result
 
@@ -115,8 +120,10 @@ def execute_run(
             elsewhere is finished here.
 
     Returns:
-        The evaluation of the last checkpoint, action noise 0.1; ``config["run"]`` says what was done, and
-        ``config["seconds"]`` how long this call took.
+        The evaluation of the last checkpoint, action noise 0.1; ``config["run"]`` says what was done,
+        ``config["seconds"]`` how long this call took, and ``config["best"]``, where the preset has more evaluations
+        than one, ``of`` how many ``rates`` has each task's best success rate. The earlier ones are in
+        ``evaluations/<steps>.json``.
 
     Raises:
         ValueError: ``out`` holds the same run of another configuration.
@@ -129,8 +136,26 @@ def execute_run(
     started = time.perf_counter()
     for dataset in run.datasets:
         dataset.collect(out, progress)
-    result = _evaluate(run, plans, out, resolve_tasks(tasks), progress, text_encoder, there)
-    spent = {"run": run.describe(plans), "seconds": round(time.perf_counter() - started, 1)}
-    result = replace(result, config=result.config | spent)
+    shown, earlier = resolve_tasks(tasks), out / run.folder / "evaluations"
+    described: dict[str, Any] = {"run": run.describe(plans)}
+
+    def look(policies: Policy | dict[str, Policy], step: int) -> None:
+        file = earlier / f"{step}.json"
+        if _load(file, run, plans) is None:
+            result = _evaluate(policies, run, shown, progress, there)
+            replace(result, config=result.config | described).save(file)
+
+    policies: Any
+    if run.method == SCRIPTED:
+        policies = ScriptedSkillActor(plans)
+    else:
+        train = train_one if run.setting.targets is None else train_each
+        policies = train(run, plans, out, progress, text_encoder, there, look)
+    result = _evaluate(policies, run, shown, progress, there)
+    if run.preset.evaluations > 1 and run.method != SCRIPTED:
+        found = [_load(file, run, plans) for file in sorted(earlier.glob("*.json"))]
+        described["best"] = _best([result, *filter(None, found)])
+    described["seconds"] = round(time.perf_counter() - started, 1)
+    result = replace(result, config=result.config | described)
     result.save(out / run.folder / RESULTS)
     return result

@@ -99,6 +99,11 @@ class Preset:
         passes: train for so many passes over the rows instead of ``training.steps`` minibatches.
         members: the actors of a policy, each trained by itself on the same demonstrations.
         training: of the optimizer.
+        evaluations: the policy is evaluated so many times, the last time when it is trained, and a 25th of the training
+            apart. More than one is for policies of one member.
+
+    Raises:
+        ValueError: more evaluations than one, of more members than one.
     """
 
     name: str
@@ -109,6 +114,15 @@ class Preset:
     passes: int | None
     members: tuple[Member, ...]
     training: BehavioralCloningConfig
+    evaluations: int = 1
+
+    def __post_init__(self) -> None:
+        if self.evaluations > 1 and len(self.members) > 1:
+            raise ValueError(f"evaluations must be 1 of {len(self.members)} members, got {self.evaluations}")
+
+    def evaluated_before(self, steps: int) -> list[int]:
+        """After how many steps a policy is evaluated that is trained for more."""
+        return sorted({steps - k * steps // 25 for k in range(1, self.evaluations)} - {steps})
 
 
 _DIFFERENCES = {"features": "differences", "width": 256}
@@ -198,14 +212,18 @@ _PAPER = Preset(
         max_grad_norm=1e9,
         checkpoint_every=10_000,
     ),
+    evaluations=10,
 )
+# Four rows of each task, as few-shot's 200 are; and so five times as many steps in a pass.
+_PAPER_ZERO_SHOT = replace(_PAPER, training=replace(_PAPER.training, batch_size=40))
+# There 40, too, but the half of a minibatch must suit ten base tasks, or nine where the target is one of them.
 _PAPER_ONE_SHOT = replace(_PAPER, base=NOISY, target=CLEAN, training=replace(_PAPER.training, batch_size=180))
 
 PRESETS: Mapping[str, Mapping[str, Preset]] = MappingProxyType(
     {
         "strong": {"zero-shot": _STRONG_ZERO_SHOT, "few-shot": _STRONG, "one-shot": _STRONG_ONE_SHOT},
         "evaluator": {"few-shot": _EVALUATOR},
-        "paper": {"zero-shot": _PAPER, "few-shot": _PAPER, "one-shot": _PAPER_ONE_SHOT},
+        "paper": {"zero-shot": _PAPER_ZERO_SHOT, "few-shot": _PAPER, "one-shot": _PAPER_ONE_SHOT},
     }
 )
 """Preset's name, then setting's name, to :class:`Preset`. Source of "paper": section 'Conditional Plan Experiments'."""

@@ -140,6 +140,8 @@ class Run:
                 "after_success": self.preset.after_success,
                 "passes": self.preset.passes,
             }
+            if self.preset.evaluations > 1:
+                described["evaluations"] = self.preset.evaluations
         if self.encoder_name and self.method != SCRIPTED:
             described["text_encoder"] = self.encoder_name
         return plain(described)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -58,6 +58,24 @@ def _forget_checkpoints(folder: Path) -> None:
         checkpoint.unlink()
 
 
+Look = Callable[[dict[str, Policy] | Policy, int], None]
+"""Called in the midst of training with what is trained, and the steps that were made."""
+
+
+def _train(
+    trainer: BehavioralCloningTrainer | StackedBehavioralCloning,
+    run: Run,
+    policy: dict[str, Policy] | Policy,
+    look: Look | None,
+) -> None:
+    for step in run.preset.evaluated_before(trainer.config.steps) if look else ():
+        if trainer.steps <= step:
+            trainer.train(until=step)
+            assert look is not None
+            look(policy, step)
+    trainer.train()
+
+
 def _kept(described: dict[str, Any], file: Path, text_encoder: TextEncoder | None) -> Policy:
     check_description(file, {"run": described})
     return load_actor(file, text_encoder=text_encoder)
@@ -70,6 +88,7 @@ def train_one(
     progress: bool,
     text_encoder: TextEncoder | None = None,
     device: torch.device = CPU,
+    look: Look | None = None,
 ) -> Policy:
     """One policy for all tasks, kept in ``policy.zip``; until all its members are done, each has a checkpoint."""
     folder, described = out / run.folder, run.describe(plans)
@@ -92,7 +111,7 @@ def train_one(
         replay.append_transform(_transform(run, actors[-1], member))
         checkpoint = folder / f"checkpoint-{number}.zip"
         options: dict[str, Any] = {"checkpoint": checkpoint, "progress": progress, "device": device}
-        BehavioralCloningTrainer(actors[-1], replay, config, **options).train()
+        _train(BehavioralCloningTrainer(actors[-1], replay, config, **options), run, actors[-1], look)
     policy = _keep(described, actors, file, replay)
     _forget_checkpoints(folder)
     return policy
@@ -105,6 +124,7 @@ def train_each(
     progress: bool,
     text_encoder: TextEncoder | None = None,
     device: torch.device = CPU,
+    look: Look | None = None,
 ) -> dict[str, Policy]:
     """A policy for each target, kept in ``models/<target>.zip``; all are trained together, member by member.
 
@@ -140,7 +160,8 @@ def train_each(
         members.append(actors)
         checkpoint = folder / f"checkpoint-{number}.zip"
         options: dict[str, Any] = {"checkpoint": checkpoint, "progress": progress, "device": device}
-        StackedBehavioralCloning(members[-1], replays, config, **options).train()
+        stack = StackedBehavioralCloning(actors, replays, config, **options)
+        _train(stack, run, dict(zip(targets, actors, strict=True)), look)
     policies = {
         target: _keep(described, each, files[target], replay)
         for target, replay, *each in zip(targets, replays, *members, strict=True)

@@ -18,7 +18,7 @@ from lw_torchrl._files import sweep
 from lw_torchrl._progress import Progress
 from lw_torchrl.modules.policy import Policy
 from lw_torchrl.trainers.checkpoint import describe_data, describe_replay, write
-from lw_torchrl.trainers.config import BehavioralCloningConfig, make_optimizer
+from lw_torchrl.trainers.config import BehavioralCloningConfig, last_step, make_optimizer
 from lw_torchrl.trainers.evaluator_anchor import EvaluatorAnchor
 from lw_torchrl.trainers.interrupts import interrupts_between_steps
 from lw_torchrl.trainers.latent_terms import LatentTerms
@@ -154,10 +154,19 @@ class BehavioralCloningTrainer:
         self.state.step += 1
         return loss.detach()
 
-    def train(self) -> float:
+    @property
+    def steps(self) -> int:
+        """How many minibatches the actor has been trained on."""
+        return self.state.step
+
+    def train(self, until: int | None = None) -> float:
         """Train to the last step, from wherever training stands.
 
         Ctrl-C ends it between two steps, with a checkpoint; a second Ctrl-C at once.
+
+        Args:
+            until: end after so many steps in all, with a checkpoint, to look at the actor; None for all that the
+                configuration has. What is learned is the same.
 
         Returns:
             The mean loss over the last 100 steps made; NaN if there were none left to make.
@@ -165,8 +174,8 @@ class BehavioralCloningTrainer:
         losses = self._losses
         losses.clear()
         self.actor.train()
-        every, total = self.config.checkpoint_every, self.config.steps
-        bar = Progress("training", total, "step", initial=self.state.step, show=self.progress)
+        every, total = self.config.checkpoint_every, last_step(self.config, until)
+        bar = Progress("training", self.config.steps, "step", initial=self.state.step, show=self.progress)
         with bar, interrupts_between_steps() as interrupt:
             while self.state.step < total and not interrupt.asked:
                 losses.add(self.step())

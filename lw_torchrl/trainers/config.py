@@ -71,6 +71,16 @@ class BehavioralCloningConfig:
         return {name: value for name, value in asdict(self).items() if value or name not in _LATER}
 
 
+def last_step(config: BehavioralCloningConfig, until: int | None) -> int:
+    """After how many steps training ends that is asked to end at ``until``."""
+    if until is None:
+        return config.steps
+    check_int("until", until, minimum=1)
+    if until > config.steps:
+        raise ValueError(f"until must be at most the configuration's steps, {config.steps}, got {until}")
+    return until
+
+
 def make_optimizer(
     parameters: Iterable[Tensor], config: BehavioralCloningConfig
 ) -> tuple[torch.optim.Optimizer, torch.optim.lr_scheduler.LRScheduler]:
@@ -80,7 +90,8 @@ def make_optimizer(
     if config.optimizer == "adamw":
         optimizer = torch.optim.AdamW(parameters, lr=rate, weight_decay=config.weight_decay, fused=True)
     else:
-        optimizer = torch.optim.SGD(parameters, lr=rate, momentum=config.momentum, weight_decay=config.weight_decay)
+        decay, momentum = config.weight_decay, config.momentum
+        optimizer = torch.optim.SGD(parameters, lr=rate, momentum=momentum, weight_decay=decay, fused=True)
     if config.schedule == "cosine":
         return optimizer, torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, config.steps)
     return optimizer, torch.optim.lr_scheduler.LambdaLR(optimizer, lambda _: 1.0)

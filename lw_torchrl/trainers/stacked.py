@@ -20,7 +20,7 @@ from lw_torchrl._files import sweep
 from lw_torchrl._progress import Progress
 from lw_torchrl.modules.policy import Policy
 from lw_torchrl.trainers.checkpoint import describe_data, describe_replay, write
-from lw_torchrl.trainers.config import BehavioralCloningConfig, make_optimizer
+from lw_torchrl.trainers.config import BehavioralCloningConfig, last_step, make_optimizer
 from lw_torchrl.trainers.interrupts import interrupts_between_steps
 from lw_torchrl.trainers.latent_terms import LatentTerms
 from lw_torchrl.trainers.minibatches import check_replay, draw_batch
@@ -221,21 +221,27 @@ class StackedBehavioralCloning:
         for gradient in gradients:
             gradient.mul_(factor.reshape(-1, *[1] * (gradient.ndim - 1)))
 
-    def train(self) -> Tensor:
+    def train(self, until: int | None = None) -> Tensor:
         """Train to the last step and give the actors their weights; Ctrl-C as in :class:`BehavioralCloningTrainer`.
+
+        Args:
+            until: end after so many steps in all, as there.
 
         Returns:
             (M,) float32, each actor's mean loss over the last 100 steps made; NaN if there were none left to make.
         """
         losses = self._losses
         losses.clear()
+        total = last_step(self.config, until)
+        for actor in self.actors:
+            actor.train()
         what = f"training {len(self.actors)} models"
         bar = Progress(what, self.config.steps, "step", initial=self.steps, show=self.progress)
         with bar, interrupts_between_steps() as interrupt:
-            while self.steps < self.config.steps and not interrupt.asked:
+            while self.steps < total and not interrupt.asked:
                 losses.add(self.step())
                 bar.update()
-                saves = self.steps % self.config.checkpoint_every == 0 or self.steps == self.config.steps
+                saves = self.steps % self.config.checkpoint_every == 0 or self.steps == total
                 if saves or self.steps % READ_EVERY == 0:
                     losses.read(self.steps)
                 if saves:

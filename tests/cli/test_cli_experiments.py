@@ -39,7 +39,7 @@ def tiny(monkeypatch):
         members=(Member({"width": 16, "depth": 1}),),
         training=lw.BehavioralCloningConfig(steps=20, batch_size=20),
     )
-    presets = {"strong": {"few-shot": small}, "paper": {"few-shot": replace(small, passes=500)}}
+    presets = {"strong": {"few-shot": small}, "paper": {"few-shot": replace(small, passes=500, evaluations=3)}}
     monkeypatch.setattr(recipes, "PRESETS", MappingProxyType(presets))
     monkeypatch.setattr(execution, "evaluate", partial(lw.evaluate, max_steps=60))
     monkeypatch.setattr(recipes, "SETTINGS", MappingProxyType({"few-shot": DataSetting("few-shot", "reach", 1)}))
@@ -81,6 +81,18 @@ def test_units_and_their_summary(capsys, tmp_path, tiny):
     assert (folder / "summary.md").read_text().count("\n| ") == 4 + 2 + 52 + 2 - 1
     assert (folder / "tasks.png").read_bytes().startswith(b"\x89PNG")
     assert (folder / "dc" / "seed1" / "results.json").read_text() == first
+
+
+def test_the_best_of_several_evaluations_stands_beside_the_published(capsys, tmp_path, tiny):
+    out = run(capsys, *arguments(tmp_path, "--preset", "paper", "--passes", 5, methods=["dc"]))
+    assert "| dc, best of the last 3 evaluations " in out
+    folder = tmp_path / "few-shot" / "paper"
+    means = json.loads((folder / "summary.json").read_text())["published_means"]
+    best = [json.loads((folder / f"dc/seed{seed}/results.json").read_text())["config"]["best"] for seed in (0, 1)]
+    expected = sum(sum(one["rates"].values()) for one in best) / 100
+    assert means["dc, best of the last 3 evaluations"] == pytest.approx(expected)
+    assert list(means)[1:] == list(lw.evaluation.published_curves("few-shot", ("PCBC", "DC")))
+    assert "dc, best of the last 3 evaluations" in (folder / "summary.md").read_text()
 
 
 def test_plans_of_ones_own(capsys, tmp_path, tiny):

@@ -142,6 +142,15 @@ def test_it_carries_on_from_its_checkpoint(demos, tmp_path):
     for name, value in whole._parameters.items():
         assert torch.equal(value, done._parameters[name])
 
+    parts = trainer(config)
+    for until in (7, 13, None):
+        parts.train(until=until)
+        assert not parts.actors[1].training
+    for name, value in whole._parameters.items():
+        assert torch.equal(value, parts._parameters[name])
+    with pytest.raises(ValueError, match="until must be at most the configuration's steps, 20, got 21"):
+        parts.train(until=21)
+
     with pytest.raises(ValueError, match="is of another configuration, its training differs in steps"):
         trainer(lw.BehavioralCloningConfig(steps=21, batch_size=30, checkpoint_every=10), path)
     path.write_bytes(path.read_bytes()[:-100])

@@ -99,6 +99,23 @@ def test_checkpoints_come_in_their_time_and_leave_one_file(demos, tmp_path, monk
     assert [path.name for path in tmp_path.iterdir()] == ["checkpoint.zip"]
 
 
+def test_trained_in_parts_it_ends_the_same(demos, undisturbed, tmp_path):
+    trainer = make_trainer(demos, tmp_path / "checkpoint.zip")
+    trainer.train(until=4)
+    assert (trainer.steps, trainer.actor.training) == (4, False)
+    assert make_trainer(demos, tmp_path / "checkpoint.zip").steps == 4
+    assert math.isnan(trainer.train(until=3))
+    trainer.train(until=7)
+    trainer.train()
+    assert_same(everything(trainer), undisturbed)
+    for until, message in (
+        (0, "until must be at least 1, got 0"),
+        (13, "at most the configuration's steps, 12, got 13"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            trainer.train(until=until)
+
+
 def test_without_a_checkpoint_nothing_is_written(demos, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     make_trainer(demos).train()

@@ -1,0 +1,43 @@
+"""Runs of experiments of one task and sixty steps, and doing them."""
+
+import json
+from dataclasses import replace
+
+import lw_torchrl as lw
+from lw_torchrl.experiments.execution import execute_run
+from lw_torchrl.experiments.recipes import PRESETS, DataSetting, Execution, Member
+from lw_torchrl.experiments.runs import Run
+
+PLANS = lw.load_plans("MT50")
+TINY = DataSetting("tiny", "reach", 2)
+TINY_ONE_SHOT = DataSetting("tiny-one-shot", "reach", 2, targets="push")
+ASTRAY = PRESETS["strong"]["few-shot"].base
+MEMBER = Member({"features": "differences", "width": 32, "depth": 1}, {"focus": True, "swap_unmentioned": 0.5})
+PRESET = replace(
+    PRESETS["strong"]["few-shot"],
+    target=Execution("target", (0.0,)),
+    members=(MEMBER,),
+    training=lw.BehavioralCloningConfig(steps=60, batch_size=20, checkpoint_every=20),
+)
+ROLES = {"features": "opening", "roles": True, "jitter": 0.03, "hide_opening": 1.0}
+OTHER = Member({"features": "relative", "width": 16, "depth": 1}, ROLES, yaw=0.3, any_yaw=True)
+ENSEMBLE = replace(PRESET, name="ensemble", members=(MEMBER, OTHER))
+
+
+def a_run(method="pcbc", seed=3, setting=TINY, preset=PRESET):
+    return Run(setting, method, seed, preset, episodes=2)
+
+
+def task_of(one):
+    return one.setting.targets or "reach"
+
+
+def execute(one, out, preset=None):
+    one = one if preset is None else replace(one, preset=preset)
+    return execute_run(one, PLANS, out, tasks=task_of(one), progress=False)
+
+
+def rates(path):
+    found = json.loads((path / "results.json").read_text())
+    assert found["config"].pop("seconds") > 0
+    return found["episodes"], found["config"]
