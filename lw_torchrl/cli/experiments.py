@@ -217,8 +217,7 @@ def _summarize(runs: list[Run], load: Callable[[Run], Plans], out: Path) -> None
         print(f"\n{group}\n{comparison.headline()}")
         write_json(folder / "summary.json", comparison.to_json())
         write_text(folder / "summary.md", f"{comparison.headline()}\n\n{comparison.per_task()}\n")
-        curves = {} if setting is None else best | published_curves(setting.name)
-        plot_sorted_tasks(
-            comparison.summaries, folder / "tasks.png", published=curves, title=f"{group}, last checkpoint"
-        )
+        curves = {} if setting is None else published_curves(setting.name)
+        drawn = comparison.summaries | best
+        plot_sorted_tasks(drawn, folder / "tasks.png", published=curves, title=f"{group}, last checkpoint")
         print(f"\nsummary.md, summary.json and tasks.png are in {folder}")

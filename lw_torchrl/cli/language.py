@@ -90,8 +90,8 @@ def plans(
 
     Args:
         names: MT10, MT50, or names of tasks.
-        plans: MT10 or MT50 for the shipped plans, .plan files, .json files of pairs, or folders; where several have a
-            plan for a task, the last one's counts.
+        plans: MT10 or MT50 for the shipped plans, .plan files, each named after its task (push.plan), .json files of
+            pairs, or folders; where several have a plan for a task, the last one's counts.
         skill_set: of the shipped plans, those with scripted skills of their own, or those worded as MT10's are.
         roles: a table of the steps, what each moves and what it goes to, and what told: "skill", the text is a scripted
             skill's; "reworded", the text speaks of other tasks' things, and the shipped plan has a scripted skill under

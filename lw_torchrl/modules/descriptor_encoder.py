@@ -59,6 +59,8 @@ class DescriptorEncoder(Encoder):
         out_keys: Sequence[NestedKey] | None = None,
     ) -> None:
         super().__init__()
+        if features == "opening":
+            raise ValueError("features='opening' shows nothing of where things are; only plans with roles or focus do")
         self.definitions = named_tasks(tasks)
         self.tasks = tuple(self.definitions)
         self.in_keys = as_keys("in_keys", in_keys, ("observation", "task_id"))

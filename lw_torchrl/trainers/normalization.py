@@ -83,8 +83,8 @@ def check_contacts(actor: nn.Module) -> None:
     """Raise :class:`ValueError` if an actor with ``roles`` would be trained without contacts."""
     if _lacks_contacts(actor):
         raise ValueError(
-            "normalize: False, but roles want to know where the demonstrations touch things; call "
-            "fit_normalization(actor, replay) of lw_torchrl.trainers first"
+            "roles want to know where the demonstrations touch things; call fit_normalization(actor, replay) of "
+            "lw_torchrl.trainers first, which normalize=True does for a Policy"
         )
 
 

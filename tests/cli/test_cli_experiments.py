@@ -39,7 +39,8 @@ def tiny(monkeypatch):
         members=(Member({"width": 16, "depth": 1}),),
         training=lw.BehavioralCloningConfig(steps=20, batch_size=20),
     )
-    presets = {"strong": {"few-shot": small}, "paper": {"few-shot": replace(small, passes=500, evaluations=3)}}
+    paper = replace(small, name="paper", passes=500, evaluations=3)
+    presets = {"strong": {"few-shot": small}, "paper": {"few-shot": paper}}
     monkeypatch.setattr(recipes, "PRESETS", MappingProxyType(presets))
     monkeypatch.setattr(execution, "evaluate", partial(lw.evaluate, max_steps=60))
     monkeypatch.setattr(recipes, "SETTINGS", MappingProxyType({"few-shot": DataSetting("few-shot", "reach", 1)}))
@@ -84,7 +85,7 @@ def test_units_and_their_summary(capsys, tmp_path, tiny):
 
 
 def test_the_best_of_several_evaluations_stands_beside_the_published(capsys, tmp_path, tiny):
-    out = run(capsys, *arguments(tmp_path, "--preset", "paper", "--passes", 5, methods=["dc"]))
+    out = run(capsys, *arguments(tmp_path, "--preset", "paper", "--passes", 50, methods=["dc"]))
     assert "| dc, best of the last 3 evaluations " in out
     folder = tmp_path / "few-shot" / "paper"
     means = json.loads((folder / "summary.json").read_text())["published_means"]

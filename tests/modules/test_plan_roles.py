@@ -181,9 +181,7 @@ def test_training_without_statistics_wants_contacts_first():
         lambda: lw.BehavioralCloningTrainer(actor, replay, config, progress=False),
         lambda: lw.StackedBehavioralCloning([actor], [replay], config, progress=False),
     ):
-        with pytest.raises(
-            ValueError, match=r"normalize: False, but roles .*; call fit_normalization\(actor, replay\)"
-        ):
+        with pytest.raises(ValueError, match=r"roles want to know .*; call fit_normalization\(actor, replay\)"):
             make()
     fit_normalization(actor, replay)
     lw.BehavioralCloningTrainer(actor, replay, config, progress=False).train()
