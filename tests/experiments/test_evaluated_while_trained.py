@@ -4,7 +4,7 @@ import shutil
 from dataclasses import replace
 
 import pytest
-from tiny_runs import ENSEMBLE, PRESET, TINY, TINY_ONE_SHOT, a_run, execute, rates
+from tiny_runs import ENSEMBLE, PRESET, TINY, TINY_ONE_SHOT, a_run, execute, rates, stop_training
 
 import lw_torchrl as lw
 from lw_torchrl.experiments.recipes import PRESETS
@@ -55,16 +55,7 @@ def test_what_is_learned_is_the_same(undisturbed, tmp_path, setting):
 @pytest.mark.parametrize("stop", [46, 57])
 def test_stopped_and_resumed_it_ends_the_same(undisturbed, tmp_path, monkeypatch, setting, stop):
     one = a_run(setting=setting, preset=WATCHED)
-    trainer = lw.BehavioralCloningTrainer if setting is TINY else lw.StackedBehavioralCloning
-    step, count = trainer.step, [0]
-
-    def stops(self):
-        count[0] += 1
-        if count[0] == stop:
-            raise KeyboardInterrupt
-        return step(self)
-
-    monkeypatch.setattr(trainer, "step", stops)
+    count = stop_training(monkeypatch, setting, stop)
     with pytest.raises(KeyboardInterrupt):
         execute(one, tmp_path)
     execute(one, tmp_path)

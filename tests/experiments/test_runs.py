@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tiny_runs import ENSEMBLE, PLANS, PRESET, ROLES, TINY, TINY_ONE_SHOT, a_run, execute, rates, task_of
+from tiny_runs import ENSEMBLE, PLANS, PRESET, ROLES, TINY, TINY_ONE_SHOT, a_run, execute, rates, stop_training, task_of
 
 import lw_torchrl as lw
 from lw_torchrl.experiments import execution, training
@@ -115,16 +115,8 @@ def test_a_result_of_another_configuration_is_refused(undisturbed):
     ],
 )
 def test_stopped_in_training_and_resumed_it_ends_the_same(undisturbed, tmp_path, monkeypatch, setting, preset, stop):
-    trainer = lw.BehavioralCloningTrainer if setting is TINY else lw.StackedBehavioralCloning
-    one, step, count = a_run(setting=setting, preset=preset), trainer.step, [0]
-
-    def stops(self):
-        count[0] += 1
-        if count[0] == stop:
-            raise KeyboardInterrupt
-        return step(self)
-
-    monkeypatch.setattr(trainer, "step", stops)
+    one = a_run(setting=setting, preset=preset)
+    count = stop_training(monkeypatch, setting, stop)
     with pytest.raises(KeyboardInterrupt):
         execute(one, tmp_path)
     execute(one, tmp_path)

@@ -41,3 +41,18 @@ def rates(path):
     found = json.loads((path / "results.json").read_text())
     assert found["config"].pop("seconds") > 0
     return found["episodes"], found["config"]
+
+
+def stop_training(monkeypatch, setting, at):
+    """Ctrl-C before the at-th step that is made; returns a list of the number of steps that were asked for."""
+    trainer = lw.BehavioralCloningTrainer if setting is TINY else lw.StackedBehavioralCloning
+    step, count = trainer.step, [0]
+
+    def stops(self):
+        count[0] += 1
+        if count[0] == at:
+            raise KeyboardInterrupt
+        return step(self)
+
+    monkeypatch.setattr(trainer, "step", stops)
+    return count
