@@ -180,12 +180,12 @@ def _here(
         yield f"{name}: mean success {result.mean_success:.3f}, {result.config['seconds']:.0f} s"
 
 
-def _best(method: str, results: Mapping[int, EvaluationResult]) -> dict[str, dict[str, float]]:
-    """A method's best rates of several evaluations, a mean over seeds, where its preset has several."""
+def _best(method: str, results: Mapping[int, EvaluationResult]) -> dict[str, dict[str, list[float]]]:
+    """Task to the best rate of several evaluations, of each seed, where the method's preset has several."""
     found = [result.config["best"] for result in results.values() if "best" in result.config]
     if not found:
         return {}
-    rates = {task: sum(one["rates"][task] for one in found) / len(found) for task in found[0]["rates"]}
+    rates = {task: [one["rates"][task] for one in found] for task in found[0]["rates"]}
     return {f"{method}, best of the last {min(one['of'] for one in found)} evaluations": rates}
 
 
@@ -209,9 +209,10 @@ def _summarize(runs: list[Run], load: Callable[[Run], Plans], out: Path) -> None
         # One policy for all tasks can be good or bad at all of them alike; a policy for each task cannot.
         options = {"whole_seeds": setting is not None and setting.targets is None}
         best = {label: rates for method, results in methods.items() for label, rates in _best(method, results).items()}
+        means = {label: {task: sum(of) / len(of) for task, of in rates.items()} for label, rates in best.items()}
         published = {} if setting is None else published_curves(setting.name, ("PCBC", "DC"))
         comparison = MethodComparison(
-            {method: summarize(results, **options) for method, results in methods.items()}, best | published, **options
+            {method: summarize(results, **options) for method, results in methods.items()}, means | published, **options
         )
         folder = out / group
         print(f"\n{group}\n{comparison.headline()}")
