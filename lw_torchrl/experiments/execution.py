@@ -150,7 +150,7 @@ def execute_run(
         policies = ScriptedSkillActor(plans)
     else:
         train = train_one if run.setting.targets is None else train_each
-        policies = train(run, plans, out, progress, text_encoder, there, look)
+        policies = train(run, plans, out, progress, look, text_encoder, there)
     result = _evaluate(policies, run, shown, progress, there)
     if run.preset.evaluations > 1 and run.method != SCRIPTED:
         found = [_load(file, run, plans) for file in sorted(earlier.glob("*.json"))]

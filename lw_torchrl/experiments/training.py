@@ -66,12 +66,11 @@ def _train(
     trainer: BehavioralCloningTrainer | StackedBehavioralCloning,
     run: Run,
     policy: dict[str, Policy] | Policy,
-    look: Look | None,
+    look: Look,
 ) -> None:
-    for step in run.preset.evaluated_before(trainer.config.steps) if look else ():
+    for step in run.preset.evaluated_before(trainer.config.steps):
         if trainer.steps <= step:
             trainer.train(until=step)
-            assert look is not None
             look(policy, step)
     trainer.train()
 
@@ -86,9 +85,9 @@ def train_one(
     plans: Plans,
     out: Path,
     progress: bool,
+    look: Look,
     text_encoder: TextEncoder | None = None,
     device: torch.device = CPU,
-    look: Look | None = None,
 ) -> Policy:
     """One policy for all tasks, kept in ``policy.zip``; until all its members are done, each has a checkpoint."""
     folder, described = out / run.folder, run.describe(plans)
@@ -122,9 +121,9 @@ def train_each(
     plans: Plans,
     out: Path,
     progress: bool,
+    look: Look,
     text_encoder: TextEncoder | None = None,
     device: torch.device = CPU,
-    look: Look | None = None,
 ) -> dict[str, Policy]:
     """A policy for each target, kept in ``models/<target>.zip``; all are trained together, member by member.
 
