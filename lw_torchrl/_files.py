@@ -8,6 +8,8 @@ import json
 import os
 import re
 import secrets
+import sys
+import time
 import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -20,8 +22,17 @@ try:
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
+PATIENCE = 1.0
+"""Seconds to wait for others that are at work in a place: they may be about to end."""
 JSON_LIMIT = 32 * 2**20
 """Bytes of a file of JSON or text; read, JSON takes some twenty times as much memory."""
+TOML_LIMIT = 2**18
+"""Bytes of a TOML file, which takes a second to read; the largest of ours has 22 kB."""
+MOST_KEYS = 16
+"""Names joined by dots in a TOML key: Python's reader takes their square in time."""
+
+_KEY = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
+_DOTTED = re.compile(rf"{_KEY}(?:[ \t]*+\.[ \t]*+{_KEY})*+")
 
 
 @contextmanager
@@ -87,12 +98,13 @@ def flush(path: Path) -> None:
 
 
 def sweep(target: str | os.PathLike[str]) -> list[Path]:
-    """Remove the temporary files that killed writers of ``target`` left beside it; returns them.
+    """Remove the temporary files that killed writers of ``target`` left beside it, and those that were being replaced
+    themselves; returns them.
 
     One that is still being written is locked, by whatever thread, process or machine, and stays.
     """
     path = Path(target)
-    pattern = re.compile(re.escape(f".{path.stem}.") + r"[0-9a-f]{16}\.tmp" + re.escape(path.suffix))
+    pattern = re.compile(rf"\.+{re.escape(path.stem)}(\.[0-9a-f]{{16}}\.tmp)+{re.escape(path.suffix)}")
     there = os.listdir(path.parent) if path.parent.is_dir() else ()
     return [left for left in map(path.with_name, filter(pattern.fullmatch, there)) if _remove_unlocked(left)]
 
@@ -112,6 +124,68 @@ def _remove_unlocked(path: Path) -> bool:
     finally:
         os.close(handle)
     return True
+
+
+@contextmanager
+def held(
+    place: str | os.PathLike[str],
+    argument: str,
+    who: str = "process",
+    *,
+    folder: bool = False,
+    wait: bool = False,
+    error: type[ValueError] = ValueError,
+) -> Iterator[None]:
+    """Keep others out of a place that is written to for a while, in whatever thread or process.
+
+    Meanwhile a lock lies in the folder, or beside the file. That of a killed process is free.
+
+    Args:
+        place: the file or the folder.
+        argument: what it is called in the error: "out".
+        who: else may be at work there.
+        folder: whether it is one; it is made where there is none.
+        wait: for those who are at work there, however long it takes.
+        error: what is raised, a second later, where ``wait`` is False.
+    """
+    path = Path(place)
+    lock = path / ".lock" if folder else path.with_name(f".{path.name}.lock")
+    lock.parent.mkdir(parents=True, exist_ok=True)
+    handle = _locked(lock, PATIENCE)
+    if handle is None:
+        if not wait:
+            raise error(
+                f"{argument}: another {who} is at work in {str(path)!r}; let it finish, or choose another "
+                f"{'folder' if folder else 'file'}"
+            )
+        print(f"waiting for another {who} that is at work in {str(path)!r}", file=sys.stderr, flush=True)
+        handle = _locked(lock, float("inf"))
+    try:
+        yield
+    finally:
+        lock.unlink(missing_ok=True)
+        if handle is not None:
+            os.close(handle)
+
+
+def _locked(lock: Path, patience: float) -> int | None:
+    """The handle of a lock, None where others hold it for so many seconds."""
+    until = time.monotonic() + patience
+    while True:
+        handle = os.open(lock, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            if fcntl is not None:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if os.fstat(handle).st_nlink:
+                return handle
+        except BlockingIOError:
+            if time.monotonic() > until:
+                os.close(handle)
+                return None
+            time.sleep(0.05)
+        except OSError:
+            return handle  # a file system without locks
+        os.close(handle)  # it is held, or was removed before it was locked
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
@@ -141,20 +215,26 @@ def read_bytes(path: Path | Traversable, limit: int) -> bytes:
         return stream.read()
 
 
-def read_text(path: Path | Traversable, error: type[ValueError]) -> str:
-    """A text file in UTF-8, with or without a byte order mark; ``error`` names the file that is none."""
+def read_text(path: Path | Traversable, error: type[ValueError], *, limit: int = JSON_LIMIT) -> str:
+    """A text file in UTF-8, with or without a byte order mark; ``error`` names the file that is none, or larger."""
     try:
-        return io.TextIOWrapper(io.BytesIO(read_bytes(path, JSON_LIMIT)), encoding="utf-8-sig").read()
+        return io.TextIOWrapper(io.BytesIO(read_bytes(path, limit)), encoding="utf-8-sig").read()
     except ValueError as fault:
         raise error(f"{path}: must be a text file in UTF-8: {fault}") from fault
 
 
 def read_toml(path: Path | Traversable, error: type[ValueError]) -> dict[str, Any]:
-    """What a TOML file holds; ``error`` names the file that is none."""
-    text = read_text(path, error)
+    """What a TOML file holds; ``error`` names the file that is none, is too large or nested too deeply."""
+    text = read_text(path, error, limit=TOML_LIMIT)
+    for found in _DOTTED.finditer(text):
+        if found[0].count(".") >= MOST_KEYS and (names := len(re.findall(_KEY, found[0]))) > MOST_KEYS:
+            line = text.count("\n", 0, found.start()) + 1
+            raise error(f"{path}: a key of line {line} has {names} nested keys, at most {MOST_KEYS} are read")
     try:
         return tomllib.loads(text)
-    except (ValueError, RecursionError) as fault:  # too long a number is a ValueError, too deep a nesting the other
+    except RecursionError as fault:
+        raise error(f"{path}: it is nested too deeply") from fault
+    except ValueError as fault:  # also too long a number
         raise error(f"{path}: {fault}") from fault
 
 
@@ -176,6 +256,24 @@ def read_json(path: str | os.PathLike[str], what: str, *, limit: int = JSON_LIMI
         return parse_json(read_bytes(file, limit))
     except ValueError as error:
         raise ValueError(f"{what} {str(file)!r} cannot be read: {error}") from error
+
+
+@contextmanager
+def reading(path: str | os.PathLike[str], what: str) -> Iterator[None]:
+    """Let an error in the block name the argument ``path``, a folder that was to hold ``what``.
+
+    Raises:
+        FileNotFoundError: the block looks for a file that is not there.
+        ValueError: the block cannot use what is there.
+    """
+    try:
+        yield
+    except FileNotFoundError as error:
+        raise FileNotFoundError(
+            f"path: {str(path)!r} holds no {what} ({error.filename} is missing); dumps writes one"
+        ) from error
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, IndexError, RuntimeError) as error:
+        raise ValueError(f"path: {str(path)!r} holds no {what} ({error})") from error
 
 
 def parse_json(content: bytes) -> dict[str, Any]:

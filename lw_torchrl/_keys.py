@@ -1,10 +1,14 @@
-"""Keys of tensordicts as arguments."""
+"""Keys of tensordicts as arguments, and modules that are called with a tensordict or with tensors."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import wraps
+from inspect import Parameter, Signature
+from typing import Any
 
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, dispatch, skip_existing
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 
@@ -37,6 +41,17 @@ def as_keys(argument: str, given: Sequence[NestedKey] | None, default: Sequence[
     return keys
 
 
+def check_key(argument: str, given: Any) -> None:
+    """Raise :class:`TypeError` unless ``given`` is a key of a tensordict."""
+    error = TypeError(f"{argument} must be a key, a string or a tuple of strings, got {given!r}")
+    if not isinstance(given, (str, tuple)) or not given:
+        raise error
+    try:
+        unravel_key(given)
+    except Exception as cause:
+        raise error from cause
+
+
 def check_apart(in_keys: Sequence[NestedKey], out_keys: Sequence[NestedKey]) -> None:
     """Raise :class:`ValueError` if a module would write over what it reads."""
     if both := [key for key in out_keys if key in in_keys]:
@@ -59,3 +74,32 @@ def read(tensordict: TensorDictBase, keys: Sequence[NestedKey]) -> list[Tensor]:
     if any(one is None for one in found):
         raise missing_keys(tensordict.keys(True, True), *map(str, keys))
     return found
+
+
+def write(tensordict: TensorDictBase, module: TensorDictModuleBase, values: Sequence[Tensor]) -> TensorDictBase:
+    """Write a tensor for each of the module's keys; ``select_out_keys`` removes those that it did not select."""
+    for key, value in zip(module.out_keys_source, values, strict=True):
+        tensordict.set(key, value)
+    return tensordict
+
+
+def dispatched(forward: Callable[[Any, TensorDictBase], TensorDictBase]) -> Callable[..., Any]:
+    """Let a module's ``forward`` be called as those of TensorDictModules are.
+
+    With a tensordict, or with the tensors of ``in_keys``, by position or by name, as ``torch.export`` calls it too.
+    Under ``set_skip_existing(True)`` a module whose ``out_keys`` are all there does nothing.
+    """
+
+    @wraps(forward)
+    def run(self: TensorDictModuleBase, tensordict: TensorDictBase) -> TensorDictBase:
+        if skip_existing() and all(tensordict.get(key, None) is not None for key in self.out_keys):
+            return tensordict
+        return forward(self, tensordict)
+
+    called = dispatch(run)
+    # torch.export binds arguments to the signature, and dispatch leaves the names of in_keys out.
+    called.__signature__ = Signature([Parameter("self", Parameter.POSITIONAL_OR_KEYWORD), *_ANY])
+    return called
+
+
+_ANY = Parameter("args", Parameter.VAR_POSITIONAL), Parameter("kwargs", Parameter.VAR_KEYWORD)

@@ -6,13 +6,15 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 _STATE = {torch.optim.AdamW: {"step", "exp_avg", "exp_avg_sq"}, torch.optim.SGD: {"momentum_buffer"}}
 
 
 def split(state: Any, tensors: dict[str, Tensor]) -> Any:
-    """JSON for a state of dictionaries, lists, tuples, numbers, strings, None and tensors; these go into ``tensors``.
+    """JSON for a state of dictionaries, tensordicts, lists, tuples, numbers, strings, None and tensors, which go into
+    ``tensors``.
 
     Raises:
         TypeError: it holds something else.
@@ -21,6 +23,9 @@ def split(state: Any, tensors: dict[str, Tensor]) -> Any:
         name = str(len(tensors))
         tensors[name] = state.detach()
         return {"tensor": name}
+    if isinstance(state, TensorDictBase):
+        device = None if state.device is None else str(state.device)
+        return {"tensordict": [list(state.batch_size), device, split(state.to_dict(), tensors)]}
     if isinstance(state, Mapping):
         return {"dict": [[split(key, tensors), split(value, tensors)] for key, value in state.items()]}
     if isinstance(state, (list, tuple)):
@@ -44,10 +49,13 @@ def join(tree: Any, tensors: Mapping[str, Tensor]) -> Any:
         ((kind, inside),) = tree.items()
         if kind == "tensor":
             return tensors[inside]
+        if kind == "tensordict":
+            shape, device, entries = inside
+            return TensorDict(join(entries, tensors), shape, device=device)
         if kind == "dict":
             return {join(key, tensors): join(value, tensors) for key, value in inside}
         return {"list": list, "tuple": tuple}[kind](join(value, tensors) for value in inside)
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"it is not as a training state is written ({error})") from error
 
 

@@ -20,6 +20,7 @@ from safetensors.torch import load, save
 from torch import Tensor
 
 from lw_torchrl._files import parse_json, read_bytes, replacing
+from lw_torchrl._versions import package_versions
 
 _DESCRIPTION = "description.json"
 _MOST_BYTES = 8 * 2**30  # of a file, which is read whole; most have 1 MB
@@ -47,7 +48,7 @@ def write_archive(
 
     Args:
         path: the file.
-        description: JSON; ``sha256`` is added to it.
+        description: JSON; ``sha256`` and the ``versions`` of packages are added to it.
         groups: name to tensors by name.
 
     Raises:
@@ -60,7 +61,8 @@ def write_archive(
         )
         for name, tensors in groups.items()
     }
-    stated = {**description, "sha256": {name: sha256(content).hexdigest() for name, content in data.items()}}
+    digests = {name: sha256(content).hexdigest() for name, content in data.items()}
+    stated = {**description, "versions": package_versions(), "sha256": digests}
     text = json.dumps(stated, indent=1, allow_nan=False).encode()
     parse_json(text)
     if len(text) > _MOST_JSON or sum(map(len, data.values())) + 2 * _MOST_JSON > _MOST_BYTES:

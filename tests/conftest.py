@@ -13,6 +13,7 @@ import pytest
 from forks import Forks
 
 import lw_torchrl as lw
+from lw_torchrl import _files
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -100,3 +101,32 @@ def in_time():
     yield
     signal.alarm(0)
     signal.signal(signal.SIGALRM, before)
+
+
+HOLDER = """
+import importlib.util, sys
+spec = importlib.util.spec_from_file_location("_files", sys.argv[1])  # the package would take seconds to import
+files = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(files)
+with files.held(sys.argv[2], "place", folder=sys.argv[3] == "True"):
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.fixture
+def holding() -> Iterator[Callable[..., Callable[[], None]]]:
+    """A function that lets another process be at work in a place; it returns one that ends that."""
+    processes = []
+
+    def hold(place: Any, *, folder: bool = False) -> Callable[[], None]:
+        command = [sys.executable, "-c", HOLDER, _files.__file__, str(place), str(folder)]
+        process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        processes.append(process)
+        assert process.stdout.readline() == b"held\n"
+        return process.communicate  # type: ignore[return-value]
+
+    yield hold
+    for process in processes:
+        process.kill()
+        process.communicate()

@@ -8,6 +8,7 @@ import time
 from collections import deque
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from socketserver import StreamRequestHandler, ThreadingTCPServer
 
 import lw_torchrl as lw
 from lw_torchrl.language.formats import PLAN_FORMATS
@@ -15,6 +16,11 @@ from lw_torchrl.language.formats.structured import write_structured
 
 KEY = "sk-a-secret-of-the-tests"
 PLANS = lw.load_plans("MT50")
+
+
+def planner(address, tmp_path, **options):
+    """A planner of the server at an address, which asks once and keeps its answers below ``tmp_path``."""
+    return lw.OpenAIPlanner("m", base_url=address, **{"cache": tmp_path / "kept", "retries": 0, **options})
 
 
 def completion(text, finish="stop", **message):
@@ -137,3 +143,47 @@ def serving(server):
         http.shutdown()
         http.server_close()
         thread.join()
+
+
+@contextmanager
+def talking(talk):
+    """The address of a server that reads a question and answers with what ``talk()`` yields: bytes, or seconds to wait.
+
+    It stops where nobody listens any more, and when the block ends.
+    """
+    ended = threading.Event()
+
+    class Handler(StreamRequestHandler):
+        def handle(self):
+            self.rfile.readline()
+            length = 0
+            while line := self.rfile.readline().strip().lower():
+                if line.startswith(b"content-length:"):
+                    length = int(line.split(b":")[1])
+            self.rfile.read(length)
+            try:
+                for part in talk():
+                    if ended.is_set():
+                        return
+                    if isinstance(part, bytes):
+                        self.wfile.write(part)
+                    else:
+                        ended.wait(part)
+            except OSError:
+                pass
+
+    class Listening(ThreadingTCPServer):
+        daemon_threads = True
+
+        def handle_error(self, *_):
+            pass
+
+    with Listening(("127.0.0.1", 0), Handler) as tcp:
+        thread = threading.Thread(target=tcp.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
+        thread.start()
+        try:
+            yield f"http://127.0.0.1:{tcp.server_address[1]}/v1"
+        finally:
+            ended.set()
+            tcp.shutdown()
+            thread.join()

@@ -104,14 +104,16 @@ def test_co_learning_runs_on_ones_own_data(tmp_path):
     assert "the target's rows 50" in done.stdout
     for task in ("window-open", "drawer-open", "door-open"):
         assert any(line.startswith(f"{task} ") for line in done.stdout.splitlines()), "the table"
-    assert not list(tmp_path.iterdir()), "it leaves nothing behind"
+    left = {path.name for path in tmp_path.iterdir() if not path.name.startswith("torchinductor")}
+    assert not left, "it leaves nothing behind"
 
 
 def test_offline_rl_runs(tmp_path):
     done = run("offline_rl.py", tmp_path, "--steps", 3, "--episodes", 1, "--data", 6)
     lines = done.stdout.splitlines()
     assert [line.split(":")[0] for line in lines[-2:]] == ["by advantage", "successes cloned"]
-    assert not list(tmp_path.iterdir()), "it leaves nothing behind"
+    left = {path.name for path in tmp_path.iterdir() if not path.name.startswith("torchinductor")}
+    assert not left, "it leaves nothing behind"
     assert {"ExpectileValueLoss", "AdvantageWeightedLoss", "SoftUpdate"} <= names(EXAMPLES / "offline_rl.py")
 
 
@@ -145,4 +147,5 @@ def test_train_bc_runs(tmp_path):
     for task in ("drawer-open", "window-open"):
         assert any(line.startswith(f"{task} ") for line in done.stdout.splitlines()), "the table"
         assert any(line.startswith(f"{task}: ") for line in done.stdout.splitlines()), "the skills"
-    assert not list(tmp_path.iterdir()), "it leaves nothing behind"
+    left = {path.name for path in tmp_path.iterdir() if not path.name.startswith("torchinductor")}
+    assert not left, "it leaves nothing behind"

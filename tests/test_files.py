@@ -8,13 +8,14 @@ import re
 import signal
 import subprocess
 import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
 from lw_torchrl import _files
-from lw_torchrl._files import read_json, read_text, replacing, sweep, write_json, write_text
+from lw_torchrl._files import held, read_json, read_text, read_toml, replacing, sweep, write_json, write_text
 
 
 class OwnError(ValueError):
@@ -238,6 +239,69 @@ def test_sweeping_where_there_is_no_folder_does_nothing(tmp_path):
     assert not (tmp_path / "nowhere").exists()
 
 
+NESTED = """
+import importlib.util, os, signal, sys
+spec = importlib.util.spec_from_file_location("_files", sys.argv[2])
+_files = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(_files)
+with _files.replacing(sys.argv[1]) as outer, _files.replacing(outer) as inner, _files.replacing(inner):
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_what_was_being_replaced_itself_goes_at_the_next_write(tmp_path, locked):
+    """As of a killed evaluation, whose recording is made beside its place and made compact there."""
+    target = tmp_path / "rollout.rrd"
+    subprocess.run([sys.executable, "-c", NESTED, str(target), _files.__file__])
+    assert len(names(tmp_path)) == 3
+    being_written = tmp_path / f"..rollout.{LEFT}.tmp.{LEFT}.tmp.rrd"
+    locked(being_written)
+    write_text(target, "new")
+    assert names(tmp_path) == [being_written.name, "rollout.rrd"]
+
+
+# ---- holding a place
+
+
+@pytest.mark.parametrize("folder", [False, True])
+def test_one_process_at_a_time_holds_a_place(tmp_path, holding, folder):
+    place = tmp_path / "runs" / "mine.zip"
+    release = holding(place, folder=folder)
+    other = "folder" if folder else "file"
+    said = f"out: another training is at work in '{place}'; let it finish, or choose another {other}"
+    with pytest.raises(OwnError) as caught, held(place, "out", "training", folder=folder, error=OwnError):
+        pytest.fail("it is held")
+    assert str(caught.value) == said
+    release()
+    again = held(place, "out", folder=folder)
+    with held(place, "out", folder=folder), pytest.raises(ValueError, match="another process is at work"), again:
+        pytest.fail("a thread is another one too")
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+
+
+def test_what_a_killed_process_held_is_free(tmp_path, holding):
+    holding(tmp_path / "a.zip").__self__.kill()
+    with held(tmp_path / "a.zip", "out"):
+        assert names(tmp_path) == [".a.zip.lock"]
+    assert names(tmp_path) == []
+
+
+def test_of_many_that_wait_one_at_a_time_gets_in(tmp_path):
+    inside, most = [], []
+
+    def work(number):
+        with held(tmp_path / "a", "out", wait=True):
+            inside.append(number)
+            most.append(len(inside))
+            time.sleep(0.002)
+            inside.remove(number)
+
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(work, range(40)))
+    assert most == [1] * 40
+    assert names(tmp_path) == []
+
+
 # ---- reading
 
 
@@ -258,6 +322,45 @@ def test_text_has_one_kind_of_line_end_and_no_byte_order_mark(tmp_path):
     assert read_text(tmp_path / "a.txt", OwnError) == "ä\nb\nc\n"
     with pytest.raises(FileNotFoundError):
         read_text(tmp_path / "nowhere", OwnError)
+
+
+# ---- TOML
+
+
+def read_toml_text(tmp_path, text):
+    (tmp_path / "tasks.toml").write_text(text)
+    return read_toml(tmp_path / "tasks.toml", OwnError)
+
+
+@pytest.mark.usefixtures("in_time")
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        (".".join("a" * 50_000) + " = 1", "a key of line 1 has 50000 nested keys, at most 16 are read"),
+        ("x = 1\n" + " . ".join(["'a b'"] * 17) + " = 1", "a key of line 2 has 17 nested keys, at most 16 are read"),
+        ('[a]\nb = {"x"' + ".y" * 30_000 + "=1}", "a key of line 2 has 30001 nested keys"),
+        ("[" + "a." * 20_000 + "b]", "a key of line 1 has 20001 nested keys"),
+        ("a = " + "[" * 50_000, "it is nested too deeply"),
+        ("a = " + "{a=" * 50_000, "it is nested too deeply"),
+        ("#" * (2**18 + 1), "it is larger than 262144 bytes"),
+    ],
+    ids=["dotted", "quoted", "inline", "table", "lists", "tables", "large"],
+)
+def test_toml_is_read_up_to_limits(tmp_path, text, says):
+    with pytest.raises(OwnError) as caught:
+        read_toml_text(tmp_path, text)
+    assert str(caught.value).startswith(f"{tmp_path / 'tasks.toml'}: ")
+    assert says in str(caught.value)
+
+
+def test_toml_below_its_limits_is_read(tmp_path):
+    deep = ".".join("a" * 16)
+    text = f'{deep} = "{".".join("b" * 40)}"\n# {"..." * 40}\nc = [{"1.5, " * 40}]\n'
+    found = read_toml_text(tmp_path, text)
+    assert found["c"] == [1.5] * 40
+    for _ in range(16):
+        found = found["a"]
+    assert found == ".".join("b" * 40)
 
 
 # ---- JSON

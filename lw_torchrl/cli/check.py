@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
 from lw_torchrl._checks import counted
-from lw_torchrl.cli.sources import read_tasks
+from lw_torchrl.cli.sources import read_skills, read_tasks
+from lw_torchrl.cli.tables import Output
 
 if TYPE_CHECKING:
     from lw_torchrl.language.skills import ScriptedSkill
@@ -22,7 +24,8 @@ def check(
     task: str | None = None,
     skill_file: Path | None = None,
     task_file: Path | None = None,
-) -> None:
+    json: bool = False,
+) -> Output:
     """Validate a file of plans, skills or tasks of your own: what is wrong, where, and the nearest allowed text.
 
     Example: lw-torchrl check my-plans/push.plan
@@ -32,51 +35,65 @@ def check(
         task: the task that a plan must be for.
         skill_file: skills of yours that join ours, or replace those of the same text, for the plans.
         task_file: tasks of yours, instead of ours of the same name or beside ours, for plans and skills.
+        json: print one JSON document instead, see docs/cli.md.
     """
     import lw_torchrl as lw
     from lw_torchrl._files import read_text
+    from lw_torchrl.language.plans import PLAN_LIMIT
 
     if not file.exists():
         raise FileNotFoundError(f"file: there is no {str(file)!r}")
     known = read_tasks(task_file)
+    output = Output(json)
     if file.suffix == ".toml":
-        print(_check_table(file, known, "" if task_file else "; tasks of yours come by --task-file"))
-        return
+        kind, number, notes = _check_table(file, known, "" if task_file else "; tasks of yours come by --task-file")
+        lines = [*(f"{file.name}: note: {note}" for note in notes), f"{file.name}: {counted(number, kind)}, valid"]
+        row = {"file": file, f"{kind}s": number, "faults": [], "notes": notes}
+        output.show("files", [row], "\n".join(lines))
+        return output
     paths = sorted(file.glob("*.plan")) if file.is_dir() else [file]
     if not paths:
         raise ValueError(f"file: the folder {str(file)!r} holds no .plan files")
-    table = lw.load_skills(skill_file, tasks=known)
-    wrong, unknown = 0, False
+    table = read_skills(skill_file, known)
+    read = partial(read_text, error=lw.PlanError, limit=PLAN_LIMIT)
+    rows: list[dict[str, Any]] = []
     for path in paths:
-        faults, steps, notes = _check_plan(read_text(path, lw.PlanError), task, path.name, table, known)
-        wrong += len(faults)
-        unknown |= any(" is no task" in fault for fault in faults)
+        faults, steps, notes = _check_plan(read(path), task, path.name, table, known)
+        rows.append({"file": path, "steps": steps, "faults": faults, "notes": notes})
         found = counted(len(faults), "fault") if faults else f"{counted(steps, 'step')}, valid"
-        print("\n".join([*faults, *notes, f"{path.name}: {found}"]))
-    if wrong:
+        if not json:
+            print("\n".join([*faults, *(f"{path.name}: note: {note}" for note in notes), f"{path.name}: {found}"]))
+    output.show("files", rows)
+    faults = [fault for row in rows for fault in row["faults"]]
+    if faults:
+        unknown = any(" is no task" in fault for fault in faults)
         hint = "; tasks of yours come by --task-file" if unknown and task_file is None else ""
-        raise ValueError(f"{counted(wrong, 'fault')} in {counted(len(paths), 'file')}{hint}")
+        output.fault = f"{counted(len(faults), 'fault')} in {counted(len(paths), 'file')}{hint}"
+    return output
 
 
-def _check_table(file: Path, known: Mapping[str, Task], hint: str) -> str:
+def _check_table(file: Path, known: Mapping[str, Task], hint: str) -> tuple[str, int, list[str]]:
+    """What a file is a table of, of how many, and what is noted of them."""
     import lw_torchrl as lw
     from lw_torchrl._checks import nearest
     from lw_torchrl._files import read_toml
 
     rows = read_toml(file, ValueError)
+    notes = []
     if any(isinstance(row, dict) and ("description" in row or "objects" in row) for row in rows.values()):
         lw.load_tasks(file)
         for name in sorted(set(rows) - set(lw.TASKS)):
             close = nearest(name, lw.TASKS, n=1)
-            hint = f"; did you mean {close[0]!r}?" if close else ""
-            print(f"{file.name}: note: task {name!r} is none of the simulator's{hint}")
-        return f"{file.name}: {counted(len(rows), 'task')}, valid"
+            notes.append(
+                f"task {name!r} is none of the simulator's" + (f"; did you mean {close[0]!r}?" if close else "")
+            )
+        return "task", len(rows), notes
     table = lw.load_skills(file, tasks=known)
     for text in rows:
         if not any(table[text].suits(task) for task in known.values()):
             needed = f"{table[text].target!r} and {table[text].moved!r}"
-            print(f"{file.name}: note: skill {text!r} suits no task; it needs {needed}{hint}")
-    return f"{file.name}: {counted(len(rows), 'skill')}, valid"
+            notes.append(f"skill {text!r} suits no task; it needs {needed}{hint}")
+    return "skill", len(rows), notes
 
 
 def _check_plan(
@@ -100,5 +117,5 @@ def _check_plan(
             except ValueError:
                 hint = "nor does another; yours come by --skill-file"
             note = f"no scripted skill {step.skill!r} suits {plan.task}; {hint}. A learned policy needs none"
-            notes.append(f"{source}: note: {note}")
+            notes.append(note)
     return [], len(plan.steps), notes

@@ -7,11 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import median, quantiles
 from textwrap import fill
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
 from lw_torchrl._checks import counted
+from lw_torchrl.cli.sources import check_dataset
+from lw_torchrl.cli.tables import Output, Row
 
 if TYPE_CHECKING:
     from lw_torchrl.data.behaviours import Behaviour
@@ -27,7 +29,6 @@ class _Episode:
     earned: float
 
 
-_HEADINGS = f"{'episodes':>8} {'steps':>9} {'success':>7} {'first success':>15} {'dense return':>12} {'quartiles':>24}"
 _WIDTH = 120
 
 
@@ -36,7 +37,8 @@ def data(
     folders: Positional[Annotated[tuple[Path, ...], arg(metavar="FOLDERS ...")]],
     /,
     check: bool = False,
-) -> None:
+    json: bool = False,
+) -> Output:
     """Show what datasets hold: who acted, in what, how often it succeeded, what it earned. Several are a mixture.
 
     Example: lw-torchrl data show demos/mt10 demos/spoilt --check
@@ -45,26 +47,35 @@ def data(
         action: the word show.
         folders: of `lw-torchrl collect`.
         check: also read them through against their checksums.
+        json: print one JSON document instead, see docs/cli.md.
     """
+    if not folders:
+        raise ValueError("folders must name at least one dataset")
+    for folder in folders:
+        check_dataset("folders", folder)
     from lw_torchrl.data.metadata import read_metadata
     from lw_torchrl.data.replay_checks import check_behaviours
 
-    if not folders:
-        raise ValueError("folders must name at least one dataset")
+    output = Output(json)
     parts = [read_metadata(folder) for folder in folders]
     check_behaviours(parts)
     told: list[_Episode] = []
     for part in parts:
-        own = _episodes(part)
-        print("\n".join(_about(part)) + "\n")
-        told += own
-    _table("task", _by(told, lambda one: one.info.task))
-    if len(parts) > 1:
-        print()
-        _table("behaviour", _by(told, lambda one: one.behaviour))
-    print(_row("all", told))
+        told += _episodes(part)
+        if not json:
+            print("\n".join(_about(part)) + "\n")
+    output.show("datasets", [_described(part) for part in parts])
+    every = [] if json else [_row("all", told)]
+    mixed = len(parts) > 1
+    _table(output, "task", _by(told, lambda one: one.info.task), [] if mixed else every)
+    if mixed:
+        if not json:
+            print()
+        _table(output, "behaviour", _by(told, lambda one: one.behaviour), every)
+    output.show("all", _row("all", told))
     if check:
-        _check(parts)
+        _check(output, parts)
+    return output
 
 
 def _by(told: list[_Episode], key: Callable[[_Episode], str]) -> dict[str, list[_Episode]]:
@@ -81,12 +92,21 @@ def _episodes(part: Demonstrations) -> list[_Episode]:
     return [_Episode(part.config.behaviour, *pair) for pair in zip(part.episodes, earned, strict=True)]
 
 
+def _described(part: Demonstrations) -> dict[str, Any]:
+    """What a dataset's metadata say of it, for a program."""
+    told = {"folder": part.root, "bytes": _size(part), "behaviour": part.config.behaviour}
+    return told | {"config": part.config.to_json(), "attempts": part.attempts, "versions": part.versions}
+
+
+def _size(part: Demonstrations) -> int:
+    return sum(path.stat().st_size for path in part.root.rglob("*") if path.is_file())
+
+
 def _about(part: Demonstrations) -> list[str]:
     """What a dataset's metadata say of it, in lines."""
     from lw_torchrl.data.metadata import FORMAT_VERSION
 
     how = part.config
-    size = sum(path.stat().st_size for path in part.root.rglob("*") if path.is_file())
     noise = "none"
     if any(how.noise_scale):
         scales = ", ".join(f"{scale:g}" for scale in how.noise_scale)
@@ -94,7 +114,7 @@ def _about(part: Demonstrations) -> list[str]:
     asked = f"{how.episodes_per_task} of each task, of at most {counted(how.max_steps, 'step')}, seed {how.seed}"
     redrawn = sum(part.attempts.values()) - len(part.episodes)
     lines = {
-        "dataset": f"{part.root}: {_bytes(size)}, format version {FORMAT_VERSION}",
+        "dataset": f"{part.root}: {_bytes(_size(part))}, format version {FORMAT_VERSION}",
         "behaviour": f"{how.behaviour}: {_acted(how.policy)}",
         "tasks": ", ".join(how.tasks) if len(how.tasks) <= 10 else counted(len(how.tasks), "task"),
         "episodes": asked + (f"; {counted(redrawn, 'failure')} drawn again" if how.redraw_failures else ""),
@@ -130,31 +150,54 @@ def _bytes(size: float) -> str:
     return f"{size:.3g} GB"
 
 
-def _table(name: str, lines: dict[str, list[_Episode]]) -> None:
-    print(f"{name:28} {_HEADINGS}")
-    for label, episodes in lines.items():
-        print(_row(label, episodes))
+def _table(output: Output, name: str, found: dict[str, list[_Episode]], ending: list[dict[str, Any]]) -> None:
+    """A row for each task or behaviour, and a last one; each is called ``label``."""
 
+    def first(row: Row) -> str:
+        when = row["first_success"]
+        return "never" if when is None else f"{when['median']:.0f} ({when['min']}..{when['max']})"
 
-def _row(label: str, episodes: list[_Episode]) -> str:
-    first = [one.info.first_success for one in episodes if one.info.first_success is not None]
-    earned = [one.earned for one in episodes]
-    low, middle, high = quantiles(earned, n=4, method="inclusive") if len(earned) > 1 else earned * 3
-    when = f"{median(first):.0f} ({min(first)}..{max(first)})" if first else "never"
-    return (
-        f"{label if len(label) <= 28 else label[:25] + '...':28} {len(episodes):8} "
-        f"{sum(one.info.length for one in episodes):9} {len(first) / len(episodes):7.2f} {when:>15} "
-        f"{sum(earned) / len(earned):12.1f} {f'{low:.1f} {middle:.1f} {high:.1f}':>24}"
+    output.table(
+        f"{name}s",
+        [_row(label, episodes) for label, episodes in found.items()] + ending,
+        {
+            name: "label",
+            "episodes": "episodes",
+            "steps": "steps",
+            "success": lambda row: f"{row['success']:.2f}",
+            "first success": first,
+            "dense return": lambda row: f"{row['dense_return']['mean']:.1f}",
+            "quartiles": lambda row: " ".join(f"{one:.1f}" for one in row["dense_return"]["quartiles"]),
+        },
     )
 
 
-def _check(parts: list[Demonstrations]) -> None:
-    from lw_torchrl.data.rows import whole_episodes
+def _row(label: str, episodes: list[_Episode]) -> dict[str, Any]:
+    first = [one.info.first_success for one in episodes if one.info.first_success is not None]
+    earned = [one.earned for one in episodes]
+    return {
+        "label": label,
+        "episodes": len(episodes),
+        "steps": sum(one.info.length for one in episodes),
+        "success": len(first) / len(episodes),
+        "first_success": {"median": median(first), "min": min(first), "max": max(first)} if first else None,
+        "dense_return": {
+            "mean": sum(earned) / len(earned),
+            "quartiles": quantiles(earned, n=4, method="inclusive") if len(earned) > 1 else earned * 3,
+        },
+    }
 
+
+def _check(output: Output, parts: list[Demonstrations]) -> None:
+    from lw_torchrl.data.checksums import whole_episodes
+
+    damaged = []
     for part in parts:
         if broken := len(part.episodes) - len(whole_episodes(part, progress=True)):
-            raise ValueError(
+            damaged.append({"folder": part.root, "episodes": broken})
+            output.fault = output.fault or (
                 f"{str(part.root)!r} is damaged: {broken} of {counted(len(part.episodes), 'episode')} differ from "
                 "their checksums; the same collect_demonstrations runs these again"
             )
-    print(f"\nchecked: all rows of {counted(len(parts), 'dataset')} are as they were written")
+    sound = f"\nchecked: all rows of {counted(len(parts), 'dataset')} are as they were written"
+    output.show("damaged", damaged, None if damaged else sound)

@@ -28,6 +28,7 @@ OWN_NAMES = {
         "policy": "behaviours",
     },
     "evaluate": {"episodes_per_task": "episodes", "noise_scale": "noise", "task": "tasks"},
+    "record": {"tasks": "names", "task": "names"},
     "view": {"path": "recording"},
     "scripted": {"episodes_per_task": "episodes", "noise_scale": "noise", "tasks": "names", "task": "names"},
     "tasks": {"tasks": "names", "task": "names"},

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, cast
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 from tyro.conf import Positional
 
-from lw_torchrl.cli.sources import read_encoder, read_plans, read_tasks
+from lw_torchrl.cli.sources import check_encoder, read_encoder, read_plans, read_tasks
+from lw_torchrl.cli.tables import Output
 from lw_torchrl.cli.units import check_asked, elsewhere, report
 
 if TYPE_CHECKING:
@@ -39,7 +40,8 @@ def reproduce(
     run: str | None = None,
     list: bool = False,
     out: Path = Path("runs/reproduce"),
-) -> None:
+    json: bool = False,
+) -> Output:
     """Run the paper's experiments and compare them with the published results. Stopped and started again it carries on.
 
     A run is a dataset, or the policy of one method and seed with its evaluation (in one-shot, a policy for each of the
@@ -70,9 +72,18 @@ def reproduce(
         run: run this one alone, such as few-shot/strong/pcbc/seed0.
         list: print the names of the runs and do nothing.
         out: where everything goes; on a cluster, a folder that all its machines share.
+        json: print one JSON document instead, see docs/cli.md.
     """
     check_asked(list, run, out, jobs)
-    from lw_torchrl._checks import check_choice, check_int
+    check_encoder(text_encoder)
+    if launcher == "ray" and device != "cpu":
+        raise ValueError(f"--device {device} is for the launcher local: the tasks of ray have a CPU core each")
+    if passes is not None and preset != "paper":
+        raise ValueError("--passes is for --preset paper; ours counts minibatches")
+    load = _Plans(plans, task_file)
+    if plans:
+        load.of("own")
+    from lw_torchrl._checks import check_choice
     from lw_torchrl._devices import check_device
     from lw_torchrl.cli.threads import use_one_thread
     from lw_torchrl.experiments.execution import execute_run
@@ -80,8 +91,6 @@ def reproduce(
     from lw_torchrl.experiments.runs import SCRIPTED, Run
     from lw_torchrl.modules.policy import METHODS
 
-    if launcher == "ray" and device != "cpu":
-        raise ValueError(f"--device {device} is for the launcher local: the tasks of ray have a CPU core each")
     recipes = PRESETS[preset]
     if preset == "evaluator":
         if experiment not in recipes:
@@ -90,9 +99,6 @@ def reproduce(
             raise ValueError("--methods must be pcbc with --preset evaluator: others ask no conditions")
         methods = ("pcbc",)
     if passes is not None:
-        check_int("passes", passes, minimum=1)
-        if preset != "paper":
-            raise ValueError("--passes is for --preset paper; ours counts minibatches")
         recipes = {name: replace(recipe, passes=passes) for name, recipe in recipes.items()}
     if methods is None:
         methods = cast("tuple[Method, ...]", (*METHODS, *([] if plans else [SCRIPTED])))
@@ -109,20 +115,24 @@ def reproduce(
     ]
     datasets = {str(dataset.folder): dataset for one in runs for dataset in one.datasets}
     named = {str(one.folder): one for one in runs}
-    load = _Plans(plans, task_file)
     for one in runs:  # before any work
         load(one)
+    output = Output(json)
     if list:
-        print("\n".join([*datasets, *named]))
-        return
+        output.show("runs", [*datasets, *named], "\n".join([*datasets, *named]))
+        return output
     there, encoder = check_device("device", device), read_encoder(text_encoder)
     use_one_thread()
+    if run is not None:
+        output.show("run", run)
     if run in datasets:
         datasets[run].collect(out, progress=True)
     elif run is not None:
         one = named[check_choice("run", run, [*datasets, *named])]
         result = execute_run(one, load(one), out, text_encoder=encoder, device=there)
         print(f"{one.folder}: mean success {result.mean_success:.3f}, {result.config['seconds']:.0f} s")
+        if json:
+            output.result(result)
     else:
         if launcher == "local" and jobs == 1:
             report(len(named), _here(named, load, out, encoder, device))
@@ -136,7 +146,8 @@ def reproduce(
             given += [] if task_file is None else ["--task-file", str(task_file)]
             for stage in (datasets, named):
                 report(len(stage), elsewhere(stage, ["reproduce", *given], launcher, jobs))
-        _summarize(runs, load, out)
+        output.show("summaries", _summarize(runs, load, out))
+    return output
 
 
 def _plans_name(source: str) -> str:
@@ -156,18 +167,22 @@ class _Plans:
         self.known: dict[str, Plans] = {}
 
     def __call__(self, run: Run) -> Plans:
+        return self.of(run.skills)
+
+    def of(self, skills: Literal["own", "MT10"]) -> Plans:
+        """Those with these skills, where they are shipped ones."""
         from lw_torchrl.language.tasks import MT50
 
-        if run.skills not in self.known:
-            found = read_plans(self.sources or ["MT50"], self.tasks, run.skills)
+        if skills not in self.known:
+            found = read_plans(self.sources or ["MT50"], self.tasks, skills)
             if missing := [task for task in MT50 if task not in found]:
                 raise ValueError(
                     f"--plans must have a plan for each of the 50 tasks, they lack {len(missing)}: "
                     f"{', '.join(missing[:5])}{', ...' if len(missing) > 5 else ''}; --plans MT50 "
                     f"{' '.join(self.sources)} takes ours for these"
                 )
-            self.known[run.skills] = found
-        return self.known[run.skills]
+            self.known[skills] = found
+        return self.known[skills]
 
 
 def _here(
@@ -189,8 +204,9 @@ def _best(method: str, results: Mapping[int, EvaluationResult]) -> dict[str, dic
     return {f"{method}, best of the last {min(one['of'] for one in found)} evaluations": rates}
 
 
-def _summarize(runs: list[Run], load: Callable[[Run], Plans], out: Path) -> None:
-    """A summary, tables and a figure for each setting, from the results on disk."""
+def _summarize(runs: list[Run], load: Callable[[Run], Plans], out: Path) -> dict[str, Any]:
+    """A summary, tables and a figure for each setting, from the results on disk; returns what each summary.json
+    holds."""
     from lw_torchrl._files import write_json, write_text
     from lw_torchrl.evaluation import MethodComparison, plot_sorted_tasks, published_curves, summarize
     from lw_torchrl.experiments.execution import load_result
@@ -204,21 +220,22 @@ def _summarize(runs: list[Run], load: Callable[[Run], Plans], out: Path) -> None
         assert result is not None
         found.setdefault(group, {}).setdefault(one.method, {})[one.seed] = result
         settings[group] = None if alone else one.setting
+    told = {}
     for group, methods in found.items():
         setting = settings[group]
-        # One policy for all tasks can be good or bad at all of them alike; a policy for each task cannot.
-        options = {"whole_seeds": setting is not None and setting.targets is None}
         best = {label: rates for method, results in methods.items() for label, rates in _best(method, results).items()}
         means = {label: {task: sum(of) / len(of) for task, of in rates.items()} for label, rates in best.items()}
         published = {} if setting is None else published_curves(setting.name, ("PCBC", "DC"))
         comparison = MethodComparison(
-            {method: summarize(results, **options) for method, results in methods.items()}, means | published, **options
+            {method: summarize(results) for method, results in methods.items()}, means | published
         )
         folder = out / group
         print(f"\n{group}\n{comparison.headline()}")
-        write_json(folder / "summary.json", comparison.to_json())
+        told[group.as_posix()] = comparison.to_json()
+        write_json(folder / "summary.json", told[group.as_posix()])
         write_text(folder / "summary.md", f"{comparison.headline()}\n\n{comparison.per_task()}\n")
         curves = {} if setting is None else published_curves(setting.name)
         drawn = comparison.summaries | best
         plot_sorted_tasks(drawn, folder / "tasks.png", published=curves, title=f"{group}, last checkpoint")
         print(f"\nsummary.md, summary.json and tasks.png are in {folder}")
+    return told

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
 from lw_torchrl._checks import counted
-from lw_torchrl.cli.sources import one_or_many, read_plans, read_tasks
-from lw_torchrl.cli.tables import print_table
+from lw_torchrl.cli.sources import one_or_many, read_plans, read_skills, read_tasks
+from lw_torchrl.cli.tables import Columns, Output, Row
+
+if TYPE_CHECKING:
+    from lw_torchrl.language.plans import ConditionalPlan
 
 
 def tasks(
     names: Positional[Annotated[tuple[str, ...], arg(metavar="[NAMES ...]")]] = (),
     /,
     task_file: Path | None = None,
-) -> None:
+    json: bool = False,
+) -> Output:
     """List tasks: their descriptions, and the objects that queries can name.
 
     Example: lw-torchrl tasks MT10
@@ -24,16 +29,33 @@ def tasks(
     Args:
         names: MT10, MT50, or names of tasks; all there are if none is given.
         task_file: tasks of yours, instead of ours of the same name or beside ours.
+        json: print one JSON document instead, see docs/cli.md.
     """
     import lw_torchrl as lw
 
     known = read_tasks(task_file)
-    rows = []
-    for name in lw.resolve_tasks(one_or_many(names) or list(known), tasks=known):
-        task = known[name]
-        objects = ", ".join(o.name + (" (ours)" if getattr(o, "ours", False) else "") for o in task.objects[1:])
-        rows.append((name, "yes" if name in lw.MT10 else "", task.description, objects))
-    print_table(counted(len(rows), "task"), ("task", "MT10", "description", "objects beside the gripper"), rows)
+    rows = [
+        {
+            "task": name,
+            "mt10": name in lw.MT10,
+            "description": known[name].description,
+            "objects": [{"name": one.name, "ours": one.ours} for one in known[name].objects[1:]],
+        }
+        for name in lw.resolve_tasks(one_or_many(names) or list(known), tasks=known)
+    ]
+
+    def objects(row: Row) -> str:
+        return ", ".join(one["name"] + (" (ours)" if one["ours"] else "") for one in row["objects"])
+
+    output = Output(json)
+    columns: Columns = {
+        "task": "task",
+        "MT10": "mt10",
+        "description": "description",
+        "objects beside the gripper": objects,
+    }
+    output.table("tasks", rows, columns, counted(len(rows), "task"))
+    return output
 
 
 def skills(
@@ -42,7 +64,8 @@ def skills(
     nearest: str | None = None,
     skill_file: Path | None = None,
     task_file: Path | None = None,
-) -> None:
+    json: bool = False,
+) -> Output:
     """List the scripted skills, or find the one closest to a text.
 
     Example: lw-torchrl skills push --nearest "grab the puck"
@@ -52,28 +75,42 @@ def skills(
         nearest: a text; the closest skill is shown.
         skill_file: skills of yours that join ours, or replace those of the same text.
         task_file: tasks of yours, instead of ours of the same name or beside ours.
+        json: print one JSON document instead, see docs/cli.md.
     """
     import lw_torchrl as lw
+    from lw_torchrl.language.named_objects import GRIPPER
     from lw_torchrl.language.tasks import check_task
 
     known = read_tasks(task_file)
-    table = lw.load_skills(skill_file, tasks=known)
+    table = read_skills(skill_file, known)
     definition = None if task is None else known[check_task(task, known)]
+    output = Output(json)
     if nearest is not None:
         skill, score = lw.nearest_skill(nearest, definition, table)
-        print(f"{skill.text}   (similarity {score:.2f})")
-        return
+        found = {"skill": skill.text, "similarity": score}
+        output.show("nearest", found, f"{skill.text}   (similarity {score:.2f})")
+        return output
     rows = []
     for skill in table.values():
         if definition is not None and not skill.suits(definition):
             continue
         shown = skill if definition is None else skill.for_task(definition)
-        moved = "" if shown.moved == "robot's gripper" else shown.moved
-        offset = " ".join(f"{x:g}" for x in shown.offset)
-        gain = f"{shown.gain[0]:g}" if len(set(shown.gain)) == 1 else " ".join(f"{x:g}" for x in shown.gain)
-        rows.append((skill.text, shown.target, moved, offset, gain, f"{shown.gripper:g}"))
-    columns = ("skill", "target", "moved", "offset, m", "gain", "gripper")
-    print_table(counted(len(rows), "scripted skill"), columns, rows)
+        numbers = {"offset": shown.offset, "gain": shown.gain, "gripper": shown.gripper}
+        rows.append({"skill": skill.text, "target": shown.target, "moved": shown.moved, **numbers})
+    columns: Columns = {
+        "skill": "skill",
+        "target": "target",
+        "moved": lambda row: "" if row["moved"] == GRIPPER else row["moved"],
+        "offset, m": lambda row: _numbers(row["offset"]),
+        "gain": lambda row: _numbers(row["gain"][:1] if len({*row["gain"]}) == 1 else row["gain"]),
+        "gripper": lambda row: f"{row['gripper']:g}",
+    }
+    output.table("skills", rows, columns, counted(len(rows), "scripted skill"))
+    return output
+
+
+def _numbers(values: Iterable[float]) -> str:
+    return " ".join(f"{value:g}" for value in values)
 
 
 def plans(
@@ -83,20 +120,21 @@ def plans(
     skill_set: Literal["own", "MT10"] = "own",
     roles: bool = False,
     task_file: Path | None = None,
-) -> None:
+    json: bool = False,
+) -> Output:
     """Show plans: the whole text of those named, or a list of all; or which thing each of their steps brings where.
 
     Example: lw-torchrl plans drawer-open --roles
 
     Args:
         names: MT10, MT50, or names of tasks.
-        plans: MT10 or MT50 for the shipped plans, .plan files, each named after its task (push.plan), .json files of
-            pairs, or folders; where several have a plan for a task, the last one's counts.
+        plans: MT10 or MT50 for the shipped plans, .plan files, .json files of pairs, or folders; where several have a
+            plan for a task, the last one's counts.
         skill_set: of the shipped plans, those with scripted skills of their own, or those worded as MT10's are.
         roles: a table of the steps, what each moves and what it goes to, and what told: "skill", the text is a scripted
-            skill's; "reworded", the text speaks of other tasks' things, and the shipped plan has a scripted skill under
-            the same condition; "words", the text's; "condition", the things that it compares; "nothing".
+            skill's; "words", the text's; "condition", the things that it compares; "nothing".
         task_file: tasks of yours, instead of ours of the same name or beside ours.
+        json: print one JSON document instead, see docs/cli.md.
     """
     import lw_torchrl as lw
 
@@ -104,24 +142,41 @@ def plans(
     loaded = read_plans(plans, known, skill_set)
     chosen = lw.resolve_tasks(one_or_many(names), tasks=known) if names else tuple(loaded)
     loaded.require(chosen)
+    output = Output(json)
     if roles:
         from lw_torchrl.language.roles import plan_roles
 
         told = [
-            (name, step.skill, one.moved or "?", one.target or "?", one.source)
+            {"task": name, "step": number, "skill": step.skill}
+            | {"moved": one.moved or None, "target": one.target or None, "told_by": one.source}
             for name in chosen
-            for step, one in zip(loaded[name].steps, plan_roles(loaded[name]), strict=True)
+            for number, (step, one) in enumerate(zip(loaded[name].steps, plan_roles(loaded[name]), strict=True), 1)
         ]
-        print_table(counted(len(told), "step"), ("task", "skill", "moved", "target", "told by"), told)
-        return
+        columns: Columns = {
+            "task": "task",
+            "skill": "skill",
+            "moved": lambda row: row["moved"] or "?",
+            "target": lambda row: row["target"] or "?",
+            "told by": "told_by",
+        }
+        output.table("steps", told, columns, counted(len(told), "step"))
+        return output
+    rows = [_written(loaded[name]) for name in chosen]
     if names:
-        print("\n".join(str(loaded[name]) for name in chosen))
-        return
-    rows = [
-        (name, str(len(plan.steps)), "; ".join(dict.fromkeys(step.skill for step in plan.steps)))
-        for name, plan in loaded.items()
-    ]
-    print_table(counted(len(rows), "plan"), ("task", "steps", "skills"), rows)
+        output.show("plans", rows, "\n".join(row["text"] for row in rows))
+        return output
+    columns = {
+        "task": "task",
+        "steps": lambda row: len(row["steps"]),
+        "skills": lambda row: "; ".join(dict.fromkeys(step["skill"] for step in row["steps"])),
+    }
+    output.table("plans", rows, columns, counted(len(rows), "plan"))
+    return output
+
+
+def _written(plan: ConditionalPlan) -> dict[str, Any]:
+    steps = [{"condition": str(step.condition), "skill": step.skill} for step in plan.steps]
+    return {"task": plan.task, "steps": steps, "text": str(plan)}
 
 
 def queries(
@@ -130,7 +185,8 @@ def queries(
     /,
     by: Literal["edit", "embedding"] = "edit",
     task_file: Path | None = None,
-) -> None:
+    json: bool = False,
+) -> Output:
     """List a task's base queries, or find the one closest to a text.
 
     Example: lw-torchrl queries push "the gripper touches the puck"
@@ -140,18 +196,22 @@ def queries(
         text: any words; what the query answering function makes of them is shown.
         by: closest in spelling, or in meaning, which wants the extra [text].
         task_file: tasks of yours, instead of ours of the same name or beside ours.
+        json: print one JSON document instead, see docs/cli.md.
     """
     import lw_torchrl as lw
     from lw_torchrl.language.tasks import check_task
 
     known = read_tasks(task_file)
     definition = known[check_task(task, known)]
+    output = Output(json)
     if text is not None:
         found = lw.nearest_query(text, definition, by=by)
-        print(f"{found.query}   (similarity {found.score:.2f})")
-        return
-    listed = lw.supported_queries(definition)
+        nearest = {"query": str(found.query), "similarity": found.score}
+        output.show("nearest", nearest, f"{found.query}   (similarity {found.score:.2f})")
+        return output
     published = set(lw.supported_queries(definition, published_only=True))
-    for query in listed:
-        print(query + ("" if query in published else "   (ours)"))
-    print(f"\n{len(listed)} base queries; each may be negated, and joined to others by 'and'")
+    listed = [{"query": query, "ours": query not in published} for query in lw.supported_queries(definition)]
+    lines = [f"{one['query']}{'   (ours)' if one['ours'] else ''}" for one in listed]
+    ending = f"\n{len(listed)} base queries; each may be negated, and joined to others by 'and'"
+    output.show("queries", listed, "\n".join([*lines, ending]))
+    return output

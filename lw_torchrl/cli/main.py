@@ -1,4 +1,7 @@
-"""The command line, ``lw-torchrl``: each command is a function, and its docstring the help text."""
+"""The command line, ``lw-torchrl``: each command is a function, and its docstring the help text.
+
+A command returns what it found, an :class:`~lw_torchrl.cli.tables.Output`, where it has ``--json``.
+"""
 
 from __future__ import annotations
 
@@ -6,13 +9,15 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext, redirect_stdout
+from functools import partial
 from types import FrameType
 from typing import Any, NoReturn
 
 import tyro
 
 from lw_torchrl import __version__
+from lw_torchrl._checks import nearest, shown
 from lw_torchrl.cli import experiments as cli_experiments
 from lw_torchrl.cli import language as cli_language
 from lw_torchrl.cli import plan as cli_plan
@@ -22,9 +27,11 @@ from lw_torchrl.cli.data import data
 from lw_torchrl.cli.errors import in_its_words
 from lw_torchrl.cli.offline import offline
 from lw_torchrl.cli.online import online
+from lw_torchrl.cli.parsing import parse, unpadded
 from lw_torchrl.cli.record import record
 from lw_torchrl.cli.scripted import scripted
 from lw_torchrl.cli.streams import check_arguments, complain, nobody_reads, sound_streams
+from lw_torchrl.cli.tables import Output
 from lw_torchrl.cli.train import train
 from lw_torchrl.cli.train_evaluator import train_evaluator
 
@@ -51,7 +58,10 @@ COMMANDS: dict[str, Any] = {
 }
 GROUPS: dict[str, dict[str, Any]] = {"plan": cli_plan.COMMANDS}
 """Commands that have commands of their own."""
+ABOUT = """Language-World with TorchRL: policies carried by plans in English. --version tells which.
 
+Exit status: 0, done; 1, a fault of ours, with a traceback; 2, an error that you can mend, in one line on the standard
+error; 130, stopped by Ctrl-C; 141, nobody reads the output. What prints a table prints JSON with --json."""
 
 RESUMABLE = (
     "demo",
@@ -84,9 +94,9 @@ def main(args: Sequence[str] | None = None) -> None:
             if isinstance(error, BrokenPipeError) and nobody_reads():
                 raise
             message = str(error)
-            command, table = _table(given)
-            if command in table:
-                message = in_its_words(command, table[command], message)
+            _, args, table = _group(given)
+            if args and args[0] in table:
+                message = in_its_words(args[0], table[args[0]], message)
             complain(f"lw-torchrl: error: {message}")
             sys.exit(2)
 
@@ -96,24 +106,50 @@ def _run(given: Sequence[str]) -> None:
     if list(given) == ["--version"]:
         print(f"lw-torchrl {__version__}")
         return
-    about = "Language-World with TorchRL: policies carried by plans in English. --version tells which."
-    group = given[0] if given and given[0] in GROUPS else ""
+    group, args, table = _group(given)
+    prog = f"lw-torchrl {group}".strip()
     try:
-        tyro.extras.subcommand_cli_from_dict(
-            GROUPS.get(group, COMMANDS),
-            prog=f"lw-torchrl {group}".strip(),
-            description=COMMANDS[group].__doc__ if group else about,
-            args=given[1:] if group else given,
-        )
+        if args and (args[0] in ("-h", "--help") or args[0].startswith("--tyro-")):
+            about = COMMANDS[group].__doc__ if group else ABOUT
+            with unpadded():
+                tyro.extras.subcommand_cli_from_dict(table, prog=prog, description=about, args=args)
+        else:
+            name = _command(prog, args, table)
+            _call(parse(f"{prog} {name}", table[name], args[1:]))
     finally:
         sys.stdout.flush()
 
 
-def _table(given: Sequence[str]) -> tuple[str, dict[str, Any]]:
-    """The command that is given, and the table it may be found in."""
+def _call(command: partial[Any]) -> None:
+    """Run a command; with ``--json`` its document is all that goes to the standard output."""
+    with redirect_stdout(sys.stderr) if command.keywords.get("json") else nullcontext():
+        output = command()
+    if isinstance(output, Output):
+        if output.as_json:
+            print(output.document())
+        if output.fault:
+            raise ValueError(output.fault)
+
+
+def _group(given: Sequence[str]) -> tuple[str, list[str], dict[str, Any]]:
+    """The command that has commands of its own, if that is given; what follows it; the commands to choose from."""
     group = given[0] if given and given[0] in GROUPS else ""
-    rest = given[1:] if group else given
-    return rest[0] if rest else "", GROUPS.get(group, COMMANDS)
+    return group, [*given[1:]] if group else [*given], GROUPS.get(group, COMMANDS)
+
+
+def _command(prog: str, args: Sequence[str], table: dict[str, Any]) -> str:
+    """The name of the command that is given; else :class:`ValueError` with the nearest."""
+    known = ", ".join(table)
+    if not args or args[0].startswith("-"):
+        got = f", got {shown(args[0])}" if args else ""
+        raise ValueError(f"a command must come first, one of {known}{got}; `{prog} --help` says what each does")
+    if args[0] not in table:
+        inner = {name: f"{group} {name}" for group, names in GROUPS.items() for name in names}
+        known_as = inner | {name: name for name in table}
+        close = nearest(args[0], known_as, n=1)
+        hint = f"; did you mean {known_as[close[0]]!r}?" if close else ";"
+        raise ValueError(f"there is no command {shown(args[0])}{hint} `{prog} --help` lists them: {known}")
+    return args[0]
 
 
 @contextmanager

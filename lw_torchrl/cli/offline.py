@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal
 from tyro.conf import Positional
 
 from lw_torchrl.cli.sources import read_plans, read_tasks
+from lw_torchrl.cli.tables import Output
 from lw_torchrl.cli.units import check_asked, elsewhere, report
 
 if TYPE_CHECKING:
@@ -18,14 +19,16 @@ if TYPE_CHECKING:
     from lw_torchrl.language.plans import Plans
 
 Table = Literal["methods", "conditioning", "mt10", "quick", "all"]
+Mixture = Literal["B", "W", "C"]
+OfflineMethod = Literal["advantage", "filtered-bc", "best-bc", "bc", "iql", "td3-bc", "cql"]
 
 
 def offline(
     table: Positional[Table],
     /,
     seeds: tuple[int, ...] = (0, 1, 2),
-    mixtures: tuple[str, ...] = (),
-    methods: tuple[str, ...] = (),
+    mixtures: tuple[Mixture, ...] = (),
+    methods: tuple[OfflineMethod, ...] = (),
     plans: tuple[str, ...] = ("MT10",),
     reward: Literal["sparse", "cost", "dense_cost"] | None = None,
     beta: float | None = None,
@@ -37,7 +40,8 @@ def offline(
     run: str | None = None,
     list: bool = False,
     out: Path = Path("runs/offline"),
-) -> None:
+    json: bool = False,
+) -> Output:
     """Learn policies offline, from scripts that were spoilt, and compare the methods. Stopped and started again it
     carries on.
 
@@ -67,19 +71,18 @@ def offline(
         run: run this one alone, such as five/B/advantage-plan/seed0.
         list: print the names of the runs and do nothing.
         out: where everything goes; on a cluster, a folder that all its machines share.
+        json: print one JSON document instead, see docs/cli.md.
     """
     check_asked(list, run, out, jobs)
+    known = read_plans(plans, read_tasks(None))
     from lw_torchrl._checks import check_choice
+    from lw_torchrl._files import read_json
     from lw_torchrl.cli.threads import use_one_thread
-    from lw_torchrl.experiments.mixtures import MIXTURES, TASK_SETS
-    from lw_torchrl.experiments.offline_recipes import OFFLINE_METHODS, OfflineRecipe
+    from lw_torchrl.experiments.mixtures import TASK_SETS
+    from lw_torchrl.experiments.offline_recipes import OfflineRecipe
     from lw_torchrl.experiments.offline_tables import OFFLINE_TABLES, advantages_of, write_table
     from lw_torchrl.experiments.offline_training import execute_offline, make_advantages
 
-    for name in mixtures:
-        check_choice("mixtures", name, MIXTURES)
-    for name in methods:
-        check_choice("methods", name, OFFLINE_METHODS)
     changed = {"reward": reward, "beta": beta, "distance": distance, "steps": steps, "value_steps": steps}
     recipe = replace(OfflineRecipe(), **{name: value for name, value in changed.items() if value is not None})  # type: ignore[arg-type]
     tables = {
@@ -97,20 +100,25 @@ def offline(
     runs = {str(one.folder): one for chosen in tables.values() for one in chosen}
     datasets = {str(dataset.folder): dataset for one in runs.values() for dataset in one.datasets}
     advantages = advantages_of(runs.values())
+    output = Output(json)
     if list:
-        print("\n".join([*datasets, *advantages, *runs]))
-        return
-    known = read_plans(plans, read_tasks(None))
+        output.show("runs", [*datasets, *advantages, *runs], "\n".join([*datasets, *advantages, *runs]))
+        return output
     for one in runs.values():
         known.require(TASK_SETS[one.tasks])
     use_one_thread()
+    if run is not None:
+        output.show("run", run)
     if run in datasets:
         datasets[run].make(out, progress=True)
     elif run in advantages:
         make_advantages(advantages[run], known, out, progress=True)
     elif run is not None:
         one = runs[check_choice("run", run, [*datasets, *advantages, *runs])]
-        print(_said(run, execute_offline(one, known, out)))
+        result = execute_offline(one, known, out)
+        print(_said(run, result))
+        if json:
+            output.result(result)
     else:
         if launcher == "local" and jobs == 1:
             report(len(runs), _here(runs, known, out))
@@ -123,10 +131,14 @@ def offline(
                 given += [name, *values] if values else []
             for stage in (datasets, advantages, runs):
                 report(len(stage), elsewhere(stage, given, launcher, jobs))
+        summaries = {}
         for name, chosen in tables.items():
             results = {one: execute_offline(one, known, out) for one in chosen}
             print(f"\n{name}\n{write_table(name, chosen, results, out)}")
             print(f"\n{name}.md, {name}.json and {name}.png are in {out}")
+            summaries[name] = read_json(out / f"{name}.json", "the summary")
+        output.show("summaries", summaries)
+    return output
 
 
 def _said(name: str, result: EvaluationResult) -> str:

@@ -8,15 +8,20 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
-from lw_torchrl.cli.sources import make_logger, one_or_many, read_plans, simulated
+from lw_torchrl.cli.sources import check_saved, make_logger, one_or_many, read_plans, simulated
+from lw_torchrl.cli.tables import Output
 from lw_torchrl.cli.units import check_asked, elsewhere, report
 
 if TYPE_CHECKING:
+    from lw_torchrl.evaluation import EvaluationResult
     from lw_torchrl.experiments.online import OnlineRun
     from lw_torchrl.language.plans import Plans
 
 OnlineMethod = Literal["advantage", "td3", "sac", "residual", "ppo", "expert-iteration", "start"]
 LoggerName = Literal["none", "csv", "tensorboard", "wandb"]
+
+
+WEAKEST = "weakest"
 
 
 def online(
@@ -37,7 +42,8 @@ def online(
     run: str | None = None,
     list: bool = False,
     out: Path = Path("runs/online"),
-) -> None:
+    json: bool = False,
+) -> Output:
     """Train policies in their environment, beside demonstrations. Stopped and started again it carries on.
 
     A run is a policy of one task, method and seed with its evaluation; the policy that it begins with is a run too.
@@ -66,22 +72,30 @@ def online(
         run: run this one alone, such as pcbc/hammer/td3/seed0.
         list: print the names of the runs and do nothing.
         out: where everything goes; on a cluster, a folder that all its machines share.
+        json: print one JSON document instead, see docs/cli.md.
     """
     check_asked(list, run, out, jobs)
     from lw_torchrl._checks import check_choice, counted
-    from lw_torchrl.cli.threads import use_one_thread
-    from lw_torchrl.experiments.online import START, OnlineRecipe, OnlineRun
     from lw_torchrl.language.tasks import TASKS
 
-    if start is not None and not start.is_file():
-        raise FileNotFoundError(f"--start: no file {str(start)!r}; `lw-torchrl train` writes one")
+    if start is not None:
+        check_saved("start", start)
     tuned = None if step is None else _read_step(step)
     if tuned is not None and "residual" not in methods:
         raise ValueError(f"--step is of the method residual, --methods are {', '.join(methods)}")
+    chosen = simulated("tasks", one_or_many(tasks), TASKS)
+    found = read_plans(plans, TASKS)
+    found.require(chosen)
+    if isinstance(tuned, int) and start is None:
+        for task in chosen:
+            if tuned >= (there := len(found[task].steps)):
+                raise ValueError(f"--step: the plan of {task!r} has {counted(there, 'step')}, got {step}")
+    from lw_torchrl.cli.threads import use_one_thread
+    from lw_torchrl.experiments.online import START, OnlineRecipe, OnlineRun
+
     recipe = OnlineRecipe(demonstrations=demonstrations)
     recipe = replace(recipe, config=replace(recipe.config, frames=frames))
     whole = replace(recipe, config=replace(recipe.config, residual_scale=1.0))  # of a step: to any action at all
-    chosen = simulated("tasks", one_or_many(tasks), TASKS)
     runs = [
         OnlineRun(task, method, seed, recipe, condition, start, episodes)
         if tuned is None or method != "residual"
@@ -92,21 +106,20 @@ def online(
         for method in stage
     ]
     named = {str(one.folder): one for one in runs}
+    output = Output(json)
     if list:
-        print("\n".join(named))
-        return
-    found = read_plans(plans, TASKS)
-    found.require(chosen)
-    if isinstance(tuned, int) and start is None:
-        for task in chosen:
-            if tuned >= (there := len(found[task].steps)):
-                raise ValueError(f"--step: the plan of {task!r} has {counted(there, 'step')}, got {step}")
+        output.show("runs", [*named], "\n".join(named))
+        return output
     use_one_thread()
     if run is not None:
-        print(_done(named[check_choice("run", run, named)], found, out, logger))
+        result, said = _done(named[check_choice("run", run, named)], found, out, logger)
+        print(said)
+        output.show("run", run)
+        if json:
+            output.result(result)
     else:
         if launcher == "local" and jobs == 1:
-            report(len(runs), (_done(one, found, out, logger) for one in runs))
+            report(len(runs), (_done(one, found, out, logger)[1] for one in runs))
         else:
             given = [
                 "online",
@@ -125,23 +138,23 @@ def online(
             for first in (True, False):
                 stage = [name for name, one in named.items() if (one.method == START) == first]
                 report(len(stage), elsewhere(stage, given, launcher, jobs))
-        _summarize(runs, found, out)
+        output.show("summaries", {runs[0].group: _summarize(runs, found, out)})
+    return output
 
 
-def _done(one: OnlineRun, plans: Plans, out: Path, logger: LoggerName) -> str:
-    """Do a run, and say how it went."""
+def _done(one: OnlineRun, plans: Plans, out: Path, logger: LoggerName) -> tuple[EvaluationResult, str]:
+    """Do a run; its result, and how it went in words."""
     from lw_torchrl.experiments.online import execute_online
 
     make = None if logger == "none" else lambda file: make_logger(logger, file)
     result = execute_online(one, plans, out, make_logger=make)
     said = f"{one.folder}: success {result.mean_success:.3f}, {result.config['seconds']:.0f} s"
-    return said if one.step is None else f"{said}\n{_told_of_step(result.config)}"
+    return result, said if one.step is None else f"{said}\n{_told_of_step(result.config)}"
 
 
 def _read_step(given: str) -> int | str:
     """A step's number, counted from 0, or the word for the weakest."""
     from lw_torchrl._checks import shown
-    from lw_torchrl.experiments.tuning import WEAKEST
 
     if given == WEAKEST:
         return given
@@ -164,10 +177,10 @@ def _told_of_step(config: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _summarize(runs: list[OnlineRun], plans: Plans, out: Path) -> None:
-    """A summary, tables and a figure, from the results on disk."""
+def _summarize(runs: list[OnlineRun], plans: Plans, out: Path) -> dict[str, Any]:
+    """A summary, tables and a figure, from the results on disk; returns what summary.json holds."""
     from lw_torchrl._files import write_json, write_text
-    from lw_torchrl.evaluation import EvaluationResult, MethodComparison, plot_learning_curves, summarize
+    from lw_torchrl.evaluation import MethodComparison, plot_learning_curves, summarize
     from lw_torchrl.experiments.execution import load_result
     from lw_torchrl.experiments.online import START, joined
 
@@ -200,10 +213,12 @@ def _summarize(runs: list[OnlineRun], plans: Plans, out: Path) -> None:
         }
         for task in tasks
     }
-    starts = {task: summary.mean for task, summary in comparison.summaries[START].per_task.items()}
+    starts = {task: one.mean for task, one in comparison.summaries[START].per_task.items()}
     text = f"{comparison.per_task()}\n\n{comparison.headline()}\n"
     print(f"\n{folder}\n{text}")
-    write_json(folder / "summary.json", comparison.to_json() | {"curves": curves})
+    summary = comparison.to_json() | {"curves": curves}
+    write_json(folder / "summary.json", summary)
     write_text(folder / "summary.md", text)
     plot_learning_curves(curves, folder / "curves.png", starts=starts)
     print(f"summary.md, summary.json and curves.png are in {folder}")
+    return summary

@@ -27,13 +27,15 @@ def check_folder(option: str, path: Path) -> Path:
     return path
 
 
-def check_file(option: str, path: Path) -> Path:
+def check_file(option: str, path: Path, ending: str = "") -> Path:
     """Return ``path`` if it is a file that can be written to, or one could be made there.
 
     Raises:
-        ValueError: it is a folder, or its folder cannot be written to.
+        ValueError: it is a folder, its folder cannot be written to, or its name ends otherwise.
     """
     if path.is_dir():
         raise ValueError(f"{option} must be a file, {str(path)!r} is a folder")
     check_folder(f"{option}'s folder", path.parent)
+    if not path.name.endswith(ending):
+        raise ValueError(f"{option} must end in {ending!r}, got {str(path)!r}")
     return path

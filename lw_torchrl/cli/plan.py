@@ -15,8 +15,8 @@ from lw_torchrl.cli.plan_check import check
 from lw_torchrl.cli.plan_compare import compare
 from lw_torchrl.cli.plan_repair import repair
 from lw_torchrl.cli.plan_serve import serve
-from lw_torchrl.cli.sources import one_or_many, read_plans, read_tasks
-from lw_torchrl.cli.tables import print_table
+from lw_torchrl.cli.sources import one_or_many, read_plans, read_skills, read_tasks
+from lw_torchrl.cli.tables import Output
 
 if TYPE_CHECKING:
     from lw_torchrl.planners import Answer
@@ -71,7 +71,8 @@ def generate(
     timeout: float = 300.0,
     cache: Path = Path("runs/answers"),
     out: Path = Path("runs/plans"),
-) -> None:
+    json: bool = False,
+) -> Output:
     """Ask a language model for plans, and say what became of them.
 
     The model is behind an OpenAI-compatible server: OpenAI's own, vLLM (http://127.0.0.1:8000/v1), Ollama
@@ -99,9 +100,10 @@ def generate(
         task_file: tasks of yours, instead of ours of the same name or beside ours.
         concurrency: questions at once.
         retries: how often a question is asked again after a rate limit or a fault, with growing waits.
-        timeout: seconds that an answer may take.
+        timeout: seconds that one try may take as a whole, to the answer's last byte; each retry has as long.
         cache: folder where answers are kept, each under a key of all that determines it.
         out: folder for the answers as texts, OUT/<name>/<format>/<task>-<attempt>.py or .md.
+        json: print one JSON document instead, see docs/cli.md.
     """
     check_folder("--out", out)
     check_folder("--cache", cache)
@@ -121,7 +123,7 @@ def generate(
         base_url=base_url,
         constrain=constrain,
         free_skills=free_skills,
-        skills=lw.load_skills(skill_file, tasks=known) if skill_file else None,
+        skills=read_skills(skill_file, known) if skill_file else None,
         plans=read_plans(plans, known),
         vocabulary=vocabulary,
         temperature=temperature,
@@ -139,29 +141,32 @@ def generate(
         total += answers.tokens.total
         noted.update(note for answer in answers for note in answer.notes)
         for task in dict.fromkeys(answer.task for answer in answers):
-            rows.append((task, one, *_counts([answer for answer in answers if answer.task == task])))
-    columns = ("task", "format", "answers", "plans", "all scripted", "asked now", "tokens read", "tokens written")
-    print_table(f"{planner.model} at {planner.address}", columns, rows)
+            rows.append({"task": task, "format": one, **_counts([answer for answer in answers if answer.task == task])})
+    output = Output(json)
+    title = f"{planner.model} at {planner.address}"
+    output.table("answers", rows, {key.replace("_", " "): key for row in rows[:1] for key in row}, title)
+    output.show("notes", [{"note": note, "answers": times} for note, times in noted.most_common()])
     for note, times in noted.most_common():
         print(f"{counted(times, 'answer')}: {note}")
-    print(f"{total} tokens; written to {out / planner.name}")
+    output.show("tokens", total)
+    output.show("folder", out / planner.name, f"{total} tokens; written to {out / planner.name}")
+    return output
 
 
-def _counts(answers: Sequence[Answer]) -> tuple[str, ...]:
+def _counts(answers: Sequence[Answer]) -> dict[str, int]:
     """What a row of the table says of the answers to one question."""
     plans = [answer.decoded for answer in answers if answer.decoded.plan is not None]
-    numbers = (
-        len(answers),
-        len(plans),
-        sum(decoded.all_scripted for decoded in plans),
-        sum(not answer.cached for answer in answers),
-        sum(answer.tokens.prompt for answer in answers),
-        sum(answer.tokens.completion for answer in answers),
-    )
-    return tuple(map(str, numbers))
+    return {
+        "answers": len(answers),
+        "plans": len(plans),
+        "all_scripted": sum(decoded.all_scripted for decoded in plans),
+        "asked_now": sum(not answer.cached for answer in answers),
+        "tokens_read": sum(answer.tokens.prompt for answer in answers),
+        "tokens_written": sum(answer.tokens.completion for answer in answers),
+    }
 
 
-COMMANDS: dict[str, Callable[..., None]] = {
+COMMANDS: dict[str, Callable[..., Output | None]] = {
     "prompt": prompt,
     "generate": generate,
     "serve": serve,

@@ -8,7 +8,8 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from lw_torchrl.cli.sources import read_tasks
+from lw_torchrl.cli.sources import read_skills, read_tasks
+from lw_torchrl.cli.tables import Output
 from lw_torchrl.cli.threads import use_one_thread
 
 
@@ -21,7 +22,8 @@ def check(
     seed: int = 0,
     skill_file: Path | None = None,
     task_file: Path | None = None,
-) -> None:
+    json: bool = False,
+) -> Output:
     """Say of a plan how it was read, where its conditions hold, and which steps never fire.
 
     Example: lw-torchrl plan check runs/plans/llama3.1/chain_py/push-0.py
@@ -35,11 +37,15 @@ def check(
         seed: of these.
         skill_file: skills of yours that join ours, or replace those of the same text.
         task_file: tasks of yours, instead of ours of the same name or beside ours.
+        json: print one JSON document instead, see docs/cli.md.
     """
     import lw_torchrl as lw
+    from lw_torchrl._checks import check_choice
     from lw_torchrl._files import read_text
-    from lw_torchrl.planners.checking import check_plan
+    from lw_torchrl.language.tasks import check_task
 
+    if not file.is_file():
+        raise FileNotFoundError(f"file: there is no file {str(file)!r}")
     known = read_tasks(task_file)
     if task is None:
         task = re.sub(r"-\d+$", "", file.stem)
@@ -49,7 +55,31 @@ def check(
         format = "basic_py" if file.suffix == ".plan" else file.absolute().parent.name
         if format not in lw.PLAN_FORMATS:
             raise ValueError(f"--format must be given, one of {', '.join(lw.PLAN_FORMATS)}: the file's folder is none")
-    use_one_thread()
-    skills = lw.load_skills(skill_file, tasks=known) if skill_file else None
+    check_task(task, known)
+    check_choice("format", format, lw.PLAN_FORMATS)
+    skills = read_skills(skill_file, known) if skill_file else None
     text = read_text(file, ValueError)
-    print(check_plan(text, task, format, episodes=episodes, seed=seed, skills=skills, tasks=known))
+    from lw_torchrl.planners.checking import check_plan
+
+    use_one_thread()
+    found = check_plan(text, task, format, episodes=episodes, seed=seed, skills=skills, tasks=known)
+    output = Output(json)
+    steps = [step for step in found.decoded.steps if not step.dropped]
+    rows = [
+        {
+            "condition": str(step.condition),
+            "skill": step.written_skill,
+            "scripted": step.scripted,
+            "expert": None if found.expert is None else found.expert.true[k],
+            "own": None if found.own is None else found.own.true[k],
+            "chosen": None if found.own is None else found.own.chosen[k],
+            "never": k in found.never,
+        }
+        for k, step in enumerate(steps)
+    ]
+    output.show("task", found.task, str(found))
+    output.show("reason", found.decoded.reason or None)
+    output.show("notes", [*map(str, found.decoded.notes)])
+    output.show("steps", rows)
+    output.show("success", None if found.own is None else found.success)
+    return output

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from lw_torchrl._checks import counted
+from lw_torchrl._checks import check_choice, counted
 from lw_torchrl.cli.outputs import check_folder
-from lw_torchrl.cli.sources import one_or_many, read_plans, read_tasks
+from lw_torchrl.cli.sources import one_or_many, read_plans, read_skills, read_tasks
+from lw_torchrl.cli.tables import Columns, Output, Row
 from lw_torchrl.cli.threads import use_one_thread
 
 
@@ -41,7 +43,8 @@ def repair(
     timeout: float = 300.0,
     cache: Path = Path("runs/answers"),
     out: Path = Path("runs/plans"),
-) -> None:
+    json: bool = False,
+) -> Output:
     """Ask a model for plans, carry them out by scripted skills, tell it what became of those that fail, and ask again.
 
     What it is told: the step where the robot got stuck, conditions that never held, how near things came, what could
@@ -73,18 +76,16 @@ def repair(
         task_file: tasks of yours, instead of ours of the same name or beside ours.
         concurrency: questions at once.
         retries: how often a question is asked again after a rate limit or a fault, with growing waits.
-        timeout: seconds that an answer may take.
+        timeout: seconds that one try may take as a whole, to the answer's last byte; each retry has as long.
         cache: folder where answers are kept, each under a key of all that determines it.
         out: folder for the answers as texts, OUT/<name>/<format>/<task>-<attempt>.py or .md.
+        json: print one JSON document instead, see docs/cli.md.
     """
     check_folder("--out", out)
     check_folder("--cache", cache)
     import lw_torchrl as lw
-    from lw_torchrl.cli.tables import print_table
     from lw_torchrl.language.tasks import named_tasks
-    from lw_torchrl.planners.repairing import repair_plans
 
-    use_one_thread()
     known = read_tasks(task_file)
     chosen = list(named_tasks(one_or_many(tasks), known=known).values())
     planner = lw.OpenAIPlanner(
@@ -92,7 +93,7 @@ def repair(
         base_url=base_url,
         constrain=constrain,
         free_skills=free_skills,
-        skills=lw.load_skills(skill_file, tasks=known) if skill_file else None,
+        skills=read_skills(skill_file, known) if skill_file else None,
         plans=read_plans(plans, known),
         vocabulary=vocabulary,
         temperature=temperature,
@@ -104,21 +105,33 @@ def repair(
         retries=retries,
         timeout=timeout,
     )
+    check_choice("format", format, lw.PLAN_FORMATS)
+    from lw_torchrl.planners.repairing import repair_plans
+
+    use_one_thread()
     first = planner.plans(chosen, format=format, attempts=attempts, out=out, recorded=True)
     found = repair_plans(
         planner, first, rounds=rounds, enough=enough, episodes=episodes, seed=episode_seed, tasks=known, out=out
     )
-    columns = ("task", "attempt", "first", *(f"round {k}" for k in range(1, rounds + 1)))
     rows = []
     for one in found:
-        rates = [f"{check.success:.0%}" for check in one.checks]
-        rows.append((one.answers[0].task, str(one.answers[0].attempt), *rates, *[""] * (rounds + 1 - len(rates))))
-    print_table(f"success by scripted skills, {planner.model} in {format}", columns, rows)
+        row = {"task": one.answers[0].task, "attempt": one.answers[0].attempt}
+        rows.append(row | {"success": [check.success for check in one.checks]})
+
+    def after(told: int) -> Callable[[Row], str]:
+        return lambda row: f"{row['success'][told]:.0%}" if told < len(row["success"]) else ""
+
+    each = {f"round {k}": after(k) for k in range(1, rounds + 1)}
+    output = Output(json)
+    columns: Columns = {"task": "task", "attempt": "attempt", "first": after(0), **each}
+    output.table("plans", rows, columns, f"success by scripted skills, {planner.model} in {format}")
     noted = Counter(note for one in found for answer in one.answers for note in answer.notes)
+    output.show("notes", [{"note": note, "answers": times} for note, times in noted.most_common()])
     for note, times in noted.most_common():
         print(f"{counted(times, 'answer')}: {note}")
     asked = sum(not answer.cached for answer in first)
     print(f"{counted(len(first), 'answer')} to begin with, {asked} asked now")
     done = max(len(one.checks) for one in found) - 1
-    folders = [planner.name, *(f"{planner.name}-round{k}" for k in range(1, done + 1))]
-    print(f"written to {', '.join(str(out / folder) for folder in folders)}")
+    folders = [out / name for name in (planner.name, *(f"{planner.name}-round{k}" for k in range(1, done + 1)))]
+    output.show("folders", folders, f"written to {', '.join(map(str, folders))}")
+    return output

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,12 +11,18 @@ from tyro.conf import Positional, arg
 from lw_torchrl._checks import counted
 from lw_torchrl.cli.outputs import check_folder
 from lw_torchrl.cli.sources import (
+    ACTORS,
+    check_actor,
+    check_encoder,
+    check_plan_files,
+    check_saved,
     load_policy,
     one_or_many,
     read_plans,
     read_tasks,
     simulated,
 )
+from lw_torchrl.cli.tables import Columns, Output
 from lw_torchrl.cli.threads import use_one_thread
 from lw_torchrl.cli.train_evaluator import with_evaluator
 
@@ -37,7 +44,8 @@ def collect(
     policy: str = "expert",
     behaviour: str | None = None,
     num_envs: int | None = None,
-) -> None:
+    json: bool = False,
+) -> Output:
     """Collect demonstrations of the scripted experts, or of others. Stopped and started again it carries on.
 
     Example: lw-torchrl collect MT10 --out demos/mt10 --noise 0 0.1 0.2 --redraw-failures
@@ -56,19 +64,23 @@ def collect(
             of `lw-torchrl train`.
         behaviour: the label of its episodes; by default the name of who acts, of a policy its file's.
         num_envs: environments stepped together; the dataset does not depend on it.
+        json: print one JSON document instead, see docs/cli.md.
     """
     check_folder("--out", out)
-    from lw_torchrl.data import BEHAVIOURS, collect_demonstrations
+    check_actor("policy", policy)
     from lw_torchrl.language.tasks import TASKS
 
+    chosen = simulated("tasks", one_or_many(tasks), TASKS)
+    from lw_torchrl.data import collect_demonstrations
+
     acts: str | Policy = policy
-    if policy not in BEHAVIOURS and (policy.endswith(".zip") or Path(policy).exists()):
+    if policy not in ACTORS:
         from lw_torchrl.trainers.checkpoint import load_actor
 
         use_one_thread()
         acts, behaviour = load_actor(policy), behaviour or Path(policy).stem
     made = collect_demonstrations(
-        simulated("tasks", one_or_many(tasks), TASKS),
+        chosen,
         episodes_per_task=episodes,
         root=out,
         seed=seed,
@@ -80,10 +92,15 @@ def collect(
         behaviour=behaviour,
         num_envs=num_envs,
     )
-    print(f"{'task':28} {'success':>7} {'episodes run':>13}")
-    for task, rate in made.success_rate.items():
-        print(f"{task:28} {rate:7.2f} {made.attempts[task]:13}")
-    print(f"{counted(made.num_steps, 'step')} in {made.root}")
+    output = Output(json)
+    rows = [
+        {"task": task, "success": rate, "episodes_run": made.attempts[task]} for task, rate in made.success_rate.items()
+    ]
+    columns: Columns = {"task": "task", "success": lambda row: f"{row['success']:.2f}", "episodes run": "episodes_run"}
+    output.table("tasks", rows, columns)
+    output.show("dataset", made.root)
+    output.show("steps", made.num_steps, f"{counted(made.num_steps, 'step')} in {made.root}")
+    return output
 
 
 def evaluate(
@@ -103,7 +120,8 @@ def evaluate(
     evaluator: Path | None = None,
     out: Path | None = None,
     device: str = "cpu",
-) -> None:
+    json: bool = False,
+) -> Output:
     """Evaluate a trained policy, or the scripted experts, and write the result, a figure and a recording.
 
     Example: lw-torchrl evaluate runs/mt10.zip --out runs/mt10
@@ -129,6 +147,7 @@ def evaluate(
         out: folder for results.json, success.png and rollout.rrd; with --attribute also failures.png.
         device: where the networks work: cpu; cuda, or cuda:1 for the second of several; mps, a Mac's; or auto, the GPU
             where there is one. The simulation is always on the CPU.
+        json: print one JSON document instead, see docs/cli.md.
     """
     if out is not None:
         check_folder("--out", out)
@@ -136,25 +155,31 @@ def evaluate(
         raise ValueError("--reference is for --attribute, which runs failed episodes again with these plans")
     if evaluator is not None and str(checkpoint) == "expert":
         raise ValueError("--evaluator is for a policy with plans, the scripted experts ask no conditions")
+    if str(checkpoint) != "expert":
+        check_saved("checkpoint", checkpoint)
+    if evaluator is not None:
+        check_saved("evaluator", evaluator, "network", "train-evaluator")
+    check_encoder(text_encoder)
+    known = dict(read_tasks(task_file))
+    chosen = simulated("tasks", one_or_many(tasks), known) if tasks else ()
+    given = read_plans(plans, known) if plans else None
+    check_plan_files("--reference", reference)  # which may speak of a policy's own tasks
     import lw_torchrl as lw
     from lw_torchrl._devices import check_device
+    from lw_torchrl._files import held
     from lw_torchrl.evaluation import plot_failures
     from lw_torchrl.record.rollouts import run_recorded, write_recording
 
     use_one_thread()
     there = check_device("device", device)
-    known = dict(read_tasks(task_file))
-    given = read_plans(plans, known) if plans else None
     policy = None
     if str(checkpoint) != "expert":
         policy = load_policy(checkpoint, seed, given, text_encoder)
         if evaluator is not None:
             policy = with_evaluator(policy, evaluator, text_encoder)
         known.update({task: found for task in policy.tasks if (found := policy.definition(task)) is not None})
-    if tasks or policy is None:
-        chosen = simulated("tasks", one_or_many(tasks) or "MT10", known)
-    else:
-        chosen = _default_tasks(policy, checkpoint, trained=not plans)
+    if not chosen:
+        chosen = lw.MT10 if policy is None else _default_tasks(policy, checkpoint, trained=not plans)
     if policy is None and there.type != "cpu":
         raise ValueError("--device is for a policy; the scripted experts work on the CPU")
     if attribute and (policy is None or policy.plans is None):
@@ -171,24 +196,28 @@ def evaluate(
         attribute=attribute,
         reference=read_plans(reference, known) if reference else None,
     )
-    print(result.table())
+    output = Output(json)
+    output.result(result)
     if attribute:
-        print(f"\n{result.failure_table()}")
+        failures = [asdict(one) for one in result.failures or ()]
+        output.show("failures", failures, f"\n{result.failure_table()}")
     if out is not None:
-        told: dict[str, Any] = {} if policy is None else {"checkpoint": checkpoint}
-        if policy is not None and policy.plans is not None:
-            told["plans"] = policy.plans.fingerprint
-        if evaluator is not None:
-            told["evaluator"] = evaluator
-        result.save(out / "results.json", **told)
-        lw.plot_success(result, out / "success.png", title=f"{checkpoint}, {episodes} episodes a task")
-        if attribute:
-            plot_failures(result, out / "failures.png", title=str(checkpoint))
-        if policy is not None:
-            shown: list[str | Task] = list(result.config["tasks"][:3])
-            recorded = run_recorded(policy, shown, seed=seed, noise_scale=noise)
-            write_recording(out / "rollout.rrd", recorded, policy.plans, seed=seed, policy=checkpoint.stem)
+        with held(out, "out", folder=True, wait=True):
+            told: dict[str, Any] = {} if policy is None else {"checkpoint": checkpoint}
+            if policy is not None and policy.plans is not None:
+                told["plans"] = policy.plans.fingerprint
+            if evaluator is not None:
+                told["evaluator"] = evaluator
+            result.save(out / "results.json", **told)
+            lw.plot_success(result, out / "success.png", title=f"{checkpoint}, {episodes} episodes a task")
+            if attribute:
+                plot_failures(result, out / "failures.png", title=str(checkpoint))
+            if policy is not None:
+                shown: list[str | Task] = list(result.config["tasks"][:3])
+                recorded = run_recorded(policy, shown, seed=seed, noise_scale=noise)
+                write_recording(out / "rollout.rrd", recorded, policy.plans, seed=seed, policy=checkpoint.stem)
         print(f"written to {out}")
+    return output
 
 
 def _default_tasks(policy: Policy, checkpoint: Path, *, trained: bool) -> tuple[str, ...]:

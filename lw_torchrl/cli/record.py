@@ -3,13 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
 from lw_torchrl.cli.outputs import check_file
-from lw_torchrl.cli.sources import load_policy, one_or_many, read_plans, read_tasks, simulated
+from lw_torchrl.cli.sources import (
+    ACTORS,
+    check_actor,
+    check_encoder,
+    check_plan_files,
+    load_policy,
+    one_or_many,
+    read_plans,
+    read_tasks,
+    simulated,
+)
+from lw_torchrl.cli.tables import Output
 from lw_torchrl.cli.threads import use_one_thread
 
 if TYPE_CHECKING:
@@ -17,8 +29,6 @@ if TYPE_CHECKING:
     from lw_torchrl.evaluation.failures import Failure
     from lw_torchrl.language.plans import Plans
     from lw_torchrl.language.tasks import Task
-
-WORDS = ("expert", "scripted", "random", "spoilt-60", "spoilt-30", "wrong")
 
 
 def record(
@@ -36,7 +46,8 @@ def record(
     noise: float = 0.1,
     max_steps: int = 500,
     out: Path | None = None,
-) -> None:
+    json: bool = False,
+) -> Output:
     """Record episodes: the robot in 3-D, the plan as it goes, what held when, and how it ended.
 
     Example: lw-torchrl record drawer-open --policy runs/mt10.zip --compare scripted --episodes 0 1
@@ -58,26 +69,30 @@ def record(
         noise: standard deviation of the noise on the executed action.
         max_steps: of an episode.
         out: the file; runs/recordings/TASK-POLICY.rrd if none is given. One that is there is replaced.
+        json: print one JSON document instead, see docs/cli.md.
     """
     if reference and not attribute:
         raise ValueError("--reference is for --attribute, which runs failed episodes again with these plans")
+    for option, who in (("policy", policy), ("compare", compare or policy)):
+        check_actor(option, who)
+    check_encoder(text_encoder)
+    check_plan_files("--reference", reference)
+    known = dict(read_tasks(task_file))
+    tasks = simulated("names", one_or_many(names), known)
+    given = read_plans(plans, known) if plans else None
     label = names[0] if len(names) == 1 else f"{len(names)}-tasks"
     out = out or Path("runs/recordings") / f"{label}-{Path(policy).stem}.rrd"
-    check_file("--out", out)
-    if out.suffix != ".rrd":
-        raise ValueError(f"--out must end in '.rrd', got {str(out)!r}")
+    check_file("--out", out, ".rrd")
     import lw_torchrl as lw
     from lw_torchrl._files import replacing
     from lw_torchrl.record.rollouts import run_recorded
 
     use_one_thread()
-    known = dict(read_tasks(task_file))
-    tasks = simulated("tasks", one_or_many(names), known)
-    given = read_plans(plans, known) if plans else None
     trusted = read_plans(reference, known) if reference else None
     options: dict[str, Any] = {"seed": seed, "noise_scale": noise, "max_steps": max_steps}
     # What can be refused is refused before the first episode runs.
     cast = [_cast(who, tasks, given, known, seed, max_steps, text_encoder) for who in filter(None, (policy, compare))]
+    output, rows = Output(json), []
     recorded: list[list[str]] = []
     with replacing(out) as file, lw.RerunLogger(file, exp_name=out.stem) as logger:
         for actor, shown, who in cast:
@@ -90,6 +105,8 @@ def record(
             for one in found:
                 failure = why.get((one.task, one.episode))
                 print(_line(one, who, failure))
+                row = {"task": one.task, "episode": one.episode, "policy": who, "first_success": one.first_success}
+                rows.append(row | {"failure": None if failure is None else asdict(failure)})
                 name = None if compare is None else f"{one.task}-{one.episode}-{len(recorded) + 1}"
                 pages.append(
                     lw.log_rollout(logger, one.steps, shown, seed=seed, policy=who, failure=failure, name=name)
@@ -97,7 +114,9 @@ def record(
             recorded.append(pages)
         for pair, one in zip(zip(*recorded, strict=True), found, strict=True) if compare is not None else ():
             logger.compare(pair, f"{one.task} · episode {one.episode} · side by side")
-    print(f"written to {out}\nlook at it with: lw-torchrl view {out}")
+    output.show("episodes", rows)
+    output.show("recording", out, f"written to {out}\nlook at it with: lw-torchrl view {out}")
+    return output
 
 
 def _cast(
@@ -111,13 +130,10 @@ def _cast(
 ) -> tuple[Any, Plans | None, str]:
     """Who acts, the plans whose conditions are answered, and what the policy is called."""
     import lw_torchrl as lw
-    from lw_torchrl._checks import unknown_name
     from lw_torchrl.data.behaviours import behaviour_of
     from lw_torchrl.data.segment_actor import SegmentActor
 
-    if who not in WORDS:
-        if not Path(who).is_file():
-            raise unknown_name("policy", who, [*WORDS, "a policy's file"])
+    if who not in ACTORS:
         actor = load_policy(Path(who), seed, plans, text_encoder)
         if missing := [task for task in tasks if task not in actor.tasks]:
             raise ValueError(

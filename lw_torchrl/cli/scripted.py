@@ -8,7 +8,8 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from lw_torchrl.cli.outputs import check_folder
-from lw_torchrl.cli.sources import one_or_many, read_plans, read_tasks, simulated
+from lw_torchrl.cli.sources import one_or_many, read_plans, read_skills, read_tasks, simulated
+from lw_torchrl.cli.tables import Output
 
 
 def scripted(
@@ -23,7 +24,8 @@ def scripted(
     task_file: Path | None = None,
     full: bool = False,
     out: Path = Path("runs/scripted"),
-) -> None:
+    json: bool = False,
+) -> Output:
     """Carry out plans with scripted skills, and say how each step fared: no training, no expert.
 
     Example: lw-torchrl scripted MT50 --episodes 50
@@ -40,20 +42,22 @@ def scripted(
         task_file: tasks of yours, whose objects and points the plans may name.
         full: run all 500 steps, instead of stopping at the first success.
         out: folder for results.json, plan_use.json and success.png.
+        json: print one JSON document instead, see docs/cli.md.
     """
     check_folder("--out", out)
-    import lw_torchrl as lw
-    from lw_torchrl._files import write_json
-    from lw_torchrl.evaluation.plan_use import PlanUse
-
     known = read_tasks(task_file)
     chosen = simulated("tasks", one_or_many(names), known)
     loaded = read_plans(plans, known)
     loaded.require(chosen)
     loaded = type(loaded)({task: loaded[task] for task in chosen})
+    skills = read_skills(skill_file, known)
+    import lw_torchrl as lw
+    from lw_torchrl._files import held, write_json
+    from lw_torchrl.evaluation.plan_use import PlanUse
+
     use = PlanUse(loaded)
     result = lw.evaluate(
-        lw.ScriptedSkillActor(loaded, select, skills=lw.load_skills(skill_file, tasks=known)),
+        lw.ScriptedSkillActor(loaded, select, skills=skills),
         tasks=chosen,
         episodes_per_task=episodes,
         seed=seed,
@@ -63,14 +67,25 @@ def scripted(
         on_episode=use,
     )
     seen = use.tasks()
-    for task, found in seen.items():
-        print(f"{task}: success {result.success_once[task]:.2f}")
-        for step, true, taken, stuck in zip(loaded[task].steps, found.true, found.chosen, found.stuck, strict=True):
-            at_end = f", stuck here in {stuck} of {found.failed} failed episodes" if stuck else ""
-            print(f"    true {true:4.0%}  chosen {taken:4.0%}  {step.skill}{at_end}")
-    print(f"\n{result.table()}")
-    out.mkdir(parents=True, exist_ok=True)
-    result.save(out / "results.json", plans=loaded.fingerprint)
-    write_json(out / "plan_use.json", {task: found.to_json() for task, found in seen.items()})
-    lw.plot_success(result, out / "success.png", title=f"plans and scripted skills, {episodes} episodes a task")
+    steps = {
+        task: [
+            {"skill": step.skill, "true": true, "chosen": taken, "stuck": stuck}
+            for step, true, taken, stuck in zip(loaded[task].steps, found.true, found.chosen, found.stuck, strict=True)
+        ]
+        for task, found in seen.items()
+    }
+    if not json:
+        for task, found in seen.items():
+            print(f"{task}: success {result.success_once[task]:.2f}")
+            for one in steps[task]:
+                ended = f", stuck here in {one['stuck']} of {found.failed} failed episodes" if one["stuck"] else ""
+                print(f"    true {one['true']:4.0%}  chosen {one['chosen']:4.0%}  {one['skill']}{ended}")
+        print()
+    output = Output(json)
+    output.result(result, steps=steps)
+    with held(out, "out", folder=True, wait=True):
+        result.save(out / "results.json", plans=loaded.fingerprint)
+        write_json(out / "plan_use.json", {task: found.to_json() for task, found in seen.items()})
+        lw.plot_success(result, out / "success.png", title=f"plans and scripted skills, {episodes} episodes a task")
     print(f"written to {out}")
+    return output

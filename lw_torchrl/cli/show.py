@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
@@ -10,10 +11,11 @@ from tyro.conf import Positional, arg
 
 from lw_torchrl.cli.outputs import check_file, check_folder
 from lw_torchrl.cli.sources import read_tasks, simulated
+from lw_torchrl.cli.tables import Output
 from lw_torchrl.cli.threads import use_one_thread
 
 
-def demo(out: Path | None = None, quick: bool = False) -> None:
+def demo(out: Path | None = None, quick: bool = False, json: bool = False) -> Output:
     """Train a plan-conditioned policy on MT10 and show it: demonstrations, training, evaluation, a recording.
 
     Takes some minutes on two cores. Stopped and started again it carries on.
@@ -22,12 +24,17 @@ def demo(out: Path | None = None, quick: bool = False) -> None:
         out: folder for results.json, success.png, rollout.rrd, checkpoint.zip and config.json; runs/demo, or
             runs/demo-quick with --quick.
         quick: two tasks and little training, in under a minute; not a measure of anything.
+        json: print one JSON document instead, see docs/cli.md.
     """
     folder = check_folder("--out", out or Path("runs/demo-quick" if quick else "runs/demo"))
     from lw_torchrl.experiments.demo import QUICK, DemoConfig, run_demo
 
     use_one_thread()
-    run_demo(folder, QUICK if quick else DemoConfig())
+    result = run_demo(folder, QUICK if quick else DemoConfig())
+    output = Output(json)
+    if json:  # as text it has printed itself
+        output.result(result)
+    return output
 
 
 def view(
@@ -58,10 +65,15 @@ def view(
     given = [f"--{name}" for name, value in (("screenshot", screenshot), ("html", html), ("web", web)) if value]
     if len(given) > 1:
         raise ValueError(f"give one of --screenshot, --html and --web, got {' and '.join(given)}")
-    if screenshot is not None:
-        check_file("--screenshot", screenshot)
-    if html is not None:
-        check_file("--html", html)
+    for option, file, ending in (("--screenshot", screenshot, ".png"), ("--html", html, ".html")):
+        if file is not None:
+            check_file(option, file, ending)
+    if not re.fullmatch(r"[1-9]\d*x[1-9]\d*", window_size):
+        raise ValueError(f"window_size must be like '1400x900', got {window_size!r}")
+    if not recording.exists():
+        raise FileNotFoundError(f"recording: there is no file or folder {str(recording)!r}")
+    if recording.is_dir() and not any(recording.glob("*.rrd")):
+        raise FileNotFoundError(f"recording: the folder {str(recording)!r} holds no recording (*.rrd)")
     from lw_torchrl.record import WebPage, open_viewer, write_html
 
     if web:
@@ -86,7 +98,8 @@ def query(
     seed: int = 0,
     episode: int = 0,
     task_file: Path | None = None,
-) -> None:
+    json: bool = False,
+) -> Output:
     """Answer a query on a state of a task: the state after so many steps of the scripted expert.
 
     Example: lw-torchrl query pick-place "Is the gripper open and not above the puck?" --step 40
@@ -98,6 +111,7 @@ def query(
         seed: of the episode.
         episode: its index.
         task_file: tasks of yours, whose objects and points the query may name.
+        json: print one JSON document instead, see docs/cli.md.
     """
     import lw_torchrl as lw
     from lw_torchrl._checks import check_int
@@ -119,11 +133,16 @@ def query(
         state = env.rollout(step, lw.ExpertActor(name), auto_reset=False, tensordict=state)[:, -1]["next"]
     truths = lw.QueryProgram({definition: listed})(state["observation"], state["task_id"])[0].tolist()
     env.close()
-    for place, position in definition.positions(state["observation"][0]).items():
-        print(f"the {place:24} at " + " ".join(f"{number:7.3f}" for number in position.tolist()) + " m")
-    print(f"the gripper's opening       {state['observation'][0, 3]:7.3f}\n")
-    for found, truth in zip(listed, truths, strict=True):
-        if text is not None:
-            print(f"{'yes' if truth else 'no'}: {found}")
-        elif truth:
-            print(found)
+    output = Output(json)
+    positions = {place: at.tolist() for place, at in definition.positions(state["observation"][0]).items()}
+    lines = [f"the {place:24} at {' '.join(f'{x:7.3f}' for x in at)} m" for place, at in positions.items()]
+    output.show("positions", positions, "\n".join(lines))
+    opening = state["observation"][0, 3].item()
+    output.show("opening", opening, f"the gripper's opening       {opening:7.3f}\n")
+    answers = [{"query": str(found), "holds": truth} for found, truth in zip(listed, truths, strict=True)]
+    if text is not None:
+        said = [f"{'yes' if one['holds'] else 'no'}: {one['query']}" for one in answers]
+    else:
+        said = [one["query"] for one in answers if one["holds"]]
+    output.show("queries", answers, "\n".join(said))
+    return output

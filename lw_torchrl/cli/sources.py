@@ -1,21 +1,32 @@
 """What a user brings to a command, under the same option everywhere: --task-file, --plans, --skill-file,
---text-encoder."""
+--text-encoder, datasets and policies. What names and files alone can tell is checked without torch."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from lw_torchrl._checks import unknown_name
+
 if TYPE_CHECKING:
     from lw_torchrl.language.plans import Plans
+    from lw_torchrl.language.skills import ScriptedSkill
     from lw_torchrl.language.tasks import Task
     from lw_torchrl.language.text import TextEncoder
     from lw_torchrl.modules.policy import Policy
 
 SETS = ("MT10", "MT50")
+ACTORS = ("expert", "scripted", "spoilt-60", "spoilt-30", "wrong", "random")
+"""The names of :data:`lw_torchrl.data.BEHAVIOURS`."""
+METHODS = ("pcbc", "dc", "one-hot")
+"""The names of :data:`lw_torchrl.modules.METHODS`."""
+
+
+_OWN_ENGINE = "tasks of your own run in an engine of yours, in Python: docs/training.md"
 
 
 def one_or_many(names: tuple[str, ...]) -> str | tuple[str, ...]:
@@ -24,11 +35,41 @@ def one_or_many(names: tuple[str, ...]) -> str | tuple[str, ...]:
 
 
 def read_tasks(task_file: Path | None) -> Mapping[str, Task]:
-    """The 50 tasks, with those of --task-file in their place or beside them."""
+    """The 50 tasks, with those of --task-file in their place or beside them.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it holds no valid tasks.
+    """
     from lw_torchrl.language.task_files import load_tasks
     from lw_torchrl.language.tasks import TASKS
 
-    return TASKS if task_file is None else load_tasks(task_file)
+    if task_file is None:
+        return TASKS
+    with _of_option("--task-file", task_file):
+        return load_tasks(task_file)
+
+
+def read_skills(skill_file: Path | None, tasks: Mapping[str, Task]) -> Mapping[str, ScriptedSkill]:
+    """The scripted skills, with those of --skill-file in their place or beside them; errors as of
+    :func:`read_tasks`."""
+    from lw_torchrl.language.skills import load_skills
+
+    if skill_file is None:
+        return load_skills()
+    with _of_option("--skill-file", skill_file):
+        return load_skills(skill_file, tasks=tasks)
+
+
+@contextmanager
+def _of_option(option: str, file: Path) -> Iterator[None]:
+    """Errors within the block name the option that the file is of."""
+    if not file.is_file():
+        raise FileNotFoundError(f"{option}: there is no file {str(file)!r}")
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{option} {error}") from error
 
 
 def simulated(argument: str, names: str | Sequence[str], known: Mapping[str, Task]) -> tuple[str, ...]:
@@ -41,16 +82,8 @@ def simulated(argument: str, names: str | Sequence[str], known: Mapping[str, Tas
 
     given = [names] if isinstance(names, str) else names
     if own := [name for name in given if name not in (*SETS, *TASKS) and name in known]:
-        raise ValueError(
-            f"{argument}: the simulator has no {', '.join(own)}; tasks of your own run in an engine of yours, in "
-            "Python: docs/training.md"
-        )
-    try:
-        return resolve_tasks(names, tasks=TASKS)
-    except ValueError as error:
-        if all(name in (*SETS, *TASKS) for name in given):
-            raise
-        raise ValueError(f"{error}. The simulator has no others") from error
+        raise ValueError(f"{argument}: the simulator has no {', '.join(own)}; {_OWN_ENGINE}")
+    return resolve_tasks(names, tasks=TASKS)
 
 
 def read_plans(sources: Sequence[str], tasks: Mapping[str, Task], skills: Literal["own", "MT10"] = "own") -> Plans:
@@ -60,6 +93,7 @@ def read_plans(sources: Sequence[str], tasks: Mapping[str, Task], skills: Litera
 
     Raises:
         PlanError: (a ValueError) a source holds no valid plans, or a shipped one names what a task of the user's lacks.
+        FileNotFoundError: a source is not there.
     """
     from lw_torchrl.language.plan_files import load_plans
     from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans
@@ -68,8 +102,8 @@ def read_plans(sources: Sequence[str], tasks: Mapping[str, Task], skills: Litera
     for source in sources:
         try:
             found.update(load_plans(source, skills=skills) if source in SETS else load_plans(source, tasks=tasks))
-        except PlanError as error:
-            raise PlanError(f"--plans {source}: {error}") from error
+        except (PlanError, FileNotFoundError) as error:
+            raise type(error)(f"--plans {source}: {error}") from error
     if not found:
         raise ValueError("--plans must name at least one source of plans: MT10, MT50, a file or a folder")
     for task, plan in found.items():
@@ -84,6 +118,47 @@ def read_plans(sources: Sequence[str], tasks: Mapping[str, Task], skills: Litera
     return Plans(found)
 
 
+def check_encoder(name: str | None) -> None:
+    """Raise :class:`ValueError` for a --text-encoder that is not "package.module:function"; nothing is imported."""
+    module, _, function = "m:f".partition(":") if name is None else name.partition(":")
+    if not module or not function.isidentifier():
+        raise ValueError(f"--text-encoder must be like my_texts:encode, a module and a function, got {name!r}")
+
+
+def check_dataset(argument: str, folder: Path) -> None:
+    """Raise :class:`FileNotFoundError` where there is no dataset's folder."""
+    if not folder.is_dir():
+        raise FileNotFoundError(f"{argument}: no dataset folder {str(folder)!r}; make one with `lw-torchrl collect`")
+
+
+def check_plan_files(option: str, sources: Sequence[str]) -> None:
+    """Raise :class:`FileNotFoundError` for a source of plans that is neither a set nor there."""
+    for source in sources:
+        if source not in SETS and not Path(source).exists():
+            raise FileNotFoundError(f"{option}: no plan file or folder {source!r}; 'MT10' and 'MT50' name the shipped")
+
+
+def check_saved(argument: str, path: Path, what: str = "policy", writer: str = "train") -> None:
+    """Raise for a path where there is no file of a policy, or of what else a command writes.
+
+    Raises:
+        FileNotFoundError: there is nothing.
+        ValueError: it is a folder.
+    """
+    if path.is_dir():
+        raise ValueError(f"{argument}: {str(path)!r} is a folder; a {what} is one file")
+    if not path.exists():
+        raise FileNotFoundError(f"{argument}: no file {str(path)!r}; `lw-torchrl {writer}` writes one")
+
+
+def check_actor(argument: str, who: str) -> None:
+    """Raise :class:`ValueError` for who is neither one of :data:`ACTORS` nor a policy's file."""
+    if who not in ACTORS:
+        if not who.endswith(".zip") and not Path(who).exists():
+            raise unknown_name(argument, who, [*ACTORS, "a policy's file"])
+        check_saved(argument, Path(who))
+
+
 def read_encoder(name: str | None) -> TextEncoder | None:
     """The function that --text-encoder names, "package.module:function"; the working folder is searched first.
 
@@ -92,9 +167,8 @@ def read_encoder(name: str | None) -> TextEncoder | None:
     """
     if name is None:
         return None
+    check_encoder(name)
     module, _, function = name.partition(":")
-    if not module or not function.isidentifier():
-        raise ValueError(f"--text-encoder must be like my_texts:encode, a module and a function, got {name!r}")
     if "" not in sys.path:
         sys.path.insert(0, "")
     try:

@@ -2,17 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
+from lw_torchrl._checks import check_choice
 from lw_torchrl.cli.outputs import check_file
-from lw_torchrl.cli.sources import make_logger, one_or_many, read_encoder, read_plans, read_tasks
+from lw_torchrl.cli.sources import (
+    METHODS,
+    check_dataset,
+    check_encoder,
+    check_saved,
+    make_logger,
+    one_or_many,
+    read_encoder,
+    read_plans,
+    read_tasks,
+)
+from lw_torchrl.cli.tables import Output
 from lw_torchrl.cli.threads import use_one_thread
 
 if TYPE_CHECKING:
-    from lw_torchrl.data.replay import LanguageWorldExperienceReplay
     from lw_torchrl.language.plans import Plans
     from lw_torchrl.language.text import TextEncoder
     from lw_torchrl.modules.policy import Policy
@@ -44,7 +56,8 @@ def train(
     seed: int = 0,
     logger: Literal["csv", "tensorboard", "wandb"] | None = None,
     device: str = "cpu",
-) -> None:
+    json: bool = False,
+) -> Output:
     """Train a policy on demonstrations. Stopped and started again it carries on from its checkpoint.
 
     Example: lw-torchrl train demos/mt10 --out runs/mt10.zip
@@ -81,16 +94,12 @@ def train(
         device: where the networks work: cpu; cuda, or cuda:1 for the second of several; mps, a Mac's; or auto, the GPU
             where there is one. Minibatches are the same everywhere, and the policy can be loaded
             anywhere.
+        json: print one JSON document instead, see docs/cli.md.
     """
     check_file("--out", out)
     if begin is not None and out.resolve() == begin.resolve():
         raise ValueError("--out must be another file than --begin, which is only read")
-    import torch
-
-    import lw_torchrl as lw
-    from lw_torchrl._checks import check_choice
-    from lw_torchrl._devices import check_device
-    from lw_torchrl.modules.policy import METHODS, make_policy, policy_class
+    from lw_torchrl.language.tasks import resolve_tasks
 
     if answers is not None and evaluator is None:
         raise ValueError("--answers is of an evaluator's answers; give --evaluator")
@@ -100,16 +109,30 @@ def train(
         raise ValueError(
             "--evaluator new knows nothing: give --qaf-anchor 1 too, by which it learns what conditions mean"
         )
-    use_one_thread()
-    there = check_device("device", device)
+    check_dataset("data", data)
+    check_choice("method", method, METHODS)
+    check_encoder(text_encoder)
     known = read_tasks(task_file)
-    encoder = read_encoder(text_encoder)
+    chosen = resolve_tasks(one_or_many(tasks), tasks=known) if tasks else ()
     if begin is not None:
+        check_saved("--begin", begin)
         given = {"method": method, "mix": mix, "features": features, "width": width, "depth": depth, "plans": plans}
         _refuse_beside_begin(given)
+    if evaluator not in (None, "new"):
+        check_saved("evaluator", Path(evaluator), "network", "train-evaluator")
     loaded = read_plans(plans, known)
+    import torch
+
+    import lw_torchrl as lw
+    from lw_torchrl import modules
+    from lw_torchrl._devices import check_device
+    from lw_torchrl.modules.policy import make_policy, policy_class
+
+    use_one_thread()
+    there = check_device("device", device)
+    encoder = read_encoder(text_encoder)
     options: dict[str, Any] = {"features": features, "width": width, "depth": depth}
-    reads_plans = policy_class(METHODS[check_choice("method", method, METHODS)].policy).plan_options
+    reads_plans = policy_class(modules.METHODS[method].policy).plan_options
     if mix is not None and not reads_plans:
         raise ValueError(f"--mix is for a method that reads plans, --method {method} does not")
     if latent_consistency and not reads_plans:
@@ -127,7 +150,7 @@ def train(
     )
     replay = lw.LanguageWorldExperienceReplay(
         data,
-        episodes=_all_of(data, lw.resolve_tasks(one_or_many(tasks), tasks=known)) if tasks else None,
+        episodes=_all_of(data, chosen) if chosen else None,
         sampler=lw.TaskBalancedSampler(),
         after_success=after_success,
         device=there,
@@ -160,14 +183,21 @@ def train(
         replay.append_transform(transform)
     writes = None if logger is None else make_logger(logger, out)
     loss = lw.BehavioralCloningTrainer(actor, replay, config, checkpoint=out, logger=writes, device=there).train()
-    print(f"trained to step {steps}" + ("" if loss != loss else f", loss {loss:.4f}") + f": {out}")
+    output = Output(json)
+    output.show("policy", out)
+    output.show("steps", steps)
+    output.show("loss", loss, f"trained to step {steps}" + ("" if loss != loss else f", loss {loss:.4f}") + f": {out}")
     if inside is not None:
-        print(f"conditions that drifted most from their words, in the demonstrations' states:\n{_drift(actor, replay)}")
+        from lw_torchrl.evaluation import condition_drift, drift_table
+
+        drifts = condition_drift(actor, replay[:])
+        heading = "conditions that drifted most from their words, in the demonstrations' states:"
+        output.show("drift", [asdict(one) for one in drifts], f"{heading}\n{drift_table(drifts, most=5)}")
+    return output
 
 
 def _all_of(data: Path, tasks: tuple[str, ...]) -> dict[str, list[int]]:
     """Every episode of these tasks in a dataset."""
-    from lw_torchrl._checks import check_choice
     from lw_torchrl.data.metadata import read_metadata
 
     found = read_metadata(data)
@@ -209,9 +239,3 @@ def _with_evaluator(
     if not isinstance(actor, lw.PlanConditionedActor):
         raise ValueError(f"--evaluator is for one policy with plans, --begin names a {type(actor).__name__}")
     return actor.with_evaluator(_evaluator(named, actor.plans, encoder), answers=answers)
-
-
-def _drift(actor: Policy, replay: LanguageWorldExperienceReplay) -> str:
-    from lw_torchrl.evaluation import condition_drift, drift_table
-
-    return drift_table(condition_drift(actor, replay[:]), most=5)

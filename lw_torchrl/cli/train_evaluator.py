@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
+from lw_torchrl._checks import check_choice
 from lw_torchrl.cli.outputs import check_folder
-from lw_torchrl.cli.sources import one_or_many, read_encoder, simulated
+from lw_torchrl.cli.sources import ACTORS, check_dataset, check_encoder, one_or_many, read_encoder, simulated
+from lw_torchrl.cli.tables import Output
 from lw_torchrl.cli.threads import use_one_thread
 
 if TYPE_CHECKING:
@@ -44,7 +46,8 @@ def train_evaluator(
     states_per_task: int = 2000,
     seed: int = 0,
     num_envs: int | None = None,
-) -> None:
+    json: bool = False,
+) -> Output:
     """Train a network to answer conditions, on all base queries of tasks, and say how well it does. Stopped and started
     again it carries on.
 
@@ -78,13 +81,26 @@ def train_evaluator(
         states_per_task: at most so many of each task are labelled.
         seed: of the episodes, of what is held out, the initial weights and the minibatches.
         num_envs: environments stepped together; the result does not depend on it.
+        json: print one JSON document instead, see docs/cli.md.
     """
     check_folder("--out", out)
     if text_encoder is not None and structure:
         raise ValueError("--text-encoder is for --no-structure; with structure no text is read")
+    from lw_torchrl._rendering import CAMERAS
     from lw_torchrl.language.tasks import TASKS
 
     names = simulated("tasks", one_or_many(tasks), TASKS)
+    drawn = len(held_out_tasks) == 1 and held_out_tasks[0].isdigit()
+    for argument, given, allowed in (
+        ("behaviours", behaviours, ACTORS),
+        ("cameras", cameras, CAMERAS),
+        ("held_out_tasks", () if drawn else held_out_tasks, names),
+    ):
+        for one in given:
+            check_choice(argument, one, allowed)
+    for folder in data:
+        check_dataset("data", folder)
+    check_encoder(text_encoder)
     import torch
 
     import lw_torchrl as lw
@@ -93,13 +109,12 @@ def train_evaluator(
     from lw_torchrl.evaluation.wrong_answers import plot_wrong_answers
 
     use_one_thread()
-    drawn = len(held_out_tasks) == 1 and held_out_tasks[0].isdigit()
     defaults = {"steps": 4000, "batch_size": 48, "learning_rate": 2e-3, "every": 5}
     if not cameras:
         defaults = {"steps": 6000, "batch_size": 1024, "learning_rate": 3e-3, "every": 1}
-    given = {"steps": steps, "batch_size": batch_size, "learning_rate": learning_rate, "every": every}
+    said = {"steps": steps, "batch_size": batch_size, "learning_rate": learning_rate, "every": every}
     config = (lw.ImageQueryEvaluatorConfig if cameras else lw.QueryEvaluatorConfig)(
-        **defaults | {name: value for name, value in given.items() if value is not None},  # type: ignore[arg-type]
+        **defaults | {name: value for name, value in said.items() if value is not None},  # type: ignore[arg-type]
         states_per_task=states_per_task,
         held_out_states=held_out_states,
         held_out_pairs=held_out_pairs,
@@ -130,14 +145,18 @@ def train_evaluator(
     labelled = lw.LabelledQueries(replay, config)
     trainer = lw.ImageQueryEvaluatorTrainer if cameras else lw.QueryEvaluatorTrainer
     loss = trainer(evaluator, labelled, config, checkpoint=out / "evaluator.zip").train()
-    print(f"trained to step {config.steps}" + ("" if loss != loss else f", loss {loss:.4f}"))
+    output = Output(json)
+    output.show("evaluator", out / "evaluator.zip")
+    output.show("steps", config.steps)
+    output.show("loss", loss, f"trained to step {config.steps}" + ("" if loss != loss else f", loss {loss:.4f}"))
     report = score_evaluator(evaluator, labelled)
-    print(report.table())
+    output.show("parts", {name: one.to_json() for name, one in report.parts.items()}, report.table())
     report.save(out / "report.json")
     plot_reliability(report, out / "reliability.png")
     if cameras:
         plot_wrong_answers(evaluator, labelled, out / "wrong.png")
     print(f"written to {out}")
+    return output
 
 
 def _collected(out: Path, who: str, tasks: tuple[str, ...], noise: tuple[float, ...], run: dict[str, Any]) -> Path:

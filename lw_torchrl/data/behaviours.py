@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import torch
 
-from lw_torchrl._checks import check_choice, check_int, check_probability, shown, unknown_name
+from lw_torchrl._checks import check_choice, check_fields, check_int, check_probability, shown, unknown_name
 from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.modules.policy import Policy
@@ -52,6 +52,7 @@ class Behaviour:
     fingerprint: str | None = None
 
     def __post_init__(self) -> None:
+        check_fields(self, "behaviour: ")
         label = self.name if isinstance(self.name, str) else ""
         if not 0 < len(label) <= 100 or not label.isprintable() or label != label.strip():
             raise ValueError(f"behaviour: name must be a label of 1 to 100 characters, got {shown(self.name)}")

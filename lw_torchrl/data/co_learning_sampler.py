@@ -13,6 +13,7 @@ from torch import Tensor
 from torchrl.data.replay_buffers.storages import Storage
 
 from lw_torchrl._checks import unknown_name
+from lw_torchrl._keys import check_key
 from lw_torchrl.data.device_storage import beside
 from lw_torchrl.data.group_sampler import GroupSampler, column, nearest_sizes
 from lw_torchrl.data.growing import GrowingStorage
@@ -67,7 +68,7 @@ class CoLearningSampler(GroupSampler):
 
     Where a target by name is itself a base task, its base demonstrations are left out. A batch holds the target's rows,
     then those of the base tasks in the order of their ids; each row has, beside the storage's own columns:
-        is_target: (B,) bool.
+        is_target: (B,) bool, whether it is the target's; which rows are a dataset's, the storage says.
 
     Args:
         target: "grown"; a task's name; or the episodes that are the target's: one bool for each episode, in the order
@@ -109,6 +110,8 @@ class CoLearningSampler(GroupSampler):
     ) -> None:
         self.target = _check_target(target)
         self.target_fraction = _check_fraction(target_fraction)
+        check_key("task_key", task_key)
+        check_key("episode_key", episode_key)
         self.task_key = task_key
         self.episode_key = episode_key
         super().__init__()
@@ -178,7 +181,7 @@ class CoLearningSampler(GroupSampler):
         base = len(self._passes.size) - (not self._grown)
         part, whole = self.target_fraction.numerator, self.target_fraction.denominator
         unit = whole * base // gcd(base, whole - part)
-        if batch_size < 1 or batch_size % unit:
+        if batch_size % unit:
             raise ValueError(
                 f"batch_size must be a multiple of {unit}, so that {self.target_fraction} of it is the target's and "
                 f"{base} base tasks share the rest equally, got {batch_size}; the nearest are "
@@ -194,7 +197,7 @@ class CoLearningSampler(GroupSampler):
 
     extend = add
 
-    def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[str, Any]]:
+    def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor | tuple[Tensor, ...], dict[str, Any]]:
         """Draw ``batch_size`` indices, the target's first, and tell which are the target's."""
         self._check_storage(storage)
         if not isinstance(storage, GrowingStorage):
@@ -204,6 +207,7 @@ class CoLearningSampler(GroupSampler):
         if not storage.num_grown:
             raise ValueError("target 'grown': nothing has come yet; extend the buffer before the first sample")
         index, info = super().sample(storage, batch_size)
+        assert isinstance(index, Tensor)  # of one dimension
         mine = batch_size - len(index)
         grown = torch.randint(storage.num_grown, (mine,), generator=self._rng) + storage.num_joined
         info["is_target"] = torch.arange(batch_size) < mine

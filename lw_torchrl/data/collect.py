@@ -6,16 +6,19 @@ import os
 import shutil
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import nullcontext, suppress
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
 import torch
-from filelock import FileLock, Timeout
 from tensordict import TensorDictBase
 
-from lw_torchrl._files import flush, write_json
+from lw_torchrl._checks import checked
+from lw_torchrl._files import flush, held, write_json
+from lw_torchrl._versions import SIMULATORS, package_versions, version_changes
 from lw_torchrl.data.behaviours import Behaviour, behaviour_of
+from lw_torchrl.data.checksums import whole_episodes
 from lw_torchrl.data.dataset import (
     DATA,
     LOCK,
@@ -28,7 +31,7 @@ from lw_torchrl.data.dataset import (
     EpisodeInfo,
 )
 from lw_torchrl.data.episode_files import EpisodeFiles, write_failed
-from lw_torchrl.data.metadata import read_config, read_metadata, write_metadata
+from lw_torchrl.data.metadata import read_config, read_metadata, read_versions, write_metadata
 from lw_torchrl.data.missing_episodes import run_missing_episodes
 from lw_torchrl.data.rows import (
     ROW_BYTES,
@@ -36,14 +39,11 @@ from lw_torchrl.data.rows import (
     holds_columns,
     load_rows,
     read_rows,
-    whole_episodes,
     write_rows,
 )
 from lw_torchrl.language.tasks import resolve_tasks, task_id
 from lw_torchrl.modules.networks import evaluating
 from lw_torchrl.modules.policy import Policy
-
-_PATIENCE = 1.0  # seconds to wait for another call: it may be about to end
 
 
 def _known_to_experts(tasks: str | Iterable[str]) -> tuple[str, ...]:
@@ -56,16 +56,44 @@ def _known_to_experts(tasks: str | Iterable[str]) -> tuple[str, ...]:
         ) from error
 
 
-def _open_episode_files(root: Path, config: CollectConfig) -> EpisodeFiles:
+def _open_episode_files(
+    root: Path, config: CollectConfig, made_with: dict[str, str] | None = None
+) -> tuple[EpisodeFiles, dict[str, str]]:
+    """The episodes so far, and the versions of the packages that the dataset is begun with; of a damaged one, which is
+    taken apart, they are ``made_with``."""
     folder = root / PARTIAL
-    stated = folder / "config.json"
-    if stated.is_file():
+    stated, of_packages = folder / "config.json", folder / "versions.json"
+    begun = stated.is_file()
+    if begun:
         _check_same(read_config(stated), config, f"root: {str(root)!r} holds a half-made dataset")
-    else:
+    recorded = made_with or (read_versions(of_packages) if begun else {})
+    versions = package_versions()
+    if recorded and (made_with or any(folder.glob("*.npz"))):
+        _check_versions(root, recorded)
+        versions = recorded
+    if recorded or not begun:  # what an older one was begun with, nobody knows
+        write_json(of_packages, versions)
+    if not begun:
         write_json(stated, config.to_json())
     files = EpisodeFiles(folder, config.tasks, config.max_steps)
     files.drop_damaged()
-    return files
+    return files, versions
+
+
+def _check_versions(root: Path, recorded: dict[str, str]) -> None:
+    """Refuse to mix the episodes of two simulators, and warn where others may differ in their last bits."""
+    if changes := version_changes(recorded, SIMULATORS):
+        wanted = " ".join(f"{name}=={recorded[name]}" for name in SIMULATORS if name in recorded)
+        raise DatasetError(
+            f"root: {str(root)!r} holds episodes of another simulator ({'; '.join(changes)}), which are not mixed with "
+            f"others: install {wanted} to go on, choose another folder, or delete it to start again"
+        )
+    if changes := version_changes(recorded, ("lw_torchrl", "numpy", "torch")):
+        warnings.warn(
+            f"root: the dataset in {str(root)!r} was begun under other versions ({'; '.join(changes)}): it is gone on "
+            "with, but the episodes to come may differ in their last bits from those that these would have given",
+            stacklevel=5,
+        )
 
 
 def _flat(config: CollectConfig) -> dict[str, Any]:
@@ -121,27 +149,16 @@ def _take_apart(root: Path, config: CollectConfig, whole: list[EpisodeInfo], rea
         f"root: {str(root)!r} is damaged; {kept} are kept, the others are run again ({reason})",
         stacklevel=4,
     )
-    files = _open_episode_files(root, config)
+    files, _ = _open_episode_files(root, config, read_metadata(root).versions if whole else None)
     for info in whole:
         if not files.has(info.task, info.episode):
             files.put(info.task, info.episode, read_rows(root / DATA, info.start, info.length))
     (root / METADATA).unlink()
 
 
-@contextmanager
-def _alone(root: Path) -> Iterator[None]:
-    """Keep other calls out of a folder, in whatever process."""
-    root.mkdir(parents=True, exist_ok=True)
-    try:
-        with FileLock(root / LOCK, timeout=_PATIENCE):
-            yield
-    except Timeout:
-        raise DatasetError(
-            f"root: another collect_demonstrations is at work in {str(root)!r}; let it finish, or choose another folder"
-        ) from None
-
-
-def _assemble(root: Path, config: CollectConfig, files: EpisodeFiles, kept: dict[str, list[int]]) -> None:
+def _assemble(
+    root: Path, config: CollectConfig, versions: dict[str, str], files: EpisodeFiles, kept: dict[str, list[int]]
+) -> None:
     """Make the dataset of the kept episodes."""
     listed = [(task, episode) for task in config.tasks for episode in kept[task]]
     infos: list[EpisodeInfo] = []
@@ -164,7 +181,7 @@ def _assemble(root: Path, config: CollectConfig, files: EpisodeFiles, kept: dict
         write_rows(building, episodes())
         os.replace(building, root / DATA)
         flush(root)
-        write_metadata(root, config, infos, {task: max(kept[task]) + 1 for task in config.tasks})
+        write_metadata(root, config, versions, infos, {task: max(kept[task]) + 1 for task in config.tasks})
     except OSError as error:
         shutil.rmtree(building, ignore_errors=True)
         raise write_failed(root, len(listed) * config.max_steps * ROW_BYTES, error) from error
@@ -182,13 +199,14 @@ def _made(
             _take_apart(root, config, whole, reason)
     if found is None:
         _check_folders(root)
-        files = _open_episode_files(root, config)
-        _assemble(root, config, files, run_missing_episodes(config, policy, files, num_envs, progress))
+        files, versions = _open_episode_files(root, config)
+        _assemble(root, config, versions, files, run_missing_episodes(config, policy, files, num_envs, progress))
         found = read_metadata(root)
     shutil.rmtree(root / PARTIAL, ignore_errors=True)
     return found
 
 
+@checked
 def collect_demonstrations(
     tasks: str | Iterable[str],
     *,
@@ -246,11 +264,12 @@ def collect_demonstrations(
         The finished dataset's description.
 
     Warns:
-        UserWarning: a finished dataset was damaged.
+        UserWarning: a finished dataset was damaged; or one that is gone on with was begun under another version of
+            numpy, torch or this package.
 
     Raises:
-        ValueError: a wrong argument; DatasetError where ``root`` holds something else, or another call is at work
-            in it.
+        ValueError: a wrong argument; DatasetError where ``root`` holds something else, or episodes of another version
+            of MuJoCo or Meta-World to go on with, or another call is at work in it.
         TypeError: ``tasks`` holds a :class:`~lw_torchrl.Task`.
         OSError: it cannot be written, since there is no room, say; nothing is lost.
         RuntimeError: redrawing found too few successes.
@@ -270,7 +289,7 @@ def collect_demonstrations(
         tasks=names,
         episodes_per_task=episodes_per_task,
         seed=seed,
-        noise_scale=(noise_scale,) if isinstance(noise_scale, (int, float)) else tuple(noise_scale),
+        noise_scale=(noise_scale,) if isinstance(noise_scale, (float, Real)) else tuple(noise_scale),
         noise_hold=noise_hold,
         gripper_noise_factor=gripper_noise_factor,
         redraw_failures=bool(redraw_failures),
@@ -287,6 +306,7 @@ def collect_demonstrations(
     elif folder.is_dir() and {path.name for path in folder.iterdir()} - {LOCK} and not (folder / PARTIAL).is_dir():
         raise DatasetError(f"root: {str(folder)!r} is not empty and holds no dataset; choose another folder")
     if found is None or (folder / PARTIAL).is_dir():
-        with _alone(folder), nullcontext() if actor is None else evaluating(actor):
+        alone = held(folder, "root", "collect_demonstrations", folder=True, error=DatasetError)
+        with alone, nullcontext() if actor is None else evaluating(actor):
             found = _made(folder, config, actor, num_envs, progress)
     return found

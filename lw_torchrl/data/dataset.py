@@ -2,8 +2,9 @@
 
 root/data/            TorchRL's TED layout as a memory-mapped TensorDict, one row a step; see :mod:`.rows`
 root/metadata.json    written last: without it the dataset is not finished; see :mod:`.metadata`
-root/.partial/        the episodes so far, while collecting; see :mod:`.episode_files`
-root/.lock            held while collecting, and otherwise without a meaning
+root/.partial/        the episodes so far, while collecting; see :mod:`.episode_files`. Beside them config.json and
+                      versions.json say how they are made, from the start
+root/.lock            held while collecting
 """
 
 from __future__ import annotations
@@ -124,7 +125,7 @@ class Demonstrations:
     Attributes:
         root: its folder.
         config: how it was collected.
-        versions: of the packages that made it.
+        versions: of the packages that it was begun with.
         task_ids: task name to the number that stands for it in the files; rows are shown with today's
             :func:`~lw_torchrl.task_id`, whatever it was then.
         episodes: in the order of the rows.

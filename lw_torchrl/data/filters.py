@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from lw_torchrl._checks import check_probability, unknown_name
+from lw_torchrl._checks import check_fields, check_probability, check_text, unknown_name
 from lw_torchrl.data.dataset import Demonstrations
 
 _Listed = tuple[int, int, str, float, int]  # part, number in it, task, return, rows
@@ -44,19 +44,17 @@ class EpisodeFilter:
     else_best: float | None = None
 
     def __post_init__(self) -> None:
-        if self.success is not None and not isinstance(self.success, bool):
-            raise TypeError(f"keep: success must be True, False or None, got {self.success!r}")
+        check_fields(self, "keep: ")
         for name in ("best", "else_best"):
             if (part := getattr(self, name)) is not None and not check_probability(f"keep: {name}", part):
                 raise ValueError(f"keep: {name} must be above 0, got 0")
-        least = self.least_return
-        if least is not None and (isinstance(least, bool) or not isinstance(least, (int, float)) or least != least):
-            raise ValueError(f"keep: least_return must be a number, got {least!r}")
         if self.behaviours is None:
             return
         if isinstance(self.behaviours, str) or not isinstance(self.behaviours, Iterable):
             raise TypeError(f"keep: behaviours must be a tuple of labels, got {self.behaviours!r}")
         object.__setattr__(self, "behaviours", tuple(self.behaviours))
+        for label in self.behaviours:
+            check_text("keep: behaviours", label)
         if not self.behaviours:
             raise ValueError("keep: behaviours must hold at least one label, got none")
 
@@ -97,7 +95,7 @@ class EpisodeFilter:
 
     def _keeps(self, part: Demonstrations, number: int, earned: float) -> bool:
         return (
-            (self.success is None or part.episodes[number].success is self.success)
+            (self.success is None or part.episodes[number].success == self.success)
             and (self.least_return is None or earned >= self.least_return)
             and (self.behaviours is None or part.config.behaviour in self.behaviours)
         )

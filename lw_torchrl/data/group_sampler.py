@@ -2,30 +2,43 @@
 
 from __future__ import annotations
 
+import os
 from abc import abstractmethod
 from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDict
+from tensordict import NestedKey
 from torch import Tensor
+from torch.utils.data import get_worker_info
 from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.storages import Storage
 
+from lw_torchrl._checks import check_int
+from lw_torchrl._files import reading
+from lw_torchrl._tensor_archive import TensorArchive, write_archive
 from lw_torchrl.data.device_storage import beside
 from lw_torchrl.data.passes import Passes
-from lw_torchrl.data.sampler_state import check_state, read_state
+from lw_torchrl.data.sampler_state import check_state
 from lw_torchrl.data.storage import JoinedStorage
+
+_FILE = "sampler.zip"
 
 
 def column(storage: Storage, key: NestedKey, index: Tensor | None = None) -> Tensor:
     """One column of all rows of a storage, or of those at an index, on the CPU; a joined one would otherwise copy all
-    columns."""
+    columns.
+
+    Rows of a storage of several dimensions are numbered in row-major order.
+    """
     if isinstance(storage, JoinedStorage):
         return storage.column(key, index).cpu()
-    found = storage.get(slice(0, len(storage))).get(key, None)
-    if found is None:
+    rows = storage.get(slice(0, len(storage)))
+    each = [row.get(key, None) for row in rows] if isinstance(rows, list) else [rows.get(key, None)]
+    if any(one is None for one in each):
         raise KeyError(f"the storage has no column {key!r}, by which rows are to be grouped")
+    found = torch.stack(each) if isinstance(rows, list) else each[0]
+    found = found.flatten(0, storage.ndim - 1)
     return (found if index is None else found[index.to(found.device)]).cpu()
 
 
@@ -45,10 +58,13 @@ class GroupSampler(Sampler):
     Rows may come and be overwritten. If the subclass says by what a row's group is known (:meth:`_keys`), the groups
     and passes are kept up: a row that comes takes a random place in what is left of its group's pass, so that it comes
     once before any comes again, and the work is that of the rows that came. All rows are grouped again, and all passes
-    begin, where a group comes or goes, and where the subclass does not say.
+    begin, where a group comes or goes, where the subclass does not say, and in a storage of several dimensions.
+
+    Of a storage of several dimensions (``ndim=2``) an index is a tuple of as many tensors, as TorchRL's samplers give.
     """
 
     def __init__(self) -> None:
+        self._process = os.getpid()
         self._empty()
 
     def _empty(self) -> None:
@@ -75,7 +91,7 @@ class GroupSampler(Sampler):
 
     def _covered(self, storage: Storage) -> int:
         """The number of rows that are grouped: the first so many."""
-        return len(storage)
+        return len(storage) if storage.ndim == 1 else storage.shape.numel()
 
     @property
     def ran_out(self) -> bool:
@@ -129,8 +145,20 @@ class GroupSampler(Sampler):
             self._laid_out = (batch_size, shares, group, place)
         return self._laid_out[1:]
 
-    def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[str, Any]]:
+    def _check_worker(self) -> None:
+        """Raise where each worker of a DataLoader has a copy of this sampler, all of which would draw the same rows."""
+        worker = get_worker_info()
+        if worker is not None and worker.num_workers > 1 and self._process != os.getpid():
+            raise RuntimeError(
+                f"each of the DataLoader's {worker.num_workers} workers would draw the same rows: in each, open the "
+                "buffer anew with a generator of its own, or replay.set_sampler(...) and replay.set_rng(...); see "
+                "docs/sampling.md"
+            )
+
+    def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor | tuple[Tensor, ...], dict[str, Any]]:
         """Draw ``batch_size`` indices, group after group."""
+        batch_size = check_int("batch_size", batch_size, minimum=1)
+        self._check_worker()
         if not len(storage):
             raise ValueError("storage must hold at least one row, got an empty one")
         if self._restored and self._length:
@@ -152,7 +180,8 @@ class GroupSampler(Sampler):
                 rows, ended = passes.take(number, int(shares[number]), self._rng)
                 index[first[number] : first[number] + len(rows)] = rows
                 self._ran_out |= ended and bool(longest[number])
-        return beside(storage, index), {}
+        index = beside(storage, index)
+        return (index if storage.ndim == 1 else torch.unravel_index(index, storage.shape)), {}
 
     def add(self, index: Any) -> None:
         """Note that rows were written, over old ones perhaps."""
@@ -221,13 +250,15 @@ class GroupSampler(Sampler):
         self._restored = False
 
     def dumps(self, path: Any) -> None:
-        """Write the state to a folder, memory-mapped."""
-        TensorDict(self.state_dict()).memmap(path)
+        """Write the state to a folder, as one file that is there whole or not at all."""
+        write_archive(Path(path) / _FILE, {}, {"state": self.state_dict()})
 
     def loads(self, path: Any) -> None:
-        """Read the state that :meth:`dumps` wrote.
+        """Read the state that :meth:`dumps` wrote, without unpickling.
 
         Raises:
+            FileNotFoundError: there is no such file.
             ValueError: it is damaged, or of something else.
         """
-        self.load_state_dict(read_state(Path(path)))
+        with reading(path, "sampler's state"):
+            self.load_state_dict(TensorArchive(Path(path) / _FILE).tensors("state"))

@@ -13,10 +13,11 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from lw_torchrl._checks import check_int
+from lw_torchrl._files import reading
 from lw_torchrl._tensor_archive import TensorArchive, write_archive
 from lw_torchrl.data.collected import collected_rows
 from lw_torchrl.data.grown_state import check_grown
-from lw_torchrl.data.storage import DONE, REWARD, TRAJECTORY, JoinedStorage, column_name
+from lw_torchrl.data.storage import DEMONSTRATION, DONE, REWARD, TRAJECTORY, JoinedStorage, column_name
 from lw_torchrl.data.trajectories import Open, follow, shared_keys
 
 Columns = Mapping[NestedKey, Tensor]
@@ -34,6 +35,8 @@ class GrowingStorage(JoinedStorage):
     trajectory keeps its number from batch to batch for as long as its newest row is here, and no other, of this
     collector, another one or one after a restart, ever gets it. A row follows another if both have the collector's id,
     the other is not done, and it is bit for bit what the other became.
+
+    Samples have one column more, ``is_demonstration`` (B,) bool: true of the parts' rows, false of those that came.
 
     Args:
         parts, rows, n_steps, gamma: as for :class:`JoinedStorage`; ("collector", "traj_ids") and ("next", "done") are
@@ -87,7 +90,7 @@ class GrowingStorage(JoinedStorage):
     ) -> None:
         self.grow, self.count = check_int("grow", grow, minimum=1), 0
         self._admit, self._check = admit, check
-        super().__init__(parts, rows, n_steps=n_steps, gamma=gamma)
+        super().__init__([part.exclude(DEMONSTRATION) for part in parts], rows, n_steps=n_steps, gamma=gamma)
         if absent := [column_name(key) for key in (TRAJECTORY, DONE) if key not in self._columns]:
             raise ValueError(f"grow={self.grow} needs the columns {', '.join(absent)}, which parts do not have")
         if not shared_keys(self._columns):
@@ -105,10 +108,10 @@ class GrowingStorage(JoinedStorage):
         self._rows = torch.cat([self._rows, torch.arange(joined, joined + self.grow)])
         self.num_parts += 1
         self.max_size = self.num_joined + self.grow
+        self._places = torch.arange(self.max_size)
         if self.n_steps > 1:
             self._previous = torch.full((self.grow,), -1)
-            more = torch.arange(self.num_joined, self.max_size)
-            self._places, self._last = torch.arange(self.max_size), torch.cat([self._last, more])
+            self._last = torch.cat([self._last, more := torch.arange(self.num_joined, self.max_size)])
             self._earned = torch.cat([self._earned, self._earned.new_zeros(self.grow, 1)])
             self._ahead = torch.cat([self._ahead, torch.ones_like(more)])
 
@@ -119,6 +122,14 @@ class GrowingStorage(JoinedStorage):
 
     def __len__(self) -> int:
         return self.num_joined + self.num_grown
+
+    def keys(self) -> list[NestedKey]:
+        """The names of the columns."""
+        return [*super().keys(), DEMONSTRATION]
+
+    def _read(self, index: Tensor, keys: Sequence[NestedKey]) -> dict[NestedKey, Tensor]:
+        found = super()._read(index, [key for key in keys if key != DEMONSTRATION])
+        return {**found, DEMONSTRATION: index < self.num_joined} if DEMONSTRATION in keys else found
 
     def extend(self, batch: TensorDictBase) -> Tensor:
         """Write the rows of a batch; their places, int64 of the batch's shape."""
@@ -222,8 +233,10 @@ class GrowingStorage(JoinedStorage):
 
     def loads(self, path: Any) -> None:
         """Read what :meth:`dumps` wrote."""
-        archive = TensorArchive(Path(path) / "grown.zip")
-        self.load_state_dict({**archive.description, "rows": archive.tensors("rows"), "open": archive.tensors("open")})
+        with reading(path, "growing storage's state"):
+            archive = TensorArchive(Path(path) / "grown.zip")
+            groups = {name: archive.tensors(name) for name in ("rows", "open")}
+            self.load_state_dict({**archive.description, **groups})
 
     def __getstate__(self) -> dict[str, Any]:
         if get_spawning_popen() is not None:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from lw_torchrl.data.storage import TRAJECTORY, column_name
 from lw_torchrl.data.trajectories import Open
+from lw_torchrl.language.value_checks import finite
 
 
 def check_grown(
@@ -37,7 +38,11 @@ def check_grown(
         leaf, like = given[name], ring[key]  # type: ignore[index]
         fits = isinstance(leaf, Tensor) and leaf.dtype == like.dtype and leaf.shape == (there, *like.shape[1:])
         require(fits, f"rows[{name!r}]", f"{like.dtype} of shape {(there, *like.shape[1:])}")
+        if leaf.dtype.is_floating_point:
+            require(finite(leaf), f"rows[{name!r}]", "finite numbers")
         rows[key] = leaf
+    if "action" in rows:
+        require(bool((rows["action"].abs() <= 1).all()), "rows['action']", "in [-1, 1]")
     require(bool((rows[TRAJECTORY] < number).all()), f"rows[{column_name(TRAJECTORY)!r}]", f"below {number}")
     given = state.get("open")
     require(isinstance(given, Mapping) and set(given) == {"key", "number", "last"}, "open", "key, number and last")
@@ -48,4 +53,6 @@ def check_grown(
     opened = Open(*(part.clone() for part in parts))
     inside = (opened.last >= count - there) & (opened.last < count)
     require(bool(inside.all()) and len(opened.last.unique()) == len(opened.last), "open", "of rows that are there")
+    numbers = rows[TRAJECTORY].reshape(-1)[opened.last - (count - there)]
+    require(torch.equal(opened.number, numbers), "open", "of these rows' trajectories")
     return count, number, rows, opened

@@ -9,7 +9,6 @@ from reprlib import repr as short
 from typing import Any
 
 from lw_torchrl._files import read_json, write_json
-from lw_torchrl._versions import package_versions
 from lw_torchrl.data.behaviours import Behaviour
 from lw_torchrl.data.dataset import (
     METADATA,
@@ -28,7 +27,11 @@ _BAD = (ValueError, TypeError, KeyError, OverflowError, RecursionError)
 
 
 def write_metadata(
-    root: Path, config: CollectConfig, episodes: Sequence[EpisodeInfo], attempts: dict[str, int]
+    root: Path,
+    config: CollectConfig,
+    versions: dict[str, str],
+    episodes: Sequence[EpisodeInfo],
+    attempts: dict[str, int],
 ) -> None:
     """Write the metadata, which makes the dataset a finished one."""
     write_json(
@@ -37,7 +40,7 @@ def write_metadata(
             "format": FORMAT,
             "version": FORMAT_VERSION,
             "config": config.to_json(),
-            "versions": package_versions(),
+            "versions": versions,
             "task_ids": {task: task_id(task) for task in config.tasks},
             "attempts": attempts,
             "episodes": {
@@ -105,6 +108,22 @@ def read_config(path: Path) -> CollectConfig:
         ) from error
 
 
+def read_versions(path: Path) -> dict[str, str]:
+    """The versions of the packages that a half-made dataset was begun with; of one that does not say, none.
+
+    Raises:
+        DatasetError: (a ValueError) the file is damaged.
+    """
+    try:
+        return _versions(read_json(path, "root: the versions"))
+    except FileNotFoundError:
+        return {}
+    except _BAD as error:
+        raise DatasetError(
+            f"root: {str(path)!r} is damaged ({str(error)[:500]}); delete {str(path.parent.parent)!r} to start again"
+        ) from error
+
+
 def parse_config(stated: Any) -> CollectConfig:
     """A configuration from its JSON.
 
@@ -142,8 +161,8 @@ def _integer(name: str, stated: Any, minimum: int = 0, maximum: int = 2**63 - 1)
 
 
 def _versions(stated: Any) -> dict[str, str]:
-    if not isinstance(stated, dict) or not all(isinstance(version, str) for version in stated.values()):
-        raise ValueError(f"versions must be names and texts, got {short(stated)}")
+    if not isinstance(stated, dict) or not all(isinstance(v, str) and len(v) <= 100 for v in stated.values()):
+        raise ValueError(f"versions must be names and short texts, got {short(stated)}")
     return stated
 
 

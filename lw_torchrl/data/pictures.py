@@ -20,10 +20,11 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv, step_mdp
 
-from lw_torchrl._checks import check_int
+from lw_torchrl._checks import check_int, checked
 from lw_torchrl._files import replacing
 from lw_torchrl._progress import Progress
 from lw_torchrl._rendering import check_cameras
+from lw_torchrl.data.checksums import verify
 from lw_torchrl.data.dataset import DatasetError, Demonstrations, EpisodeInfo
 from lw_torchrl.data.metadata import read_metadata
 from lw_torchrl.data.replay import LanguageWorldExperienceReplay
@@ -61,6 +62,7 @@ def _wanted(cameras: str | Sequence[str], height: int, width: int, every: int) -
     return _Wanted(check_cameras(cameras, height, width), height, width, check_int("every", every, minimum=1))
 
 
+@checked
 def add_pictures(
     root: str | os.PathLike[str],
     cameras: str | Sequence[str] = "corner",
@@ -97,6 +99,7 @@ def add_pictures(
         torch.Size([8, 64, 64, 3])
     """
     wanted, found = _wanted(cameras, height, width, every), read_metadata(Path(root))
+    verify(found, found.episodes)
     rows = load_rows(found)
     missing = [one for one in found.episodes if not _whole(wanted.file(found.root, one), wanted, wanted.count(one))]
     bar = Progress("taking pictures", sum(map(wanted.count, missing)), "picture", show=progress)
@@ -185,6 +188,7 @@ def _read(path: Path, wanted: _Wanted, count: int) -> Tensor:
     return torch.from_numpy(pictures)
 
 
+@checked
 def load_pictures(
     replay: LanguageWorldExperienceReplay,
     cameras: str | Sequence[str] = "corner",
@@ -207,10 +211,8 @@ def load_pictures(
         ValueError: a wrong argument; DatasetError where a dataset has no such pictures, or they are damaged.
     """
     wanted = _wanted(cameras, height, width, every)
-    shown = replay.demonstrations
-    parts = (shown,) if isinstance(shown, Demonstrations) else shown.parts
-    _, lengths = torch.unique_consecutive(replay.storage[:].get(("collector", "traj_ids")), return_counts=True)
-    listed = [(part.root, episode) for part in parts for episode in part.episodes]
+    _, lengths = torch.unique_consecutive(replay.storage.column(("collector", "traj_ids")), return_counts=True)
+    listed = [(part.root, episode) for part in replay.parts for episode in part.episodes]
     found = torch.empty((int(lengths.sum()), *wanted.shape), dtype=torch.uint8)
     row = 0
     for (root, episode), length in zip(listed, lengths.tolist(), strict=True):

@@ -12,17 +12,16 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import ImmutableDatasetWriter, TensorStorage
-from torchrl.data.datasets.common import BaseDatasetExperienceReplay
+from torch.utils.data import get_worker_info
+from torchrl.data import ImmutableDatasetWriter
 from torchrl.data.replay_buffers.samplers import Sampler
-from torchrl.data.replay_buffers.storages import Storage
 from torchrl.data.replay_buffers.writers import Writer
 from torchrl.envs import Transform
 
-from lw_torchrl._checks import check_choice, check_int
+from lw_torchrl._checks import check_choice, check_int, check_path, checked_but
 from lw_torchrl._devices import CPU, check_device
-from lw_torchrl._state_tree import join, split
-from lw_torchrl._tensor_archive import ArchiveError, TensorArchive, write_archive
+from lw_torchrl.data.buffer_state import RestorableReplay, fingerprint
+from lw_torchrl.data.checksums import verify
 from lw_torchrl.data.dataset import DATA, Demonstrations
 from lw_torchrl.data.device_storage import DeviceStorage
 from lw_torchrl.data.filters import EpisodeFilter
@@ -32,6 +31,7 @@ from lw_torchrl.data.metadata import read_metadata
 from lw_torchrl.data.n_steps import check_n_steps
 from lw_torchrl.data.replay_checks import (
     admit_rows,
+    check_apart,
     check_behaviours,
     check_column,
     check_growing,
@@ -39,6 +39,7 @@ from lw_torchrl.data.replay_checks import (
     check_prefetch,
     check_rows,
     check_transform,
+    warn_of_simulators,
 )
 from lw_torchrl.data.rewards import REWARDS, RewardName
 from lw_torchrl.data.selection import (
@@ -50,7 +51,7 @@ from lw_torchrl.data.selection import (
     read_part,
     returns_of,
 )
-from lw_torchrl.data.storage import JoinedStorage
+from lw_torchrl.data.storage import JoinedStorage, WholeStorage
 
 
 def _as_it_is(batch: TensorDictBase) -> TensorDictBase:
@@ -73,15 +74,17 @@ def _choices(episodes: Any, roots: int, joined: bool) -> list[EpisodeChoice]:
 _NOT_COLLECTED = ("behaviour", "expert_action", "unclipped_action", ("next", "reward_sparse"), ("next", "reward_dense"))
 
 
-class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
+class LanguageWorldExperienceReplay(RestorableReplay):
     """The rows of datasets that :func:`collect_demonstrations` made; several are joined, and none is copied.
 
     Samples hold observation (B, 39) float32, action (B, 4) float32, task_id and episode (B,) int64, and what
     ``label`` leaves; a :class:`QAFTransform` adds ``qaf`` and ``qaf_plan``. collector/traj_ids (B,) int64 tells
     episodes apart, those of different datasets too; behaviour (B,) int64 says who acted, an index of ``behaviours``.
+    is_demonstration (B,) bool is true of rows of datasets, and false of those that :meth:`extend` wrote.
 
     Args:
-        root: the dataset's folder, or a list of folders: the rows of the first come first.
+        root: the dataset's folder, or a list of folders: the rows of the first come first. None may come twice, unless
+            ``episodes`` says which to show of each.
         episodes: which episodes to show. None: all; a number: the first so many of each task; a mapping: for each task
             to show, the first so many, or a list of indices of episodes. Of a list of folders, a list of such choices.
         keep: of these, the ones that went so: the successes, the best tenth, those of one behaviour; see
@@ -106,6 +109,9 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
             the other reward, are left out.
         device: where the rows are kept and transforms work: None or "cpu" for the files, memory-mapped; or "cuda",
             "cuda:1", "mps" or "auto", into whose memory all rows are copied once. Minibatches are the same everywhere.
+        check: whether to read the episodes that are shown through against their checksums, once in a process as long as
+            the files stay as they are; of more than 2 GiB so much, spread evenly. It takes one to three seconds a
+            gigabyte. :meth:`verify` reads all, and so does a trainer that goes on from a checkpoint.
         **kwargs: for :class:`torchrl.data.TensorDictReplayBuffer`: generator, pin_memory, ...; prefetch, at most 1:
             several threads would draw in an order that differs from run to run.
 
@@ -116,11 +122,16 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         columns: of :meth:`add_column`, the name to a digest of the values.
         behaviours: the labels of who acted, sorted.
 
+    Warns:
+        UserWarning: the folders were collected with different versions of MuJoCo or Meta-World; or, with ``grow``, with
+            others than the installed ones.
+
     Raises:
         ValueError: a wrong argument; a task or an episode that the dataset does not hold; ``n_steps`` or ``grow``
-            without label="executed"; a ``MultiStepTransform``, in place of which there is ``n_steps``. From
-            :meth:`extend`, with ``grow``: rows that do not fit the demonstrations, or have another reward.
-        RuntimeError: :meth:`extend` without ``grow``.
+            without label="executed"; a transform that does nothing to samples, such as ``MultiStepTransform``, in place
+            of which there is ``n_steps``. From :meth:`extend`, with ``grow``: rows that do not fit the demonstrations,
+            or have another reward.
+        RuntimeError: :meth:`extend` without ``grow``; rows that are assigned to.
         FileNotFoundError: there is no such folder.
         DatasetError: (a ValueError) the dataset is half-written, damaged, or of another format or version.
 
@@ -135,6 +146,7 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
     Source: the datasets of ``torchrl.data.datasets``.
     """
 
+    @checked_but("episodes")
     def __init__(
         self,
         root: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
@@ -152,6 +164,7 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         gamma: float | None = None,
         grow: int | None = None,
         device: str | torch.device | None = None,
+        check: bool = True,
         **kwargs: Any,
     ) -> None:
         check_n_steps(n_steps, gamma)
@@ -178,15 +191,22 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         if grow is not None and where != CPU:
             raise ValueError("device: a buffer that grows is on the CPU; leave it out, trainers move each minibatch")
         joined = not isinstance(root, (str, os.PathLike))
+        for folder in root if joined else [root]:  # type: ignore[union-attr]
+            check_path("root", folder)
         self.roots = tuple(map(Path, root)) if joined else (Path(root),)  # type: ignore[arg-type]
+        if episodes is None:
+            check_apart(self.roots)
         choices = _choices(episodes, len(self.roots), joined)
         whole = [read_metadata(folder) for folder in self.roots]
         check_label(label, whole)
         check_behaviours(whole)
+        warn_of_simulators(whole, grow is not None)
         shown = [
             choose_episodes(found, choice, f"episodes[{number}]" if joined else "episodes")
             for number, (found, choice) in enumerate(zip(whole, choices, strict=True))
         ]
+        for found, chosen in zip(whole, shown, strict=True) if check else ():
+            verify(found, chosen.episodes, every=False)
         if keep is not None:
             after = 0 if terminate_on_success else after_success
             pairs = zip(whole, shown, strict=True)
@@ -209,7 +229,7 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
             parts.append(rows if grow is None else rows.exclude(*_NOT_COLLECTED))
             kept.append(taken)
             trajectories += len(found.episodes)
-        storage: Storage
+        storage: JoinedStorage
         several = joined or episodes is not None or keep is not None
         self.demonstrations: Demonstrations | JoinedDemonstrations = (
             JoinedDemonstrations(tuple(shown)) if several else shown[0]
@@ -228,11 +248,11 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
             storage = JoinedStorage(parts, kept, n_steps=n_steps, gamma=gamma)
             storage = storage if where == CPU else DeviceStorage(storage, where)
         else:
-            storage = TensorStorage(parts[0] if kept[0] is None else parts[0][kept[0]])  # the second is in memory
-        if isinstance(storage, JoinedStorage):
-            kwargs.setdefault("collate_fn", _as_it_is)
+            storage = WholeStorage(parts[0] if kept[0] is None else parts[0][kept[0]])  # the second is in memory
+        kwargs.setdefault("collate_fn", _as_it_is)
         writer: Writer = ImmutableDatasetWriter() if grow is None else GrowingWriter()
         self.root = self.roots[0]
+        self._fingerprint = fingerprint(shown, after_success, terminate_on_success)
         self.n_steps, self.gamma, self.columns = n_steps, gamma, dict[str, str]()
         self.label, self.reward, self.terminate_on_success = label, reward, terminate_on_success
         self._grows = grow is not None
@@ -246,21 +266,29 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         )
 
     def set_sampler(self, sampler: Sampler) -> Sampler:
-        """Take another sampler; returns the one before."""
+        """Take another sampler, which draws from the buffer's generator; returns the one before.
+
+        In one of several workers of a DataLoader, where all have copies of the generator, it waits for ``set_rng``.
+        """
         if self._grows:
             check_growing(sampler, {})
-        return super().set_sampler(sampler)
+        before = super().set_sampler(sampler)
+        if get_worker_info() is None:
+            self.set_rng(self._rng)
+        return before
 
     def append_transform(self, transform: Transform, *, invert: bool = False) -> LanguageWorldExperienceReplay:
-        """Apply a transform to each sample, after those that are there."""
-        check_transform(transform)
+        """Apply a transform, or with ``invert`` its inverse, to each sample, after those that are there."""
+        if not invert:
+            check_transform(transform)
         return super().append_transform(transform, invert=invert)
 
     def insert_transform(
         self, index: int, transform: Transform, *, invert: bool = False
     ) -> LanguageWorldExperienceReplay:
-        """Apply a transform to each sample, before the one at ``index``."""
-        check_transform(transform)
+        """Apply a transform, or with ``invert`` its inverse, to each sample, before the one at ``index``."""
+        if not invert:
+            check_transform(transform)
         return super().insert_transform(index, transform, invert=invert)
 
     def share(self, shared: bool = True) -> LanguageWorldExperienceReplay:
@@ -271,33 +299,6 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
                 "with them here"
             )
         return super().share(shared)
-
-    def dumps(self, path: str | os.PathLike[str]) -> None:
-        """Save the state to a folder; that of a buffer that grows, as one file, which is there whole or not at all."""
-        if not self._grows:
-            return super().dumps(path)
-        tensors: dict[str, Tensor] = {}
-        tree = split(self.state_dict(), tensors)
-        write_archive(Path(path) / "buffer.zip", {"format_version": 1, "state": tree}, {"tensors": tensors})
-
-    def loads(self, path: str | os.PathLike[str]) -> None:
-        """Restore what :meth:`dumps` saved.
-
-        Raises:
-            FileNotFoundError: there is no such file.
-            ValueError: it is damaged, or the state of another buffer.
-        """
-        if not self._grows:
-            return super().loads(path)
-        file = Path(path) / "buffer.zip"
-        try:
-            archive = TensorArchive(file)
-            if archive.description.get("format_version") != 1:
-                raise ArchiveError("it is of another version")
-            state = join(archive.description.get("state"), archive.tensors("tensors"))
-        except ValueError as error:
-            raise ValueError(f"path: {str(file)!r} holds no buffer's state ({error})") from error
-        self.load_state_dict(state)
 
     def add_column(self, name: str, values: Tensor, *, of: LanguageWorldExperienceReplay | None = None) -> None:
         """Give each row a number of its own, held in memory, that samples then have: its advantage, say.
@@ -322,11 +323,7 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
             )
         own = values.detach().clone()
         self.columns = {**self.columns, name: sha256(own.cpu().contiguous().numpy().tobytes()).hexdigest()}
-        if isinstance(self.storage, TensorStorage):
-            rows = self.storage._storage.clone(recurse=False)  # replay[:] is the one before, not a copy
-            self.storage._storage = rows.set(name, own)
-        else:
-            self.storage.add_column(name, own)
+        self.storage.add_column(name, own)
 
     @property
     def tasks(self) -> tuple[str, ...]:

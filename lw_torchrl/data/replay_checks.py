@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -11,21 +14,61 @@ from torch import Tensor
 from torchrl.data.replay_buffers.samplers import SliceSampler
 from torchrl.envs import Compose, MultiStepTransform, Transform
 
+from lw_torchrl._versions import SIMULATORS, package_versions
 from lw_torchrl.data.dataset import Demonstrations
 from lw_torchrl.data.rewards import REWARDS, RewardName, check_reward
+from lw_torchrl.language.value_checks import finite
 
 _OF_SAMPLERS = ("index", "is_target")  # what samples have beside rows
 
 
+_ELSEWHERE = ("inv", "_inv_call", "_inv_apply_transform", "_call", "_step", "_reset")
+"""What a transform overrides that acts on rows as they are written, or in an environment."""
+
+
+class _Looked(Exception):
+    pass
+
+
+def _refusal(transform: Transform) -> str | None:
+    """Why a transform is of no use to samples; None for one whose forward looks at them.
+
+    Its forward is given what is no sample, but notes that somebody looks at it.
+    """
+    if all(getattr(type(transform), name) is getattr(Transform, name) for name in _ELSEWHERE):
+        return None  # a forward of its own alone, which may count samples, say: it is not called for a trial
+    looked: list[str] = []
+
+    class Sample:
+        def __getattribute__(self, name: str) -> Any:
+            looked.append(name)
+            raise _Looked
+
+    try:
+        inspect.unwrap(type(transform).forward)(transform, Sample())
+    except (RuntimeError, ValueError) as error:  # of those that work in an environment alone
+        return None if looked else f"refuses samples ({str(error) or 'it works in an environment alone'})"
+    except Exception:  # it is no sample
+        return None
+    return (
+        "would do nothing to samples, which its forward hands back as they are: it acts in an environment, or on rows "
+        "as they are written, and demonstrations are written already"
+    )
+
+
 def check_transform(transform: Any) -> None:
-    """Raise for a transform that would do nothing to demonstrations, and say nothing."""
-    if isinstance(transform, MultiStepTransform):
-        raise ValueError(
-            "MultiStepTransform acts on rows as they are written, and demonstrations are not: leave it out and give "
-            f"n_steps={transform.n_steps}, gamma={transform.gamma}, which makes n steps of all rows"
-        )
-    for part in transform if isinstance(transform, Compose) else ():
-        check_transform(part)
+    """Raise for a transform that would do nothing to samples, or refuse each of them."""
+    if isinstance(transform, Compose):
+        for part in transform:
+            check_transform(part)
+    elif isinstance(transform, Transform) and (why := _refusal(transform)):
+        instead = "leave it out; what it makes of the rows may be a column of your own, add_column"
+        if isinstance(transform, MultiStepTransform):
+            instead = (
+                f"leave it out and give n_steps={transform.n_steps}, gamma={transform.gamma}, which makes n steps of "
+                "all rows"
+            )
+        raise ValueError(f"transform: {type(transform).__name__} {why}; {instead}")
 
 
 def check_prefetch(batches: int | None) -> None:
@@ -46,6 +89,17 @@ def check_label(label: str, parts: Sequence[Demonstrations]) -> None:
         )
 
 
+def check_apart(roots: Sequence[Path]) -> None:
+    """Raise :class:`ValueError` where two of the folders are one, whose rows would come twice."""
+    first: dict[Path, Path] = {}
+    for root in roots:
+        if (before := first.setdefault(root.resolve(), root)) is not root:
+            raise ValueError(
+                f"root must hold each folder once, {str(before)!r} and {str(root)!r} are one; episodes= says which to "
+                "show of each, where both are meant"
+            )
+
+
 def check_behaviours(parts: Sequence[Demonstrations]) -> None:
     """Raise :class:`ValueError` where one label stands for two behaviours."""
     first: dict[str, Demonstrations] = {}
@@ -56,6 +110,24 @@ def check_behaviours(parts: Sequence[Demonstrations]) -> None:
             raise ValueError(
                 f"root: {label!r} stands for two behaviours, {before.config.policy} in {str(before.root)!r} and "
                 f"{policy} in {str(part.root)!r}; give one another name, in its metadata.json under config, policy"
+            )
+
+
+def warn_of_simulators(parts: Sequence[Demonstrations], grows: bool) -> None:
+    """Warn where episodes of different simulators come together, those to come among them where the buffer grows."""
+    made = [(repr(str(part.root)), part.versions) for part in parts]
+    made += [("the rows to come", package_versions())] if grows else []
+    for name in SIMULATORS:
+        first: dict[str, str] = {}  # version to who was made with it
+        for who, versions in made:
+            if name in versions:
+                first.setdefault(versions[name], who)
+        if len(first) > 1:
+            told = ", ".join(f"{version} for {who}" for version, who in first.items())
+            warnings.warn(
+                f"root: the episodes are of different simulators, {name} {told}: an action leads elsewhere in each. "
+                "Collect them again, into other folders, to have all of one",
+                stacklevel=3,
             )
 
 
@@ -102,3 +174,5 @@ def check_column(name: Any, values: Any, rows: int, there: Iterable[str], transf
         raise ValueError(f"name must be new, samples have {name!r} already")
     if values.dim() == 0 or len(values) != rows:
         raise ValueError(f"values must be of {rows} rows, got a tensor of shape {tuple(values.shape)}")
+    if not finite(values):
+        raise ValueError(f"values must hold finite numbers, got NaN or infinity for {name!r}")

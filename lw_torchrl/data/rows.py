@@ -1,8 +1,9 @@
 """The rows of a dataset: a file for each column, written through files and read through a memory map.
 
 They are what ``TensorDict.memmap`` writes, so ``TensorDict.load_memmap`` reads them too. Here they are mapped column by
-column, as :data:`COLUMNS` says: nothing that lies in the folder can ask for another shape, class or pickle. Writing
-goes through files, since a full disk under a memory map ends the process without a word.
+column, as :data:`COLUMNS` says: nothing that lies in the folder can ask for another shape, class or pickle. The map is
+copy-on-write: whoever writes to a column changes it for this process alone, never the file. Writing goes through files,
+since a full disk under a memory map ends the process without a word.
 """
 
 from __future__ import annotations
@@ -15,10 +16,10 @@ from pathlib import Path
 from typing import Any
 from zlib import crc32
 
+import numpy as np
 import torch
-from tensordict import MemoryMappedTensor, TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from tqdm.auto import tqdm
 
 from lw_torchrl._files import flush, read_json
 from lw_torchrl.data.dataset import DATA, DamagedDatasetError, DatasetError, Demonstrations, EpisodeInfo
@@ -46,6 +47,11 @@ ROW_BYTES = sum(_WIDTH.values())
 
 def _path(folder: Path, key: Column) -> Path:
     return folder.joinpath(*key[:-1], f"{key[-1]}.memmap")
+
+
+def column_files(folder: Path) -> list[Path]:
+    """The files of the columns."""
+    return [_path(folder, key) for key in COLUMNS]
 
 
 def _meta(rows: int) -> dict[str, dict[str, Any]]:
@@ -106,19 +112,6 @@ def describe_episode(task: str, episode: int, start: int, rows: TensorDictBase) 
     return EpisodeInfo(task, episode, start, len(rows), first is not None, first, checksum)
 
 
-def whole_episodes(demonstrations: Demonstrations, *, progress: bool) -> list[EpisodeInfo]:
-    """The episodes whose rows are as they were written, by their checksums and what else the metadata say of them."""
-    whole = []
-    bar = tqdm(demonstrations.episodes, desc="checking", unit="episode", delay=1, disable=not progress)
-    for info in bar:
-        rows = read_rows(demonstrations.root / DATA, info.start, info.length)
-        if rows is None or describe_episode(info.task, info.episode, info.start, rows) != info:
-            continue
-        if (rows["task_id"] == demonstrations.task_ids[info.task]).all() and (rows["episode"] == info.episode).all():
-            whole.append(info)
-    return whole
-
-
 def surplus(folder: Path) -> list[str]:
     """What lies among the rows and is no part of them; hidden files do not count."""
     ours = {_path(folder, key) for key in COLUMNS} | {folder / name / _META for name in _meta(0)}
@@ -152,15 +145,37 @@ def _renumbered(demonstrations: Demonstrations) -> Tensor:
     return numbers.repeat_interleave(torch.tensor([episode.length for episode in episodes]))
 
 
-def load_rows(demonstrations: Demonstrations) -> TensorDictBase:
-    """The rows of a dataset, memory-mapped.
+class MappedColumn(Tensor):
+    """A column in its file. A process that is spawned maps the file again; what is computed of it is a plain tensor."""
 
-    Where tasks were numbered otherwise when the dataset was made, ``task_id`` and ``("next", "task_id")`` are today's
-    numbers, in memory.
+    __torch_function__ = torch._C._disabled_torch_function_impl  # type: ignore[assignment]
+    _source: tuple[Path, tuple[int, ...], torch.dtype]
+
+    @staticmethod
+    def of(path: Path, shape: tuple[int, ...], dtype: torch.dtype) -> MappedColumn:
+        """Map a file that holds exactly such a column.
+
+        Raises:
+            OSError, ValueError, RuntimeError: it cannot be read, or is of another size.
+        """
+        content = torch.from_numpy(np.memmap(path, np.uint8, "c"))
+        column = content.view(dtype).view(shape).as_subclass(MappedColumn)
+        column._source = (path.absolute(), shape, dtype)
+        return column
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        return MappedColumn.of, self._source
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Tensor:
+        return self.clone()
+
+
+def map_rows(demonstrations: Demonstrations) -> TensorDict:
+    """The rows of a dataset as they lie in the files, memory-mapped.
 
     Raises:
-        DatasetError: (a ValueError) a column is missing, damaged, or not as long as the metadata say; or something
-            else lies among them.
+        DatasetError: (a ValueError) a column is missing, or not as long as the metadata say; or something else lies
+            among them.
     """
     folder, number = demonstrations.root / DATA, demonstrations.num_steps
     if odd := surplus(folder):
@@ -171,13 +186,25 @@ def load_rows(demonstrations: Demonstrations) -> TensorDictBase:
     try:
         _check_files(folder, number)
         for key, (tail, dtype) in COLUMNS.items():
-            path = str(_path(folder, key))
-            rows.set(key, MemoryMappedTensor.from_filename(path, dtype=dtype, shape=(number, *tail)))
+            rows.set(key, MappedColumn.of(_path(folder, key), (number, *tail), dtype))
     except (OSError, ValueError, RuntimeError) as error:
         raise DamagedDatasetError(
             f"root: the rows in {str(folder)!r} cannot be read ({error}); the same collect_demonstrations keeps the "
             "episodes that are whole and collects the others again"
         ) from error
+    return rows
+
+
+def load_rows(demonstrations: Demonstrations) -> TensorDict:
+    """The rows of a dataset, memory-mapped.
+
+    Where tasks were numbered otherwise when the dataset was made, ``task_id`` and ``("next", "task_id")`` are today's
+    numbers, in memory.
+
+    Raises:
+        DatasetError: (a ValueError) as for :func:`map_rows`.
+    """
+    rows = map_rows(demonstrations)
     if any(task_id(task) != stored for task, stored in demonstrations.task_ids.items()):
         rows.set("task_id", now := _renumbered(demonstrations))
         rows.set(("next", "task_id"), now.clone())

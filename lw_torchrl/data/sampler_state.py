@@ -1,36 +1,12 @@
-"""A sampler's state, read from a folder without unpickling, and checked before it is taken."""
+"""A sampler's state, checked before it is taken."""
 
 from __future__ import annotations
 
-from math import prod
-from pathlib import Path
 from reprlib import repr as short
 from typing import Any
 
 import torch
-from tensordict import TensorDict
 from torch import Tensor
-
-from lw_torchrl._files import read_json
-
-
-def read_state(folder: Path) -> dict[str, Any]:
-    """The tensors in a folder, if each file is as long as its description says; a shorter one would be lengthened."""
-    try:
-        for name, leaf in read_json(folder / "meta.json", "path: the description", limit=2**20).items():
-            if not isinstance(leaf, dict):
-                continue
-            if set(leaf) != {"device", "shape", "dtype", "is_nested"} or leaf["is_nested"] or "/" in name:
-                raise ValueError(f"{name} is no tensor")
-            dtype = {"torch.int64": torch.int64, "torch.bool": torch.bool}[leaf["dtype"]]
-            if not all(type(size) is int and 0 <= size < 2**48 for size in leaf["shape"]):
-                raise ValueError(f"{name} is of no shape")
-            size, file = prod(leaf["shape"]) * dtype.itemsize, folder / f"{name}.memmap"
-            if (there := file.stat().st_size if file.is_file() else 0) != size:
-                raise ValueError(f"{name}.memmap has {there} bytes, not {size}")
-        return TensorDict.load_memmap(folder, allow_pickle=False).to_dict()
-    except (OSError, RuntimeError, TypeError, KeyError, ValueError) as error:
-        raise ValueError(f"path: {str(folder)!r} holds no sampler's state ({type(error).__name__}: {error})") from error
 
 
 def check_state(state: Any) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from lw_torchrl.data.dataset import CollectConfig, DamagedDatasetError, Demonstr
 from lw_torchrl.data.filters import episode_returns
 from lw_torchrl.data.rewards import REWARDS, RewardName
 from lw_torchrl.data.rows import load_rows
-from lw_torchrl.data.storage import TRAJECTORY
+from lw_torchrl.data.storage import DEMONSTRATION, TRAJECTORY
 from lw_torchrl.language.value_checks import finite
 
 Label = Literal["expert", "unclipped", "executed"]
@@ -137,6 +137,7 @@ def read_part(
     if first_trajectory:
         rows.set(TRAJECTORY, rows.get(TRAJECTORY) + first_trajectory)
     rows.set("behaviour", torch.full(rows.batch_size, behaviour))
+    rows.set(DEMONSTRATION, torch.ones(rows.batch_size, dtype=torch.bool))
     after = 0 if terminate_on_success else after_success
     if chosen.episodes == whole.episodes and after is None:
         return rows, None

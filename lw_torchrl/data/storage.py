@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from reprlib import repr as short
@@ -13,10 +13,12 @@ from tensordict import NestedKey, TensorDict, TensorDictBase, is_leaf_nontensor
 from torch import Tensor
 from torchrl.data.replay_buffers.storages import Storage
 
-from lw_torchrl._files import read_json, write_json
+from lw_torchrl._files import read_json, reading, write_json
 from lw_torchrl.data.n_steps import STEPS, check_n_steps, last_rows, sum_rewards
 
 TRAJECTORY, REWARD, DONE = ("collector", "traj_ids"), ("next", "reward"), ("next", "done")
+DEMONSTRATION = "is_demonstration"
+"""The column that says which rows are a dataset's, and which ones a buffer was extended with."""
 _MAX_RUNS = 4  # runs of one part in a batch, for each part, up to which they are read one after another
 
 
@@ -39,7 +41,6 @@ def _columns(parts: Sequence[TensorDictBase]) -> dict[NestedKey, list[Tensor]]:
                 raise TypeError(
                     f"parts[{number}]: column {column_name(key)} must be a tensor, got {type(leaf).__name__}"
                 )
-            leaf = leaf.as_subclass(Tensor)  # the same memory; indexing a memory map's own class is slow
             before = columns.setdefault(key, [leaf])[0]
             if (leaf.shape[1:], leaf.dtype) != (before.shape[1:], before.dtype):
                 raise ValueError(
@@ -49,6 +50,17 @@ def _columns(parts: Sequence[TensorDictBase]) -> dict[NestedKey, list[Tensor]]:
             if number:
                 columns[key].append(leaf)
     return columns
+
+
+def _nested(columns: Mapping[NestedKey, Tensor], shape: Sequence[int], device: torch.device | None) -> TensorDict:
+    nested: dict[str, Any] = {}
+    for key, leaf in columns.items():
+        *path, last = (key,) if isinstance(key, str) else key
+        node = nested
+        for name in path:
+            node = node.setdefault(name, {})
+        node[last] = leaf
+    return TensorDict(nested, shape, device=device)
 
 
 class JoinedStorage(Storage):
@@ -119,6 +131,7 @@ class JoinedStorage(Storage):
         self._rows = torch.cat(taken)
         self.num_joined, self.num_parts = len(self._rows), len(parts)
         self._batch_device = parts[0].device
+        self._places: Tensor | None = None  # of all rows, where a row says more than its part's columns
         super().__init__(max_size=len(self._rows))
         if self.n_steps > 1:
             self._look_ahead()
@@ -206,18 +219,14 @@ class JoinedStorage(Storage):
 
     def get(self, index: Any) -> TensorDict:
         """The rows at an int, a slice, a list, a mask or a tensor of indices of any shape, as fresh tensors."""
-        plain = self.n_steps == 1
-        rows = (self._rows if plain else self._places)[: len(self)][index].contiguous()  # a slice with a step is not
+        plain = self._places is None
+        rows = (self._rows if self._places is None else self._places)[: len(self)][index]
+        rows = rows.contiguous()  # a slice with a step is not
         flat = rows.reshape(-1)
         found = self._gather(flat, list(self._columns)) if plain else self._read(flat, self.keys())
-        nested: dict[str, Any] = {}
-        for key, leaf in found.items():
-            *path, last = (key,) if isinstance(key, str) else key
-            node = nested
-            for name in path:
-                node = node.setdefault(name, {})
-            node[last] = leaf if rows.dim() == 1 else leaf.reshape(rows.shape + leaf.shape[1:])
-        return TensorDict(nested, rows.shape, device=self._batch_device)
+        if rows.dim() != 1:
+            found = {key: leaf.reshape(rows.shape + leaf.shape[1:]) for key, leaf in found.items()}
+        return _nested(found, rows.shape, self._batch_device)
 
     def contains(self, item: Any) -> Any:
         """Whether an index, or each of a tensor of indices, names a row."""
@@ -250,8 +259,26 @@ class JoinedStorage(Storage):
 
     def loads(self, path: Any) -> None:
         """Check that what :meth:`dumps` wrote is of as many rows."""
-        self.load_state_dict(read_json(Path(path) / "joined.json", "path: the storage's state"))
+        with reading(path, "storage's state"):
+            self.load_state_dict(read_json(Path(path) / "joined.json", "the file"))
 
     def __repr__(self) -> str:
         columns = ", ".join(map(column_name, self.keys()))
         return f"{type(self).__name__}({len(self)} rows of {self.num_parts} parts, columns {columns})"
+
+
+class WholeStorage(JoinedStorage):
+    """A :class:`JoinedStorage` of all rows of one tensordict, of which a slice is not copied.
+
+    Whoever writes to a slice changes what later batches hold.
+    """
+
+    def __init__(self, rows: TensorDictBase) -> None:
+        super().__init__([rows])
+
+    def get(self, index: Any) -> TensorDict:
+        """The rows at an index, as for :class:`JoinedStorage`; of a slice, where they lie."""
+        if not isinstance(index, slice):
+            return super().get(index)
+        found = {key: leaf[index] for key, (leaf,) in self._columns.items()}
+        return _nested(found, self._rows[index].shape, self._batch_device)

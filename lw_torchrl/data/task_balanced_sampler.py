@@ -7,6 +7,7 @@ from tensordict import NestedKey
 from torch import Tensor
 from torchrl.data.replay_buffers.storages import Storage
 
+from lw_torchrl._keys import check_key
 from lw_torchrl.data.group_sampler import GroupSampler, column, nearest_sizes
 
 
@@ -39,6 +40,7 @@ class TaskBalancedSampler(GroupSampler):
     """
 
     def __init__(self, task_key: NestedKey = "task_id") -> None:
+        check_key("task_key", task_key)
         self.task_key = task_key
         super().__init__()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable, Sequence
+from threading import Lock
 
 import numpy as np
 import torch
@@ -12,10 +13,12 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 
 from lw_torchrl._checks import missing_keys
-from lw_torchrl._keys import as_keys
+from lw_torchrl._keys import as_keys, dispatched, write
 from lw_torchrl.envs.engine import ACTION_SIZE, OBSERVATION_SIZE
 from lw_torchrl.envs.engines.metaworld import import_metaworld
 from lw_torchrl.language.tasks import resolve_tasks, task_id
+
+_quiet = Lock()  # Python's filters of warnings are the process's: two threads would leave ours behind
 
 
 class ExpertActor(TensorDictModuleBase):
@@ -58,7 +61,9 @@ class ExpertActor(TensorDictModuleBase):
         policies = import_metaworld().policies.ENV_POLICY_MAP
         self._policies = {task_id(task): policies[f"{task}-v3"]() for task in self.tasks}
 
+    @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``out_keys``."""
         observation, given = (tensordict.get(key, None) for key in self.in_keys)
         if observation is None or given is None:
             raise missing_keys(tensordict.keys(True, True), *self.in_keys)
@@ -74,7 +79,7 @@ class ExpertActor(TensorDictModuleBase):
         mask = tensordict.get("_step", None)
         wanted = [True] * len(task_ids) if mask is None else mask.reshape(-1).tolist()
         action = np.zeros((len(task_ids), ACTION_SIZE), dtype=np.float32)
-        with warnings.catch_warnings():
+        with _quiet, warnings.catch_warnings():
             # The scripts warn nearly every step that they ask for more than [-1, 1].
             warnings.filterwarnings("ignore", message="Constant\\(s\\) may be too high")
             for row, (state, task) in enumerate(zip(states, task_ids, strict=True)):
@@ -84,5 +89,4 @@ class ExpertActor(TensorDictModuleBase):
                     raise ValueError(f"task_id {task} is none of this expert's tasks: {', '.join(self.tasks)}")
                 action[row] = self._policies[task].get_action(state)
         asked = torch.from_numpy(action).to(observation.device).reshape(*observation.shape[:-1], ACTION_SIZE)
-        tensordict.set(self.out_keys[1], asked)
-        return tensordict.set(self.out_keys[0], asked.clamp(-1.0, 1.0))
+        return write(tensordict, self, [asked.clamp(-1.0, 1.0), asked])

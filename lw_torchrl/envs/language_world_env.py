@@ -6,6 +6,7 @@ import math
 import os
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from threading import RLock
 from typing import Any, Literal, NoReturn
 
 import numpy as np
@@ -15,11 +16,12 @@ from torch import Tensor
 from torchrl._utils import seed_generator
 from torchrl.envs import EnvBase
 
-from lw_torchrl._checks import check_choice, check_int
+from lw_torchrl._checks import check_choice, check_int, checked
 from lw_torchrl._rendering import check_picture
 from lw_torchrl.envs.engine import ACTION_SIZE, Engine
 from lw_torchrl.envs.engines import make_engine
 from lw_torchrl.envs.episode_counter import EpisodeCounter, check_worker, stated_episode
+from lw_torchrl.envs.one_thread import OneThread, alone
 from lw_torchrl.envs.row_states import RowStates
 from lw_torchrl.envs.specs import action_spec, clipped_action, done_spec, observation_spec, reward_spec, row_mask
 from lw_torchrl.envs.workers import torchrl_worker
@@ -84,7 +86,8 @@ class LanguageWorldEnv(EnvBase):
 
     Raises:
         ValueError: an unknown task or engine, ``num_envs`` under the number of tasks, or a wrong ``episode``.
-        RuntimeError: a step of a row that has ended; a reset or step in a forked process that did not make it.
+        RuntimeError: a step of a row that has ended; a reset or step in a forked process that did not make it, or while
+            another thread is in one, or draws.
         TypeError: it is pickled or copied; pass the function that makes it.
         ImportError: a rendering library named by MUJOCO_GL is absent, or the vectorized engine does not know the
             installed version of Meta-World or MuJoCo.
@@ -102,6 +105,7 @@ class LanguageWorldEnv(EnvBase):
     _supports_set_state = True
     _has_frame_skip = True  # else TorchRL puts a transform of its own around it, which knows nothing of rows that end
 
+    @checked
     def __init__(
         self,
         tasks: str | Task | Iterable[str | Task],
@@ -130,7 +134,7 @@ class LanguageWorldEnv(EnvBase):
         self.max_steps = check_int("max_steps", max_steps, minimum=1)
         self.frame_skip = check_int("frame_skip", frame_skip, minimum=1)
         self.strict, self.terminate_on_success = strict, terminate_on_success
-        if batch_size is not None and (tuple(batch_size) != () or num_envs != 1):
+        if batch_size is not None and (batch_size not in ((), []) or num_envs != 1):
             raise ValueError(
                 f"batch_size must be (), for a single environment, or None for one dimension of {num_envs} rows, got "
                 f"{batch_size!r}"
@@ -139,6 +143,8 @@ class LanguageWorldEnv(EnvBase):
         found = torchrl_worker()  # which refuses some pools
         self.worker = found if worker is None else check_worker(worker)
         self._process = os.getpid()
+        lock = RLock()
+        self._one_thread, self._last_one = OneThread(lock), OneThread(lock, patience=10.0)
         self._counter = EpisodeCounter([named[t] for t in self.row_tasks], check_int("seed", seed), self.worker)
         super().__init__(device=torch.device("cpu"), batch_size=(num_envs,) if batch_size is None else ())
         self._rows = RowStates(self.row_tasks)
@@ -156,7 +162,8 @@ class LanguageWorldEnv(EnvBase):
         return seed if seed is None or static_seed else seed_generator(abs(seed))
 
     def _set_seed(self, seed: int | None) -> None:
-        self._counter.start_again(seed)
+        with self._one_thread:
+            self._counter.start_again(seed)
 
     @property
     def task_of_row(self) -> tuple[Task, ...]:
@@ -179,8 +186,9 @@ class LanguageWorldEnv(EnvBase):
 
     def set_extra_state(self, state: Tensor) -> None:
         """Take seed and counters; the episodes that ran are over."""
-        self._counter.load(state)
-        self._rows.over[:] = True
+        with self._one_thread:
+            self._counter.load(state)
+            self._rows.over[:] = True
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
         """Take seed and episode counters from another's ``state_dict()``, and want a reset.
@@ -210,10 +218,10 @@ class LanguageWorldEnv(EnvBase):
                 "make the environment in this process (give ParallelEnv or a collector a function that makes it)"
             )
 
+    @alone
     def _reset(
         self, tensordict: TensorDictBase | None = None, *, episode: int | Tensor | None = None, set_state: bool = False
     ) -> TensorDict:
-        self._check_usable()
         rows = np.flatnonzero(row_mask(tensordict, "_reset", len(self.row_tasks)))
         if set_state:
             episode = stated_episode(tensordict, episode)
@@ -228,8 +236,8 @@ class LanguageWorldEnv(EnvBase):
     def _shown(self, rows: TensorDict) -> TensorDict:
         return rows if self.batch_size else rows[0]
 
+    @alone
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        self._check_usable()
         action = clipped_action(tensordict, self.batch_size).cpu().numpy().reshape(-1, ACTION_SIZE)
         active = row_mask(tensordict, "_step", len(self.row_tasks))
         if (active & self._rows.over).any():
@@ -279,8 +287,9 @@ class LanguageWorldEnv(EnvBase):
         if fatal:
             raise ValueError(f"action must hold numbers: {message}")
         self._rows.fault |= rows
-        warnings.warn(f"{message}; the row is truncated and flagged, the others go on", stacklevel=3)
+        warnings.warn(f"{message}; the row is truncated and flagged, the others go on", stacklevel=4)
 
+    @alone
     def render(
         self, *, camera: str = "corner2", height: int = 240, width: int = 320, rows: Sequence[int] | None = None
     ) -> Tensor:
@@ -312,7 +321,6 @@ class LanguageWorldEnv(EnvBase):
             torch.Size([1, 48, 64, 3])
             >>> env.close()
         """
-        self._check_usable()
         check_picture(camera, height, width)
         asked = range(len(self.row_tasks)) if rows is None else [check_int("rows", row, minimum=0) for row in rows]
         if asked and max(asked) >= len(self.row_tasks):
@@ -327,7 +335,12 @@ class LanguageWorldEnv(EnvBase):
         return pictures if self.batch_size else pictures[0]
 
     def close(self, *, raise_if_closed: bool = True) -> None:
-        """Free the simulators."""
-        if not self.is_closed:
-            self._engine.close()
-        super().close(raise_if_closed=raise_if_closed)
+        """Free the simulators, behind the last step of another thread.
+
+        Raises:
+            RuntimeError: another thread was still in the simulation after ten seconds.
+        """
+        with self._last_one:
+            if not self.is_closed:
+                self._engine.close()
+            super().close(raise_if_closed=raise_if_closed)

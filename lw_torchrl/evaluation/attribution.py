@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import torch
@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from lw_torchrl._checks import check_int, check_scale, missing_keys
+from lw_torchrl._checks import check_int, check_scale, checked, missing_keys
 from lw_torchrl._devices import device_of
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.evaluation.exchanges import Exchanges
@@ -26,13 +26,14 @@ from lw_torchrl.modules.networks import evaluating
 from lw_torchrl.modules.policy import plans_of
 
 
+@checked
 def attribute_failures(
     rollouts: Iterable[FinishedEpisode | TensorDictBase],
     plans: Plans | Mapping[str, ConditionalPlan],
     *,
-    actor: Any = None,
+    actor: Callable[[TensorDictBase], TensorDictBase] | None = None,
     reference: Plans | Mapping[str, ConditionalPlan] | None = None,
-    evaluator: Any = None,
+    evaluator: Callable[[TensorDictBase], TensorDictBase] | None = None,
     skills: Mapping[str, ScriptedSkill] | None = None,
     seed: int,
     noise_scale: float = 0.1,
@@ -122,11 +123,17 @@ def attribute_failures(
     if actor is not None and (own := plans_of(actor)) is not None and (other := answered.differences(own)):
         raise ValueError(f"plans differ from the actor's own for {', '.join(other)}; pass the actor's plans")
     table = load_skills() if skills is None else skills
+    if not isinstance(rollouts, Iterable):
+        raise TypeError(f"rollouts must be a list of finished episodes, got {type(rollouts).__name__}")
     failed = _failed(rollouts, answered)
     if not failed:
         return []
     names = sorted({task for task, _, _ in failed})
-    others = {} if reference is None else {task: plan for task, plan in as_plans(reference).items() if task in names}
+    others = (
+        {}
+        if reference is None
+        else {task: plan for task, plan in as_plans(reference, "reference").items() if task in names}
+    )
     trusted = Plans(others) if others else None
     seen = [see(task, k, steps, answered, _answers(steps, actor)) for task, k, steps in failed]
     scripts = Scripts(answered, table)

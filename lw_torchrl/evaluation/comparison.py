@@ -32,7 +32,7 @@ class MethodComparison:
     Args:
         summaries: method to :class:`Summary`; the first is compared with each of the others.
         published: label to (task to success rate), such as :func:`published_curves` gives.
-        options: of the bootstrap, as for :func:`mean_rate`.
+        confidence: of the intervals of differences, in (0, 1).
 
     Raises:
         ValueError: no summaries, or summaries of different tasks.
@@ -42,14 +42,15 @@ class MethodComparison:
         >>> a = summarize_rates({"push": [0.5, 0.7], "reach": [1.0, 0.9]})
         >>> b = summarize_rates({"push": [0.3, 0.3], "reach": [0.6, 0.7]})
         >>> print(MethodComparison({"a": a, "b": b}).pairs[0].difference)
-        0.300 [0.225, 0.375]
+        0.300 [0.148, 0.452]
     """
 
     def __init__(
         self,
         summaries: Mapping[str, Summary],
         published: Mapping[str, Mapping[str, float]] | None = None,
-        **options: Any,
+        *,
+        confidence: float = 0.95,
     ) -> None:
         if not summaries:
             raise ValueError("summaries must hold at least one method, got none")
@@ -59,12 +60,13 @@ class MethodComparison:
         for other in others:
             if different := sorted(set(self.tasks) ^ set(self.summaries[other].tasks)):
                 raise ValueError(f"summaries of {first!r} and {other!r} do not share the tasks {different}")
-        self.pairs = [self._pair(first, other, options) for other in others]
+        self.pairs = [self._pair(first, other, confidence) for other in others]
 
-    def _pair(self, x: str, y: str, options: dict[str, Any]) -> Pair:
+    def _pair(self, x: str, y: str, confidence: float) -> Pair:
         order = [self.summaries[y].tasks.index(task) for task in self.tasks]
         rates = self.summaries[x].array, self.summaries[y].array[:, order]
-        return Pair((x, y), mean_difference(*rates, **options), probability_of_improvement(*rates, **options))
+        difference = mean_difference(*rates, confidence=confidence)
+        return Pair((x, y), difference, probability_of_improvement(*rates, confidence=confidence))
 
     def to_json(self) -> dict[str, Any]:
         """As plain numbers, lists and mappings."""

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 
+from lw_torchrl._checks import checked
 from lw_torchrl.language.tasks import task_id
 from lw_torchrl.modules.networks import evaluating
 from lw_torchrl.modules.query_evaluator import QueryEvaluator
@@ -37,6 +38,7 @@ class Drift:
     agreement: float
 
 
+@checked
 def condition_drift(policy: Any, states: TensorDictBase) -> list[Drift]:
     """Compare the answers of a policy's evaluator with the query answering function's.
 
@@ -77,6 +79,7 @@ def condition_drift(policy: Any, states: TensorDictBase) -> list[Drift]:
     return sorted(found, key=lambda drift: (drift.agreement, drift.task, drift.step))
 
 
+@checked
 def drift_table(drifts: Sequence[Drift], most: int = 10) -> str:
     """The first so many as text."""
     lines = [f"{'agrees':>6} {'by its words':>12} {'believed':>8}  condition"]

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from lw_torchrl._checks import checked
 from lw_torchrl._files import write_json
 from lw_torchrl.modules.clause_evaluator import ClauseEvaluator
 from lw_torchrl.modules.networks import evaluating
@@ -117,6 +118,7 @@ class EvaluatorReport:
         write_json(path, {"about": self.about, "parts": {name: one.to_json() for name, one in self.parts.items()}})
 
 
+@checked
 def score_evaluator(evaluator: ClauseEvaluator, data: LabelledQueries) -> EvaluatorReport:
     """Ask an evaluator what was held out.
 

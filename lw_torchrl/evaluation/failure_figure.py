@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING
 
-from lw_torchrl._checks import counted
+from lw_torchrl._checks import checked, counted
 from lw_torchrl.evaluation.failure_table import count_causes
 from lw_torchrl.evaluation.failures import CAUSES
 from lw_torchrl.evaluation.figures import check_image, saved
@@ -23,6 +23,7 @@ _COLORS = {
 }
 
 
+@checked
 def plot_failures(result: EvaluationResult, path: str | os.PathLike[str] | None = None, *, title: str = "") -> Figure:
     """Draw how many episodes of each task failed, and of what; the task with most failures at the top.
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from lw_torchrl._checks import check_choice, counted
+from lw_torchrl._checks import check_choice, checked, counted
 from lw_torchrl._files import replacing
 from lw_torchrl.evaluation.result import EvaluationResult
 from lw_torchrl.evaluation.statistics import Array, check_rates
@@ -38,6 +38,7 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
     return max(0.0, center - half), min(1.0, center + half)
 
 
+@checked
 def plot_success(result: EvaluationResult, path: str | os.PathLike[str] | None = None, *, title: str = "") -> Figure:
     """Draw the any-step success rate of each task, best first, with 95 % intervals over the episodes.
 
@@ -94,6 +95,7 @@ COLORS = ("#4c78a8", "#f58518", "#54a24b", "#b279a2", "#9d755d", "#e45756")
 _DASHES = ((0, (5, 2)), (0, (1, 1.5)), (0, (5, 1, 1, 1)), (0, (3, 3)))
 
 
+@checked
 def plot_sorted_tasks(
     curves: Mapping[str, Rates | Summary],
     path: str | os.PathLike[str] | None = None,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lw_torchrl._checks import counted
+from lw_torchrl._checks import checked, counted
 from lw_torchrl.evaluation.figures import COLORS, check_image, saved
 
 if TYPE_CHECKING:
@@ -19,6 +19,7 @@ Curve = Sequence[tuple[float, float]]
 """Points (steps of the environment, success rate in [0, 1])."""
 
 
+@checked
 def plot_learning_curves(
     curves: Mapping[str, Mapping[str, Sequence[Curve]]],
     path: str | os.PathLike[str] | None = None,

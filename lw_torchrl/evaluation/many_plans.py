@@ -12,7 +12,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from lw_torchrl._checks import check_choice, check_int, check_scale
+from lw_torchrl._checks import check_choice, check_int, check_scale, checked
 from lw_torchrl._progress import Progress
 from lw_torchrl.envs.episodes import FinishedEpisode, policy_of, run_episodes
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
@@ -27,6 +27,7 @@ _ROWS = 256
 _PLACE = "place"
 
 
+@checked
 def evaluate_plans(
     plans: Sequence[ConditionalPlan],
     *,

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lw_torchrl._checks import checked
 from lw_torchrl.evaluation.figures import check_image, saved
 from lw_torchrl.evaluation.summary import Summary
 
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+@checked
 def plot_methods(
     groups: Mapping[str, Mapping[str, Summary]], path: str | os.PathLike[str] | None = None, *, title: str = ""
 ) -> Figure:
@@ -57,10 +59,10 @@ def plot_methods(
             if mean.low is not None:
                 axes.plot([mean.low, mean.high], [place, place], color="#333333", linewidth=1.2)
             axes.plot(seeds, np.full(len(seeds), place), ".", color="#f58518", markersize=5, zorder=3)
-            color = "white" if place == 0 else "#222222"
-            axes.text(0.02, place, f"{mean.value:.2f}", va="center", fontsize=8, color=color)
+            axes.text(1.04, place, f"{mean.value:.2f}", va="center", fontsize=8, color="#222222")
         axes.set_title(group)
-        axes.set_xlim(0, 1.02)
+        axes.set_xlim(0, 1.18)
+        axes.set_xticks(np.linspace(0, 1, 6))
         axes.set_yticks(range(len(labels)), labels, fontsize=9)
         axes.grid(axis="x", color="#dddddd", linewidth=0.6)
         axes.set_axisbelow(True)

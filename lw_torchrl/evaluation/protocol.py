@@ -13,7 +13,8 @@ from tensordict.utils import NestedKey, unravel_key
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from lw_torchrl._checks import check_int, check_scale, unknown_name
+from lw_torchrl._checks import check_int, check_scale, checked, unknown_name
+from lw_torchrl._keys import check_key
 from lw_torchrl._progress import Progress
 from lw_torchrl.envs.episodes import FinishedEpisode, policy_of, read_action, run_episodes
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
@@ -84,6 +85,7 @@ def _checked(
     return run
 
 
+@checked
 def evaluate(
     actor: TensorDictModuleBase | Callable[[TensorDictBase], TensorDictBase],
     *,
@@ -103,7 +105,7 @@ def evaluate(
     also_record: Sequence[NestedKey] = (),
     on_episode: Callable[[FinishedEpisode], object] | None = None,
     device: str | torch.device | None = None,
-    evaluator: Any = None,
+    evaluator: Callable[[TensorDictBase], TensorDictBase] | None = None,
     attribute: bool = False,
     reference: Plans | Mapping[str, ConditionalPlan] | None = None,
 ) -> EvaluationResult:
@@ -177,6 +179,11 @@ def evaluate(
         raise ValueError("attribute must be False for an actor without plans, unless plans are given")
     if reference is not None and not attribute:
         raise ValueError("reference is for attribute=True, which runs failed episodes again with it")
+    if isinstance(also_record, str) or not isinstance(also_record, Iterable):
+        raise TypeError(f"also_record must be a list of keys, got {also_record!r}")
+    also_record = list(also_record)
+    for key in also_record:
+        check_key("also_record", key)
     check_int("episodes_per_task", episodes_per_task, minimum=1)
     check_scale("noise_scale", noise_scale)
     most = len(names) * episodes_per_task  # a row more would have nothing to do

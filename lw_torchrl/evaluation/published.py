@@ -8,7 +8,7 @@ from functools import cache
 from importlib.resources import files
 from typing import Any, Literal
 
-from lw_torchrl._checks import check_choice
+from lw_torchrl._checks import check_choice, checked
 
 #: What each choice of ``which`` is called in tables and legends; the best of ten is never the headline.
 WHICH = {"last": "published, last", "best": "published, best of the last 10 evaluations"}
@@ -19,6 +19,7 @@ def _table(name: str = "published") -> dict[str, Any]:
     return json.loads((files("lw_torchrl.evaluation") / f"data/{name}.json").read_text(encoding="utf-8"))
 
 
+@checked
 def published(setting: str, method: str = "PCBC", which: Literal["last", "best"] = "last") -> dict[str, float]:
     """The published success rate of each of the 50 tasks, a mean over 4 seeds of 20 episodes each.
 
@@ -49,6 +50,7 @@ def published(setting: str, method: str = "PCBC", which: Literal["last", "best"]
     return dict(zip(_table()["tasks"], choices[check_choice("which", which, choices)], strict=True))
 
 
+@checked
 def published_curves(setting: str, methods: str | Iterable[str] = ("PCBC",)) -> dict[str, dict[str, float]]:
     """Both published curves of each method, by the label that a figure or a table gives them.
 
@@ -74,6 +76,7 @@ def published_curves(setting: str, methods: str | Iterable[str] = ("PCBC",)) -> 
     }
 
 
+@checked
 def published_plans(model: str = "PaLM 2", format: str = "chain_py") -> dict[str, tuple[float, ...]]:
     """The published success rate of each of a model's 5 generated plans per task, run with scripted skills.
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING
 
+from lw_torchrl._checks import checked
 from lw_torchrl.evaluation.evaluator_report import BINS, PARTS, EvaluatorReport
 from lw_torchrl.evaluation.figures import check_image, saved
 
@@ -12,6 +13,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+@checked
 def plot_reliability(report: EvaluatorReport, path: str | os.PathLike[str] | None = None) -> Figure:
     """Draw, for each part of a report, the share of answers that are true over their mean probability, and how many
     answers there are.

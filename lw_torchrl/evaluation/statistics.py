@@ -1,30 +1,27 @@
-"""Statistics over training seeds × tasks: means with bootstrap intervals, comparisons of methods, counts of tasks.
+"""Statistics over training seeds × tasks: means with their intervals, comparisons of methods, counts of tasks.
 
-Every function takes success rates as an array (seeds, tasks): a row per training seed, a column per task. Intervals
-are percentiles of a stratified bootstrap, as in rliable: seeds are drawn with replacement within each task, the tasks
-stay. Two things to know when reading them:
+Every function takes success rates as an array (seeds, tasks): a row for each training seed, a column for each task.
+Intervals are Student's t over the seeds; the tasks stay the same. The standard error is the jackknife's over seeds,
+which for a mean is the usual one, so the interval of a mean is exactly Student's. Two methods' errors add as in
+Welch's test. A few seeds give wide intervals: with three, t is 4.3 standard errors, not 2. In simulation (20 tasks, 20
+episodes) the 95 % interval holds the true mean in 0.95 of the cases for 3, 5 and 20 seeds.
 
-- n seeds make them too narrow by about sqrt((n - 1) / n): in simulation (50 tasks, 20 episodes) the 95 % interval of
-  the mean holds the truth in 0.87 of the cases for 3 seeds, 0.92 for 5, 0.93 for 10.
-- Drawing seeds task by task takes them for independent, as where each task has its own policy. One policy for all
-  tasks can be good or bad at all of them alike; then ``whole_seeds=True``, which draws a seed with all its tasks.
-
-Source: Agarwal et al. 2021, 'Deep Reinforcement Learning at the Edge of the Statistical Precipice'.
+Source: Agarwal et al. 2021, 'Deep Reinforcement Learning at the Edge of the Statistical Precipice', for the statistics;
+Tukey 1958 for the jackknife with Student's t.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lw_torchrl._checks import check_int
+from lw_torchrl._checks import checked
 
 Array = NDArray[np.float64]
-_CHUNK = 2_000_000  # resampled rates held in memory at once
 
 
 @dataclass(frozen=True)
@@ -71,67 +68,69 @@ def check_rates(argument: str, given: Any) -> Array:
     return rates
 
 
-def mean_rate(rates: ArrayLike, **options: Any) -> Estimate:
+@checked
+def mean_rate(rates: ArrayLike, *, confidence: float = 0.95) -> Estimate:
     """The mean success rate over seeds and tasks, with its interval.
 
     Args:
         rates: (seeds, tasks), in [0, 1].
-        options: of the bootstrap, ``resamples`` (5000), ``seed`` (0), ``confidence`` (0.95); ``whole_seeds`` (False),
-            draw a seed with all its tasks; ``resample_tasks`` (False), draw tasks with replacement too, for an
-            interval over tasks like these instead of these.
+        confidence: of the interval, in (0, 1).
 
     Raises:
         ValueError, TypeError: a wrong argument.
 
     Example:
         >>> print(mean_rate([[1.0, 0.2], [0.9, 0.3], [1.0, 0.1]]))
-        0.583 [0.533, 0.633]
+        0.583 [0.512, 0.655]
     """
-    return _estimate(lambda x: x.mean((-2, -1)), [check_rates("rates", rates)], **options)
+    return _estimate(np.mean, [check_rates("rates", rates)], confidence, least=0.0)
 
 
-def interquartile_mean(rates: ArrayLike, **options: Any) -> Estimate:
+@checked
+def interquartile_mean(rates: ArrayLike, *, confidence: float = 0.95) -> Estimate:
     """The mean of the middle half of all seeds × tasks: a quarter is cut at each end.
 
     Args:
         rates: (seeds, tasks), in [0, 1].
-        options: as for :func:`mean_rate`.
+        confidence: of the interval, in (0, 1).
 
     Raises:
         ValueError, TypeError: a wrong argument.
 
     Example:
-        >>> print(interquartile_mean([[1.0, 0.2], [0.9, 0.3], [1.0, 0.1]]))
-        0.600 [0.525, 0.650]
+        >>> print(interquartile_mean([[1.0, 0.2, 0.6, 0.7], [0.9, 0.3, 0.5, 0.9], [1.0, 0.1, 0.4, 0.8]]))
+        0.650 [0.526, 0.774]
 
     Source: Agarwal et al. 2021; the same as ``scipy.stats.trim_mean(rates, 0.25, axis=None)``.
     """
-    return _estimate(_interquartile_mean, [check_rates("rates", rates)], **options)
+    return _estimate(_interquartile_mean, [check_rates("rates", rates)], confidence, least=0.0)
 
 
-def mean_difference(x: ArrayLike, y: ArrayLike, **options: Any) -> Estimate:
+@checked
+def mean_difference(x: ArrayLike, y: ArrayLike, *, confidence: float = 0.95) -> Estimate:
     """The mean over tasks of how much higher method X's rate is than Y's on the same task.
 
     Args:
         x, y: (seeds, tasks), in [0, 1]: the same tasks in the same order; the seeds may differ in number.
-        options: as for :func:`mean_rate`. Tasks are paired: one drawn by ``resample_tasks`` is drawn for both.
+        confidence: of the interval, in (0, 1). Seeds are not paired, also where both methods have the same ones.
 
     Raises:
         ValueError, TypeError: a wrong argument.
 
     Example:
         >>> print(mean_difference([[1.0, 0.5], [0.9, 0.4]], [[0.6, 0.3], [0.7, 0.3]]))
-        0.225 [0.175, 0.275]
+        0.225 [-0.121, 0.571]
     """
-    return _estimate(lambda a, b: a.mean((-2, -1)) - b.mean((-2, -1)), _pair(x, y), **options)
+    return _estimate(lambda a, b: a.mean() - b.mean(), _pair(x, y), confidence, least=-1.0)
 
 
-def probability_of_improvement(x: ArrayLike, y: ArrayLike, **options: Any) -> Estimate:
+@checked
+def probability_of_improvement(x: ArrayLike, y: ArrayLike, *, confidence: float = 0.95) -> Estimate:
     """How likely a seed of method X beats one of Y on a task drawn at random; a tie counts half.
 
     Args:
         x, y: (seeds, tasks), in [0, 1]: the same tasks in the same order; the seeds may differ in number.
-        options: as for :func:`mean_rate`.
+        confidence: of the interval, in (0, 1).
 
     Raises:
         ValueError, TypeError: a wrong argument.
@@ -142,9 +141,10 @@ def probability_of_improvement(x: ArrayLike, y: ArrayLike, **options: Any) -> Es
 
     Source: Agarwal et al. 2021; the Mann-Whitney statistic of each task, averaged.
     """
-    return _estimate(_improvement, _pair(x, y), **options)
+    return _estimate(_improvement, _pair(x, y), confidence, least=0.0)
 
 
+@checked
 def count_solved(rates: ArrayLike, threshold: float = 0.8) -> int:
     """How many tasks' mean over seeds is at least ``threshold``; rounding of the mean does not matter.
 
@@ -164,18 +164,14 @@ def count_solved(rates: ArrayLike, threshold: float = 0.8) -> int:
     return int((check_rates("rates", rates).mean(0) >= threshold - 1e-9).sum())
 
 
-def _interquartile_mean(rates: Array) -> Array:
-    flat = np.sort(rates.reshape(*rates.shape[:-2], -1), axis=-1)
-    cut = flat.shape[-1] // 4
-    return flat[..., cut : flat.shape[-1] - cut].mean(-1)
+def _interquartile_mean(rates: Array) -> float:
+    flat = np.sort(rates, axis=None)
+    cut = len(flat) // 4
+    return flat[cut : len(flat) - cut].mean()
 
 
-def _improvement(x: Array, y: Array) -> Array:
-    wins = np.zeros(x.shape[:-2])
-    for rates in np.moveaxis(x, -2, 0):  # a method's few seeds, not tasks or resamples
-        beaten = rates[..., None, :]
-        wins += ((beaten > y) + 0.5 * (beaten == y)).mean((-2, -1))
-    return wins / x.shape[-2]
+def _improvement(x: Array, y: Array) -> float:
+    return ((x[:, None] > y) + 0.5 * (x[:, None] == y)).mean()
 
 
 def _pair(x: ArrayLike, y: ArrayLike) -> list[Array]:
@@ -186,38 +182,30 @@ def _pair(x: ArrayLike, y: ArrayLike) -> list[Array]:
 
 
 def _estimate(
-    statistic: Callable[..., Array],
-    methods: list[Array],
-    *,
-    resamples: int = 5000,
-    seed: int = 0,
-    confidence: float = 0.95,
-    whole_seeds: bool = False,
-    resample_tasks: bool = False,
+    statistic: Callable[..., Any], methods: list[Array], confidence: float, *, least: float, most: float = 1.0
 ) -> Estimate:
-    """The statistic of the methods' rates, and its percentile interval over bootstrap resamples."""
-    check_int("resamples", resamples, minimum=1)
-    check_int("seed", seed, minimum=0)
+    """The statistic of the methods' rates and its interval, cut to what the statistic can be."""
+    from scipy.special import stdtrit
+
     if not 0 < confidence < 1:
         raise ValueError(f"confidence must be in (0, 1), got {confidence!r}")
     value = float(statistic(*methods))
     if min(len(rates) for rates in methods) == 1:
-        return Estimate(value)  # one seed says nothing of another: an interval would be a point
-    drawn = _resampled(methods, resamples, seed, whole_seeds, resample_tasks)
-    found = np.concatenate([statistic(*sample) for sample in drawn])
-    low, high = np.quantile(found, [(1 - confidence) / 2, (1 + confidence) / 2])
-    return Estimate(value, float(low), float(high))
+        return Estimate(value)  # one seed says nothing of another
+    variances = np.array([_jackknife(statistic, methods, number) for number in range(len(methods))])
+    if not variances.any():
+        return Estimate(value, value, value)
+    shares = variances / variances.max()  # their squares may be too small for a float
+    freedom = shares.sum() ** 2 / sum(v**2 / (len(x) - 1) for v, x in zip(shares, methods, strict=True))
+    half = float(stdtrit(freedom, (1 + confidence) / 2) * np.sqrt(variances.sum()))
+    return Estimate(value, max(value - half, least), min(value + half, most))
 
 
-def _resampled(
-    methods: list[Array], resamples: int, seed: int, whole_seeds: bool, resample_tasks: bool
-) -> Iterator[list[Array]]:
-    """Resamples of each method's rates, (chunk, seeds, tasks), a chunk at a time."""
-    rng = np.random.default_rng(seed)
-    tasks = methods[0].shape[1]
-    chunk = max(1, _CHUNK // max(rates.size for rates in methods))
-    for start in range(0, resamples, chunk):
-        count = min(chunk, resamples - start)
-        columns = rng.integers(tasks, size=(count, 1, tasks)) if resample_tasks else np.arange(tasks)
-        strata = 1 if whole_seeds else tasks
-        yield [rates[rng.integers(len(rates), size=(count, len(rates), strata)), columns] for rates in methods]
+def _jackknife(statistic: Callable[..., Any], methods: list[Array], number: int) -> float:
+    """The variance of the statistic over the seeds of one method: each is left out once."""
+    n = len(methods[number])
+    left = [
+        statistic(*methods[:number], np.delete(methods[number], seed, axis=0), *methods[number + 1 :])
+        for seed in range(n)
+    ]
+    return float(np.var(left) * (n - 1))

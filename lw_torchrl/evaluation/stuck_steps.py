@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from lw_torchrl._checks import check_choice
+from lw_torchrl._checks import check_choice, checked
 from lw_torchrl.evaluation.plan_use import PlanUse
 
 
@@ -31,6 +31,7 @@ class StuckStep:
     failed: int
 
 
+@checked
 def stuck_steps(use: PlanUse) -> list[StuckStep]:
     """Every step of the plans of the tasks that were seen, in their order.
 
@@ -59,6 +60,7 @@ def stuck_steps(use: PlanUse) -> list[StuckStep]:
     ]
 
 
+@checked
 def weakest_step(use: PlanUse, task: str | None = None) -> StuckStep:
     """The step that most failed episodes came to and not beyond, the first of them if there are several.
 
@@ -82,6 +84,7 @@ def weakest_step(use: PlanUse, task: str | None = None) -> StuckStep:
     return weakest
 
 
+@checked
 def stuck_table(steps: Sequence[StuckStep]) -> str:
     """A line for each step, counted from 1: how many failed episodes ended in it, and how many came no further.
 

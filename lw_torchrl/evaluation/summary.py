@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from lw_torchrl._checks import checked, shown
 from lw_torchrl.evaluation.result import EvaluationResult
 from lw_torchrl.evaluation.statistics import (
     Array,
@@ -39,7 +40,7 @@ class Summary:
         tasks: their names, T of them.
         seeds: the training seeds' names, n of them.
         rates: n rows of T success rates at any step.
-        mean: over seeds and tasks, with its 95 % interval.
+        mean: over seeds and tasks, with its 95 % interval, Student's t over the seeds.
         iqm: the interquartile mean, likewise.
         solved: how many tasks' mean over seeds is at least ``threshold``.
         threshold: 0.8.
@@ -112,12 +113,13 @@ class Summary:
         return "\n".join([*lines, *(f"({k + 1}) {name}" for k, (name, _) in enumerate(columns))])
 
 
+@checked
 def summarize_rates(
     rates: Mapping[str, Sequence[float]],
     *,
     seeds: Sequence[object] | None = None,
     threshold: float = 0.8,
-    **options: Any,
+    confidence: float = 0.95,
 ) -> Summary:
     """Summarize success rates, for those that come from elsewhere than one evaluation per seed.
 
@@ -125,7 +127,7 @@ def summarize_rates(
         rates: task to its n success rates, one per training seed, in [0, 1].
         seeds: the seeds' names; by default 0 to n - 1.
         threshold: a task counts as solved from here.
-        options: of the bootstrap, as for :func:`mean_rate`.
+        confidence: of the intervals, in (0, 1).
 
     Raises:
         ValueError: no tasks, tasks with different numbers of seeds, or another wrong argument.
@@ -133,7 +135,7 @@ def summarize_rates(
     Example:
         >>> summary = summarize_rates({"push": [0.5, 0.7], "reach": [1.0, 0.9]})
         >>> print(summary.mean, summary.solved)
-        0.775 [0.700, 0.850] 1
+        0.775 [0.457, 1.000] 1
         >>> summary.per_task["push"].min
         0.5
     """
@@ -150,23 +152,25 @@ def summarize_rates(
         tasks=tuple(rates),
         seeds=names,
         rates=tuple(tuple(row) for row in array.tolist()),
-        mean=mean_rate(array, **options),
-        iqm=interquartile_mean(array, **options),
+        mean=mean_rate(array, confidence=confidence),
+        iqm=interquartile_mean(array, confidence=confidence),
         solved=count_solved(array, threshold),
         threshold=threshold,
     )
 
 
+@checked
 def summarize(results: Mapping[Any, EvaluationResult] | Sequence[EvaluationResult], **options: Any) -> Summary:
     """Summarize the any-step success of several training seeds, one evaluation of the same tasks each.
 
     Args:
         results: training seed to result, or the results in order.
-        options: ``threshold`` (0.8), and those of the bootstrap, as for :func:`mean_rate`.
+        options: ``threshold`` (0.8) and ``confidence`` (0.95), as for :func:`summarize_rates`.
 
     Raises:
-        ValueError: no results, other tasks in one than in another, or evaluations that cannot be averaged because
-            their episodes_per_task, noise_scale or max_steps differ.
+        ValueError: no results, one evaluation given twice, other tasks or plans in one than in another, or evaluations
+            that cannot be averaged because their episodes_per_task, noise_scale or max_steps differ.
+        TypeError: one is no :class:`EvaluationResult`.
 
     Example:
         >>> from lw_torchrl.evaluation import EpisodeResult, EvaluationResult, summarize
@@ -178,6 +182,11 @@ def summarize(results: Mapping[Any, EvaluationResult] | Sequence[EvaluationResul
     named = dict(results) if isinstance(results, Mapping) else dict(enumerate(results))
     if not named:
         raise ValueError("results must hold at least one result, got none")
+    for number, (seed, result) in enumerate(named.items()):
+        if not isinstance(result, EvaluationResult):
+            raise TypeError(f"results[{seed!r}] must be an EvaluationResult, got {shown(result)}")
+        if (twice := next((k for k, one in list(named.items())[:number] if one == result), None)) is not None:
+            raise ValueError(f"results must be of different training seeds, {twice!r} and {seed!r} are one evaluation")
     first_seed, first = next(iter(named.items()))
     tasks = tuple(first.success_once)
     for seed, result in named.items():
@@ -186,6 +195,8 @@ def summarize(results: Mapping[Any, EvaluationResult] | Sequence[EvaluationResul
                 f"results must be of the same tasks; seeds {first_seed!r} and {seed!r} do not share "
                 + ", ".join(sorted(different))
             )
+        if len({one.origin.get("plans") for one in (first, result)} - {None}) > 1:
+            raise ValueError(f"results must be of the same plans; those of seeds {first_seed!r} and {seed!r} differ")
         for key in _SETTINGS:
             if first.config.get(key) != result.config.get(key):
                 raise ValueError(

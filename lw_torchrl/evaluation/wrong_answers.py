@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from lw_torchrl._checks import checked
 from lw_torchrl.evaluation.evaluator_report import clause_logits
 from lw_torchrl.evaluation.figures import check_image, saved
 from lw_torchrl.language.queries import Clause
@@ -42,6 +43,7 @@ class WrongAnswer:
     off: dict[str, float]
 
 
+@checked
 def wrong_answers(evaluator: ImageQueryEvaluator, data: LabelledQueries, most: int = 12) -> list[WrongAnswer]:
     """The surest wrong answers in held-out states, at most one of each clause.
 
@@ -85,6 +87,7 @@ def _off(evaluator: ImageQueryEvaluator, asked: Asked, row: int, clause: Clause)
     return {name: float((places[0, evaluator.names.index(name), :3] - true[name]).norm()) for name in things}
 
 
+@checked
 def plot_wrong_answers(
     evaluator: ImageQueryEvaluator,
     data: LabelledQueries,

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from lw_torchrl._checks import counted
-from lw_torchrl._files import write_json
+from lw_torchrl._files import held, read_json, write_json
 from lw_torchrl.data import LanguageWorldExperienceReplay, TaskBalancedSampler, collect_demonstrations
 from lw_torchrl.evaluation import EvaluationResult, evaluate, plot_success
 from lw_torchrl.language.plan_files import load_plans
@@ -48,11 +48,7 @@ def _settle(out: Path, config: DemoConfig) -> None:
     path = out / "config.json"
     stated = json.loads(json.dumps(asdict(config)))
     if path.is_file():
-        try:
-            found = json.loads(path.read_text("utf-8"))
-        except ValueError as error:
-            raise ValueError(f"out: {str(path)!r} is damaged ({error}); choose another folder") from error
-        if found != stated:
+        if read_json(path, "out: the configuration") != stated:
             raise ValueError(f"out: {str(out)!r} holds a demo of another configuration; choose another folder")
         return
     write_json(path, stated)
@@ -67,9 +63,14 @@ def run_demo(out: Path, config: DemoConfig) -> EvaluationResult:
         config: what to do.
 
     Raises:
-        ValueError: ``out`` holds a demo of another configuration.
+        ValueError: ``out`` holds a demo of another configuration, or another process is at work there.
     """
-    _settle(out, config)
+    with held(out, "out", folder=True):
+        _settle(out, config)
+        return _run(out, config)
+
+
+def _run(out: Path, config: DemoConfig) -> EvaluationResult:
     plans = load_plans("MT10")
     print(f"1/4  {config.demonstrations_per_task} demonstrations of each of {counted(len(config.tasks), 'task')}")
     collect_demonstrations(

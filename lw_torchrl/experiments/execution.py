@@ -12,6 +12,7 @@ import torch
 
 from lw_torchrl._checks import differences
 from lw_torchrl._devices import check_device
+from lw_torchrl._files import held
 from lw_torchrl._progress import Progress
 from lw_torchrl.evaluation import EvaluationResult, evaluate
 from lw_torchrl.experiments.runs import SCRIPTED, Run
@@ -44,14 +45,12 @@ def _evaluate(
         options["device"] = device
     if not isinstance(policies, Mapping):
         return evaluate(policies, tasks=tasks, progress=progress, **options)
-    found = sorted({*tasks} & {*policies})
     each = []
-    with Progress("evaluating", len(found), "model", show=progress) as bar:
-        for task in found:
+    with Progress("evaluating", len(tasks), "model", show=progress) as bar:
+        for task in tasks:
             each.append(evaluate(policies[task], tasks=task, progress=False, **options))
             bar.update()
-    shown = [task for one in each for task in one.config["tasks"]]
-    return EvaluationResult(each[0].config | {"tasks": shown}, tuple(e for one in each for e in one.episodes))
+    return EvaluationResult(each[0].config | {"tasks": [*tasks]}, tuple(e for one in each for e in one.episodes))
 
 
 def _best(results: Sequence[EvaluationResult]) -> dict[str, Any]:
@@ -72,24 +71,24 @@ class Evaluated(Protocol):
     def describe(self, plans: Plans) -> dict[str, Any]: ...
 
 
-def load_result(run: Evaluated, plans: Plans, out: Path) -> EvaluationResult | None:
+def load_result(run: Evaluated, plans: Plans, out: Path, tasks: Sequence[str] | None = None) -> EvaluationResult | None:
     """The result of a run, if it is there.
 
     Raises:
-        ValueError: it is of another configuration.
+        ValueError: it is of another configuration, or an evaluation of others than ``tasks``, where they are given.
     """
-    return _load(out / run.folder / RESULTS, run, plans)
+    return _load(out / run.folder / RESULTS, run, plans, tasks)
 
 
-def _load(path: Path, run: Evaluated, plans: Plans) -> EvaluationResult | None:
+def _load(path: Path, run: Evaluated, plans: Plans, tasks: Sequence[str] | None) -> EvaluationResult | None:
     if not path.is_file():
         return None
     result = EvaluationResult.load(path)
-    found, ours = result.config.get("run") or {}, run.describe(plans)
-    evaluated = result.config.get("episodes_per_task")
-    found, ours = ({**one, "episodes": count} for one, count in ((found, evaluated), (ours, run.episodes)))
-    different = differences({key: found.get(key) for key in ours}, ours)
-    if different:
+    found = (result.config.get("run") or {}) | {"episodes": result.config["episodes_per_task"]}
+    ours = run.describe(plans) | {"episodes": run.episodes}
+    if tasks is not None:
+        found, ours = found | {"tasks": result.config["tasks"]}, ours | {"tasks": [*tasks]}
+    if different := differences(found, ours):
         raise ValueError(
             f"out: {str(path)!r} is of another configuration, it differs in {', '.join(different)}; choose another "
             f"folder, or delete {run.folder} there to do the run again"
@@ -113,7 +112,7 @@ def execute_run(
         run: what to do.
         plans: a plan for each of the 50 tasks.
         out: the experiments' folder.
-        tasks: to evaluate.
+        tasks: to evaluate; of a run with a policy for each target, the targets among them.
         progress: show progress bars.
         text_encoder: texts to vectors (n, E) float32, which ``run.encoder_name`` names; None for the shipped one.
         device: where networks are trained and evaluated; it is no part of what the run is, so one that was begun
@@ -126,22 +125,52 @@ def execute_run(
         ``evaluations/<steps>.json``.
 
     Raises:
-        ValueError: ``out`` holds the same run of another configuration.
+        ValueError: ``out`` holds the same run of another configuration, or evaluated in other tasks; no task is one of
+            its targets; or a text encoder that the run does not name, or none where it names one.
 
     Source: paper section 'Conditional Plan Experiments'.
     """
-    if (done := load_result(run, plans, out)) is not None:
+    shown, there = _shown(run, tasks), check_device("device", device)
+    if run.method != SCRIPTED and (text_encoder is None) != (not run.encoder_name):
+        raise ValueError(
+            f"text_encoder must be given where the run has an encoder_name, by which its folder is told from others, "
+            f"and only there; it has {run.encoder_name!r}"
+        )
+    if (done := load_result(run, plans, out, shown)) is not None:
         return done
-    there = check_device("device", device)
+    with held(out / run.folder, "out", folder=True, wait=True):
+        return load_result(run, plans, out, shown) or _execute(run, plans, out, shown, progress, text_encoder, there)
+
+
+def _shown(run: Run, tasks: str | Sequence[str]) -> tuple[str, ...]:
+    """The tasks that are evaluated."""
+    names = resolve_tasks(tasks)
+    if run.method == SCRIPTED or run.setting.targets is None:
+        return names
+    targets = resolve_tasks(run.setting.targets)
+    if not (shown := tuple(name for name in names if name in targets)):
+        raise ValueError(f"tasks must name some of the run's targets, {', '.join(targets)}, got {', '.join(names)}")
+    return shown
+
+
+def _execute(
+    run: Run,
+    plans: Plans,
+    out: Path,
+    shown: tuple[str, ...],
+    progress: bool,
+    text_encoder: TextEncoder | None,
+    there: torch.device,
+) -> EvaluationResult:
     started = time.perf_counter()
     for dataset in run.datasets:
         dataset.collect(out, progress)
-    shown, earlier = resolve_tasks(tasks), out / run.folder / "evaluations"
+    earlier = out / run.folder / "evaluations"
     described: dict[str, Any] = {"run": run.describe(plans)}
 
     def look(policies: Policy | dict[str, Policy], step: int) -> None:
         file = earlier / f"{step}.json"
-        if _load(file, run, plans) is None:
+        if _load(file, run, plans, shown) is None:
             result = _evaluate(policies, run, shown, progress, there)
             replace(result, config=result.config | described).save(file)
 
@@ -153,7 +182,7 @@ def execute_run(
         policies = train(run, plans, out, progress, look, text_encoder, there)
     result = _evaluate(policies, run, shown, progress, there)
     if run.preset.evaluations > 1 and run.method != SCRIPTED:
-        found = [_load(file, run, plans) for file in sorted(earlier.glob("*.json"))]
+        found = [_load(file, run, plans, shown) for file in sorted(earlier.glob("*.json"))]
         described["best"] = _best([result, *filter(None, found)])
     described["seconds"] = round(time.perf_counter() - started, 1)
     result = replace(result, config=result.config | described)

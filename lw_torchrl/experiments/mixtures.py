@@ -8,8 +8,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from filelock import FileLock
-
+from lw_torchrl._files import held
 from lw_torchrl.data.behaviours import BEHAVIOURS
 from lw_torchrl.data.collect import collect_demonstrations
 from lw_torchrl.language.tasks import MT10
@@ -76,8 +75,7 @@ class BehaviourData:
     def make(self, out: Path, progress: bool) -> None:
         """Collect it, or what is left; of several processes one does, and the others wait."""
         root = out / self.folder
-        root.parent.mkdir(parents=True, exist_ok=True)
-        with FileLock(root.with_name(f".{root.name}.lock")):
+        with held(root, "out", wait=True):
             collect_demonstrations(
                 TASK_SETS[self.tasks],
                 episodes_per_task=self.portion.episodes,

@@ -10,7 +10,7 @@ from typing import Any
 from lw_torchrl._checks import check_choice
 from lw_torchrl.experiments.mixtures import MIXTURES, NOISE, TASK_SETS, BehaviourData
 from lw_torchrl.experiments.offline_recipes import OFFLINE_METHODS, OfflineMethod, OfflineRecipe
-from lw_torchrl.experiments.runs import plain
+from lw_torchrl.experiments.runs import own_tasks, plain
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.modules.policy import METHODS
 
@@ -57,7 +57,8 @@ class Learned:
     def describe(self, plans: Plans) -> dict[str, Any]:
         """Everything that it hangs on, as JSON."""
         data = [asdict(dataset.portion) | NOISE[dataset.portion.behaviour] for dataset in self.datasets]
-        return plain(asdict(self) | {"plans": self.own_plans(plans).fingerprint, "data": data})
+        own = self.own_plans(plans)
+        return plain(asdict(self) | {"plans": own.fingerprint, "data": data} | own_tasks(own))
 
 
 @dataclass(frozen=True)

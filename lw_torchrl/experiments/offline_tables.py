@@ -17,10 +17,7 @@ from lw_torchrl.experiments.offline_runs import Advantages, OfflineRun
 
 _PLAN = "pcbc", "pcbc"
 _SEEN = ("pcbc", "dc", "one-hot")
-_BRACKETS = (
-    "Brackets are 95 % intervals, bootstraps over seeds, each drawn with all its tasks; with three seeds they are too "
-    "narrow."
-)
+_BRACKETS = "Brackets are 95 % intervals, Student's t over seeds."
 
 
 @dataclass(frozen=True)
@@ -82,8 +79,8 @@ def write_table(
         for run in runs:
             if run.mixture == mixture:
                 found.setdefault(run.label, {})[run.seed] = results[run]
-        summaries = {label: summarize(each, whole_seeds=True) for label, each in found.items()}
-        compared[mixture] = MethodComparison(summaries, whole_seeds=True)
+        summaries = {label: summarize(each) for label, each in found.items()}
+        compared[mixture] = MethodComparison(summaries)
     rows = [[label, *(_mean(compared[mixture], label) for mixture in mixtures)] for label in labels]
     head = markdown_table(["method, conditioned on", *mixtures], rows)
     parts = [f"# {name}: {runs[0].tasks} tasks, mean success", head, _BRACKETS]

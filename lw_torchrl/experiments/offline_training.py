@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from filelock import FileLock
 from torch import Tensor
 from torchrl.objectives import CQLLoss, IQLLoss, LossModule, TD3BCLoss
 
+from lw_torchrl._files import held
 from lw_torchrl._tensor_archive import ArchiveError, TensorArchive, write_archive
 from lw_torchrl.data import LanguageWorldExperienceReplay, TaskBalancedSampler
 from lw_torchrl.evaluation import EvaluationResult, evaluate
@@ -116,9 +116,8 @@ def make_advantages(one: Advantages, plans: Plans, out: Path, progress: bool) ->
         ValueError: ``out`` holds those of another configuration.
     """
     file = out / one.folder / "advantages.zip"
-    file.parent.mkdir(parents=True, exist_ok=True)
     described = _FORMAT | {"run": one.describe(plans)}
-    with FileLock(file.with_name(".advantages.lock")):
+    with held(file, "out", wait=True):
         if not file.is_file():
             for dataset in one.datasets:
                 dataset.make(out, progress)
@@ -174,7 +173,7 @@ def train_offline(run: OfflineRun, plans: Plans, out: Path, progress: bool = Tru
     config = _config(run, recipe.steps)
     OfflineTrainer(loss, replay, config, checkpoint=checkpoint, progress=progress, title=run.label).train()
     save_actor(actor, file, data=describe_data(replay), run=described)
-    checkpoint.unlink(missing_ok=True)  # another process did the same run
+    checkpoint.unlink(missing_ok=True)  # another process did the same run, where files cannot be locked
     return actor.eval()
 
 
@@ -196,6 +195,11 @@ def execute_offline(run: OfflineRun, plans: Plans, out: Path, *, progress: bool 
     """
     if (done := load_result(run, plans, out)) is not None:
         return done
+    with held(out / run.folder, "out", folder=True, wait=True):
+        return load_result(run, plans, out) or _execute(run, plans, out, progress)
+
+
+def _execute(run: OfflineRun, plans: Plans, out: Path, progress: bool) -> EvaluationResult:
     started = time.perf_counter()
     for dataset in run.datasets:
         dataset.make(out, progress)

@@ -11,17 +11,17 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from filelock import FileLock
 from torchrl.record.loggers import Logger
 
 from lw_torchrl._checks import check_choice, check_int
+from lw_torchrl._files import held
 from lw_torchrl.data.co_learning_sampler import GROWN, CoLearningSampler
 from lw_torchrl.data.replay import LanguageWorldExperienceReplay
 from lw_torchrl.data.rewards import RewardName
 from lw_torchrl.evaluation import EvaluationResult, evaluate
 from lw_torchrl.experiments.execution import EVALUATION_SEED, RESULTS, load_result
 from lw_torchrl.experiments.recipes import TARGET
-from lw_torchrl.experiments.runs import Dataset, plain
+from lw_torchrl.experiments.runs import Dataset, own_tasks, plain
 from lw_torchrl.experiments.tuning import WEAKEST, Elsewhere, tune_step
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.modules.policy import METHODS, Policy, make_policy
@@ -144,7 +144,8 @@ class OnlineRun:
             found["step"] = self.step
         if self.start is not None:
             return plain(found | {"start": self._start_digest})
-        return plain(found | {"condition": self.condition, "plans": self.own_plans(plans).fingerprint})
+        own = self.own_plans(plans)
+        return plain(found | {"condition": self.condition, "plans": own.fingerprint} | own_tasks(own))
 
 
 def _load_start(run: OnlineRun, plans: Plans, out: Path, progress: bool) -> Policy:
@@ -155,9 +156,8 @@ def _load_start(run: OnlineRun, plans: Plans, out: Path, progress: bool) -> Poli
             raise ValueError(f"start: the policy of {str(run.start)!r} does not know the task {run.task!r}")
         return policy
     folder, described = out / run.begin.folder, {"run": run.begin.describe(plans)}
-    folder.mkdir(parents=True, exist_ok=True)
     file, checkpoint = folder / "policy.zip", folder / "checkpoint.zip"
-    with FileLock(folder / ".lock"):
+    with held(file, "out", wait=True):
         if not file.is_file():
             torch.manual_seed(run.seed)
             actor = make_policy(run.condition, run.own_plans(plans), feature_noise=run.recipe.feature_noise)
@@ -205,7 +205,6 @@ def _train(
             sampler=CoLearningSampler(GROWN),
             transform=actor.transform(),
         )
-        folder.mkdir(parents=True, exist_ok=True)
         trainer = OnlineTrainer(
             actor,
             replay,
@@ -252,6 +251,13 @@ def execute_online(
     """
     if (done := load_result(run, plans, out)) is not None:
         return done
+    with held(out / run.folder, "out", folder=True, wait=True):
+        return load_result(run, plans, out) or _execute(run, plans, out, progress, make_logger)
+
+
+def _execute(
+    run: OnlineRun, plans: Plans, out: Path, progress: bool, make_logger: Callable[[Path], Logger] | None
+) -> EvaluationResult:
     started = time.perf_counter()
     run.dataset.collect(out, progress)
     more: dict[str, Any] = {"run": run.describe(plans)}

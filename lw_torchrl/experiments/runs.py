@@ -6,12 +6,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from filelock import FileLock
-
 from lw_torchrl._checks import check_choice
+from lw_torchrl._files import held
 from lw_torchrl.data.collect import collect_demonstrations
 from lw_torchrl.experiments.recipes import DataSetting, Execution, Member, Preset
 from lw_torchrl.language.plans import Plans
+from lw_torchrl.language.tasks import TASKS
 from lw_torchrl.modules.policy import METHODS, policy_class
 
 SCRIPTED = "scripted"
@@ -42,8 +42,7 @@ class Dataset:
     def collect(self, out: Path, progress: bool) -> None:
         """Collect it, or what is left; of several processes one does, and the others wait."""
         root = out / self.folder
-        root.parent.mkdir(parents=True, exist_ok=True)
-        with FileLock(root.with_name(f".{root.name}.lock")):
+        with held(root, "out", wait=True):
             collect_demonstrations(
                 self.tasks,
                 episodes_per_task=self.episodes,
@@ -142,9 +141,18 @@ class Run:
             }
             if self.preset.evaluations > 1:
                 described["evaluations"] = self.preset.evaluations
+        if read is None:
+            described |= own_tasks(plans)
         if self.encoder_name and self.method != SCRIPTED:
             described["text_encoder"] = self.encoder_name
         return plain(described)
+
+
+def own_tasks(plans: Plans) -> dict[str, Any]:
+    """The tasks of plans that are not ours of that name, by which texts and objects are others: no plan's fingerprint
+    tells what a description says."""
+    own = {task: plan.definition.to_json() for task, plan in plans.items() if plan.definition != TASKS.get(task)}
+    return {"own_tasks": own} if own else {}
 
 
 def plain(value: Any) -> Any:

@@ -77,7 +77,7 @@ class Elsewhere:
 
     def __init__(self, start: Policy, policy: ResidualActor) -> None:
         self._start, self._policy = policy_of(start.eval()), policy_of(policy.eval())
-        self._action, self._weight = policy.out_keys[0], policy.out_keys[2]
+        self._action, self._weight = policy.out_keys_source[0], policy.out_keys_source[2]
         self.states = self.outside = self.changed = 0
 
     @torch.no_grad()

@@ -7,13 +7,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Literal
 
-from lw_torchrl._checks import check_choice, check_probability, counted, shown
+from lw_torchrl._checks import check_choice, check_probability, checked, counted, shown
 from lw_torchrl.language.decoded import DecodedPlan, DecodedStep
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.formats.prose_reader import read_prose
 from lw_torchrl.language.formats.python_reader import read_python
 from lw_torchrl.language.formats.written import Clause, Note, Reading, Section, listed_steps
-from lw_torchrl.language.plans import ConditionalPlan, PlanStep
+from lw_torchrl.language.plans import MOST_STEPS, ConditionalPlan, PlanStep
 from lw_torchrl.language.queries import read_query
 from lw_torchrl.language.skill_text import canonical_skill
 from lw_torchrl.language.skills import ScriptedSkill
@@ -26,6 +26,7 @@ LIMIT, SKILL_LIMIT = 0.4, 0.7
 _LONGEST = 65_536  # characters of a text that are read
 
 
+@checked
 def decode_plan(
     text: str,
     task: str | Task,
@@ -48,7 +49,7 @@ def decode_plan(
     dropped with its step. Skills stay as they are written in ``plan``; ``scripted`` has the nearest scripted ones.
 
     Args:
-        text: the answer; of more than 65,536 characters the rest is left out.
+        text: the answer; of more than 65,536 characters, and of more than 1,000 steps, the rest is left out.
         task: the task that was asked for, or its name.
         format: the format that was asked for, a name in :data:`~lw_torchrl.PLAN_FORMATS`.
         by: nearest in spelling ("edit"), or in meaning ("embedding"), which wants the extra ``[text]``.
@@ -95,6 +96,9 @@ def decode_as(text: str, read: Callable[[str], Reading], mapper: StepMapper) -> 
     if len(text) > _LONGEST:
         notes.append(Note(text.count("\n", 0, _LONGEST) + 1, f"the rest of {len(text)} characters is not read"))
     reading, section = _read(text[:_LONGEST], owner, read)
+    if further := section.clauses[MOST_STEPS:]:
+        reading.note(further[0].line, f"begins what is more than {MOST_STEPS} steps; {len(further)} are left out")
+        del section.clauses[MOST_STEPS:]
     steps = [_mapped(clause, mapper, notes) for clause in _named(section)]
     notes += _about(reading, section, owner)
     plan = _plan(owner, steps, [step.written_skill for step in steps], section)

@@ -9,15 +9,27 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any, Literal
 
-from lw_torchrl._checks import check_choice, nearest, shown
+from lw_torchrl._checks import check_choice, checked, nearest, shown
 from lw_torchrl._files import parse_json, read_text, write_text
 from lw_torchrl.language.formats.chain_py import format_plan, parse_plan
-from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans, PlanStep, as_plans
+from lw_torchrl.language.plans import (
+    MOST_STEPS,
+    PLAN_LIMIT,
+    ConditionalPlan,
+    PlanError,
+    Plans,
+    PlanStep,
+    as_plans,
+    too_many_steps,
+)
 from lw_torchrl.language.queries import QueryError
 from lw_torchrl.language.query_search import nearest_query
 from lw_torchrl.language.tasks import MT10, TASKS, Task
 
+_MOST_PAIRS = 2_000  # of a file, each compared with all queries of its task
 
+
+@checked
 def load_plans(
     source: str | os.PathLike[str],
     *,
@@ -32,7 +44,7 @@ def load_plans(
 
     Args:
         source: "MT10" or "MT50" for the shipped plans of a set; otherwise the path of a .plan or .json file, or of a
-            folder of .plan files.
+            folder of .plan files. A .plan file may have any name but that of another task.
         skills: of the shipped plans, "own" for the set whose every step has a scripted skill; "MT10" for the set
             that words every step as the plans of MT10 do, for policies that have only seen MT10.
         tasks: whose objects the conditions name, by task name, as from :func:`~lw_torchrl.load_tasks`.
@@ -42,7 +54,7 @@ def load_plans(
 
     Raises:
         FileNotFoundError: there is no such file or folder, or the folder holds no plans.
-        PlanError: (a ValueError) a file holds no valid plan, or one for another task than its name says.
+        PlanError: (a ValueError) a file holds no valid plan, or one for another task than the one it is named after.
         ValueError: another value for ``skills``, or "MT10" with plans of your own.
 
     Example:
@@ -73,19 +85,28 @@ def load_plans(
 
 
 def _read_all(found: list[Traversable], tasks: Mapping[str, Task]) -> Plans:
-    return Plans(
-        [parse_plan(read_text(file, PlanError), file.name.removesuffix(".plan"), file.name, tasks) for file in found]
-    )
+    plans: dict[str, ConditionalPlan] = {}
+    source: dict[str, str] = {}
+    for file in found:
+        stem = file.name.removesuffix(".plan")
+        text = read_text(file, PlanError, limit=PLAN_LIMIT)
+        plan = parse_plan(text, stem if stem in tasks else None, file.name, tasks)
+        if plan.task in plans:
+            raise PlanError(f"{file.name}: a second plan for {plan.task!r}; {source[plan.task]} holds one, too")
+        plans[plan.task], source[plan.task] = plan, file.name
+    return Plans(plans)
 
 
 def _read_pairs(path: Path, tasks: Mapping[str, Task]) -> Plans:
     try:
-        whole = parse_json(read_text(path, PlanError).encode())
+        whole = parse_json(read_text(path, PlanError, limit=PLAN_LIMIT).encode())
     except ValueError as error:
         raise PlanError(f"{path.name}: expected JSON, task names with lists of pairs: {error}") from error
     found = whole.get("plans", whole)
     if not isinstance(found, dict):
         raise PlanError(f"{path.name}: expected task names with lists of (condition, skill) pairs, got {shown(found)}")
+    if (number := sum(len(pairs) for pairs in found.values() if isinstance(pairs, list))) > _MOST_PAIRS:
+        raise PlanError(f"{path.name}: its plans must have at most {_MOST_PAIRS} pairs in all, got {number}")
     plans = []
     for name, pairs in found.items():
         if name not in tasks:
@@ -93,6 +114,8 @@ def _read_pairs(path: Path, tasks: Mapping[str, Task]) -> Plans:
             raise PlanError(f"{path.name}: {shown(name)} is no task" + (f"; did you mean {near[0]!r}?" if near else ""))
         if not isinstance(pairs, list):
             raise PlanError(f"{path.name}, {name}: expected a list of (condition, skill) pairs, got {shown(pairs)}")
+        if len(pairs) > MOST_STEPS:
+            raise too_many_steps(f"{path.name}, {name}", len(pairs))
         steps = [_step(pair, tasks[name], f"{path.name}, {name}, step {n}") for n, pair in enumerate(pairs, 1)]
         plans.append(ConditionalPlan(name, tuple(steps), tasks[name]))
     return Plans(plans)
@@ -109,6 +132,7 @@ def _step(pair: Any, task: Task, where: str) -> PlanStep:
     return PlanStep(match.query, skill, "" if match.score == 1.0 else f"nearest to: {condition}")
 
 
+@checked
 def save_plans(plans: Plans | Mapping[str, ConditionalPlan], folder: str | os.PathLike[str]) -> list[Path]:
     """Write each plan to ``folder``/<task>.plan; a file is replaced whole or not at all."""
     checked = as_plans(plans)

@@ -13,16 +13,26 @@ from functools import cached_property, lru_cache
 from hashlib import sha256
 from typing import Any
 
-from lw_torchrl._checks import shown
+from lw_torchrl._checks import check_fields, checked, shown
 from lw_torchrl.language.queries import Query, check_query, read_query
 from lw_torchrl.language.relations import PREDICATES
 from lw_torchrl.language.skill_text import canonical_skill
 from lw_torchrl.language.skills import load_skills
 from lw_torchrl.language.tasks import TASKS, Task, check_task, get_task
 
+MOST_STEPS = 1_000
+"""Steps of a plan, at most; the longest of ours has 6."""
+PLAN_LIMIT = 2**18
+"""Characters of a plan's text, and bytes of a file of plans, which takes a second to read."""
+
 
 class PlanError(ValueError):
     """A text or a list of steps that is no conditional plan."""
+
+
+def too_many_steps(what: str, number: int) -> PlanError:
+    """The error for a plan of more than :data:`MOST_STEPS`; the caller raises it."""
+    return PlanError(f"{what} must have at most {MOST_STEPS} steps, got {number}")
 
 
 @lru_cache(maxsize=1024)
@@ -49,6 +59,9 @@ class PlanStep:
     reason: str = field(default="", compare=False)
     goal: Query | None = None
 
+    def __post_init__(self) -> None:
+        check_fields(self)
+
 
 @dataclass(frozen=True)
 class ConditionalPlan:
@@ -62,8 +75,8 @@ class ConditionalPlan:
         definition: the :class:`Task` whose objects the conditions name; None for ours of that name.
 
     Raises:
-        PlanError: (a ValueError) the plan has no steps, a skill does not begin with a plain word, or a
-            condition or a goal names objects of another task.
+        PlanError: (a ValueError) the plan has no steps, or more than 1,000, a skill does not begin with a plain word,
+            or a condition or a goal names objects of another task.
         TypeError: a step is no PlanStep, or its skill no string.
 
     Example:
@@ -77,12 +90,20 @@ class ConditionalPlan:
     definition: Task = field(default=None, compare=False, repr=False)  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
+        check_fields(self)
+        if isinstance(self.steps, str) or not isinstance(self.steps, Iterable):
+            raise TypeError(f"steps must be a tuple of PlanStep, got {shown(self.steps)}")
+        if self.definition is not None and not isinstance(self.definition, Task):
+            raise TypeError(f"definition must be a Task, got {shown(self.definition)}")
+        listed = tuple(self.steps)
+        if len(listed) > MOST_STEPS:
+            raise too_many_steps(f"plan of task {self.task!r}", len(listed))
         definition = TASKS[check_task(self.task)] if self.definition is None else self.definition
         if definition.name != self.task:
             raise PlanError(f"definition of plan {self.task!r} is of another task, {definition.name!r}")
         object.__setattr__(self, "definition", definition)
         steps = []
-        for number, step in enumerate(self.steps, 1):
+        for number, step in enumerate(listed, 1):
             where = f"step {number} of plan {self.task!r}"
             if not isinstance(step, PlanStep) or not isinstance(step.skill, str):
                 raise TypeError(f"{where} must be a PlanStep with a skill in words, got {step!r}")
@@ -100,8 +121,10 @@ class ConditionalPlan:
     @classmethod
     def from_pairs(cls, task: str | Task, pairs: Iterable[tuple[str | Query, str]]) -> ConditionalPlan:
         """A plan from (condition, skill) pairs, the conditions in any accepted spelling."""
-        definition = get_task(task)
-        steps = tuple(PlanStep(check_query(query, definition), skill) for query, skill in pairs)
+        definition, listed = get_task(task), list(pairs)
+        if len(listed) > MOST_STEPS:
+            raise too_many_steps(f"plan of task {definition.name!r}", len(listed))
+        steps = tuple(PlanStep(check_query(query, definition), skill) for query, skill in listed)
         return cls(definition.name, steps, definition)
 
     @property
@@ -124,6 +147,7 @@ class Plans(Mapping[str, ConditionalPlan]):
         skills: every skill text once, sorted.
     """
 
+    @checked
     def __init__(self, plans: Mapping[str, ConditionalPlan] | Iterable[ConditionalPlan]) -> None:
         listed = list(plans.values() if isinstance(plans, Mapping) else plans)
         for plan in listed:
@@ -244,10 +268,15 @@ class Plans(Mapping[str, ConditionalPlan]):
             )
 
 
-def as_plans(plans: Plans | Mapping[str, ConditionalPlan]) -> Plans:
-    """``plans`` as :class:`Plans`; a mapping is checked and copied."""
+def as_plans(plans: Plans | Mapping[str, ConditionalPlan], argument: str = "plans") -> Plans:
+    """``plans`` as :class:`Plans`; a mapping is checked and copied. Errors name the argument."""
     if isinstance(plans, Plans):
         return plans
     if isinstance(plans, ConditionalPlan) or not isinstance(plans, Mapping):
-        raise TypeError(f"plans must map task names to ConditionalPlan, got {type(plans).__name__}")
-    return Plans(plans)
+        raise TypeError(f"{argument} must map task names to ConditionalPlan, got {type(plans).__name__}")
+    try:
+        return Plans(plans)
+    except (TypeError, PlanError) as error:
+        if argument == "plans":
+            raise
+        raise type(error)(f"{argument}: {error}") from None

@@ -15,6 +15,7 @@ from functools import lru_cache
 
 from rapidfuzz import fuzz, process
 
+from lw_torchrl._checks import checked
 from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.language.observation import FIRST, SECOND, places
 from lw_torchrl.language.relations import PREDICATES, PUBLISHED, RELATIONS, TOUCHING, UNARY
@@ -96,6 +97,7 @@ def _supported(task: Task, relations: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(map(str, base_clauses(task, relations)))
 
 
+@checked
 def supported_queries(task: str | Task, published_only: bool = False) -> tuple[str, ...]:
     """The base queries of a task, in canonical spelling.
 
@@ -212,6 +214,7 @@ class _ClauseParser:
         return Clause(subject, predicate, other, negated)
 
 
+@checked
 def parse_query(text: str, task: str | Task) -> Query:
     """Read an English condition about a state of ``task``.
 

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache, reduce
+from numbers import Real
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from lw_torchrl._checks import check_choice, checked, shown
 from lw_torchrl.language.observation import OBSERVATION_SIZE
 from lw_torchrl.language.queries import Query, check_query
 from lw_torchrl.language.query_facts import compile_facts
 from lw_torchrl.language.query_tables import QueryTables, compile_queries
 from lw_torchrl.language.task_index import TaskIndex, TaskTables
-from lw_torchrl.language.tasks import Task, get_task
+from lw_torchrl.language.tasks import TASKS, Task, get_task
 from lw_torchrl.language.value_checks import check_finite
 
 _LEAST, _MOST = 1e-6, 1e4  # of the size of a logit, and of metres where a length has a gradient
@@ -61,6 +63,7 @@ class QueryProgram(nn.Module):
     Source: paper section 'Query Answering Function'.
     """
 
+    @checked
     def __init__(self, queries: Mapping[str | Task, Sequence[str | Query]]) -> None:
         if not isinstance(queries, Mapping):
             raise TypeError(f"queries must map task names to lists of queries, got {type(queries).__name__}")
@@ -68,11 +71,17 @@ class QueryProgram(nn.Module):
             raise ValueError("queries must name at least one task, got an empty mapping")
         compiled: dict[Task, tuple[Query, ...]] = {}
         for key, listed in queries.items():
+            if not isinstance(key, (str, Task)):
+                raise TypeError(f"queries must map task names to lists of queries, got {shown(key)} for a name")
+            if isinstance(key, str):
+                check_choice("queries", key, TASKS)
             task = get_task(key)
             if any(task.name == other.name for other in compiled):
                 raise ValueError(f"queries must name each task once, got {task.name!r} twice")
-            if isinstance(listed, (str, Query)) or not listed:
+            if isinstance(listed, (str, Query)) or not isinstance(listed, Iterable) or not listed:
                 raise ValueError(f"queries[{task.name!r}] must be a list of at least one query, got {listed!r}")
+            if wrong := [query for query in listed if not isinstance(query, (str, Query))]:
+                raise TypeError(f"queries[{task.name!r}] must hold strings or Query, got {shown(wrong[0])}")
             compiled[task] = tuple(check_query(query, task) for query in listed)
         super().__init__()
         self.queries = dict(sorted(((task.name, found) for task, found in compiled.items())))
@@ -140,7 +149,7 @@ class QueryProgram(nn.Module):
             >>> logit.item() > 0, torch.autograd.grad(logit.sum(), state)[0].isfinite().all().item()
             (True, True)
         """
-        if not isinstance(temperature, (int, float)) or not 1e-6 <= temperature <= 1e6:
+        if not isinstance(temperature, Real) or not 1e-6 <= temperature <= 1e6:
             raise ValueError(f"temperature must be a number between 1e-6 and 1e6, got {temperature!r}")
         holds = self(observation.detach(), task_id)
         near = observation if observation.dtype in (torch.float32, torch.float64) else observation.float()

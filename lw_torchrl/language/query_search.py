@@ -5,15 +5,17 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from rapidfuzz import fuzz, process
-from torch import Tensor
 
-from lw_torchrl._checks import check_choice
+from lw_torchrl._checks import check_choice, checked
 from lw_torchrl.language.queries import Clause, Query, base_clauses, check_length, parse_query, read_query
 from lw_torchrl.language.relations import PUBLISHED, RELATIONS, UNARY
 from lw_torchrl.language.tasks import Task, get_task
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 _NEGATIONS = frozenset(("not", "no", "never", "without", "cannot"))
 # What says nothing about which query is meant: articles, the gripper's owner, the verb of a question.
@@ -92,6 +94,7 @@ def _nearest(part: str, task: Task, relations: tuple[str, ...], by: str) -> Quer
     return QueryPart(part, str(replace(clauses[at], negated=negated)), score)
 
 
+@checked
 def nearest_query(
     text: str,
     task: str | Task,

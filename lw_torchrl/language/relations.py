@@ -11,13 +11,13 @@ import re
 from collections import ChainMap, UserDict
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Literal
-
-import torch
-from torch import Tensor
+from typing import TYPE_CHECKING, Literal
 
 from lw_torchrl._checks import check_choice, shown
 from lw_torchrl.language.named_objects import is_number
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 @dataclass(frozen=True)
@@ -58,6 +58,8 @@ class Comparison:
 
     def holds(self, d: Tensor) -> Tensor:
         """Whether the comparison holds of d: (..., 3) metres to (...) bool."""
+        import torch
+
         counted = [d[..., "xyz".index(axis)] + (self.raise_z if axis == "z" else 0.0) for axis in self.axes]
         value = torch.stack([x.square() for x in counted]).sum(0).sqrt() if self.length else counted[0]
         if self.sense == "<":
@@ -147,5 +149,7 @@ def relation_holds(relation: str, first: Tensor, second: Tensor) -> Tensor:
         >>> relation_holds("above", torch.tensor([0.0, 0.6, 0.2]), torch.tensor([0.0, 0.61, 0.02]))
         tensor(True)
     """
+    import torch
+
     check_choice("relation", relation, RELATIONS)
     return torch.stack([part.holds(first - second) for part in RELATIONS[relation]]).all(0)

@@ -9,17 +9,15 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cache
 from typing import Literal
 
 from lw_torchrl.language.named_objects import GRIPPER, NamedObject, typed
 from lw_torchrl.language.observation import FIRST, GOAL, HAND, SECOND, places
-from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.plans import ConditionalPlan, PlanStep
 from lw_torchrl.language.skills import ScriptedSkill, skills_for
-from lw_torchrl.language.tasks import TASKS, Task
+from lw_torchrl.language.tasks import Task
 
-Source = Literal["skill", "reworded", "words", "condition", "nothing"]
+Source = Literal["skill", "words", "condition", "nothing"]
 _TARGET = "target location"
 _GOAL = NamedObject(_TARGET, (GOAL.start, GOAL.start + 1, GOAL.start + 2))
 _NAMES_OF_THE_GOAL = (_TARGET, "reach target")
@@ -34,9 +32,8 @@ class Roles:
     Attributes:
         target: the object or point to go to; None where nothing tells.
         moved: what is to arrive there, the robot's gripper or a thing; None where nothing tells.
-        source: what told: "skill", the text is a scripted skill's; "reworded", it speaks of things that the task lacks,
-            and the shipped plan has a scripted skill under the same condition; "words", those of the text; "condition",
-            the things that the condition compares; "nothing".
+        source: what told: "skill", the text is a scripted skill's; "words", those of the text; "condition", the things
+            that the condition compares; "nothing".
     """
 
     target: str | None
@@ -55,13 +52,12 @@ def role_object(task: Task, name: str) -> NamedObject:
 def plan_roles(plan: ConditionalPlan, skills: Mapping[str, ScriptedSkill] | None = None) -> tuple[Roles, ...]:
     """The roles of each step of a plan.
 
-    A scripted skill's ``target`` and ``moved`` count where the text is one's that the task may use; of skills nothing
-    else is read, neither offsets nor gains nor efforts. A text about things of other tasks ("close the gripper around
-    the puck" for a mug) is taken for a rewording of the shipped plan's step under the same condition. Otherwise the
-    text's own words tell, and where they name nothing of the task, its condition. Where the gripper goes to a thing and
-    the condition compares it with a point on that thing, the point is the target. Where the text moves a thing that the
-    condition says is held, the thing is moved, though a script steers the gripper. "the target location" is the goal in
-    every task, also in one that has no object there.
+    Where the text is a scripted skill's that the task may use, the skill's ``target`` and ``moved`` count; nothing else
+    of skills is read, neither offsets nor gains nor efforts. Otherwise the text's own words tell. Where they name
+    nothing of the task ("close the gripper around the puck" for a mug), the condition tells. Where the gripper goes to
+    a thing and the condition compares it with a point on that thing, the point is the target. Where the text moves a
+    thing that the condition says is held, the thing is moved, though a script steers the gripper. "the target location"
+    is the goal in every task, also in one that has no object there.
 
     Args:
         plan: a shipped one or yours; its ``definition`` says which objects and points there are.
@@ -80,7 +76,7 @@ def plan_roles(plan: ConditionalPlan, skills: Mapping[str, ScriptedSkill] | None
 
 
 def _roles(step: PlanStep, task: Task, skills: Mapping[str, ScriptedSkill]) -> Roles:
-    found = _of_skill(step, task, skills) or _of_shipped(step, task, skills) or _of_words(step, task)
+    found = _of_skill(step, task, skills) or _of_words(step, task)
     found = _carried(found or _of_condition(step) or _NOTHING, step, task)
     return replace(found, target=_point(found, step, task))
 
@@ -93,31 +89,6 @@ def _of_skill(step: PlanStep, task: Task, skills: Mapping[str, ScriptedSkill]) -
         way = _compared(step, gripper=True)
         return Roles(way[-1], GRIPPER, "skill") if way else None
     return Roles(skill.target, skill.moved, "skill")
-
-
-@cache
-def _shipped() -> Mapping[str, ConditionalPlan]:
-    return load_plans("MT50")
-
-
-def _of_shipped(step: PlanStep, task: Task, skills: Mapping[str, ScriptedSkill]) -> Roles | None:
-    if not skills or task.name not in _shipped() or not _names_others(step.skill, task):
-        return None
-    for shipped in _shipped()[task.name].steps:
-        if str(shipped.condition) == str(step.condition):
-            found = _of_skill(shipped, task, skills)
-            return None if found is None else replace(found, source="reworded")
-    return None
-
-
-@cache
-def _things() -> frozenset[str]:
-    return frozenset(thing.name for task in TASKS.values() for thing in task.published.objects)
-
-
-def _names_others(skill: str, task: Task) -> bool:
-    """Whether a text names a thing of the 50 tasks that this one lacks."""
-    return any(re.search(rf"(?<![\w-]){re.escape(name)}(?![\w-])", skill) for name in _things() - {*task.object_names})
 
 
 def _of_words(step: PlanStep, task: Task) -> Roles | None:

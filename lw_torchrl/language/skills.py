@@ -10,15 +10,17 @@ from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from rapidfuzz import fuzz, process
-from torch import Tensor
 
-from lw_torchrl._checks import check_choice, nearest, shown
+from lw_torchrl._checks import check_choice, checked, nearest, shown
 from lw_torchrl._files import read_toml
 from lw_torchrl.language.named_objects import GRIPPER, is_number
 from lw_torchrl.language.tasks import TASKS, Task, check_task, get_task
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 Triple = tuple[float, float, float]
 
@@ -147,6 +149,7 @@ def _read(file: Path | Traversable, tasks: Mapping[str, Task]) -> dict[str, Scri
     return {name: _skill(name, row, str(file), tasks) for name, row in sorted(table.items())}
 
 
+@checked
 def load_skills(
     path: str | os.PathLike[str] | None = None, *, tasks: Mapping[str, Task] = TASKS
 ) -> Mapping[str, ScriptedSkill]:
@@ -204,6 +207,7 @@ def _vectors(texts: tuple[str, ...]) -> Tensor:
     return encode_texts(texts)
 
 
+@checked
 def nearest_skill(
     text: str,
     task: str | Task | None = None,
@@ -235,7 +239,10 @@ def nearest_skill(
     check_choice("by", by, ("edit", "embedding"))
     table = _shipped() if skills is None else skills
     if not isinstance(table, Mapping):
-        table = {name: _shipped()[name] for name in table}
+        table = {check_choice("skills", name, _shipped()): _shipped()[name] for name in table}
+    for name, skill in table.items():
+        if not isinstance(skill, ScriptedSkill):
+            raise TypeError(f"skills[{name!r}] must be a ScriptedSkill, got {shown(skill)} ({type(skill).__name__})")
     allowed = [name for name, skill in table.items() if task is None or skill.suits(task)]
     if not allowed:
         raise SkillError(f"no scripted skill suits task {task!r}")

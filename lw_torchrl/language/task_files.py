@@ -7,11 +7,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
 
-from lw_torchrl._checks import nearest
+from lw_torchrl._checks import checked, nearest
 from lw_torchrl._files import read_toml
 from lw_torchrl.language.tasks import TASKS, Task, TaskError
 
 
+@checked
 def load_tasks(path: str | os.PathLike[str]) -> Mapping[str, Task]:
     """All 50 tasks and those of a file of one's own: some of the 50 with other objects, points or words, or tasks that
     the simulator does not have.

@@ -9,14 +9,14 @@ from functools import cached_property
 from hashlib import blake2b
 from importlib.resources import files
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import torch
-from torch import Tensor
-
-from lw_torchrl._checks import shown, unknown_name
+from lw_torchrl._checks import check_fields, checked, shown, unknown_name
 from lw_torchrl._files import read_toml
 from lw_torchrl.language.named_objects import GRIPPER, NamedObject, read_objects, write_objects
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 _NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
 _OWN_IDS = 2**31 - 50  # so that an id is an int32 too
@@ -46,6 +46,9 @@ class Task:
     objects: tuple[NamedObject, ...]
 
     def __post_init__(self) -> None:
+        check_fields(self)
+        if not isinstance(self.objects, tuple) or not all(isinstance(one, NamedObject) for one in self.objects):
+            raise TypeError(f"objects of task {self.name!r} must be a tuple of NamedObject, got {shown(self.objects)}")
         _check_name(self.name)
         if len(self.objects) > _MOST_OBJECTS:
             raise ValueError(
@@ -77,6 +80,8 @@ class Task:
 
     def positions(self, observation: Tensor) -> dict[str, Tensor]:
         """Where each object is: (..., 39) float, metres, to name -> (..., 3) of the same dtype, metres."""
+        import torch  # here, since words alone should not wait for it
+
         return {
             named.name: torch.stack(
                 [
@@ -157,10 +162,20 @@ def check_task(name: object, tasks: Mapping[str, Task] = TASKS) -> str:
     if not isinstance(name, str):
         raise TypeError(f"task must be a task's name, got {shown(name)} ({type(name).__name__})")
     if name not in tasks:
-        raise unknown_name("task", name, tasks)
+        raise _unknown_task("task", name, tasks)
     return name
 
 
+def _unknown_task(argument: str, name: str, tasks: Mapping[str, Task]) -> ValueError:
+    """The error for a name that is none of ``tasks``; where these are the 50, it says how other tasks are given."""
+    error = unknown_name(argument, name, tasks if argument == "task" else ("MT10", "MT50", *tasks))
+    if tasks is not TASKS:
+        return error
+    said = str(error) if str(error).endswith("?") else f"{error}."
+    return ValueError(f"{said} A task of your own is a Task with an engine=, see docs/training.md#a-task-of-your-own")
+
+
+@checked
 def task_id(name: str) -> int:
     """The integer of a task: of the 50, the rank of the name among the sorted names, from 0; of any other, a number
     from 50 to 2³¹ - 1 that is made of the name alone.
@@ -201,11 +216,13 @@ def resolve_tasks(names: str | Iterable[str], *, tasks: Mapping[str, Task] = TAS
         >>> resolve_tasks(["push", "door-open"])
         ('door-open', 'push')
     """
+    if not isinstance(tasks, Mapping):
+        raise TypeError(f"tasks must map names to Task, got {shown(tasks)} ({type(tasks).__name__})")
     if isinstance(names, str):
         if names in ("MT10", "MT50"):
             return resolve_tasks(MT10 if names == "MT10" else MT50, tasks=tasks)
         if names not in tasks:
-            raise unknown_name("tasks", names, ("MT10", "MT50", *tasks))
+            raise _unknown_task("tasks", names, tasks)
         return (names,)
     if not isinstance(names, Iterable):
         raise TypeError(f"tasks must be 'MT10', 'MT50', a task's name or a list of names, got {shown(names)}")
@@ -237,7 +254,7 @@ def named_tasks(tasks: str | Task | Iterable[str | Task], *, known: Mapping[str,
     listed = [tasks] if isinstance(tasks, Task) else list(tasks)
     own = {task.name: task for task in listed if isinstance(task, Task)}
     names = [task.name if isinstance(task, Task) else task for task in listed]
-    there = {**known, **own}
+    there = {**known, **own} if own else known
     return {name: there[name] for name in resolve_tasks(names, tasks=there)}
 
 

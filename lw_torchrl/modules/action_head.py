@@ -7,6 +7,8 @@ from collections.abc import Callable, Sequence
 from typing import Literal
 
 import torch
+from tensordict.nn import InteractionType, ProbabilisticTensorDictModule
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.distributions import Distribution
 from torchrl.modules import IndependentNormal, TanhNormal
@@ -82,6 +84,20 @@ class ActionHead(nn.Module):
         """The distribution of actions."""
         assert self.distribution is not None
         return DISTRIBUTIONS[self.distribution](loc, scale)
+
+    def sampler(
+        self, loc: NestedKey, scale: NestedKey, action: NestedKey, log_prob: NestedKey
+    ) -> ProbabilisticTensorDictModule:
+        """TorchRL's own module that draws the action, with the keys of what it reads and writes."""
+        assert self.distribution is not None
+        return ProbabilisticTensorDictModule(
+            in_keys={"loc": loc, "scale": scale},
+            out_keys=[action],
+            distribution_class=DISTRIBUTIONS[self.distribution],
+            default_interaction_type=InteractionType.DETERMINISTIC,
+            return_log_prob=True,
+            log_prob_key=log_prob,
+        )
 
     def _squashed(self, action: Tensor) -> Tensor:
         return torch.tanh(action) if self.squash else action

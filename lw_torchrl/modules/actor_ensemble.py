@@ -7,10 +7,11 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import dispatch
 from torch import Tensor, nn
 from torchrl.envs import Transform
 
+from lw_torchrl._checks import checked
+from lw_torchrl._keys import dispatched, write
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.held_evaluator import HeldEvaluator
@@ -34,6 +35,7 @@ class ActorEnsemble(Policy):
         tasks: their tasks.
 
     Raises:
+        TypeError: a member is no :class:`Policy`.
         ValueError: no member, members of different plans, tasks or keys, or one with a :class:`HeldEvaluator`.
 
     Example:
@@ -47,6 +49,7 @@ class ActorEnsemble(Policy):
     Source: as the mean of ``torchrl.modules.EnsembleModule``.
     """
 
+    @checked
     def __init__(self, members: Sequence[Policy]) -> None:
         super().__init__()
         if not members:
@@ -63,7 +66,7 @@ class ActorEnsemble(Policy):
             )
         self.plans, self.tasks = first.plans, first.tasks
         self.in_keys = first.in_keys
-        self.out_keys = first.out_keys[: 1 if first.plans is None else 2]
+        self.out_keys = first.out_keys_source[: 1 if first.plans is None else 2]
         self.draws = any(member.draws for member in members)
         self._own_evaluators = any(getattr(member, "evaluator", None) is not None for member in members)
 
@@ -75,15 +78,15 @@ class ActorEnsemble(Policy):
     def _each(self) -> list[Policy]:
         return list(self.members)  # type: ignore[arg-type]
 
-    @dispatch
+    @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``out_keys``."""
         done = [member.act(*member.prepare(tensordict)) for member in self._each]
-        tensordict.set(self.out_keys[0], torch.stack([action for action, *_ in done]).mean(0))
-        for key in self.out_keys[1:]:  # exact truth gives every member the same weights
+        written = [torch.stack([action for action, *_ in done]).mean(0)]
+        if self.plans is not None:  # exact truth gives every member the same weights
             weights = [weights for _, weights, *_ in done]
-            tensordict.set(key, torch.stack(weights).mean(0) if self._own_evaluators else weights[0])
-        return tensordict
+            written.append(torch.stack(weights).mean(0) if self._own_evaluators else weights[0])
+        return write(tensordict, self, written)
 
     def fit_normalization(self, observation: Tensor, weights: Tensor | None = None) -> None:
         """That of each member."""
@@ -127,4 +130,4 @@ def _read(policy: Policy) -> list:
 
 
 def _written(policy: Policy) -> list:
-    return policy.out_keys
+    return policy.out_keys_source

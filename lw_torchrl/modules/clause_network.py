@@ -102,7 +102,7 @@ class ClauseNetwork(nn.Module):
         """The logits (B, C) of differences d (B, C, 3) and what is asked of them (B, C, W + 1); ``negated`` (B, C) bool
         turns some around."""
         features = torch.cat([torch.tanh(d / scale) for scale in _SCALES], -1)
-        logits = (self.trunk(features) * asked[..., :-1]).sum(-1) / sqrt(self.width) + asked[..., -1]
+        logits = (self.trunk(features.to(asked.dtype)) * asked[..., :-1]).sum(-1) / sqrt(self.width) + asked[..., -1]
         if negated is not None:
             logits = torch.where(negated, -logits, logits)
         return logits.clamp(-MOST, MOST)

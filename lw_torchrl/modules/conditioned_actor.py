@@ -7,14 +7,19 @@ from typing import Any, Self
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import InteractionType
+from tensordict.nn import (
+    InteractionType,
+    ProbabilisticTensorDictModule,
+    ProbabilisticTensorDictSequential,
+    TensorDictModuleBase,
+)
 from tensordict.nn.probabilistic import interaction_type
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.distributions import Distribution
 from torchrl.envs import Transform
 
-from lw_torchrl._keys import as_keys, check_apart, key_beside, read
+from lw_torchrl._keys import as_keys, check_apart, dispatched, key_beside, read, write
 from lw_torchrl.language.tasks import Task
 from lw_torchrl.modules.action_head import ActionHead, DistributionName
 from lw_torchrl.modules.encoder import Encoder, Encoding
@@ -47,6 +52,11 @@ class ConditionedActor(Policy):
     Source: ``torchrl.modules.ProbabilisticActor``, without its wrapping.
     """
 
+    # What V-trace asks of an actor, as of TorchRL's own.
+    default_interaction_type = InteractionType.DETERMINISTIC
+    num_samples = None
+    _dist_sample = ProbabilisticTensorDictModule._dist_sample
+
     def __init__(
         self,
         encoder: Encoder,
@@ -70,8 +80,7 @@ class ConditionedActor(Policy):
         self.head = ActionHead(encoder.width, width, depth, squash, distribution, init_std)
         self.plans, self.tasks, self.in_keys = encoder.plans, encoder.tasks, encoder.in_keys
         drawn = () if distribution is None else ("loc", "scale", "action_log_prob")
-        self.out_keys = as_keys("out_keys", out_keys, ("action", *told, *drawn))
-        check_apart(self.in_keys, self.out_keys)
+        self._written = ("action", *told, *drawn)
         self.config = {
             **encoder.config,
             "width": width,
@@ -79,8 +88,22 @@ class ConditionedActor(Policy):
             "squash": squash,
             "distribution": distribution,
             "init_std": init_std,
-            "out_keys": self.out_keys,
         }
+        self.out_keys = as_keys("out_keys", out_keys, self._written)
+
+    @property
+    def out_keys(self) -> list[NestedKey]:
+        """What is written, in this order; other names may be given."""
+        return self._out_keys_apparent
+
+    @out_keys.setter
+    def out_keys(self, keys: Sequence[NestedKey]) -> None:
+        named = as_keys("out_keys", keys, self._written)
+        check_apart(self.in_keys, named)
+        self._out_keys = self._out_keys_apparent = self.config["out_keys"] = named
+        if self.head.distribution is not None:  # where KLPENPPOLoss looks for it
+            action, *_, loc, scale, log_prob = named
+            self.sampler = self.head.sampler(loc, scale, action, log_prob)
 
     def definition(self, task: str) -> Task | None:
         return self.encoder.definition(task)
@@ -98,13 +121,19 @@ class ConditionedActor(Policy):
 
     def act(self, *prepared: Tensor) -> tuple[Tensor, ...]:
         """From what :meth:`prepare` gives to a tensor for each of ``out_keys``."""
-        encoding = self.encoder.encode(*prepared)
         if self.head.distribution is None:
+            encoding = self.encoder.encode(*prepared)
             return self.head(encoding.joined), *self.told(encoding)
-        loc, scale = self.head.loc_scale(encoding.joined)
+        *told, loc, scale = self.undrawn(*prepared)
         dist = self.head.dist(loc, scale)
         action = dist.rsample() if interaction_type() is InteractionType.RANDOM else self.head.mode(loc)
-        return action, *self.told(encoding), loc, scale, dist.log_prob(action)
+        # PyTorch's log_prob raises for no rows.
+        return action, *told, loc, scale, dist.log_prob(action) if action.numel() else action.sum(-1)
+
+    def undrawn(self, *prepared: Tensor) -> tuple[Tensor, ...]:
+        """From what :meth:`prepare` gives to what is told, ``loc`` and ``scale``."""
+        encoding = self.encoder.encode(*prepared)
+        return *self.told(encoding), *self.head.loc_scale(encoding.joined)
 
     def get_dist(self, tensordict: TensorDictBase) -> Distribution:
         """The distribution of actions in these states, as losses ask for it.
@@ -124,17 +153,43 @@ class ConditionedActor(Policy):
         """The distribution of ``loc`` and ``scale`` that were written before."""
         return self.head.dist(*read(tensordict, self.dist_params_keys))
 
-    def _loc_scale(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+    def log_prob(self, tensordict: TensorDictBase, *, dist: Distribution | None = None) -> Tensor:
+        """The log-probability (B,) float32 of the ``action`` there, in these states or in ``dist``."""
+        dist = self.get_dist(tensordict) if dist is None else dist
+        (action,) = read(tensordict, self.dist_sample_keys)
+        return dist.log_prob(action)
+
+    def as_sequential(self) -> ProbabilisticTensorDictSequential:
+        """The same actor as a ProbabilisticTensorDictSequential, for code that wants one; its weights are these.
+
+        Raises:
+            TypeError: the actor was made without a distribution.
+
+        Example:
+            >>> import lw_torchrl as lw
+            >>> actor = lw.PlanConditionedActor(lw.load_plans("MT10"), distribution="normal")
+            >>> actor.as_sequential().dist_params_keys
+            ['loc', 'scale']
+        """
+        self._require_distribution()
+        made = ProbabilisticTensorDictSequential(_Undrawn(self), self.sampler)
+        made.spec = self.spec
+        return made
+
+    def _require_distribution(self) -> None:
         if self.head.distribution is None:
             raise TypeError(
                 f"{type(self).__name__} has no distribution; make it with distribution='tanh_normal', or make a "
                 "stochastic one of a trained one by actor.stochastic()"
             )
+
+    def _loc_scale(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+        self._require_distribution()
         return self.head.loc_scale(self.encoder.encode(*self.prepare(tensordict)).joined)
 
     @property
     def _drawn(self) -> list[NestedKey]:
-        return [] if self.head.distribution is None else self.out_keys[-3:]
+        return [] if self.head.distribution is None else self.out_keys_source[-3:]
 
     @property
     def dist_params_keys(self) -> list[NestedKey]:
@@ -149,7 +204,7 @@ class ConditionedActor(Policy):
     @property
     def dist_sample_keys(self) -> list[NestedKey]:
         """Where the action is written, if it is drawn."""
-        return self.out_keys[:1] if self._drawn else []
+        return self.out_keys_source[:1] if self._drawn else []
 
     def stochastic(self, distribution: DistributionName = "tanh_normal", init_std: float = 0.3) -> Self:
         """An actor with a distribution, whose mode is what this one does, as it is now: a copy, to be trained by RL.
@@ -177,7 +232,7 @@ class ConditionedActor(Policy):
             "distribution": distribution,
             "init_std": init_std,
             **{name: 0.0 for name in _RANDOM_IN_TRAINING if name in self.config},
-            "out_keys": [*self.out_keys, "loc", "scale", key_beside(self.out_keys[0], "_log_prob")],
+            "out_keys": [*self.out_keys_source, "loc", "scale", key_beside(self.out_keys_source[0], "_log_prob")],
         }
         with torch.random.fork_rng(devices=[]):
             other = type(self).from_description(found, self.encoder.text_encoder)
@@ -193,3 +248,16 @@ class ConditionedActor(Policy):
 
     def fit_contacts(self, observation: Tensor, task_id: Tensor) -> None:
         self.encoder.fit_contacts(observation, task_id)
+
+
+class _Undrawn(TensorDictModuleBase):
+    """All of an actor but the draw of its action, which reads ``loc`` and ``scale``."""
+
+    def __init__(self, actor: ConditionedActor) -> None:
+        super().__init__()
+        self.actor = actor
+        self.in_keys, self.out_keys = actor.in_keys, actor.out_keys_source[1:-1]
+
+    @dispatched
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return write(tensordict, self, self.actor.undrawn(*self.actor.prepare(tensordict)))

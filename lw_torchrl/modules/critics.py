@@ -7,17 +7,17 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase, dispatch
+from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.envs import Transform
 
-from lw_torchrl._checks import check_int
-from lw_torchrl._keys import as_keys, check_apart, read
+from lw_torchrl._checks import check_int, checked
+from lw_torchrl._keys import as_keys, check_apart, check_key, dispatched, read, write
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.modules.action_head import DistributionName
 from lw_torchrl.modules.encoder import Encoder
-from lw_torchrl.modules.networks import ACTION_SIZE, head
+from lw_torchrl.modules.networks import ACTION_SIZE, check_width, head
 from lw_torchrl.modules.plan_conditioned_actor import PlanConditionedActor
 from lw_torchrl.modules.plan_encoder import PlanEncoder
 
@@ -51,7 +51,9 @@ class Value(TensorDictModuleBase):
 
     _written = ("state_value", "state_values")
     _more = 0
+    _numbers = 1  # of a value
 
+    @checked
     def __init__(
         self,
         encoder: Encoder,
@@ -69,7 +71,7 @@ class Value(TensorDictModuleBase):
         self.out_keys = as_keys("out_keys", out_keys, self._written[: 1 if ensemble == 1 else 2])
         check_apart(self.in_keys, self.out_keys)
         self.heads = nn.ModuleList(
-            head(encoder.width + self._more, 1, width, depth, layer_norm=layer_norm)
+            head(encoder.width + self._more, self._numbers, width, depth, layer_norm=layer_norm)
             for _ in range(check_int("ensemble", ensemble, minimum=1))
         )
 
@@ -84,26 +86,28 @@ class Value(TensorDictModuleBase):
     def _input(self, tensordict: TensorDictBase) -> Tensor:
         return self.encoder.encode(*self.encoder.prepare(tensordict)).joined
 
-    @dispatch
+    @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the values."""
         seen = self._input(tensordict)
         values = torch.cat([each(seen) for each in self.heads], -1)
-        tensordict.set(self.out_keys[0], values.amin(-1, keepdim=True))
-        if len(self.out_keys) > 1:
-            tensordict.set(self.out_keys[1], values)
-        return tensordict
+        if self._numbers > 1:
+            return write(tensordict, self, [values])
+        return write(tensordict, self, [values.amin(-1, keepdim=True), values][: len(self.out_keys_source)])
 
 
 class QValue(Value):
     """The value of an action in a state, on any encoder.
 
     Reads what the encoder reads and ``action`` (B, 4) float32; writes ``state_action_value`` (B, 1) float32, the least
-    of the ensemble's, and, with an ensemble of several, ``state_action_values`` (B, E) float32, each of them.
+    of the ensemble's, and, with an ensemble of several, ``state_action_values`` (B, E) float32, each of them. With
+    ``quantiles``, ``state_action_value`` is (B, Q) float32.
 
     Args:
         encoder, ensemble, width, depth, layer_norm, out_keys: as for :class:`Value`.
         action_key: where the action is; may be nested.
+        quantiles: Q, how many quantiles of the return are the value, as ``torchrl.objectives.TQCLoss`` wants it; 1 for
+            its mean.
 
     Raises:
         ValueError: a wrong option.
@@ -114,8 +118,24 @@ class QValue(Value):
     _written = ("state_action_value", "state_action_values")
     _more = ACTION_SIZE
 
-    def __init__(self, encoder: Encoder, *, action_key: NestedKey = "action", **options: Any) -> None:
-        super().__init__(encoder, **options)
+    @checked
+    def __init__(
+        self,
+        encoder: Encoder,
+        *,
+        ensemble: int = 1,
+        action_key: NestedKey = "action",
+        quantiles: int = 1,
+        **options: Any,
+    ) -> None:
+        self._numbers = check_int("quantiles", quantiles, minimum=1)
+        if quantiles > 1 and ensemble != 1:
+            raise ValueError(
+                f"ensemble must be 1 with quantiles, whose least is no value, got {ensemble}: TQCLoss makes several "
+                "critics by its num_qvalue_nets"
+            )
+        super().__init__(encoder, ensemble=ensemble, **options)
+        check_key("action_key", action_key)
         self.action_key = action_key
         self.in_keys = [*self.in_keys, action_key]
         check_apart(self.in_keys, self.out_keys)
@@ -143,6 +163,7 @@ class PlanConditionedValue(Value):
     Source: ``torchrl.modules.ValueOperator``.
     """
 
+    @checked
     def __init__(
         self,
         plans: Plans | Mapping[str, ConditionalPlan],
@@ -166,7 +187,7 @@ class PlanConditionedQValue(QValue):
 
     Args:
         plans: a plan for each task that will be seen.
-        ensemble, width, depth, layer_norm, action_key, out_keys: as for :class:`QValue`.
+        ensemble, width, depth, layer_norm, action_key, quantiles, out_keys: as for :class:`QValue`.
         **options: of :class:`PlanEncoder`, ``features`` say.
 
     Example:
@@ -178,6 +199,7 @@ class PlanConditionedQValue(QValue):
     Source: ``torchrl.modules.ValueOperator``.
     """
 
+    @checked
     def __init__(
         self,
         plans: Plans | Mapping[str, ConditionalPlan],
@@ -187,13 +209,16 @@ class PlanConditionedQValue(QValue):
         depth: int = 2,
         layer_norm: bool = True,
         action_key: NestedKey = "action",
+        quantiles: int = 1,
         out_keys: Sequence[NestedKey] | None = None,
         **options: Any,
     ) -> None:
         networks: dict[str, Any] = {"ensemble": ensemble, "width": width, "depth": depth, "layer_norm": layer_norm}
-        super().__init__(PlanEncoder(plans, **options), action_key=action_key, out_keys=out_keys, **networks)
+        networks |= {"action_key": action_key, "quantiles": quantiles}
+        super().__init__(PlanEncoder(plans, **options), out_keys=out_keys, **networks)
 
 
+@checked
 def plan_actor_value(
     plans: Plans | Mapping[str, ConditionalPlan],
     *,
@@ -221,4 +246,5 @@ def plan_actor_value(
     Source: ``torchrl.modules.ActorValueOperator``.
     """
     actor = PlanConditionedActor(plans, distribution=distribution, **options)
+    check_width("value_width", value_width)
     return actor, Value(actor.encoder, width=value_width, depth=value_depth)

@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 from tensordict.utils import NestedKey
 
+from lw_torchrl._checks import checked
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.tasks import Task
 from lw_torchrl.language.text import TextEncoder
@@ -44,6 +45,7 @@ class DescriptorConditionedActor(ConditionedActor):
 
     encoder: DescriptorEncoder
 
+    @checked
     def __init__(
         self,
         tasks: str | Iterable[str | Task],

@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from lw_torchrl._checks import check_choice
+from lw_torchrl._checks import check_choice, checked
 from lw_torchrl._keys import as_keys, check_apart
 from lw_torchrl.language.task_index import TaskIndex
 from lw_torchrl.language.tasks import MT50, TASKS, Task, named_tasks
@@ -44,6 +44,7 @@ class DescriptorEncoder(Encoder):
 
     text_vectors: Tensor
 
+    @checked
     def __init__(
         self,
         tasks: str | Iterable[str | Task],

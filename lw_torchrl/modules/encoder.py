@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase, dispatch
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import Transform
 
-from lw_torchrl._keys import read
+from lw_torchrl._keys import dispatched, read, write
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.language.tasks import TASKS, Task
 from lw_torchrl.language.text import TextEncoder
@@ -86,10 +86,10 @@ class Encoder(TensorDictModuleBase):
         """From what :meth:`prepare` gives."""
         raise NotImplementedError(f"{type(self).__name__} must override prepare and encode")
 
-    @dispatch
+    @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``encoding``."""
-        return tensordict.set(self.out_keys[0], self.encode(*self.prepare(tensordict)).joined)
+        return write(tensordict, self, [self.encode(*self.prepare(tensordict)).joined])
 
     def fit_contacts(self, observation: Tensor, task_id: Tensor) -> None:
         """Take from demonstrations where the hand touches things, in place; here there is nothing to take."""

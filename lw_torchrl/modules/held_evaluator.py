@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.envs import Compose, Transform
 
 from lw_torchrl._blocks import in_blocks
-from lw_torchrl._checks import check_int
+from lw_torchrl._checks import check_int, checked
 from lw_torchrl._devices import device_of
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.text import TextEncoder
@@ -61,6 +61,7 @@ class HeldEvaluator(QueryEvaluator):
     every step.
     """
 
+    @checked
     def __init__(self, evaluator: QueryEvaluator, *, every: int = 1, delay: int = 0) -> None:
         if not isinstance(evaluator, QueryEvaluator):
             raise TypeError(f"evaluator must be a QueryEvaluator, got {type(evaluator).__name__}")
@@ -96,7 +97,7 @@ class HeldEvaluator(QueryEvaluator):
         """What the evaluator says of n rows with what it reads, (n, S) float32, of each whatever rows stand beside."""
         with torch.no_grad(), evaluating(self.evaluator):
             asked = in_blocks(self.evaluator)(tensordict.to(device_of(self.evaluator)))
-        found: Tensor = asked.get(self.evaluator.out_keys[0])
+        found: Tensor = asked.get(self.evaluator.out_keys_source[0])
         return found
 
     def transform(self) -> Transform:

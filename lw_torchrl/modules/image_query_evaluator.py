@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from lw_torchrl._checks import check_choice, check_int
+from lw_torchrl._checks import check_choice, check_int, checked
 from lw_torchrl._rendering import check_cameras
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.text import TextEncoder
@@ -66,6 +66,7 @@ class ImageQueryEvaluator(ClauseEvaluator):
     rows_at_once = 4
     """As many rows are evaluated together when it acts, whatever else there is, so that results hang on no other."""
 
+    @checked
     def __init__(
         self,
         plans: Plans,

@@ -45,13 +45,20 @@ def text_to_latent(text_size: int, latent_size: int, width: int, depth: int) -> 
     )
 
 
+def check_width(argument: str, width: int | Sequence[int]) -> None:
+    """Raise unless it is the width of hidden layers, or a width for each."""
+    for cells in [width] if isinstance(width, int) else width:
+        check_int(argument, cells, minimum=1)
+
+
 def head(size: int, out: int, width: int | Sequence[int], depth: int, *, layer_norm: bool = False) -> MLP:
     """An MLP from an encoding (..., size) to (..., out); a tuple of widths says both width and depth."""
+    check_width("width", width)
     widths = [width] * check_int("depth", depth, minimum=0) if isinstance(width, int) else list(width)
     return MLP(
         in_features=size,
         out_features=out,
-        num_cells=[check_int("width", cells, minimum=1) for cells in widths],
+        num_cells=widths,
         activation_class=nn.ReLU,
         norm_class=nn.LayerNorm if layer_norm else None,
         norm_kwargs=[{"normalized_shape": cells} for cells in widths] if layer_norm else None,

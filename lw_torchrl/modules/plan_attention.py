@@ -11,7 +11,8 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from lw_torchrl._keys import as_keys, check_apart, read
+from lw_torchrl._checks import checked
+from lw_torchrl._keys import as_keys, check_apart, dispatched, read, write
 from lw_torchrl.language.plan_tables import PlanTables
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.value_checks import check_values
@@ -84,6 +85,7 @@ class PlanAttention(TensorDictModuleBase):
 
     mask: Tensor
 
+    @checked
     def __init__(
         self,
         plans: Plans | Mapping[str, ConditionalPlan],
@@ -104,8 +106,10 @@ class PlanAttention(TensorDictModuleBase):
         check_truth(qaf, (*rows.shape, self.mask.shape[-1]))
         return attend(10.0 * qaf.to(torch.float32) - 5.0, self.mask[rows])
 
+    @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``skill_weights``."""
         qaf, task_id = read(tensordict, self.in_keys)
         rows = self.tables.rows(task_id)
         self.tables.refuse_others(tensordict.get(plan_number_key(self.in_keys[0]), None), rows)
-        return tensordict.set(self.out_keys[0], self.over_steps(qaf, rows))
+        return write(tensordict, self, [self.over_steps(qaf, rows)])

@@ -9,7 +9,7 @@ import torch
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from lw_torchrl._checks import check_choice
+from lw_torchrl._checks import check_choice, checked
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.action_head import DistributionName
@@ -88,6 +88,7 @@ class PlanConditionedActor(ConditionedActor):
     encoder: PlanEncoder
     plans: Plans
 
+    @checked
     def __init__(
         self,
         plans: Plans | Mapping[str, ConditionalPlan],

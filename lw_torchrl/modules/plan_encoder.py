@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import Transform
 
-from lw_torchrl._checks import check_choice, check_probability, check_scale
+from lw_torchrl._checks import check_choice, check_probability, check_scale, checked
 from lw_torchrl._keys import as_keys, check_apart
 from lw_torchrl.language.observation import OPENING
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
@@ -83,6 +83,7 @@ class PlanEncoder(Encoder):
     closing: Tensor
     plans: Plans
 
+    @checked
     def __init__(
         self,
         plans: Plans | Mapping[str, ConditionalPlan],
@@ -232,7 +233,8 @@ class PlanEncoder(Encoder):
         weights = self.weights(*prepared)
         # A product with (B, K) is faster than picking (B, S, D) latents, forwards and backwards.
         over_skills = weights.new_zeros((*weights.shape[:-1], len(self.skills))).scatter_add(-1, prepared[1], weights)
-        return Encoding(over_skills @ self.latents(), prepared[2], weights)
+        latents = self.latents()
+        return Encoding(over_skills.to(latents.dtype) @ latents, prepared[2], weights)
 
     def latents(self) -> Tensor:
         """(K, D), the latent of each skill."""

@@ -8,13 +8,13 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase, dispatch
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite
 from torchrl.envs import Compose, Transform
 
-from lw_torchrl._checks import check_choice
-from lw_torchrl._keys import read
+from lw_torchrl._checks import check_choice, checked
+from lw_torchrl._keys import dispatched, read, write
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.tasks import TASKS, Task
 from lw_torchrl.language.text import TextEncoder
@@ -113,7 +113,7 @@ class Policy(TensorDictModuleBase):
     def spec(self) -> Composite:
         """Of the action, which losses ask for: (4,) float32 in [-1, 1]."""
         spec = Composite()
-        spec[self.out_keys[0]] = Bounded(-1.0, 1.0, (ACTION_SIZE,))
+        spec[self.out_keys_source[0]] = Bounded(-1.0, 1.0, (ACTION_SIZE,))
         return spec
 
     @classmethod
@@ -137,12 +137,10 @@ class Policy(TensorDictModuleBase):
         """From what :meth:`prepare` gives to a tensor for each of ``out_keys``; can be vmapped over parameters."""
         raise NotImplementedError(f"{type(self).__name__} must override prepare and act")
 
-    @dispatch
+    @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``out_keys``."""
-        for key, value in zip(self.out_keys, self.act(*self.prepare(tensordict)), strict=True):
-            tensordict.set(key, value)
-        return tensordict
+        return write(tensordict, self, self.act(*self.prepare(tensordict)))
 
     def read(self, tensordict: TensorDictBase) -> list[Tensor]:
         """The tensors of ``in_keys``; :class:`ValueError` names those that are missing."""
@@ -191,6 +189,7 @@ def policy_class(kind: Any) -> type[Policy]:
     return getattr(import_module(entry), kind) if isinstance(entry, str) else entry
 
 
+@checked
 def make_policy(
     method: str,
     plans: Plans | Mapping[str, ConditionalPlan],

@@ -13,7 +13,8 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import Transform
 
-from lw_torchrl._checks import check_choice
+from lw_torchrl._checks import check_choice, checked
+from lw_torchrl._keys import dispatched, write
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.text import TextEncoder
 
@@ -53,6 +54,7 @@ class QueryEvaluator(TensorDictModuleBase):
 
     config: dict[str, Any]
 
+    @checked
     def __init__(self, plans: Plans) -> None:
         super().__init__()
         self.plans = plans
@@ -88,9 +90,10 @@ class QueryEvaluator(TensorDictModuleBase):
         """A new transform that writes what it reads and the environment does not give, pictures say; None for none."""
         return None
 
+    @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``qaf_logits``."""
-        return tensordict.set(self.out_keys[0], self.answers(*(tensordict.get(key) for key in self.in_keys)))
+        return write(tensordict, self, [self.answers(*(tensordict.get(key) for key in self.in_keys))])
 
     def with_plans(self, plans: Plans) -> QueryEvaluator:
         """One with the same weights for the conditions of other plans: training either trains both.

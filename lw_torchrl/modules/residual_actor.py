@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs import Transform
 
-from lw_torchrl._checks import check_scale
+from lw_torchrl._checks import check_scale, checked
 from lw_torchrl._keys import key_beside, read
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.tasks import Task
@@ -66,6 +66,7 @@ class ResidualActor(Policy):
 
     chosen: Tensor
 
+    @checked
     def __init__(
         self,
         base: Policy,
@@ -87,7 +88,7 @@ class ResidualActor(Policy):
             raise ValueError("base must mix latents, this one mixes actions")
         self.base = base.requires_grad_(False).eval()
         self.plans, self.tasks = base.plans, base.tasks
-        self.in_keys, self.out_keys = base.in_keys, base.out_keys[:1]
+        self.in_keys, self.out_keys = base.in_keys, base.out_keys_source[:1]
         self.network = head(base.encoder.width + ACTION_SIZE, ACTION_SIZE, width, depth)
         nn.init.zeros_(self.network[-1].weight)
         nn.init.zeros_(self.network[-1].bias)
@@ -97,7 +98,8 @@ class ResidualActor(Policy):
             if not isinstance(base.encoder, PlanEncoder):
                 raise TypeError(f"steps are of plans, which the base, a {type(base).__name__}, does not read")
             self.steps = self.config["steps"] = check_steps(steps, base.encoder.plans)
-            self.out_keys = [*base.out_keys[:2], key_beside(base.out_keys[0], "_corrected")]
+            action, weights, *_ = base.out_keys_source
+            self.out_keys = [action, weights, key_beside(action, "_corrected")]
             table = as_table(self.steps, base.encoder.attention.tables)
             self.register_buffer("chosen", table, persistent=False)
 

@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import Transform
 
-from lw_torchrl._checks import check_choice, check_int, shown
+from lw_torchrl._checks import check_choice, check_int, checked, shown
 from lw_torchrl._keys import as_keys, check_apart
 from lw_torchrl.language.plan_tables import PlanTables
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
@@ -57,6 +57,7 @@ class ScriptedSkillActor(Policy):
     Source: paper sections 'Scripted Skills' and 'Conditional Plan Generation'.
     """
 
+    @checked
     def __init__(
         self,
         plans: Plans | Mapping[str, ConditionalPlan],

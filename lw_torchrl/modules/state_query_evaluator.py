@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from lw_torchrl._checks import checked
 from lw_torchrl.language.observation import OBSERVATION_SIZE
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.text import TextEncoder
@@ -51,6 +52,7 @@ class StateQueryEvaluator(ClauseEvaluator):
 
     network: ClauseNetwork
 
+    @checked
     def __init__(
         self,
         plans: Plans,

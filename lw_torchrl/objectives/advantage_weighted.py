@@ -14,9 +14,10 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 from torchrl.objectives.utils import distance_loss
 
-from lw_torchrl._checks import check_choice, check_scale
+from lw_torchrl._checks import check_choice, check_scale, checked
 from lw_torchrl._keys import read
 from lw_torchrl.language.value_checks import check_finite
+from lw_torchrl.objectives.reduction import Reduction, let_go, set_reduction
 
 DISTANCES = ("l2", "l1", "smooth_l1", "log_prob")
 
@@ -27,8 +28,9 @@ class AdvantageWeightedLoss(LossModule):
 
     Reads what the actor reads, ``action`` (B, 4) float32, the action to imitate, and ``advantage`` (B, 1) float32,
     which :meth:`ExpectileValueLoss.advantage` gives and :func:`standardize_by_task` makes comparable. Gives
-    ``loss_actor`` () float32, and, detached, ``weight_clipped`` () float32, the share of rows whose weight is the
-    largest that may be, and ``ESS`` () float32, in (0, 1], the effective sample size over B, as TorchRL's PPO gives.
+    ``loss_actor`` () float32, (B,) by ``reduction="none"``, and, detached, ``weight_clipped`` () float32, the share of
+    rows whose weight is the largest that may be, and ``ESS`` () float32, in (0, 1], the effective sample size over B,
+    as TorchRL's PPO gives.
 
     Args:
         actor_network: an actor; its mode is compared where it has a distribution.
@@ -36,6 +38,7 @@ class AdvantageWeightedLoss(LossModule):
         max_weight: the largest weight, over 0.
         loss_function: "l2", "l1" or "smooth_l1", the distance to the action, the mean over its numbers, or "log_prob",
             less the action's log-probability, for an actor with a distribution.
+        reduction: "mean", by the weights; "none", each row's distance times its weight; or "sum", the sum of these.
 
     Raises:
         ValueError: a wrong option; at call time, a missing key, an advantage that is not (B, 1) or not finite.
@@ -70,6 +73,7 @@ class AdvantageWeightedLoss(LossModule):
     actor_network_params: TensorDictParams
     target_actor_network_params: TensorDictParams
 
+    @checked
     def __init__(
         self,
         actor_network: TensorDictModuleBase,
@@ -77,8 +81,10 @@ class AdvantageWeightedLoss(LossModule):
         beta: float = 1.0,
         max_weight: float = 20.0,
         loss_function: Literal["l2", "l1", "smooth_l1", "log_prob"] = "l2",
+        reduction: Reduction | None = None,
     ) -> None:
         super().__init__()
+        set_reduction(self, reduction)
         self.beta = check_scale("beta", beta)
         self.max_weight = check_scale("max_weight", max_weight)
         if not self.max_weight:
@@ -102,15 +108,16 @@ class AdvantageWeightedLoss(LossModule):
             )
         check_finite("advantage", advantage)
         logs, most = self.beta * advantage.detach().squeeze(-1), math.log(self.max_weight)
-        # Only the weights' ratios count: over the largest of the batch they cannot all vanish.
-        weights = (logs.clamp(max=most) - logs.max().clamp(max=most)).exp()
+        # In a mean only the weights' ratios count: over the largest of the batch they cannot all vanish.
+        largest = logs.max().clamp(max=most) if self.reduction == "mean" else 0.0
+        weights = (logs.clamp(max=most) - largest).exp()
         loss = self._reduce_loss(self._distance(tensordict, action), tensordict, weights=weights)
         found = TensorDict(
             loss_actor=loss,
             weight_clipped=(logs > most).to(weights.dtype).mean(),
             ESS=weights.sum().square() / weights.square().sum() / weights.numel(),
         )
-        self._clear_weakrefs(tensordict, found, "actor_network_params")
+        let_go(tensordict, found, self.actor_network_params)
         return found
 
     def _distance(self, tensordict: TensorDictBase, action: Tensor) -> Tensor:
@@ -123,6 +130,7 @@ class AdvantageWeightedLoss(LossModule):
         return distance_loss(predicted, action, self.loss_function).mean(-1)
 
 
+@checked
 def standardize_by_task(advantage: Tensor, task_id: Tensor) -> Tensor:
     """Advantages in standard deviations of their task, about its mean.
 

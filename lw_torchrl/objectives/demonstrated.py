@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
+from torchrl.data import Composite
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import SACLoss, TD3BCLoss
 
-from lw_torchrl._checks import check_scale
+from lw_torchrl._checks import check_choice, check_scale, checked, shown
+from lw_torchrl.objectives.reduction import REDUCTIONS, let_go, priority_weight
 
 
-def imitation(action: Tensor, demonstrated: Tensor, is_target: Tensor) -> Tensor:
+def imitation(action: Tensor, demonstrated: Tensor, is_demonstration: Tensor) -> Tensor:
     """The squared distance to the demonstrated action, of each row: (B,) float32.
 
     It is 0 in rows that are no demonstrations, and scaled so that its mean over all rows is the mean over
@@ -23,27 +27,59 @@ def imitation(action: Tensor, demonstrated: Tensor, is_target: Tensor) -> Tensor
 
     Args:
         action, demonstrated: (B, A) float32.
-        is_target: (B,) or (B, 1) bool, false of demonstrations.
+        is_demonstration: (B,) or (B, 1) bool.
 
     Example:
         >>> import torch
         >>> one, other = torch.zeros(4, 2), torch.tensor([[9.0, 9.0], [9.0, 9.0], [1.0, 1.0], [0.0, 2.0]])
-        >>> imitation(one, other, torch.tensor([True, True, False, False])).mean()
+        >>> imitation(one, other, torch.tensor([False, False, True, True])).mean()
         tensor(1.5000)
     """
-    rows = ~is_target.reshape(action.shape[:-1])
+    rows = is_demonstration.reshape(action.shape[:-1])
     distance = (action - demonstrated).square().mean(-1) * rows
     return distance * (rows.numel() / rows.sum().clamp(min=1))
+
+
+def _demonstrations(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
+    """Which rows are demonstrations, (B,) or (B, 1) bool; :class:`ValueError` if nothing says so."""
+    found = tensordict.get(key, None)
+    if found is None:
+        raise ValueError(
+            f"the batch lacks {key!r}, which says which rows to imitate: a LanguageWorldExperienceReplay writes it, as "
+            f"does a buffer on a GrowingStorage; in a buffer of your own, set it, (B,) bool, or name it by set_keys"
+        )
+    if found.dtype != torch.bool:
+        raise ValueError(f"{key!r} must be torch.bool, true of demonstrations, got {found.dtype}")
+    return found
+
+
+def _check_critics(given: Any) -> None:
+    critics = given if isinstance(given, list) else [given]
+    if not critics or not all(isinstance(critic, TensorDictModuleBase) for critic in critics):
+        raise TypeError(f"qvalue_network must be a TensorDictModule, or a list of these, got {shown(given)}")
+
+
+def _check_options(options: Mapping[str, Any]) -> None:
+    """Raise for an unknown reduction, and for the spec of all rows of an environment, of which a loss would make an
+    action of as many rows."""
+    if options.get("reduction") is not None:
+        check_choice("reduction", options["reduction"], REDUCTIONS)
+    spec = options.get("action_spec")
+    if spec is not None and not isinstance(spec, Composite) and len(spec.shape) > 1:
+        raise ValueError(
+            f"action_spec must be of one row, got one of shape {tuple(spec.shape)}: take env.action_spec_unbatched"
+        )
 
 
 class DemonstratedTD3Loss(TD3BCLoss):
     """TD3 on a collector's rows and demonstrations alike, whose actor also imitates the demonstrations.
 
     The actor's loss is -Q / mean(abs(Q)) over all rows, where Q is the mean of the critics, plus ``bc_weight`` times
-    the mean squared distance to ``action`` over the rows that are demonstrations: those of which ``is_target`` is
-    false, as :class:`~lw_torchrl.CoLearningSampler` of the target "grown" says. The critics' loss is TD3's.
+    the mean squared distance to ``action`` over the rows that are demonstrations, of which ``is_demonstration`` is
+    true. A :class:`~lw_torchrl.LanguageWorldExperienceReplay` says so of its datasets' rows, and not of what it was
+    extended with. The critics' loss is TD3's.
 
-    Reads what TD3 reads, and ``is_target`` (B,) bool; writes what :class:`torchrl.objectives.TD3BCLoss` does:
+    Reads what TD3 reads, and ``is_demonstration`` (B,) bool; writes what :class:`torchrl.objectives.TD3BCLoss` does:
     ``loss_actor`` and ``loss_qvalue``, () float32 each, and, detached, ``bc_loss`` (), without its weight, ``lmbd`` (),
     what Q is divided by inverted, ``state_action_value_actor`` (B,), ``pred_value`` (E, B), ``target_value`` and
     ``next_state_value`` (B,).
@@ -56,7 +92,9 @@ class DemonstratedTD3Loss(TD3BCLoss):
             ``action_spec``, ``num_qvalue_nets``, ``policy_noise``, ...
 
     Raises:
-        ValueError: ``bc_weight`` is negative or no number.
+        ValueError: ``bc_weight`` is negative or no number; another ``reduction``; ``action_spec`` is of several rows;
+            at call time, rows
+            without ``is_demonstration``.
 
     Example:
         >>> import lw_torchrl as lw
@@ -66,7 +104,7 @@ class DemonstratedTD3Loss(TD3BCLoss):
         >>> loss = lw.DemonstratedTD3Loss(actor, critic, bounds=(-1.0, 1.0))
         >>> loss.make_value_estimator(gamma=0.99)
         >>> targets = SoftUpdate(loss, eps=0.995)
-        >>> "is_target" in loss.in_keys
+        >>> "is_demonstration" in loss.in_keys
         True
 
     Source: Fujimoto and Gu, 'A Minimalist Approach to Offline Reinforcement Learning' (TD3+BC); Ball et al., 'Efficient
@@ -75,61 +113,73 @@ class DemonstratedTD3Loss(TD3BCLoss):
 
     @dataclass
     class _AcceptedKeys(TD3BCLoss._AcceptedKeys):
-        """The names that ``set_keys`` takes: TD3BCLoss's, and ``is_target``, false of rows that are demonstrations."""
+        """The names that ``set_keys`` takes: TD3BCLoss's, and ``is_demonstration``."""
 
-        is_target: NestedKey = "is_target"
+        is_demonstration: NestedKey = "is_demonstration"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
+    in_keys: list[NestedKey]
 
+    @checked
     def __init__(
         self,
-        actor_network: TensorDictModule,
-        qvalue_network: TensorDictModule | list[TensorDictModule],
+        actor_network: TensorDictModuleBase,
+        qvalue_network: TensorDictModuleBase | list[TensorDictModuleBase],
         *,
         bc_weight: float = 2.0,
         **options: Any,
     ) -> None:
         if "alpha" in options:
             raise ValueError("alpha is 1 here: give bc_weight, the weight of the imitation")
+        _check_options(options)
+        _check_critics(qvalue_network)
         super().__init__(actor_network, qvalue_network, alpha=1.0, **options)
         self.bc_weight = check_scale("bc_weight", bc_weight)
+        self.in_keys = [*self.in_keys, self.tensor_keys.is_demonstration]
 
-    def _set_in_keys(self) -> None:
-        super()._set_in_keys()
-        self._in_keys: list[NestedKey] = list({*self._in_keys, self.tensor_keys.is_target})
+    def set_keys(self, **keys: NestedKey) -> None:
+        """Read and write under other names; see :class:`torchrl.objectives.LossModule`."""
+        super().set_keys(**keys)
+        self.in_keys = [*self.in_keys, self.tensor_keys.is_demonstration]
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict]:
         """The actor's loss, () float32, and ``bc_loss``, ``lmbd`` and ``state_action_value_actor``, detached."""
-        weights = self._maybe_get_priority_weight(tensordict)
         seen = tensordict.select(*self.actor_network.in_keys, strict=False)
         with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
             seen = self.actor_network(seen)
-        asked = seen.select(*self.qvalue_network.in_keys, strict=False).expand(self.num_qvalue_nets, *seen.batch_size)
-        values = self._vmap_qvalue_network00(asked, self._cached_detach_qvalue_network_params)
-        value = values.get(self.tensor_keys.state_action_value).squeeze(-1).mean(0)
-        key = self.tensor_keys.action
-        bc = imitation(seen.get(key), tensordict.get(key), tensordict.get(self.tensor_keys.is_target))
+        value = self._judged(seen).mean(0)
+        key, demonstrated = self.tensor_keys.action, _demonstrations(tensordict, self.tensor_keys.is_demonstration)
+        bc = imitation(seen.get(key), tensordict.get(key), demonstrated)
         scale = self.alpha / value.abs().mean().detach().clamp(min=1e-6)
+        weights = priority_weight(self, tensordict)
         loss = self._reduce_loss(self.bc_weight * bc - scale * value, tensordict=tensordict, weights=weights)
-        self._clear_weakrefs(
-            tensordict,
-            "actor_network_params",
-            "qvalue_network_params",
-            "target_actor_network_params",
-            "target_qvalue_network_params",
-        )
+        let_go(tensordict, self.actor_network_params, self.qvalue_network_params)
         return loss, {"state_action_value_actor": value.detach(), "bc_loss": bc.mean().detach(), "lmbd": scale}
+
+    def _judged(self, seen: TensorDictBase) -> Tensor:
+        """What each critic says of the rows, (E, B), without a gradient for the critics."""
+
+        def judge(rows: TensorDictBase, params: TensorDictBase) -> Tensor:
+            with params.to_module(self.qvalue_network, preserve_module_state=False):
+                return self.qvalue_network(rows).get(self.tensor_keys.state_action_value)
+
+        number, params = self.num_qvalue_nets, self.qvalue_network_params.detach()
+        asked = seen.select(*self.qvalue_network.in_keys, strict=False).expand(number, *seen.batch_size)
+        if self.deactivate_vmap:
+            return torch.stack([judge(asked[one], params[one]) for one in range(number)]).squeeze(-1)
+        return torch.vmap(judge, randomness=self.vmap_randomness)(asked, params).squeeze(-1)
 
 
 class DemonstratedSACLoss(SACLoss):
     """SAC on a collector's rows and demonstrations alike, whose actor also imitates the demonstrations.
 
     The actor's loss is SAC's over all rows, plus ``bc_weight`` times the mean squared distance of the distribution's
-    mode to ``action`` over the rows that are demonstrations, of which ``is_target`` is false. It is a distance and no
-    likelihood, since half of the demonstrated actions have a component at ±1, where that of a TanhNormal explodes.
+    mode to ``action`` over the rows of which ``is_demonstration`` is true, as for
+    :class:`DemonstratedTD3Loss`. It is a distance and no likelihood, since half of the demonstrated actions have a
+    component at ±1, where that of a TanhNormal explodes.
 
-    Reads what SAC reads, and ``is_target`` (B,) bool; writes what :class:`torchrl.objectives.SACLoss` does:
+    Reads what SAC reads, and ``is_demonstration`` (B,) bool; writes what :class:`torchrl.objectives.SACLoss` does:
     ``loss_actor``, ``loss_qvalue``, ``loss_alpha``, ``alpha`` and ``entropy``, () float32 each.
 
     Args:
@@ -139,7 +189,9 @@ class DemonstratedSACLoss(SACLoss):
         **options: of :class:`torchrl.objectives.SACLoss`.
 
     Raises:
-        ValueError: ``bc_weight`` is negative or no number.
+        ValueError: ``bc_weight`` is negative or no number; another ``reduction``; ``action_spec`` is of several rows;
+            at call time, rows
+            without ``is_demonstration``.
 
     Example:
         >>> import lw_torchrl as lw
@@ -156,37 +208,44 @@ class DemonstratedSACLoss(SACLoss):
 
     @dataclass
     class _AcceptedKeys(SACLoss._AcceptedKeys):
-        """The names that ``set_keys`` takes: SACLoss's, and ``is_target``, false of rows that are demonstrations."""
+        """The names that ``set_keys`` takes: SACLoss's, and ``is_demonstration``."""
 
-        is_target: NestedKey = "is_target"
+        is_demonstration: NestedKey = "is_demonstration"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
+    in_keys: list[NestedKey]
 
+    @checked
     def __init__(
         self,
-        actor_network: TensorDictModule,
-        qvalue_network: TensorDictModule | list[TensorDictModule],
+        actor_network: TensorDictModuleBase,
+        qvalue_network: TensorDictModuleBase | list[TensorDictModuleBase],
         *,
         bc_weight: float = 2.0,
         **options: Any,
     ) -> None:
+        _check_options(options)
+        _check_critics(qvalue_network)
         super().__init__(actor_network, qvalue_network, **options)
         self.bc_weight = check_scale("bc_weight", bc_weight)
+        self.in_keys = [*self.in_keys, self.tensor_keys.is_demonstration]
 
-    def _set_in_keys(self) -> None:
-        super()._set_in_keys()
-        self._in_keys: list[NestedKey] = list({*self._in_keys, self.tensor_keys.is_target})
+    def set_keys(self, **keys: NestedKey) -> None:
+        """Read and write under other names; see :class:`torchrl.objectives.LossModule`."""
+        super().set_keys(**keys)
+        self.in_keys = [*self.in_keys, self.tensor_keys.is_demonstration]
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """The actor's loss, () float32, and ``log_prob`` and ``bc_loss``, detached."""
         loss, metadata = super().actor_loss(tensordict)
-        weights = self._maybe_get_priority_weight(tensordict)
         with (
             set_exploration_type(ExplorationType.DETERMINISTIC),
             self.actor_network_params.to_module(self.actor_network, preserve_module_state=False),
         ):
             mode = self.actor_network.get_dist(tensordict.copy()).deterministic_sample
-        bc = imitation(mode, tensordict.get(self.tensor_keys.action), tensordict.get(self.tensor_keys.is_target))
+        demonstrated = _demonstrations(tensordict, self.tensor_keys.is_demonstration)
+        bc = imitation(mode, tensordict.get(self.tensor_keys.action), demonstrated)
+        weights = priority_weight(self, tensordict)
         term = self._reduce_loss(self.bc_weight * bc, tensordict=tensordict, weights=weights)
         return loss + term, {**metadata, "bc_loss": bc.mean().detach()}

@@ -13,10 +13,11 @@ from torch import Tensor
 from torchrl.objectives import LossModule, ValueEstimators
 from torchrl.objectives.utils import dispatch_value_estimator
 
-from lw_torchrl._checks import check_probability
+from lw_torchrl._checks import check_probability, checked
 from lw_torchrl._keys import read
 from lw_torchrl.modules.critics import Value
 from lw_torchrl.modules.networks import evaluating
+from lw_torchrl.objectives.reduction import Reduction, let_go, priority_weight, set_reduction
 
 
 class ExpectileValueLoss(LossModule):
@@ -29,15 +30,16 @@ class ExpectileValueLoss(LossModule):
 
     Reads what the network reads, here and in ``next``, ``("next", "reward")`` (B, 1) float32, ``("next", "done")`` and
     ``("next", "terminated")`` (B, 1) bool, and, where they are, ``steps_to_next_obs`` (B,) int64 and
-    ``priority_weight`` (B,) float32. Gives ``loss_value`` () float32, and ``value`` () float32, the mean of V,
-    detached; it writes ``td_error`` (B,) float32, the largest of a row's u², into what it is given, for
-    :class:`torchrl.data.PrioritizedSampler`.
+    ``priority_weight`` (B,) float32. Gives ``loss_value`` () float32, (B,) by ``reduction="none"``, and ``value`` ()
+    float32, the mean of V, detached; it writes ``td_error`` (B,) float32, the largest of a row's u², into what it is
+    given, for :class:`torchrl.data.PrioritizedSampler`.
 
     Args:
         value_network: writes ``state_value`` (B, 1) float32. Where it writes ``state_values`` (B, E) float32, as
             :class:`PlanConditionedValue` with an ensemble does, each member learns by itself: their losses are added.
         expectile: τ, from 0 to 1.
         delay_value: targets by a network of their own, which :class:`torchrl.objectives.SoftUpdate` moves.
+        reduction: "mean", "none" or "sum" of the rows' losses.
 
     Raises:
         ValueError: a wrong option; at call time, keys that the network does not write, or rows that lack one.
@@ -86,10 +88,17 @@ class ExpectileValueLoss(LossModule):
     value_network_params: TensorDictParams
     target_value_network_params: TensorDictParams
 
+    @checked
     def __init__(
-        self, value_network: TensorDictModuleBase, *, expectile: float = 0.7, delay_value: bool = True
+        self,
+        value_network: TensorDictModuleBase,
+        *,
+        expectile: float = 0.7,
+        delay_value: bool = True,
+        reduction: Reduction | None = None,
     ) -> None:
         super().__init__()
+        set_reduction(self, reduction)
         self.expectile = check_probability("expectile", expectile)
         self.convert_to_functional(value_network, "value_network", create_target_params=delay_value)
 
@@ -135,9 +144,9 @@ class ExpectileValueLoss(LossModule):
         weight = torch.where(error < 0, 1.0 - self.expectile, self.expectile)
         tensordict.set(self.tensor_keys.priority, error.detach().square().amax(-1))
         by_row = (weight * error.square()).sum(-1)
-        loss = self._reduce_loss(by_row, tensordict, weights=self._maybe_get_priority_weight(tensordict))
+        loss = self._reduce_loss(by_row, tensordict, weights=priority_weight(self, tensordict))
         found = TensorDict(loss_value=loss, value=values.detach().mean())
-        self._clear_weakrefs(tensordict, found, "value_network_params", "target_value_network_params")
+        let_go(tensordict, found, self.value_network_params, self.target_value_network_params)
         return found
 
     @torch.no_grad()

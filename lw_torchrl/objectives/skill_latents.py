@@ -12,6 +12,7 @@ from torchrl.objectives import LossModule
 
 from lw_torchrl._checks import check_choice
 from lw_torchrl.modules.plan_encoder import PlanEncoder
+from lw_torchrl.objectives.reduction import Reduction, let_go, set_reduction
 
 Kind = Literal["consistency", "contrastive"]
 KINDS = ("consistency", "contrastive")
@@ -28,12 +29,13 @@ class SkillLatentLoss(LossModule):
     "contrastive": latents of different skills keep apart. InfoNCE with each skill as its own positive and the others as
     negatives, at temperature 0.1; 0 would be the least that is. It draws nothing at random.
 
-    It reads no batch, and gives ``loss_latents`` () float32.
+    It reads no batch, and gives ``loss_latents`` () float32, of K skills (K,) by ``reduction="none"``.
 
     Args:
         network: a :class:`PlanEncoder`, or a policy or critic with one, of at least two different skills; its weights
             are trained, not copies.
         kind: "consistency" or "contrastive".
+        reduction: "mean", "none" or "sum" of the skills' terms, each of which is a mean over the others.
 
     Raises:
         ValueError: a network without plans, fewer than two skills, or another kind.
@@ -52,21 +54,23 @@ class SkillLatentLoss(LossModule):
 
     out_keys = ["loss_latents"]
     in_keys: list[str] = []
+    reduction: Reduction = "mean"
 
     encoder: TensorDictModule
     encoder_params: TensorDictParams
     target_encoder_params: TensorDictParams
 
-    def __init__(self, network: Any, kind: Kind = "consistency") -> None:
+    def __init__(self, network: Any, kind: Kind = "consistency", *, reduction: Reduction | None = None) -> None:
         super().__init__()
+        set_reduction(self, reduction)
         self.kind: Kind = check_choice("kind", kind, KINDS)
         self.convert_to_functional(skill_encoder("network", network), "encoder")
 
     def forward(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
         """The term; what is given is not read."""
         with self.encoder_params.to_module(self.encoder, preserve_module_state=False):
-            found = TensorDict(loss_latents=latent_term(self.encoder, self.kind))
-        self._clear_weakrefs(found, "encoder_params")
+            found = TensorDict(loss_latents=latent_term(self.encoder, self.kind, self.reduction))
+        let_go(found, self.encoder_params)
         return found
 
 
@@ -82,12 +86,19 @@ def skill_encoder(argument: str, network: Any) -> PlanEncoder:
     return encoder
 
 
-def latent_term(encoder: PlanEncoder, kind: Kind) -> Tensor:
-    """() float32, differentiable; works within ``vmap`` over the encoder's parameters."""
+def latent_term(encoder: PlanEncoder, kind: Kind, reduction: Reduction = "mean") -> Tensor:
+    """() float32, of K skills (K,) by "none", differentiable; works within ``vmap`` over the encoder's parameters."""
     latents = normalize(encoder.latents(), dim=-1)
     near = latents @ latents.mT
     if kind == "contrastive":
-        return (near / _TEMPERATURE).logsumexp(-1).mean() - 1.0 / _TEMPERATURE
-    texts = normalize(encoder.text_vectors, dim=-1)
-    pairs = len(texts) * (len(texts) - 1)  # the diagonal is 1 in both
-    return (near - texts @ texts.mT).square().sum() / pairs
+        apart = (near / _TEMPERATURE).logsumexp(-1)
+        if reduction == "mean":
+            return apart.mean() - 1.0 / _TEMPERATURE
+        each = apart - 1.0 / _TEMPERATURE
+    else:
+        texts = normalize(encoder.text_vectors, dim=-1)
+        off, others = (near - texts @ texts.mT).square(), len(texts) - 1  # the diagonal is 1 in both
+        if reduction == "mean":
+            return off.sum() / (len(texts) * others)
+        each = off.sum(-1) / others
+    return each if reduction == "none" else each.sum()

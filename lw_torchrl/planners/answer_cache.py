@@ -9,8 +9,8 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from lw_torchrl._files import read_json, write_json
-from lw_torchrl.planners.answers import NO_TOKENS, Tokens
+from lw_torchrl._files import JSON_LIMIT, parse_json, read_json, write_text
+from lw_torchrl.planners.answers import NO_TOKENS, Tokens, is_count
 
 _VERSION = 1
 
@@ -71,19 +71,40 @@ class AnswerCache:
         except FileNotFoundError:
             return None
         try:
-            if answer_key(found["request"]) != answer_key(request):
-                raise ValueError("it answers another request")
-            said = found["answer"]
-            reply = Reply(said["text"], said["finish"], said["refusal"], Tokens(**said["tokens"]), tuple(said["notes"]))
-            texts = (reply.text, reply.finish, reply.refusal, *reply.notes)
-            if not all(isinstance(text, str) for text in texts):
-                raise ValueError("its texts must be strings")
-            if not all(type(count) is int for count in (reply.tokens.prompt, reply.tokens.completion)):
-                raise ValueError("its tokens must be integers")
-        except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"the kept answer {str(path)!r} cannot be read: {error!r}") from error
-        return reply
+            return _reply(found, request)
+        except ValueError as error:
+            raise ValueError(f"the kept answer {str(path)!r} cannot be read: {error}") from error
 
     def write(self, request: dict[str, Any], reply: Reply) -> None:
-        """Keep an answer, whole or not at all."""
-        write_json(self.path(request), {"request": request, "answer": asdict(reply)})
+        """Keep an answer, whole or not at all.
+
+        Raises:
+            ValueError: it could not be read back, so it is not written.
+        """
+        try:
+            text = json.dumps({"request": request, "answer": asdict(reply)}, indent=2, allow_nan=False) + "\n"
+            if len(text) > JSON_LIMIT:
+                raise ValueError(f"it is larger than {JSON_LIMIT} bytes")
+            if _reply(parse_json(text.encode()), request) != reply:
+                raise ValueError("it would be read back as another")
+        except (TypeError, ValueError, RecursionError) as error:
+            raise ValueError(f"the answer cannot be kept: {error}") from error
+        write_text(self.path(request), text)
+
+
+def _reply(found: dict[str, Any], request: dict[str, Any]) -> Reply:
+    """The reply in what a file holds; :class:`ValueError` if it is none to this request."""
+    try:
+        if answer_key(found["request"]) != answer_key(request):
+            raise ValueError("it answers another request")
+        said = found["answer"]
+        reply = Reply(said["text"], said["finish"], said["refusal"], Tokens(**said["tokens"]), tuple(said["notes"]))
+    except (KeyError, TypeError, RecursionError) as error:
+        raise ValueError(repr(error)) from error
+    texts = (reply.text, reply.finish, reply.refusal, *reply.notes)
+    if not all(isinstance(text, str) for text in texts):
+        raise ValueError("its texts must be strings")
+    "".join(texts).encode()  # a lone surrogate goes into no file of an answer
+    if not (is_count(reply.tokens.prompt) and is_count(reply.tokens.completion)):
+        raise ValueError("its tokens must be integers from 0 to 2**53")
+    return reply

@@ -7,8 +7,9 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import overload
+from typing import TypeGuard, overload
 
+from lw_torchrl._checks import checked
 from lw_torchrl._files import write_text
 from lw_torchrl.language.decoded import DecodedPlan
 from lw_torchrl.language.formats import PLAN_FORMATS
@@ -35,6 +36,23 @@ class Tokens:
 
 
 NO_TOKENS = Tokens()
+
+
+def is_count(value: object) -> TypeGuard[int]:
+    """Whether it can be a number of tokens."""
+    return type(value) is int and 0 <= value < 2**53
+
+
+def storable(text: str) -> str:
+    r"""A text as it reads once it was in a file: without half characters and marks of byte order, and its lines end in
+    one way.
+
+    Example:
+        >>> storable("\ufeffone\r\ntwo \ud800")
+        'one\ntwo ?'
+    """
+    whole = text.encode("utf-8", "replace").decode()
+    return whole.replace("\r\n", "\n").replace("\r", "\n").lstrip("\ufeff")
 
 
 @dataclass(frozen=True)
@@ -92,6 +110,7 @@ class Answers(Sequence[Answer]):
         return f"Answers({len(self)} answers, {plans} plans, {self.tokens.total} tokens)"
 
 
+@checked
 def folder_name(model: str) -> str:
     """A model's name as that of a folder.
 
@@ -102,11 +121,13 @@ def folder_name(model: str) -> str:
     return re.sub(r"[^\w .+-]+", "_", model).strip(" ._")[:100].rstrip(" .") or "model"
 
 
+@checked
 def answer_path(folder: str | os.PathLike[str], model: str, format: str, task: str, attempt: int) -> Path:
     """Where the answer of a model is kept."""
     return Path(folder) / folder_name(model) / format / f"{task}-{attempt}.{PLAN_FORMATS[format].extension}"
 
 
+@checked
 def write_answer(folder: str | os.PathLike[str], model: str, answer: Answer) -> Path:
     """Write an answer to its place, whole or not at all; one that came in another form beside it, as .json."""
     path = answer_path(folder, model, answer.format, answer.task, answer.attempt)

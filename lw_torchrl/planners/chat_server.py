@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import re
-from collections.abc import Mapping
+import threading
+from collections.abc import Coroutine, Mapping
 from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Any
-from urllib.parse import urlsplit
+from urllib.parse import parse_qsl, unquote, urlsplit
 
-from lw_torchrl._checks import shown
+from lw_torchrl._checks import counted, shown
 from lw_torchrl.planners.answer_cache import Reply
-from lw_torchrl.planners.answers import Tokens
+from lw_torchrl.planners.bounded_client import bounded_client
+from lw_torchrl.planners.completion import NoCompletion, in_a_line, read_completion
 from lw_torchrl.planners.errors import PlannerError
+from lw_torchrl.planners.hiding import Hider
 
 OPENAI = "https://api.openai.com/v1"
 _KEY = "OPENAI_API_KEY"
-_LONGEST = 300  # characters of what a server said, in an error
 
 
 def server_address(base_url: str | None) -> str:
@@ -30,9 +33,8 @@ def server_address(base_url: str | None) -> str:
         >>> server_address("http://me:secret@127.0.0.1:8000/v1/")
         'http://127.0.0.1:8000/v1'
     """
-    given = base_url or os.environ.get("OPENAI_BASE_URL") or OPENAI
     try:
-        found = urlsplit(given)
+        found = urlsplit(_given(base_url))
         host = f"[{found.hostname}]" if found.hostname and ":" in found.hostname else found.hostname
         port = "" if found.port is None else f":{found.port}"
     except (ValueError, AttributeError, TypeError):
@@ -40,6 +42,17 @@ def server_address(base_url: str | None) -> str:
     if not host or found.scheme not in ("http", "https"):
         raise ValueError(f"base_url must be an address like 'http://127.0.0.1:8000/v1', got {shown(base_url)}")
     return f"{found.scheme}://{host}{port}{found.path.rstrip('/')}"
+
+
+def _given(base_url: str | None) -> str:
+    return base_url or os.environ.get("OPENAI_BASE_URL") or OPENAI
+
+
+def _secrets(key: str, base_url: str | None) -> list[str]:
+    """The key, and what an address has that :func:`server_address` leaves out."""
+    found = urlsplit(_given(base_url))
+    inside = [found.username, found.password, *(value for _, value in parse_qsl(found.query))]
+    return [key, *(unquote(text) for text in inside if text)]
 
 
 @dataclass(frozen=True)
@@ -77,13 +90,13 @@ class ChatServer:
     Args:
         model: its name there.
         base_url: None for what OPENAI_BASE_URL says, or OpenAI's.
-        timeout: seconds that an answer may take.
+        timeout: seconds that one try may take as a whole, from the connection to the answer's last byte.
         retries: how often a question is asked again after a rate limit, a fault of the server or of the connection.
         dialect: what it is known to write.
 
     Raises:
         ImportError: the extra ``[llm]`` is absent.
-        PlannerError: there is no key for a server that wants one.
+        PlannerError: there is no key for a server that wants one, or it is none that can be sent.
     """
 
     def __init__(
@@ -105,19 +118,44 @@ class ChatServer:
                 "base_url of a server that wants none",
                 fatal=True,
             )
+        if not (self._key.isascii() and self._key.isprintable()):
+            raise PlannerError(f"the key in {_KEY} has characters that no key has: set it anew", fatal=True)
+        self._hidden = Hider(_secrets(self._key, base_url))
         self.dialect = dialect or Dialect("max_completion_tokens" if own else "max_tokens")
         self._settled = False  # whether it has answered, so that its dialect is known
-        self._client = openai.OpenAI(
-            api_key=self._key or "none", base_url=base_url, timeout=openai.Timeout(timeout, connect=min(timeout, 10.0))
+        self._client = openai.AsyncOpenAI(
+            api_key=self._key or "none", base_url=base_url, http_client=bounded_client(openai, timeout)
         )
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, name="questions to a server", daemon=True)
 
     def __enter__(self) -> ChatServer:
+        self._hidden.__enter__()
+        self._thread.start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._client.close()
+        """Questions that are under way end unanswered."""
+        self._wait(self._close())
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
+        self._hidden.__exit__()
+
+    async def _close(self) -> None:
+        asked = asyncio.all_tasks() - {asyncio.current_task()}
+        for task in asked:
+            task.cancel()
+        await asyncio.gather(*asked, return_exceptions=True)
+        await self._client.close()
+
+    def _wait(self, work: Coroutine[Any, Any, Any]) -> Any:
+        try:
+            return asyncio.run_coroutine_threadsafe(work, self._loop).result()
+        finally:
+            work.close()  # where the loop was closed before it began
 
     def ask(self, request: Mapping[str, Any], question: str) -> Reply:
         """The answer to a request.
@@ -128,60 +166,50 @@ class ChatServer:
             question: what to call it in an error.
 
         Raises:
-            PlannerError: no answer came.
+            PlannerError: no answer came, or none that can be read.
         """
         fault: Exception
         while True:
             settled, dialect = self._settled, self.dialect
             try:
-                found = self._create(request, dialect, self.retries if settled or not request["schema"] else 0)
+                retries = self.retries if settled or not request["schema"] else 0
+                content = self._wait(self._create(request, dialect, retries))
             except self._openai.APIStatusError as error:
-                adapted = dialect.after(error.status_code, self._clean(str(error)))
+                adapted = dialect.after(error.status_code, self._clean(self._said(error)))
                 if adapted != dialect:
                     self.dialect = adapted
                     continue
                 fault = error
-            except (self._openai.OpenAIError, ValueError) as error:  # the second: JSON that is none
+            except Exception as error:  # whatever a hostile reply brings the client to
                 fault = error
             else:
                 self._settled = True
                 notes = ["the schema was sent as json_object, since the server takes no json_schema"]
-                return self._reply(found, notes if dialect.refused and request["schema"] else [], question)
+                return self._reply(content, notes if dialect.refused and request["schema"] else [], question)
             if settled or not request["schema"]:
                 break
             self._settled = True  # it is not the dialect: again, with all retries
         raise self._explained(fault, question)  # here, where no cause that may hold the key is chained to it
 
-    def _create(self, request: Mapping[str, Any], dialect: Dialect, retries: int) -> Any:
+    async def _create(self, request: Mapping[str, Any], dialect: Dialect, retries: int) -> bytes:
         fields: dict[str, Any] = {dialect.limit: request["max_tokens"]}
         fields |= {name: request[name] for name in ("temperature", "seed") if request[name] is not None}
         if request["schema"]:
             fields["response_format"] = dialect.response_format(request["schema"])
-        return self._client.with_options(max_retries=retries).chat.completions.create(
+        client = self._client.with_options(max_retries=retries).chat.completions.with_raw_response
+        found = await client.create(
             model=self.model, messages=request["messages"], extra_body=request["options"], **fields
         )
+        return bytes(found.content)
 
-    def _reply(self, found: Any, notes: list[str], question: str) -> Reply:
-        choices = getattr(found, "choices", None)
-        choice = choices[0] if isinstance(choices, list) and choices else None
-        message = getattr(choice, "message", None)
-        if message is None:
-            raise self._error(
-                question,
-                f"what came is no chat completion: {self._clean(str(found))}",
-                "See that base_url is the address of an OpenAI-compatible server; it usually ends in /v1",
-                fatal=True,
-            )
-        usage, answered = getattr(found, "usage", None), self._clean(_text(getattr(found, "model", None)))
+    def _reply(self, content: bytes, notes: list[str], question: str) -> Reply:
+        try:
+            reply, answered = read_completion(content, self._hidden)
+        except NoCompletion as error:
+            raise self._error(question, str(error), error.hint, error.fatal) from None
         if not (answered.startswith(self.model) or self.model.startswith(answered)):  # a date may stand behind
             notes = [*notes, f"the server says that the model {answered!r} answered, not {self.model!r}"]
-        return Reply(
-            _text(getattr(message, "content", None)),
-            _text(getattr(choice, "finish_reason", None)),
-            _text(getattr(message, "refusal", None)),
-            Tokens(_count(usage, "prompt_tokens"), _count(usage, "completion_tokens")),
-            tuple(notes),
-        )
+        return replace(reply, notes=(*notes, *reply.notes))
 
     def _error(self, question: str, what: str, hint: str, fatal: bool = False) -> PlannerError:
         refused = f" (before, it did not take response_format json_schema: {self.dialect.refused})"
@@ -190,8 +218,9 @@ class ChatServer:
 
     def _explained(self, fault: Exception, question: str) -> PlannerError:
         """The error in our words: what came, and what to try."""
-        said, tried = self._clean(str(fault)), f"asked {self.retries + 1} times"
-        cause = self._clean(str(fault.__cause__ or fault))
+        said, tried = self._clean(self._said(fault)), self._tried()
+        broken = fault.__cause__ or fault
+        cause = self._clean(str(broken)) or type(broken).__name__
         if isinstance(fault, self._openai.APITimeoutError):
             what, hint = (
                 f"no answer within {self.timeout:g} s, {tried}",
@@ -201,13 +230,18 @@ class ChatServer:
             what = f"the connection failed or broke off, {tried}: {cause}"
             return self._error(question, what, "See that the server runs, and that base_url is its address", fatal=True)
         elif not isinstance(fault, self._openai.APIStatusError):
-            return self._error(question, f"the answer was cut off or is no JSON: {said}", "Ask again")
+            what, hint = f"it could not be asked ({type(fault).__name__}: {said})", "Ask again"
         else:
-            return self._refused(fault.status_code, said, question)
+            return self._refused(fault, said, question)
         return self._error(question, what, hint)
 
-    def _refused(self, status: int, said: str, question: str) -> PlannerError:
-        tried, fatal = f", asked {self.retries + 1} times", status in (401, 403, 404, 429)
+    def _refused(self, fault: Any, said: str, question: str) -> PlannerError:
+        status = fault.status_code
+        tried, fatal = f", {self._tried()}", status < 400 or status in (401, 403, 404, 429)
+        if status < 400:
+            there = self._clean(str(fault.response.headers.get("location", "nowhere")))
+            hint = "Give the address that it really has as base_url; no redirect is followed"
+            return self._error(question, f"the server sends on to {there} (status {status})", hint, fatal)
         if status in (401, 403):
             known = f"the key in {_KEY} is not accepted" if self._key else f"it wants a key, in {_KEY}"
             return self._error(question, f"{known} ({said})", "Give the key of this server", fatal)
@@ -226,20 +260,19 @@ class ChatServer:
             return self._error(question, f"the server failed{tried} ({said})", "Its own log may say why; ask again")
         return self._error(question, f"the request is refused ({said})", "Leave out what it does not know")
 
+    def _tried(self) -> str:
+        return f"asked {counted(self.retries + 1, 'time')}"
+
+    def _said(self, fault: Exception) -> str:
+        """What a fault says; of a refusal in a form that the client does not know, what came."""
+        said = str(fault)
+        if (
+            isinstance(fault, self._openai.APIStatusError)
+            and " - " not in said
+            and (came := fault.response.text.strip())
+        ):
+            return f"{said} - {came}"
+        return said
+
     def _clean(self, text: str) -> str:
-        """What a server said: in one line, short, and without the key."""
-        plain = self._hidden(" ".join(re.sub(r"<(style|script).*?</\1>|<[^>]*>", " ", text, flags=re.DOTALL).split()))
-        return plain if len(plain) <= _LONGEST else f"{plain[:_LONGEST]} ..."
-
-    def _hidden(self, text: str) -> str:
-        return text.replace(self._key, "(the key)") if self._key else text
-
-
-def _text(value: Any) -> str:
-    """A text that any file can hold; "" for what is none."""
-    return value.encode("utf-8", "replace").decode() if isinstance(value, str) else ""
-
-
-def _count(usage: Any, name: str) -> int:
-    value = getattr(usage, name, 0)
-    return value if type(value) is int and value >= 0 else 0
+        return in_a_line(text, self._hidden)

@@ -9,12 +9,12 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from lw_torchrl._checks import check_choice, check_int, counted, shown, unknown_name
+from lw_torchrl._checks import check_choice, check_int, checked, counted, shown, unknown_name
 from lw_torchrl._files import read_text
 from lw_torchrl.language.decoding import decode_plan
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.tasks import Task, named_tasks
-from lw_torchrl.planners.answers import Answer, Answers, folder_name, write_answer
+from lw_torchrl.planners.answers import Answer, Answers, folder_name, storable, write_answer
 from lw_torchrl.planners.errors import PlannerError
 
 _FIELDS = {"llm": str, "format": str, "task": str, "attempt": int, "completion": str}
@@ -50,6 +50,7 @@ class FilePlanner:
         True
     """
 
+    @checked
     def __init__(self, source: str | os.PathLike[str], model: str | None = None) -> None:
         found = recorded_answers(source)
         if model is None and len(found) > 1:
@@ -125,7 +126,7 @@ def ignored_files(source: str | os.PathLike[str]) -> list[Path]:
 
 def answer_text(found: str | Path) -> str:
     """The text of an answer that :func:`recorded_answers` gives."""
-    return read_text(found, ValueError) if isinstance(found, Path) else found
+    return storable(read_text(found, ValueError) if isinstance(found, Path) else found)
 
 
 def _of_folder(root: Path) -> dict[str, dict[_Place, str | Path]]:
@@ -165,4 +166,6 @@ def _row(line: str, where: str) -> dict[str, Any]:
         if not isinstance(row, dict) or type(row.get(name)) is not kind:
             raise ValueError(f"{where}: an answer has {', '.join(_FIELDS)}, got {shown(row)}")
     check_choice(f"{where}: format", row["format"], PLAN_FORMATS)
+    if not 0 <= row["attempt"] < 10**9:
+        raise ValueError(f"{where}: attempt must be from 0 to 999999999, got {shown(row['attempt'])}")
     return dict(row)

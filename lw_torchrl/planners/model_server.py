@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import os
 import socket
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
-from lw_torchrl._checks import check_int, shown, unknown_name
+from lw_torchrl._checks import check_int, unknown_name
+from lw_torchrl.planners.guard import Guard, run_server
 
 INSTALL = (
     "serving a model needs the extra [serve]: pip install 'lw_torchrl[serve]'; llama.cpp is built from its source, "
@@ -53,6 +52,9 @@ def serve_model(
 ) -> None:
     """Serve a language model until Ctrl-C, one question at a time.
 
+    It takes ``POST /v1/chat/completions`` and ``GET /v1/models`` alone, with the fields and sizes that
+    :class:`~lw_torchrl.planners.guard.Guard` lets pass. By default it refuses who calls this machine by another name.
+
     Args:
         model: a GGUF file; None for the small one of the extra ``[serve]``.
         host: the address to listen at; the default is heard by this machine alone, and there is no key.
@@ -76,7 +78,6 @@ def serve_model(
         check_int("threads", threads, minimum=1)
     file = model_file(model)
     try:
-        import uvicorn
         from llama_cpp.server.app import create_app
         from llama_cpp.server.settings import ModelSettings, ServerSettings
     except ImportError as error:
@@ -95,58 +96,12 @@ def serve_model(
         except ValueError as error:
             raise ValueError(f"model {str(file)!r} cannot be loaded: {error}") from error
         ready(name, f"http://{host}:{listener.getsockname()[1]}/v1")
-        uvicorn.Server(uvicorn.Config(as_openai(app, name), log_level="warning")).run(sockets=[listener])
+        run_server(Guard(app, name, context, local_names(host)), listener)
 
 
-def as_openai(app: Any, name: str) -> Any:
-    """A server that takes a schema as OpenAI's does, which llama-cpp-python's knows by another name alone, and has no
-    other model than ``name``, where that answers for any."""
-
-    async def asked(scope: Any, receive: Any, send: Any) -> None:
-        if scope["type"] != "http" or scope["path"] != "/v1/chat/completions":
-            return await app(scope, receive, send)
-        message = await receive()
-        while message.get("more_body"):
-            more = await receive()
-            message = {**more, "body": message.get("body", b"") + more.get("body", b"")}
-
-        async def whole() -> Any:
-            nonlocal message
-            now, message = message, {"type": "http.disconnect"}
-            return now if now["type"] == "http.request" else await receive()
-
-        body = message.get("body", b"")
-        if (wanted := _wanted(body)) not in (None, name):
-            return await _refuse(send, f"the model {shown(wanted)} does not exist here; {name!r} is served")
-        message["body"] = _renamed(body)
-        await app(scope, whole, send)
-
-    return asked
-
-
-def _wanted(body: bytes) -> Any:
-    try:
-        found = json.loads(body)
-    except (ValueError, RecursionError):
-        return None
-    return found.get("model") if isinstance(found, dict) else None
-
-
-async def _refuse(send: Any, message: str) -> None:
-    """As OpenAI's server refuses a model."""
-    error = {"message": message, "type": "invalid_request_error", "param": "model", "code": "model_not_found"}
-    headers = [(b"content-type", b"application/json")]
-    await send({"type": "http.response.start", "status": 404, "headers": headers})
-    await send({"type": "http.response.body", "body": json.dumps({"error": error}).encode()})
-
-
-def _renamed(body: bytes) -> bytes:
-    try:
-        request = json.loads(body)
-        schema = request["response_format"]["json_schema"]["schema"]
-    except (ValueError, RecursionError, KeyError, TypeError):
-        return body
-    return json.dumps(request | {"response_format": {"type": "json_object", "schema": schema}}).encode()
+def local_names(host: str) -> set[str] | None:
+    """What a request may call a machine that is heard by itself alone; None where others hear it, by any name."""
+    return {"localhost", host} if host == "localhost" or host.startswith("127.") else None
 
 
 def model_file(model: str | os.PathLike[str] | None) -> Path:

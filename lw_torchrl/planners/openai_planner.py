@@ -10,15 +10,15 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, Literal
 
-from lw_torchrl._checks import check_choice, check_int, check_scale, counted, shown
+from lw_torchrl._checks import check_choice, check_int, check_scale, checked, counted, shown
 from lw_torchrl._progress import Progress
 from lw_torchrl.language.formats import PLAN_FORMATS
-from lw_torchrl.language.plans import ConditionalPlan, Plans
+from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.skills import ScriptedSkill
 from lw_torchrl.language.tasks import TASKS, Task, check_task, named_tasks
 from lw_torchrl.planners.answer_cache import AnswerCache, Reply
 from lw_torchrl.planners.answer_folder import already_answered, recorded_answer, settle_folder
-from lw_torchrl.planners.answers import Answer, Answers, folder_name, write_answer
+from lw_torchrl.planners.answers import Answer, Answers, folder_name, storable, write_answer
 from lw_torchrl.planners.asking import ask_at_once
 from lw_torchrl.planners.chat_server import ChatServer, Dialect, server_address
 from lw_torchrl.planners.errors import unanswered
@@ -54,7 +54,8 @@ class OpenAIPlanner:
         concurrency: questions at once.
         retries: how often a question is asked again after a rate limit, a fault of the server or of the connection,
             after a wait that doubles from half a second to 8, or as long as the server says, up to two minutes.
-        timeout: seconds that an answer may take.
+        timeout: seconds that one try may take as a whole, from the connection to the answer's last byte; each of the
+            ``retries`` has as long.
 
     Raises:
         ValueError: a number that is too small, ``base_url`` is no address, or ``free_skills`` without ``constrain``.
@@ -70,6 +71,7 @@ class OpenAIPlanner:
     Source: paper section 'LLM Experiments'.
     """
 
+    @checked
     def __init__(
         self,
         model: str,
@@ -92,13 +94,16 @@ class OpenAIPlanner:
     ) -> None:
         if not isinstance(model, str) or not model.strip():
             raise TypeError(f"model must be a model's name, got {shown(model)}")
+        if storable(model) != model:
+            raise ValueError(f"model must be a name that UTF-8 can hold, in one line, got {shown(model)}")
         for argument, given in (("constrain", constrain), ("free_skills", free_skills), ("vocabulary", vocabulary)):
             if not isinstance(given, bool):
                 raise TypeError(f"{argument} must be True or False, got {shown(given)}")
         if free_skills and not constrain:
             raise ValueError("free_skills=True is for constrain alone: without, skills are in any words")
         self.model, self.base_url, self.constrain, self.free_skills = model, base_url, constrain, free_skills
-        self.skills, self.examples, self.vocabulary = skills, plans, vocabulary
+        self.skills, self.vocabulary = skills, vocabulary
+        self.examples = None if plans is None else as_plans(plans)
         self.address = server_address(base_url)
         self.temperature = None if temperature is None else check_scale("temperature", temperature)
         self.max_tokens = check_int("max_tokens", max_tokens, minimum=1)
@@ -301,7 +306,10 @@ class OpenAIPlanner:
 
             def ask(question: Question) -> Reply:
                 reply = server.ask(question.request, str(question))
-                self.cache.write(question.request, reply)
+                try:
+                    self.cache.write(question.request, reply)
+                except ValueError as error:
+                    return replace(reply, notes=(*reply.notes, str(error)))
                 return reply
 
             yield from ask_at_once(ask, questions, self.concurrency)

@@ -11,7 +11,7 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from lw_torchrl._checks import check_choice
+from lw_torchrl._checks import check_choice, checked
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.queries import base_clauses
 from lw_torchrl.language.relations import RELATIONS
@@ -22,8 +22,10 @@ MOST_STEPS, MOST_CLAUSES = 8, 5
 """So that a model that repeats itself comes to an end; the longest shipped plan has 6 steps, its conditions up to 5."""
 _SKILL = "^[a-z]+( [a-z'-]+){1,12}$"
 _BECAUSE = "^[A-Za-z0-9,.:;'-]+( [A-Za-z0-9,.:;'-]+){1,29}$"
+PATTERNS = frozenset([_SKILL, _BECAUSE])
 
 
+@checked
 def plan_schema(
     task: str | Task,
     format: str = "basic_py",

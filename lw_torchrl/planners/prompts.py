@@ -10,7 +10,7 @@ from functools import cache
 
 from rapidfuzz.distance import Levenshtein
 
-from lw_torchrl._checks import check_choice, shown
+from lw_torchrl._checks import check_choice, checked, shown
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
@@ -21,6 +21,7 @@ _ALWAYS = "pick-place"  # it has skills that many tasks need
 _EXAMPLES = 3
 
 
+@checked
 def prompt_examples(
     task: str | Task, plans: Plans | Mapping[str, ConditionalPlan] | None = None, *, tasks: Mapping[str, Task] = TASKS
 ) -> tuple[ConditionalPlan, ...]:
@@ -64,6 +65,7 @@ def _hand_written() -> Plans:
     return load_plans("MT10")
 
 
+@checked
 def plan_prompt(
     task: str | Task,
     format: str,

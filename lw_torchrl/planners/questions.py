@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from lw_torchrl._checks import shown
+from lw_torchrl._files import parse_json
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.formats.structured import write_structured
 from lw_torchrl.language.plans import ConditionalPlan, Plans
@@ -89,8 +90,8 @@ def request_options(options: Mapping[str, Any] | None) -> dict[str, Any] | None:
     if options is None:
         return None
     try:
-        found = json.loads(json.dumps(dict(options), allow_nan=False))
-    except (TypeError, ValueError) as error:
+        found = parse_json(json.dumps(dict(options), allow_nan=False, ensure_ascii=False).encode())
+    except (TypeError, ValueError, RecursionError) as error:
         raise TypeError(f"options must be fields of a request, as JSON has them, got {shown(options)}") from error
     if taken := sorted(_OWN_FIELDS & set(found)):
         raise ValueError(f"options must be other fields than {', '.join(sorted(_OWN_FIELDS))}, got {', '.join(taken)}")

@@ -14,7 +14,7 @@ from lw_torchrl.language.skills import ScriptedSkill
 from lw_torchrl.language.step_mapping import StepMapper
 from lw_torchrl.language.tasks import Task
 from lw_torchrl.planners.answer_cache import Reply
-from lw_torchrl.planners.answers import Answer
+from lw_torchrl.planners.answers import Answer, storable
 from lw_torchrl.planners.plan_schema import passes
 
 CUT_OFF = "it was cut off at max_tokens"
@@ -39,8 +39,9 @@ def read_reply(
         schema: what the model was to be held to; JSON is expected then, and becomes a text in the format.
     """
     read = PLAN_FORMATS[format].read if schema is None else read_structured
-    decoded = decode_as(reply.text, read, StepMapper(task, skills, "edit", LIMIT, SKILL_LIMIT))
-    text = encode_plan(decoded.plan, format) if schema and decoded.plan is not None else reply.text
+    raw = storable(reply.text)
+    decoded = decode_as(raw, read, StepMapper(task, skills, "edit", LIMIT, SKILL_LIMIT))
+    text = encode_plan(decoded.plan, format) if schema and decoded.plan is not None else raw
     notes = []
     if reply.finish == "length":
         notes.append(CUT_OFF)
@@ -48,13 +49,12 @@ def read_reply(
         notes.append("a filter of the server cut it off")
     if reply.refusal:
         notes.append(f"the model refused: {shown(reply.refusal)}")
-    elif not reply.text.strip():
+    elif not raw.strip():
         notes.append("it is empty")
-    elif schema and reply.finish != "length" and not _passes(reply.text, schema):
+    elif schema and reply.finish != "length" and not _passes(raw, schema):
         notes.append("the server did not keep to the schema")
     return Answer(
-        task.name, format, attempt, text.encode("utf-8", "replace").decode(), reply.text, decoded, reply.tokens,
-        notes=(*notes, *reply.notes),
+        task.name, format, attempt, storable(text), raw, decoded, reply.tokens, notes=(*notes, *reply.notes)
     )  # fmt: skip
 
 

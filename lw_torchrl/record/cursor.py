@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import subprocess
+import threading
 import time
+from contextlib import suppress
+from queue import Empty, SimpleQueue
 from typing import Any
 
 from lw_torchrl.record.rerun_binary import LOCAL
@@ -21,17 +24,32 @@ def connect(process: subprocess.Popen[bytes], port: int) -> tuple[Any, Any]:
     from rerun.experimental import ViewerClient
 
     deadline = time.monotonic() + START_SECONDS
-    client: Any = None
-    while time.monotonic() < deadline and process.poll() is None:
-        try:
-            client = client or ViewerClient.connect(f"rerun+http://{LOCAL}:{port}/proxy")
-            state = client.get_state()
-            if state.recordings and state.active_recording and not state.loading:
-                return client, state.recordings[0]
-        except ConnectionError:
-            client = None
-        time.sleep(0.1)
-    raise TimeoutError(f"no answer within {START_SECONDS:.0f} seconds")
+    found: SimpleQueue[tuple[Any, Any] | Exception | None] = SimpleQueue()
+
+    def ask() -> None:
+        client: Any = None
+        while time.monotonic() < deadline and process.poll() is None:
+            try:
+                client = client or ViewerClient.connect(f"rerun+http://{LOCAL}:{port}/proxy")
+                state = client.get_state()
+                if state.recordings and state.active_recording and not state.loading:
+                    return found.put((client, state.recordings[0]))
+            except ConnectionError:
+                client = None
+            except Exception as error:
+                return found.put(error)
+            time.sleep(0.1)
+        found.put(None)
+
+    # A call waits for ever where something listens and says nothing.
+    threading.Thread(target=ask, name="a viewer that starts", daemon=True).start()
+    with suppress(Empty):
+        came = found.get(timeout=START_SECONDS)
+        if isinstance(came, Exception):
+            raise came
+        if came is not None:
+            return came
+    raise TimeoutError(f"no answer within {START_SECONDS:g} seconds")
 
 
 def go_to(client: Any, recording: Any, step: int | None) -> None:

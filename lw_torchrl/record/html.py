@@ -15,6 +15,7 @@ from pathlib import Path
 from string import Template
 from urllib.error import URLError
 
+from lw_torchrl._checks import checked
 from lw_torchrl._files import replacing
 from lw_torchrl.record.cursor import request, sign
 from lw_torchrl.record.opening import find_recording, opened
@@ -32,6 +33,7 @@ _INSIDE = """const load = (name) => {
 };"""
 
 
+@checked
 def write_html(
     path: str | os.PathLike[str], page: str | os.PathLike[str], *, episode: str | None = None, step: int | None = None
 ) -> Path:

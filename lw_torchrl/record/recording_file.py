@@ -66,7 +66,8 @@ class RecordingFile:
 
     def close(self, indexed: bool = True) -> None:
         """End the file; where there is room for another of its size it is made compact, with an index."""
-        os.close(self._file)
+        if not self._close():
+            return
         room = shutil.disk_usage(self.path.parent).free > 2 * self._length + 2**20
         if indexed and room and self._length <= MOST_INDEXED:
             with replacing(self.path) as copy:
@@ -74,9 +75,15 @@ class RecordingFile:
 
     def discard(self) -> None:
         """Remove the file; an older one gets the name back."""
+        if self._close():
+            self.path.unlink()
+            self._put_back()
+
+    def _close(self) -> bool:
+        """Whether the file still has its name: another recording of that name sets it aside, in whatever process."""
+        own = os.fstat(self._file)
         os.close(self._file)
-        self.path.unlink(missing_ok=True)
-        self._put_back()
+        return self.path.exists() and os.path.samestat(own, self.path.stat())
 
     def _put_back(self) -> None:
         if self.previous is not None:

@@ -18,7 +18,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.record.loggers import Logger
 
-from lw_torchrl._checks import check_choice
+from lw_torchrl._checks import check_choice, checked
 from lw_torchrl.record.blueprint import make_blueprint
 from lw_torchrl.record.episodes import episode_name
 from lw_torchrl.record.heading import Heading
@@ -90,6 +90,7 @@ class RerunLogger(Logger):
     experiment: RecordingStream
     _service_shutdown: bool = False
 
+    @checked
     def __init__(
         self,
         path: str | os.PathLike[str] | None = None,
@@ -104,7 +105,7 @@ class RerunLogger(Logger):
         self.connect = None if connect is None else check_address(connect)[0]
         name = exp_name or (self.path.stem if self.path else "lw_torchrl")
         self.application_id = application_id or f"{name}-{uuid.uuid4().hex[:8]}"
-        self._lock = threading.Lock()
+        self._lock, self._adding = threading.RLock(), threading.Lock()
         self._scalars: dict[str, tuple[list[int], list[list[float]]]] = {}
         self._curves: dict[str, int] = {}
         self._counters: dict[str, int] = {}
@@ -283,8 +284,9 @@ class RerunLogger(Logger):
         self._counters = dict(state_dict.get("counters", {}))
 
     def _count(self, path: str, step: int | None) -> int:
-        now = self._counters.get(path, 0) if step is None else int(step)
-        self._counters[path] = now + 1
+        with self._lock:
+            now = self._counters.get(path, 0) if step is None else int(step)
+            self._counters[path] = now + 1
         return now
 
     def _send_scalars(self) -> None:
@@ -359,10 +361,11 @@ class RerunLogger(Logger):
     ) -> str:
         """Add the page of an episode that was checked; returns its name. With a motion the robot is shown as it is."""
         stream = self._open()
-        entity = episode_name(heading.name, name, self._pages)
-        title = heading.title(episode, None if entity == heading.name else entity)
-        self._pages[entity] = page = send_page(stream, entity, title, heading, episode, motion)
-        self._episodes.append(page.tab())
+        with self._adding:  # else two threads find the same name free
+            entity = episode_name(heading.name, name, self._pages)
+            title = heading.title(episode, None if entity == heading.name else entity)
+            self._pages[entity] = page = send_page(stream, entity, title, heading, episode, motion)
+            self._episodes.append(page.tab())
         return entity
 
     def compare(self, names: Sequence[str], title: str = "Side by side") -> None:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from lw_torchrl._checks import check_int, missing_keys
+from lw_torchrl._checks import check_int, checked, missing_keys, shown
 from lw_torchrl.evaluation.failures import Failure
 from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
@@ -18,12 +18,11 @@ from lw_torchrl.language.tasks import MT50, TASKS, Task, task_id
 from lw_torchrl.record.heading import Heading
 from lw_torchrl.record.mujoco_scene import Motion
 from lw_torchrl.record.recorded_episode import RecordedEpisode
+from lw_torchrl.record.rerun_logger import RerunLogger
 from lw_torchrl.record.resimulation import Difference, simulate_again
 
-if TYPE_CHECKING:
-    from lw_torchrl.record.rerun_logger import RerunLogger
 
-
+@checked
 def log_rollout(
     logger: RerunLogger,
     rollout: TensorDictBase,
@@ -121,6 +120,8 @@ def read_rollout(
         plans.require([label])
         plan = plans[label]
         _check_answers(rollout, plan)
+    if not isinstance(failure, Failure | None):
+        raise TypeError(f"failure must be a Failure, got {shown(failure)} ({type(failure).__name__})")
     if failure is not None and (failure.task, failure.episode) != (label, failure.episode if index is None else index):
         raise ValueError(
             f"failure must be of the rollout's episode, {label} {index}, got that of {failure.task} {failure.episode}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,15 +14,13 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase, Transform
 
-from lw_torchrl._checks import check_int
+from lw_torchrl._checks import check_int, checked
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.record.mujoco_scene import Motion, model_geometry
+from lw_torchrl.record.rerun_logger import RerunLogger
 from lw_torchrl.record.rollout_pages import read_rollout
 from lw_torchrl.transforms.containers import base_env, refuse_changed
-
-if TYPE_CHECKING:
-    from lw_torchrl.record.rerun_logger import RerunLogger
 
 _ROOM = 512  # steps, at first
 _FIXED = ("task_id", "episode", "qaf_plan")
@@ -68,6 +66,7 @@ class RolloutRecorder(Transform):
         >>> logger.shutdown()
     """
 
+    @checked
     def __init__(
         self,
         logger: RerunLogger,

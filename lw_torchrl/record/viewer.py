@@ -7,6 +7,7 @@ import re
 from contextlib import suppress
 from pathlib import Path
 
+from lw_torchrl._checks import checked
 from lw_torchrl._files import replacing
 from lw_torchrl.record.cursor import connect, go_to
 from lw_torchrl.record.opening import find_recording, opened
@@ -15,6 +16,7 @@ from lw_torchrl.record.rerun_binary import failure, free_port, running
 from lw_torchrl.record.screenshot import take_picture
 
 
+@checked
 def open_viewer(
     path: str | os.PathLike[str],
     screenshot: str | os.PathLike[str] | None = None,

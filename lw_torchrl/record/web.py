@@ -4,14 +4,21 @@ from __future__ import annotations
 
 import gzip
 import os
+import socket
+import threading
 from contextlib import AbstractContextManager, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from types import TracebackType
 
+from lw_torchrl._checks import checked
 from lw_torchrl.record.html import page_of, viewer_script, viewer_wasm
 from lw_torchrl.record.opening import find_recording, opened
 from lw_torchrl.record.opening_step import opening_step
 from lw_torchrl.record.rerun_binary import LOCAL
+
+ASKING_SECONDS, STALLED_SECONDS = 30.0, 30.0
+"""How long a request may take to come as a whole, and each piece of an answer to be taken."""
+_PIECE = 65_536
 
 _FETCHED = """const load = async (name) => {
   const answer = await fetch(name + ".gz");
@@ -43,6 +50,7 @@ class WebPage(AbstractContextManager["WebPage"]):
         ...     page.serve()
     """
 
+    @checked
     def __init__(
         self, path: str | os.PathLike[str], *, episode: str | None = None, step: int | None = None, port: int = 0
     ) -> None:
@@ -78,7 +86,24 @@ class WebPage(AbstractContextManager["WebPage"]):
 
 def _handler(files: dict[str, tuple[str, bytes]]) -> type[BaseHTTPRequestHandler]:
     class Handler(BaseHTTPRequestHandler):
+        def setup(self) -> None:
+            super().setup()
+            self.connection.settimeout(STALLED_SECONDS)
+            self._asking = threading.Timer(ASKING_SECONDS, self._end)
+            self._asking.daemon = True
+            self._asking.start()
+
+        def _end(self) -> None:
+            with suppress(OSError):  # it has ended by itself
+                self.connection.shutdown(socket.SHUT_RDWR)
+
+        def finish(self) -> None:
+            self._asking.cancel()
+            with suppress(OSError):  # what is left goes to nobody
+                super().finish()
+
         def do_GET(self) -> None:
+            self._asking.cancel()
             kind, content = files.get(self.path.partition("?")[0], ("", b""))
             if not kind:
                 self.send_error(404)
@@ -88,8 +113,9 @@ def _handler(files: dict[str, tuple[str, bytes]]) -> type[BaseHTTPRequestHandler
             self.send_header("Content-Length", str(len(content)))
             self.send_header("Cache-Control", "no-store")
             self.end_headers()
-            with suppress(ConnectionError):  # the page was closed
-                self.wfile.write(content)
+            with suppress(OSError):  # the page was closed, or takes nothing more
+                for start in range(0, len(content), _PIECE):
+                    self.wfile.write(content[start : start + _PIECE])
 
         def log_message(self, format: str, *args: object) -> None:
             pass

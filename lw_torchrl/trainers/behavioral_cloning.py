@@ -13,8 +13,8 @@ from torch.nn.utils import clip_grad_norm_
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.record.loggers import Logger
 
+from lw_torchrl._checks import checked
 from lw_torchrl._devices import CPU, drawn_on, place
-from lw_torchrl._files import sweep
 from lw_torchrl._progress import Progress
 from lw_torchrl.modules.policy import Policy
 from lw_torchrl.trainers.checkpoint import describe_data, describe_replay, write
@@ -23,11 +23,12 @@ from lw_torchrl.trainers.evaluator_anchor import EvaluatorAnchor
 from lw_torchrl.trainers.interrupts import interrupts_between_steps
 from lw_torchrl.trainers.latent_terms import LatentTerms
 from lw_torchrl.trainers.loss_state import bc_loss
-from lw_torchrl.trainers.minibatches import check_replay, draw_batch
+from lw_torchrl.trainers.minibatches import check_replay, draw_batch, verify_rows
 from lw_torchrl.trainers.normalization import check_contacts, fit_normalization
 from lw_torchrl.trainers.policy_checks import check_can_be_saved, check_trained
 from lw_torchrl.trainers.recent_losses import READ_EVERY, RecentLosses
 from lw_torchrl.trainers.training_state import (
+    OneWriter,
     TrainingState,
     check_description,
     load_state,
@@ -58,7 +59,7 @@ class BehavioralCloningTrainer:
 
     Warns:
         UserWarning: the checkpoint is of training on another kind of device: it goes on with the same minibatches, but
-            not bit for bit.
+            not bit for bit. Or it was written under another version of torch or another package that bits hang on.
 
     Raises:
         ValueError: the checkpoint is damaged, of another architecture, configuration or data; the actor writes no
@@ -83,6 +84,7 @@ class BehavioralCloningTrainer:
     Source: paper section 'Conditional Plan Experiments'; ``torchrl.objectives.BCLoss``.
     """
 
+    @checked
     def __init__(
         self,
         actor: TensorDictModuleBase,
@@ -98,13 +100,13 @@ class BehavioralCloningTrainer:
         self.device = place(actor, device)
         self.config = config = config or BehavioralCloningConfig()
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
+        self._writer = OneWriter(self.checkpoint)
         check_replay(actor, replay, config.batch_size)
         self._latent_terms = LatentTerms(actor, config)
         self._anchor = EvaluatorAnchor(actor) if config.qaf_anchor else None
         self._policy = None if self.checkpoint is None else check_can_be_saved(actor)
         self._described: dict[str, Any] = {}
         if self.checkpoint is not None and self._policy is not None:
-            sweep(self.checkpoint)
             self._described = {"actor": self._policy.describe(), "training": config.describe()}
             self._described |= {"data": describe_data(replay), "replay": describe_replay(replay)}
         self.loss = bc_loss(actor, config.loss_function)
@@ -112,6 +114,7 @@ class BehavioralCloningTrainer:
         self._losses = RecentLosses(("the loss",), config.learning_rate)
         self.state = TrainingState(replay, config.seed)
         if self.checkpoint is not None and self._policy is not None and self.checkpoint.exists():
+            verify_rows(replay)
             check_description(self.checkpoint, self._described)
             warn_of_another_device(self.checkpoint, self.device)
             found = load_training(self.checkpoint, self._policy, self._policy.state_dict(keep_vars=True))
@@ -132,6 +135,7 @@ class BehavioralCloningTrainer:
             state = state_of(self.optimizer, self.schedule, [self.state])
             described = self._described | where(self.device)
             write(self.checkpoint, described, self._policy, self._policy.state_dict(), state)
+            self._writer.know()
 
     def step(self) -> Tensor:
         """Train on one minibatch and return its loss, () float32, on the device: nobody has waited for it."""
@@ -176,7 +180,7 @@ class BehavioralCloningTrainer:
         self.actor.train()
         every, total = self.config.checkpoint_every, last_step(self.config, until)
         bar = Progress("training", self.config.steps, "step", initial=self.state.step, show=self.progress)
-        with bar, interrupts_between_steps() as interrupt:
+        with self._writer.alone(), bar, interrupts_between_steps() as interrupt:
             while self.state.step < total and not interrupt.asked:
                 losses.add(self.step())
                 step = self.state.step

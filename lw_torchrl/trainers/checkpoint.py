@@ -12,20 +12,22 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from torch import Tensor
 from torchrl.envs import Compose, Transform
 
+from lw_torchrl._checks import checked
 from lw_torchrl._state_tree import split
 from lw_torchrl._tensor_archive import ArchiveError, TensorArchive, write_archive
-from lw_torchrl.language.text import TEXT_DIMENSION, TextEncoder
+from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.policy import Policy, from_description
 from lw_torchrl.trainers.policy_checks import (
-    at_most,
     check_can_be_saved,
     check_options,
+    check_size,
     check_texts,
     copy_weights,
     first_line,
@@ -34,7 +36,7 @@ from lw_torchrl.trainers.policy_checks import (
 
 FORMAT = "lw_torchrl.policy"
 FORMAT_VERSION = 3
-_RESERVED = {"format", "version", "actor", "state", "sha256"}
+_RESERVED = {"format", "version", "versions", "actor", "state", "sha256"}
 
 
 def describe_data(replay: Any) -> dict[str, Any] | None:
@@ -68,6 +70,7 @@ def _describe_transform(transform: Transform) -> dict[str, str]:
     return {"class": type(transform).__name__, **simple}
 
 
+@checked
 def save_actor(actor: Policy, path: str | os.PathLike[str], **about: Any) -> None:
     """Write a policy, for :func:`load_actor`; an earlier file is replaced whole.
 
@@ -181,18 +184,7 @@ def demonstrated_tasks(path: str | os.PathLike[str]) -> set[str]:
     return {task for part in named for task in part if isinstance(task, str)}
 
 
-def _of_texts(archive: TensorArchive) -> str:
-    """What an error is to say beside of texts that the shipped encoder did not encode."""
-    try:
-        widths = {vectors.shape[-1] for vectors in archive.tensors("texts").values() if vectors.ndim == 2}
-    except ArchiveError:
-        return ""
-    if widths <= {TEXT_DIMENSION} or "'one-hot'" in str(archive.description["actor"].get("options")):
-        return ""
-    wanted = ", ".join(map(str, sorted(widths)))
-    return f"; its texts have {wanted} numbers each: text_encoder must be the one that gave them"
-
-
+@checked
 def load_actor(path: str | os.PathLike[str], *, text_encoder: TextEncoder | None = None) -> Policy:
     """Make the policy of a file, with its plans and weights, in eval mode.
 
@@ -209,15 +201,14 @@ def load_actor(path: str | os.PathLike[str], *, text_encoder: TextEncoder | None
     archive = open_policy(path)
     try:
         weights, texts = archive.tensors("weights"), archive.tensors("texts")
-        check_options(archive.description["actor"], weights)
-        with at_most(weights):
-            actor = from_description(archive.description["actor"], text_encoder)
+        described = archive.description["actor"]
+        check_options(described, weights)
+        check_size(partial(from_description, described), weights, texts)
+        actor = from_description(described, text_encoder)
         check_texts(texts, text_vectors(actor))
         copy_weights(weights, actor.state_dict(keep_vars=True))
     except ImportError:
         raise
     except Exception as error:  # a file from a stranger may say anything
-        said = first_line(error)
-        said += "" if "text_encoder" in said else _of_texts(archive)
-        raise ValueError(f"checkpoint: the actor of {str(path)!r} cannot be made ({said})") from error
+        raise ValueError(f"checkpoint: the actor of {str(path)!r} cannot be made ({first_line(error)})") from error
     return actor.eval()

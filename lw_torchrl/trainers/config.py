@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lw_torchrl._checks import check_choice, check_int, check_scale
+from lw_torchrl._checks import check_choice, check_fields, check_int, check_positive, check_scale
 
 LOSSES = ("l1", "l2", "smooth_l1")
 _LATER = {"latent_consistency", "latent_contrast", "qaf_anchor"}
@@ -57,10 +57,12 @@ class BehavioralCloningConfig:
     qaf_anchor: float = 0.0
 
     def __post_init__(self) -> None:
+        check_fields(self)
         for name in ("steps", "batch_size", "checkpoint_every"):
             check_int(name, getattr(self, name), minimum=1)
-        for name in ("learning_rate", "weight_decay", "momentum", "max_grad_norm", *sorted(_LATER)):
+        for name in ("learning_rate", "weight_decay", "momentum", *sorted(_LATER)):
             check_scale(name, getattr(self, name))
+        check_positive("max_grad_norm", self.max_grad_norm)
         check_int("seed", self.seed)
         check_choice("loss_function", self.loss_function, LOSSES)
         check_choice("optimizer", self.optimizer, ("adamw", "sgd"))

@@ -13,21 +13,23 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from lw_torchrl._checks import checked, checked_but
 from lw_torchrl._state_tree import split
 from lw_torchrl._tensor_archive import ArchiveError, TensorArchive, write_archive
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.text import TextEncoder, encoded
 from lw_torchrl.modules.query_evaluator import QueryEvaluator, evaluator_from_description
 from lw_torchrl.trainers.policy_checks import (
-    at_most,
     check_options,
     check_remade,
+    check_size,
     check_texts,
     copy_weights,
     first_line,
@@ -39,6 +41,7 @@ _RESERVED = {"format", "version", "evaluator", "state", "sha256"}
 _PROBE = "the robot's gripper is open"
 
 
+@checked_but("evaluator")
 def save_evaluator(evaluator: QueryEvaluator, path: str | os.PathLike[str], **about: Any) -> None:
     """Write an evaluator, for :func:`load_evaluator`; an earlier file is replaced whole.
 
@@ -124,6 +127,7 @@ def open_evaluator(path: str | os.PathLike[str]) -> TensorArchive:
     return found
 
 
+@checked
 def load_evaluator(
     path: str | os.PathLike[str],
     plans: Plans | Mapping[str, ConditionalPlan],
@@ -145,11 +149,12 @@ def load_evaluator(
     """
     archive = open_evaluator(path)
     try:
-        weights = archive.tensors("weights")
-        check_options(archive.description.get("evaluator"), weights)
-        with at_most(weights):
-            evaluator = evaluator_from_description(archive.description.get("evaluator"), as_plans(plans), text_encoder)
-        check_texts(archive.tensors("texts"), _texts(evaluator))
+        weights, texts = archive.tensors("weights"), archive.tensors("texts")
+        described, asked = archive.description.get("evaluator"), as_plans(plans)
+        check_options(described, weights)
+        check_size(partial(evaluator_from_description, described, asked), weights, texts)
+        evaluator = evaluator_from_description(described, asked, text_encoder)
+        check_texts(texts, _texts(evaluator))
         copy_weights(weights, evaluator.state_dict(keep_vars=True))
     except ImportError:
         raise

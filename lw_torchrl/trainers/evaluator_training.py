@@ -13,10 +13,10 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from lw_torchrl._checks import differences
-from lw_torchrl._files import sweep
+from lw_torchrl._checks import checked_but, differences
 from lw_torchrl._progress import Progress
 from lw_torchrl._state_tree import check_optimizer_state, join
+from lw_torchrl._versions import warn_of_other_versions
 from lw_torchrl.modules.clause_evaluator import ClauseEvaluator
 from lw_torchrl.modules.clauses import Clauses
 from lw_torchrl.modules.state_query_evaluator import StateQueryEvaluator
@@ -25,6 +25,7 @@ from lw_torchrl.trainers.interrupts import interrupts_between_steps
 from lw_torchrl.trainers.labelled_queries import LabelledQueries, QueryEvaluatorConfig
 from lw_torchrl.trainers.policy_checks import copy_weights, first_line
 from lw_torchrl.trainers.recent_losses import READ_EVERY, RecentLosses
+from lw_torchrl.trainers.training_state import OneWriter
 
 
 class QueryEvaluatorTrainer:
@@ -41,6 +42,10 @@ class QueryEvaluatorTrainer:
         checkpoint: a file to write checkpoints to, which :func:`load_evaluator` reads. If it is there already, training
             carries on from it, bit for bit.
         progress: show a progress bar.
+
+    Warns:
+        UserWarning: the checkpoint was written under another version of torch or another package that bits hang on: it
+            goes on, but not bit for bit.
 
     Raises:
         TypeError: the evaluator is no :class:`StateQueryEvaluator`.
@@ -61,6 +66,7 @@ class QueryEvaluatorTrainer:
 
     trains: ClassVar[type[ClauseEvaluator]] = StateQueryEvaluator
 
+    @checked_but("evaluator")
     def __init__(
         self,
         evaluator: ClauseEvaluator,
@@ -74,6 +80,7 @@ class QueryEvaluatorTrainer:
             raise TypeError(f"evaluator must be of class {self.trains.__name__}, got {type(evaluator).__name__}")
         self.evaluator, self.config, self.progress = evaluator, config or QueryEvaluatorConfig(), progress
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
+        self._writer = OneWriter(self.checkpoint)
         self._gather(data)
         trained = (weight for weight in evaluator.parameters() if weight.requires_grad)
         self.optimizer = torch.optim.AdamW(
@@ -87,7 +94,6 @@ class QueryEvaluatorTrainer:
         self._described["data"]["labels"] = self._digest
         if self.checkpoint is not None:
             check_evaluator_can_be_saved(evaluator)
-            sweep(self.checkpoint)
             if self.checkpoint.exists():
                 self._load(self.checkpoint)
 
@@ -136,6 +142,7 @@ class QueryEvaluatorTrainer:
                     f"checkpoint: {str(path)!r} is of another {part}, which differs in {', '.join(differ[:8])}; choose "
                     "another file, or delete it to start again"
                 )
+        warn_of_other_versions(path, archive.description.get("versions"))
         try:
             state = join(archive.description.get("state"), archive.tensors("training"))
             if not isinstance(state, dict) or set(state) != {"step", "optimizer"}:
@@ -154,6 +161,7 @@ class QueryEvaluatorTrainer:
         if self.checkpoint is not None:
             state = {"step": self.done, "optimizer": self.optimizer.state_dict()}
             write_evaluator(self.evaluator, self.checkpoint, self._described, state)
+            self._writer.know()
 
     def _draw(self) -> tuple[Tensor, Clauses, Tensor]:
         """Observation (B, 39) float32, clauses (B, 1) and their truth (B, 1) float32."""
@@ -197,7 +205,7 @@ class QueryEvaluatorTrainer:
         self.evaluator.train()
         total = self.config.steps
         bar = Progress("training the evaluator", total, "step", initial=self.done, show=self.progress)
-        with bar, interrupts_between_steps() as interrupt:
+        with self._writer.alone(), bar, interrupts_between_steps() as interrupt:
             while self.done < total and not interrupt.asked:
                 self._losses.add(self.step())
                 bar.update()

@@ -19,7 +19,7 @@ def check_growing_replay(actor: Policy, replay: Any, config: OnlineConfig) -> No
     sampler = replay.sampler
     if not isinstance(sampler, CoLearningSampler) or sampler.target != GROWN:
         raise ValueError(
-            "replay's sampler must be CoLearningSampler('grown'), which says which rows are demonstrations"
+            "replay's sampler must be CoLearningSampler('grown'), which draws demonstrations and rows that came 1:1"
         )
     if not replay.terminate_on_success:
         raise ValueError("replay must end at success, as the environment does: give it terminate_on_success=True")

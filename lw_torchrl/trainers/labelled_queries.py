@@ -12,7 +12,16 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import TensorDictReplayBuffer
 
-from lw_torchrl._checks import check_choice, check_int, check_probability, check_scale, shown
+from lw_torchrl._checks import (
+    check_choice,
+    check_fields,
+    check_int,
+    check_probability,
+    check_scale,
+    check_text,
+    checked,
+    shown,
+)
 from lw_torchrl.language.queries import Clause, Query, base_clauses
 from lw_torchrl.language.query_program import QueryProgram
 from lw_torchrl.language.relations import RELATIONS
@@ -52,6 +61,7 @@ class QueryEvaluatorConfig:
     checkpoint_every: int = 500
 
     def __post_init__(self) -> None:
+        check_fields(self)
         for name in ("steps", "batch_size", "states_per_task", "every", "checkpoint_every"):
             check_int(name, getattr(self, name), minimum=1)
         for name in ("learning_rate", "weight_decay"):
@@ -63,7 +73,11 @@ class QueryEvaluatorConfig:
         if isinstance(self.held_out_tasks, (int, str)):
             check_int("held_out_tasks", self.held_out_tasks, minimum=0)
         else:
+            if not isinstance(self.held_out_tasks, Iterable):
+                raise TypeError(f"held_out_tasks must be a number or names, got {shown(self.held_out_tasks)}")
             object.__setattr__(self, "held_out_tasks", tuple(self.held_out_tasks))
+            for task in self.held_out_tasks:
+                check_text("held_out_tasks", task)
 
 
 @dataclass(frozen=True)
@@ -117,6 +131,7 @@ class LabelledQueries:
             that are held while the hand moves on.
     """
 
+    @checked
     def __init__(
         self, replay: TensorDictReplayBuffer, config: QueryEvaluatorConfig, tasks: Iterable[Task] | None = None
     ) -> None:

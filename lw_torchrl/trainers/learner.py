@@ -66,7 +66,7 @@ class Learner:
         """
         policy = self.policy
         of_steps = isinstance(policy, ResidualActor) and policy.steps is not None
-        return state.get(policy.out_keys[2]) if of_steps else 1.0
+        return state.get(policy.out_keys_source[2]) if of_steps else 1.0
 
     def observe(self, rows: TensorDictBase) -> None:
         """Take rows (N, T) that came, time last."""

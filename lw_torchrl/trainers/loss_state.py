@@ -9,15 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import MultiStepTransform
-from torchrl.objectives import BCLoss, IQLLoss, LossModule, REDQLoss, SoftUpdate
+from torchrl.objectives import BCLoss, LossModule, SoftUpdate
 
 from lw_torchrl._state_tree import check_like, join, split
 from lw_torchrl._tensor_archive import TensorArchive, write_archive
-from lw_torchrl.data.n_steps import STEPS
+from lw_torchrl._versions import warn_of_other_versions
 from lw_torchrl.trainers.policy_checks import check_finite
 from lw_torchrl.trainers.training_state import check_same_description
 
@@ -77,7 +76,7 @@ def load_tensors(loss: nn.Module, found: Mapping[str, Tensor]) -> None:
 
 
 def check_loss(loss: LossModule, replay: TensorDictReplayBuffer) -> None:
-    """Make a loss's value estimator see the buffer's n steps; one that TorchRL would make in the first step is made.
+    """Raise unless a loss can be trained on a buffer; a value estimator that TorchRL would make later is made.
 
     Raises:
         TypeError: it is no :class:`LossModule`, but what ``torch.compile`` made of one.
@@ -95,8 +94,6 @@ def check_loss(loss: LossModule, replay: TensorDictReplayBuffer) -> None:
             "loss: with_lagrange=True gives a loss_alpha_prime that reaches the critics, and takes from them what "
             "loss_cql adds; give with_lagrange=False"
         )
-    if _forgets_steps(loss):
-        loss.value_estimator.set_keys(steps_to_next_obs=("next", STEPS))
     if (shown := _gamma_of(replay)) is None or loss.default_value_estimator is None:
         return
     own = getattr(loss.value_estimator, "gamma", None)
@@ -111,17 +108,6 @@ def _gamma_of(replay: TensorDictReplayBuffer) -> float | None:
     """The discount of the rewards that a buffer sums; None where ``next`` is one step ahead."""
     summed = [part.gamma for part in replay.transform if isinstance(part, MultiStepTransform)]
     return next(iter(summed), getattr(replay, "gamma", None))
-
-
-def _forgets_steps(loss: LossModule) -> bool:
-    """Whether a loss shows its value estimator ``next``, but not how many steps it lies ahead: as if it were one."""
-    return isinstance(loss, (IQLLoss, REDQLoss))
-
-
-def with_steps(loss: LossModule, batch: TensorDictBase) -> TensorDictBase:
-    """A minibatch whose n steps the loss's value estimator sees, too."""
-    steps = batch.get(STEPS, None)
-    return batch if steps is None or not _forgets_steps(loss) else batch.set(("next", STEPS), steps)
 
 
 def sum_of_losses(found: Mapping[str, Any]) -> Tensor:
@@ -171,6 +157,9 @@ def write_training(
 def open_training(path: Path, described: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """The state and the tensors that :func:`write_training` wrote of a training of this description.
 
+    Warns:
+        UserWarning: it was written under other versions of packages.
+
     Raises:
         ValueError: it is no such file, damaged, or of another description.
     """
@@ -183,4 +172,5 @@ def open_training(path: Path, described: Mapping[str, Any]) -> tuple[dict[str, A
     except (ValueError, OSError, RecursionError) as error:
         raise ValueError(f"checkpoint: {str(path)!r} is damaged or none of a loss's training ({error})") from error
     check_same_description(path, found, dict(described))
+    warn_of_other_versions(path, found.get("versions"))
     return state, tensors

@@ -13,6 +13,7 @@ from torchrl.data.replay_buffers.samplers import PrioritizedSampler, RandomSampl
 from lw_torchrl._devices import CPU
 from lw_torchrl.data.device_storage import DeviceStorage, device_of_rows
 from lw_torchrl.data.group_sampler import GroupSampler
+from lw_torchrl.data.replay import LanguageWorldExperienceReplay
 from lw_torchrl.modules.critics import Value
 from lw_torchrl.modules.policy import plans_of
 
@@ -36,9 +37,9 @@ def _called(network: Any) -> str:
 
 def _check_batch_size(replay: TensorDictReplayBuffer, size: int) -> None:
     """Raise :class:`ValueError` if the buffer was made for minibatches of another size."""
-    if replay._batch_size not in (None, size):
+    if replay.batch_size not in (None, size):
         raise ValueError(
-            f"batch_size of the replay buffer must be None or the configuration's, {size}, got {replay._batch_size}"
+            f"batch_size of the replay buffer must be None or the configuration's, {size}, got {replay.batch_size}"
         )
 
 
@@ -77,3 +78,14 @@ def check_replay(actor: Any, replay: TensorDictReplayBuffer, size: int) -> None:
     if "action" not in actor.out_keys:
         raise ValueError(f"actor must write 'action', it writes {', '.join(map(str, actor.out_keys))}")
     check_minibatches([actor], replay, size)
+
+
+def verify_rows(*replays: TensorDictReplayBuffer) -> None:
+    """Read the demonstrations through that a training is to go on with; of a buffer that is none of ours, nothing.
+
+    Raises:
+        DatasetError: (a ValueError) they are not as they were written.
+    """
+    for replay in replays:
+        if isinstance(replay, LanguageWorldExperienceReplay):
+            replay.verify()

@@ -12,12 +12,14 @@ from torch import Tensor, nn
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.objectives import LossModule
 
+from lw_torchrl._checks import checked
 from lw_torchrl.modules.critics import Value
 from lw_torchrl.modules.observation_features import ObservationFeatures
 from lw_torchrl.modules.plan_roles import PlanRoles
 from lw_torchrl.modules.policy import Policy
 
 
+@checked
 def fit_normalization(target: nn.Module, replay: TensorDictReplayBuffer) -> None:
     """Give a policy, a critic, or all that a loss holds, the statistics of a buffer's rows.
 

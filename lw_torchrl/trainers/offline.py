@@ -15,10 +15,18 @@ from torchrl.data import TensorDictReplayBuffer
 from torchrl.objectives import LossModule
 from torchrl.record.loggers import Logger
 
-from lw_torchrl._checks import check_choice, check_int, check_probability, check_scale
+from lw_torchrl._checks import (
+    check_choice,
+    check_fields,
+    check_int,
+    check_positive,
+    check_probability,
+    check_scale,
+    checked_but,
+)
 from lw_torchrl._devices import CPU, drawn_on
-from lw_torchrl._files import sweep
 from lw_torchrl._progress import Progress
+from lw_torchrl.objectives.n_steps import with_n_steps
 from lw_torchrl.trainers.checkpoint import describe_data, describe_learning
 from lw_torchrl.trainers.interrupts import interrupts_between_steps
 from lw_torchrl.trainers.loss_state import (
@@ -31,14 +39,13 @@ from lw_torchrl.trainers.loss_state import (
     targets_of,
     tensors_of,
     trained_parameters,
-    with_steps,
     write_training,
 )
-from lw_torchrl.trainers.minibatches import check_minibatches, draw_batch
+from lw_torchrl.trainers.minibatches import check_minibatches, draw_batch, verify_rows
 from lw_torchrl.trainers.normalization import fit_untrained
 from lw_torchrl.trainers.policy_checks import check_trained
 from lw_torchrl.trainers.recent_losses import READ_EVERY, RecentLosses
-from lw_torchrl.trainers.training_state import TrainingState, load_state, state_of
+from lw_torchrl.trainers.training_state import OneWriter, TrainingState, load_state, state_of
 
 
 @dataclass(frozen=True)
@@ -76,10 +83,12 @@ class OfflineConfig:
     checkpoint_every: int = 1000
 
     def __post_init__(self) -> None:
+        check_fields(self)
         for name in ("steps", "batch_size", "checkpoint_every"):
             check_int(name, getattr(self, name), minimum=1)
-        for name in ("learning_rate", "critic_learning_rate", "weight_decay", "max_grad_norm"):
+        for name in ("learning_rate", "critic_learning_rate", "weight_decay"):
             check_scale(name, getattr(self, name))
+        check_positive("max_grad_norm", self.max_grad_norm)
         check_probability("target_eps", self.target_eps)
         check_choice("schedule", self.schedule, ("cosine", "constant"))
         check_int("seed", self.seed)
@@ -102,6 +111,10 @@ class OfflineTrainer:
 
     Attributes:
         last: the means over the last 100 steps of what the loss gives, by name.
+
+    Warns:
+        UserWarning: the checkpoint was written under another version of torch or another package that bits hang on: it
+            goes on, but not bit for bit.
 
     Raises:
         ValueError: the checkpoint is damaged, or of another loss, configuration or data; a buffer that answers the
@@ -129,6 +142,7 @@ class OfflineTrainer:
     Source: ``torchrl.trainers.Trainer``, without an environment.
     """
 
+    @checked_but("loss")
     def __init__(
         self,
         loss: LossModule,
@@ -144,6 +158,7 @@ class OfflineTrainer:
         self.loss, self.replay, self.logger, self.progress, self.title = loss, replay, logger, progress, title
         self.config = config = config or OfflineConfig()
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
+        self._writer = OneWriter(self.checkpoint)
         self.networks = networks_of(loss)
         self.device = next(loss.parameters()).device
         check_minibatches(self.networks, replay, config.batch_size)
@@ -163,7 +178,6 @@ class OfflineTrainer:
         self.last: dict[str, float] = {}
         self._recent = RecentLosses(("the loss",), config.learning_rate)
         if self.checkpoint is not None:
-            sweep(self.checkpoint)
             self._described = {
                 "loss": describe_loss(loss),
                 "training": asdict(config),
@@ -173,6 +187,7 @@ class OfflineTrainer:
         if config.normalize:
             fit_untrained(loss, replay)
         if self.checkpoint is not None and self.checkpoint.exists():
+            verify_rows(replay)
             found, tensors = open_training(self.checkpoint, self._described)
             load_state(self.checkpoint, found, self.optimizer, self.schedule, [self.state], config.steps)
             load_tensors(loss, tensors)
@@ -187,12 +202,13 @@ class OfflineTrainer:
         if self.checkpoint is not None:
             state = state_of(self.optimizer, self.schedule, [self.state])
             write_training(self.checkpoint, self._described, state, tensors_of(self.loss))
+            self._writer.know()
 
     def step(self) -> TensorDictBase:
         """Train on one minibatch and return what the loss gives, detached."""
         with drawn_on(self.device, self.state.torch_generator):
             batch = draw_batch(self.replay, self.config.batch_size, self.device)
-            found = self.loss(with_steps(self.loss, batch))
+            found = self.loss(with_n_steps(self.loss, batch))
             self.state.torch_generator = torch.get_rng_state()
         total = sum_of_losses(found)
         if self.device == CPU:
@@ -216,7 +232,7 @@ class OfflineTrainer:
         config, state = self.config, self.state
         given: list[Mapping[str, Tensor]] = []
         bar = Progress(self.title, config.steps, "step", initial=state.step, show=self.progress)
-        with bar, interrupts_between_steps() as interrupt:
+        with self._writer.alone(), bar, interrupts_between_steps() as interrupt:
             while state.step < config.steps and not interrupt.asked:
                 given.append(self.step())
                 bar.update()

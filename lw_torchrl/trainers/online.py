@@ -14,11 +14,11 @@ from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.record.loggers import Logger
 
-from lw_torchrl._checks import check_choice
+from lw_torchrl._checks import check_choice, checked_but
 from lw_torchrl._devices import CPU, drawn_on
-from lw_torchrl._files import sweep
 from lw_torchrl._progress import Progress
 from lw_torchrl._state_tree import check_like
+from lw_torchrl._versions import LIBRARIES, SIMULATORS
 from lw_torchrl.data.replay import LanguageWorldExperienceReplay
 from lw_torchrl.data.rewards import REWARDS
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
@@ -33,12 +33,12 @@ from lw_torchrl.trainers.first_episodes import FirstEpisodes
 from lw_torchrl.trainers.growing_replay import check_growing_replay
 from lw_torchrl.trainers.interrupts import Interrupt, interrupts_between_steps
 from lw_torchrl.trainers.learner import Learner
-from lw_torchrl.trainers.minibatches import check_minibatches
+from lw_torchrl.trainers.minibatches import check_minibatches, verify_rows
 from lw_torchrl.trainers.off_policy import ResidualLearner, SACLearner, TD3Learner
 from lw_torchrl.trainers.on_policy import PPOLearner
 from lw_torchrl.trainers.online_config import OnlineConfig
 from lw_torchrl.trainers.policy_checks import check_can_be_saved, check_trained
-from lw_torchrl.trainers.training_state import check_description, load_training, misfit
+from lw_torchrl.trainers.training_state import OneWriter, check_description, load_training, misfit
 
 LEARNERS: dict[str, type[Learner]] = {
     "advantage": AdvantageLearner,
@@ -84,6 +84,10 @@ class OnlineTrainer:
         history: of each round, "frames", "episodes" (those that ended), the means of losses and values, and "success",
             that of the first episode of each row, which has the time to end; not of a round shorter than an episode.
 
+    Warns:
+        UserWarning: the checkpoint was written under another version of torch or another package that bits hang on: it
+            goes on, but not bit for bit.
+
     Raises:
         ValueError: a wrong method; a buffer that does not grow, or is not of these plans; the checkpoint is damaged, or
             of another architecture, start, configuration or data; or, in :meth:`train`, a loss is no number.
@@ -116,6 +120,7 @@ class OnlineTrainer:
     Slow with Deep Learning and Tree Search', for expert iteration.
     """
 
+    @checked_but("critic")
     def __init__(
         self,
         actor: Policy,
@@ -137,9 +142,10 @@ class OnlineTrainer:
         if critic is not None:
             check_minibatches([critic], replay, config.batch_size)
         self.replay, self.logger, self.progress = replay, logger, progress
-        self.tasks = replay.tasks if tasks is None else tasks
+        self.tasks = replay.tasks if tasks is None else list(named_tasks(tasks).values())
         self.num_threads = num_threads
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
+        self._writer = OneWriter(self.checkpoint)
         generator = torch.Generator().manual_seed(config.seed)
         replay.set_rng(generator)
         self._drawn = generator.get_state()
@@ -153,7 +159,6 @@ class OnlineTrainer:
         self.round = 0
         self._episodes: Tensor | None = None
         if self.checkpoint is not None:
-            sweep(self.checkpoint)
             self._described = {
                 "actor": self.policy.describe(),
                 "start": {"weights": start},
@@ -163,8 +168,11 @@ class OnlineTrainer:
                 "replay": describe_learning(replay),
             }
             if self.checkpoint.exists():
+                verify_rows(replay)
                 check_description(self.checkpoint, self._described)
-                self._load(load_training(self.checkpoint, self.policy, self.policy.state_dict(keep_vars=True)))
+                weights = self.policy.state_dict(keep_vars=True)
+                packages = (*SIMULATORS, *LIBRARIES)
+                self._load(load_training(self.checkpoint, self.policy, weights, packages))
 
     @property
     def frames(self) -> int:
@@ -179,6 +187,7 @@ class OnlineTrainer:
         check_trained(dict(self.policy.named_parameters()), self.learner.made)
         if self.checkpoint is not None:
             write(self.checkpoint, self._described, self.policy, self.policy.state_dict(), self._state())
+            self._writer.know()
 
     def _state(self) -> dict[str, Any]:
         return {
@@ -200,7 +209,7 @@ class OnlineTrainer:
             self.learner.load_state_dict(found["learner"])
             self.replay.load_state_dict(found["replay"])
             self._episodes, self._drawn = found["episodes"].clone(), found["drawn"].clone()
-            self.history = [{str(name): float(value) for name, value in one.items()} for one in found["history"]]
+            self.history = [{str(name): _number(value) for name, value in one.items()} for one in found["history"]]
             self.round = found["round"]
         except (ValueError, KeyError, TypeError, RuntimeError, AttributeError) as error:
             raise misfit(self.checkpoint, error) from error
@@ -226,7 +235,7 @@ class OnlineTrainer:
         transform = self.policy.transform()
         env = base if transform is None else TransformedEnv(base, transform)
         try:
-            with bar, interrupts_between_steps() as interrupt:
+            with self._writer.alone(), bar, interrupts_between_steps() as interrupt:
                 if self._episodes is not None:
                     base.set_extra_state(self._episodes)
                 while self.round < self.config.rounds and not interrupt.asked:
@@ -297,6 +306,11 @@ class OnlineTrainer:
 
 
 _UNLIKE = {"replay": None, "history": None, "learner": None, "episodes": None}
+
+
+def _number(value: Any) -> int | float:
+    """A number as it was written: an integer stays one."""
+    return value if type(value) is int else float(value)
 
 
 def _fingerprint(module: torch.nn.Module) -> str:

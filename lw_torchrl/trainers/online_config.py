@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from lw_torchrl._checks import check_choice, check_int, check_probability, check_scale
+from lw_torchrl._checks import check_choice, check_fields, check_int, check_probability, check_scale
 
 
 @dataclass(frozen=True)
@@ -76,6 +76,7 @@ class OnlineConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        check_fields(self)
         for name in (
             "frames",
             "rows",

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import json
-import threading
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.nn.modules.module import register_module_parameter_registration_hook
+from torch.overrides import TorchFunctionMode
 
 from lw_torchrl._state_tree import check_like
+from lw_torchrl.language.text import TEXT_DIMENSION, TextEncoder
 from lw_torchrl.modules.policy import Policy, from_description
 
 _TEXT_TOLERANCE = 0.01  # of numbers of size 1: more than machines differ, far less than encoders do
@@ -30,14 +29,13 @@ def check_can_be_saved(actor: Any) -> Policy:
             f"actor must be a Policy to be kept in a file, got {type(actor).__name__}: save the policy inside of it, "
             "derive your class from lw_torchrl.Policy, or train without a checkpoint"
         )
-    described, texts = actor.describe(), text_vectors(actor)
-    size = next((vectors.shape[-1] for vectors in texts.values()), 0)
+    described = actor.describe()
     try:
         with torch.random.fork_rng(devices=[]):
-            again = from_description(
-                json.loads(json.dumps(described)), (lambda found: torch.ones(len(found), size)) if texts else None
-            )
+            again = from_description(json.loads(json.dumps(described)), _stand_in(text_vectors(actor)))
         check_remade(actor, again)
+        if (again.in_keys, again.out_keys_source) != (actor.in_keys, actor.out_keys_source):
+            raise ValueError("its in_keys or out_keys were changed later: give them where it is made")
     except Exception as error:
         raise ValueError(
             f"actor cannot be kept in a file, which would not make it again from its description ({first_line(error)})"
@@ -79,50 +77,76 @@ def text_vectors(actor: nn.Module) -> dict[str, Tensor]:
 
 def check_options(found: Any, weights: Mapping[str, Tensor]) -> None:
     """Refuse integers that no network of these weights can have, before lists of that length are made."""
-    _check_integers(found, sum(tensor.numel() for tensor in weights.values()))
+    _check_integers(found, sum(tensor.numel() for tensor in weights.values()), len(weights))
 
 
-def _check_integers(found: Any, numbers: int) -> None:
-    inside = found.values() if isinstance(found, dict) else found if isinstance(found, list) else ()
-    if isinstance(found, int) and abs(found) > max(numbers, 2**16):
+def _check_integers(found: Any, numbers: int, tensors: int, name: str = "") -> None:
+    if isinstance(found, dict):
+        for key, one in found.items():
+            _check_integers(one, numbers, tensors, key)
+    elif isinstance(found, list):
+        for one in found:
+            _check_integers(one, numbers, tensors, name)
+    elif isinstance(found, int) and abs(found) > max(numbers, 2**16):
         raise ValueError(f"it says {found:.3g}, but holds only {numbers} numbers")
-    for one in inside:
-        _check_integers(one, numbers)
+    elif isinstance(found, int) and name.endswith("depth") and found > max(tensors, 64):
+        raise ValueError(f"it describes a network of {found:.3g} layers, but holds only {tensors} tensors")
 
 
-class _Limit(threading.local):
-    """How many parameters a thread's new modules may still have, and numbers in them; None where no limit is."""
-
-    parameters: int | None = None
-    numbers = 0
+_FACTORIES = {torch.empty, torch.zeros, torch.ones, torch.full, torch.rand, torch.randn}
+_MORE_TENSORS, _MORE_NUMBERS = 10_000, 2**20  # that a constructor may make besides its weights
+_MORE_OF_TEXTS = 2**24  # numbers; an evaluator's file holds one text, whatever plans it is for
 
 
-_LIMIT = _Limit()
+class _Budget(TorchFunctionMode):
+    """Inside of it, PyTorch raises once it has made many more tensors, or numbers, than some weights have."""
+
+    def __init__(self, weights: Mapping[str, Tensor]) -> None:
+        super().__init__()
+        self.stored = sum(tensor.numel() for tensor in weights.values())
+        self.tensors = 10 * len(weights) + _MORE_TENSORS
+        self.numbers = 2 * self.stored + _MORE_NUMBERS
+
+    def __torch_function__(
+        self, func: Callable[..., Any], types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        made = func(*args, **(kwargs or {}))
+        if func in _FACTORIES:
+            self.tensors -= 1
+            self.numbers -= made.numel()
+            if min(self.tensors, self.numbers) < 0:
+                raise ValueError(f"it describes a network of more weights or numbers than it holds, {self.stored}")
+        return made
 
 
-def _count(module: nn.Module, name: str, parameter: nn.Parameter | None) -> None:
-    if _LIMIT.parameters is None or parameter is None:
-        return
-    _LIMIT.parameters -= 1
-    _LIMIT.numbers -= parameter.numel()
-    if min(_LIMIT.parameters, _LIMIT.numbers) < 0:
-        raise ValueError("it describes a network of more weights or numbers than it holds")
+def check_size(
+    make: Callable[[TextEncoder], nn.Module], weights: Mapping[str, Tensor], texts: Mapping[str, Tensor]
+) -> None:
+    """Make a module for a trial, and raise :class:`ValueError` as soon as it has more weights than are stored.
+
+    Args:
+        make: from a text encoder to the module.
+        weights: the stored ones.
+        texts: the stored vectors of its texts; the trial gets others of their width, so that no text model is loaded.
+    """
+    with torch.random.fork_rng(devices=[]), _Budget(weights):
+        make(_stand_in(texts))
 
 
-# Once and for all: one that came and went would break the threads that are just going through the hooks.
-register_module_parameter_registration_hook(_count)
+def _stand_in(found: Mapping[str, Tensor]) -> TextEncoder:
+    """An encoder that gives ones, as many as the vectors of a file's texts have, and not many more in all."""
+    width = next((vectors.shape[-1] for vectors in found.values() if vectors.ndim == 2), TEXT_DIMENSION)
+    stored = sum(vectors.numel() for vectors in found.values())
+    left = stored + _MORE_OF_TEXTS
 
+    def ones(texts: Sequence[str]) -> Tensor:
+        nonlocal left
+        left -= len(texts) * width
+        if left < 0:
+            raise ValueError(f"its texts have more numbers than the {stored} that it holds of them")
+        return torch.tensor(1.0).expand(len(texts), width)
 
-@contextmanager
-def at_most(weights: Mapping[str, Tensor]) -> Iterator[None]:
-    """Stop a module that this thread makes as soon as it has more parameters than there are weights, or more numbers in
-    them, before they are filled."""
-    before = _LIMIT.parameters, _LIMIT.numbers
-    _LIMIT.parameters, _LIMIT.numbers = len(weights), sum(tensor.numel() for tensor in weights.values())
-    try:
-        yield
-    finally:
-        _LIMIT.parameters, _LIMIT.numbers = before
+    return ones
 
 
 @torch.no_grad()
@@ -140,9 +164,10 @@ def check_texts(stored: Mapping[str, Tensor], ours: Mapping[str, Tensor]) -> Non
         found = stored.get(name)
         if found is None or found.shape != vectors.shape or found.dtype != vectors.dtype:
             said = "none" if found is None else tuple(found.shape)
-            raise ValueError(
-                f"text_encoder gives vectors of shape {tuple(vectors.shape)}, the policy was made with {said}"
-            )
+            given = f"text_encoder gives vectors of shape {tuple(vectors.shape)}, the policy was made with {said}"
+            if found is not None and found.ndim and found.shape[-1] != vectors.shape[-1]:
+                given += f"; its texts have {found.shape[-1]} numbers each: text_encoder must be the one that gave them"
+            raise ValueError(given)
         if not torch.allclose(found, vectors.cpu(), atol=_TEXT_TOLERANCE, rtol=0.0):
             raise ValueError(
                 "text_encoder is not the one that the policy was made with: its texts have other vectors; pass that "

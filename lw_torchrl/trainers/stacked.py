@@ -15,19 +15,20 @@ from torch.func import functional_call, stack_module_state, vmap
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.objectives.utils import distance_loss
 
+from lw_torchrl._checks import checked
 from lw_torchrl._devices import CPU, drawn_on, place
-from lw_torchrl._files import sweep
 from lw_torchrl._progress import Progress
 from lw_torchrl.modules.policy import Policy
 from lw_torchrl.trainers.checkpoint import describe_data, describe_replay, write
 from lw_torchrl.trainers.config import BehavioralCloningConfig, last_step, make_optimizer
 from lw_torchrl.trainers.interrupts import interrupts_between_steps
 from lw_torchrl.trainers.latent_terms import LatentTerms
-from lw_torchrl.trainers.minibatches import check_replay, draw_batch
+from lw_torchrl.trainers.minibatches import check_replay, draw_batch, verify_rows
 from lw_torchrl.trainers.normalization import check_contacts, fit_normalization
 from lw_torchrl.trainers.policy_checks import check_can_be_saved, check_trained
 from lw_torchrl.trainers.recent_losses import READ_EVERY, RecentLosses
 from lw_torchrl.trainers.training_state import (
+    OneWriter,
     TrainingState,
     check_description,
     load_state,
@@ -85,6 +86,10 @@ class StackedBehavioralCloning:
         progress: show a progress bar.
         device: where to train, as for :class:`BehavioralCloningTrainer`; None for where the first actor is.
 
+    Warns:
+        UserWarning: the checkpoint was written under another version of torch or another package that bits hang on: it
+            goes on, but not bit for bit.
+
     Raises:
         ValueError: not as many buffers as actors, one twice, or actors of different options; a checkpoint that is
             damaged, or of other actors, data or another configuration; in :meth:`train`, a loss or weights that are no
@@ -107,6 +112,7 @@ class StackedBehavioralCloning:
     Source: paper section 'Conditional Plan Experiments', which trains 50 one-shot models; ``torch.func``.
     """
 
+    @checked
     def __init__(
         self,
         actors: Sequence[Policy],
@@ -122,6 +128,7 @@ class StackedBehavioralCloning:
             raise ValueError(f"replays must be as many as actors, at least one, got {len(replays)} and {len(actors)}")
         self.actors, self.replays, self.progress = list(actors), list(replays), progress
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
+        self._writer = OneWriter(self.checkpoint)
         _check_actors(self.actors)
         if len({*map(id, replays)}) < len(replays) or len({id(one.sampler) for one in replays}) < len(replays):
             raise ValueError("replays must be different buffers, each with a sampler of its own")
@@ -132,7 +139,6 @@ class StackedBehavioralCloning:
         self._losses = RecentLosses(tuple(of), config.learning_rate)
         self._described: dict[str, Any] = {}
         if self.checkpoint is not None:
-            sweep(self.checkpoint)
             check_can_be_saved(self.actors[0])
             self._described = self._describe()
         self.states = []
@@ -159,6 +165,7 @@ class StackedBehavioralCloning:
         self._buffers = buffers
         self.optimizer, self.schedule = make_optimizer(list(self._parameters.values()), config)
         if self.checkpoint is not None and self.checkpoint.exists():
+            verify_rows(*replays)
             check_description(self.checkpoint, self._described)
             warn_of_another_device(self.checkpoint, self.device)
             found = load_training(self.checkpoint, self.actors[0], self._parameters)
@@ -183,6 +190,7 @@ class StackedBehavioralCloning:
         if self.checkpoint is not None:
             state = state_of(self.optimizer, self.schedule, self.states)
             write(self.checkpoint, self._described | where(self.device), self.actors[0], self._parameters, state)
+            self._writer.know()
 
     @property
     def steps(self) -> int:
@@ -237,7 +245,7 @@ class StackedBehavioralCloning:
             actor.train()
         what = f"training {len(self.actors)} models"
         bar = Progress(what, self.config.steps, "step", initial=self.steps, show=self.progress)
-        with bar, interrupts_between_steps() as interrupt:
+        with self._writer.alone(), bar, interrupts_between_steps() as interrupt:
             while self.steps < total and not interrupt.asked:
                 losses.add(self.step())
                 bar.update()

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import os
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,9 @@ from torch import Tensor
 from torchrl.data import TensorDictReplayBuffer
 
 from lw_torchrl._checks import differences, shown
+from lw_torchrl._files import held, sweep
 from lw_torchrl._state_tree import check_like, check_optimizer_state, check_same, join
+from lw_torchrl._versions import LIBRARIES, warn_of_other_versions
 from lw_torchrl.modules.policy import Policy
 from lw_torchrl.trainers.checkpoint import open_policy, read_description
 from lw_torchrl.trainers.policy_checks import check_texts, copy_weights, first_line, text_vectors
@@ -57,6 +60,48 @@ class TrainingState:
         self.torch_generator = state_dict["torch_generator"].clone()
         if sampler:
             self.sampler.load_state_dict(sampler)
+
+
+class OneWriter:
+    """Keeps a checkpoint to one training at a time; what killed ones left beside it goes.
+
+    Args:
+        path: the checkpoint; None for a training without one.
+    """
+
+    def __init__(self, path: Path | None) -> None:
+        self.path = path
+        if path is not None:
+            sweep(path)
+        self.know()
+
+    def know(self) -> None:
+        """This training knows the file as it is now: it goes on from it, or wrote it."""
+        self._known = self._found()
+
+    def _found(self) -> tuple[int, ...] | None:
+        if self.path is None or not self.path.exists():
+            return None
+        stat = self.path.stat()
+        return stat.st_ino, stat.st_size, stat.st_mtime_ns
+
+    @contextmanager
+    def alone(self) -> Iterator[None]:
+        """Keep other trainings out while the block lasts.
+
+        Raises:
+            ValueError: another one is at work, or has written the checkpoint meanwhile.
+        """
+        if self.path is None:
+            yield
+            return
+        with held(self.path, "checkpoint", "training"):
+            if self._found() not in (None, self._known):
+                raise ValueError(
+                    f"checkpoint: {str(self.path)!r} was written by another training after this one had begun; begin "
+                    "anew to go on from it, or choose another file"
+                )
+            yield
 
 
 def state_of(optimizer: torch.optim.Optimizer, schedule: Schedule, states: Sequence[TrainingState]) -> dict[str, Any]:
@@ -105,13 +150,28 @@ def warn_of_another_device(path: Path, device: torch.device) -> None:
         )
 
 
-def load_training(path: str | os.PathLike[str], actor: Policy, weights: Mapping[str, Tensor]) -> dict[str, Any]:
+def load_training(
+    path: str | os.PathLike[str],
+    actor: Policy,
+    weights: Mapping[str, Tensor],
+    packages: Sequence[str] = LIBRARIES,
+) -> dict[str, Any]:
     """Copy a file's weights into those of live actors, in place, and return the state of their training.
+
+    Args:
+        path: the file.
+        actor: whose texts it must have.
+        weights: of the live actors.
+        packages: what the bits of the training hang on.
+
+    Warns:
+        UserWarning: the file was written under other versions of these.
 
     Raises:
         ValueError: they do not fit, or the file has no training state.
     """
     archive = open_policy(path)
+    warn_of_other_versions(path, archive.description.get("versions"), packages)
     try:
         state = join(archive.description.get("state"), archive.tensors("training"))
         if not isinstance(state, dict):

@@ -13,7 +13,7 @@ from torchrl.data import Composite, TensorSpec, UnboundedDiscrete
 from torchrl.envs import EnvBase, Transform
 from torchrl.envs.batched_envs import BatchedEnvBase
 
-from lw_torchrl._checks import check_int
+from lw_torchrl._checks import check_int, checked
 from lw_torchrl._keys import as_keys
 from lw_torchrl._rendering import check_cameras
 from lw_torchrl.transforms.containers import base_env
@@ -52,6 +52,7 @@ class CameraTransform(KeepsEnvState):
     Source: mirrors ``torchrl.record.PixelRenderTransform``, for some rows and some steps.
     """
 
+    @checked
     def __init__(
         self,
         cameras: str | Sequence[str] = "corner",

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 from torchrl.envs import Transform
 
-from lw_torchrl._checks import check_int, check_probability, missing_keys, shown, unknown_name
+from lw_torchrl._checks import check_int, check_probability, checked, missing_keys, shown, unknown_name
 from lw_torchrl._keys import as_keys, read
 from lw_torchrl._seeding import episode_generator
 from lw_torchrl.language.plan_tables import PlanTables
@@ -67,6 +67,7 @@ class CorruptQAF(Transform):
     Source: the paper names a visual question answering model as a query answering function; such a one errs.
     """
 
+    @checked
     def __init__(
         self,
         plans: Plans | Mapping[str, ConditionalPlan],

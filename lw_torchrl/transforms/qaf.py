@@ -13,7 +13,7 @@ from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase, Transform
 from torchrl.envs.batched_envs import BatchedEnvBase
 
-from lw_torchrl._checks import check_int, missing_keys
+from lw_torchrl._checks import check_int, checked, missing_keys
 from lw_torchrl._keys import as_keys, check_apart, key_beside
 from lw_torchrl.language.plan_tables import PlanTables
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
@@ -86,6 +86,7 @@ class QAFTransform(KeepsEnvState):
     Source: paper section 'Query Answering Function'.
     """
 
+    @checked
     def __init__(
         self,
         plans: Plans | Mapping[str, ConditionalPlan],

@@ -10,7 +10,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase, Transform
 
-from lw_torchrl._checks import check_scale, missing_keys
+from lw_torchrl._checks import check_scale, checked, missing_keys
 from lw_torchrl._keys import as_keys, check_apart, key_beside, read
 from lw_torchrl.language.observation import FIRST, HAND, POSITIONS, SECOND, a_step_before
 from lw_torchrl.language.plan_tables import PlanTables
@@ -91,6 +91,7 @@ class RandomYaw(Transform):
     Source: data augmentation by a symmetry of the task, as for images in ``torchvision.transforms.RandomRotation``.
     """
 
+    @checked
     def __init__(
         self,
         scale: float,

@@ -10,6 +10,7 @@ import time
 from dataclasses import replace
 from functools import partial
 from importlib.metadata import entry_points
+from pathlib import Path
 
 import pytest
 from commands import fails, run
@@ -17,6 +18,7 @@ from commands import fails, run
 import lw_torchrl as lw
 import lw_torchrl.cli.main as cli
 from lw_torchrl.cli.main import main
+from lw_torchrl.cli.streams import BROKEN_PIPE
 from lw_torchrl.experiments.demo import QUICK
 
 COMMANDS = (
@@ -73,13 +75,29 @@ def test_every_command_explains_itself(capsys, command):
 
 
 @pytest.mark.parametrize(
-    "args", [["dance"], ["query"], ["collect", "reach"], ["train", "x", "--out", "y", "--mix", "z"]]
+    ("args", "message"),
+    [
+        (["dance"], "there is no command 'dance'; did you mean "),
+        (["query"], "TASK must be given; `lw-torchrl query --help` says what there is"),
+        (["collect", "reach"], "--out must be given; "),
+        (["collect", "reach", "--out"], "--out must be given a value"),
+        (["train", "x", "--out", "y", "--mix", "z"], "--mix must be one of 'latents', 'actions', got 'z'"),
+    ],
 )
-def test_a_wrong_command_line_is_refused_with_code_2(capsys, args):
-    with pytest.raises(SystemExit) as caught:
-        main(args)
-    assert caught.value.code == 2
-    assert "Traceback" not in capsys.readouterr().err
+def test_a_wrong_command_line_is_refused_with_code_2(capsys, monkeypatch, args, message):
+    assert message in fails(capsys, *args)
+    monkeypatch.setenv("COLUMNS", "20")
+    assert message in fails(capsys, *args)
+
+
+def test_the_statuses_are_stated_in_the_help(capsys):
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    printed = " ".join(capsys.readouterr().out.split())
+    text = (Path(__file__).parents[2] / "docs" / "cli.md").read_text("utf-8")
+    statuses = re.findall(r"^\| (\d+) \|", text, re.MULTILINE)
+    assert statuses == ["0", "1", "2", str(130), str(BROKEN_PIPE)]
+    assert [found for found in re.findall(r"(?:Exit status: |; )(\d+), ", printed)] == statuses
 
 
 def test_ctrl_c_says_that_it_carries_on(capsys, monkeypatch):

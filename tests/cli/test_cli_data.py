@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 import statistics
+import time
 
 import pytest
 import torch
@@ -13,6 +14,9 @@ from commands import fails, run
 
 import lw_torchrl as lw
 import lw_torchrl.data as data_room
+import lw_torchrl.data.checksums as checksums
+from lw_torchrl import _progress
+from lw_torchrl.cli.main import main
 from lw_torchrl.data import collect_demonstrations
 from lw_torchrl.data.rows import load_rows
 
@@ -128,6 +132,16 @@ def test_check_reads_every_row(capsys, made, tmp_path):
     assert caught.value.code == 2
     error = capsys.readouterr().err
     assert "is damaged: 1 of 6 episodes differ from their checksums; the same `lw-torchrl collect` runs these" in error
+
+
+def test_a_long_check_writes_lines_into_a_pipe(capsys, made, monkeypatch):
+    describe = checksums.describe_episode
+    monkeypatch.setattr(checksums, "describe_episode", lambda *given: time.sleep(0.4) or describe(*given))
+    monkeypatch.setattr(_progress, "EVERY", 0.5)
+    main(["data", "show", str(made[0].root), "--check"])
+    error = capsys.readouterr().err
+    assert "\r" not in error
+    assert re.fullmatch(r"(checking: \d/6 episodes, \d s left\n)+", error)
 
 
 def test_what_is_no_dataset_is_one_line(capsys, made, tmp_path):

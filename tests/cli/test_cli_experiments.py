@@ -7,7 +7,7 @@ from functools import partial
 from types import MappingProxyType
 
 import pytest
-from commands import fails, run
+from commands import document, fails, run
 
 import lw_torchrl as lw
 from lw_torchrl.experiments import execution, recipes
@@ -75,6 +75,10 @@ def test_units_and_their_summary(capsys, tmp_path, tiny):
     assert "probability of improvement 0." in out
     folder = tmp_path / "few-shot" / "strong"
     summary = json.loads((folder / "summary.json").read_text())
+    assert document(capsys, *arguments(tmp_path)) == {"summaries": {"few-shot/strong": summary}}
+    one = document(capsys, *arguments(tmp_path, "--run", listed[-1]))
+    assert [*one] == ["run", "tasks", "mean_success", "config"]
+    assert (one["run"], len(one["tasks"])) == (listed[-1], 50)
     assert list(summary["methods"]) == ["pcbc", "dc"]
     assert list(summary["methods"]["dc"]["tasks"]) == list(lw.MT50)
     assert summary["pairs"][0]["methods"] == ["pcbc", "dc"]

@@ -2,6 +2,7 @@
 
 import json
 import re
+import sys
 
 import pytest
 from commands import fails, run
@@ -107,12 +108,10 @@ def test_a_plan_beyond_repair(capsys, tmp_path, text, message):
     assert message in capsys.readouterr().out
 
 
-def test_roles_of_plans(capsys, tmp_path, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "160")
-
+def test_roles_of_plans(capsys, tmp_path):
     def told(*arguments):
         lines = run(capsys, "plans", *arguments, "--roles").splitlines()
-        return [re.split(r" {2,}", line.strip()) for line in lines[4:] if line.strip()]
+        return [re.split(r" {2,}", line) for line in lines[3:]]
 
     assert told("coffee-pull")[-1] == [
         "coffee-pull",
@@ -121,7 +120,7 @@ def test_roles_of_plans(capsys, tmp_path, monkeypatch):
         "target location",
         "skill",
     ]
-    assert {row[-1] for row in told("coffee-pull", "--skill-set", "MT10")} == {"reworded"}
+    assert {row[-1] for row in told("coffee-pull", "--skill-set", "MT10")} == {"condition", "words"}
     assert len(told()) == 186
     path = tmp_path / "push.plan"
     path.write_text(
@@ -182,11 +181,27 @@ def test_a_plan_for_a_task_of_ones_own(capsys, tmp_path):
     assert "stack-cup.plan: 1 step, valid" in out
 
 
-def test_tables_are_as_wide_as_they_are_asked_to_be(capsys, monkeypatch):
-    for width in ("60", "140"):
+@pytest.mark.parametrize("width", [10, 60, 140])
+def test_tables_are_as_wide_as_the_terminal(capsys, monkeypatch, width):
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", str(width))
+    shown = re.sub(r"\x1b\[[\d;]*m", "", run(capsys, "tasks"))
+    assert max(map(len, shown.splitlines())) <= width
+
+
+@pytest.mark.parametrize(
+    "command", [["tasks"], ["skills", "push"], ["plans"], ["plans", "--roles"], ["queries", "push"]]
+)
+def test_a_pipe_gets_whole_lines_without_padding(capsys, monkeypatch, command):
+    whole = run(capsys, *command)
+    for width in ("10", "400"):
         monkeypatch.setenv("COLUMNS", width)
-        assert max(map(len, run(capsys, "tasks").splitlines())) <= int(width)
-    assert run(capsys, "tasks", "reach").split()[:2] == ["1", "task"]
+        assert run(capsys, *command) == whole
+    assert all(line == line.rstrip() for line in whole.splitlines())
+    assert whole.isascii(), "no lines are drawn, no word is cut"
+    if command == ["tasks"]:
+        assert all(task.description in whole for task in lw.TASKS.values())
 
 
 def test_scripted_writes_what_it_found(capsys, tmp_path):

@@ -5,7 +5,7 @@ import shutil
 from dataclasses import replace
 
 import pytest
-from commands import fails, run
+from commands import document, fails, run
 
 import lw_torchrl as lw
 from lw_torchrl.experiments.offline_tables import OFFLINE_TABLES, OfflineTable
@@ -52,6 +52,8 @@ def test_a_table_is_made_and_shown(capsys, tmp_path, tiny):
     assert "| method, conditioned on | W " in printed
     assert f"quick.md, quick.json and quick.png are in {tmp_path}" in printed
     assert {path.name for path in tmp_path.glob("quick.*")} == {"quick.md", "quick.json", "quick.png"}
+    found = document(capsys, *arguments(tmp_path))
+    assert found == {"summaries": {"quick": json.loads((tmp_path / "quick.json").read_text())}}
     again = run(capsys, *arguments(tmp_path))
     assert again.split("\nquick\n")[1] == printed.split("\nquick\n")[1]
 
@@ -68,7 +70,7 @@ def test_runs_have_names_and_are_done_one_by_one(capsys, tmp_path, tiny):
     ]
     assert not list(tmp_path.iterdir())
     for name in names:
-        run(capsys, *arguments(tmp_path, "--run", name))
+        assert document(capsys, *arguments(tmp_path, "--run", name))["run"] == name
         assert (tmp_path / name).is_dir()
     assert not (tmp_path / "quick.md").exists()
     assert (tmp_path / "two/W/advantages/plan/seed0/advantages.zip").is_file()

@@ -4,7 +4,7 @@ import json
 from functools import partial
 
 import pytest
-from commands import fails, run
+from commands import document, fails, run
 
 import lw_torchrl as lw
 from lw_torchrl.experiments import online, runs, tuning
@@ -74,7 +74,8 @@ def test_runs_and_their_summary(capsys, tmp_path, tiny, monkeypatch):
     assert "| reach | 0." in (tmp_path / "pcbc" / "summary.md").read_text()
 
     monkeypatch.setattr(online, "evaluate", lambda *_, **__: pytest.fail("done twice"))
-    run(capsys, *arguments(tmp_path, seeds=(0, 1)))
+    found = document(capsys, *arguments(tmp_path, seeds=(0, 1)))
+    assert found == {"summaries": {"pcbc": json.loads((tmp_path / "pcbc" / "summary.json").read_text())}}
     message = fails(capsys, *arguments(tmp_path, "--demonstrations", 2))
     assert "is of another configuration, it differs in recipe.demonstrations (1, now 2); choose another" in message
 

@@ -7,7 +7,7 @@ import sys
 import time
 
 import pytest
-from commands import fails, run
+from commands import check_documented, document, fails, run
 from fake_server import FakeServer, asked_for, completion, error, serving, shipped
 
 import lw_torchrl as lw
@@ -63,15 +63,17 @@ def table(printed):
 
 
 @pytest.mark.usefixtures("_no_key")
-def test_generate_writes_answers_and_says_what_became_of_them(capsys, tmp_path, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "160")
+def test_generate_writes_answers_and_says_what_became_of_them(capsys, tmp_path):
     server = FakeServer(
         lambda body: completion("I will not", "length") if asked_for(body) == "reach" else shipped(body)
     )
     with serving(server) as address:
         asked = generate(address, tmp_path, "push", "reach", "--format", "chain_py", "basic_md")
         first, second = run(capsys, *asked), run(capsys, *asked)
+        told = document(capsys, *asked)
         constrained = run(capsys, *generate(address, tmp_path, "push", "--format", "basic_py", "--constrain"))
+    check_documented("plan generate", told)
+    assert told["notes"] == [{"note": "it was cut off at max_tokens", "answers": 4}]
     rows = table(first)
     assert rows["push", "chain_py"] == ["2", "2", "2", "2", "200", "20"]
     assert rows["reach", "basic_md"] == ["2", "0", "0", "2", "200", "20"]
@@ -151,6 +153,10 @@ def test_compare_runs_what_generate_wrote(capsys, tmp_path):
     path.with_name("reach_1.py").write_text("?")
     path.with_name("reach-1.py").write_text("No.")
     printed = run(capsys, *command)
+    found = document(capsys, *command)
+    check_documented("plan compare", found)
+    assert [one["success"] for one in found["answers"]] == [1.0, 0.0]
+    assert [one["reason"] is None for one in found["answers"]] == [True, False]
     assert "1 answer has no plan:\n1: it has no steps, neither for the task" in printed
     assert f"not read, since no answer is named so (<task>-<attempt>.<ext>): {path.with_name('reach_1.py')}" in printed
     message = fails(capsys, *command, "--episodes", 3)
@@ -193,6 +199,9 @@ def test_repair_tells_the_model_and_shows_how_each_round_fared(capsys, tmp_path)
         where = ("--out", tmp_path / "plans", "--cache", tmp_path / "kept", "--episodes", 1)
         command = ("plan", "repair", "reach", "--model", "m", "--base-url", address, "--rounds", 2, *where)
         printed = run(capsys, *command)
+        told = document(capsys, *command)
+    check_documented("plan repair", told)
+    assert told["plans"] == [{"task": "reach", "attempt": 0, "success": [0.0, 1.0]}]
     assert ["reach", "0", "0%", "100%"] in [line.split() for line in printed.splitlines()]
     assert "1 answer: it was cut off at max_tokens" in printed
     assert (tmp_path / "plans/m-round1/chain_py/reach-0.py").is_file()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 
 import pytest
-from commands import fails, run
+from commands import check_documented, document, fails, run
 
 import lw_torchrl as lw
 
@@ -32,6 +32,9 @@ def test_it_is_trained_reported_and_used(capsys, tmp_path, policy):
     assert (out / "reliability.png").stat().st_size > 1000
     before = (out / "evaluator.zip").read_bytes()
     assert "trained to step 20\n" in run(capsys, *args)
+    told = document(capsys, *args)
+    check_documented("train-evaluator", told)
+    assert (told["loss"], told["parts"]) == (None, report["parts"])
     assert (out / "evaluator.zip").read_bytes() == before
     found = run(
         capsys, "evaluate", policy, "--evaluator", out / "evaluator.zip", "--episodes", 1, "--tasks", "reach",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from commands import fails, run
+from commands import check_documented, document, documented, fails, run
 from pictures import why_no_pictures
 
 import lw_torchrl as lw
@@ -38,7 +38,11 @@ def weights(path, part="head"):
 
 def test_a_new_one_is_trained_with_the_policy(capsys, demos, tmp_path):
     out = tmp_path / "policy.zip"
-    printed = run(capsys, "train", demos, "--out", out, "--evaluator", "new", "--qaf-anchor", 1, *SMALL, *NET)
+    args = "train", demos, "--out", out, "--evaluator", "new", "--qaf-anchor", 1, *SMALL, *NET
+    printed = run(capsys, *args)
+    told = document(capsys, *args)
+    check_documented("train", told, also=["drift"])
+    assert [*told["drift"][0]] == documented("train --evaluator")["drift"]
     assert "conditions that drifted most from their words" in printed
     assert "reach, step" in printed
     actor = lw.load_actor(out)

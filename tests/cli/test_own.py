@@ -123,6 +123,24 @@ def test_a_policy_is_trained_and_evaluated_with_them(capsys, tmp_path):
     assert (tmp_path / "out" / "rollout.rrd").is_file()
 
 
+@pytest.mark.slow
+def test_a_policy_on_words_of_ones_own_serves_in_other_processes(forks, own, tmp_path):
+    """Trained, evaluated, recorded and trained on, each time where no text has been encoded yet."""
+    plan = PLAN.replace("the ball", "the reach target")
+    (tmp_path / "mine.plan").write_text(plan)  # the plan itself says which task it is for
+    policy = tmp_path / "policy.zip"
+    for command in (
+        ("train", own / "demos", "--tasks", "reach", "--plans", tmp_path / "mine.plan", "--out", policy, *TINY),
+        ("evaluate", policy, "--episodes", 1, "--stop-at-success", "--out", tmp_path / "evaluated"),
+        ("record", "reach", "--policy", policy, "--out", tmp_path / "rollout.rrd"),
+        ("train", own / "demos", "--tasks", "reach", "--begin", policy, "--out", tmp_path / "on.zip", "--steps", 5),
+        ("evaluate", tmp_path / "on.zip", "--episodes", 1, "--stop-at-success", "--out", tmp_path / "again"),
+    ):
+        forks.start(*command)
+        ended = forks.end()
+        assert ended.status == 0, (command, ended.err)
+
+
 def test_a_task_that_the_simulator_lacks_is_named(capsys, tmp_path):
     (tmp_path / "tasks.toml").write_text('[stack-cup]\ndescription = "Stack."\nobjects.cup = "obs[4:7]"\n')
     pairs = [["the gripper is open", "go to the cup"]]
@@ -136,7 +154,9 @@ def test_a_task_that_the_simulator_lacks_is_named(capsys, tmp_path):
         actor = lw.PlanConditionedActor(some, width=8, text_encoder=read_encoder("my_texts:encode"))
         lw.save_actor(actor, tmp_path / f"{name}.zip")
     lacks = "the simulator has no stack-cup; tasks of your own run in an engine of yours, in Python"
-    assert "--tasks: " + lacks in fails(capsys, "evaluate", tmp_path / "alone.zip", "--tasks", "stack-cup", *encoder)
+    message = fails(capsys, "evaluate", tmp_path / "alone.zip", "--tasks", "stack-cup", *encoder)
+    assert "got 'stack-cup'" in message
+    assert "A task of your own is a Task with an engine=, see docs/training.md" in message
     assert f"TASK: {lacks}" in fails(capsys, "query", "stack-cup", *files)
     scripted = ("scripted", "stack-cup", "--plans", tmp_path / "plans.json", "--out", tmp_path)
     assert lacks in fails(capsys, *scripted, *files)
@@ -144,7 +164,7 @@ def test_a_task_that_the_simulator_lacks_is_named(capsys, tmp_path):
     assert "the simulator has none of the policy's tasks, stack-cup; name others with --tasks" in message
     printed = run(capsys, "evaluate", tmp_path / "both.zip", "--episodes", 1, *encoder)
     assert printed.startswith("without stack-cup, which the simulator lacks\n")
-    assert "The simulator has no others" in fails(capsys, "collect", "stack-cup", "--out", tmp_path / "demos")
+    assert "A task of your own is a Task" in fails(capsys, "collect", "stack-cup", "--out", tmp_path / "demos")
     assert "did you mean 'reach'" in fails(capsys, "collect", "raech", "--out", tmp_path / "demos")
 
 

@@ -92,7 +92,7 @@ def test_what_is_drawn_and_the_samplers_state_stay_as_they_were(roots, variant, 
 def test_beside_a_transform_and_a_co_learning_sampler(roots):
     plans = lw.load_plans("MT10")
     replay = opened(roots, "joined", batch_size=8, sampler=CoLearningSampler("push"), transform=lw.QAFTransform(plans))
-    for name in ("qaf", "qaf_plan", "is_target", "index", "action", "next", "behaviour"):
+    for name in ("qaf", "qaf_plan", "is_target", "is_demonstration", "index", "action", "next", "behaviour"):
         with pytest.raises(ValueError, match=f"name must be new, samples have '{name}' already"):
             replay.add_column(name, torch.zeros(len(replay)))
     replay.add_column("advantage", torch.arange(len(replay)))

@@ -186,6 +186,18 @@ def test_it_ran_out_whenever_the_pass_that_takes_most_batches_ends(base, target,
         assert replay.sampler.ran_out == (batch // longest > (batch - 1) // longest)
 
 
+def test_it_draws_from_a_storage_of_two_dimensions():
+    storage = LazyTensorStorage(200, ndim=2)
+    replay = TensorDictReplayBuffer(storage=storage, sampler=CoLearningSampler(TARGET), batch_size=8)
+    task = torch.tensor([1, 2, task_id(TARGET)])[:, None].expand(3, 20)
+    for _ in range(2):
+        replay.extend(TensorDict(task_id=task, row=torch.arange(60).view(3, 20), batch_size=[3, 20]))
+        for batch in (replay.sample() for _ in range(10)):
+            assert batch["task_id"].tolist() == [task_id(TARGET)] * 4 + [1, 1, 2, 2]
+            assert batch["is_target"].tolist() == [True] * 4 + [False] * 4
+            assert (storage[batch["index"].unbind(-1)]["row"] == batch["row"]).all()
+
+
 def test_a_masked_target_leaves_out_its_tasks_other_demonstrations():
     """Rows 0..4 are a base task, 5..8 and 9..11 demonstrations of the target, 12..17 another base task."""
     rows = with_episodes((1, 5), (task_id(TARGET), 4), (task_id(TARGET), 3), (2, 6))

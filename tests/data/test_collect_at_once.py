@@ -9,8 +9,8 @@ from contextlib import contextmanager
 
 import pytest
 from collecting import collect, tree
-from filelock import FileLock
 
+from lw_torchrl._files import held
 from lw_torchrl.data import DatasetError, LanguageWorldExperienceReplay
 from lw_torchrl.data import collect as collect_module
 from lw_torchrl.data.episode_files import EpisodeFiles
@@ -44,24 +44,24 @@ def test_a_second_call_is_refused_while_the_first_is_at_work(made, tmp_path, mon
 
 
 def test_what_another_call_finished_meanwhile_is_kept(made, tmp_path, monkeypatch):
-    alone, put = collect_module._alone, EpisodeFiles.put
+    put = EpisodeFiles.put
 
     @contextmanager
-    def after_another(root):
-        monkeypatch.setattr(collect_module, "_alone", alone)
+    def after_another(root, *args, **options):
+        monkeypatch.setattr(collect_module, "held", held)
         elsewhere(root)
         monkeypatch.setattr(EpisodeFiles, "put", lambda *_: pytest.fail("nothing is to be run again"))
-        with alone(root):
+        with held(root, *args, **options):
             yield
 
-    monkeypatch.setattr(collect_module, "_alone", after_another)
+    monkeypatch.setattr(collect_module, "held", after_another)
     assert collect(tmp_path / "demos").episodes == made.episodes
     monkeypatch.setattr(EpisodeFiles, "put", put)
     assert tree(tmp_path / "demos") == tree(made.root)
 
 
 def test_a_finished_dataset_is_read_by_as_many_as_like(made):
-    with FileLock(made.root / ".lock"):
+    with held(made.root, "root", folder=True):
         assert elsewhere(made.root) == made
 
 

@@ -12,8 +12,9 @@ from tensordict import TensorDict
 
 from lw_torchrl.data import DatasetError, LanguageWorldExperienceReplay, collect_demonstrations, missing_episodes
 from lw_torchrl.data import collect as collect_module
+from lw_torchrl.data.checksums import whole_episodes
 from lw_torchrl.data.metadata import read_metadata
-from lw_torchrl.data.rows import COLUMNS, load_rows, whole_episodes
+from lw_torchrl.data.rows import COLUMNS, load_rows
 
 STEPS, EPISODES = 12, 3
 OPTIONS = dict(episodes_per_task=EPISODES, seed=3, noise_scale=(0.0, 0.3), max_steps=STEPS, progress=False)
@@ -130,11 +131,7 @@ def test_collected_again_it_is_what_it_was_and_whole_episodes_are_not_run_again(
     assert collect(root) == found
 
 
-LOADS = {"flipped bytes in one episode", "flipped bytes across two", "a flag that is 2", "a column of zeros"}
-LOADS |= {"a first success that was none", "other numbers of the tasks"}
-
-
-@pytest.mark.parametrize("name", sorted(DAMAGE.keys() - LOADS))
+@pytest.mark.parametrize("name", DAMAGE)
 def test_a_dataset_whose_files_are_not_as_they_should_be_is_not_loaded(root, name):
     DAMAGE[name][0](root)
     before = tree(root)
@@ -305,7 +302,7 @@ def test_an_action_that_is_no_number_is_not_loaded(root, column, label):
     values[17] = np.nan
     values.tofile(path)
     with pytest.raises(DatasetError, match=f"no finite number, for label='{label}'"):
-        LanguageWorldExperienceReplay(root, label=label)
+        LanguageWorldExperienceReplay(root, label=label, check=False)
     values[17:19] = 3e38  # whose sum overflows
     values.tofile(path)
-    assert len(LanguageWorldExperienceReplay(root, label=label)) == len(values) // 4
+    assert len(LanguageWorldExperienceReplay(root, label=label, check=False)) == len(values) // 4

@@ -9,6 +9,7 @@ import shutil
 import numpy as np
 import pytest
 import torch
+from collecting import restate_checksums
 from tensordict import NonTensorData, TensorDict
 
 from lw_torchrl.data import DatasetError, LanguageWorldExperienceReplay, TaskBalancedSampler, collect_demonstrations
@@ -103,6 +104,7 @@ def test_tasks_are_numbered_as_today_whatever_their_numbers_were(root, made, sto
     for name in ("task_id", "next/task_id"):
         np.full(10, stored).tofile(root / "data" / f"{name}.memmap")
     edit(root, lambda found: found.update(task_ids={"reach": stored}))
+    restate_checksums(root)
     changed = tree(root)
     assert {name for name in before if before[name] != changed[name]} == {
         "metadata.json",

@@ -70,6 +70,7 @@ def test_collect_extend_sample_and_step(root, mt10, kind):
         replay.extend(batch)
         sample = replay.sample()
         assert sample["is_target"].sum() == 20
+        assert torch.equal(sample["is_demonstration"], ~sample["is_target"])
         assert sample["task_id"][~sample["is_target"]].unique(return_counts=True)[1].tolist() == [10, 10]
         assert sample["steps_to_next_obs"].max() == 5
         found = loss(sample)
@@ -167,8 +168,8 @@ def test_a_save_that_is_none_is_refused_and_nothing_changes(root, tmp_path, dama
     elif damage == "other":
         file.write_bytes(b"PK")
     else:
-        file.write_bytes(file.read_bytes().replace(b'"format_version": 1', b'"format_version": 2'))
-    with pytest.raises((ValueError, FileNotFoundError)):
+        file.write_bytes(file.read_bytes().replace(b'"format_version": 2', b'"format_version": 3'))
+    with pytest.raises((ValueError, FileNotFoundError), match=f"path: '{tmp_path}' holds no buffer's state"):
         replay.loads(tmp_path)
     assert (replay[:] == before).all()
 
@@ -273,6 +274,6 @@ def test_what_is_shown_is_what_a_collector_gives_too(root):
     replay = open_replay(root)
     later = ("observation", "task_id", "success", "done", "terminated", "truncated", "reward")
     here = ("observation", "task_id", "episode", "action", IDS)
-    assert replay.storage.keys() == [*here, *(("next", key) for key in later)]
+    assert replay.storage.keys() == [*here, *(("next", key) for key in later), "is_demonstration"]
     assert replay.tasks == tuple(TASKS)
     assert replay.demonstrations.num_steps == len(replay) == 120

@@ -343,3 +343,27 @@ def test_own_columns_keep_their_nesting():
     storage = GrowingStorage([rows.update(found)], grow=4)
     storage.extend(own_rows([2], first=5.0).update(TensorDict({"a": {"b": torch.ones(2, 2)}}, [2])))
     assert storage[3:]["a", "b"].tolist() == [[1, 1], [1, 1]]
+
+
+@pytest.mark.parametrize("options", [{}, {"n_steps": 3, "gamma": 0.9}])
+@pytest.mark.parametrize("sampler", [RandomSampler, SamplerWithoutReplacement, TaskBalancedSampler])
+def test_every_sampler_gives_rows_that_say_whether_they_are_demonstrations(sampler, options):
+    replay = buffer(10, sampler(), **options)
+    assert replay.sample()["is_demonstration"].all()
+    for batch in batches([(0, 1, 3), (1, 0, 2), (0, 1, 5)], 2, seed=0):
+        replay.extend(batch)
+        sample = replay.sample()
+        assert torch.equal(sample["is_demonstration"], sample["index"] < 12)
+        assert torch.equal(sample["is_demonstration"], sample["observation"][:, 0] < 0)
+    assert torch.equal(replay.storage.column("is_demonstration"), torch.arange(22) < 12)
+    balanced = buffer(10, TaskBalancedSampler("is_demonstration"))
+    balanced.extend(batch)
+    assert balanced.sample()["is_demonstration"].sum() == 4
+
+
+def test_parts_that_say_so_themselves_are_demonstrations_all_the_same():
+    said = own_rows([4, 3]).set("is_demonstration", torch.zeros(7, dtype=torch.bool))
+    storage = GrowingStorage([said], grow=10)
+    storage.extend(Stream(0, 2, seed=0).batch(3))
+    assert storage[:]["is_demonstration"].tolist() == [True] * 7 + [False] * 6
+    assert "is_demonstration" not in storage.state_dict()["rows"]

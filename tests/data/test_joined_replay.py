@@ -88,6 +88,7 @@ def test_labels_and_dropped_steps_are_those_of_each_dataset(base, target, label,
         ends = torch.cat([first_ends, second_ends])
         expected["next", "done"] = expected["next", "truncated"] = ends
     expected["behaviour"] = torch.zeros(len(expected), dtype=torch.int64)
+    expected["is_demonstration"] = torch.ones(len(expected), dtype=torch.bool)
     found = replay[:]
     assert len(replay) == len(expected)
     assert replay.behaviours == ("noisy",)
@@ -108,7 +109,9 @@ def test_labels_and_dropped_steps_are_those_of_each_dataset(base, target, label,
 def test_episodes_are_chosen_from_one_dataset(base, choice, wanted):
     replay = LanguageWorldExperienceReplay(base.root, episodes=choice, label="executed")
     assert [(e.task, e.episode) for e in replay.demonstrations.episodes] == wanted
-    assert (replay[:].exclude("behaviour", ("next", "reward")) == expected_rows(base, wanted)[0]).all()
+    assert (
+        replay[:].exclude("behaviour", "is_demonstration", ("next", "reward")) == expected_rows(base, wanted)[0]
+    ).all()
     assert replay.tasks == tuple(sorted({task for task, _ in wanted}))
     assert replay.demonstrations.num_steps == len(replay) == STEPS * len(wanted)
     assert replay.data_path_root == base.root
@@ -156,7 +159,8 @@ def test_no_column_of_numbers_is_copied(base, target, label, monkeypatch):
     monkeypatch.setattr(selection, "load_rows", lambda part: loaded.append(load_rows(part)) or loaded[-1])
     replay = LanguageWorldExperienceReplay([base.root, target.root], label=label, after_success=0)
     assert isinstance(replay.storage, JoinedStorage)
-    own = {"behaviour", ("collector", "traj_ids"), ("next", "done"), ("next", "truncated")}  # one number a row, changed
+    # one number a row, changed
+    own = {"behaviour", "is_demonstration", ("collector", "traj_ids"), ("next", "done"), ("next", "truncated")}
     for key, leaves in replay.storage._columns.items():
         if key not in own:
             source = {("next", "reward"): ("next", "reward_sparse")}.get(key, key)

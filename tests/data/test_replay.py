@@ -14,7 +14,8 @@ from lw_torchrl.language.query_program import QueryProgram
 from lw_torchrl.transforms import QAFTransform
 
 STEPS = 50
-WITHOUT_NEXT = {"observation", "task_id", "episode", "behaviour", "action", ("collector", "traj_ids")}
+OWN = {"behaviour", "is_demonstration"}  # of the buffer, not of the files
+WITHOUT_NEXT = {"observation", "task_id", "episode", "action", ("collector", "traj_ids"), *OWN}
 
 
 @pytest.fixture(scope="module")
@@ -58,8 +59,8 @@ def test_or_what_was_executed_with_its_consequences(made, rows, reward):
     replay = LanguageWorldExperienceReplay(made.root, label="executed", reward=reward)
     found = replay[:]
     assert not torch.equal(rows["action"], rows["expert_action"])
-    assert set(found.keys(True, True)) == {*rows.keys(True, True), "behaviour", ("next", "reward")}
-    assert (found.exclude("behaviour", ("next", "reward")) == rows).all()
+    assert set(found.keys(True, True)) == {*rows.keys(True, True), ("next", "reward"), *OWN}
+    assert (found.exclude(("next", "reward"), *OWN) == rows).all()
     assert torch.equal(found["next", "reward"], rows["next", f"reward_{reward}"])
     assert not torch.equal(rows["next", "reward_sparse"], rows["next", "reward_dense"])
     assert (replay.label, replay.reward) == ("executed", reward)
@@ -120,6 +121,19 @@ def test_the_generator_fixes_the_batches(made):
 
     assert torch.equal(batches(0), batches(0))
     assert not torch.equal(batches(0), batches(1))
+
+
+def test_the_generator_is_that_of_a_sampler_that_comes_later(made):
+    def drawn(later):
+        generator = torch.Generator().manual_seed(0)
+        replay = LanguageWorldExperienceReplay(
+            made.root, batch_size=16, generator=generator, sampler=None if later else TaskBalancedSampler()
+        )
+        if later:
+            replay.set_sampler(TaskBalancedSampler())
+        return replay.sample()["index"]
+
+    assert torch.equal(drawn(later=True), drawn(later=False))
 
 
 def test_torchrls_own_slice_sampler_finds_the_episodes(made):

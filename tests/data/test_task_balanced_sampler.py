@@ -7,8 +7,17 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
-from torchrl.data import LazyTensorStorage, RandomSampler, TensorDictReplayBuffer
+from torchrl.collectors import Collector
+from torchrl.data import (
+    LazyMemmapStorage,
+    LazyStackStorage,
+    LazyTensorStorage,
+    ListStorage,
+    RandomSampler,
+    TensorDictReplayBuffer,
+)
 
+from lw_torchrl import LanguageWorldEnv
 from lw_torchrl.data import TaskBalancedSampler
 
 sizes = st.lists(st.integers(1, 9), min_size=1, max_size=5)  # rows of each task
@@ -217,3 +226,81 @@ def test_the_counts_of_torchrls_random_sampler_are_not_exact():
     """Why there is a sampler of our own."""
     replay = make_replay(make_rows([50, 50]), 10, sampler=RandomSampler())
     assert len({int((replay.sample()["task_id"] == 3).sum()) for _ in range(20)}) > 1
+
+
+def make_grid(steps, *tasks):
+    """A batch as a collector gives it: an environment a task, by steps."""
+    task = torch.tensor(tasks)[:, None].expand(-1, steps)
+    return TensorDict({"task_id": task, "row": torch.arange(task.numel()).view(task.shape)}, task.shape)
+
+
+@pytest.mark.parametrize("capacity", [200, 60], ids=["not full", "full"])
+def test_of_a_storage_of_two_dimensions_every_row_comes_once_before_any_comes_again(capacity):
+    storage = LazyTensorStorage(capacity, ndim=2)
+    replay = TensorDictReplayBuffer(storage=storage, sampler=TaskBalancedSampler(), batch_size=9)
+    for _ in range(2):
+        replay.extend(make_grid(20, 3, 5, 5, 7)[:, : 20 if capacity == 200 else 15])
+    batches = [replay.sample() for _ in range(20)]
+    for batch in batches:
+        assert batch["task_id"].bincount().tolist() == [0, 0, 0, 3, 0, 3, 0, 3]
+        assert (storage[batch["index"].unbind(-1)]["row"] == batch["row"]).all()
+    rows = len(storage) // 4
+    mine = torch.cat([batch["index"][batch["task_id"] == 3] for batch in batches])[:rows]
+    assert len(mine.unique(dim=0)) == rows
+
+
+def test_of_a_storage_of_two_dimensions_the_state_goes_on(tmp_path):
+    one, two = (
+        TensorDictReplayBuffer(
+            storage=LazyTensorStorage(200, ndim=2),
+            sampler=TaskBalancedSampler(),
+            batch_size=6,
+            generator=torch.Generator().manual_seed(seed),
+        )
+        for seed in range(2)
+    )
+    one.extend(make_grid(20, 3, 5, 7))
+    two.extend(make_grid(20, 3, 5, 7))
+    drawn(one, 3), drawn(two, 1)
+    one.sampler.dumps(tmp_path)
+    two.sampler.loads(tmp_path)
+    two._rng.set_state(one._rng.get_state())
+    assert drawn(two, 20) == drawn(one, 20)
+    one.extend(make_grid(20, 3, 5, 7))
+    assert one.sample()["task_id"].bincount().tolist() == [0, 0, 0, 2, 0, 2, 0, 2]
+
+
+def test_rows_of_a_collector_in_a_storage_of_two_dimensions():
+    env = LanguageWorldEnv(["push", "reach"], num_envs=4, max_steps=10)
+    replay = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(200, ndim=2), sampler=TaskBalancedSampler(), batch_size=20
+    )
+    collector = Collector(
+        env, None, frames_per_batch=40, total_frames=80, auto_register_policy_transforms=False, traj_format="padded"
+    )
+    for rows in collector:
+        replay.extend(rows)
+        batch = replay.sample()
+        assert batch["task_id"].unique(return_counts=True)[1].tolist() == [10, 10]
+    collector.shutdown()
+
+
+@pytest.mark.parametrize("storage", [ListStorage, LazyStackStorage, LazyMemmapStorage])
+def test_other_storages_are_drawn_from_as_well(storage):
+    replay = TensorDictReplayBuffer(storage=storage(20), sampler=TaskBalancedSampler(), batch_size=4)
+    replay.extend(make_rows([7, 3]))
+    assert replay.sample()["task_id"].bincount().tolist() == [0, 0, 0, 2, 0, 2]
+
+
+@pytest.mark.parametrize(
+    ("size", "error", "message"),
+    [
+        (0, ValueError, "batch_size must be at least 1, got 0"),
+        (-4, ValueError, "batch_size must be at least 1, got -4"),
+        (2.0, TypeError, "batch_size must be an integer, got 2.0"),
+        ("4", TypeError, "batch_size must be an integer, got '4'"),
+    ],
+)
+def test_a_batch_size_that_is_none_is_named(size, error, message):
+    with pytest.raises(error, match=message):
+        make_replay(make_rows([4, 4]), None).sample(size)

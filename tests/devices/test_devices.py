@@ -89,7 +89,7 @@ def test_without_a_gpu_there_is_the_cpu(demos, tmp_path):
             "--device must be one of 'cpu', 'auto' here",
         ),
         (
-            ["evaluate", "p.zip", "--device", "gpu"],
+            ["train", "DEMOS", "--out", "p.zip", "--device", "gpu"],
             "--device must be one of 'cpu', 'cuda', 'cuda:0', 'mps', 'auto'",
         ),
         (

@@ -108,6 +108,12 @@ def test_mistakes_are_named(tasks, message):
         lw.LanguageWorldEnv(tasks, engine=Counting)
 
 
+@pytest.mark.parametrize("tasks", ["stack-cups", ["stack-cups"], ["reach", "stack-cups"], [STACK]], ids=str)
+def test_a_task_of_ones_own_without_an_engine_is_told_how(tasks):
+    with pytest.raises(ValueError, match=r"'stack-cups'.* is a Task with an engine=, see docs/training.md"):
+        lw.LanguageWorldEnv(tasks)
+
+
 def test_a_name_alone_must_be_known():
     """A typo is no task of one's own."""
     with pytest.raises(ValueError, match=r"task must be one of .* got 'stack-cups'"):

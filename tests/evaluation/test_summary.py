@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 import lw_torchrl as lw
@@ -55,16 +56,27 @@ def test_the_numbers_by_hand():
     assert summary.mean == mean_rate(summary.array)
 
 
+def test_one_evaluation_twice_and_other_plans_are_refused():
+    one, other = RESULTS.values()
+    with pytest.raises(ValueError, match="different training seeds, 0 and 2 are one evaluation"):
+        summarize([one, other, one])
+    with pytest.raises(ValueError, match="of the same plans; those of seeds 0 and 1 differ"):
+        summarize([replace(one, origin={"plans": "a"}), replace(other, origin={"plans": "b"})])
+    summarize([replace(one, origin={"plans": "a"}), other])  # not saved yet, so it does not say
+    with pytest.raises(TypeError, match=r"results\[1\] must be an EvaluationResult, got 'other'"):
+        summarize([one, "other"])
+
+
 def test_tasks_in_another_order_are_the_same_tasks():
     other = make_result({"sweep": 0, "reach": 3, "push": 3})
     assert summarize({3: RESULTS[3], 7: other}) == summarize(RESULTS)
 
 
 def test_options_reach_the_statistics():
-    summary = summarize(RESULTS, threshold=0.6, resamples=100, seed=4, whole_seeds=True)
+    summary = summarize(RESULTS, threshold=0.6, confidence=0.5)
     assert summary.solved == 2
     assert summary.threshold == 0.6
-    assert summary.mean == mean_rate(summary.array, resamples=100, seed=4, whole_seeds=True)
+    assert summary.mean == mean_rate(summary.array, confidence=0.5)
 
 
 def test_one_seed_has_no_interval():
@@ -83,8 +95,9 @@ def test_one_seed_has_no_interval():
         )
     )
 )
+@example({"0": [0.0, 1e-151]})
 def test_it_is_json_and_consistent(rates):
-    summary = summarize_rates(rates, resamples=20)
+    summary = summarize_rates(rates)
     found = json.loads(json.dumps(summary.to_json(), allow_nan=False))
     assert {task: row["rates"] for task, row in found["tasks"].items()} == rates
     assert found["mean"]["value"] == pytest.approx(np.mean([row["mean"] for row in found["tasks"].values()]))

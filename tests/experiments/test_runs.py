@@ -1,6 +1,8 @@
 """The experiments' runs: resumed anywhere they end with the same result."""
 
 import shutil
+import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import pytest
@@ -14,6 +16,10 @@ from lw_torchrl.experiments.recipes import PRESETS, SETTINGS, Member
 from lw_torchrl.experiments.runs import SCRIPTED, Run
 from lw_torchrl.modules.policy import METHODS
 from lw_torchrl.trainers.checkpoint import demonstration_seeds
+
+
+def backwards(texts):
+    return lengths(texts).flip(-1)
 
 
 def lengths(texts):
@@ -101,6 +107,55 @@ def test_a_result_of_another_configuration_is_refused(undisturbed):
         load_result(a_run(), lw.load_plans("MT50", skills="MT10"), undisturbed)
     with pytest.raises(ValueError, match=r"differs in episodes \(.*, now 3\)"):
         load_result(replace(a_run(), episodes=3), PLANS, undisturbed)
+
+
+def test_a_result_of_other_tasks_is_refused(undisturbed):
+    """It gave reach's result for push's."""
+    for one in (a_run(), a_run(SCRIPTED)):
+        with pytest.raises(
+            ValueError, match=r"another configuration, it differs in tasks \(\['reach'\], now \['push'\]\)"
+        ):
+            execute_run(one, PLANS, undisturbed, tasks="push", progress=False)
+    one = a_run(setting=TINY_ONE_SHOT)
+    assert execute_run(one, PLANS, undisturbed, tasks=["push", "reach"], progress=False).config["tasks"] == ["push"]
+    with pytest.raises(ValueError, match="tasks must name some of the run's targets, push, got reach"):
+        execute_run(one, PLANS, undisturbed, tasks="reach", progress=False)
+
+
+def test_a_result_of_another_description_of_a_task_is_refused(undisturbed):
+    """Plans' fingerprint does not tell what a task's description says, by which "dc" is conditioned."""
+    reach = replace(lw.TASKS["reach"], description="Go there.")
+    plans = lw.Plans({**PLANS, "reach": lw.ConditionalPlan("reach", PLANS["reach"].steps, reach)})
+    assert plans.fingerprint == PLANS.fingerprint
+    with pytest.raises(ValueError, match="another configuration, it differs in own_tasks"):
+        execute_run(a_run("dc"), plans, undisturbed, tasks="reach", progress=False)
+    assert execute_run(a_run("pcbc"), plans, undisturbed, tasks="reach", progress=False)
+
+
+def test_what_a_result_says_beyond_the_run_counts(undisturbed, tmp_path):
+    shutil.copytree(undisturbed / a_run().folder, tmp_path / a_run().folder)
+    found = lw.EvaluationResult.load(tmp_path / a_run().folder / "results.json")
+    found.config["run"]["evaluations"] = 10
+    found.save(tmp_path / a_run().folder / "results.json")
+    with pytest.raises(ValueError, match=r"it differs in evaluations \(10, now None\)"):
+        execute(a_run(), tmp_path)
+
+
+def test_a_run_waits_for_another_process_that_does_it(undisturbed, tmp_path, holding, capfd):
+    """Its result is there afterwards, and it is not done twice."""
+    one = a_run("dc")
+    folder = tmp_path / one.folder
+    release = holding(folder, folder=True)
+    with ThreadPoolExecutor(1) as pool:
+        waiting = pool.submit(execute, one, tmp_path)
+        deadline = time.monotonic() + 20
+        while f"waiting for another process that is at work in '{folder}'" not in capfd.readouterr().err:
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        shutil.copyfile(undisturbed / one.folder / "results.json", folder / "results.json")
+        release()
+        assert waiting.result() == lw.EvaluationResult.load(undisturbed / one.folder / "results.json")
+    assert [path.name for path in folder.iterdir()] == ["results.json"]
 
 
 @pytest.mark.parametrize(
@@ -227,7 +282,10 @@ def test_a_text_encoder_of_ones_own(one, tmp_path):
     if one.method != "one-hot":
         (tmp_path / own.folder / "results.json").unlink()
         with pytest.raises(ValueError, match="text"):  # a policy of other texts is no policy of these
-            execute_run(own, PLANS, tmp_path, tasks=task_of(own), progress=False)
+            execute_run(own, PLANS, tmp_path, tasks=task_of(own), progress=False, text_encoder=backwards)
+    for named, encoder in ((own, None), (one, lengths)):
+        with pytest.raises(ValueError, match="text_encoder must be given where the run has an encoder_name"):
+            execute_run(named, PLANS, tmp_path, tasks=task_of(own), progress=False, text_encoder=encoder)
 
 
 def test_a_preset_may_put_an_evaluator_into_the_policy(tmp_path):

@@ -350,6 +350,8 @@ def test_mutations_of_answers_raise_nothing_and_cost_little():
         "- When a, " * 5_000,
         "</a>" * 10_000,
         "1. " * 10_000,
+        "\\\n" * 30_000,
+        "when a the robot should b\n" * 2_500,
         "\n".join(f'if check("a{k} b"):\n robot.x("c")' for k in range(2_000)),
         "\n".join(f"{' ' * k}if check('open'):" for k in range(300)),
     ],
@@ -359,6 +361,12 @@ def test_long_texts_take_no_more_than_their_length(text, format):
     start = thread_time()
     lw.decode_plan(text, "stick-pull", format)
     assert thread_time() - start < 1.0
+
+
+def test_of_more_steps_than_a_plan_has_the_rest_is_left_out():
+    found = lw.decode_plan("if check('gripper open'):\n robot.a()\n" * 1_500, "push", "basic_py")
+    assert len(found.plan.steps) == len(found.steps) == 1_000
+    assert "line 2001: begins what is more than 1000 steps; 500 are left out" in map(str, found.notes)
 
 
 NO_CLAUSE = {  # answers of the recorded file that say nothing for the task they were asked about: refusals, other tasks

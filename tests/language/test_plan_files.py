@@ -79,6 +79,12 @@ def test_any_condition_becomes_the_nearest_query(tmp_path_factory, condition, sk
         ('{"push": ' + "[" * 900 + "]" * 900 + "}", "push, step 1: expected a condition"),
         ('{"push": [[' + "9" * 5000 + ", 3]]}", "expected JSON"),
         ('{"push": [["gripper is open", "wait"]], "push": [["gripper is closed", "wait"]]}', "'push' more than once"),
+        ({"push": [["gripper is open", "wait"]] * 1001}, r"plans.json, push must have at most 1000 steps, got 1001"),
+        (
+            dict.fromkeys(("push", "reach", "door-open"), [["open", "wait"]] * 999),
+            "at most 2000 pairs in all, got 2997",
+        ),
+        (" " * 2**18 + "{}", "larger than 262144 bytes"),
         ({"push": [["open and " * 64 + "closed", "wait"]]}, "push, step 1: query .* must have at most 64 clauses"),
     ],
 )

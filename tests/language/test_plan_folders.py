@@ -129,6 +129,14 @@ def test_a_file_named_after_another_task_is_an_error(tmp_path):
         load_plans(tmp_path)
 
 
+def test_a_file_of_another_name_is_for_the_task_that_its_plan_says(tmp_path):
+    (tmp_path / "mine.plan").write_text(HEAD)
+    assert list(load_plans(tmp_path / "mine.plan")) == list(load_plans(tmp_path)) == ["push"]
+    (tmp_path / "push.plan").write_text(HEAD)
+    with pytest.raises(PlanError, match=r"^push\.plan: a second plan for 'push'; mine\.plan holds one"):
+        load_plans(tmp_path)
+
+
 def test_one_bad_file_names_itself_and_its_line(tmp_path):
     save_plans(Plans([plan(), parse_plan(DRAWER)]), tmp_path)
     (tmp_path / "reach.plan").write_text(HEAD.replace("push(robot)", "reach(robot)").replace("is open", "is opne"))

@@ -1,5 +1,7 @@
 """The text of a plan: read line by line, faults named by their lines, nothing executed."""
 
+from time import thread_time
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -8,7 +10,7 @@ from plan_texts import DRAWER, HEAD, plan
 from lw_torchrl.language.formats import chain_py
 from lw_torchrl.language.formats.chain_py import check_plan, format_plan, parse_plan
 from lw_torchrl.language.plan_files import load_plans
-from lw_torchrl.language.plans import PlanError
+from lw_torchrl.language.plans import MOST_STEPS, PLAN_LIMIT, ConditionalPlan, PlanError
 from lw_torchrl.language.queries import check_query, parse_query
 
 
@@ -226,3 +228,31 @@ def push(robot):
     with pytest.raises(PlanError) as caught:
         parse_plan(text)
     assert str(caught.value) == check_plan(text)[1][0]
+
+
+def asking(steps):
+    return "def push(robot):\n" + 'if check("gripper is open"):\nrobot.push("the puck")\n' * steps
+
+
+def test_a_plan_has_at_most_a_thousand_steps_and_its_text_an_end():
+    assert len(parse_plan(asking(MOST_STEPS)).steps) == MOST_STEPS
+    assert check_plan(asking(20_000), source="my.plan") == (None, ["my.plan must have at most 1000 steps, got 20000"])
+    with pytest.raises(PlanError, match=f"plan: a plan's text must have at most {PLAN_LIMIT} characters, got {10**7}"):
+        parse_plan("#" * 10**7)
+    pairs = [("gripper is open", "push the puck")]
+    with pytest.raises(PlanError, match="plan of task 'push' must have at most 1000 steps, got 1001"):
+        ConditionalPlan.from_pairs("push", pairs * 1001)
+    with pytest.raises(PlanError, match="plan of task 'push' must have at most 1000 steps, got 1001"):
+        ConditionalPlan("push", plan().steps * 1001)
+
+
+@pytest.mark.usefixtures("in_time")
+@pytest.mark.parametrize(
+    "line",
+    ["robot.place(" + " " * 10**5, 'robot.place("a"' + " " * 10**5 + "x", "if check(" + " " * 10**5, "\n" * 10**5],
+    ids=["skill", "goal", "condition", "lines"],
+)
+def test_a_line_takes_no_more_time_than_its_length(line):
+    start = thread_time()
+    assert check_plan(f"def push(robot):\n{line}")[0] is None
+    assert thread_time() - start < 1.0

@@ -174,7 +174,7 @@ def test_wrong_options_are_named(tasks, options, message):
     [
         (lambda texts: torch.full((len(texts), 4), torch.nan), ValueError, "it gives NaN or infinity for"),
         (lambda texts: [[1.0] * 4 for _ in texts], TypeError, "must give a tensor of floats"),
-        ("my_texts:encode", TypeError, "text_encoder must be a function of texts, got 'my_texts:encode'"),
+        ("my_texts:encode", TypeError, "text_encoder must be a function, got 'my_texts:encode'"),
     ],
 )
 def test_an_encoder_that_gives_no_vectors_is_named(encoder, error, message):

@@ -71,6 +71,23 @@ def test_exported_it_gives_the_same_bits_at_every_number_of_rows(name):
 
 
 @pytest.mark.parametrize("name", ACTORS)
+def test_the_bare_actor_is_exported(name):
+    actor = ACTORS[name]().eval()
+    read = lw.QAFTransform(PLANS)(TensorDict(dict(zip(("observation", "task_id"), make_rows(7), strict=True)), [7]))
+    read = read.select(*actor.in_keys)
+    written = actor(read.clone())
+    by_name = torch.export.export(actor, args=(), kwargs=read.to_dict()).module()(**read.to_dict())
+    tensors = tuple(read[key] for key in actor.in_keys)
+    any_rows = (tuple({0: torch.export.Dim("rows")} for _ in tensors),)
+    by_place = torch.export.export(actor, tensors, dynamic_shapes=any_rows).module()
+    fewer = by_place(*(tensor[:3] for tensor in tensors))
+    for found, rows in ((by_name, 7), (by_place(*tensors), 7), (fewer, 3)):
+        found = found if isinstance(found, tuple) else (found,)
+        expected = actor(read[:rows].clone()) if rows < 7 else written
+        assert all(torch.equal(one, expected[key]) for one, key in zip(found, actor.out_keys, strict=True))
+
+
+@pytest.mark.parametrize("name", ACTORS)
 def test_compiled_it_is_one_graph(name):
     torch._dynamo.reset()  # all share one forward, which is compiled eight times at most
     module = Deployed(ACTORS[name]().eval())

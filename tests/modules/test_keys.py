@@ -1,14 +1,19 @@
-"""in_keys and out_keys are obeyed by every module: read there, written there, nested ones too."""
+"""in_keys and out_keys are obeyed by every module, as TorchRL's own do: also selected, or called with tensors."""
 
 from __future__ import annotations
+
+import copy
+import inspect
 
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictSequential, set_skip_existing
+from torchrl.objectives.value import GAE
 
 import lw_torchrl as lw
 from lw_torchrl._keys import as_keys
-from lw_torchrl.modules import PlanAttention
+from lw_torchrl.modules import DescriptorEncoder, PlanAttention, PlanEncoder, QValue, Value
 
 PLANS = lw.load_plans("MT10")
 SMALL = dict(latent_size=4, width=8, depth=1, encoder_width=8)
@@ -108,3 +113,145 @@ def test_a_json_list_is_a_nested_key():
 def test_nothing_writes_over_what_it_reads(make_one):
     with pytest.raises(ValueError, match="out_keys must not be among in_keys"):
         make_one()
+
+
+# --- what TorchRL does with modules --------------------------------------------------------------------------------
+
+
+def plan_actor(**more):
+    return lw.PlanConditionedActor(PLANS, **SMALL, **more)
+
+
+networks = dict(width=8, depth=1)
+MODULES = {
+    "plan": plan_actor,
+    "actions": lambda: plan_actor(mix="actions"),
+    "tanh_normal": lambda: plan_actor(distribution="tanh_normal"),
+    "normal": lambda: lw.DescriptorConditionedActor("MT10", distribution="normal", **SMALL),
+    "description": lambda: lw.DescriptorConditionedActor("MT10", **SMALL),
+    "with evaluator": lambda: plan_actor(evaluator=lw.StateQueryEvaluator(PLANS, width=8)),
+    "scripted": lambda: lw.ScriptedSkillActor(PLANS),
+    "expert": lambda: lw.ExpertActor("MT10"),
+    "ensemble": lambda: lw.ActorEnsemble([plan_actor(), plan_actor()]),
+    "residual": lambda: lw.ResidualActor(plan_actor(), **networks),
+    "residual of steps": lambda: lw.ResidualActor(plan_actor(), steps={"push": [0]}, **networks),
+    "plan encoder": lambda: PlanEncoder(PLANS),
+    "description encoder": lambda: DescriptorEncoder("MT10"),
+    "value": lambda: Value(PlanEncoder(PLANS), ensemble=2, **networks),
+    "value of actions": lambda: QValue(PlanEncoder(PLANS), ensemble=2, **networks),
+    "quantiles": lambda: QValue(PlanEncoder(PLANS), quantiles=5, **networks),
+    "attention": lambda: PlanAttention(PLANS),
+    "evaluator": lambda: lw.StateQueryEvaluator(PLANS, width=8),
+    "held evaluator": lambda: lw.HeldEvaluator(lw.StateQueryEvaluator(PLANS, width=8)),
+}
+each_module = pytest.mark.parametrize("name", MODULES)
+
+
+def made(name):
+    """A module, what it reads of some rows, and what it writes."""
+    torch.manual_seed(0)
+    module, rows = MODULES[name]().eval(), state()
+    rows["action"], rows["qaf_held_logits"] = torch.rand(3, 4), torch.randn(3, PLANS.num_steps)
+    read = rows.select(*module.in_keys)
+    return module, read, module(read.copy()).select(*module.out_keys)
+
+
+def as_tuple(found):
+    return found if isinstance(found, tuple) else (found,)
+
+
+@each_module
+def test_selected_keys_hold_what_they_held_before(name):
+    module, read, written = made(name)
+    names = list(module.out_keys)
+    for chosen in ([names[0]], [names[-1]], names[::-1]):
+        assert module.select_out_keys(*chosen) is module
+        assert (module.out_keys, module.out_keys_source) == (chosen, names)
+        for one in (module, copy.deepcopy(module)):
+            found = one(read.copy())
+            assert set(found.keys(True, True)) == {*module.in_keys, *chosen}
+            assert all(torch.equal(found[key], written[key]) for key in chosen)
+        by_name = as_tuple(module(**read.to_dict()))
+        assert all(torch.equal(one, written[key]) for one, key in zip(by_name, chosen, strict=True))
+        module.reset_out_keys()
+        assert (module(read.copy()).select(*names) == written).all()
+
+
+@each_module
+def test_selected_by_a_sequence(name):
+    module, read, written = made(name)
+    found = TensorDictSequential(module, selected_out_keys=[module.out_keys[-1]])(read.copy())
+    assert set(found.keys(True, True)) == {*module.in_keys, module.out_keys[-1]}
+    assert torch.equal(found[module.out_keys[-1]], written[module.out_keys[-1]])
+
+
+@each_module
+def test_called_with_tensors(name):
+    module, read, written = made(name)
+    for found in (module(**read.to_dict()), module(*(read[key] for key in module.in_keys))):
+        assert all(torch.equal(one, written[key]) for one, key in zip(as_tuple(found), module.out_keys, strict=True))
+    with pytest.raises(TypeError, match="unexpected keyword argument 'observatoin'"):
+        module(observatoin=read[module.in_keys[0]])
+
+
+@each_module
+def test_new_names_for_what_it_writes(name):
+    module, read, written = made(name)
+    names = list(module.out_keys)
+    module.out_keys = [("other", key) for key in names]
+    found = module(read.copy())
+    assert all(torch.equal(found["other", key], written[key]) for key in names)
+
+
+@each_module
+def test_what_is_there_is_skipped_if_asked(name):
+    module, read, written = made(name)
+    there = read.copy().update(written.clone().zero_())
+    with set_skip_existing(True):
+        assert not any(module(there.copy())[key].any() for key in module.out_keys)
+        assert torch.equal(module(read.copy())[module.out_keys[0]], written[module.out_keys[0]])
+    assert torch.equal(module(there.copy())[module.out_keys[0]], written[module.out_keys[0]])
+
+
+@each_module
+@pytest.mark.parametrize("rows", [(0,), (2, 0)])
+def test_no_rows(name, rows):
+    module, read, written = made(name)
+    found = module(TensorDict({key: value.new_zeros(*rows, *value.shape[1:]) for key, value in read.items()}, rows))
+    for key in module.out_keys:
+        assert (found[key].shape, found[key].dtype) == ((*rows, *written[key].shape[1:]), written[key].dtype)
+
+
+@each_module
+def test_in_double_precision_it_says_the_same(name):
+    module, read, written = made(name)
+    found = module.to(torch.float64)(read.copy())
+    for key in module.out_keys:
+        torch.testing.assert_close(found[key].to(written[key].dtype), written[key], atol=1e-4, rtol=1e-4)
+
+
+def test_estimators_skip_values_that_are_there():
+    value, rows = Value(PlanEncoder(PLANS), **networks), state().unsqueeze(0)
+    flag = torch.zeros(1, 3, 1, dtype=torch.bool)
+    rows["state_value"] = torch.ones(1, 3, 1)
+    rows["next"] = rows.copy().update({"reward": torch.ones(1, 3, 1), "done": flag, "terminated": flag})
+    found = GAE(gamma=0.5, lmbda=0.0, value_network=value, skip_existing=True)(rows)
+    assert torch.equal(found["advantage"], torch.full((1, 3, 1), 0.5)), "1 + 0.5 - 1"
+
+
+@pytest.mark.parametrize("make_one", [plan_actor, MODULES["scripted"]])
+def test_new_names_are_saved_or_refused(make_one, tmp_path):
+    actor = make_one()
+    actor.out_keys = [("other", key) for key in actor.out_keys]
+    if isinstance(actor, lw.ScriptedSkillActor):
+        with pytest.raises(ValueError, match="in_keys or out_keys were changed later: give them where it is made"):
+            lw.save_actor(actor, tmp_path / "policy.zip")
+    else:
+        lw.save_actor(actor, tmp_path / "policy.zip")
+        assert lw.load_actor(tmp_path / "policy.zip").out_keys == actor.out_keys
+
+
+def test_every_forward_of_ours_is_called_so():
+    for make_one in MODULES.values():
+        kinds = [p.kind for p in inspect.signature(make_one().forward).parameters.values()]
+        assert kinds == [inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD]

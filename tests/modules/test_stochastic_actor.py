@@ -8,7 +8,10 @@ import pickle
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import ProbabilisticTensorDictSequential
 from torchrl.envs import ExplorationType, TransformedEnv, set_exploration_type
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.utils import ValueEstimators
 
 import lw_torchrl as lw
 
@@ -151,8 +154,9 @@ def test_wrong_options_are_named(options, error, message):
 
 def test_without_a_distribution_that_is_said():
     actor = make("plan", None)
-    with pytest.raises(TypeError, match="has no distribution; make it with distribution='tanh_normal'"):
-        actor.get_dist(make_state())
+    for ask in (lambda: actor.get_dist(make_state()), actor.as_sequential):
+        with pytest.raises(TypeError, match="has no distribution; make it with distribution='tanh_normal'"):
+            ask()
     assert (actor.log_prob_keys, actor.dist_sample_keys, actor.dist_params_keys) == ([], [], [])
 
 
@@ -172,3 +176,66 @@ def test_nothing_random_is_left_in_the_likelihoods_of_one_made_of_a_trained_one(
     actor, state = trained.stochastic().train(), make_state(50)
     first, second = (actor.get_dist(state).log_prob(torch.zeros(50, 4)) for _ in range(2))
     assert torch.equal(first, second)
+
+
+@by_kind
+@by_distribution
+def test_as_torchrls_own_it_is_the_same_to_the_bit(kind, distribution):
+    actor, state = make(kind, distribution), make_state()
+    own = actor.as_sequential()
+    assert isinstance(own, ProbabilisticTensorDictSequential)
+    assert (own.in_keys, sorted(own.out_keys), own.spec) == (actor.in_keys, sorted(actor.out_keys), actor.spec)
+    for name in ("dist_params_keys", "dist_sample_keys", "log_prob_keys"):
+        assert getattr(own, name) == getattr(actor, name), name
+    for mode in (ExplorationType.RANDOM, ExplorationType.DETERMINISTIC):
+        found = []
+        for each in (actor, own, copy.deepcopy(own)):
+            torch.manual_seed(0)
+            with set_exploration_type(mode):
+                found.append(each(state.clone()))
+        assert all(torch.equal(found[0][key], other[key]) for key in actor.out_keys for other in found)
+    done = found[0]
+    assert torch.equal(own.log_prob(done.clone()), actor.log_prob(done))
+    assert torch.equal(actor.log_prob(done), done["action_log_prob"])
+    assert torch.equal(actor.log_prob(done, dist=actor.build_dist_from_params(done)), done["action_log_prob"])
+    for p in own.parameters():
+        p.data.add_(1.0)
+    assert not torch.equal(actor(state.clone())["loc"], done["loc"]), "the weights are the actor's"
+
+
+@pytest.mark.parametrize("chosen", [["action"], ["scale", "action"], ["skill_weights"]])
+def test_selected_keys_do_not_move_the_distributions(chosen):
+    actor, state = make(), make_state()
+    everything = drawn(actor, state)
+    actor.select_out_keys(*chosen)
+    assert (actor.dist_params_keys, actor.log_prob_keys) == (["loc", "scale"], ["action_log_prob"])
+    assert actor.dist_sample_keys == ["action"]
+    assert torch.equal(actor.log_prob(everything), everything["action_log_prob"])
+    assert torch.equal(
+        actor.build_dist_from_params(everything).log_prob(everything["action"]), everything["action_log_prob"]
+    )
+    assert actor.get_dist_params(state.clone())["scale"].equal(everything["scale"])
+    assert actor.spec["action"].shape == (4,)
+
+
+def test_new_names_move_them():
+    actor = make()
+    actor.out_keys = [("new", key) for key in actor.out_keys]
+    found = drawn(actor, make_state())
+    assert actor.dist_params_keys == [("new", "loc"), ("new", "scale")]
+    assert torch.equal(actor.log_prob(found), found["new", "action_log_prob"])
+    assert actor.as_sequential().dist_params_keys == actor.dist_params_keys
+    with pytest.raises(ValueError, match="out_keys must be a list of 6, in this order: action, skill_weights"):
+        actor.out_keys = ["action"]
+
+
+def test_v_trace_takes_it():
+    actor, value = lw.plan_actor_value(PLANS, **SMALL)
+    rows = drawn(actor, make_state(6)).detach().reshape(1, 6)
+    flag = torch.zeros(1, 6, 1, dtype=torch.bool)
+    rows["next"] = (
+        make_state(6, 1).reshape(1, 6).update({"reward": torch.ones(1, 6, 1), "done": flag, "terminated": flag})
+    )
+    loss = ClipPPOLoss(actor, value)
+    loss.make_value_estimator(ValueEstimators.VTrace)
+    assert loss(rows)["loss_objective"].isfinite()

@@ -340,3 +340,26 @@ def test_from_the_value_to_the_weights():
 
 
 ACTOR = make_actor()
+
+
+@pytest.mark.parametrize("distribution", [None, "normal"])
+def test_reduced_otherwise_each_row_has_its_own_weight(distribution):
+    batch, found = make_batch(spread=3.0), {}
+    name = "l2" if distribution is None else "log_prob"
+    for reduction in ("none", "sum", "mean", None):
+        loss = lw.AdvantageWeightedLoss(
+            make_actor(distribution=distribution).eval(), beta=1.5, loss_function=name, reduction=reduction
+        )
+        found[reduction] = loss(batch)["loss_actor"]
+    weights = (1.5 * batch["advantage"].squeeze(-1)).exp().clamp(max=20.0)
+    assert found["none"].shape == (12,)
+    torch.testing.assert_close(found["none"].sum(), found["sum"])
+    torch.testing.assert_close(found["sum"] / weights.sum(), found["mean"])
+    assert torch.equal(found["mean"], found[None])
+    alone = lw.AdvantageWeightedLoss(make_actor(distribution=distribution).eval(), loss_function=name, beta=0.0)
+    for row in range(12):  # with the weight 1
+        torch.testing.assert_close(found["none"][row], weights[row] * alone(batch[row : row + 1])["loss_actor"])
+    with pytest.raises(
+        ValueError, match="reduction must be one of 'none', 'mean', 'sum', got 'men'; did you mean 'mean'"
+    ):
+        lw.AdvantageWeightedLoss(make_actor(), reduction="men")

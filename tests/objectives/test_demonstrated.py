@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from test_losses import BOUNDS, SMALL, make_actor, make_batch, make_encoder, total
+from test_losses import BOUNDS, PLANS, SMALL, make_actor, make_batch, make_encoder, total
 from torchrl.objectives import SACLoss, SoftUpdate, TD3Loss
 
 import lw_torchrl as lw
@@ -36,11 +36,11 @@ def values(loss, critic, batch, action):
 def test_td3s_actor_is_torn_between_values_and_demonstrations(shape):
     loss, actor, critic = make(lw.DemonstratedTD3Loss, bc_weight=0.7)
     batch = make_batch()
-    batch["is_target"] = batch["is_target"].view(shape)
+    batch["is_demonstration"] = batch["is_demonstration"].view(shape)
     found, about = loss.actor_loss(batch)
     action = actor(batch.copy())["action"]
     value = values(loss, critic, batch, action).mean(0)
-    demonstrated = [row for row in range(24) if not batch["is_target"].flatten()[row]]
+    demonstrated = [row for row in range(24) if batch["is_demonstration"].flatten()[row]]
     assert demonstrated == list(range(12, 24))
     distance = sum(((action[row] - batch["action"][row]) ** 2).sum() for row in demonstrated) / (4 * len(demonstrated))
     expected = -value.mean() / value.abs().mean().detach() + 0.7 * distance
@@ -95,10 +95,10 @@ def test_sacs_actor_is_drawn_to_demonstrations_by_its_mode():
 @pytest.mark.parametrize("kind", [lw.DemonstratedTD3Loss, lw.DemonstratedSACLoss])
 def test_without_demonstrations_nothing_is_imitated(kind):
     batch = make_batch()
-    batch["is_target"] = torch.ones(24, dtype=torch.bool)
+    batch["is_demonstration"] = torch.zeros(24, dtype=torch.bool)
     losses = [total(make(kind, weight)[0], batch) for weight in (0.0, 5.0)]
     assert torch.equal(*losses)
-    batch["is_target"] = ~batch["is_target"]
+    batch["is_demonstration"] = ~batch["is_demonstration"]
     assert total(make(kind, 5.0)[0], batch) > losses[0]
 
 
@@ -106,14 +106,20 @@ def test_without_demonstrations_nothing_is_imitated(kind):
 def test_keys_are_obeyed(kind):
     batch, (loss, _, _), (other, _, _) = make_batch(), make(kind), make(kind)
     expected = total(loss, batch)
-    assert "is_target" in loss.in_keys
-    other.set_keys(is_target=("from", "environment"))
+    assert "is_demonstration" in loss.in_keys
+    other.set_keys(is_demonstration=("from", "environment"))
     assert ("from", "environment") in other.in_keys
-    assert "is_target" not in other.in_keys
-    batch["from", "environment"] = batch.pop("is_target")
+    assert "is_demonstration" not in other.in_keys
+    batch["from", "environment"] = batch.pop("is_demonstration")
     assert torch.equal(total(other, batch), expected)
-    with pytest.raises(ValueError, match="is_target"):
-        loss.set_keys(is_targets="is_target")
+    with pytest.raises(ValueError, match="is_demonstration"):
+        loss.set_keys(is_demonstrations="is_demonstration")
+
+
+@pytest.mark.parametrize("kind", [lw.DemonstratedTD3Loss, lw.DemonstratedSACLoss])
+def test_another_reduction_is_refused_when_the_loss_is_made(kind):
+    with pytest.raises(ValueError, match="reduction must be one of 'none', 'mean', 'sum', got 'men'; did you mean"):
+        make(kind, reduction="men")
 
 
 def test_a_loss_for_each_row_has_the_same_mean():
@@ -128,10 +134,10 @@ def test_a_loss_for_each_row_has_the_same_mean():
 def test_imitation_is_of_demonstrated_rows_alone():
     generator = torch.Generator().manual_seed(0)
     action, other = (torch.rand(7, 4, generator=generator) for _ in range(2))
-    is_target = torch.tensor([True, False, True, True, False, True, True])
-    found = imitation(action, other, is_target)
-    assert (found[is_target] == 0).all()
-    torch.testing.assert_close(found.mean(), (action - other)[~is_target].square().mean())
+    rows = torch.tensor([False, True, False, False, True, False, False])
+    found = imitation(action, other, rows)
+    assert (found[~rows] == 0).all()
+    torch.testing.assert_close(found.mean(), (action - other)[rows].square().mean())
 
 
 def test_wrong_options_are_named():
@@ -141,3 +147,61 @@ def test_wrong_options_are_named():
         make(lw.DemonstratedSACLoss, float("nan"))
     with pytest.raises(ValueError, match="alpha is 1 here: give bc_weight"):
         make(lw.DemonstratedTD3Loss, alpha=2.5)
+
+
+@pytest.mark.parametrize("kind", [lw.DemonstratedTD3Loss, lw.DemonstratedSACLoss])
+def test_what_says_which_rows_are_demonstrations_is_named_where_it_is_missing(kind):
+    loss, batch = make(kind)[0], make_batch()
+    batch["is_target"] = batch.pop("is_demonstration")  # of co-learning, which is another thing
+    with pytest.raises(
+        ValueError, match=r"the batch lacks 'is_demonstration', .*: a LanguageWorldExperienceReplay writes"
+    ):
+        loss(batch)
+    batch["is_demonstration"] = torch.zeros(24)
+    with pytest.raises(
+        ValueError, match=r"'is_demonstration' must be torch.bool, true of demonstrations, got torch.float"
+    ):
+        loss(batch)
+
+
+@pytest.mark.parametrize("sampler", [lw.CoLearningSampler("reach"), lw.TaskBalancedSampler(), None])
+def test_of_a_buffer_of_demonstrations_all_rows_are_imitated(tmp_path, sampler):
+    lw.collect_demonstrations(["push", "reach"], episodes_per_task=1, root=tmp_path / "d", max_steps=20, progress=False)
+    replay = lw.LanguageWorldExperienceReplay(
+        tmp_path / "d", label="executed", batch_size=8, sampler=sampler, transform=lw.QAFTransform(PLANS)
+    )
+    loss, actor, _ = make(lw.DemonstratedTD3Loss)
+    batch = replay.sample()
+    found = loss.actor_loss(batch)[1]["bc_loss"]
+    torch.testing.assert_close(found, (actor(batch.copy())["action"] - batch["action"]).square().mean())
+
+
+def test_with_and_without_vmap_it_is_the_same():
+    found = [total(make(lw.DemonstratedTD3Loss, deactivate_vmap=which)[0], make_batch()) for which in (False, True)]
+    torch.testing.assert_close(*found)
+
+
+@pytest.mark.parametrize("kind", [lw.DemonstratedTD3Loss, lw.DemonstratedSACLoss])
+def test_a_sum_is_the_mean_times_the_rows(kind):
+    batch, found = make_batch(), {}
+    for reduction in ("mean", "sum", "none"):
+        more = {"scalar_output_mode": "exclude"} if kind is lw.DemonstratedSACLoss else {}
+        loss = make(kind, reduction=reduction, **more)[0]
+        torch.manual_seed(3)
+        found[reduction] = loss.actor_loss(batch.copy())[0]
+    torch.testing.assert_close(found["sum"], found["mean"] * 24)
+    torch.testing.assert_close(found["none"].sum(), found["sum"])
+    assert found["none"].shape == (24,)
+
+
+def test_an_action_spec_of_several_rows_is_refused():
+    env = lw.LanguageWorldEnv("reach", num_envs=4)
+    for kind in (lw.DemonstratedTD3Loss, lw.DemonstratedSACLoss):
+        actor, critic = make_actor("plan"), QValue(make_encoder("plan"), **SMALL)
+        with pytest.raises(
+            ValueError, match=r"action_spec must be of one row, got one of shape \(4, 4\): take env.action"
+        ):
+            kind(actor, critic, action_spec=env.action_spec)
+    assert make(lw.DemonstratedSACLoss, action_spec=env.action_spec_unbatched)[0].target_entropy == -4
+    assert make(lw.DemonstratedSACLoss, action_spec=env.full_action_spec)[0].target_entropy == -4
+    env.close()

@@ -357,3 +357,20 @@ def test_it_can_be_copied_and_makes_no_warnings():
         loss = make_loss()
         other, batch = copy.deepcopy(loss), make_batch()
         assert torch.equal(loss(batch)["loss_value"], other(batch)["loss_value"])
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_reduced_otherwise(weighted):
+    batch, found = make_batch(), {}
+    if weighted:
+        batch["priority_weight"] = torch.rand(12, generator=torch.Generator().manual_seed(0))
+    for reduction in ("none", "sum", "mean", None):
+        found[reduction] = make_loss(reduction=reduction)(batch.copy())["loss_value"]
+    one_by_one = [make_loss()(batch[row : row + 1].exclude("priority_weight"))["loss_value"] for row in range(12)]
+    weights = batch["priority_weight"] if weighted else torch.ones(12)
+    torch.testing.assert_close(found["none"], torch.stack(one_by_one) * weights)
+    torch.testing.assert_close(found["sum"], found["none"].sum())
+    torch.testing.assert_close(found["mean"], found["sum"] / weights.sum())
+    assert torch.equal(found["mean"], found[None])
+    with pytest.raises(ValueError, match="reduction must be one of 'none', 'mean', 'sum', got 1"):
+        make_loss(reduction=1)

@@ -151,3 +151,15 @@ def test_what_is_refused():
     one = lw.ConditionalPlan.from_pairs("reach", [(str(step.condition), step.skill)])
     with pytest.raises(ValueError, match=f"network is for plans of at least two different skills, got {step.skill}"):
         lw.SkillLatentLoss(make_actor(plans={"reach": one}))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_reduced_otherwise_each_skill_has_a_term(kind):
+    actor = make_actor()
+    found = {r: lw.SkillLatentLoss(actor, kind, reduction=r)()["loss_latents"] for r in ("none", "sum", "mean", None)}
+    assert found["none"].shape == (len(actor.encoder.skills),)
+    torch.testing.assert_close(found["none"].sum(), found["sum"])
+    torch.testing.assert_close(found["none"].mean(), found["mean"])
+    assert torch.equal(found["mean"], found[None])
+    with pytest.raises(ValueError, match="reduction must be one of 'none', 'mean', 'sum', got 'max'"):
+        lw.SkillLatentLoss(actor, kind, reduction="max")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
-import json
 import re
 import signal
 import socket
@@ -16,7 +14,7 @@ from commands import fails
 import lw_torchrl as lw
 from lw_torchrl.planners import model_server
 from lw_torchrl.planners.comparing import compare_plans
-from lw_torchrl.planners.model_server import as_openai, serve_model
+from lw_torchrl.planners.model_server import serve_model
 
 TASKS = [*lw.MT10]
 
@@ -48,36 +46,6 @@ def test_what_is_no_model_is_refused(tmp_path):
 def test_numbers_that_are_too_small_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         serve_model(**options)
-
-
-def posted(body, path="/v1/chat/completions"):
-    """What a server of the model "mine" does with a request: its own answer, and what reached the one behind it."""
-    reached, said = [], []
-
-    async def behind(scope, receive, send):
-        reached.append((await receive())["body"])
-
-    async def receive():
-        return {"type": "http.request", "body": body}
-
-    async def send(message):
-        said.append(message)
-
-    asyncio.run(as_openai(behind, "mine")({"type": "http", "path": path}, receive, send))
-    return said, reached
-
-
-def test_another_model_is_not_found():
-    (start, content), reached = posted(json.dumps({"model": "gpt-4o", "messages": []}).encode())
-    assert (start["status"], reached) == (404, [])
-    error = json.loads(content["body"])["error"]
-    assert error["code"] == "model_not_found"
-    assert error["message"] == "the model 'gpt-4o' does not exist here; 'mine' is served"
-
-
-@pytest.mark.parametrize("body", [b'{"model": "mine"}', b'{"messages": []}', b"[1]", b"{", b'{"model": null}'])
-def test_what_asks_for_the_model_or_none_goes_on(body):
-    assert posted(body) == ([], [body])
 
 
 def test_serve_looks_at_the_file_before_it_says_that_it_loads(capsys, tmp_path):

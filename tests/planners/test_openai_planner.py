@@ -107,6 +107,13 @@ ALWAYS = {
     "401": (lambda body: error(401, f"wrong: {KEY}"), "wants a key, in OPENAI_API_KEY", "Give the key"),
     "404": (lambda body: error(404, "no model a/model"), "no such model or address", "/v1/models"),
     "400": (lambda body: error(400, "unknown field"), "refused .*unknown field", "Leave out"),
+    "400 in plain words": (lambda body: Failure(400, "no top_k"), "refused .*400 - no top_k", "Leave out"),
+    "400 in words of its own": (
+        lambda body: Failure(400, {"detail": [{"msg": "top_k"}]}),
+        "refused .*top_k",
+        "Leave out",
+    ),
+    "500 in words of its own": (lambda body: Failure(500, {"error": "out of memory"}), "500 - .*out of memory", "log"),
     "context": (lambda body: error(400, "maximum context length is 2048"), "does not fit", "max_tokens"),
     "cut body": (lambda body: Failure(200, completion("x" * 99), cut=True), "broke off, asked 2", "server runs"),
     "cut JSON": (lambda body: Failure(200, '{"choices": ['), "cut off or is no JSON", "Ask again"),
@@ -160,7 +167,7 @@ def test_what_passes_is_tried_again(ask, failure):
 
 def test_a_slow_server(ask):
     server = FakeServer(lambda body: Failure(200, completion("x"), wait=0.5))
-    with pytest.raises(lw.PlannerError, match=r"no answer within 0.1 s, asked 1 times.*longer timeout"):
+    with pytest.raises(lw.PlannerError, match=r"no answer within 0.1 s, asked 1 time.*longer timeout"):
         ask(server, "push", timeout=0.1, retries=0)
 
 

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import io
+import socket
 import threading
+import time
 import urllib.request
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -94,6 +97,31 @@ def test_a_page_is_served_until_it_is_closed(tmp_path, recording):
     assert not server.is_alive()
     with pytest.raises(OSError, match="refused"):
         urllib.request.urlopen(page.address, timeout=5)
+
+
+@pytest.mark.parametrize("begun", [b"", b"G", b"GET / HTTP/1.1\r\nX: ", b"GET /wasm.gz HTTP/1.0\r\n\r\n"])
+def test_who_asks_or_takes_too_slowly_holds_no_thread(monkeypatch, recording, begun):
+    monkeypatch.setattr("lw_torchrl.record.web.ASKING_SECONDS", 0.5)
+    monkeypatch.setattr("lw_torchrl.record.web.STALLED_SECONDS", 0.5)
+    page = WebPage(recording)
+    server = threading.Thread(target=page.serve)
+    server.start()
+    before = threading.active_count()
+    try:
+        with socket.create_connection(("127.0.0.1", int(page.address.rstrip("/").rpartition(":")[2]))) as slow:
+            slow.sendall(begun)
+            for _ in range(100):
+                time.sleep(0.05)
+                with suppress(ConnectionError):
+                    slow.sendall(b"x")
+                if threading.active_count() <= before:
+                    break
+            assert threading.active_count() <= before
+        with urllib.request.urlopen(page.address, timeout=20) as answer:
+            assert answer.status == 200
+    finally:
+        page.close()
+        server.join(20)
 
 
 def test_wrong_pages_are_named(tmp_path, recording):

@@ -74,6 +74,24 @@ def test_discarding_gives_the_older_file_its_name_back(tmp_path):
     assert os.listdir(tmp_path) == ["a.rrd"]
 
 
+@pytest.mark.parametrize("end", ["shutdown", "discard"])
+def test_a_recording_leaves_alone_the_one_that_has_its_name_now(tmp_path, end):
+    path = tmp_path / "a.rrd"
+    first = RerunLogger(path)
+    first.log_scalar("first", 1.0)
+    first.flush()
+    second = RerunLogger(path)
+    assert second.previous == tmp_path / "a.previous.rrd"
+    getattr(first, end)()
+    second.log_scalar("second", 1.0)
+    second.shutdown()
+    assert Recording(path).entities() == {"/__properties", "/metrics/second"}
+    assert is_whole(path)
+    if end == "shutdown":
+        with pytest.warns(UserWarning, match="was not closed"), opened(second.previous) as kept:
+            assert "/metrics/first" in Recording(kept).entities()
+
+
 def test_a_file_without_room_for_an_index_stays_as_it_is(tmp_path, monkeypatch):
     import shutil
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -207,6 +208,19 @@ def test_histograms(tmp_path):
     centers = [row[0]["buffer"] for row in found.values(entity, "BarChart:abscissa")]
     assert centers == [((edges[1:] + edges[:-1]) / 2).tolist()]
     np.testing.assert_allclose(found.values(entity, "BarChart:widths"), [np.diff(edges)], rtol=1e-6)
+
+
+def test_episodes_of_two_threads_have_names_of_their_own(tmp_path):
+    rollout = TensorDict({"observation": torch.rand(5, 39), "action": torch.rand(5, 4)}, [5])
+    objects = {"puck": rollout["observation"][:, 4:7]}
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        with RerunLogger(tmp_path / "a.rrd") as logger, ThreadPoolExecutor(4) as threads:
+            names = list(threads.map(lambda _: logger.log_episode(rollout, task="reach", objects=objects), range(24)))
+    finally:
+        sys.setswitchinterval(before)
+    assert sorted(names) == sorted({"reach", *(f"reach-{number}" for number in range(2, 25))})
 
 
 def test_importing_loads_no_rerun():

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import socket
 import stat
+import time
 from contextlib import contextmanager
 from types import SimpleNamespace
 
@@ -14,7 +16,7 @@ from rerun.chunk import RrdReader
 from tensordict import TensorDict
 
 from lw_torchrl.record import RerunLogger, open_viewer, viewer
-from lw_torchrl.record.cursor import go_to
+from lw_torchrl.record.cursor import connect, go_to
 from lw_torchrl.record.opening import find_recording, opened
 from lw_torchrl.record.opening_step import opening_step
 from lw_torchrl.record.rerun_binary import running
@@ -107,6 +109,15 @@ def entities_of_copy(path):
     with opened(path) as copy:
         assert is_whole(copy)
         return Recording(copy).entities()
+
+
+def test_a_viewer_that_says_nothing_is_not_waited_for_for_ever(monkeypatch):
+    monkeypatch.setattr("lw_torchrl.record.cursor.START_SECONDS", 1.0)
+    with socket.create_server(("127.0.0.1", 0)) as mute:  # it takes connections, and that is all
+        began = time.monotonic()
+        with pytest.raises(TimeoutError, match="no answer within 1 seconds"):
+            connect(SimpleNamespace(poll=lambda: None), mute.getsockname()[1])
+        assert time.monotonic() - began < 10
 
 
 @pytest.mark.parametrize("share", [0.3, 0.6, 0.9, 0.99])

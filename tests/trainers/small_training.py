@@ -79,3 +79,4 @@ def assert_same(found, expected):
             assert found[key].item() == value, key
         else:
             assert found[key] == value, key
+            assert type(found[key]) is type(value), key  # an integer stays one

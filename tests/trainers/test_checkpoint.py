@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import threading
 import zipfile
+from dataclasses import replace
 
 import pytest
 import torch
@@ -15,12 +16,27 @@ from torch.nn.utils import prune
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from lw_torchrl.data import TaskBalancedSampler
+from lw_torchrl.language import text
 from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.language.skills import load_skills
-from lw_torchrl.language.tasks import MT10, task_id
-from lw_torchrl.modules import ActorEnsemble, DescriptorConditionedActor, PlanConditionedActor, ScriptedSkillActor
-from lw_torchrl.trainers import BehavioralCloningConfig, BehavioralCloningTrainer, load_actor, save_actor
+from lw_torchrl.language.tasks import MT10, TASKS, task_id
+from lw_torchrl.modules import (
+    ActorEnsemble,
+    DescriptorConditionedActor,
+    PlanConditionedActor,
+    ResidualActor,
+    ScriptedSkillActor,
+    StateQueryEvaluator,
+)
+from lw_torchrl.trainers import (
+    BehavioralCloningConfig,
+    BehavioralCloningTrainer,
+    load_actor,
+    load_evaluator,
+    save_actor,
+    save_evaluator,
+)
 from lw_torchrl.trainers.checkpoint import read_description
 
 SMALL = dict(latent_size=4, width=16, depth=1, encoder_width=8)
@@ -127,11 +143,45 @@ def test_another_text_encoder_is_found_out(saved, tmp_path):
     save_actor(PlanConditionedActor(own_plans(), text_encoder=counted, **SMALL), path)
     for other in (
         lambda texts: counted(texts).flip(-1),
-        lambda texts: counted([text.replace("e", "a") for text in texts]),
+        lambda texts: counted([one.replace("e", "a") for one in texts]),
     ):
         with pytest.raises(ValueError, match="text_encoder is not the one that the policy was made with"):
             load_actor(path, text_encoder=other)
     load_actor(path, text_encoder=lambda texts: counted(texts) * 3.0)  # the same after scaling
+
+
+def own_words(evaluator=None):
+    return PlanConditionedActor(own_plans(), evaluator=evaluator, **SMALL)
+
+
+NOT_SHIPPED = {
+    "a plan": own_words,
+    "a description": lambda: DescriptorConditionedActor(
+        [replace(TASKS["reach"], description="Bring the hand over to the red spot.")], **SMALL
+    ),
+    "an ensemble": lambda: ActorEnsemble([own_words(), own_words()]),
+    "a residual": lambda: ResidualActor(own_words()),
+    "an evaluator's plan": lambda: own_words(StateQueryEvaluator(own_plans(), structure=False, width=8, depth=1)),
+}
+
+
+@pytest.mark.parametrize("make", NOT_SHIPPED.values(), ids=NOT_SHIPPED)
+def test_texts_that_are_not_shipped_load_in_a_new_process(make, tmp_path):
+    """The text model that encodes them, far larger than the policy, is made while the file is loaded."""
+    save_actor(make(), tmp_path / "own.zip")
+    text._sentence_transformer.cache_clear()  # as in a new process
+    load_actor(tmp_path / "own.zip")
+    assert text._sentence_transformer.cache_info().misses
+
+
+def test_an_evaluator_that_reads_texts_loads_in_a_new_process(tmp_path):
+    gripper, target = TASKS["reach"].objects
+    ball = replace(TASKS["reach"], objects=(gripper, replace(target, name="red ball")))
+    plans = Plans([ConditionalPlan.from_pairs(ball, [("the gripper is not near the red ball", "glide over")])])
+    save_evaluator(StateQueryEvaluator(plans, structure=False, width=8, depth=1), tmp_path / "evaluator.zip")
+    text._sentence_transformer.cache_clear()
+    load_evaluator(tmp_path / "evaluator.zip", plans)
+    assert text._sentence_transformer.cache_info().misses
 
 
 def test_what_another_thread_makes_meanwhile_is_none_of_its_business(tmp_path):

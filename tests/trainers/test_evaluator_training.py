@@ -60,6 +60,7 @@ def assert_same(found, expected):
     assert found.keys() == expected.keys()
     for key, value in expected.items():
         assert torch.equal(found[key], value) if isinstance(value, torch.Tensor) else found[key] == value, key
+        assert type(found[key]) is type(value), key
 
 
 # ---- what is trained, and what is not

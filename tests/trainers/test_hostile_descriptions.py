@@ -76,6 +76,7 @@ def test_descriptions_that_are_no_json_of_ours_are_refused(good, tmp_path, text)
     refuses(tmp_path / "c.zip")
 
 
+@pytest.mark.filterwarnings("ignore:checkpoint. .* was written under other versions")
 @settings(max_examples=60, deadline=None)
 @given(data=st.data())
 def test_any_change_of_the_description_is_harmless(good, tmp_path_factory, data):

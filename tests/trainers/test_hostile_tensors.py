@@ -108,13 +108,29 @@ def test_tensors_that_are_no_safetensors_are_refused(good, tmp_path, group, chan
     refuses(tmp_path / "c.zip")
 
 
-def test_more_layers_than_there_are_weights_are_refused_before_they_are_made(good, tmp_path):
-    """Their numbers are few enough, but each layer is a module of several kB."""
+@pytest.mark.parametrize("option", ["depth", "encoder_depth"])
+def test_more_layers_than_there_are_weights_are_refused_before_they_are_made(good, tmp_path, option):
+    """Their numbers are few enough, but each layer is a module of several kB, and even a list of them takes memory."""
     description, groups = parts(good)
     changed("weights", lambda t: t.update({"more": torch.zeros(30_000)}))(description, groups)
-    description["actor"]["options"].update(width=1, depth=10_000)
+    description["actor"]["options"].update({"width": 1, option: 10_000})
     rebuild(tmp_path / "c.zip", description, groups)
-    with pytest.raises(ValueError, match=r"checkpoint: .*describes a network of more weights or numbers than it holds"):
+    with pytest.raises(ValueError, match=r"checkpoint: .*describes a network of 1e\+04 layers, but holds only"):
+        lw.load_actor(tmp_path / "c.zip")
+
+
+@pytest.mark.parametrize("shape", [(0, 2**21), (0, 2**40), (1, 2**21)])
+def test_texts_of_more_numbers_than_are_stored_are_refused_before_they_are_made(good, tmp_path, shape):
+    """Vectors of any length take no room in a file that holds none of them."""
+    description, groups = parts(good)
+
+    def widened(tensors):
+        for name in tensors:
+            tensors[name] = torch.zeros(shape)
+
+    changed("texts", widened)(description, groups)
+    rebuild(tmp_path / "c.zip", description, groups)
+    with pytest.raises(ValueError, match=r"checkpoint: .*its texts have more numbers than the \d+ that it holds"):
         lw.load_actor(tmp_path / "c.zip")
 
 

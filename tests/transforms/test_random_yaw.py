@@ -188,7 +188,7 @@ def test_with_plans_it_needs_their_answers():
 
 @pytest.mark.parametrize("scale", [-0.1, float("inf"), float("nan")])
 def test_a_wrong_scale_is_named(scale):
-    with pytest.raises(ValueError, match="scale must be finite and at least 0"):
+    with pytest.raises(ValueError, match=r"scale must be finite( and at least 0)?, got"):
         lw.RandomYaw(scale)
 
 

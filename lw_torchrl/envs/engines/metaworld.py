@@ -8,11 +8,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl._checks import check_choice
 from lw_torchrl._rendering import naming_absent_renderer
 from lw_torchrl.envs.cameras import Cameras
 from lw_torchrl.envs.engine import OBSERVATION_SIZE, BodyPoses, EngineStep, RowModel
-from lw_torchrl.language.tasks import MT50
+from lw_torchrl.language.tasks import check_task
 
 
 def import_metaworld() -> Any:
@@ -31,7 +30,7 @@ def make_metaworld_env(task: str, *, max_steps: int = 500) -> Any:
     import_metaworld()
     from metaworld.env_dict import ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE
 
-    check_choice("task", task, MT50)
+    check_task(task)
     env = ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE[f"{task}-v3-goal-observable"](seed=0)
     env._freeze_rand_vec = False
     env.seeded_rand_vec = True

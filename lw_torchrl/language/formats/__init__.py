@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from types import MappingProxyType
 
-from lw_torchrl._checks import check_choice
+from lw_torchrl._checks import check_choice, checked
 from lw_torchrl.language.formats.md import md
 from lw_torchrl.language.formats.plan_format import STYLES, PlanFormat
 from lw_torchrl.language.formats.py import py
@@ -25,6 +25,7 @@ PLAN_FORMATS: Mapping[str, PlanFormat] = MappingProxyType(
 """The formats by name."""
 
 
+@checked
 def encode_plan(plan: ConditionalPlan, format: str) -> str:
     """A plan as text.
 

@@ -18,14 +18,15 @@ import re
 from collections.abc import Generator, Mapping
 
 from lw_torchrl._checks import nearest, shown
-from lw_torchrl.language.plans import ConditionalPlan, PlanError, PlanStep
+from lw_torchrl.language.plans import MOST_STEPS, PLAN_LIMIT, ConditionalPlan, PlanError, PlanStep, too_many_steps
 from lw_torchrl.language.queries import Query, check_query
 from lw_torchrl.language.tasks import TASKS, Task
 
 _TEXT = r'"((?:[^"\\]|\\.)*)"|\'((?:[^\'\\]|\\.)*)\''
 _DEF = re.compile(r"def\s+([A-Za-z]\w*)\s*\(\s*robot\s*\)\s*:")
 _CHECK = re.compile(rf"if\s+check\s*\(\s*(?:{_TEXT})\s*\)\s*:")
-_SKILL = re.compile(rf"robot\.([A-Za-z]\w*)\s*\(\s*(?:{_TEXT})?\s*(?:,?\s*goal\s*=\s*(?:{_TEXT}))?\s*\)")
+_ASKS = re.compile(r"^[ \t]*+if[ \t]+check\b", re.MULTILINE)
+_SKILL = re.compile(rf"robot\.([A-Za-z]\w*)\s*\(\s*+(?:{_TEXT})?\s*+(?:,?\s*+goal\s*=\s*(?:{_TEXT}))?\s*+\)")
 
 
 def _unquote(match: re.Match[str], group: int) -> str:
@@ -38,6 +39,12 @@ def _read(
     """Yields every fault, line by line, and returns the plan where there is none."""
     if not isinstance(text, str):
         raise TypeError(f"text must be a string, got {type(text).__name__}")
+    if (asked := len(_ASKS.findall(text))) > MOST_STEPS:
+        yield too_many_steps(source, asked)
+        return None
+    if len(text) > PLAN_LIMIT:
+        yield PlanError(f"{source}: a plan's text must have at most {PLAN_LIMIT} characters, got {len(text)}")
+        return None
     found: str | None = None
     condition: Query | None = None
     opened, sound = False, True  # opened: a condition, sound or not, waits for its skill

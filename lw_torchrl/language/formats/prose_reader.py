@@ -7,6 +7,7 @@ count that say "When C, the robot should S". Other sentences before a clause are
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 from lw_torchrl._checks import shown
 from lw_torchrl.language.formats.written import END, Clause, Reading, item
@@ -43,7 +44,7 @@ def is_comment(line: str) -> bool:
         or _BULLET.match(line)
         or item(line)
         or _listing(line) is not None
-        or _clause(1, line, "", bullet=False)
+        or _clause(1, line, bullet=False)
     )
 
 
@@ -70,7 +71,7 @@ class _Reader:
             self.reason.clear()
         elif (steps := _listing(raw)) is not None:
             self.listing, self.section.listed = True, steps
-        elif found := _clause(number, line, " ".join(self.reason), bullet is not None):
+        elif found := _clause(number, line, bullet is not None):
             self.add(found, bullet is not None, line)
         elif self.listing and (numbered := item(line)):
             self.section.listed += f"  {numbered[0]}. {numbered[1]}"
@@ -87,7 +88,7 @@ class _Reader:
             self.section.clauses.clear()  # sentences that only say why
         if bullet or not self.bulleted.get(place, False):
             self.bulleted[place] = bullet
-            self.section.clauses.append(found)
+            self.section.clauses.append(replace(found, reason=" ".join(self.reason)))
             self.reason.clear()
         else:
             self.reason.append(line)
@@ -108,7 +109,7 @@ def _listing(line: str) -> str | None:
     return found[1] if found else None
 
 
-def _clause(number: int, line: str, reason: str, bullet: bool) -> Clause | None:
+def _clause(number: int, line: str, bullet: bool) -> Clause | None:
     start = _BULLET.match(line)
     found = _WHEN.match(line, start.end() if start else 0)
     if not found:
@@ -119,16 +120,16 @@ def _clause(number: int, line: str, reason: str, bullet: bool) -> Clause | None:
         goal = re.sub(r"^it is\b", f"the {GRIPPER} is", _ended(rest[until.end() :]))
         if not goal:
             return None  # cut off
-        return Clause(number, rest[: until.start()], "", goal, reason)
+        return Clause(number, rest[: until.start()], "", goal)
     if (should and found[1].lower() in ("when", "if", "whenever", "once")) or (should and bullet):
-        return Clause(number, rest[: should.start()], _ended(rest[should.end() :]), "", reason)
+        return Clause(number, rest[: should.start()], _ended(rest[should.end() :]))
     comma = _COMMA.search(rest)
     if not bullet or not comma:
         return None
     skill = _ended(rest[comma.end() :])
     if skill.partition(" ")[0].lower() in _NO_SKILL:
         return None
-    return Clause(number, rest[: comma.start()], skill, "", reason)
+    return Clause(number, rest[: comma.start()], skill)
 
 
 def _ended(text: str) -> str:

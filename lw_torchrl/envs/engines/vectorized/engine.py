@@ -24,6 +24,7 @@ from lw_torchrl.envs.engines.vectorized.simulation_table import simulation_table
 from lw_torchrl.envs.engines.vectorized.success import SuccessFunction
 from lw_torchrl.envs.engines.vectorized.task_logic import make_task_logic, model_path
 from lw_torchrl.envs.engines.vectorized.worker_pool import RowGroup, WorkerPool, split_into_groups
+from lw_torchrl.language.tasks import check_task
 
 Rows = NDArray[np.intp]
 Array = NDArray[np.float64]
@@ -81,7 +82,7 @@ class VectorizedEngine:
             num_threads = available_cores()
         num_threads = check_int("num_threads", num_threads, minimum=1)
         table = simulation_table()
-        tasks = [check_choice("task", task, table) for task in tasks]
+        tasks = [check_task(task) for task in tasks]
         self._groups = split_into_groups([model_path(task) for task in tasks], num_threads)
         self._group_of_row = np.empty(len(tasks), dtype=np.intp)
         builders: list[Any] = [None] * len(tasks)

@@ -1,0 +1,128 @@
+"""A replay buffer of datasets whose state is one file: the rows stay in their datasets, and no pickle is read."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from hashlib import sha256
+from pathlib import Path
+from reprlib import repr as short
+from typing import Any, NoReturn
+
+from torch import Tensor
+from torchrl.data import TensorStorage
+from torchrl.data.datasets.common import BaseDatasetExperienceReplay
+from torchrl.data.replay_buffers.storages import Storage
+
+from lw_torchrl._files import reading
+from lw_torchrl._state_tree import join, split
+from lw_torchrl._tensor_archive import TensorArchive, write_archive
+from lw_torchrl.data.checksums import verify
+from lw_torchrl.data.dataset import Demonstrations
+from lw_torchrl.data.metadata import read_metadata
+from lw_torchrl.data.selection import JoinedDemonstrations
+
+_FILE = "buffer.zip"
+_VERSION = 2
+
+
+def fingerprint(parts: Sequence[Demonstrations], *cuts: Any) -> str:
+    """What tells the rows of these episodes, cut short as ``cuts`` say, from any others."""
+    listed = [[[e.task, e.episode, e.start, e.length, e.checksum] for e in part.episodes] for part in parts]
+    return sha256(json.dumps([listed, *cuts]).encode()).hexdigest()
+
+
+class RestorableReplay(BaseDatasetExperienceReplay):
+    """A buffer that shows rows of datasets, which it neither changes nor saves.
+
+    Attributes:
+        demonstrations: what is shown.
+    """
+
+    demonstrations: Demonstrations | JoinedDemonstrations
+    _fingerprint: str
+
+    @property
+    def parts(self) -> tuple[Demonstrations, ...]:
+        """The description of each dataset, of the episodes that are shown."""
+        shown = self.demonstrations
+        return (shown,) if isinstance(shown, Demonstrations) else shown.parts
+
+    def verify(self) -> None:
+        """Read the episodes that are shown through against their checksums, unless this process has, since the files
+        were last changed.
+
+        Raises:
+            DatasetError: (a ValueError) they are not as they were written.
+        """
+        for part in self.parts:
+            verify(read_metadata(part.root), part.episodes)
+
+    def __setitem__(self, index: Any, value: Any) -> NoReturn:
+        """Raise: datasets are shown as they are on disk."""
+        raise RuntimeError(
+            "a dataset's rows cannot be assigned to: change what replay.sample() gives, which is yours, or give each "
+            "row a value of its own by add_column"
+        )
+
+    def preprocess(self, *args: Any, **kwargs: Any) -> TensorStorage:
+        """As TorchRL's, which wants the rows in one tensordict."""
+        shown = self.storage
+        self._storage: Storage = TensorStorage(shown[:])
+        try:
+            return super().preprocess(*args, **kwargs)
+        finally:
+            self._storage = shown
+
+    def state_dict(self) -> dict[str, Any]:
+        """The state of sampler, generator and transforms, the rows that came, and which rows of datasets are shown."""
+        return super().state_dict() | {"rows": self._fingerprint}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore what :meth:`state_dict` gave, once the rows that are shown are verified.
+
+        Raises:
+            ValueError: it is the state of a buffer that shows other rows, or none; nothing has changed then.
+                DatasetError as from :meth:`verify`.
+        """
+        self.verify()
+        self._restore(state_dict)
+
+    def _restore(self, state: Any) -> None:
+        if not isinstance(state, Mapping) or state.get("rows") != self._fingerprint:
+            raise ValueError("state_dict must be of the rows that this buffer shows, got one of others")
+        size = state.get("_batch_size")
+        if size is not None and (type(size) is not int or size < 1):
+            raise ValueError(f"state_dict: _batch_size must be None or at least 1, got {short(size)}")
+        before, generator = super().state_dict(), self._rng
+        try:
+            super().load_state_dict(dict(state))
+        except Exception as error:
+            super().load_state_dict(before)
+            if generator is not None:
+                self.set_rng(generator)
+            if isinstance(error, ValueError):
+                raise
+            raise ValueError(f"state_dict does not fit this buffer ({type(error).__name__}: {error})") from error
+
+    def dumps(self, path: str | os.PathLike[str]) -> None:
+        """Save the state to a folder, as one file, which is there whole or not at all."""
+        tensors: dict[str, Tensor] = {}
+        tree = split(self.state_dict(), tensors)
+        write_archive(Path(path) / _FILE, {"format_version": _VERSION, "state": tree}, {"tensors": tensors})
+
+    def loads(self, path: str | os.PathLike[str]) -> None:
+        """Restore what :meth:`dumps` saved, once the rows that are shown are verified.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            ValueError: it is damaged, or the state of a buffer that shows other rows; nothing has changed then.
+                DatasetError as from :meth:`verify`.
+        """
+        self.verify()
+        with reading(path, "buffer's state"):
+            archive = TensorArchive(Path(path) / _FILE)
+            if (version := archive.description.get("format_version")) != _VERSION:
+                raise ValueError(f"it is of version {short(version)}, this package reads {_VERSION}")
+            self._restore(join(archive.description.get("state"), archive.tensors("tensors")))

@@ -1,0 +1,91 @@
+"""What a server sent, read as a chat completion: nothing that it holds is believed, and no key in it is passed on."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from typing import Any
+
+from lw_torchrl._files import parse_json
+from lw_torchrl.planners.answer_cache import Reply
+from lw_torchrl.planners.answers import Tokens, is_count, storable
+from lw_torchrl.planners.bounded_client import REPLY_LIMIT
+
+_LONGEST, _SEARCHED = 300, 20_000  # characters of what a server said: in an error, and looked through for them
+KEY_SENT_BACK = "the server sent the key back; it is hidden"
+
+
+class NoCompletion(ValueError):
+    """What came is no chat completion.
+
+    Attributes:
+        hint: what to try.
+        fatal: any other question would end the same way.
+    """
+
+    def __init__(self, message: str, hint: str, fatal: bool = False) -> None:
+        super().__init__(message)
+        self.hint, self.fatal = hint, fatal
+
+
+def read_completion(content: bytes, hide: Callable[[str], str]) -> tuple[Reply, str]:
+    """The answer in a reply's body, and the model that the server says gave it.
+
+    A missing or wrong ``finish_reason``, ``refusal`` or ``usage`` takes nothing from the answer; a wrong one is noted.
+
+    Args:
+        content: the body.
+        hide: takes secrets out of a text.
+
+    Raises:
+        NoCompletion: it is too large, no JSON, or has no message whose content is a text or null.
+    """
+    if len(content) > REPLY_LIMIT:
+        raise NoCompletion(
+            f"the reply is larger than {REPLY_LIMIT // 2**20} MiB",
+            "Leave out options that make it long, or give fewer max_tokens",
+        )
+    found: dict[str, Any] = {}
+    try:
+        found = parse_json(content.removeprefix(b"\xef\xbb\xbf"))
+    except ValueError as error:
+        if content.strip()[:1] in (b"", b"{"):
+            said = in_a_line(str(error), hide)
+            raise NoCompletion(f"the answer was cut off or is no JSON: {said}", "Ask again") from None
+    choices = found.get("choices")
+    choice = _object(choices[0] if isinstance(choices, list) and choices else None)
+    message = _object(choice.get("message"))
+    text = message.get("content")
+    if not message or not isinstance(text, str | None):
+        raise NoCompletion(
+            f"what came is no chat completion: {in_a_line(content.decode('utf-8', 'replace'), hide)}",
+            "See that base_url is the address of an OpenAI-compatible server; it usually ends in /v1",
+            fatal=True,
+        )
+    finish, refusal, usage = choice.get("finish_reason"), message.get("refusal"), found.get("usage")
+    counts = [_object(usage).get(name) for name in ("prompt_tokens", "completion_tokens")]
+    right = {
+        "finish_reason": isinstance(finish, str | None),
+        "refusal": isinstance(refusal, str | None),
+        "usage": isinstance(usage, dict | None) and all(count is None or is_count(count) for count in counts),
+    }
+    texts = [hide(said) if isinstance(said, str) else "" for said in (text, finish, refusal)]
+    notes = [f"the server's {name} could not be read" for name, known in right.items() if not known]
+    if texts != [said if isinstance(said, str) else "" for said in (text, finish, refusal)]:
+        notes.append(KEY_SENT_BACK)
+    prompt, written = (count if is_count(count) else 0 for count in counts)
+    model = found.get("model")
+    answered = in_a_line(model, hide) if isinstance(model, str) else ""
+    said, finish, refusal = map(storable, texts)
+    return Reply(said, finish, refusal, Tokens(prompt, written), tuple(notes)), answered
+
+
+def in_a_line(text: str, hide: Callable[[str], str]) -> str:
+    """What a server said, for a message: short, without secrets, and without what moves a terminal's cursor."""
+    plain = re.sub(r"<(style|script).*?</\1>|<[^>]*>", " ", hide(text)[:_SEARCHED], flags=re.DOTALL)
+    plain = "".join(sign if sign.isprintable() else "?" for sign in hide(" ".join(plain.split())))
+    return plain if len(plain) <= _LONGEST else f"{plain[:_LONGEST]} ..."
+
+
+def _object(value: Any) -> dict[str, Any]:
+    return value if isinstance(value, dict) else {}

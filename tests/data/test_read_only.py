@@ -1,0 +1,202 @@
+"""Whatever is done to rows that a buffer gave, the dataset on disk stays; other processes read the same files."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from multiprocessing.reduction import ForkingPickler
+
+import pytest
+import torch
+import torch.multiprocessing as mp
+from collecting import collect, tree
+from tensordict import MemoryMappedTensor, TensorDict
+from torchrl.data import SliceSampler
+
+from lw_torchrl.data import JoinedStorage, LanguageWorldExperienceReplay, TaskBalancedSampler
+from lw_torchrl.data.metadata import read_metadata
+from lw_torchrl.data.rows import MappedColumn, load_rows, map_rows
+
+KINDS = {
+    "expert": {},
+    "unclipped": dict(label="unclipped"),
+    "executed": dict(label="executed", reward="dense"),
+    "cut": dict(label="executed", after_success=3),
+    "chosen": dict(episodes=2),
+    "n steps": dict(label="executed", n_steps=3, gamma=0.9),
+    "growing": dict(label="executed", grow=20),
+}
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    return collect(tmp_path_factory.mktemp("made") / "demos").root
+
+
+def open_replay(root, kind="expert", **options):
+    given = dict(batch_size=8, generator=torch.Generator().manual_seed(0))
+    return LanguageWorldExperienceReplay(root, **{**given, **KINDS[kind], **options})
+
+
+WAYS = {
+    "all": lambda replay: replay[:],
+    "a slice": lambda replay: replay[2:9],
+    "a row": lambda replay: replay[3],
+    "the last row": lambda replay: replay[-1],
+    "rows": lambda replay: replay[torch.tensor([1, 5])],
+    "a list": lambda replay: replay[[4, 5]],
+    "a batch": lambda replay: replay.sample(),
+    "a larger batch": lambda replay: replay.sample(40),
+    "iteration": lambda replay: next(iter(replay)),
+    "the storage, all": lambda replay: replay.storage[:],
+    "the storage, got": lambda replay: replay.storage.get(slice(None)),
+    "the storage, a row": lambda replay: replay.storage[0],
+    "the storage's rows": lambda replay: next(iter(replay.storage)),
+    "in order": lambda replay: replay.read_all_in_order(),
+    "a column": lambda replay: TensorDict({"observation": replay.storage.column("observation")}, [len(replay)]),
+    "parts": lambda replay: TensorDict({str(k): leaves[0] for k, leaves in replay.storage._columns.items()}),
+}
+
+
+@pytest.mark.filterwarnings("ignore:Got conflicting batch_sizes")
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("way", WAYS)
+def test_what_is_written_to_rows_stays_in_memory(root, kind, way):
+    before = tree(root)
+    rows = WAYS[way](open_replay(root, kind))
+    for _, leaf in rows.items(True, True):
+        leaf.fill_(1)
+    rows.zero_()
+    assert all((leaf == 0).all() for leaf in rows.values(True, True))
+    assert tree(root) == before
+    assert open_replay(root, kind)[:]["observation"].any(), "another buffer shows the files"
+
+
+def test_neither_what_a_datasets_reader_gives(root):
+    before = tree(root)
+    for read in (load_rows, map_rows):
+        rows = read(read_metadata(root))
+        rows["next"].zero_()
+        rows["observation"][:, 3:].add_(1)
+        rows[3:4]["action"].fill_(9)
+        for leaf in rows.values(True, True):
+            leaf.as_subclass(torch.Tensor).zero_()
+    assert tree(root) == before
+
+
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in ("n steps", "growing")])
+def test_batches_are_ones_own(root, kind):
+    replay = open_replay(root, kind)
+    expected = replay[:].clone()
+    for index in (3, [3], torch.tensor([3])):
+        replay[index].zero_()
+    replay.sample().zero_()
+    assert (replay[:] == expected).all()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_rows_are_not_assigned_to(root, kind):
+    replay, before = open_replay(root, kind), tree(root)
+    rows, row = replay[:], replay[0]
+    for index in (0, slice(None), "observation", [0, 1], torch.tensor([2]), (0,)):
+        with pytest.raises(RuntimeError, match=r"a dataset's rows cannot be assigned to: .* add_column"):
+            replay[index] = row
+    storage = replay.storage
+    for write in (
+        lambda: storage.set(0, row),
+        lambda: storage.set(slice(None), rows, set_cursor=False),
+        lambda: storage.__setitem__(0, row),
+    ):
+        with pytest.raises(RuntimeError, match=r"read-only|GrowingWriter alone"):
+            write()
+    if kind != "growing":
+        for write in (lambda: replay.extend(rows), lambda: replay.add(row), replay.empty, storage._empty):
+            with pytest.raises(RuntimeError, match=r"read-only|doesn't allow writing"):
+                write()
+    patch = dict(index=torch.tensor([0]), generation=torch.tensor([0]), patch={"observation": torch.zeros(1, 39)})
+    with pytest.raises(RuntimeError):
+        replay.update_if_present(**patch)
+    assert tree(root) == before
+    assert (replay[:] == rows).all()
+
+
+def _sum(replay, queue):
+    """In another process: what it reads of the buffer, and a write to what it was given."""
+    rows = replay[:]
+    total = float(rows["observation"].double().sum()), float(replay.sample()["action"].double().sum())
+    rows.zero_()
+    queue.put((*total, [type(leaf[0]).__name__ for leaf in replay.storage._columns.values()]))
+
+
+@pytest.mark.parametrize("kind", ["expert", "chosen"])
+@pytest.mark.parametrize("start", ["fork", pytest.param("spawn", marks=pytest.mark.slow)])
+def test_other_processes_read_the_files_themselves(root, kind, start):
+    before, replay = tree(root), open_replay(root, kind, generator=None)  # TorchRL 0.14.1 spawns none with a generator
+    context = mp.get_context(start)
+    queue = context.Queue()
+    process = context.Process(target=_sum, args=(replay, queue))
+    process.start()
+    total, batch, kinds = queue.get(timeout=60)
+    process.join()
+    assert process.exitcode == 0
+    assert total == float(replay[:]["observation"].double().sum())
+    assert batch != 0.0
+    assert "MappedColumn" in kinds
+    assert tree(root) == before
+
+
+@pytest.mark.parametrize("kind", ["expert", "chosen"])
+def test_a_copy_of_a_buffer_is_small_and_maps_the_same_files(root, kind, tmp_path, monkeypatch):
+    replay = open_replay(root, kind, sampler=TaskBalancedSampler())
+    packed = pickle.dumps(replay)
+    assert len(packed) < 20_000
+    monkeypatch.chdir(tmp_path)
+    for again in (pickle.loads(packed), copy.deepcopy(replay)):
+        assert (again[:] == replay[:]).all()
+        before = tree(root)
+        again[:].zero_()
+        assert tree(root) == before
+
+
+def test_a_file_that_is_not_writable_is_read(root):
+    path = root / "data" / "observation.memmap"
+    path.chmod(0o400)
+    try:
+        assert len(open_replay(root).sample()) == 8
+    finally:
+        path.chmod(0o644)
+
+
+def test_columns_compute_plain_tensors(root):
+    column = map_rows(read_metadata(root))["observation"]
+    assert type(column) is MappedColumn
+    for made in (column + 1, column[3], column[1:4], column.index_select(0, torch.tensor([1])), column.double()):
+        assert type(made) is torch.Tensor
+    assert column[2:4].data_ptr() == column.data_ptr() + 2 * 39 * 4
+
+
+def test_memory_maps_of_ones_own_join_and_go_to_other_processes(tmp_path):
+    own = TensorDict({"x": MemoryMappedTensor.from_tensor(torch.arange(6), filename=tmp_path / "x")}, [6])
+    storage = JoinedStorage([own, own])
+    assert len(ForkingPickler.dumps(storage)) < 10_000
+    assert storage[[7, 0]]["x"].tolist() == [1, 0]
+    assert type(storage[:]["x"]) is torch.Tensor
+
+
+def test_slices_of_a_whole_dataset_are_not_copied(root):
+    replay = open_replay(root, sampler=SliceSampler(slice_len=4, traj_key=("collector", "traj_ids")))
+    assert replay[:]["observation"].data_ptr() == replay[0:1]["observation"].data_ptr()
+    assert len(replay.sample()) == 8
+
+
+def _doubled(rows):
+    return rows.select("observation").set("twice", 2 * rows["observation"])
+
+
+@pytest.mark.parametrize("kind", ["expert", "chosen"])
+def test_torchrls_preprocess_makes_rows_of_ones_own(root, tmp_path, kind):
+    replay, before = open_replay(root, kind), tree(root)
+    made = replay.preprocess(_doubled, num_workers=1, mp_start_method="fork", dest=tmp_path / "own")
+    assert torch.equal(made[:]["twice"], 2 * replay[:]["observation"])
+    assert isinstance(replay.storage, JoinedStorage)
+    assert tree(root) == before

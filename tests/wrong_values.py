@@ -1,0 +1,269 @@
+"""Wrong values of arguments by annotation, and good calls of the public names whose arguments need one another."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+
+import lw_torchrl as lw
+
+PLAN = lw.load_plans("MT10")["reach"]
+PLANS = [3, "reach", [], {}, {"reach": "a plan"}, {"push": PLAN}, object()]
+TASKS = [3, "reech", ["reech"], [], [3], ["reach", "reach"], True]
+KEYS = ["observation", 3, [3], [None], ["one", "one"], [], {}]
+DEVICE = [3, "gpu", "cuda:99", [], b"cpu"]
+WIDTH = ["8", 1.5, -1, 0, (0,), ("8",), True, (8, -1)]
+A_CLASS = [3, "one", [], object()]
+FUNCTION = [3, "print", [], {}]
+MAPPING = [3, "one", ["one"], {"one": 3}, {3: "one"}]
+CAMERAS = ["corner9", ["corner", "nose"], 3, [], ["corner", "corner"], [3]]
+WRONG: dict[str, list[Any]] = {
+    "Plans | Mapping[str, ConditionalPlan]": PLANS,
+    "Plans": [3, "reach", [], {}, object()],
+    "Mapping[str, ConditionalPlan] | Iterable[ConditionalPlan]": [
+        3,
+        "reach",
+        [],
+        {},
+        [3],
+        {"push": PLAN},
+        [PLAN, PLAN],
+    ],
+    "ConditionalPlan": A_CLASS,
+    "Sequence[ConditionalPlan]": [3, "reach", [], [3], object()],
+    "str | Task": [3, "reech", b"reach", [], 1.5],
+    "str | Task | Iterable[str | Task]": TASKS,
+    "str | Iterable[str | Task]": TASKS,
+    "str | Iterable[str]": TASKS,
+    "Sequence[NestedKey]": KEYS,
+    "NestedKey": [3, [], {}, 1.5],
+    "TextEncoder": FUNCTION,
+    "str | torch.device": DEVICE,
+    "Features": ["no such", 3, None, []],
+    "Answers": ["no such", 3, None, []],
+    "DistributionName": ["no such", 3, []],
+    "Reduction": ["no such", 3, []],
+    "Label": ["no such", 3, None, []],
+    "RewardName": ["no such", 3, None, []],
+    "Kind": ["no such", 3, None, []],
+    "int | tuple[int, ...]": WIDTH,
+    "int | Sequence[int]": WIDTH,
+    "Mapping[str, ScriptedSkill]": MAPPING,
+    "Mapping[str, ScriptedSkill] | Iterable[str]": [3, {"one": 3}, ["no such skill"]],
+    "Mapping[str, Task]": [3, "MT10", ["reach"], {"reach": 3}],
+    "Mapping[str, Sequence[int]]": [3, "one", ["one"], {"one": [0]}, {"reach": 0}, {"reach": ["0"]}, {"reach": [99]}],
+    "Mapping[str | Task, Sequence[str | Query]]": [3, "one", ["one"], {}, {"reech": []}, {"reach": 3}, {"reach": [3]}],
+    "Iterable[str | Query]": [3, [3], ["no query at all"]],
+    "Iterable[Task]": [3, "reach", [3], ["reach"]],
+    "EpisodeFilter": A_CLASS,
+    "EpisodeChoice | Sequence[EpisodeChoice]": [
+        "all",
+        1.5,
+        -1,
+        99,
+        {"push": 1},
+        {"reach": "x"},
+        {"reach": [9]},
+        [1],
+        {},
+    ],
+    "float | Sequence[float]": ["0.1", -1.0, math.nan, math.inf, [], ["0.1"], [math.nan], None],
+    "Callable[[FinishedEpisode], object]": FUNCTION,
+    "Callable[[int, tuple[bool, ...]], object]": FUNCTION,
+    "Literal['vectorized', 'metaworld'] | Callable[..., Engine]": [3, "mujoco", None, []],
+    "tuple[int, int]": [3, (0,), (2, 1), ("0", 1), (0, 0), "01", (0.5, 2)],
+    "tuple[()]": [3, (2,), "x"],
+    "str | os.PathLike[str] | Sequence[str | os.PathLike[str]]": [3, None, [], [3], [None], 1.5],
+    "str | Behaviour | Policy": [3, None, "expart", [], object()],
+    "str | Sequence[str]": CAMERAS,
+    "Sequence[int]": [3, "0", [-1], ["0"], [0.5]],
+    "Sequence[str]": ["gripper", 3, [3], ["no such"]],
+    "tuple[str, ...]": ["one", 3, [3]],
+    "int | tuple[str, ...]": ["one", 1.5, -1, True, [3]],
+    "tuple[PlanStep, ...]": [3, [3], "one"],
+    "tuple[NamedObject, ...]": [3, [3], "one"],
+    "Iterable[FinishedEpisode | TensorDictBase]": [3, "one", [3]],
+    "Failure | Sequence[Failure | None]": [3, "one", [3]],
+    "str | Sequence[bool] | Tensor": [
+        3,
+        "reech",
+        [],
+        ["yes"],
+        torch.zeros(3),
+        torch.zeros(1, 1, dtype=torch.bool),
+        None,
+    ],
+    "float | Fraction": ["half", -0.1, 1.5, math.nan, None, True],
+    "Sequence[Policy]": [3, "a", [], [3], ["a"]],
+    "Sequence[TensorDictReplayBuffer]": [3, "a", [], [3], ["a"]],
+    "TensorDictModuleBase | Callable[[TensorDictBase], TensorDictBase]": [None, 3, "expert", []],
+    "TensorDictModuleBase | list[TensorDictModuleBase]": [3, "a", [], [3], None],
+    "Mapping[str, Any]": [3, "one", ["one"]],
+}
+for name in [
+    "TensorDictModuleBase",
+    "TensorDictModule",
+    "TensorDictReplayBuffer",
+    "LanguageWorldExperienceReplay",
+    "BehavioralCloningConfig",
+    "OfflineConfig",
+    "OnlineConfig",
+    "QueryEvaluatorConfig",
+    "Logger",
+    "Sampler",
+    "Transform",
+    "QueryEvaluator",
+    "ClauseEvaluator",
+    "LabelledQueries",
+    "LossModule",
+    "Policy",
+    "QValue",
+    "RerunLogger",
+    "TensorDictBase",
+    "EvaluationResult",
+    "Query",
+    "Task",
+    "Tensor",
+]:
+    WRONG[name] = A_CLASS
+OF_ONE_NAME: dict[str, list[Any]] = {
+    "ImageQueryEvaluator.names": ["gripper", 3, [3]],  # those that a plan speaks of must be there
+    "resolve_tasks.tasks": [3, "MT10", ["reach"]],
+    "evaluate.engine": [3, "mujoco", None, []],
+    "attribute_failures.engine": [3, "mujoco", None, []],
+    "evaluate.evaluator": FUNCTION,
+    "attribute_failures.evaluator": FUNCTION,
+    "attribute_failures.actor": FUNCTION,
+    "SkillLatentLoss.network": A_CLASS,
+    "evaluate.also_record": ["observation", 3, [3], [None]],
+    "QueryEvaluatorConfig.held_out_tasks": ["one", 1.5, -1, True, [3]],
+}
+
+
+def good_calls(folder: Any) -> dict[str, dict[str, Any]]:
+    """Arguments with which a public name can be called; a wrong value takes the place of one."""
+    plans = lw.Plans({"reach": PLAN})
+    demos = lw.collect_demonstrations("reach", episodes_per_task=1, root=folder / "demos", max_steps=3, progress=False)
+    root = demos.root
+    replay = lw.LanguageWorldExperienceReplay(root, batch_size=2, transform=lw.QAFTransform(plans))
+    executed = lw.LanguageWorldExperienceReplay(
+        root,
+        batch_size=2,
+        label="executed",
+        terminate_on_success=True,
+        grow=4,
+        sampler=lw.CoLearningSampler("grown"),
+        transform=lw.QAFTransform(plans),
+    )
+    actor = lw.PlanConditionedActor(plans, width=8)
+    expert = lw.ExpertActor("reach")
+    evaluator = lw.StateQueryEvaluator(plans, width=8)
+    images = lw.ImageQueryEvaluator(plans, width=8)
+    config = lw.QueryEvaluatorConfig(steps=1, batch_size=2, held_out_states=0.0, held_out_pairs=0.0)
+    data = lw.LabelledQueries(replay, config)
+    value = lw.PlanConditionedValue(plans, width=8)
+    qvalue = lw.PlanConditionedQValue(plans, width=8)
+    gaussian = lw.PlanConditionedActor(plans, width=8, distribution="tanh_normal")
+    logger = lw.RerunLogger(folder / "pages.rrd")
+    env = lw.LanguageWorldEnv("reach", max_steps=3)
+    rollout = env.rollout(3, expert)[0]
+    env.close()
+    result = lw.evaluate(expert, tasks="reach", episodes_per_task=1, seed=1, max_steps=1, progress=False)
+    run = {"tasks": "reach", "episodes_per_task": 1, "seed": 1, "max_steps": 1, "progress": False}
+    episodes: list[Any] = []
+    keys = ["observation", "task_id", "qaf", "skill_weights"]
+    lw.evaluate(actor, **run, also_record=keys, on_episode=episodes.append)
+    return {
+        "ActorEnsemble": {"members": [actor]},
+        "AdvantageWeightedLoss": {"actor_network": actor},
+        "BehavioralCloningTrainer": {"actor": actor, "replay": replay, "progress": False},
+        "CameraTransform": {},
+        "CoLearningSampler": {"target": "reach"},
+        "ConditionalPlan": {"task": "reach", "steps": PLAN.steps},
+        "CorruptQAF": {"plans": plans},
+        "DemonstratedSACLoss": {"actor_network": gaussian, "qvalue_network": qvalue},
+        "DemonstratedTD3Loss": {"actor_network": actor, "qvalue_network": qvalue},
+        "DescriptorConditionedActor": {"tasks": "reach", "width": 8},
+        "EpisodeFilter": {},
+        "ExpectileValueLoss": {"value_network": value},
+        "ExpertActor": {"tasks": "reach"},
+        "HeldEvaluator": {"evaluator": evaluator},
+        "ImageQueryEvaluator": {"plans": plans, "width": 8},
+        "ImageQueryEvaluatorConfig": {},
+        "ImageQueryEvaluatorTrainer": {"evaluator": images, "data": data},
+        "LabelledQueries": {"replay": replay, "config": config},
+        "LanguageWorldEnv": {"tasks": "reach"},
+        "LanguageWorldExperienceReplay": {"root": root, "label": "executed"},
+        "OfflineTrainer": {"loss": lw.ExpectileValueLoss(value), "replay": executed, "progress": False},
+        "OnlineTrainer": {
+            "actor": actor,
+            "replay": executed,
+            "config": lw.OnlineConfig(batch_size=2),
+            "progress": False,
+        },
+        "OpenAIPlanner": {"model": "none", "base_url": "http://localhost:1"},
+        "PlanConditionedActor": {"plans": plans, "width": 8},
+        "PlanConditionedQValue": {"plans": plans, "width": 8},
+        "PlanConditionedValue": {"plans": plans, "width": 8},
+        "PlanStep": {"condition": PLAN.steps[0].condition, "skill": PLAN.steps[0].skill},
+        "Plans": {"plans": plans},
+        "QAFTransform": {"plans": plans},
+        "QueryEvaluator": {"plans": plans},
+        "QueryEvaluatorConfig": {},
+        "QueryEvaluatorTrainer": {"evaluator": evaluator, "data": data, "progress": False},
+        "QueryProgram": {"queries": {"reach": ["the robot's gripper is open"]}},
+        "RandomYaw": {"scale": 0.1},
+        "ResidualActor": {"base": actor, "width": 8},
+        "RolloutRecorder": {"logger": logger},
+        "ScriptedSkillActor": {"plans": plans},
+        "SkillLatentLoss": {"network": actor},
+        "StackedBehavioralCloning": {"actors": [actor], "replays": [replay], "progress": False},
+        "StateQueryEvaluator": {"plans": plans, "width": 8},
+        "Task": {"name": "stack", "description": "stack it", "objects": lw.TASKS["reach"].objects},
+        "TaskBalancedSampler": {},
+        "add_pictures": {"root": root},
+        "attribute_failures": {
+            "rollouts": episodes,
+            "plans": plans,
+            "actor": actor,
+            "seed": 1,
+            "max_steps": 1,
+            "progress": False,
+        },
+        "collect_demonstrations": {
+            "tasks": "reach",
+            "episodes_per_task": 1,
+            "root": folder / "none",
+            "max_steps": 1,
+            "progress": False,
+        },
+        "decode_plan": {"text": str(PLAN), "format": "chain_py", "task": "reach"},
+        "encode_plan": {"plan": PLAN, "format": "chain_py"},
+        "evaluate": {"actor": actor, **run},
+        "evaluate_plans": {"plans": [PLAN], "episodes": 1, "seed": 1, "max_steps": 1, "progress": False},
+        "load_actor": {"path": lw_saved(lw.save_actor, actor, folder / "actor.zip")},
+        "load_evaluator": {"path": lw_saved(lw.save_evaluator, evaluator, folder / "asked.zip"), "plans": plans},
+        "load_pictures": {"replay": replay},
+        "load_plans": {"source": "MT10"},
+        "load_skills": {},
+        "log_rollout": {"logger": logger, "rollout": rollout},
+        "nearest_query": {"text": "the gripper is open", "task": "reach"},
+        "nearest_skill": {"text": "reach"},
+        "parse_query": {"text": "the robot's gripper is open", "task": "reach"},
+        "plan_actor_value": {"plans": plans, "width": 8},
+        "plan_prompt": {"task": "reach", "format": "basic_py"},
+        "plot_success": {"result": result},
+        "resolve_tasks": {"names": "reach"},
+        "save_actor": {"actor": actor, "path": folder / "none.zip"},
+        "save_evaluator": {"evaluator": evaluator, "path": folder / "none.zip"},
+        "save_plans": {"plans": plans, "folder": folder / "none"},
+        "standardize_by_task": {"advantage": torch.zeros(2, 1), "task_id": torch.zeros(2).long()},
+        "supported_queries": {"task": "reach"},
+    }
+
+
+def lw_saved(save: Any, what: Any, path: Any) -> Any:
+    save(what, path)
+    return path
