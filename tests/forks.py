@@ -125,8 +125,7 @@ class Forks:
         return whole, killed
 
     def close(self) -> None:
-        """Kill the process that forks. It might not see its input end: what else this test run has forked holds the pipe
-        too."""
+        """Kill the process that forks: it need not see its input end, since other forks of the test run hold the pipe."""
         self.parent.kill()
         self.parent.wait()
         self.parent.stdin.close()
