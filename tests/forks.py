@@ -125,7 +125,7 @@ class Forks:
         return whole, killed
 
     def close(self) -> None:
-        """Kill the process that forks: it need not see its input end, since other forks of the test run hold the pipe."""
+        """Kill the process that forks: it may never see its input end, since other forks hold the pipe too."""
         self.parent.kill()
         self.parent.wait()
         self.parent.stdin.close()
