@@ -17,13 +17,13 @@ import lw_torchrl as lw
 from lw_torchrl._files import write_text
 from lw_torchrl.evaluation import count_solved
 from lw_torchrl.evaluation.comparison import markdown_table
-from lw_torchrl.experiments.execution import execute_run
-from lw_torchrl.experiments.recipes import CLEAN, NOISY, PRESETS, SETTINGS, Member, Preset
-from lw_torchrl.experiments.runs import Run
 from lw_torchrl.language.named_objects import NamedObject
 from lw_torchrl.language.roles import role_object
 from lw_torchrl.language.tasks import Task
 from lw_torchrl.modules.plan_roles import PlanRoles
+from lw_torchrl.paper.execution import execute_run
+from lw_torchrl.paper.recipes import CLEAN, NOISY, PRESETS, SETTINGS, Member, Preset
+from lw_torchrl.paper.runs import Run
 
 Setting = Literal["few-shot", "zero-shot"]
 FULL: Mapping[str, Preset] = PRESETS["strong"]

@@ -15,7 +15,7 @@ import lw_torchrl as lw
 from lw_torchrl._files import write_text
 from lw_torchrl.evaluation import EvaluationResult, condition_drift, drift_table, score_evaluator
 from lw_torchrl.evaluation.comparison import markdown_table
-from lw_torchrl.experiments.demo import DemoConfig
+from lw_torchrl.paper.demo import DemoConfig
 
 RECIPE = DemoConfig()
 WHO = ("expert", "scripted", "spoilt-30", "random")

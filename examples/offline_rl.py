@@ -12,7 +12,7 @@ import torch
 from torchrl.objectives import BCLoss, SoftUpdate
 
 import lw_torchrl as lw
-from lw_torchrl.trainers import fit_normalization
+from lw_torchrl.training import fit_normalization
 
 TASKS, GAMMA = ["drawer-open", "push"], 0.99
 

@@ -76,22 +76,22 @@ if TYPE_CHECKING:  # the table below, for type checkers and editors
     from lw_torchrl.record import RerunLogger as RerunLogger
     from lw_torchrl.record import RolloutRecorder as RolloutRecorder
     from lw_torchrl.record import log_rollout as log_rollout
-    from lw_torchrl.trainers import BehavioralCloningConfig as BehavioralCloningConfig
-    from lw_torchrl.trainers import BehavioralCloningTrainer as BehavioralCloningTrainer
-    from lw_torchrl.trainers import ImageQueryEvaluatorConfig as ImageQueryEvaluatorConfig
-    from lw_torchrl.trainers import ImageQueryEvaluatorTrainer as ImageQueryEvaluatorTrainer
-    from lw_torchrl.trainers import LabelledQueries as LabelledQueries
-    from lw_torchrl.trainers import OfflineConfig as OfflineConfig
-    from lw_torchrl.trainers import OfflineTrainer as OfflineTrainer
-    from lw_torchrl.trainers import OnlineConfig as OnlineConfig
-    from lw_torchrl.trainers import OnlineTrainer as OnlineTrainer
-    from lw_torchrl.trainers import QueryEvaluatorConfig as QueryEvaluatorConfig
-    from lw_torchrl.trainers import QueryEvaluatorTrainer as QueryEvaluatorTrainer
-    from lw_torchrl.trainers import StackedBehavioralCloning as StackedBehavioralCloning
-    from lw_torchrl.trainers import load_actor as load_actor
-    from lw_torchrl.trainers import load_evaluator as load_evaluator
-    from lw_torchrl.trainers import save_actor as save_actor
-    from lw_torchrl.trainers import save_evaluator as save_evaluator
+    from lw_torchrl.training import BehavioralCloningConfig as BehavioralCloningConfig
+    from lw_torchrl.training import BehavioralCloningTrainer as BehavioralCloningTrainer
+    from lw_torchrl.training import ImageQueryEvaluatorConfig as ImageQueryEvaluatorConfig
+    from lw_torchrl.training import ImageQueryEvaluatorTrainer as ImageQueryEvaluatorTrainer
+    from lw_torchrl.training import LabelledQueries as LabelledQueries
+    from lw_torchrl.training import OfflineConfig as OfflineConfig
+    from lw_torchrl.training import OfflineTrainer as OfflineTrainer
+    from lw_torchrl.training import OnlineConfig as OnlineConfig
+    from lw_torchrl.training import OnlineTrainer as OnlineTrainer
+    from lw_torchrl.training import QueryEvaluatorConfig as QueryEvaluatorConfig
+    from lw_torchrl.training import QueryEvaluatorTrainer as QueryEvaluatorTrainer
+    from lw_torchrl.training import StackedBehavioralCloning as StackedBehavioralCloning
+    from lw_torchrl.training import load_actor as load_actor
+    from lw_torchrl.training import load_evaluator as load_evaluator
+    from lw_torchrl.training import save_actor as save_actor
+    from lw_torchrl.training import save_evaluator as save_evaluator
     from lw_torchrl.transforms import CameraTransform as CameraTransform
     from lw_torchrl.transforms import CorruptQAF as CorruptQAF
     from lw_torchrl.transforms import EnvState as EnvState
@@ -123,7 +123,7 @@ _NAMES = {
     "SkillLatentLoss standardize_by_task",
     "lw_torchrl.planners": "FilePlanner OpenAIPlanner Planner PlannerError plan_prompt",
     "lw_torchrl.record": "RerunLogger RolloutRecorder log_rollout",
-    "lw_torchrl.trainers": "BehavioralCloningConfig BehavioralCloningTrainer ImageQueryEvaluatorConfig "
+    "lw_torchrl.training": "BehavioralCloningConfig BehavioralCloningTrainer ImageQueryEvaluatorConfig "
     "ImageQueryEvaluatorTrainer LabelledQueries OfflineConfig OfflineTrainer OnlineConfig OnlineTrainer "
     "QueryEvaluatorConfig QueryEvaluatorTrainer StackedBehavioralCloning load_actor load_evaluator "
     "save_actor save_evaluator",
@@ -134,13 +134,13 @@ _PACKAGES = (
     "data",
     "envs",
     "evaluation",
-    "experiments",
+    "paper",
     "language",
     "modules",
     "objectives",
     "planners",
     "record",
-    "trainers",
+    "training",
     "transforms",
 )
 

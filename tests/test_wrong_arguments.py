@@ -81,7 +81,7 @@ def test_numpys_numbers_are_numbers(number):
 
 
 ELSEWHERE = {"EvaluationResult", "PlanStep"}  # the library makes the first, a plan checks its steps
-ROOMS = ["envs", "transforms", "modules", "objectives", "data", "trainers", "evaluation", "planners", "record"]
+ROOMS = ["envs", "transforms", "modules", "objectives", "data", "training", "evaluation", "planners", "record"]
 
 
 def other_arguments():

@@ -15,9 +15,9 @@ from lw_torchrl.cli.units import check_asked, elsewhere, report
 
 if TYPE_CHECKING:
     from lw_torchrl.evaluation import EvaluationResult
-    from lw_torchrl.experiments.runs import Run
     from lw_torchrl.language.plans import Plans
     from lw_torchrl.language.text import TextEncoder
+    from lw_torchrl.paper.runs import Run
 
 Experiment = Literal["zero-shot", "few-shot", "one-shot", "scripted", "all"]
 Method = Literal["pcbc", "dc", "one-hot", "scripted"]
@@ -86,10 +86,10 @@ def reproduce(
     from lw_torchrl._checks import check_choice
     from lw_torchrl._devices import check_device
     from lw_torchrl.cli.threads import use_one_thread
-    from lw_torchrl.experiments.execution import execute_run
-    from lw_torchrl.experiments.recipes import PRESETS, SETTINGS
-    from lw_torchrl.experiments.runs import SCRIPTED, Run
     from lw_torchrl.modules.policy import METHODS
+    from lw_torchrl.paper.execution import execute_run
+    from lw_torchrl.paper.recipes import PRESETS, SETTINGS
+    from lw_torchrl.paper.runs import SCRIPTED, Run
 
     recipes = PRESETS[preset]
     if preset == "evaluator":
@@ -188,7 +188,7 @@ class _Plans:
 def _here(
     named: dict[str, Run], load: Callable[[Run], Plans], out: Path, encoder: TextEncoder | None, device: str
 ) -> Iterator[str]:
-    from lw_torchrl.experiments.execution import execute_run
+    from lw_torchrl.paper.execution import execute_run
 
     for name, one in named.items():
         result = execute_run(one, load(one), out, text_encoder=encoder, device=device)
@@ -209,7 +209,7 @@ def _summarize(runs: list[Run], load: Callable[[Run], Plans], out: Path) -> dict
     holds."""
     from lw_torchrl._files import write_json, write_text
     from lw_torchrl.evaluation import MethodComparison, plot_sorted_tasks, published_curves, summarize
-    from lw_torchrl.experiments.execution import load_result
+    from lw_torchrl.paper.execution import load_result
 
     found: dict[Path, dict[str, dict[int, EvaluationResult]]] = {}
     settings = {}

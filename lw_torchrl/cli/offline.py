@@ -15,8 +15,8 @@ from lw_torchrl.cli.units import check_asked, elsewhere, report
 
 if TYPE_CHECKING:
     from lw_torchrl.evaluation import EvaluationResult
-    from lw_torchrl.experiments.offline_runs import OfflineRun
     from lw_torchrl.language.plans import Plans
+    from lw_torchrl.paper.offline_runs import OfflineRun
 
 Table = Literal["methods", "conditioning", "mt10", "quick", "all"]
 Mixture = Literal["B", "W", "C"]
@@ -78,10 +78,10 @@ def offline(
     from lw_torchrl._checks import check_choice
     from lw_torchrl._files import read_json
     from lw_torchrl.cli.threads import use_one_thread
-    from lw_torchrl.experiments.mixtures import TASK_SETS
-    from lw_torchrl.experiments.offline_recipes import OfflineRecipe
-    from lw_torchrl.experiments.offline_tables import OFFLINE_TABLES, advantages_of, write_table
-    from lw_torchrl.experiments.offline_training import execute_offline, make_advantages
+    from lw_torchrl.paper.mixtures import TASK_SETS
+    from lw_torchrl.paper.offline_recipes import OfflineRecipe
+    from lw_torchrl.paper.offline_tables import OFFLINE_TABLES, advantages_of, write_table
+    from lw_torchrl.paper.offline_training import execute_offline, make_advantages
 
     changed = {"reward": reward, "beta": beta, "distance": distance, "steps": steps, "value_steps": steps}
     recipe = replace(OfflineRecipe(), **{name: value for name, value in changed.items() if value is not None})  # type: ignore[arg-type]
@@ -146,7 +146,7 @@ def _said(name: str, result: EvaluationResult) -> str:
 
 
 def _here(runs: dict[str, OfflineRun], plans: Plans, out: Path) -> Iterator[str]:
-    from lw_torchrl.experiments.offline_training import execute_offline
+    from lw_torchrl.paper.offline_training import execute_offline
 
     for name, one in runs.items():
         yield _said(name, execute_offline(one, plans, out))

@@ -14,8 +14,8 @@ from lw_torchrl.cli.units import check_asked, elsewhere, report
 
 if TYPE_CHECKING:
     from lw_torchrl.evaluation import EvaluationResult
-    from lw_torchrl.experiments.online import OnlineRun
     from lw_torchrl.language.plans import Plans
+    from lw_torchrl.paper.online import OnlineRun
 
 OnlineMethod = Literal["advantage", "td3", "sac", "residual", "ppo", "expert-iteration", "start"]
 LoggerName = Literal["none", "csv", "tensorboard", "wandb"]
@@ -91,7 +91,7 @@ def online(
             if tuned >= (there := len(found[task].steps)):
                 raise ValueError(f"--step: the plan of {task!r} has {counted(there, 'step')}, got {step}")
     from lw_torchrl.cli.threads import use_one_thread
-    from lw_torchrl.experiments.online import START, OnlineRecipe, OnlineRun
+    from lw_torchrl.paper.online import START, OnlineRecipe, OnlineRun
 
     recipe = OnlineRecipe(demonstrations=demonstrations)
     recipe = replace(recipe, config=replace(recipe.config, frames=frames))
@@ -144,7 +144,7 @@ def online(
 
 def _done(one: OnlineRun, plans: Plans, out: Path, logger: LoggerName) -> tuple[EvaluationResult, str]:
     """Do a run; its result, and how it went in words."""
-    from lw_torchrl.experiments.online import execute_online
+    from lw_torchrl.paper.online import execute_online
 
     make = None if logger == "none" else lambda file: make_logger(logger, file)
     result = execute_online(one, plans, out, make_logger=make)
@@ -181,8 +181,8 @@ def _summarize(runs: list[OnlineRun], plans: Plans, out: Path) -> dict[str, Any]
     """A summary, tables and a figure, from the results on disk; returns what summary.json holds."""
     from lw_torchrl._files import write_json, write_text
     from lw_torchrl.evaluation import MethodComparison, plot_learning_curves, summarize
-    from lw_torchrl.experiments.execution import load_result
-    from lw_torchrl.experiments.online import START, joined
+    from lw_torchrl.paper.execution import load_result
+    from lw_torchrl.paper.online import START, joined
 
     found: dict[OnlineRun, EvaluationResult] = {}
     for one in runs:

@@ -27,7 +27,7 @@ def demo(out: Path | None = None, quick: bool = False, json: bool = False) -> Ou
         json: print one JSON document instead, see docs/cli.md.
     """
     folder = check_folder("--out", out or Path("runs/demo-quick" if quick else "runs/demo"))
-    from lw_torchrl.experiments.demo import QUICK, DemoConfig, run_demo
+    from lw_torchrl.paper.demo import QUICK, DemoConfig, run_demo
 
     use_one_thread()
     result = run_demo(folder, QUICK if quick else DemoConfig())

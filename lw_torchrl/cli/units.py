@@ -32,7 +32,7 @@ def elsewhere(
     names: Iterable[str], command: Sequence[str], launcher: Literal["local", "ray"], jobs: int
 ) -> Iterator[str]:
     """Do runs by ``lw-torchrl COMMAND --run NAME``, several at a time; yields what each printed, as it ends."""
-    from lw_torchrl.experiments.launchers import run_commands
+    from lw_torchrl.paper.launchers import run_commands
 
     listed = [*names]
     for index, printed in run_commands([[*command, "--run", name] for name in listed], launcher, jobs):

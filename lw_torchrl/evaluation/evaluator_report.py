@@ -13,7 +13,7 @@ from lw_torchrl._checks import checked
 from lw_torchrl._files import write_json
 from lw_torchrl.modules.clause_evaluator import ClauseEvaluator
 from lw_torchrl.modules.networks import evaluating
-from lw_torchrl.trainers.labelled_queries import Asked, LabelledQueries
+from lw_torchrl.training.labelled_queries import Asked, LabelledQueries
 
 BINS = 15
 PARTS = {

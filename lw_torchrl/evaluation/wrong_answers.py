@@ -16,7 +16,7 @@ from lw_torchrl.evaluation.figures import check_image, saved
 from lw_torchrl.language.queries import Clause
 from lw_torchrl.modules.image_query_evaluator import ImageQueryEvaluator
 from lw_torchrl.modules.networks import evaluating
-from lw_torchrl.trainers.labelled_queries import Asked, LabelledQueries
+from lw_torchrl.training.labelled_queries import Asked, LabelledQueries
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -19,7 +19,7 @@ import lw_torchrl as lw
 import lw_torchrl.cli.main as cli
 from lw_torchrl.cli.main import main
 from lw_torchrl.cli.streams import BROKEN_PIPE
-from lw_torchrl.experiments.demo import QUICK
+from lw_torchrl.paper.demo import QUICK
 
 COMMANDS = (
     "demo",
@@ -343,7 +343,7 @@ def test_the_quick_demo_killed_twice_ends_and_then_does_nothing_twice(forks, tmp
     config, out = replace(QUICK, training_steps=200, episodes_per_task=2), tmp_path / "demo"
     shorter = f"""
 from dataclasses import replace
-from lw_torchrl.experiments import demo
+from lw_torchrl.paper import demo
 demo.QUICK = replace(demo.QUICK, training_steps={config.training_steps}, episodes_per_task={config.episodes_per_task})
 """
     demonstrations = out / "demonstrations"

@@ -10,15 +10,15 @@ import pytest
 from commands import document, fails, run
 
 import lw_torchrl as lw
-from lw_torchrl.experiments import execution, recipes
-from lw_torchrl.experiments.recipes import PRESETS, DataSetting, Member
+from lw_torchrl.paper import execution, recipes
+from lw_torchrl.paper.recipes import PRESETS, DataSetting, Member
 
 TINY = """
 from dataclasses import replace
 from functools import partial
 import lw_torchrl as lw
-from lw_torchrl.experiments import execution, recipes, runs
-from lw_torchrl.experiments.recipes import PRESETS, DataSetting, Execution, Member
+from lw_torchrl.paper import execution, recipes, runs
+from lw_torchrl.paper.recipes import PRESETS, DataSetting, Execution, Member
 
 training = lw.BehavioralCloningConfig(steps=40, batch_size=180, checkpoint_every=5)
 options = {"target": Execution("clean", (0.0,)), "members": (Member({"width": 16, "depth": 1}),), "training": training}

@@ -8,12 +8,12 @@ import pytest
 from commands import document, fails, run
 
 import lw_torchrl as lw
-from lw_torchrl.experiments.offline_tables import OFFLINE_TABLES, OfflineTable
+from lw_torchrl.paper.offline_tables import OFFLINE_TABLES, OfflineTable
 
 SMALL = dict(width=16, depth=1, critic_depth=1, batch_size=20)
 TINY = f"""
 from dataclasses import replace
-from lw_torchrl.experiments.offline_tables import OfflineTable
+from lw_torchrl.paper.offline_tables import OfflineTable
 runs = OfflineTable.runs
 OfflineTable.runs = lambda self, seeds, recipe, episodes: runs(self, seeds, replace(recipe, **{SMALL}), episodes, 120)
 """

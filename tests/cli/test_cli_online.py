@@ -7,12 +7,12 @@ import pytest
 from commands import document, fails, run
 
 import lw_torchrl as lw
-from lw_torchrl.experiments import online, runs, tuning
+from lw_torchrl.paper import online, runs, tuning
 
 TINY = """
 from functools import partial
 import lw_torchrl as lw
-from lw_torchrl.experiments import online, runs, tuning
+from lw_torchrl.paper import online, runs, tuning
 
 cloning = lw.BehavioralCloningConfig(steps=30, batch_size=20, checkpoint_every=10)
 config = lw.OnlineConfig(rows=4, round_steps=15, max_steps=12, batch_size=8, first_frames=20, warm_up=3, epochs=2)

@@ -31,7 +31,7 @@ def _no_work(monkeypatch):
     import builtins
 
     original = builtins.__import__
-    working = ("lw_torchrl.data", "lw_torchrl.experiments.demo", "lw_torchrl.experiments.runs", "openai")
+    working = ("lw_torchrl.data", "lw_torchrl.paper.demo", "lw_torchrl.paper.runs", "openai")
 
     def refuse(name, *args, **kwargs):
         assert name not in working, name

@@ -234,10 +234,10 @@ def test_the_words_of_the_command_line_are_those_of_the_library():
     from typing import get_args
 
     from lw_torchrl.data import BEHAVIOURS
-    from lw_torchrl.experiments.mixtures import MIXTURES
-    from lw_torchrl.experiments.offline_recipes import OFFLINE_METHODS
-    from lw_torchrl.experiments.tuning import WEAKEST
     from lw_torchrl.modules import METHODS
+    from lw_torchrl.paper.mixtures import MIXTURES
+    from lw_torchrl.paper.offline_recipes import OFFLINE_METHODS
+    from lw_torchrl.paper.tuning import WEAKEST
 
     assert tuple(BEHAVIOURS) == sources.ACTORS
     assert tuple(METHODS) == sources.METHODS

@@ -20,7 +20,7 @@ from lw_torchrl.data.rows import load_rows
 from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.tasks import task_id
 from lw_torchrl.modules import PlanConditionedActor
-from lw_torchrl.trainers import BehavioralCloningConfig, BehavioralCloningTrainer
+from lw_torchrl.training import BehavioralCloningConfig, BehavioralCloningTrainer
 from lw_torchrl.transforms import QAFTransform
 
 STEPS = 50

@@ -21,7 +21,7 @@ from lw_torchrl.evaluation import evaluate
 from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.modules import DescriptorConditionedActor, PlanConditionedActor, Policy
-from lw_torchrl.trainers import BehavioralCloningConfig, BehavioralCloningTrainer
+from lw_torchrl.training import BehavioralCloningConfig, BehavioralCloningTrainer
 from lw_torchrl.transforms import QAFTransform
 
 PLANS = load_plans("MT10")

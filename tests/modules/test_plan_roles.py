@@ -12,7 +12,7 @@ from torchrl.objectives import TD3Loss
 import lw_torchrl as lw
 from lw_torchrl.language.plan_tables import PlanTables
 from lw_torchrl.modules.plan_roles import PlanRoles
-from lw_torchrl.trainers.normalization import fit_normalization
+from lw_torchrl.training.normalization import fit_normalization
 
 MT10 = lw.load_plans("MT10")
 ZERO_SHOT = lw.load_plans("MT50", skills="MT10")

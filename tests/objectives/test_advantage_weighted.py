@@ -16,7 +16,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.objectives import BCLoss
 
 import lw_torchrl as lw
-from lw_torchrl.trainers import fit_normalization
+from lw_torchrl.training import fit_normalization
 
 PLANS = lw.load_plans("MT10")
 SMALL = dict(width=16, depth=1)

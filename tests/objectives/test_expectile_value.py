@@ -19,7 +19,7 @@ from torchrl.objectives.value import TD0Estimator
 
 import lw_torchrl as lw
 from lw_torchrl.modules import DescriptorEncoder, ObservationFeatures, Value
-from lw_torchrl.trainers import fit_normalization
+from lw_torchrl.training import fit_normalization
 
 PLANS = lw.load_plans("MT10")
 SMALL = dict(width=16, depth=1)

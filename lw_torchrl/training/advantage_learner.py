@@ -1,0 +1,55 @@
+"""Learning online as offline: a value of all that was done, and imitation of what did better."""
+
+from __future__ import annotations
+
+from tensordict import TensorDictBase
+from torch import nn
+from torchrl.data import TensorDictReplayBuffer
+from torchrl.objectives import SoftUpdate
+
+from lw_torchrl.modules.critics import QValue, Value
+from lw_torchrl.modules.policy import Policy
+from lw_torchrl.objectives.advantage_weighted import AdvantageWeightedLoss, standardize_by_task
+from lw_torchrl.objectives.expectile_value import ExpectileValueLoss
+from lw_torchrl.training.learner import Learner, encoder_like, make_optimizer
+from lw_torchrl.training.online_config import OnlineConfig
+
+
+class AdvantageLearner(Learner):
+    """A value by expectile regression, and imitation of demonstrations and of the policy's own steps, as much as each
+    one's advantage says: nothing is done that was not tried, so a value that errs about the untried harms nothing."""
+
+    def __init__(
+        self, start: Policy, replay: TensorDictReplayBuffer, config: OnlineConfig, critic: Value | None = None
+    ) -> None:
+        super().__init__(start, replay, config)
+        if isinstance(critic, QValue):
+            raise TypeError("critic must be a Value, of states alone, for the method 'advantage'; got a QValue")
+        value = Value(encoder_like(start), ensemble=2) if critic is None else critic
+        self.value = ExpectileValueLoss(value.eval(), expectile=config.expectile)
+        self.value.make_value_estimator(gamma=config.gamma)
+        self.targets = SoftUpdate(self.value, eps=config.target_eps)
+        self.actor = AdvantageWeightedLoss(start, beta=config.beta, loss_function=config.distance)
+        self.loss = nn.ModuleDict({"value": self.value, "actor": self.actor})
+        self.optimizers["critic"] = make_optimizer(self.value.parameters(), config.critic_learning_rate)
+        self.optimizers["actor"] = make_optimizer(self.actor.parameters(), config.cloning_learning_rate)
+
+    def observe(self, rows: TensorDictBase) -> None:
+        self.replay.extend(rows)
+
+    def learn(self, steps: int) -> None:
+        for _ in range(steps):
+            batch = self.replay.sample(self.config.batch_size)
+            found = self.value(batch)
+            self.optimize("critic", found["loss_value"])
+            self.targets.step()
+            self.tell(loss_value=found["loss_value"], value=found["value"])
+            if self.made >= self.config.warm_up:
+                advantage = self.value.advantage(batch)
+                batch.set("advantage", standardize_by_task(advantage, batch["task_id"]))
+                self.policy.train()
+                found = self.actor(batch)
+                self.policy.eval()
+                self.optimize("actor", found["loss_actor"])
+                self.tell(loss_actor=found["loss_actor"])
+            self.made += 1

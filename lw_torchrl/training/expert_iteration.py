@@ -1,0 +1,57 @@
+"""Expert iteration: what a policy achieved in a round becomes its demonstrations of the next one."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.data import TensorDictReplayBuffer
+
+from lw_torchrl.modules.critics import QValue
+from lw_torchrl.modules.policy import Policy
+from lw_torchrl.training.learner import Learner, make_optimizer
+from lw_torchrl.training.loss_state import bc_loss
+from lw_torchrl.training.online_config import OnlineConfig
+
+
+class ExpertIterationLearner(Learner):
+    """Behavioral cloning of demonstrations and of the policy's own successful episodes, half of each minibatch each;
+    as many gradient steps at the end of each round as other methods make in it."""
+
+    wants_round = True
+
+    def __init__(
+        self, start: Policy, replay: TensorDictReplayBuffer, config: OnlineConfig, critic: QValue | None = None
+    ) -> None:
+        if critic is not None:
+            raise ValueError("critic: expert iteration has none; leave it out")
+        super().__init__(start, replay, config)
+        self.loss = bc_loss(self.policy.train(), config.distance)  # its copy has the start's noise on features
+        self.policy.eval()
+        self.optimizers["actor"] = make_optimizer(self.loss.parameters(), config.cloning_learning_rate)
+
+    def end_round(self, rows: TensorDictBase | None, steps: int) -> None:
+        assert rows is not None
+        if (kept := successful(rows)) is not None:
+            self.replay.extend(kept)
+        if not self.replay.storage.num_grown:
+            return
+        for _ in range(steps):
+            found = self.loss(self.replay.sample(self.config.batch_size))["loss_bc"]
+            self.optimize("actor", found)
+            self.tell(loss_actor=found)
+            self.made += 1
+
+
+def successful(rows: TensorDictBase) -> TensorDictBase | None:
+    """The rows of a round (N, T), time last, that belong to episodes that ended in success: (R,); None for none.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> ids, success = torch.tensor([[0, 0, 2], [1, 1, 1]]), torch.tensor([[0, 1, 0], [0, 0, 0]]).bool()
+        >>> rows = TensorDict({"collector": {"traj_ids": ids}, "next": {"success": success[..., None]}}, [2, 3])
+        >>> successful(rows)["collector", "traj_ids"]
+        tensor([0, 0])
+    """
+    ids = rows["collector", "traj_ids"]
+    here = torch.isin(ids, ids[rows["next", "success"].squeeze(-1)])
+    return rows[here] if here.any() else None

@@ -1,0 +1,143 @@
+"""Normalisation of what policies, critics and whole losses see, from the rows of a replay buffer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torchrl.data import TensorDictReplayBuffer
+from torchrl.objectives import LossModule
+
+from lw_torchrl._checks import checked
+from lw_torchrl.modules.critics import Value
+from lw_torchrl.modules.observation_features import ObservationFeatures
+from lw_torchrl.modules.plan_roles import PlanRoles
+from lw_torchrl.modules.policy import Policy
+
+
+@checked
+def fit_normalization(target: nn.Module, replay: TensorDictReplayBuffer) -> None:
+    """Give a policy, a critic, or all that a loss holds, the statistics of a buffer's rows.
+
+    A TorchRL loss copies the networks it is given, buffers included: statistics that the networks get later never
+    reach its critics' copies, nor its targets. Here they get them, all the same. Each row counts as often as
+    :class:`CoLearningSampler` draws it: without weights a target's few rows would not count, and its features lie far
+    outside the base tasks' range.
+
+    Args:
+        target: a :class:`Policy`, a critic, a module with :class:`ObservationFeatures` in it, or a loss of such.
+        replay: rows of ``observation`` (39,) float32.
+
+    Raises:
+        ValueError: there is nothing in it to normalise, or a row holds NaN or infinity, or no ``observation``; a loss
+            has an actor with ``roles`` that has taken no contacts yet, by this function.
+
+    Example:
+        >>> import lw_torchrl as lw, torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+        >>> from torchrl.objectives import SoftUpdate, TD3Loss
+        >>> from lw_torchrl.training import fit_normalization
+        >>> replay = TensorDictReplayBuffer(storage=LazyTensorStorage(64), batch_size=8)
+        >>> _ = replay.extend(TensorDict(observation=torch.rand(64, 39)).auto_batch_size_(1))
+        >>> plans = lw.load_plans("MT10")
+        >>> loss = TD3Loss(lw.PlanConditionedActor(plans), lw.PlanConditionedQValue(plans), bounds=(-1.0, 1.0))
+        >>> targets = SoftUpdate(loss, eps=0.995)
+        >>> fit_normalization(loss, replay)
+        >>> loss.target_qvalue_network_params["encoder", "features", "mean"].shape  # of two critics
+        torch.Size([2, 56])
+
+    Source: :meth:`Policy.fit_normalization`.
+    """
+    weigh = getattr(replay.sampler, "row_weights", None)
+    weights = None if weigh is None else weigh(replay.storage)
+    rows = replay.storage.get(slice(0, len(replay)))
+    if (seen := rows.get("observation", None)) is None:
+        raise ValueError(f"replay must hold 'observation', its rows hold {', '.join(map(str, rows.keys(True, True)))}")
+    observation = seen.cpu()  # the same sums on every device
+    if isinstance(target, (Policy, Value)):
+        target.fit_normalization(observation, weights)
+        if isinstance(target, Policy) and (task_id := rows.get("task_id", None)) is not None:
+            target.fit_contacts(observation, task_id.cpu())
+        return
+    if _lacks_contacts(target):
+        raise ValueError(
+            "roles: where the hand touches things is taken from demonstrations by fit_normalization(actor, replay), "
+            "before the loss is made of the actor"
+        )
+    known: dict[str, ObservationFeatures] = {}
+    for kind, mean, std in _statistics(target):
+        if kind not in known:
+            known[kind] = ObservationFeatures(kind).to(observation.device)  # type: ignore[arg-type]
+            known[kind].fit(observation, weights)
+        with torch.no_grad():
+            mean.copy_(known[kind].mean)
+            std.copy_(known[kind].std)
+    if not known:
+        raise ValueError(f"{type(target).__name__} holds no ObservationFeatures: there is nothing to normalise")
+
+
+def check_contacts(actor: nn.Module) -> None:
+    """Raise :class:`ValueError` if an actor with ``roles`` would be trained without contacts."""
+    if _lacks_contacts(actor):
+        raise ValueError(
+            "roles want to know where the demonstrations touch things; call fit_normalization(actor, replay) of "
+            "lw_torchrl.training first, which normalize=True does for a Policy"
+        )
+
+
+def fit_untrained(loss: LossModule, replay: TensorDictReplayBuffer) -> None:
+    """As :func:`fit_normalization`, of networks that have no statistics yet, or these.
+
+    Raises:
+        ValueError: one was trained with others: it would see, and do, something else than before.
+    """
+    before = [(mean, mean.clone(), std, std.clone()) for _, mean, std in _statistics(loss)]
+    fit_normalization(loss, replay)
+    for mean, old_mean, std, old_std in before:
+        untrained = not old_mean.any() and bool((old_std == 1).all())
+        if not untrained and not (torch.allclose(mean, old_mean) and torch.allclose(std, old_std)):
+            for now, then in ((a, b) for row in before for a, b in (row[:2], row[2:])):
+                now.copy_(then)
+            raise ValueError(
+                "normalize: a network of the loss has the statistics of other rows, with which it was trained; give "
+                "OfflineConfig(normalize=False) to keep them, and fresh networks theirs by fit_normalization(network, "
+                "replay) before the loss is made"
+            )
+
+
+def _lacks_contacts(target: nn.Module) -> bool:
+    return any(not of("fitted") for _, of in _held(target, PlanRoles))
+
+
+def _statistics(target: nn.Module) -> Iterator[tuple[str, Tensor, Tensor]]:
+    """The kind of each :class:`ObservationFeatures`, its mean and its standard deviation; of a loss, every copy's."""
+    for module, of in _held(target, ObservationFeatures):
+        yield module.kind, of("mean"), of("std")
+
+
+def _held(target: nn.Module, kind: type[nn.Module]) -> Iterator[tuple[Any, Callable[[str], Tensor]]]:
+    """Each module of a kind, and what gives a buffer of it by name; of a loss, those of every copy."""
+    if not isinstance(target, LossModule):
+        for module in target.modules():
+            if isinstance(module, kind):
+                yield module, module.get_buffer
+        return
+    held = dict(target.named_children())  # asked for by name, targets warn where nothing moves them yet
+    for name, network in vars(target).items():  # a loss keeps its networks there, without their parameters
+        if not isinstance(network, nn.Module):
+            continue
+        for path, module in network.named_modules():
+            if isinstance(module, kind):
+                for copy in (f"{name}_params", f"target_{name}_params"):
+                    params: Any = held.get(copy)
+                    if isinstance(params, TensorDictBase):
+                        yield module, partial(_buffer, params, path)
+
+
+def _buffer(params: TensorDictBase, path: str, name: str) -> Tensor:
+    return params.get((*path.split("."), name)).data

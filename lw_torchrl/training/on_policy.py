@@ -1,0 +1,60 @@
+"""Learning from the rows of a round alone: PPO, of an actor and a value on one encoder."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from torch.nn.utils import clip_grad_norm_
+from torchrl.data import TensorDictReplayBuffer
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value import GAE
+
+from lw_torchrl.data.rewards import REWARDS
+from lw_torchrl.modules.critics import QValue, Value
+from lw_torchrl.modules.policy import Policy
+from lw_torchrl.training.learner import Learner, make_optimizer, stochastic
+from lw_torchrl.training.online_config import OnlineConfig
+
+
+class PPOLearner(Learner):
+    """PPO: several passes over each round's rows. It sees no demonstrations but in its start."""
+
+    noisy = False
+    wants_round = True
+
+    def __init__(
+        self, start: Policy, replay: TensorDictReplayBuffer, config: OnlineConfig, critic: QValue | None = None
+    ) -> None:
+        if critic is not None:
+            raise ValueError("critic: PPO's is the value of a state on the actor's own encoder; leave it out")
+        super().__init__(start, replay, config)
+        self.policy = actor = stochastic(start, "normal", config.init_std)
+        value = Value(actor.encoder)
+        self.loss = ClipPPOLoss(actor, value, clip_epsilon=config.clip, entropy_coeff=config.entropy)
+        self.advantage = GAE(
+            gamma=config.gamma, lmbda=config.gae_lambda, value_network=value, average_gae=True, deactivate_vmap=True
+        )
+        self.optimizers["all"] = make_optimizer(self.loss.parameters(), config.actor_learning_rate)
+
+    def act(self, state: TensorDictBase) -> TensorDictBase:
+        with set_exploration_type(ExplorationType.RANDOM):
+            return self.policy(state)
+
+    def end_round(self, rows: TensorDictBase | None, steps: int) -> None:
+        assert rows is not None
+        following = rows["next"]
+        reward = REWARDS[self.replay.reward].of(following["reward"].reshape(-1, 1), following["success"].reshape(-1, 1))
+        rows.set(("next", "reward"), reward.view_as(following["reward"]))
+        with torch.no_grad():
+            rows = self.advantage(rows).reshape(-1)
+        for _ in range(self.config.epochs):
+            for index in torch.randperm(len(rows)).split(self.config.batch_size):
+                found = self.loss(rows[index])
+                total = found["loss_objective"] + found["loss_critic"] + found["loss_entropy"]
+                self.optimizers["all"].zero_grad()
+                total.backward()
+                clip_grad_norm_(self.loss.parameters(), 1.0)
+                self.optimizers["all"].step()
+                self.tell(loss_actor=found["loss_objective"], loss_value=found["loss_critic"])
+                self.made += 1

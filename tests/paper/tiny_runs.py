@@ -1,0 +1,58 @@
+"""Runs of experiments of one task and sixty steps, and doing them."""
+
+import json
+from dataclasses import replace
+
+import lw_torchrl as lw
+from lw_torchrl.paper.execution import execute_run
+from lw_torchrl.paper.recipes import PRESETS, DataSetting, Execution, Member
+from lw_torchrl.paper.runs import Run
+
+PLANS = lw.load_plans("MT50")
+TINY = DataSetting("tiny", "reach", 2)
+TINY_ONE_SHOT = DataSetting("tiny-one-shot", "reach", 2, targets="push")
+ASTRAY = PRESETS["strong"]["few-shot"].base
+MEMBER = Member({"features": "differences", "width": 32, "depth": 1}, {"focus": True, "swap_unmentioned": 0.5})
+PRESET = replace(
+    PRESETS["strong"]["few-shot"],
+    target=Execution("target", (0.0,)),
+    members=(MEMBER,),
+    training=lw.BehavioralCloningConfig(steps=60, batch_size=20, checkpoint_every=20),
+)
+ROLES = {"features": "opening", "roles": True, "jitter": 0.03, "hide_opening": 1.0}
+OTHER = Member({"features": "relative", "width": 16, "depth": 1}, ROLES, yaw=0.3, any_yaw=True)
+ENSEMBLE = replace(PRESET, name="ensemble", members=(MEMBER, OTHER))
+
+
+def a_run(method="pcbc", seed=3, setting=TINY, preset=PRESET):
+    return Run(setting, method, seed, preset, episodes=2)
+
+
+def task_of(one):
+    return one.setting.targets or "reach"
+
+
+def execute(one, out, preset=None):
+    one = one if preset is None else replace(one, preset=preset)
+    return execute_run(one, PLANS, out, tasks=task_of(one), progress=False)
+
+
+def rates(path):
+    found = json.loads((path / "results.json").read_text())
+    assert found["config"].pop("seconds") > 0
+    return found["episodes"], found["config"]
+
+
+def stop_training(monkeypatch, setting, at):
+    """Ctrl-C before the at-th step that is made; returns a list of the number of steps that were asked for."""
+    trainer = lw.BehavioralCloningTrainer if setting is TINY else lw.StackedBehavioralCloning
+    step, count = trainer.step, [0]
+
+    def stops(self):
+        count[0] += 1
+        if count[0] == at:
+            raise KeyboardInterrupt
+        return step(self)
+
+    monkeypatch.setattr(trainer, "step", stops)
+    return count

@@ -1,0 +1,101 @@
+"""A buffer's statistics reach every network that a loss holds, its targets and copies too."""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.objectives import CQLLoss, DDPGLoss, IQLLoss, REDQLoss, SACLoss, TD3Loss
+
+import lw_torchrl as lw
+from lw_torchrl.modules import ObservationFeatures
+from lw_torchrl.training import fit_normalization
+
+pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
+PLANS = lw.load_plans("MT10")
+SMALL = dict(width=8, depth=1)
+
+
+@pytest.fixture(scope="module")
+def replay():
+    generator = torch.Generator().manual_seed(0)
+    rows = TensorDict(observation=torch.randn(50, 39, generator=generator) * 3 + 1).auto_batch_size_(1)
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(50), batch_size=8)
+    buffer.extend(rows)
+    return buffer
+
+
+@pytest.fixture(scope="module")
+def expected(replay):
+    found = {}
+    for kind in ("differences", "raw"):
+        found[kind] = ObservationFeatures(kind)
+        found[kind].fit(replay[:]["observation"])
+    return found
+
+
+def make(kind="differences", distribution=None, **options):
+    options |= SMALL | {"features": kind}
+    actor = lw.PlanConditionedActor(PLANS, distribution=distribution, **options)
+    return actor, lw.PlanConditionedQValue(PLANS, **options), lw.PlanConditionedValue(PLANS, **options)
+
+
+def losses(kind="differences"):
+    bounds = (-torch.ones(4), torch.ones(4))
+    actor, q, _ = make(kind)
+    yield DDPGLoss(actor, q, delay_actor=True)
+    actor, q, _ = make(kind)
+    yield TD3Loss(actor, q, bounds=bounds)
+    for loss in (SACLoss, REDQLoss, lambda *networks: CQLLoss(*networks, action_spec=networks[0].spec["action"])):
+        actor, q, _ = make(kind, "tanh_normal")
+        yield loss(actor, q)
+    yield IQLLoss(*make(kind, "normal"))
+
+
+@pytest.mark.parametrize("kind", ["differences", "raw"])
+def test_it_reaches_all_networks_of_a_loss(replay, expected, kind):
+    for loss in losses(kind):
+        fit_normalization(loss, replay)
+        found = {name: value for name, value in loss.state_dict().items() if name.endswith(("mean", "std"))}
+        assert len(found) >= 6, type(loss)  # two each of actor and critic, and of the targets
+        for name, value in found.items():
+            wanted = getattr(expected[kind], name.rpartition(".")[2])
+            assert torch.equal(value, wanted.expand_as(value)), (type(loss), name)
+
+
+def test_the_loss_sees_it():
+    """The value of a state is what a critic of the same weights says that has these statistics."""
+    _, q, _ = make()
+    other = copy.deepcopy(q)
+    loss = DDPGLoss(make()[0], q)
+    rows = TensorDict(
+        observation=torch.rand(50, 39), task_id=torch.full((50,), lw.task_id("push")), action=torch.zeros(50, 4)
+    ).auto_batch_size_(1)
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(50), batch_size=8)
+    buffer.extend(rows)
+    rows = lw.QAFTransform(PLANS)(rows)
+    fit_normalization(loss, buffer)
+    with loss.value_network_params.to_module(loss.value_network):
+        found = loss.value_network(rows.copy())["state_action_value"]
+    assert not torch.allclose(other(rows.copy())["state_action_value"], found)
+    fit_normalization(other, buffer)
+    assert torch.equal(other(rows.copy())["state_action_value"], found)
+
+
+def test_of_modules(replay, expected):
+    actor, q, v = make()
+    for target in (actor, q, v, nn.ModuleList([make()[0]])):
+        fit_normalization(target, replay)
+        for module in target.modules():
+            if isinstance(module, ObservationFeatures):
+                assert torch.equal(module.mean, expected["differences"].mean)
+    other = TensorDictReplayBuffer(storage=LazyTensorStorage(4), batch_size=2)
+    other.extend(TensorDict(seen=torch.rand(4, 39), batch_size=[4]))
+    with pytest.raises(ValueError, match="replay must hold 'observation', its rows hold seen"):
+        fit_normalization(nn.Linear(1, 1), other)
+    with pytest.raises(ValueError, match="Linear holds no ObservationFeatures: there is nothing to normalise"):
+        fit_normalization(nn.Linear(2, 2), replay)

@@ -1,0 +1,392 @@
+"""Any loss over a buffer: a step by hand, stopped and resumed with the same bits, and what is refused."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+
+import pytest
+import torch
+from small_training import PLANS, SMALL, assert_same, collect_demos, flat
+from torch.nn.utils import clip_grad_norm_
+from torchrl.data import PrioritizedSampler, RandomSampler
+from torchrl.envs import Transform
+from torchrl.objectives import BCLoss, CQLLoss, IQLLoss, REDQLoss, SACLoss, SoftUpdate, TD3BCLoss
+from torchrl.record.loggers import Logger
+
+import lw_torchrl as lw
+from lw_torchrl.training import OfflineConfig, OfflineTrainer, fit_normalization
+from lw_torchrl.training.loss_state import sum_of_losses, tensors_of
+from lw_torchrl.training.minibatches import check_minibatches
+
+CONFIG = OfflineConfig(steps=12, batch_size=8, checkpoint_every=5)
+CRITIC = dict(width=16, depth=1)
+GAMMA = 0.95
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory):
+    return collect_demos(tmp_path_factory.mktemp("offline") / "demos")
+
+
+def make_replay(demos, plans=PLANS, sampler=None, n_steps=3, advantage=1.0, **options):
+    replay = lw.LanguageWorldExperienceReplay(
+        demos,
+        label="executed",
+        n_steps=n_steps,
+        gamma=GAMMA if n_steps > 1 else None,
+        sampler=sampler or lw.TaskBalancedSampler(),
+        transform=lw.QAFTransform(plans),
+        **options,
+    )
+    replay.add_column("advantage", torch.linspace(-1, advantage, len(replay)).unsqueeze(-1))
+    return replay
+
+
+class Networks:
+    """Makes networks with a noise on their features, on a device."""
+
+    def __init__(self, noise, device):
+        self.noise, self.device = noise, device
+
+    def actor(self, **options):
+        return lw.PlanConditionedActor(PLANS, **{**SMALL, "feature_noise": self.noise, **options}).to(self.device)
+
+    def value(self, ensemble=1):
+        return lw.PlanConditionedValue(PLANS, ensemble=ensemble, feature_noise=self.noise, **CRITIC).to(self.device)
+
+    def qvalue(self):
+        return lw.PlanConditionedQValue(PLANS, **CRITIC).to(self.device)
+
+
+def bc(made):
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*target_actor_network_params.*")
+        return BCLoss(made.actor(), loss_function="l2")
+
+
+LOSSES = {
+    "bc": bc,
+    "value": lambda made: lw.ExpectileValueLoss(made.value(ensemble=2)),
+    "advantage": lambda made: lw.AdvantageWeightedLoss(made.actor()),
+    "iql": lambda made: IQLLoss(made.actor(distribution="normal"), made.qvalue(), made.value()),
+    "td3-bc": lambda made: TD3BCLoss(made.actor(), made.qvalue(), bounds=(-1.0, 1.0), delay_actor=True),
+    "cql": lambda made: CQLLoss(made.actor(distribution="tanh_normal"), made.qvalue(), num_random=2),
+    "sac": lambda made: SACLoss(made.actor(distribution="tanh_normal"), made.qvalue()),
+    "redq": lambda made: REDQLoss(
+        made.actor(distribution="tanh_normal"), made.qvalue(), num_qvalue_nets=2, sub_sample_len=2
+    ),
+}
+
+
+def make_loss(name, seed=0, noise=0.05, device="cpu"):
+    torch.manual_seed(seed)
+    loss = LOSSES[name](Networks(noise, device))
+    if name not in ("bc", "advantage"):
+        loss.make_value_estimator(gamma=GAMMA)
+    return loss
+
+
+class Stopping(OfflineTrainer):
+    stop_at = None
+
+    def step(self):
+        if self.state.step == self.stop_at:
+            raise KeyboardInterrupt
+        return super().step()
+
+
+def make_trainer(demos, name, checkpoint=None, *, seed=0, config=CONFIG, stop_at=None, **options):
+    trainer = Stopping(
+        make_loss(name, seed), make_replay(demos), config, checkpoint=checkpoint, progress=False, **options
+    )
+    trainer.stop_at = stop_at
+    return trainer
+
+
+def everything(trainer):
+    return flat(
+        {
+            "loss": tensors_of(trainer.loss),
+            "optimizer": trainer.optimizer.state_dict(),
+            "schedule": trainer.schedule.state_dict(),
+            "state": trainer.state.state_dict(),
+        }
+    )
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_stopped_and_started_again_it_ends_with_the_same_bits(demos, tmp_path, name):
+    undisturbed = make_trainer(demos, name)
+    undisturbed.train()
+    path = tmp_path / "checkpoint.zip"
+    for stop in (7, 11):
+        with pytest.raises(KeyboardInterrupt):
+            make_trainer(demos, name, path, stop_at=stop).train()
+    resumed = make_trainer(demos, name, path, seed=99)
+    assert resumed.state.step == 10
+    resumed.train()
+    assert_same(everything(resumed), everything(undisturbed))
+    again = make_trainer(demos, name, path, seed=99)
+    again.train()
+    assert_same(everything(again), everything(undisturbed))
+
+
+def test_a_step_is_the_one_written_by_hand(demos):
+    trainer = make_trainer(demos, "td3-bc", config=replace(CONFIG, critic_learning_rate=3e-3, target_eps=0.9))
+    trainer.train()
+    loss, replay = make_loss("td3-bc"), make_replay(demos)
+    generator = torch.Generator().manual_seed(CONFIG.seed)
+    replay.set_rng(generator)
+    targets = SoftUpdate(loss, eps=0.9)
+    fit_normalization(loss, replay)
+    loss.actor_network.train()
+    named = dict(loss.named_parameters())
+    groups = [[p for n, p in named.items() if n.startswith("actor") is first] for first in (True, False)]
+    rates = CONFIG.learning_rate, 3e-3
+    optimizer = torch.optim.AdamW(
+        [{"params": group, "lr": rate} for group, rate in zip(groups, rates, strict=True)],
+        weight_decay=1e-4,
+        fused=True,
+    )
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, CONFIG.steps)
+    with torch.random.fork_rng():
+        torch.manual_seed(CONFIG.seed)
+        for _ in range(CONFIG.steps):
+            found = loss(replay.sample(CONFIG.batch_size))
+            optimizer.zero_grad()
+            (found["loss_actor"] + found["loss_qvalue"]).backward()
+            for group in groups:
+                clip_grad_norm_(group, CONFIG.max_grad_norm)
+            optimizer.step()
+            schedule.step()
+            targets.step()
+    assert_same(flat(tensors_of(trainer.loss)), flat(tensors_of(loss)))
+
+
+@pytest.mark.parametrize("name", ["value", "iql", "td3-bc", "cql", "sac", "redq"])
+def test_what_lies_n_steps_ahead_is_discounted_as_often(demos, name):
+    seen = []
+    trainer = make_trainer(demos, name, config=replace(CONFIG, steps=1))
+    estimator = trainer.loss.value_estimator
+    estimate = type(estimator).value_estimate
+
+    def note(rows, **options):
+        zero, never = torch.zeros_like(rows["next", "reward"]), torch.zeros_like(rows["next", "terminated"])
+        rows = rows.copy().set("next", rows["next"].copy().update({"reward": zero, "terminated": never}))
+        seen.append(estimate(estimator, rows, **{**options, "next_value": torch.ones_like(zero)}).reshape(-1))
+        return zero
+
+    estimator.value_estimate = note
+    steps = []
+    trainer.replay.append_transform(_Note(steps))
+    trainer.train()
+    torch.testing.assert_close(seen[0], GAMMA ** steps[0].float())
+    assert steps[0].max() == 3
+
+
+class _Note(Transform):
+    def __init__(self, noted):
+        super().__init__()
+        self.noted = noted
+
+    def forward(self, tensordict):
+        self.noted.append(tensordict["steps_to_next_obs"].clone())
+        return tensordict
+
+
+def test_the_first_steps_of_cqls_actor_stand_for_its_loss_and_not_beside_it(demos):
+    trainer = make_trainer(demos, "cql", config=replace(CONFIG, steps=1))
+    found = trainer.loss(trainer.replay.sample(8))
+    wanted = sum(found[name] for name in ("loss_actor", "loss_qvalue", "loss_cql", "loss_alpha"))
+    assert found["loss_actor_bc"] > 1
+    torch.testing.assert_close(sum_of_losses(found), wanted)
+
+
+def test_an_actor_learns_from_its_own_loss_and_a_critic_from_its_own(demos):
+    trainer = make_trainer(demos, "td3-bc", config=replace(CONFIG, critic_learning_rate=0.0, weight_decay=0.0))
+    before = {name: p.detach().clone() for name, p in trainer.loss.named_parameters()}
+    trainer.train()
+    after = dict(trainer.loss.named_parameters())
+    moved = {name for name in before if not torch.equal(before[name], after[name])}
+    assert moved
+    assert all(name.startswith("actor_network_params") for name in moved)
+
+
+@pytest.mark.parametrize("name", ["value", "td3-bc"])
+def test_statistics_of_the_rows_reach_networks_and_their_targets(demos, name):
+    trainer = make_trainer(demos, name)
+    tensors = tensors_of(trainer.loss)
+    means = {key: tensor for key, tensor in tensors.items() if key.endswith("features.mean")}
+    assert any(key.startswith("target_") for key in means)
+    assert all(tensor.abs().sum() > 0 for tensor in means.values())
+    untouched = make_trainer(demos, name, config=replace(CONFIG, normalize=False))
+    assert all(
+        tensor.abs().sum() == 0 for key, tensor in tensors_of(untouched.loss).items() if key.endswith("features.mean")
+    )
+
+
+def test_a_policy_that_was_trained_keeps_its_statistics(demos):
+    actor = Networks(0.0, "cpu").actor()
+    OfflineTrainer(lw.AdvantageWeightedLoss(actor), make_replay(demos), CONFIG, progress=False).train()
+    before = {name: tensor.clone() for name, tensor in actor.state_dict().items()}
+    OfflineTrainer(lw.AdvantageWeightedLoss(actor), make_replay(demos), CONFIG, progress=False)  # of the same rows
+    others = make_replay(demos, episodes={"reach": 1}, sampler=RandomSampler())
+    with pytest.raises(ValueError, match="has the statistics of other rows"):
+        OfflineTrainer(lw.AdvantageWeightedLoss(actor), others, CONFIG, progress=False)
+    OfflineTrainer(lw.AdvantageWeightedLoss(actor), others, replace(CONFIG, normalize=False), progress=False)
+    assert_same(actor.state_dict(), before)
+
+
+def test_networks_are_in_eval_mode_afterwards_and_in_train_mode_meanwhile(demos):
+    trainer = make_trainer(demos, "td3-bc")
+    seen = []
+    step = trainer.step
+    trainer.step = lambda: (seen.extend(network.training for network in trainer.networks), step())[1]
+    trainer.train()
+    assert seen
+    assert all(seen)
+    assert not any(network.training for network in trainer.networks)
+
+
+def test_what_the_loss_gives_is_logged_as_means_of_a_hundred_steps(demos):
+    class Note(Logger):
+        def __init__(self):
+            self.noted = {}
+
+        def log_scalar(self, name, value, step=None):
+            self.noted.setdefault(name, []).append((step, value))
+
+    note = Note()
+    trainer = make_trainer(demos, "value", logger=note, config=replace(CONFIG, steps=101))
+    trainer.train()
+    assert set(note.noted) == {"train/loss_value", "train/value"}
+    assert [step for step, _ in note.noted["train/value"]] == [100, 101]
+    assert trainer.last["value"] == note.noted["train/value"][-1][1]
+
+
+# ---- what is refused
+
+
+@pytest.fixture(scope="module")
+def checkpoint(demos, tmp_path_factory):
+    path = tmp_path_factory.mktemp("checkpoint") / "checkpoint.zip"
+    make_trainer(demos, "value", path).train()
+    return path
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (dict(config=replace(CONFIG, learning_rate=1e-2)), "its training differs in learning_rate"),
+        (dict(name="advantage"), "its loss differs in class"),
+        (dict(expectile=0.9), r"its loss differs in options.expectile \(0.7, now 0.9\)"),
+        (dict(gamma=0.5, n_steps=1), "its loss differs in fixed"),
+        (dict(width=8), "shapes.value_network_params.heads.0.0.bias"),
+        (dict(sampler=RandomSampler()), "its replay differs in sampler"),
+        (dict(episodes=1), "of another configuration"),
+        (dict(reward="cost"), r"its replay differs in reward \('sparse', now 'cost'\)"),
+        (dict(n_steps=2), r"its replay differs in n_steps \(3, now 2\)"),
+        (dict(terminate_on_success=True), "its replay differs in .*terminate_on_success"),
+        (dict(advantage=0.5), "its replay differs in columns.advantage"),
+    ],
+)
+def test_a_checkpoint_of_another_training_is_refused(demos, checkpoint, change, message):
+    torch.manual_seed(0)
+    loss = make_loss(change.get("name", "value"))
+    if {"expectile", "gamma", "width"} & set(change):
+        value = lw.PlanConditionedValue(
+            PLANS, ensemble=2, feature_noise=0.05, **{**CRITIC, "width": change.get("width", 16)}
+        )
+        loss = lw.ExpectileValueLoss(value, expectile=change.get("expectile", 0.7))
+        loss.make_value_estimator(gamma=change.get("gamma", GAMMA))
+    shown = ("sampler", "episodes", "reward", "n_steps", "terminate_on_success", "advantage")
+    options = {name: change[name] for name in shown if name in change}
+    with pytest.raises(ValueError, match=message):
+        OfflineTrainer(
+            loss, make_replay(demos, **options), change.get("config", CONFIG), checkpoint=checkpoint, progress=False
+        )
+
+
+def test_a_checkpoint_of_other_plans_is_refused(demos, checkpoint):
+    others = lw.Plans([lw.ConditionalPlan(plan.task, plan.steps[::-1]) for plan in PLANS.values()])
+    loss = lw.ExpectileValueLoss(lw.PlanConditionedValue(others, ensemble=2, feature_noise=0.02, **CRITIC))
+    loss.make_value_estimator(gamma=GAMMA)
+    with pytest.raises(ValueError, match=r"its loss differs in fixed|replay differs"):
+        OfflineTrainer(loss, make_replay(demos, others), CONFIG, checkpoint=checkpoint, progress=False)
+
+
+@pytest.mark.parametrize("content", [b"", b"no archive", None])
+def test_a_file_that_is_no_checkpoint_is_refused(demos, checkpoint, tmp_path, content):
+    path = tmp_path / "checkpoint.zip"
+    if content is None:
+        lw.save_actor(Networks(0.0, "cpu").actor(), path)
+    else:
+        path.write_bytes(content)
+    with pytest.raises(ValueError, match="is damaged or none of a loss's training"):
+        make_trainer(demos, "value", path)
+    whole = checkpoint.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(ValueError, match="is damaged or none of a loss's training"):
+        make_trainer(demos, "value", path)
+
+
+def test_a_buffer_of_other_plans_is_refused(demos):
+    others = lw.Plans([lw.ConditionalPlan(plan.task, plan.steps[::-1]) for plan in PLANS.values()])
+    loss = make_loss("value")
+    with pytest.raises(ValueError, match="replay's QAFTransform must have the critic's plans"):
+        OfflineTrainer(loss, make_replay(demos, others), CONFIG, progress=False)
+
+
+@pytest.mark.parametrize("made", [True, False])
+def test_a_value_of_another_discount_than_the_rows_is_refused(demos, made):
+    loss = LOSSES["value"](Networks(0.0, "cpu"))
+    if made:
+        loss.make_value_estimator(gamma=0.9)
+    with pytest.raises(ValueError, match=rf"the replay buffer's n steps, 0.95, got 0.9{'' if made else '9'};"):
+        OfflineTrainer(loss, make_replay(demos), CONFIG, progress=False)
+
+
+def test_losses_that_cannot_be_summed_are_refused(demos):
+    made = Networks(0.0, "cpu")
+    actor, critic = made.actor(distribution="tanh_normal"), made.qvalue()
+    unreduced = SACLoss(actor, critic, reduction="none", scalar_output_mode="exclude")
+    with pytest.raises(ValueError, match="got reduction='none'"):
+        OfflineTrainer(unreduced, make_replay(demos), CONFIG, progress=False)
+    with pytest.raises(ValueError, match="with_lagrange=False"):
+        OfflineTrainer(CQLLoss(actor, critic, with_lagrange=True), make_replay(demos), CONFIG, progress=False)
+    with pytest.raises(TypeError, match=r"got Sequential.*by loss.compile\(\)"):
+        OfflineTrainer(torch.nn.Sequential(make_loss("td3-bc")), make_replay(demos), CONFIG, progress=False)
+    with pytest.raises(ValueError, match="entries that begin with 'loss_', it gives loss"):
+        sum_of_losses({"loss": torch.zeros(())})
+
+
+def test_priorities_that_nothing_would_change_are_refused(demos):
+    replay = make_replay(demos)
+    replay._sampler = PrioritizedSampler.__new__(PrioritizedSampler)  # made as users do, it needs compiled code
+    with pytest.raises(ValueError, match="a PrioritizedSampler draws them all alike"):
+        check_minibatches([], replay, 8)
+
+
+def test_a_loss_that_is_no_number_stops_the_training(demos, tmp_path):
+    path = tmp_path / "checkpoint.zip"
+    trainer = make_trainer(demos, "value", path)
+    with torch.no_grad():
+        next(trainer.loss.parameters()).fill_(float("inf"))
+    with pytest.raises(ValueError, match="the loss is nan at step 0"):
+        trainer.train()
+    assert not path.exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (dict(steps=0), "steps must be at least 1, got 0"),
+        (dict(target_eps=1.5), "target_eps must be from 0 to 1"),
+        (dict(schedule="cosin"), "schedule must be one of 'cosine', 'constant', got 'cosin'; did you mean 'cosine'"),
+        (dict(learning_rate=-1.0), "learning_rate must be finite and at least 0"),
+    ],
+)
+def test_wrong_options_are_named(options, message):
+    with pytest.raises(ValueError, match=message):
+        OfflineConfig(**options)

@@ -1,0 +1,163 @@
+"""A checkpoint of another training, or none, is refused and left alone."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+from hostile_files import parts, rebuild
+from small_training import CONFIG, PLANS, SMALL, collect_demos, make_actor, make_trainer
+from torchrl.data import RandomSampler
+from torchrl.envs import Compose
+
+from lw_torchrl.data import LanguageWorldExperienceReplay, TaskBalancedSampler, collect_demonstrations
+from lw_torchrl.modules import DescriptorConditionedActor, PlanConditionedActor
+from lw_torchrl.training import BehavioralCloningConfig, BehavioralCloningTrainer
+from lw_torchrl.transforms import QAFTransform, RandomYaw
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory):
+    return collect_demos(tmp_path_factory.mktemp("trainer") / "demos")
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    """Demonstrations that come to an end: steps follow the first success."""
+    root = tmp_path_factory.mktemp("whole") / "demos"
+    collect_demonstrations(["push", "reach"], episodes_per_task=1, root=root, max_steps=100, progress=False)
+    return root
+
+
+@pytest.fixture(scope="module")
+def checkpoint(demos, tmp_path_factory):
+    path = tmp_path_factory.mktemp("checkpoint") / "checkpoint.zip"
+    make_trainer(demos, path).train()
+    return path
+
+
+def refused(path, message, make):
+    content = path.read_bytes()
+    with pytest.raises(ValueError, match=message) as caught:
+        make()
+    assert path.read_bytes() == content
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "differs"),
+    [
+        (dict(width=32), r"options.width \(16, now 32\)"),
+        (dict(depth=2), r"options.depth \(1, now 2\)"),
+        (dict(latent_size=5), r"options.latent_size \(.*, now 5\)"),
+        (dict(mix="actions"), r"options.mix \('latents', now 'actions'\)"),
+        (dict(features="raw"), r"options.features \('differences', now 'raw'\)"),
+    ],
+)
+def test_a_checkpoint_of_another_architecture_is_refused(demos, checkpoint, options, differs):
+    actor = make_actor(1, **options)
+    before = {name: value.clone() for name, value in actor.state_dict().items()}
+    refused(
+        checkpoint,
+        f"of another architecture, its actor differs in {differs}; choose another file, or delete it",
+        lambda: make_trainer(demos, checkpoint, actor=actor),
+    )
+    assert all(torch.equal(value, before[name]) for name, value in actor.state_dict().items())
+
+
+def test_a_checkpoint_of_other_plans_or_another_kind_is_refused(demos, checkpoint):
+    plans = {task: plan for task, plan in PLANS.items() if task in ("push", "reach")}
+    refused(
+        checkpoint,
+        r"of another architecture, its actor differs in plans.button-press-topdown, .*plans.window-open;",
+        lambda: make_trainer(demos, checkpoint, actor=PlanConditionedActor(plans, **SMALL)),
+    )
+    refused(
+        checkpoint,
+        "of another architecture, its actor differs in kind",
+        lambda: make_trainer(demos, checkpoint, actor=DescriptorConditionedActor("MT10", **SMALL)),
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("steps", 13),
+        ("batch_size", 6),
+        ("learning_rate", 1e-3),
+        ("loss_function", "l1"),
+        ("seed", 1),
+        ("weight_decay", 0.0),
+    ],
+)
+def test_a_checkpoint_of_another_configuration_is_refused(demos, checkpoint, name, value):
+    config = BehavioralCloningConfig(**{**vars(CONFIG), name: value})
+    refused(
+        checkpoint,
+        rf"of another configuration, its training differs in {name} \({vars(CONFIG)[name]!r}, now {value!r}\);",
+        lambda: make_trainer(demos, checkpoint, config=config),
+    )
+
+
+def test_a_checkpoint_of_other_demonstrations_is_refused(checkpoint, tmp_path):
+    root = tmp_path / "demos"
+    collect_demonstrations(["push", "reach"], episodes_per_task=1, root=root, max_steps=15, seed=8, progress=False)
+    refused(
+        checkpoint,
+        r"its data differs in episodes_per_task \(.*, now 1\), noise_scale \(.*\), seed \(0, now 8\);",
+        lambda: make_trainer(root, checkpoint),
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "differs"),
+    [
+        (dict(label="executed"), "label"),
+        (dict(label="unclipped"), "label"),
+        (dict(after_success=0), "rows"),
+        (dict(sampler=RandomSampler), "sampler"),
+        (dict(yaw=0.2), "transforms"),
+        (dict(yaw=None), "transforms"),
+        (dict(plans=PLANS), "transforms"),
+    ],
+)
+def test_a_checkpoint_of_rows_shown_in_another_way_is_refused(root, tmp_path, change, differs):
+    path = tmp_path / "c.zip"
+
+    def trainer(label="expert", after_success=None, sampler=TaskBalancedSampler, yaw=0.1, plans=None):
+        turned = Compose(QAFTransform(PLANS), *([] if yaw is None else [RandomYaw(yaw, plans=plans)]))
+        replay = LanguageWorldExperienceReplay(
+            root, label=label, after_success=after_success, sampler=sampler(), transform=turned
+        )
+        return BehavioralCloningTrainer(make_actor(), replay, CONFIG, checkpoint=path, progress=False)
+
+    trainer().save()
+    trainer()
+    refused(path, f"of another configuration, its replay differs in {differs}", lambda: trainer(**change))
+
+
+def test_a_checkpoint_from_before_that_was_said_goes_on(demos, tmp_path):
+    path = tmp_path / "c.zip"
+    make_trainer(demos, path).train()
+    description, groups = parts(path)
+    del description["replay"]
+    rebuild(path, description, groups)
+    assert make_trainer(demos, path).state.step == CONFIG.steps
+    with pytest.raises(ValueError, match=r"does not fit.* a sampler's state, one of a RandomSampler"):
+        make_trainer(demos, path, sampler=RandomSampler())
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 not quite", b"years of work\n", json.dumps({"a": 1}).encode()])
+def test_a_foreign_file_is_refused(demos, tmp_path, content):
+    path = tmp_path / "thesis.tex"
+    path.write_bytes(content)
+    refused(path, "checkpoint: .* is damaged or none of ours", lambda: make_trainer(demos, path))
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.99])
+def test_a_truncated_checkpoint_is_refused(demos, checkpoint, tmp_path, share):
+    path = tmp_path / "checkpoint.zip"
+    content = checkpoint.read_bytes()
+    path.write_bytes(content[: int(share * len(content))])
+    refused(path, "damaged or none of ours", lambda: make_trainer(demos, path))

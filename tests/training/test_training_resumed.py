@@ -1,0 +1,210 @@
+"""Training stopped anywhere, and carried on from its checkpoint, ends with the same bits."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+import textwrap
+
+import pytest
+import torch
+from small_training import CONFIG, assert_same, collect_demos, everything, flat, make_actor, make_replay, make_trainer
+from torchrl.data import RandomSampler, SamplerWithoutReplacement
+
+from lw_torchrl.training import BehavioralCloningConfig, BehavioralCloningTrainer, StackedBehavioralCloning
+from lw_torchrl.transforms import RandomYaw
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory):
+    return collect_demos(tmp_path_factory.mktemp("trainer") / "demos")
+
+
+@pytest.fixture(scope="module")
+def undisturbed(demos):
+    trainer = make_trainer(demos)
+    trainer.train()
+    return everything(trainer)
+
+
+@pytest.mark.parametrize("stops", [[5], [7], [11], [6, 6], [3, 8, 11]])
+def test_stopped_anywhere_and_started_again_it_ends_with_the_same_bits(demos, undisturbed, tmp_path, stops):
+    path = tmp_path / "runs" / "checkpoint.zip"
+    for stop in stops:
+        with pytest.raises(KeyboardInterrupt):
+            make_trainer(demos, path, stop_at=stop).train()
+    resumed = make_trainer(demos, path, actor=make_actor(99))
+    assert resumed.state.step == max(stops) // 5 * 5
+    resumed.train()
+    assert_same(everything(resumed), undisturbed)
+
+
+def test_what_a_transform_draws_hangs_on_the_seed_and_resumes_too(demos, tmp_path):
+    def trainer(noise, checkpoint=None, stop_at=None):
+        made = make_trainer(demos, checkpoint, stop_at=stop_at)
+        made.replay.append_transform(RandomYaw(0.5))
+        torch.manual_seed(noise)  # what else draws in this process must not matter
+        return made
+
+    whole = trainer(1)
+    whole.train()
+    with pytest.raises(KeyboardInterrupt):
+        trainer(2, tmp_path / "c.zip", stop_at=7).train()
+    resumed = trainer(3, tmp_path / "c.zip")
+    resumed.train()
+    assert_same(flat(resumed.actor.state_dict()), flat(whole.actor.state_dict()))
+    unturned = make_trainer(demos)
+    unturned.train()
+    assert not torch.equal(unturned.actor.head.network[0].weight, whole.actor.head.network[0].weight)
+
+
+@pytest.mark.parametrize("sampler", [RandomSampler, SamplerWithoutReplacement])
+def test_torchrls_samplers_resume_too(demos, tmp_path, sampler):
+    whole = make_trainer(demos, sampler=sampler())
+    whole.train()
+    path = tmp_path / "checkpoint.zip"
+    with pytest.raises(KeyboardInterrupt):
+        make_trainer(demos, path, sampler=sampler(), stop_at=8).train()
+    resumed = make_trainer(demos, path, actor=make_actor(99), sampler=sampler())
+    assert resumed.state.step == 5
+    resumed.train()
+    assert_same(everything(resumed), everything(whole))
+
+
+def test_a_learning_rate_that_is_an_integer_resumes_too(demos, tmp_path):
+    config = BehavioralCloningConfig(steps=12, batch_size=8, checkpoint_every=5, learning_rate=1)
+    path = tmp_path / "checkpoint.zip"
+    with pytest.raises(KeyboardInterrupt):
+        make_trainer(demos, path, config=config, stop_at=7).train()
+    assert make_trainer(demos, path, config=config).state.step == 5
+
+
+def test_a_finished_training_does_nothing_twice(demos, undisturbed, tmp_path):
+    path = tmp_path / "checkpoint.zip"
+    make_trainer(demos, path).train()
+    content = path.read_bytes()
+    again = make_trainer(demos, path, actor=make_actor(99), stop_at=CONFIG.steps)
+    assert math.isnan(again.train())
+    assert path.read_bytes() == content
+    assert_same(everything(again), undisturbed)
+
+
+def test_checkpoints_come_in_their_time_and_leave_one_file(demos, tmp_path, monkeypatch):
+    saved = []
+    save = BehavioralCloningTrainer.save
+    monkeypatch.setattr(BehavioralCloningTrainer, "save", lambda self: (saved.append(self.state.step), save(self)))
+    make_trainer(demos, tmp_path / "checkpoint.zip").train()
+    assert saved == [5, 10, 12]
+    assert [path.name for path in tmp_path.iterdir()] == ["checkpoint.zip"]
+
+
+def test_trained_in_parts_it_ends_the_same(demos, undisturbed, tmp_path):
+    trainer = make_trainer(demos, tmp_path / "checkpoint.zip")
+    trainer.train(until=4)
+    assert (trainer.steps, trainer.actor.training) == (4, False)
+    assert make_trainer(demos, tmp_path / "checkpoint.zip").steps == 4
+    assert math.isnan(trainer.train(until=3))
+    trainer.train(until=7)
+    trainer.train()
+    assert_same(everything(trainer), undisturbed)
+    for until, message in (
+        (0, "until must be at least 1, got 0"),
+        (13, "at most the configuration's steps, 12, got 13"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            trainer.train(until=until)
+
+
+def test_without_a_checkpoint_nothing_is_written(demos, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    make_trainer(demos).train()
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_weights_that_the_last_step_spoils_are_not_saved(demos, tmp_path, kept):
+    """No loss is taken after it that would tell."""
+    path = tmp_path / "checkpoint.zip" if kept else None
+    config = BehavioralCloningConfig(steps=1, batch_size=8, optimizer="sgd", learning_rate=1e30, weight_decay=1e10)
+    with pytest.raises(ValueError, match=r"weights: .* must be finite, .* after step 1: the learning rate is too high"):
+        make_trainer(demos, path, config=config).train()
+    assert not list(tmp_path.iterdir())
+    actors = [make_actor(), make_actor(1)]
+    stacked = StackedBehavioralCloning(
+        actors, [make_replay(demos) for _ in actors], config, checkpoint=path, progress=False
+    )
+    with pytest.raises(ValueError, match=r"weights: .* must be finite, .* after step 1: the learning rate is too high"):
+        stacked.train()
+    assert not list(tmp_path.iterdir())
+
+
+KILLER = """
+    import os, random, signal, sys, time
+    import torch
+    import lw_torchrl as lw
+
+    root, path = sys.argv[1:]
+    plans = lw.load_plans("MT10")
+    config = lw.BehavioralCloningConfig(steps=40, batch_size=8, checkpoint_every=1)
+
+    def train(path, seed):
+        torch.manual_seed(seed)
+        actor = lw.PlanConditionedActor(plans, latent_size=4, width=16, depth=1, encoder_width=8)
+        replay = lw.LanguageWorldExperienceReplay(
+            root, sampler=lw.TaskBalancedSampler(), transform=lw.QAFTransform(plans)
+        )
+        trainer = lw.BehavioralCloningTrainer(actor, replay, config, checkpoint=path, progress=False)
+        trainer.train()
+        return {**actor.state_dict(), "batch": replay.sample(8)["observation"]}
+
+    draw, kills, seed = random.Random(0), 0, 0
+    for _ in range(12):
+        child = os.fork()
+        if child == 0:
+            try:
+                train(path, seed)
+            except BaseException as error:
+                print(repr(error), file=sys.stderr)
+                os._exit(1)
+            os._exit(0)
+        time.sleep(draw.uniform(0.02, 0.3))
+        os.kill(child, signal.SIGKILL)
+        status = os.waitpid(child, 0)[1]
+        assert not os.WIFEXITED(status) or os.WEXITSTATUS(status) == 0
+        kills += os.WIFSIGNALED(status)
+        if os.path.exists(path):
+            lw.load_actor(path)
+            seed = 99
+    resumed, whole = train(path, seed), train(None, 0)
+    assert all(torch.equal(resumed[key], whole[key]) for key in whole)
+    print(kills)
+"""
+
+
+def test_killed_at_any_moment_the_checkpoint_is_whole_and_training_the_same(demos, tmp_path):
+    path = tmp_path / "checkpoint.zip"
+    command = [sys.executable, "-W", "ignore", "-c", textwrap.dedent(KILLER), str(demos), str(path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=240)
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout) >= 3
+
+
+@pytest.mark.parametrize("failing", ["zipfile.ZipFile.writestr", "os.replace"])
+def test_a_disk_that_fills_while_saving_leaves_the_old_checkpoint(demos, tmp_path, monkeypatch, failing):
+    path = tmp_path / "checkpoint.zip"
+    with pytest.raises(KeyboardInterrupt):
+        make_trainer(demos, path, stop_at=6).train()
+    content = path.read_bytes()
+
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    resumed = make_trainer(demos, path)
+    monkeypatch.setattr(failing, full)
+    with pytest.raises(OSError, match="No space left"):
+        resumed.save()
+    monkeypatch.undo()
+    assert path.read_bytes() == content
+    assert [found.name for found in tmp_path.iterdir()] == ["checkpoint.zip"]
+    assert make_trainer(demos, path).state.step == 5
