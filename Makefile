@@ -1,5 +1,6 @@
 # make demo    train, evaluate and record a plan-conditioned policy on MT10
-# make test    the whole test suite, warnings as errors; JOBS=4 for four processes instead of two
+# make test    the fast tests, about eight minutes on two cores; JOBS=4 for four processes instead of two
+# make test-all    the fast tests and the slow ones
 # make check   ruff and mypy
 # make bench   what everything costs, against rivals (docs/performance.md)
 # make setup   the environment alone (.venv)
@@ -15,13 +16,18 @@ TORCH_INDEX ?=
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test test-python check setup bench clean
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
+
+.PHONY: demo test test-slow test-all test-python check setup bench clean
 demo: $(READY)
 	$(BIN)/lw-torchrl demo
 test: $(READY)
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
+	$(PYTEST) -m 'not slow'
+test-slow: $(READY)
+	$(PYTEST) -m slow
+test-all: test test-slow
 test-python:
-	$(MAKE) test VENV=.venv-$(notdir $(PYTHON)) PYTHON=$(PYTHON)
+	$(MAKE) test-all VENV=.venv-$(notdir $(PYTHON)) PYTHON=$(PYTHON)
 check: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
