@@ -41,7 +41,7 @@ class ActorEnsemble(Policy):
     Example:
         >>> import lw_torchrl as lw
         >>> env = lw.LanguageWorldEnv("reach")
-        >>> actor = lw.ActorEnsemble([lw.DescriptorConditionedActor("MT10") for _ in range(4)])
+        >>> actor = lw.modules.ActorEnsemble([lw.DescriptorConditionedActor("MT10") for _ in range(4)])
         >>> actor(env.reset())["action"].shape
         torch.Size([1, 4])
         >>> env.close()

@@ -241,7 +241,7 @@ def plan_actor_value(
     Example:
         >>> import lw_torchrl as lw
         >>> from torchrl.objectives import ClipPPOLoss
-        >>> loss = ClipPPOLoss(*lw.plan_actor_value(lw.load_plans("MT10")))
+        >>> loss = ClipPPOLoss(*lw.modules.plan_actor_value(lw.load_plans("MT10")))
 
     Source: ``torchrl.modules.ActorValueOperator``.
     """

@@ -52,7 +52,7 @@ class ImageQueryEvaluator(ClauseEvaluator):
     Example:
         >>> import lw_torchrl as lw
         >>> plans = lw.load_plans("MT10")
-        >>> actor = lw.ScriptedSkillActor(plans, evaluator=lw.ImageQueryEvaluator(plans))
+        >>> actor = lw.ScriptedSkillActor(plans, evaluator=lw.modules.ImageQueryEvaluator(plans))
         >>> actor.in_keys
         ['observation', 'task_id', 'pixels']
         >>> actor.transform().shape

@@ -57,10 +57,10 @@ class QueryEvaluatorTrainer:
         >>> with tempfile.TemporaryDirectory() as root:
         ...     _ = lw.collect_demonstrations("reach", episodes_per_task=2, root=root + "/demos", max_steps=80)
         ...     replay = lw.LanguageWorldExperienceReplay(root + "/demos", label="executed")
-        ...     config = lw.QueryEvaluatorConfig(steps=200, batch_size=64, held_out_pairs=0.0)
-        ...     data = lw.LabelledQueries(replay, config)
+        ...     config = lw.training.QueryEvaluatorConfig(steps=200, batch_size=64, held_out_pairs=0.0)
+        ...     data = lw.training.LabelledQueries(replay, config)
         ...     evaluator = lw.StateQueryEvaluator(lw.load_plans("MT10"))
-        ...     lw.QueryEvaluatorTrainer(evaluator, data, config).train() < 0.65
+        ...     lw.training.QueryEvaluatorTrainer(evaluator, data, config).train() < 0.65
         True
     """
 

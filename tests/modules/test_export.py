@@ -31,7 +31,7 @@ ACTORS = {
     "scripted": lambda: lw.ScriptedSkillActor(PLANS),
     "residual": lambda: moved(lw.ResidualActor(lw.PlanConditionedActor(PLANS, **SMALL), **SMALL)),
     "steps": lambda: moved(lw.ResidualActor(lw.PlanConditionedActor(PLANS, **SMALL), steps={"push": [0, 2]}, **SMALL)),
-    "ensemble": lambda: lw.ActorEnsemble([lw.PlanConditionedActor(PLANS, **SMALL) for _ in range(2)]),
+    "ensemble": lambda: lw.modules.ActorEnsemble([lw.PlanConditionedActor(PLANS, **SMALL) for _ in range(2)]),
 }
 
 

@@ -225,7 +225,7 @@ SMALL = {"height": 16, "width": 24, "hidden": 8, "depth": 1}
 
 @pytest.mark.parametrize(("own", "every", "drawn"), [(1, 4, 4), (2, 4, 4), (4, 4, 4), (8, 4, 8), (2, 3, 2)])
 def test_cameras_draw_what_is_looked_at(own, every, drawn):
-    eyes = lw.ImageQueryEvaluator(PLANS, every=own, **SMALL)
+    eyes = lw.modules.ImageQueryEvaluator(PLANS, every=own, **SMALL)
     camera, asks = lw.HeldEvaluator(eyes, every=every, delay=1).transform().transforms
     assert (camera.every, asks.every, asks.delay) == (drawn, every, 1)
     assert asks.in_keys == ["pixels", "task_id"]
@@ -241,7 +241,7 @@ class TestPictures:
     @pytest.mark.parametrize("inside", [True, False])
     def test_at_every_step_it_is_what_it_holds(self, inside):
         torch.manual_seed(0)
-        eyes, actor = lw.ImageQueryEvaluator(PLANS, **SMALL), lw.PlanConditionedActor(PLANS, width=8)
+        eyes, actor = lw.modules.ImageQueryEvaluator(PLANS, **SMALL), lw.PlanConditionedActor(PLANS, width=8)
         settings = {"episodes_per_task": 1, "max_steps": 6}
         runs = []
         for one in (eyes, lw.HeldEvaluator(eyes)):
@@ -253,7 +253,7 @@ class TestPictures:
 
     def test_the_answers_are_of_the_pictures_of_steps_that_are_due(self):
         torch.manual_seed(0)
-        eyes, actor = lw.ImageQueryEvaluator(PLANS, **SMALL), lw.PlanConditionedActor(PLANS, width=8)
+        eyes, actor = lw.modules.ImageQueryEvaluator(PLANS, **SMALL), lw.PlanConditionedActor(PLANS, width=8)
         held = actor.with_evaluator(lw.HeldEvaluator(eyes, every=4), answers="logit")
         keys = ["pixels", "task_id", "qaf_held_logits"]
         _, seen = evaluated(held, episodes_per_task=1, also_record=keys)

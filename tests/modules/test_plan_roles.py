@@ -141,7 +141,7 @@ def test_training_takes_contacts_and_they_go_with_the_policy(tmp_path):
     wider = actor.with_plans(ZERO_SHOT).encoder.roles
     assert torch.equal(wider.contact[PlanTables(ZERO_SHOT).index.row("drawer-open")], contact[row])
     assert wider.contact.count_nonzero() == contact.count_nonzero()
-    ensemble = lw.ActorEnsemble([lw.PlanConditionedActor(MT10, **OPTIONS) for _ in range(2)])
+    ensemble = lw.modules.ActorEnsemble([lw.PlanConditionedActor(MT10, **OPTIONS) for _ in range(2)])
     fit_normalization(ensemble, replay)
     assert all(torch.equal(member.encoder.roles.contact, contact) for member in ensemble.members)
 
@@ -179,7 +179,7 @@ def test_training_without_statistics_wants_contacts_first():
     replay.append_transform(actor.transform())
     for make in (
         lambda: lw.BehavioralCloningTrainer(actor, replay, config, progress=False),
-        lambda: lw.StackedBehavioralCloning([actor], [replay], config, progress=False),
+        lambda: lw.training.StackedBehavioralCloning([actor], [replay], config, progress=False),
     ):
         with pytest.raises(ValueError, match=r"roles want to know .*; call fit_normalization\(actor, replay\)"):
             make()
