@@ -80,7 +80,7 @@ if TYPE_CHECKING:  # the tables below, for type checkers and editors
 
 __version__ = "0.2.0"
 
-_ROOMS = [*"data envs evaluation language modules objectives paper planners record training transforms".split()]
+_ROOMS = "data envs evaluation language modules objectives paper planners record training transforms"
 _NAMES = {
     "lw_torchrl.data": "CoLearningSampler EpisodeFilter LanguageWorldExperienceReplay TaskBalancedSampler "
     "collect_demonstrations",
@@ -126,7 +126,7 @@ __all__ = sorted(_ROOM_OF)
 
 
 def __getattr__(name: str) -> object:
-    if name in _ROOMS:
+    if name in _ROOMS.split():
         return import_module(f"lw_torchrl.{name}")
     if name in _ROOM_OF:
         found = globals()[name] = getattr(import_module(_ROOM_OF[name]), name)
@@ -139,4 +139,4 @@ def __getattr__(name: str) -> object:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__, *_ROOMS})
+    return sorted({*globals(), *__all__, *_ROOMS.split()})

@@ -116,7 +116,7 @@ def test_type_checkers_see_the_names_that_are_there():
     ]
     stated = {alias.asname: line.module for line in block.body for alias in line.names}
     rooms = [name for name, module in stated.items() if module == "lw_torchrl"]
-    assert rooms == lw_torchrl._ROOMS
+    assert rooms == lw_torchrl._ROOMS.split()
     assert {name: module for name, module in stated.items() if name not in rooms} == lw_torchrl._ROOM_OF
     assert sorted({*stated} - {*rooms}) == lw_torchrl.__all__
 
@@ -147,4 +147,4 @@ def test_names_rooms_and_what_is_neither():
     with pytest.raises(AttributeError, match="no attribute 'load_plan'"):
         lw_torchrl.load_plan  # noqa: B018
     rooms = {module.name for module in pkgutil.iter_modules(lw_torchrl.__path__) if module.ispkg}
-    assert {*lw_torchrl._ROOMS, "cli"} == rooms
+    assert {*lw_torchrl._ROOMS.split(), "cli"} == rooms
