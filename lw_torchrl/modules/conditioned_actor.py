@@ -21,8 +21,8 @@ from torchrl.envs import Transform
 
 from lw_torchrl._keys import as_keys, check_apart, dispatched, key_beside, read, write
 from lw_torchrl.language.tasks import Task
-from lw_torchrl.modules.action_head import ActionHead, DistributionName
 from lw_torchrl.modules.encoder import Encoder, Encoding
+from lw_torchrl.modules.networks import ActionHead, DistributionName
 from lw_torchrl.modules.policy import Policy
 
 _ALTERING = ("jitter", "swap_unmentioned", "hide_opening")

@@ -15,9 +15,8 @@ from torchrl.envs import Transform
 from lw_torchrl._checks import check_int, checked
 from lw_torchrl._keys import as_keys, check_apart, check_key, dispatched, read, write
 from lw_torchrl.language.plans import ConditionalPlan, Plans
-from lw_torchrl.modules.action_head import DistributionName
 from lw_torchrl.modules.encoder import Encoder
-from lw_torchrl.modules.networks import ACTION_SIZE, check_width, head
+from lw_torchrl.modules.networks import ACTION_SIZE, DistributionName, check_width, head
 from lw_torchrl.modules.plan_conditioned_actor import PlanConditionedActor
 from lw_torchrl.modules.plan_encoder import PlanEncoder
 

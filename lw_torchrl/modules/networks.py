@@ -1,15 +1,20 @@
-"""The networks that policies and critics are made of."""
+"""The networks that policies and critics are made of, and the head from an encoding to an action."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import Literal
 
 import torch
+from tensordict.nn import InteractionType, ProbabilisticTensorDictModule
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torchrl.modules import MLP
+from torch.distributions import Distribution
+from torchrl.modules import MLP, IndependentNormal, TanhNormal
 
-from lw_torchrl._checks import check_int
+from lw_torchrl._checks import check_choice, check_int, check_scale
 
 ACTION_SIZE = 4
 
@@ -63,3 +68,101 @@ def head(size: int, out: int, width: int | Sequence[int], depth: int, *, layer_n
         norm_class=nn.LayerNorm if layer_norm else None,
         norm_kwargs=[{"normalized_shape": cells} for cells in widths] if layer_norm else None,
     )
+
+
+_LEAST_STD = 1e-3
+
+DistributionName = Literal["tanh_normal", "normal"]
+DISTRIBUTIONS: dict[str, Callable[[Tensor, Tensor], Distribution]] = {
+    "tanh_normal": TanhNormal,
+    "normal": IndependentNormal,
+}
+
+
+class ActionHead(nn.Module):
+    """An MLP to the action, and to its standard deviation where there is a distribution.
+
+    Args:
+        size: of the encoding.
+        width, depth: hidden layers; a tuple of widths says both.
+        squash: keep each number of the action in (-1, 1) by tanh; a "tanh_normal" does so itself.
+        distribution: None, "tanh_normal" or "normal".
+        init_std: the standard deviation at first, of the Normal: before tanh for "tanh_normal".
+
+    Raises:
+        ValueError: a wrong option.
+    """
+
+    def __init__(
+        self,
+        size: int,
+        width: int | Sequence[int],
+        depth: int,
+        squash: bool = True,
+        distribution: DistributionName | None = None,
+        init_std: float = 0.3,
+    ) -> None:
+        super().__init__()
+        if not isinstance(squash, bool):
+            raise TypeError(f"squash must be True or False, got {squash!r}")
+        if distribution is not None:
+            check_choice("distribution", distribution, DISTRIBUTIONS)
+        if distribution == "tanh_normal" and not squash:
+            raise ValueError("squash must be true for the distribution 'tanh_normal', which squashes; take 'normal'")
+        if check_scale("init_std", init_std) <= _LEAST_STD:
+            raise ValueError(f"init_std must be over {_LEAST_STD}, got {init_std}")
+        self.squash, self.distribution = squash, distribution
+        self.network = head(size, ACTION_SIZE * (1 if distribution is None else 2), width, depth)
+        self._first = math.log(math.expm1(init_std - _LEAST_STD)) if init_std < 20 else init_std
+        if distribution is not None:  # the same at every state, until it is trained
+            with torch.no_grad():
+                self.network[-1].weight[ACTION_SIZE:] = 0.0
+                self.network[-1].bias[ACTION_SIZE:] = 0.0
+
+    def forward(self, encoding: Tensor) -> Tensor:
+        """(..., size) float32 to the action (..., 4) float32, the distribution's mode where there is one."""
+        return self.mode(self.loc_scale(encoding)[0]) if self.distribution else self._squashed(self.network(encoding))
+
+    def loc_scale(self, encoding: Tensor) -> tuple[Tensor, Tensor]:
+        """(..., size) float32 to the Normal's mean and standard deviation, (..., 4) float32 each."""
+        loc, scale = self.network(encoding).chunk(2, -1)
+        if self.distribution == "normal":
+            loc = self._squashed(loc)
+        return loc, nn.functional.softplus(scale + self._first) + _LEAST_STD
+
+    def mode(self, loc: Tensor) -> Tensor:
+        """The action that the Normal's mean stands for."""
+        return torch.tanh(loc) if self.distribution == "tanh_normal" else loc
+
+    def dist(self, loc: Tensor, scale: Tensor) -> Distribution:
+        """The distribution of actions."""
+        assert self.distribution is not None
+        return DISTRIBUTIONS[self.distribution](loc, scale)
+
+    def sampler(
+        self, loc: NestedKey, scale: NestedKey, action: NestedKey, log_prob: NestedKey
+    ) -> ProbabilisticTensorDictModule:
+        """TorchRL's own module that draws the action, with the keys of what it reads and writes."""
+        assert self.distribution is not None
+        return ProbabilisticTensorDictModule(
+            in_keys={"loc": loc, "scale": scale},
+            out_keys=[action],
+            distribution_class=DISTRIBUTIONS[self.distribution],
+            default_interaction_type=InteractionType.DETERMINISTIC,
+            return_log_prob=True,
+            log_prob_key=log_prob,
+        )
+
+    def _squashed(self, action: Tensor) -> Tensor:
+        return torch.tanh(action) if self.squash else action
+
+    def copy_from(self, other: ActionHead) -> None:
+        """Take the weights of a head without a distribution; the standard deviation stays as it is."""
+        last = len(self.network) - 1
+        with torch.no_grad():
+            for number, (own, theirs) in enumerate(zip(self.network, other.network, strict=True)):
+                if number < last:
+                    own.load_state_dict(theirs.state_dict())
+                else:
+                    own.weight[:ACTION_SIZE] = theirs.weight
+                    own.bias[:ACTION_SIZE] = theirs.bias

@@ -12,9 +12,9 @@ from torch import Tensor
 from lw_torchrl._checks import check_choice, checked
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.text import TextEncoder
-from lw_torchrl.modules.action_head import DistributionName
 from lw_torchrl.modules.conditioned_actor import ConditionedActor, noise_of_features
 from lw_torchrl.modules.encoder import Encoding
+from lw_torchrl.modules.networks import DistributionName
 from lw_torchrl.modules.observation_features import Features
 from lw_torchrl.modules.plan_attention import Answers
 from lw_torchrl.modules.plan_encoder import PlanEncoder

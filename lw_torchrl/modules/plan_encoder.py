@@ -13,19 +13,16 @@ from torchrl.envs import Transform
 
 from lw_torchrl._checks import check_choice, check_probability, check_scale, checked
 from lw_torchrl._keys import as_keys, check_apart
-from lw_torchrl.language.observation import OPENING
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.skill_words import closes
 from lw_torchrl.language.text import TextEncoder, encoded
+from lw_torchrl.modules.augmentation import hide_opening, mentioned, swap_unmentioned
 from lw_torchrl.modules.encoder import Encoder, Encoding
-from lw_torchrl.modules.mentions import mentioned, swap_unmentioned
 from lw_torchrl.modules.networks import text_to_latent, unit_scale
 from lw_torchrl.modules.observation_features import Features, ObservationFeatures
 from lw_torchrl.modules.plan_attention import Answers, PlanAttention, attend, strength
-from lw_torchrl.modules.plan_focus import PlanFocus
-from lw_torchrl.modules.plan_roles import PlanRoles
-from lw_torchrl.modules.plan_ways import PlanWays
 from lw_torchrl.modules.query_evaluator import QueryEvaluator
+from lw_torchrl.modules.relative_positions import PlanFocus, PlanRoles, RelativePositions
 from lw_torchrl.transforms.qaf import QAFTransform, plan_number_key, plan_program
 from lw_torchrl.transforms.random_yaw import yaw_key
 
@@ -163,10 +160,10 @@ class PlanEncoder(Encoder):
 
     @property
     def width(self) -> int:
-        return super().width + sum(part.width for part in self._ways)
+        return super().width + sum(part.width for part in self._relative)
 
     @property
-    def _ways(self) -> list[PlanWays]:
+    def _relative(self) -> list[RelativePositions]:
         return [part for part in (self.focus, self.roles) if part is not None]
 
     def transform(self) -> Transform | None:
@@ -187,24 +184,20 @@ class PlanEncoder(Encoder):
         self.attention.tables.refuse_others(tensordict.get(self._answered, None), rows)
         weights = self.attention.over_steps(rest[0], rows)
         if self.training:
-            observation = self._altered(observation, weights, rows)
+            observation = self._augmented(observation, weights, rows)
         yaw = tensordict.get(yaw_key(self.in_keys[0]), None)
-        ways = [part(observation, weights, rows, yaw) for part in self._ways]
-        seen = torch.cat((self.features(observation), *ways), -1) if ways else self.features(observation)
+        relative = [part(observation, weights, rows, yaw) for part in self._relative]
+        seen = torch.cat((self.features(observation), *relative), -1) if relative else self.features(observation)
         return weights, self.skill_index[rows], seen
 
-    def _altered(self, observation: Tensor, weights: Tensor, rows: Tensor) -> Tensor:
+    def _augmented(self, observation: Tensor, weights: Tensor, rows: Tensor) -> Tensor:
         """Training observations without what the steps in force say nothing of."""
         in_force = weights > IN_FORCE
         if probability := self.config["swap_unmentioned"]:
             kept = (in_force.unsqueeze(-1) & self.mentioned[rows]).any(-2)
             observation = swap_unmentioned(observation, kept, probability)
         if probability := self.config["hide_opening"]:
-            opening = observation[..., OPENING]
-            others = opening.flatten()[torch.randint(opening.numel(), opening.shape, device=opening.device)]
-            hidden = torch.rand_like(opening) < probability
-            observation = observation.clone()
-            observation[..., OPENING] = torch.where(hidden & ~(in_force & self.closing[rows]).any(-1), others, opening)
+            observation = hide_opening(observation, (in_force & self.closing[rows]).any(-1), probability)
         return observation
 
     def fit_contacts(self, observation: Tensor, task_id: Tensor) -> None:
@@ -249,5 +242,5 @@ class PlanEncoder(Encoder):
         other = PlanEncoder(plans, evaluator=evaluator, text_encoder=self.text_encoder, **self.config)
         other.texts, other.features = self.texts, self.features
         if self.roles is not None and other.roles is not None:
-            other.roles.take_contact(self.roles)
+            other.roles.share_contact(self.roles)
         return other.train(self.training)

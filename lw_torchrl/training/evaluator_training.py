@@ -17,8 +17,7 @@ from lw_torchrl._checks import checked_but, differences
 from lw_torchrl._progress import Progress
 from lw_torchrl._state_tree import check_optimizer_state, join
 from lw_torchrl._versions import warn_of_other_versions
-from lw_torchrl.modules.clause_evaluator import ClauseEvaluator
-from lw_torchrl.modules.clauses import Clauses
+from lw_torchrl.modules.clause_evaluator import ClauseEvaluator, Clauses
 from lw_torchrl.modules.state_query_evaluator import StateQueryEvaluator
 from lw_torchrl.training.evaluator_files import check_evaluator_can_be_saved, open_evaluator, write_evaluator
 from lw_torchrl.training.interrupts import interrupts_between_steps

@@ -12,7 +12,7 @@ import lw_torchrl as lw
 from lw_torchrl.evaluation.swaps import with_true_answers
 from lw_torchrl.language.plans import PlanStep
 from lw_torchrl.language.relations import RELATIONS, Comparison
-from lw_torchrl.modules.clause_network import conjunction
+from lw_torchrl.modules.clause_evaluator import conjunction
 
 PLANS = lw.load_plans("MT10")
 KINDS = {"structure": {}, "texts": {"structure": False}}
