@@ -29,14 +29,11 @@ class Value(TensorDictModuleBase):
 
     Args:
         encoder: what it is conditioned on; one that is an actor's too is trained by both.
-        ensemble: E, networks on the one encoder. TorchRL's losses copy the whole critic themselves, as often as their
-            ``num_qvalue_nets`` says, and draw the copies' weights anew.
+        ensemble: E, networks on the one encoder. TorchRL's losses copy the whole critic ``num_qvalue_nets`` times
+            themselves, and draw the copies' weights anew.
         width, depth: hidden layers; a tuple of widths says both.
         layer_norm: a LayerNorm behind each hidden layer.
         out_keys: other names for what it writes, in the order above; nested ones too.
-
-    Raises:
-        ValueError: a wrong option.
 
     Example:
         >>> import lw_torchrl as lw, torch
@@ -75,7 +72,7 @@ class Value(TensorDictModuleBase):
         )
 
     def transform(self) -> Transform | None:
-        """A new transform that writes what it reads and the environment does not give; None for none."""
+        """As :meth:`Policy.transform`."""
         return self.encoder.transform()
 
     def fit_normalization(self, observation: Tensor, weights: Tensor | None = None) -> None:
@@ -105,11 +102,8 @@ class QValue(Value):
     Args:
         encoder, ensemble, width, depth, layer_norm, out_keys: as for :class:`Value`.
         action_key: where the action is; may be nested.
-        quantiles: Q, how many quantiles of the return are the value, as ``torchrl.objectives.TQCLoss`` wants it; 1 for
+        quantiles: Q, how many quantiles of the return are the value, as ``torchrl.objectives.TQCLoss`` needs it; 1 for
             its mean.
-
-    Raises:
-        ValueError: a wrong option.
 
     Source: ``torchrl.modules.ValueOperator``.
     """
@@ -145,14 +139,14 @@ class QValue(Value):
 
 
 class PlanConditionedValue(Value):
-    """:class:`Value` on a :class:`PlanEncoder`: of a state, for who carries out a plan.
+    """:class:`Value` on a :class:`PlanEncoder`.
 
     Reads ``observation`` (B, 39) float32, ``task_id`` (B,) int64 and ``qaf`` (B, S) bool; writes as :class:`Value`.
 
     Args:
         plans: a plan for each task that will be seen.
         ensemble, width, depth, layer_norm, out_keys: as for :class:`Value`.
-        **options: of :class:`PlanEncoder`, ``features`` say.
+        **options: of :class:`PlanEncoder`.
 
     Example:
         >>> import lw_torchrl as lw
@@ -179,7 +173,7 @@ class PlanConditionedValue(Value):
 
 
 class PlanConditionedQValue(QValue):
-    """:class:`QValue` on a :class:`PlanEncoder`: of an action, for who carries out a plan.
+    """:class:`QValue` on a :class:`PlanEncoder`.
 
     Reads ``observation`` (B, 39) float32, ``task_id`` (B,) int64, ``qaf`` (B, S) bool and ``action`` (B, 4) float32;
     writes as :class:`QValue`.
@@ -187,7 +181,7 @@ class PlanConditionedQValue(QValue):
     Args:
         plans: a plan for each task that will be seen.
         ensemble, width, depth, layer_norm, action_key, quantiles, out_keys: as for :class:`QValue`.
-        **options: of :class:`PlanEncoder`, ``features`` say.
+        **options: of :class:`PlanEncoder`.
 
     Example:
         >>> import lw_torchrl as lw

@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from lw_torchrl._checks import check_choice, checked
+from lw_torchrl._checks import checked
 from lw_torchrl._keys import as_keys, check_apart
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.task_index import TaskIndex
@@ -20,10 +20,6 @@ from lw_torchrl.modules.conditioned_actor import ConditionedActor, noise_of_feat
 from lw_torchrl.modules.encoder import Encoder, Encoding
 from lw_torchrl.modules.networks import DistributionName, text_to_latent, unit_scale
 from lw_torchrl.modules.observation_features import Features, ObservationFeatures
-
-
-def _one_hot(texts: Sequence[str]) -> Tensor:
-    return torch.eye(len(texts))
 
 
 class DescriptorEncoder(Encoder):
@@ -70,7 +66,7 @@ class DescriptorEncoder(Encoder):
         self.out_keys = as_keys("out_keys", out_keys, ("encoding",))
         check_apart(self.in_keys, self.out_keys)
         self.config: dict[str, Any] = {
-            "condition": check_choice("condition", condition, ("description", "one-hot")),
+            "condition": condition,
             "features": features,
             "feature_noise": feature_noise,
             "latent_size": latent_size,
@@ -79,7 +75,7 @@ class DescriptorEncoder(Encoder):
             "in_keys": self.in_keys,
         }
         self.text_encoder = text_encoder
-        own = _one_hot if text_encoder is None and condition == "one-hot" else text_encoder
+        own = (lambda texts: torch.eye(len(texts))) if text_encoder is None and condition == "one-hot" else text_encoder
         found = encoded([task.description for task in self.definitions.values()], own)
         self.index = TaskIndex(self.tasks)
         order = [self.tasks.index(task) for task in self.index.tasks]
@@ -95,7 +91,7 @@ class DescriptorEncoder(Encoder):
         return self.definitions.get(task)
 
     def prepare(self, tensordict: TensorDictBase) -> tuple[Tensor, ...]:
-        """What no trained parameter touches: each task's row (B,) int64, and the observation's features (B, F)."""
+        """Each task's row (B,) int64, and the observation's features (B, F)."""
         observation, task_id = self.read(tensordict)
         rows = self.index.rows(task_id, "tasks this actor was not made for")
         return rows, self.features(observation)
@@ -124,7 +120,7 @@ class DescriptorConditionedActor(ConditionedActor):
             init_std, text_encoder, in_keys, out_keys: as for :class:`PlanConditionedActor`, with the same networks.
 
     Raises:
-        ValueError: an unknown task, a wrong option, or at call time a task_id outside ``tasks``.
+        ValueError: an unknown task; at call time, a task_id outside ``tasks``.
 
     Example:
         >>> import lw_torchrl as lw

@@ -40,9 +40,9 @@ class Encoding(NamedTuple):
 class Encoder(TensorDictModuleBase):
     """From what is to be done, and where things are, to a latent and features.
 
-    A subclass splits its work in two, :meth:`prepare`, which no trained parameter touches and which checks the values,
-    and :meth:`encode`, which can be vmapped over parameters. As a module of its own it writes ``encoding``
-    (B, D + F) float32, for networks of yours.
+    A subclass splits its work into :meth:`prepare`, which no trained parameter touches and which checks the values,
+    and :meth:`encode`, which can be vmapped over parameters. As a module it writes ``encoding`` (B, D + F) float32,
+    for networks of yours.
 
     Attributes:
         config: the keyword arguments that make it again, as JSON.
@@ -67,7 +67,7 @@ class Encoder(TensorDictModuleBase):
         return self.latent_size + self.features.width
 
     def definition(self, task: str) -> Task | None:
-        """What it knows of a task: its plan's definition, or the shipped one; None if it knows none."""
+        """As :meth:`Policy.definition`."""
         return TASKS.get(task) if self.plans is None else self.plans[task].definition
 
     def transform(self) -> Transform | None:
@@ -92,10 +92,10 @@ class Encoder(TensorDictModuleBase):
         return write(tensordict, self, [self.encode(*self.prepare(tensordict)).joined])
 
     def fit_contacts(self, observation: Tensor, task_id: Tensor) -> None:
-        """Take from demonstrations where the hand touches things, in place; here there is nothing to take."""
+        """As :meth:`Policy.fit_contacts`."""
 
     def describe(self) -> dict[str, Any]:
-        """What a description of its actor needs beside the options, as JSON: the plans, say."""
+        """What a description of its actor needs beside the options, as JSON."""
         return {}
 
     def with_plans(self, plans: Plans | Mapping[str, ConditionalPlan]) -> Encoder:

@@ -8,20 +8,18 @@ from contextlib import contextmanager
 from typing import Literal
 
 import torch
-from tensordict.nn import InteractionType, ProbabilisticTensorDictModule
-from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.distributions import Distribution
 from torchrl.modules import MLP, IndependentNormal, TanhNormal
 
-from lw_torchrl._checks import check_choice, check_int, check_scale
+from lw_torchrl._checks import check_choice, check_flag, check_int, check_scale
 
 ACTION_SIZE = 4
 
 
 @contextmanager
 def evaluating(network: nn.Module) -> Iterator[None]:
-    """The network is in evaluation's mode meanwhile, and each of its modules in its own again afterwards."""
+    """Within the block the network is in eval mode; afterwards each of its modules is in its own mode again."""
     modes = [(module, module.training) for module in network.modules()]
     network.eval()
     try:
@@ -32,8 +30,8 @@ def evaluating(network: nn.Module) -> Iterator[None]:
 
 
 def unit_scale(vectors: Tensor) -> Tensor:
-    """Texts' vectors (n, E), rescaled so that their numbers are of size 1; encoders give vectors of length 1, whose
-    numbers are so small that a fresh network hardly tells texts apart."""
+    """Texts' vectors (n, E), rescaled to numbers of size 1: those of vectors of length 1 are so small that a fresh
+    network hardly tells texts apart."""
     vectors = vectors.to(torch.float32)
     return vectors / vectors.square().mean(-1, keepdim=True).sqrt().clamp(min=1e-6)
 
@@ -87,10 +85,7 @@ class ActionHead(nn.Module):
         width, depth: hidden layers; a tuple of widths says both.
         squash: keep each number of the action in (-1, 1) by tanh; a "tanh_normal" does so itself.
         distribution: None, "tanh_normal" or "normal".
-        init_std: the standard deviation at first, of the Normal: before tanh for "tanh_normal".
-
-    Raises:
-        ValueError: a wrong option.
+        init_std: the initial standard deviation of the Normal: before tanh for "tanh_normal".
     """
 
     def __init__(
@@ -103,8 +98,7 @@ class ActionHead(nn.Module):
         init_std: float = 0.3,
     ) -> None:
         super().__init__()
-        if not isinstance(squash, bool):
-            raise TypeError(f"squash must be True or False, got {squash!r}")
+        check_flag("squash", squash)
         if distribution is not None:
             check_choice("distribution", distribution, DISTRIBUTIONS)
         if distribution == "tanh_normal" and not squash:
@@ -139,30 +133,13 @@ class ActionHead(nn.Module):
         assert self.distribution is not None
         return DISTRIBUTIONS[self.distribution](loc, scale)
 
-    def sampler(
-        self, loc: NestedKey, scale: NestedKey, action: NestedKey, log_prob: NestedKey
-    ) -> ProbabilisticTensorDictModule:
-        """TorchRL's own module that draws the action, with the keys of what it reads and writes."""
-        assert self.distribution is not None
-        return ProbabilisticTensorDictModule(
-            in_keys={"loc": loc, "scale": scale},
-            out_keys=[action],
-            distribution_class=DISTRIBUTIONS[self.distribution],
-            default_interaction_type=InteractionType.DETERMINISTIC,
-            return_log_prob=True,
-            log_prob_key=log_prob,
-        )
-
     def _squashed(self, action: Tensor) -> Tensor:
         return torch.tanh(action) if self.squash else action
 
     def copy_from(self, other: ActionHead) -> None:
         """Take the weights of a head without a distribution; the standard deviation stays as it is."""
-        last = len(self.network) - 1
+        for own, theirs in zip([*self.network][:-1], [*other.network][:-1], strict=True):
+            own.load_state_dict(theirs.state_dict())
         with torch.no_grad():
-            for number, (own, theirs) in enumerate(zip(self.network, other.network, strict=True)):
-                if number < last:
-                    own.load_state_dict(theirs.state_dict())
-                else:
-                    own.weight[:ACTION_SIZE] = theirs.weight
-                    own.bias[:ACTION_SIZE] = theirs.bias
+            self.network[-1].weight[:ACTION_SIZE] = other.network[-1].weight
+            self.network[-1].bias[:ACTION_SIZE] = other.network[-1].bias
