@@ -11,9 +11,7 @@ from torch import nn
 BLOCK = 64
 
 
-def in_blocks(
-    policy: Callable[[TensorDictBase], TensorDictBase],
-) -> Callable[[TensorDictBase], TensorDictBase]:
+def in_blocks(policy: Callable[[TensorDictBase], TensorDictBase]) -> Callable[[TensorDictBase], TensorDictBase]:
     """``policy``, run on blocks of exactly 64 rows, the last one padded; of fewer where a module in it says so, by
     ``rows_at_once``: what looks at pictures works for each row that a block is padded with.
 

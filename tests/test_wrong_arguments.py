@@ -25,6 +25,7 @@ PUBLIC = {  # at the top level, or in 0.2.0
     for room, names in table.items()
     for name in names.split()
 }
+PUBLIC |= {name: lw.modules for name in ("Value", "QValue", "PlanEncoder")}
 NOT_MADE_BY_USERS = {"DecodedPlan", "DecodedStep", "PlannerError", "PlanError", "QueryError", "Planner", "Policy"}
 WRONG: dict[str, list[Any]] = {
     "bool": ["no", "yes", "", 1, 0, 1.0, None, [], object],

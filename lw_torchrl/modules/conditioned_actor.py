@@ -57,12 +57,7 @@ class ConditionedActor(Policy):
     _dist_sample = ProbabilisticTensorDictModule._dist_sample
 
     def __init__(
-        self,
-        encoder: Encoder,
-        extras: Sequence[str],
-        *,
-        out_keys: Sequence[NestedKey] | None,
-        **head: Any,
+        self, encoder: Encoder, extras: Sequence[str], *, out_keys: Sequence[NestedKey] | None, **head: Any
     ) -> None:
         super().__init__()
         distribution = head["distribution"]

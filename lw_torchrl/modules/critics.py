@@ -20,6 +20,8 @@ from lw_torchrl.modules.networks import ACTION_SIZE, DistributionName, check_wid
 from lw_torchrl.modules.plan_conditioned_actor import PlanConditionedActor
 from lw_torchrl.modules.plan_encoder import PlanEncoder
 
+_OWN = ("ensemble", "width", "depth", "layer_norm", "out_keys")  # options of a critic, not of its encoder
+
 
 class Value(TensorDictModuleBase):
     """The value of a state, on any encoder.
@@ -145,8 +147,7 @@ class PlanConditionedValue(Value):
 
     Args:
         plans: a plan for each task that will be seen.
-        ensemble, width, depth, layer_norm, out_keys: as for :class:`Value`.
-        **options: of :class:`PlanEncoder`.
+        **options: of :class:`Value` and of :class:`PlanEncoder`; ``out_keys`` are the value's.
 
     Example:
         >>> import lw_torchrl as lw
@@ -156,20 +157,9 @@ class PlanConditionedValue(Value):
     Source: ``torchrl.modules.ValueOperator``.
     """
 
-    @checked
-    def __init__(
-        self,
-        plans: Plans | Mapping[str, ConditionalPlan],
-        *,
-        ensemble: int = 1,
-        width: int | tuple[int, ...] = 256,
-        depth: int = 2,
-        layer_norm: bool = True,
-        out_keys: Sequence[NestedKey] | None = None,
-        **options: Any,
-    ) -> None:
-        networks: dict[str, Any] = {"ensemble": ensemble, "width": width, "depth": depth, "layer_norm": layer_norm}
-        super().__init__(PlanEncoder(plans, **options), out_keys=out_keys, **networks)
+    def __init__(self, plans: Plans | Mapping[str, ConditionalPlan], **options: Any) -> None:
+        own = {name: options.pop(name) for name in _OWN if name in options}
+        super().__init__(PlanEncoder(plans, **options), **own)
 
 
 class PlanConditionedQValue(QValue):
@@ -180,8 +170,7 @@ class PlanConditionedQValue(QValue):
 
     Args:
         plans: a plan for each task that will be seen.
-        ensemble, width, depth, layer_norm, action_key, quantiles, out_keys: as for :class:`QValue`.
-        **options: of :class:`PlanEncoder`.
+        **options: of :class:`QValue` and of :class:`PlanEncoder`; ``out_keys`` are the value's.
 
     Example:
         >>> import lw_torchrl as lw
@@ -192,23 +181,9 @@ class PlanConditionedQValue(QValue):
     Source: ``torchrl.modules.ValueOperator``.
     """
 
-    @checked
-    def __init__(
-        self,
-        plans: Plans | Mapping[str, ConditionalPlan],
-        *,
-        ensemble: int = 1,
-        width: int | tuple[int, ...] = 256,
-        depth: int = 2,
-        layer_norm: bool = True,
-        action_key: NestedKey = "action",
-        quantiles: int = 1,
-        out_keys: Sequence[NestedKey] | None = None,
-        **options: Any,
-    ) -> None:
-        networks: dict[str, Any] = {"ensemble": ensemble, "width": width, "depth": depth, "layer_norm": layer_norm}
-        networks |= {"action_key": action_key, "quantiles": quantiles}
-        super().__init__(PlanEncoder(plans, **options), out_keys=out_keys, **networks)
+    def __init__(self, plans: Plans | Mapping[str, ConditionalPlan], **options: Any) -> None:
+        own = {name: options.pop(name) for name in (*_OWN, "action_key", "quantiles") if name in options}
+        super().__init__(PlanEncoder(plans, **options), **own)
 
 
 @checked

@@ -8,16 +8,15 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite
 from torchrl.envs import Compose, Transform
 
 from lw_torchrl._checks import check_choice, checked
-from lw_torchrl._keys import dispatched, read, write
+from lw_torchrl._keys import dispatched, write
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
-from lw_torchrl.language.tasks import TASKS, Task
 from lw_torchrl.language.text import TextEncoder
+from lw_torchrl.modules.encoder import Prepared
 from lw_torchrl.modules.networks import ACTION_SIZE
 from lw_torchrl.transforms.qaf import QAFTransform
 
@@ -55,7 +54,7 @@ METHODS: dict[str, Method] = {
 """The choices of ``train --method`` and ``reproduce --methods``: on plans, the task's description, its number."""
 
 
-class Policy(TensorDictModuleBase):
+class Policy(Prepared):
     """A module that acts, and knows what it was made of.
 
     A subclass splits its work into :meth:`prepare` and :meth:`act`; ``out_keys`` names what :meth:`act` returns, in
@@ -102,9 +101,6 @@ class Policy(TensorDictModuleBase):
     Source: the contract that ``torchrl.objectives`` and :func:`lw_torchrl.evaluate` rely on.
     """
 
-    config: dict[str, Any]
-    plans: Plans | None = None
-    tasks: tuple[str, ...]
     plan_options: ClassVar[bool] = False
     row_by_row: ClassVar[bool] = False
     draws: bool = False
@@ -121,38 +117,18 @@ class Policy(TensorDictModuleBase):
         """One for the tasks of ``plans``."""
         raise NotImplementedError(f"{cls.__name__} must say how it is made for plans: override for_plans")
 
-    def definition(self, task: str) -> Task | None:
-        """What the policy knows of a task: its plan's definition, or the shipped one; None if it knows none."""
-        return TASKS.get(task) if self.plans is None else self.plans[task].definition
-
-    def transform(self) -> Transform | None:
-        """A new transform that writes what the policy reads and the environment does not give; None for none."""
-        return None
-
-    def prepare(self, tensordict: TensorDictBase) -> tuple[Tensor, ...]:
-        """What no trained parameter touches, and all checks of values, outside of vmap."""
-        raise NotImplementedError(f"{type(self).__name__} must override prepare and act")
-
     def act(self, *prepared: Tensor) -> tuple[Tensor, ...]:
         """From what :meth:`prepare` gives to a tensor for each of ``out_keys``; it can be vmapped over parameters."""
-        raise NotImplementedError(f"{type(self).__name__} must override prepare and act")
+        raise NotImplementedError(f"{type(self).__name__} must override act")
 
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``out_keys``."""
         return write(tensordict, self, self.act(*self.prepare(tensordict)))
 
-    def read(self, tensordict: TensorDictBase) -> list[Tensor]:
-        """The tensors of ``in_keys``; :class:`ValueError` names those that are missing."""
-        return read(tensordict, self.in_keys)
-
     def fit_normalization(self, observation: Tensor, weights: Tensor | None = None) -> None:
         """Take the statistics of observations (R, 39) float32, each with a weight (R,) float32 of sum 1, in place; by
         default there is nothing to normalise."""
-
-    def fit_contacts(self, observation: Tensor, task_id: Tensor) -> None:
-        """Take from demonstrations, (R, 39) float32 and (R,) int64, where the hand touches things, in place; by default
-        there is nothing to take."""
 
     def describe(self) -> dict[str, Any]:
         """All that :meth:`from_description` needs to make it again, but its weights, as JSON."""
@@ -172,7 +148,7 @@ class Policy(TensorDictModuleBase):
 
     def with_plans(self, plans: Plans | Mapping[str, ConditionalPlan]) -> Policy:
         """The same weights under other plans; :class:`TypeError` if it is not conditioned on plans."""
-        raise TypeError(f"with_plans is for policies with plans, {type(self).__name__} is conditioned on descriptions")
+        raise TypeError(f"with_plans is for policies with plans, {type(self).__name__} has none")
 
 
 def policy_class(kind: Any) -> type[Policy]:
