@@ -10,9 +10,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import Compose, Transform
 
-from lw_torchrl._blocks import in_blocks
 from lw_torchrl._checks import check_int, checked
-from lw_torchrl._devices import device_of
+from lw_torchrl._devices import device_of, in_blocks
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.networks import evaluating
