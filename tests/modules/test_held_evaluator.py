@@ -48,7 +48,9 @@ def test_at_every_step_it_is_what_it_holds(kind):
     assert same(runs[0][0], runs[1][0])
 
 
-@pytest.mark.parametrize(("every", "delay"), [(1, 0), (5, 0), (1, 3), (5, 2)])
+@pytest.mark.parametrize(
+    ("every", "delay"), [(1, 0), *(pytest.param(*one, marks=pytest.mark.slow) for one in ((5, 0), (1, 3))), (5, 2)]
+)
 def test_exact_answers_are_held_as_those_of_qaf_transform(every, delay):
     actor = lw.ScriptedSkillActor(PLANS)
     transform = lw.QAFTransform(PLANS, every=every, delay=delay)
@@ -238,7 +240,7 @@ class TestPictures:
         if missing := why_no_pictures():
             pytest.skip(missing)
 
-    @pytest.mark.parametrize("inside", [True, False])
+    @pytest.mark.parametrize("inside", [True, pytest.param(False, marks=pytest.mark.slow)])
     def test_at_every_step_it_is_what_it_holds(self, inside):
         torch.manual_seed(0)
         eyes, actor = lw.modules.ImageQueryEvaluator(PLANS, **SMALL), lw.PlanConditionedActor(PLANS, width=8)
