@@ -20,7 +20,7 @@ from lw_torchrl.evaluation.comparison import markdown_table
 from lw_torchrl.language.named_objects import NamedObject
 from lw_torchrl.language.roles import role_object
 from lw_torchrl.language.tasks import Task
-from lw_torchrl.modules.plan_roles import PlanRoles
+from lw_torchrl.modules.relative_positions import PlanRoles
 from lw_torchrl.paper.execution import execute_run
 from lw_torchrl.paper.recipes import CLEAN, NOISY, PRESETS, SETTINGS, Member, Preset
 from lw_torchrl.paper.runs import Run
@@ -90,7 +90,7 @@ PATCHES: Mapping[str, Callable[[], AbstractContextManager[Any]]] = MappingProxyT
     {
         "no contacts": lambda: patch.object(PlanRoles, "fit", lambda roles, *rows: roles.fitted.fill_(True)),
         "objects' own places instead of named points": lambda: patch(
-            "lw_torchrl.modules.plan_roles.role_object", _object_itself
+            "lw_torchrl.modules.relative_positions.role_object", _object_itself
         ),
     }
 )

@@ -112,19 +112,19 @@ class Bench:
             lw.collect_demonstrations(
                 self.args.tasks, episodes_per_task=5, root=root, policy=who, noise_scale=noise, seed=self.seed
             )
-        most = lw.QueryEvaluatorConfig(held_out_pairs=0.0, seed=self.seed, steps=self.args.steps)
+        most = lw.training.QueryEvaluatorConfig(held_out_pairs=0.0, seed=self.seed, steps=self.args.steps)
         config = replace(most, states_per_task=max(1, round(share * most.states_per_task)))
         states = lw.LanguageWorldExperienceReplay(roots, label="executed")
-        labelled = lw.LabelledQueries(states, config)
+        labelled = lw.training.LabelledQueries(states, config)
         torch.manual_seed(self.seed)
         evaluator = lw.StateQueryEvaluator(self.plans)
         file = self.folder / f"evaluator-{share:g}.zip"
-        lw.QueryEvaluatorTrainer(evaluator, labelled, config, checkpoint=file).train()
-        report = score_evaluator(evaluator, labelled if config == most else lw.LabelledQueries(states, most))
+        lw.training.QueryEvaluatorTrainer(evaluator, labelled, config, checkpoint=file).train()
+        report = score_evaluator(evaluator, labelled if config == most else lw.training.LabelledQueries(states, most))
         report.save(file.with_suffix(".json"))
         number = labelled.describe()["states"]["training"]
         print(f"seed {self.seed}, {number} labelled states:\n{report.table(most=2)}", flush=True)
-        return lw.load_evaluator(file, self.plans)
+        return lw.training.load_evaluator(file, self.plans)
 
     def tuned(self, name: str, actor: Any, anchor: float) -> Any:
         """A policy tuned by its demonstrations' loss, its evaluator too if it has one."""
@@ -164,7 +164,7 @@ class Bench:
             for anchor in self.args.anchors:
                 name = f"evaluator-{share:g}-tuned-{anchor:g}"
                 begun = self.policy().with_evaluator(
-                    lw.load_evaluator(self.folder / f"evaluator-{share:g}.zip", self.plans)
+                    lw.training.load_evaluator(self.folder / f"evaluator-{share:g}.zip", self.plans)
                 )
                 yield f"{told}, tuned, anchor {anchor:g}", self.success(name, self.tuned(name, begun, anchor))
 

@@ -73,7 +73,7 @@ def frames_per_second(args: Arguments) -> float:
 
 def evaluator(args: Arguments, plans: lw.Plans) -> Any:
     """One trained on the answers in the drawn states; report and pictures are left beside it."""
-    config = lw.ImageQueryEvaluatorConfig(
+    config = lw.training.ImageQueryEvaluatorConfig(
         steps=args.steps,
         every=args.every,
         learning_rate=2e-3,
@@ -86,28 +86,28 @@ def evaluator(args: Arguments, plans: lw.Plans) -> Any:
         noise = (0.0, 0.1, 0.2) if who == "expert" else 0.0
         options: dict[str, Any] = {"max_steps": args.max_steps, "seed": args.seed, "noise_scale": noise}
         lw.collect_demonstrations(args.tasks, episodes_per_task=episodes, root=root, policy=who, **options)
-        lw.add_pictures(root, **args.pictures, every=config.every)
+        lw.data.add_pictures(root, **args.pictures, every=config.every)
     replay = lw.LanguageWorldExperienceReplay(roots, label="executed")
-    replay.add_column("pixels", lw.load_pictures(replay, **args.pictures, every=config.every))
-    labelled = lw.LabelledQueries(replay, config)
+    replay.add_column("pixels", lw.data.load_pictures(replay, **args.pictures, every=config.every))
+    labelled = lw.training.LabelledQueries(replay, config)
     torch.manual_seed(args.seed)
-    made = lw.ImageQueryEvaluator(plans, **args.pictures, every=args.every)
+    made = lw.modules.ImageQueryEvaluator(plans, **args.pictures, every=args.every)
     file = args.out / "evaluator.zip"
-    lw.ImageQueryEvaluatorTrainer(made, labelled, config, checkpoint=file).train()
+    lw.training.ImageQueryEvaluatorTrainer(made, labelled, config, checkpoint=file).train()
     report = score_evaluator(made, labelled)
     report.save(args.out / "report.json")
     plot_reliability(report, args.out / "reliability.png")
     plot_wrong_answers(made, labelled, args.out / "wrong.png")
     print(f"{labelled.describe()['states']['training']} drawn states trained\n{report.table(most=20)}", flush=True)
-    return lw.load_evaluator(file, plans)
+    return lw.training.load_evaluator(file, plans)
 
 
 def tuned(args: Arguments, name: str, actor: Any) -> Any:
     """The policy and its evaluator, tuned by the loss of imitation through the softmax."""
     root = args.out / "demonstrations"
     replay = demonstrations(root, args.tasks, args.seed, args.max_steps)
-    lw.add_pictures(root, **args.pictures)
-    replay.add_column("pixels", lw.load_pictures(replay, **args.pictures))
+    lw.data.add_pictures(root, **args.pictures)
+    replay.add_column("pixels", lw.data.load_pictures(replay, **args.pictures))
     config = lw.BehavioralCloningConfig(
         steps=args.tuning_steps, batch_size=64, learning_rate=3e-4, normalize=False, seed=args.seed
     )
@@ -138,7 +138,7 @@ def main(args: Arguments) -> None:
         policy: Any = lw.load_actor(file).with_plans(plans)
         note("PCBC, exact answers", f"pcbc-{number}", policy)
         note("PCBC, pictures", f"pcbc-{number}-pictures", policy.with_evaluator(eyes))
-        begun = policy.with_evaluator(lw.load_evaluator(args.out / "evaluator.zip", plans))
+        begun = policy.with_evaluator(lw.training.load_evaluator(args.out / "evaluator.zip", plans))
         name = f"pcbc-{number}-pictures-tuned"
         note("PCBC, pictures, tuned", name, tuned(args, name, begun))
     rows = []

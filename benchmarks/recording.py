@@ -94,7 +94,7 @@ def _live(settings: Settings, plans: lw.Plans, path: str) -> Row:
     )
 
 
-class _Timed(lw.RolloutRecorder):
+class _Timed(lw.record.RolloutRecorder):
     """A recorder that counts its own seconds."""
 
     seconds = 0.0

@@ -73,16 +73,16 @@ def main() -> None:
 
         print("the value of states, ten steps ahead")
         rows = show(roots, plans, reward="dense_cost", n_steps=10, gamma=GAMMA)
-        value = lw.ExpectileValueLoss(lw.PlanConditionedValue(plans, ensemble=2), expectile=0.7)
+        value = lw.objectives.ExpectileValueLoss(lw.PlanConditionedValue(plans, ensemble=2), expectile=0.7)
         value.make_value_estimator(gamma=GAMMA)
         train(value, rows, args.steps, 5e-4)
         advantage = torch.cat([value.advantage(rows[i : i + 10_000]) for i in range(0, len(rows), 10_000)])
 
         print("a policy, by advantage")
         weighted = show(roots, plans, reward="dense_cost")
-        weighted.add_column("advantage", lw.standardize_by_task(advantage, weighted[:]["task_id"]), of=rows)
+        weighted.add_column("advantage", lw.objectives.standardize_by_task(advantage, weighted[:]["task_id"]), of=rows)
         ours = lw.PlanConditionedActor(plans)
-        train(lw.AdvantageWeightedLoss(ours, beta=2.0), weighted, args.steps, 1e-3)
+        train(lw.objectives.AdvantageWeightedLoss(ours, beta=2.0), weighted, args.steps, 1e-3)
 
         print("a policy, by the episodes that succeeded")
         successes = show(roots, plans, keep=lw.EpisodeFilter(success=True))

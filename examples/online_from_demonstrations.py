@@ -50,7 +50,9 @@ def main() -> None:
         transform=actor.transform(),
         **ends,
     )
-    loss = lw.DemonstratedTD3Loss(actor, critic, bounds=(-1.0, 1.0), policy_noise=0.1, noise_clip=0.3, bc_weight=2.0)
+    loss = lw.objectives.DemonstratedTD3Loss(
+        actor, critic, bounds=(-1.0, 1.0), policy_noise=0.1, noise_clip=0.3, bc_weight=2.0
+    )
     loss.make_value_estimator(gamma=GAMMA)
     targets = SoftUpdate(loss, eps=0.995)
     of_actor = torch.optim.AdamW(loss.actor_network_params.parameters(), lr=1e-4)

@@ -36,7 +36,7 @@ def main() -> None:
     torch.manual_seed(0)
     frames = args.rows * args.horizon
 
-    actor, value = lw.plan_actor_value(lw.load_plans("MT10"), distribution="normal", init_std=0.5)
+    actor, value = lw.modules.plan_actor_value(lw.load_plans("MT10"), distribution="normal", init_std=0.5)
     env = lw.LanguageWorldEnv(TASK, num_envs=args.rows, reward="dense", max_steps=args.horizon)
     collector = Collector(
         TransformedEnv(env, actor.transform()),

@@ -90,10 +90,14 @@ def check_choice(argument: str, given: Any, allowed: Iterable[str]) -> Any:
     return given
 
 
+def _wrong_type(argument: str, wanted: str, given: Any) -> TypeError:
+    return TypeError(f"{argument} must be {wanted}, got {shown(given)} ({type(given).__name__})")
+
+
 def check_int(argument: str, given: Any, *, minimum: int | None = None) -> int:
     """Return ``given`` as an int of at least ``minimum``; :class:`TypeError` for another type."""
     if isinstance(given, bool) or not hasattr(given, "__index__"):
-        raise TypeError(f"{argument} must be an integer, got {given!r} ({type(given).__name__})")
+        raise _wrong_type(argument, "an integer", given)
     value = int(given.__index__())
     if minimum is not None and value < minimum:
         raise ValueError(f"{argument} must be at least {minimum}, got {value}")
@@ -103,94 +107,66 @@ def check_int(argument: str, given: Any, *, minimum: int | None = None) -> int:
 def check_flag(argument: str, given: Any) -> bool:
     """Return ``given`` if it is True or False, NumPy's included; :class:`TypeError` otherwise."""
     if type(given).__name__ not in ("bool", "bool_"):
-        raise TypeError(f"{argument} must be True or False, got {shown(given)} ({type(given).__name__})")
+        raise _wrong_type(argument, "True or False", given)
     return bool(given)
-
-
-def _check_real(argument: str, given: Any) -> None:
-    if isinstance(given, bool) or not isinstance(given, Real):
-        raise TypeError(f"{argument} must be a number, got {shown(given)} ({type(given).__name__})")
-    if given != given:
-        raise ValueError(f"{argument} must be finite, got nan")
 
 
 def check_text(argument: str, given: Any) -> None:
     """Raise :class:`TypeError` unless ``given`` is a string."""
     if not isinstance(given, str):
-        raise TypeError(f"{argument} must be a string, got {shown(given)} ({type(given).__name__})")
+        raise _wrong_type(argument, "a string", given)
 
 
 def check_path(argument: str, given: Any) -> None:
     """Raise :class:`TypeError` unless ``given`` is a path."""
     if not isinstance(given, (str, os.PathLike)):
-        raise TypeError(f"{argument} must be a path, got {shown(given)} ({type(given).__name__})")
+        raise _wrong_type(argument, "a path", given)
 
 
+def _check_real(argument: str, given: Any) -> None:
+    if isinstance(given, bool) or not isinstance(given, Real):
+        raise _wrong_type(argument, "a number", given)
+    if given != given:
+        raise ValueError(f"{argument} must be finite, got nan")
+
+
+def check_scale(argument: str, given: Any) -> float:
+    """Return ``given`` as a finite float of at least 0."""
+    _check_real(argument, given)
+    try:
+        value = float(given)
+    except OverflowError:
+        value = math.inf
+    if not 0.0 <= value < math.inf:
+        raise ValueError(f"{argument} must be finite and at least 0, got {shown(given)}")
+    if value != given:
+        raise ValueError(f"{argument} must be a number of double precision, got {shown(given)}")
+    return value
+
+
+def check_positive(argument: str, given: Any) -> float:
+    """Return ``given`` as a finite float above 0."""
+    if (value := check_scale(argument, given)) == 0.0:
+        raise ValueError(f"{argument} must be above 0, got {given!r}")
+    return value
+
+
+def check_probability(argument: str, given: Any) -> float:
+    """Return ``given`` as a float from 0 to 1."""
+    if (value := check_scale(argument, given)) > 1.0:
+        raise ValueError(f"{argument} must be from 0 to 1, got {given}")
+    return value
+
+
+Check = Callable[[str, Any], object]
 _LITERAL = re.compile(r"Literal\[([^\[\]]*)\]")
-_KINDS: dict[str, Callable[[str, Any], object]] = {
+_PLAIN: dict[str, Check] = {
     "bool": check_flag,
     "int": check_int,
     "float": _check_real,
     "str": check_text,
     "str | os.PathLike[str]": check_path,
 }
-
-
-Check = Callable[[str, Any], object]
-
-
-def _plain_rule(annotation: object) -> Check | None:
-    """What checks a value of a plain annotation: a kind of :data:`_KINDS` or a Literal, or one of them or None."""
-    return _plain_rule_of(annotation if isinstance(annotation, str) else getattr(annotation, "__name__", ""))
-
-
-@functools.cache
-def _plain_rule_of(plain: str) -> Check | None:
-    optional, plain = plain.endswith(" | None"), plain.removesuffix(" | None")
-    check = _KINDS.get(plain)
-    if choices := _LITERAL.fullmatch(plain):
-        check = functools.partial(_check_literal, ast.literal_eval(f"({choices[1]},)"))
-    return _or_none(check) if optional else check
-
-
-def _rule(annotation: object, names: dict[str, Any]) -> Check | None:
-    """What checks a value of an annotation, whose names stand in ``names``; None for what its function checks."""
-    if (plain := _plain_rule(annotation)) is not None:
-        return plain
-    try:
-        found = eval(annotation, names) if isinstance(annotation, str) else annotation
-    except NameError:  # imported for type checkers alone
-        return None
-    return _rule_of(found)
-
-
-def _rule_of(found: Any) -> Check | None:
-    """What checks a value of a type: of a class, a Literal, a function, or a collection of these."""
-    origin, inside = get_origin(found) or found, get_args(found)
-    if origin in (Union, UnionType):
-        others = [one for one in inside if one is not NoneType]
-        origins = [get_origin(one) for one in others]
-        if str not in others and Callable in origins and Literal not in origins:
-            others = [Callable]  # a module is called too
-        if len(others) == 1:
-            check = _rule_of(others[0])
-        else:
-            kinds = {_SEVERAL.get(get_origin(one) or one): None for one in others}
-            check = None if None in kinds else functools.partial(_check_kinds, kinds)
-        return _or_none(check) if NoneType in inside else check
-    if origin is Literal:
-        return functools.partial(_check_literal, inside)
-    protocol = getattr(origin, "_is_protocol", False)
-    if origin is Callable or (protocol and "__call__" in vars(origin)):
-        return _check_function
-    if origin in (Mapping, Sequence, Iterable):
-        held = _rule_of(inside[-1]) if isinstance(inside[-1], type) else None
-        return held and functools.partial(_check_collection, origin, held)  # of the others the function tells more
-    if not isinstance(origin, type) or origin in (tuple, object, Any) or protocol or origin.__name__ == "NestedKey":
-        return None
-    return _KINDS.get(found.__name__) or functools.partial(_check_class, origin)
-
-
 _SEVERAL: dict[Any, tuple[type, str]] = {
     int: (Integral, "an integer"),
     float: (Real, "a number"),
@@ -202,26 +178,68 @@ _SEVERAL: dict[Any, tuple[type, str]] = {
 }
 
 
-def _check_kinds(kinds: Iterable[Any], argument: str, given: Any) -> None:
-    """Check that a value is of one of several kinds; what it holds, its function checks."""
-    taken = tuple(kind for kind, _ in kinds)
-    text = isinstance(given, (str, bytes)) and not (str in taken and isinstance(given, str))
-    if text or not isinstance(given, taken):
-        allowed = " or ".join(word for _, word in kinds)
-        raise TypeError(f"{argument} must be {allowed}, got {shown(given)} ({type(given).__name__})")
+@functools.cache
+def _plain_check(annotation: str) -> Check | None:
+    """The check of a plain annotation, as it is written: one of :data:`_PLAIN` or a Literal, or one of them or None."""
+    plain = annotation.removesuffix(" | None")
+    check = _PLAIN.get(plain)
+    if choices := _LITERAL.fullmatch(plain):
+        check = functools.partial(check_choice, allowed=ast.literal_eval(f"({choices[1]},)"))
+    return check if plain == annotation else _or_none(check)
+
+
+def _check_of(annotation: object, names: dict[str, Any]) -> Check | None:
+    """The check of an annotation, whose names stand in ``names``; None for what its function checks."""
+    if plain := _plain_check(annotation if isinstance(annotation, str) else getattr(annotation, "__name__", "")):
+        return plain
+    try:
+        return _check_of_type(eval(annotation, names) if isinstance(annotation, str) else annotation)
+    except NameError:  # imported for type checkers alone
+        return None
+
+
+def _check_of_type(found: Any) -> Check | None:
+    """The check of a type: of a class, a Literal, a function, or a collection of these."""
+    origin, inside = get_origin(found) or found, get_args(found)
+    if origin in (Union, UnionType):
+        others = [one for one in inside if one is not NoneType]
+        origins = [get_origin(one) for one in others]
+        if str not in others and Callable in origins and Literal not in origins:
+            others = [Callable]  # a module is called too
+        if len(others) == 1:
+            check = _check_of_type(others[0])
+        else:
+            kinds = {_SEVERAL.get(get_origin(one) or one): None for one in others}
+            check = None if None in kinds else functools.partial(_check_kinds, kinds)
+        return _or_none(check) if NoneType in inside else check
+    if origin is Literal:
+        return functools.partial(check_choice, allowed=inside)
+    protocol = getattr(origin, "_is_protocol", False)
+    if origin is Callable or (protocol and "__call__" in vars(origin)):
+        return _check_function
+    if origin in (Mapping, Sequence, Iterable):
+        held = _check_of_type(inside[-1]) if isinstance(inside[-1], type) else None
+        return held and functools.partial(_check_collection, origin, held)  # of the others the function tells more
+    if not isinstance(origin, type) or origin in (tuple, object, Any) or protocol or origin.__name__ == "NestedKey":
+        return None
+    return _PLAIN.get(found.__name__) or functools.partial(_check_class, origin)
 
 
 def _or_none(check: Check | None) -> Check | None:
     return check and (lambda argument, given: None if given is None else check(argument, given))
 
 
-def _check_literal(allowed: tuple[str, ...], argument: str, given: Any) -> None:
-    check_choice(argument, given, allowed)
+def _check_kinds(kinds: Iterable[Any], argument: str, given: Any) -> None:
+    """Check that a value is of one of several kinds; its function checks what it holds."""
+    taken = tuple(kind for kind, _ in kinds)
+    text = isinstance(given, (str, bytes)) and not (str in taken and isinstance(given, str))
+    if text or not isinstance(given, taken):
+        raise _wrong_type(argument, " or ".join(word for _, word in kinds), given)
 
 
 def _check_function(argument: str, given: Any) -> None:
     if not callable(given):
-        raise TypeError(f"{argument} must be a function, got {shown(given)} ({type(given).__name__})")
+        raise _wrong_type(argument, "a function", given)
 
 
 def _check_class(wanted: type, argument: str, given: Any) -> None:
@@ -232,12 +250,11 @@ def _check_class(wanted: type, argument: str, given: Any) -> None:
 
 
 def _check_collection(wanted: Any, check: Check, argument: str, given: Any) -> None:
-    """Check a collection, and what it holds unless it can be gone through once only."""
+    """Check a collection, and what it holds unless it can be iterated only once."""
     of_texts = isinstance(given, (str, bytes))
     right = isinstance(given, Mapping) if wanted is Mapping else hasattr(given, "__iter__") and not of_texts
     if not right or isinstance(given, type):
-        kind = "mapping" if wanted is Mapping else "list"
-        raise TypeError(f"{argument} must be a {kind}, got {shown(given)} ({type(given).__name__})")
+        raise _wrong_type(argument, "a mapping" if wanted is Mapping else "a list", given)
     if isinstance(given, (Mapping, Sequence)):
         for place, one in given.items() if isinstance(given, Mapping) else enumerate(given):
             check(f"{argument}[{shown(place)}]", one)
@@ -250,10 +267,10 @@ def checked(function: Function) -> Function:
 
 def checked_but(*arguments: str) -> Callable[[Function], Function]:
     """Check a function's arguments by their annotations: flags, numbers, texts, paths, choices, classes, functions, and
-    collections of these. What may be of several kinds, a name or a :class:`Task` say, the function checks itself.
+    collections of these. The function itself checks what may be a name or a :class:`Task`, for example.
 
     Args:
-        *arguments: names of those of which the function itself says more.
+        *arguments: names of arguments that are not checked, since the function's own error says more.
 
     Raises:
         TypeError, ValueError: when the function is called; it names the argument, what was given and what is allowed.
@@ -270,15 +287,15 @@ def checked_but(*arguments: str) -> Callable[[Function], Function]:
         signature = inspect.signature(function)
 
         @functools.cache
-        def rules() -> dict[str, Check]:  # at the first call: by then all names of the annotations are there
+        def checks() -> dict[str, Check]:  # at the first call: by then all names of the annotations are there
             found = {
-                name: _rule(one.annotation, function.__globals__)
+                name: _check_of(one.annotation, function.__globals__)
                 for name, one in signature.parameters.items()
                 if name not in arguments
                 and one.kind not in (one.VAR_POSITIONAL, one.VAR_KEYWORD)
                 and one.annotation is not one.empty
             }
-            return {name: rule for name, rule in found.items() if rule is not None}
+            return {name: check for name, check in found.items() if check is not None}
 
         @functools.wraps(function)
         def call(*args: Any, **kwargs: Any) -> Any:
@@ -286,7 +303,7 @@ def checked_but(*arguments: str) -> Callable[[Function], Function]:
                 given = signature.bind_partial(*args, **kwargs).arguments
             except TypeError:
                 given = {}  # the function itself says which argument is unknown or too many
-            for name, check in rules().items():
+            for name, check in checks().items():
                 if name in given:
                     check(name, given[name])
             return function(*args, **kwargs)
@@ -299,37 +316,8 @@ def checked_but(*arguments: str) -> Callable[[Function], Function]:
 def check_fields(instance: Any, inside: str = "") -> None:
     """Check the plain fields of a dataclass as :func:`checked` does arguments; errors begin with ``inside``."""
     for field in fields(instance):
-        if (rule := _plain_rule(str(field.type))) is not None:
-            rule(inside + field.name, getattr(instance, field.name))
-
-
-def check_scale(argument: str, given: Any) -> float:
-    """Return ``given`` as a finite float of at least 0."""
-    if isinstance(given, bool) or not isinstance(given, Real):
-        raise TypeError(f"{argument} must be a number, got {given!r} ({type(given).__name__})")
-    try:
-        value = float(given)
-    except OverflowError:
-        value = math.inf
-    if not 0.0 <= value < math.inf:
-        raise ValueError(f"{argument} must be finite and at least 0, got {given!r}")
-    if value != given:
-        raise ValueError(f"{argument} must be a number of double precision, got {given!r}")
-    return value
-
-
-def check_positive(argument: str, given: Any) -> float:
-    """Return ``given`` as a finite float above 0."""
-    if (value := check_scale(argument, given)) == 0.0:
-        raise ValueError(f"{argument} must be above 0, got {given!r}")
-    return value
-
-
-def check_probability(argument: str, given: Any) -> float:
-    """Return ``given`` as a float from 0 to 1."""
-    if (value := check_scale(argument, given)) > 1.0:
-        raise ValueError(f"{argument} must be from 0 to 1, got {given}")
-    return value
+        if (check := _plain_check(str(field.type))) is not None:
+            check(inside + field.name, getattr(instance, field.name))
 
 
 _SHOWN = Repr()

@@ -39,9 +39,9 @@ _DOTTED = re.compile(rf"{_KEY}(?:[ \t]*+\.[ \t]*+{_KEY})*+")
 def replacing(path: str | os.PathLike[str], *, sync: bool = True) -> Iterator[Path]:
     """A temporary path beside ``path`` to write to; it takes the name when the block ends without an error.
 
-    Whenever the process is killed or the machine stops, ``path`` is the old file or the new one, whole; of several
-    writers at once, the last one's. What a killed process left beside it goes at the next write, see :func:`sweep`.
-    Waiting for the disk takes some 10 ms; without ``sync`` it is whole after a kill, but not if the machine stops.
+    Whenever the process is killed or the machine stops, ``path`` is the old file or the new one, whole. The next write
+    removes what a killed process left, see :func:`sweep`. Waiting for the disk takes some 10 ms; without ``sync`` the
+    file is whole after a kill, but not if the machine stops.
     """
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -62,7 +62,7 @@ def replacing(path: str | os.PathLike[str], *, sync: bool = True) -> Iterator[Pa
 
 @contextmanager
 def _temporary(target: Path) -> Iterator[Path]:
-    """A file beside ``target`` that is the caller's alone, locked while the block lasts: by that a sweep spares it."""
+    """A new file beside ``target``, locked while the block lasts, so that no sweep removes it."""
     while True:
         # The suffix stays, since writers choose the format by it.
         path = target.with_name(f".{target.stem}.{secrets.token_hex(8)}.tmp{target.suffix}")
@@ -98,11 +98,8 @@ def flush(path: Path) -> None:
 
 
 def sweep(target: str | os.PathLike[str]) -> list[Path]:
-    """Remove the temporary files that killed writers of ``target`` left beside it, and those that were being replaced
-    themselves; returns them.
-
-    One that is still being written is locked, by whatever thread, process or machine, and stays.
-    """
+    """Remove the temporary files that killed writers of ``target`` left beside it, and return them. Those that are
+    still being written are locked, and stay."""
     path = Path(target)
     pattern = re.compile(rf"\.+{re.escape(path.stem)}(\.[0-9a-f]{{16}}\.tmp)+{re.escape(path.suffix)}")
     there = os.listdir(path.parent) if path.parent.is_dir() else ()
@@ -136,17 +133,16 @@ def held(
     wait: bool = False,
     error: type[ValueError] = ValueError,
 ) -> Iterator[None]:
-    """Keep others out of a place that is written to for a while, in whatever thread or process.
-
-    Meanwhile a lock lies in the folder, or beside the file. That of a killed process is free.
+    """Keep other threads and processes out of a place while the block writes to it, by a lock in the folder or beside
+    the file. The lock of a killed process is free.
 
     Args:
         place: the file or the folder.
-        argument: what it is called in the error: "out".
-        who: else may be at work there.
+        argument: its name in the error, "out" for example.
+        who: what may be at work there.
         folder: whether it is one; it is made where there is none.
-        wait: for those who are at work there, however long it takes.
-        error: what is raised, a second later, where ``wait`` is False.
+        wait: until nothing else is at work there; if False, ``error`` is raised after a second.
+        error: its class.
     """
     path = Path(place)
     lock = path / ".lock" if folder else path.with_name(f".{path.name}.lock")
@@ -200,12 +196,8 @@ def write_json(path: str | os.PathLike[str], value: Any) -> None:
 
 
 def read_bytes(path: Path | Traversable, limit: int) -> bytes:
-    """What a file holds, be it a file and of at most ``limit`` bytes: a pipe would wait, a device give for ever.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it is no file, or larger.
-    """
+    """The content of a file; :class:`ValueError` if it is larger than ``limit`` bytes, or no file but a pipe or a
+    device, which might never end."""
     if isinstance(path, Path) and path.exists() and not path.is_file():
         raise ValueError("it is no file")
     with path.open("rb") as stream:
@@ -216,7 +208,7 @@ def read_bytes(path: Path | Traversable, limit: int) -> bytes:
 
 
 def read_text(path: Path | Traversable, error: type[ValueError], *, limit: int = JSON_LIMIT) -> str:
-    """A text file in UTF-8, with or without a byte order mark; ``error`` names the file that is none, or larger."""
+    """A text file in UTF-8, with or without a byte order mark; ``error`` names a file that is not, or is larger."""
     try:
         return io.TextIOWrapper(io.BytesIO(read_bytes(path, limit)), encoding="utf-8-sig").read()
     except ValueError as fault:
@@ -224,7 +216,7 @@ def read_text(path: Path | Traversable, error: type[ValueError], *, limit: int =
 
 
 def read_toml(path: Path | Traversable, error: type[ValueError]) -> dict[str, Any]:
-    """What a TOML file holds; ``error`` names the file that is none, is too large or nested too deeply."""
+    """The content of a TOML file; ``error`` names a file that is none, is too large or nested too deeply."""
     text = read_text(path, error, limit=TOML_LIMIT)
     for found in _DOTTED.finditer(text):
         if found[0].count(".") >= MOST_KEYS and (names := len(re.findall(_KEY, found[0]))) > MOST_KEYS:
@@ -239,12 +231,7 @@ def read_toml(path: Path | Traversable, error: type[ValueError]) -> dict[str, An
 
 
 def read_json(path: str | os.PathLike[str], what: str, *, limit: int = JSON_LIMIT) -> dict[str, Any]:
-    """The object in a JSON file.
-
-    Args:
-        path: the file.
-        what: what it should be, for the error: "root: the metadata".
-        limit: bytes that it may have.
+    """The object in a JSON file of at most ``limit`` bytes; errors begin with ``what``, "root: the metadata".
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -260,12 +247,8 @@ def read_json(path: str | os.PathLike[str], what: str, *, limit: int = JSON_LIMI
 
 @contextmanager
 def reading(path: str | os.PathLike[str], what: str) -> Iterator[None]:
-    """Let an error in the block name the argument ``path``, a folder that was to hold ``what``.
-
-    Raises:
-        FileNotFoundError: the block looks for a file that is not there.
-        ValueError: the block cannot use what is there.
-    """
+    """Let an error in the block name the argument ``path``, a folder that was to hold ``what``: a FileNotFoundError, or
+    a ValueError for whatever the block cannot use."""
     try:
         yield
     except FileNotFoundError as error:
@@ -277,7 +260,7 @@ def reading(path: str | os.PathLike[str], what: str) -> Iterator[None]:
 
 
 def parse_json(content: bytes) -> dict[str, Any]:
-    """The object that JSON in UTF-8 says; :class:`ValueError` for anything else, as :func:`read_json` raises it."""
+    """The object in JSON in UTF-8; :class:`ValueError` for anything else, as :func:`read_json` raises it."""
     try:
         found = json.loads(
             content.decode("utf-8"), object_pairs_hook=_object, parse_constant=_no_number, parse_float=_number

@@ -16,10 +16,8 @@ from lw_torchrl._checks import missing_keys
 
 
 def as_keys(argument: str, given: Sequence[NestedKey] | None, default: Sequence[str]) -> list[NestedKey]:
-    """The keys ``given``, as many as the default ones and in their order; None for those.
-
-    Raises:
-        ValueError: another number of keys, the same twice, or what is no key.
+    """The keys ``given``, as many as the default ones and in their order; None for the default. :class:`ValueError` for
+    another number of keys, the same twice, or what is no key.
 
     Example:
         >>> as_keys("in_keys", [("agent", "observation"), "task"], ("observation", "task_id"))
@@ -84,11 +82,9 @@ def write(tensordict: TensorDictBase, module: TensorDictModuleBase, values: Sequ
 
 
 def dispatched(forward: Callable[[Any, TensorDictBase], TensorDictBase]) -> Callable[..., Any]:
-    """Let a module's ``forward`` be called as those of TensorDictModules are.
-
-    With a tensordict, or with the tensors of ``in_keys``, by position or by name, as ``torch.export`` calls it too.
-    Under ``set_skip_existing(True)`` a module whose ``out_keys`` are all there does nothing.
-    """
+    """Let a module's ``forward`` be called like a TensorDictModule's: with a tensordict, or with the tensors of
+    ``in_keys``, by position or by name, as ``torch.export`` calls it too. Under ``set_skip_existing(True)`` a module
+    whose ``out_keys`` are all there does nothing."""
 
     @wraps(forward)
     def run(self: TensorDictModuleBase, tensordict: TensorDictBase) -> TensorDictBase:

@@ -24,9 +24,9 @@ class Progress:
     """Shows how far work is, on the standard error, while the block lasts.
 
     Args:
-        what: is being done: "training".
+        what: the work, "training" for example.
         total: units of work.
-        unit: of work, in the singular: "step".
+        unit: its name in the singular, "step" for example.
         initial: units done before.
         show: False shows nothing.
     """
@@ -51,7 +51,7 @@ class Progress:
             self._bar.close()
 
     def update(self, units: int = 1) -> None:
-        """So many more units are done."""
+        """Count more units as done."""
         self.done += units
         if self._bar is not None:
             self._bar.update(units)
@@ -60,13 +60,13 @@ class Progress:
             self._print_line(now - self._started)
 
     def set_done(self, units: int) -> None:
-        """So many units are done in all; fewer than before where some must be done again."""
+        """Set how many units are done; fewer than before where some must be done again."""
         self.done = units
         if self._bar is not None:
             self._bar.n = units
 
     def note(self, **notes: str) -> None:
-        """What is shown beside, ``loss="0.012"``."""
+        """Show more beside it, ``loss="0.012"`` for example."""
         self.notes = "".join(f", {name} {value}" for name, value in notes.items())
         if self._bar is not None:
             self._bar.set_postfix(notes, refresh=False)

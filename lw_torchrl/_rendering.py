@@ -1,6 +1,4 @@
-"""Which pictures there are, and a name for a rendering library that is absent: TorchRL loads MuJoCo, and with it that
-library, wherever it is imported.
-"""
+"""Which cameras and sizes pictures have, and an error that names a missing rendering library, which MuJoCo loads."""
 
 from __future__ import annotations
 
@@ -28,8 +26,7 @@ def check_picture(camera: str, height: int, width: int) -> None:
 
 
 def check_cameras(cameras: str | Sequence[str], height: int, width: int) -> tuple[str, ...]:
-    """The cameras' names; :class:`ValueError` for an unknown one, one that comes twice, none, or a size that no picture
-    has."""
+    """The cameras' names; :class:`ValueError` for an unknown one, a repeated one, none, or a wrong size."""
     names = (cameras,) if isinstance(cameras, str) else tuple(cameras)
     if not names or len({*names}) < len(names):
         raise ValueError(f"cameras must be different names, at least one, got {cameras!r}")
@@ -40,7 +37,7 @@ def check_cameras(cameras: str | Sequence[str], height: int, width: int) -> tupl
 
 @contextmanager
 def naming_absent_renderer() -> Iterator[None]:
-    """Say what the obscure AttributeError of importing MuJoCo means: the library that MUJOCO_GL asks for is absent."""
+    """Turn MuJoCo's obscure AttributeError into one that names the missing library that MUJOCO_GL asks for."""
     try:
         yield
     except AttributeError as error:

@@ -1,4 +1,4 @@
-"""What is drawn for an episode: a function of (purpose, task, seed, episode), for every room."""
+"""Random numbers of an episode: a function of (purpose, task, seed, episode), for every room."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from lw_torchrl.language.tasks import Task, get_task
 
 
 def episode_hash(purpose: str, task: str | Task, seed: int, episode: int) -> int:
-    """A number in [0, 2**63), stable, another for each purpose, task, seed and episode."""
+    """A stable number in [0, 2**63), different for each purpose, task, seed and episode."""
     name = get_task(task).name
     text = f"lw_torchrl/{purpose}/{name}/{check_int('seed', seed)}/{check_int('episode', episode, minimum=0)}"
     return int.from_bytes(blake2b(text.encode(), digest_size=8).digest(), "little") >> 1
 
 
 def episode_generator(purpose: str, task: str | Task, seed: int, episode: int) -> np.random.Generator:
-    """A generator of an episode's own for a purpose, at its beginning; other purposes draw from others."""
+    """A new generator of an episode, for one purpose."""
     return np.random.Generator(np.random.Philox(episode_hash(purpose, task, seed, episode)))

@@ -14,11 +14,7 @@ _STATE = {torch.optim.AdamW: {"step", "exp_avg", "exp_avg_sq"}, torch.optim.SGD:
 
 def split(state: Any, tensors: dict[str, Tensor]) -> Any:
     """JSON for a state of dictionaries, tensordicts, lists, tuples, numbers, strings, None and tensors, which go into
-    ``tensors``.
-
-    Raises:
-        TypeError: it holds something else.
-    """
+    ``tensors``; :class:`TypeError` if it holds something else."""
     if isinstance(state, Tensor):
         name = str(len(tensors))
         tensors[name] = state.detach()
@@ -36,11 +32,7 @@ def split(state: Any, tensors: dict[str, Tensor]) -> Any:
 
 
 def join(tree: Any, tensors: Mapping[str, Tensor]) -> Any:
-    """What :func:`split` took apart.
-
-    Raises:
-        ValueError: the tree is none that it makes.
-    """
+    """The state that :func:`split` took apart; :class:`ValueError` if it cannot have made the tree."""
     if not isinstance(tree, dict):
         if isinstance(tree, list):
             raise ValueError("a list stands where a value was to be")
@@ -80,7 +72,7 @@ def check_like(found: Any, live: Any, where: str) -> None:
 
 def check_optimizer_state(found: Any, optimizer: torch.optim.Optimizer, step: int) -> None:
     """Raise :class:`ValueError` unless ``found`` is a state that the optimizer may have after so many steps, with a
-    learning rate from 0 to the one at the start."""
+    learning rate from 0 to the initial one."""
     live = optimizer.state_dict()
     if not isinstance(found, dict) or set(found) != set(live) or not isinstance(found["state"], dict):
         raise ValueError(f"optimizer must have the keys {sorted(live)}, got {_said(found)}")

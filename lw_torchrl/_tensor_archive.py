@@ -1,7 +1,7 @@
-"""One file of JSON and tensors, read without unpickling and without believing what it says of its own size.
+"""One file of JSON and tensors, read without unpickling and without trusting the sizes that it states.
 
-A zip archive whose entries are stored as they are: ``description.json``, and ``<group>.safetensors`` for each group of
-tensors, whose SHA-256 the description states.
+It is a zip archive without compression: ``description.json``, and ``<group>.safetensors`` for each group of tensors,
+whose SHA-256 the description states.
 """
 
 from __future__ import annotations
@@ -30,11 +30,7 @@ _GROUP = re.compile(r"([a-z_]{1,40})\.safetensors")
 
 
 class ArchiveError(ValueError):
-    """A file that is no archive of ours, or damaged.
-
-    Attributes:
-        names: of the entries of a zip archive that is none of ours.
-    """
+    """A file that is no archive of ours, or damaged; ``names`` are the entries of a zip archive that is not ours."""
 
     def __init__(self, message: str, names: Iterable[str] = ()) -> None:
         super().__init__(message)
@@ -44,23 +40,17 @@ class ArchiveError(ValueError):
 def write_archive(
     path: str | os.PathLike[str], description: Mapping[str, Any], groups: Mapping[str, Mapping[str, Tensor]]
 ) -> None:
-    """Write a file whole or not at all.
-
-    Args:
-        path: the file.
-        description: JSON; ``sha256`` and the ``versions`` of packages are added to it.
-        groups: name to tensors by name.
+    """Write a file whole or not at all: the ``description``, JSON to which ``sha256`` and the ``versions`` of packages
+    are added, and ``groups`` of tensors by name.
 
     Raises:
-        ValueError: the description is no JSON that can be read again, or all is larger than what is read.
-        OSError: the disk is full, say; an earlier file stays as it was.
+        ValueError: the description is no JSON that can be read again, or the file would be too large to be read.
+        OSError: the disk is full, for example; an earlier file stays as it was.
     """
-    data = {
-        f"{name}.safetensors": save(
-            {key: tensor.detach().cpu().contiguous().clone() for key, tensor in tensors.items()}
-        )
-        for name, tensors in groups.items()
-    }
+    data = {}
+    for name, tensors in groups.items():
+        own = {key: tensor.detach().cpu().contiguous().clone() for key, tensor in tensors.items()}
+        data[f"{name}.safetensors"] = save(own)
     digests = {name: sha256(content).hexdigest() for name, content in data.items()}
     stated = {**description, "versions": package_versions(), "sha256": digests}
     text = json.dumps(stated, indent=1, allow_nan=False).encode()
@@ -73,18 +63,11 @@ def write_archive(
 
 
 class TensorArchive:
-    """A file that :func:`write_archive` wrote, in memory.
-
-    Args:
-        path: the file.
+    """A file that :func:`write_archive` wrote, in memory; :class:`ArchiveError`, a ValueError, for any other.
 
     Attributes:
         description: its JSON.
         groups: the names of the groups of tensors.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ArchiveError: (a ValueError) it is no such file, or damaged.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -104,11 +87,7 @@ class TensorArchive:
         self.groups = {name.removesuffix(".safetensors") for name in self._data}
 
     def tensors(self, group: str) -> dict[str, Tensor]:
-        """The tensors of a group by name.
-
-        Raises:
-            ArchiveError: (a ValueError) there is no such group, or it cannot be read.
-        """
+        """The tensors of a group by name; :class:`ArchiveError` if there is none, or it cannot be read."""
         name = f"{group}.safetensors"
         if name not in self._data:
             raise ArchiveError(f"it holds no {name}")
@@ -119,7 +98,7 @@ class TensorArchive:
 
 
 def _entries(content: bytes) -> dict[str, bytes]:
-    """The entries of a zip archive, none of which may be compressed or lie over another: they are no more than it."""
+    """The entries of a zip archive; none may be compressed or overlap another, so they are no larger than the file."""
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         entries = archive.infolist()
         names = [entry.filename for entry in entries]

@@ -1,4 +1,4 @@
-"""Imports TorchRL, for the rooms that use it to import first: an absent rendering library is then named."""
+"""Imports TorchRL, with an error that names a missing rendering library: rooms that use TorchRL import this first."""
 
 from lw_torchrl._rendering import naming_absent_renderer
 

@@ -11,32 +11,28 @@ from lw_torchrl import __version__
 from lw_torchrl._checks import shown
 
 SIMULATORS = ("metaworld", "mujoco")
-"""What an episode's physics hang on."""
+"""What an episode's physics depend on."""
 LIBRARIES = ("lw_torchrl", "numpy", "tensordict", "torch", "torchrl")
-"""What the last bits of computations hang on."""
+"""What the last bits of computations depend on."""
 
 
 def package_versions() -> dict[str, str]:
-    """Package name to version: what results depend on. Ours is that of the code that runs, which the metadata of an
-    editable install need not know."""
+    """Package name to version, of what results depend on. Ours is that of the running code, which the metadata of an
+    editable install may not have."""
     others = sorted({*SIMULATORS, *LIBRARIES} - {"lw_torchrl"})
     return {"lw_torchrl": __version__, **{name: version(name) for name in others}}
 
 
 def version_changes(recorded: Any, names: Iterable[str]) -> list[str]:
-    """Which packages are installed in another version than was recorded: "mujoco 3.2.0, now 3.3.0".
-
-    Args:
-        recorded: package name to version, as a file says; of what it does not say, nothing is told.
-        names: the packages to compare.
-    """
+    """Which of some packages are installed in another version than was recorded, package name to version in a file:
+    "mujoco 3.2.0, now 3.3.0"."""
     before, now = recorded if isinstance(recorded, Mapping) else {}, package_versions()
     pairs = [(name, before.get(name), now[name]) for name in names]
     return [f"{name} {shown(was)[1:-1]}, now {is_}" for name, was, is_ in pairs if isinstance(was, str) and was != is_]
 
 
 def warn_of_other_versions(path: object, recorded: Any, names: Iterable[str] = LIBRARIES) -> None:
-    """Warn that a training which was begun under other versions will not go on bit for bit."""
+    """Warn that a training which began under other versions will not continue bit for bit."""
     if changes := version_changes(recorded, names):
         warnings.warn(
             f"checkpoint: {str(path)!r} was written under other versions ({'; '.join(changes)}): the training goes on, "

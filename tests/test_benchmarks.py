@@ -18,7 +18,7 @@ from benchmarks import ablations, latents, truth
 from benchmarks.report import Row, Skipped, compare, part_of, times_as_long, under
 from lw_torchrl.evaluation import EpisodeResult, EvaluationResult
 from lw_torchrl.language.plan_tables import PlanTables
-from lw_torchrl.modules.plan_roles import PlanRoles
+from lw_torchrl.modules.relative_positions import PlanRoles
 
 ROOT = Path(__file__).parent.parent
 

@@ -19,7 +19,7 @@ from lw_torchrl.language.relations import RELATIONS, Comparison
 from lw_torchrl.language.skills import ScriptedSkill
 from lw_torchrl.language.task_index import TaskIndex
 from lw_torchrl.modules import EVALUATORS, METHODS, POLICIES, Method, ObservationFeatures, make_policy
-from lw_torchrl.modules.action_head import ActionHead
+from lw_torchrl.modules.networks import ActionHead
 from lw_torchrl.record.rollouts import run_recorded, write_recording
 
 STEPS = 40

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import ast
 import ctypes.util
+import importlib
 import pkgutil
+import re
 import sys
 from importlib.abc import MetaPathFinder
 from pathlib import Path
@@ -113,8 +115,30 @@ def test_type_checkers_see_the_names_that_are_there():
         if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
     ]
     stated = {alias.asname: line.module for line in block.body for alias in line.names}
-    assert stated == lw_torchrl._ROOM
-    assert sorted(stated) == lw_torchrl.__all__
+    rooms = [name for name, module in stated.items() if module == "lw_torchrl"]
+    assert rooms == lw_torchrl._ROOMS.split()
+    assert {name: module for name, module in stated.items() if name not in rooms} == lw_torchrl._ROOM_OF
+    assert sorted({*stated} - {*rooms}) == lw_torchrl.__all__
+
+
+def test_the_top_level_is_small_and_each_of_its_names_is_shown():
+    assert len(lw_torchrl.__all__) <= 60
+    root = Path(__file__).parent.parent
+    pages = [root / "README.md", *root.glob("docs/**/*.md")]
+    shown = [block for page in pages for block in re.findall(r"```py.*?```", page.read_text("utf-8"), re.DOTALL)]
+    shown += [file.read_text("utf-8") for file in root.glob("examples/*.py")]
+    used = set(re.findall(r"\blw\.(\w+)", "\n".join(shown)))
+    assert not {*lw_torchrl.__all__} - used
+
+
+def test_a_name_that_left_the_top_level_says_where_it_is():
+    for room, names in lw_torchrl._MOVED.items():
+        for name in names.split():
+            assert name not in lw_torchrl.__all__
+            assert hasattr(importlib.import_module(room), name), f"{room} has no {name}"
+            said = rf"lw\.{name} is now lw{room.removeprefix('lw_torchrl')}\.{name} \(from {room} import {name}\)"
+            with pytest.raises(AttributeError, match=said):
+                getattr(lw_torchrl, name)
 
 
 def test_names_rooms_and_what_is_neither():
@@ -123,4 +147,4 @@ def test_names_rooms_and_what_is_neither():
     with pytest.raises(AttributeError, match="no attribute 'load_plan'"):
         lw_torchrl.load_plan  # noqa: B018
     rooms = {module.name for module in pkgutil.iter_modules(lw_torchrl.__path__) if module.ispkg}
-    assert {*lw_torchrl._PACKAGES, "cli"} == rooms
+    assert {*lw_torchrl._ROOMS.split(), "cli"} == rooms

@@ -19,6 +19,13 @@ import lw_torchrl as lw
 from lw_torchrl._checks import check_positive, check_probability, check_scale
 from lw_torchrl.evaluation import summarize
 
+PUBLIC = {  # at the top level, or in 0.2.0
+    name: import_module(room)
+    for table in (lw._NAMES, lw._MOVED)
+    for room, names in table.items()
+    for name in names.split()
+}
+PUBLIC |= {name: lw.modules for name in ("Value", "QValue", "PlanEncoder")}
 NOT_MADE_BY_USERS = {"DecodedPlan", "DecodedStep", "PlannerError", "PlanError", "QueryError", "Planner", "Policy"}
 WRONG: dict[str, list[Any]] = {
     "bool": ["no", "yes", "", 1, 0, 1.0, None, [], object],
@@ -45,8 +52,8 @@ def placeholder(annotation):
 
 def plain_arguments():
     """Each public name's arguments of plain annotations: what to call, the other arguments that it needs, the kind."""
-    for name in sorted(lw.__all__):
-        public = getattr(lw, name)
+    for name in sorted(PUBLIC):
+        public = getattr(PUBLIC[name], name)
         if not callable(public) or name in NOT_MADE_BY_USERS:
             continue
         called = public.__init__ if inspect.isclass(public) else public
@@ -70,7 +77,7 @@ def test_wrong_values_of_plain_arguments_are_named(calls, name, argument, others
         if value is None and optional:
             continue
         with pytest.raises((TypeError, ValueError), match=argument):
-            getattr(lw, name)(**{**calls.get(name, others), argument: value})
+            getattr(PUBLIC[name], name)(**{**calls.get(name, others), argument: value})
 
 
 @pytest.mark.parametrize("number", [np.float32(0.5), np.float64(0.5), np.int64(1), np.float16(0.5)])
@@ -86,8 +93,8 @@ ROOMS = ["envs", "transforms", "modules", "objectives", "data", "training", "eva
 
 def other_arguments():
     """Each public name's arguments of other annotations: the name, the argument, wrong values of it."""
-    for name in sorted(set(lw.__all__) - NOT_MADE_BY_USERS - ELSEWHERE):
-        public = getattr(lw, name)
+    for name in sorted({*PUBLIC} - NOT_MADE_BY_USERS - ELSEWHERE):
+        public = getattr(PUBLIC[name], name)
         if not callable(public):
             continue
         called = public.__init__ if inspect.isclass(public) else public
@@ -118,7 +125,7 @@ def test_wrong_values_of_other_arguments_are_named_and_leave_no_file(calls, fold
         with pytest.raises(
             (TypeError, ValueError), match=rf"\b({argument}|{said}|{said.removesuffix('s')})\b"
         ) as raised:
-            getattr(lw, name)(**{**calls[name], argument: value})
+            getattr(PUBLIC[name], name)(**{**calls[name], argument: value})
         assert "unexpected keyword" not in str(raised.value)
     assert sorted(folder.rglob("*")) == there
 
@@ -127,7 +134,7 @@ def room_arguments():
     """Arguments of plain annotations of what the rooms have beside the public names, where they are checked."""
     for room in ROOMS:
         names = import_module(f"lw_torchrl.{room}")
-        for name in sorted(set(names.__all__) - set(lw.__all__)):
+        for name in sorted({*names.__all__} - {*PUBLIC}):
             called = getattr(names, name)
             called = called.__init__ if inspect.isclass(called) else called
             if hasattr(called, "__wrapped__") and inspect.unwrap(called).__module__.startswith("lw_torchrl"):

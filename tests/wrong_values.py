@@ -116,6 +116,7 @@ for name in [
     "Transform",
     "QueryEvaluator",
     "ClauseEvaluator",
+    "Encoder",
     "LabelledQueries",
     "LossModule",
     "Policy",
@@ -160,9 +161,9 @@ def good_calls(folder: Any) -> dict[str, dict[str, Any]]:
     actor = lw.PlanConditionedActor(plans, width=8)
     expert = lw.ExpertActor("reach")
     evaluator = lw.StateQueryEvaluator(plans, width=8)
-    images = lw.ImageQueryEvaluator(plans, width=8)
-    config = lw.QueryEvaluatorConfig(steps=1, batch_size=2, held_out_states=0.0, held_out_pairs=0.0)
-    data = lw.LabelledQueries(replay, config)
+    images = lw.modules.ImageQueryEvaluator(plans, width=8)
+    config = lw.training.QueryEvaluatorConfig(steps=1, batch_size=2, held_out_states=0.0, held_out_pairs=0.0)
+    data = lw.training.LabelledQueries(replay, config)
     value = lw.PlanConditionedValue(plans, width=8)
     qvalue = lw.PlanConditionedQValue(plans, width=8)
     gaussian = lw.PlanConditionedActor(plans, width=8, distribution="tanh_normal")
@@ -196,7 +197,7 @@ def good_calls(folder: Any) -> dict[str, dict[str, Any]]:
         "LabelledQueries": {"replay": replay, "config": config},
         "LanguageWorldEnv": {"tasks": "reach"},
         "LanguageWorldExperienceReplay": {"root": root, "label": "executed"},
-        "OfflineTrainer": {"loss": lw.ExpectileValueLoss(value), "replay": executed, "progress": False},
+        "OfflineTrainer": {"loss": lw.objectives.ExpectileValueLoss(value), "replay": executed, "progress": False},
         "OnlineTrainer": {
             "actor": actor,
             "replay": executed,
@@ -207,6 +208,9 @@ def good_calls(folder: Any) -> dict[str, dict[str, Any]]:
         "PlanConditionedActor": {"plans": plans, "width": 8},
         "PlanConditionedQValue": {"plans": plans, "width": 8},
         "PlanConditionedValue": {"plans": plans, "width": 8},
+        "PlanEncoder": {"plans": plans},
+        "QValue": {"encoder": actor.encoder, "width": 8},
+        "Value": {"encoder": actor.encoder, "width": 8},
         "PlanStep": {"condition": PLAN.steps[0].condition, "skill": PLAN.steps[0].skill},
         "Plans": {"plans": plans},
         "QAFTransform": {"plans": plans},
@@ -244,7 +248,10 @@ def good_calls(folder: Any) -> dict[str, dict[str, Any]]:
         "evaluate": {"actor": actor, **run},
         "evaluate_plans": {"plans": [PLAN], "episodes": 1, "seed": 1, "max_steps": 1, "progress": False},
         "load_actor": {"path": lw_saved(lw.save_actor, actor, folder / "actor.zip")},
-        "load_evaluator": {"path": lw_saved(lw.save_evaluator, evaluator, folder / "asked.zip"), "plans": plans},
+        "load_evaluator": {
+            "path": lw_saved(lw.training.save_evaluator, evaluator, folder / "asked.zip"),
+            "plans": plans,
+        },
         "load_pictures": {"replay": replay},
         "load_plans": {"source": "MT10"},
         "load_skills": {},

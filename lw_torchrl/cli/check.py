@@ -100,9 +100,8 @@ def _check_plan(
     text: str, task: str | None, source: str, skills: Mapping[str, ScriptedSkill], tasks: Mapping[str, Task]
 ) -> tuple[list[str], int, list[str]]:
     """Every fault of a plan, the steps it has if there is none, and what the scripted skills make of it."""
-    import lw_torchrl as lw
     from lw_torchrl.language.formats.chain_py import check_plan
-    from lw_torchrl.language.skills import skills_for
+    from lw_torchrl.language.skills import nearest_skill, skills_for
 
     plan, faults = check_plan(text, task, source, tasks)
     if plan is None:
@@ -112,7 +111,7 @@ def _check_plan(
     for step in plan.steps:
         if step.skill not in skills or not skills[step.skill].suits(plan.definition):
             try:
-                found, score = lw.nearest_skill(step.skill, plan.definition, offered)
+                found, score = nearest_skill(step.skill, plan.definition, offered)
                 hint = f"the nearest is {found.text!r} ({score:.2f})"
             except ValueError:
                 hint = "nor does another; yours come by --skill-file"

@@ -32,6 +32,7 @@ def tasks(
         json: print one JSON document instead, see docs/cli.md.
     """
     import lw_torchrl as lw
+    from lw_torchrl.language.tasks import resolve_tasks
 
     known = read_tasks(task_file)
     rows = [
@@ -41,7 +42,7 @@ def tasks(
             "description": known[name].description,
             "objects": [{"name": one.name, "ours": one.ours} for one in known[name].objects[1:]],
         }
-        for name in lw.resolve_tasks(one_or_many(names) or list(known), tasks=known)
+        for name in resolve_tasks(one_or_many(names) or list(known), tasks=known)
     ]
 
     def objects(row: Row) -> str:
@@ -77,8 +78,8 @@ def skills(
         task_file: tasks of yours, instead of ours of the same name or beside ours.
         json: print one JSON document instead, see docs/cli.md.
     """
-    import lw_torchrl as lw
     from lw_torchrl.language.named_objects import GRIPPER
+    from lw_torchrl.language.skills import nearest_skill
     from lw_torchrl.language.tasks import check_task
 
     known = read_tasks(task_file)
@@ -86,7 +87,7 @@ def skills(
     definition = None if task is None else known[check_task(task, known)]
     output = Output(json)
     if nearest is not None:
-        skill, score = lw.nearest_skill(nearest, definition, table)
+        skill, score = nearest_skill(nearest, definition, table)
         found = {"skill": skill.text, "similarity": score}
         output.show("nearest", found, f"{skill.text}   (similarity {score:.2f})")
         return output
@@ -136,11 +137,11 @@ def plans(
         task_file: tasks of yours, instead of ours of the same name or beside ours.
         json: print one JSON document instead, see docs/cli.md.
     """
-    import lw_torchrl as lw
+    from lw_torchrl.language.tasks import resolve_tasks
 
     known = read_tasks(task_file)
     loaded = read_plans(plans, known, skill_set)
-    chosen = lw.resolve_tasks(one_or_many(names), tasks=known) if names else tuple(loaded)
+    chosen = resolve_tasks(one_or_many(names), tasks=known) if names else tuple(loaded)
     loaded.require(chosen)
     output = Output(json)
     if roles:
@@ -199,13 +200,14 @@ def queries(
         json: print one JSON document instead, see docs/cli.md.
     """
     import lw_torchrl as lw
+    from lw_torchrl.language.query_search import nearest_query
     from lw_torchrl.language.tasks import check_task
 
     known = read_tasks(task_file)
     definition = known[check_task(task, known)]
     output = Output(json)
     if text is not None:
-        found = lw.nearest_query(text, definition, by=by)
+        found = nearest_query(text, definition, by=by)
         nearest = {"query": str(found.query), "similarity": found.score}
         output.show("nearest", nearest, f"{found.query}   (similarity {found.score:.2f})")
         return output

@@ -173,12 +173,15 @@ def train(
     if isinstance(inside, lw.HeldEvaluator):
         which, mend = "--begin must have", "give the one to train by --evaluator"
         if evaluator is not None:
-            which, mend = "--evaluator must be", "train with the one inside it, lw.save_evaluator(held.evaluator, FILE)"
+            which, mend = (
+                "--evaluator must be",
+                "train with the one inside it, lw.training.save_evaluator(held.evaluator, FILE)",
+            )
         raise ValueError(f"{which} no HeldEvaluator, of whose steps a dataset's rows tell nothing: {mend}")
-    if isinstance(inside, lw.ImageQueryEvaluator):
+    if isinstance(inside, lw.modules.ImageQueryEvaluator):
         pictures: dict[str, Any] = {"cameras": inside.cameras, "height": inside.height, "width": inside.width}
-        lw.add_pictures(data, **pictures)
-        replay.add_column("pixels", lw.load_pictures(replay, **pictures))
+        lw.data.add_pictures(data, **pictures)
+        replay.add_column("pixels", lw.data.load_pictures(replay, **pictures))
     elif (transform := actor.transform()) is not None:
         replay.append_transform(transform)
     writes = None if logger is None else make_logger(logger, out)
@@ -228,7 +231,7 @@ def _evaluator(named: str, plans: Plans, encoder: TextEncoder | None) -> QueryEv
 
     if named == "new":
         return lw.StateQueryEvaluator(plans)
-    return lw.load_evaluator(named, plans, text_encoder=encoder)
+    return lw.training.load_evaluator(named, plans, text_encoder=encoder)
 
 
 def _with_evaluator(

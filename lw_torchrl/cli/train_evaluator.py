@@ -113,7 +113,7 @@ def train_evaluator(
     if not cameras:
         defaults = {"steps": 6000, "batch_size": 1024, "learning_rate": 3e-3, "every": 1}
     said = {"steps": steps, "batch_size": batch_size, "learning_rate": learning_rate, "every": every}
-    config = (lw.ImageQueryEvaluatorConfig if cameras else lw.QueryEvaluatorConfig)(
+    config = (lw.training.ImageQueryEvaluatorConfig if cameras else lw.training.QueryEvaluatorConfig)(
         **defaults | {name: value for name, value in said.items() if value is not None},  # type: ignore[arg-type]
         states_per_task=states_per_task,
         held_out_states=held_out_states,
@@ -132,7 +132,9 @@ def train_evaluator(
     plans = lw.load_plans("MT50")
     evaluator: ClauseEvaluator
     if cameras:
-        evaluator = lw.ImageQueryEvaluator(lw.Plans({task: plans[task] for task in names}), **options, **pictures)
+        evaluator = lw.modules.ImageQueryEvaluator(
+            lw.Plans({task: plans[task] for task in names}), **options, **pictures
+        )
     else:
         evaluator = lw.StateQueryEvaluator(plans, **options)
     run = {"episodes_per_task": episodes, "max_steps": max_steps, "seed": seed, "num_envs": num_envs}
@@ -140,10 +142,10 @@ def train_evaluator(
     replay = lw.LanguageWorldExperienceReplay(roots, label="executed", episodes=_of_tasks(roots, names))
     if cameras:
         for root in roots:
-            lw.add_pictures(root, **pictures, every=config.every)
-        replay.add_column("pixels", lw.load_pictures(replay, **pictures, every=config.every))
-    labelled = lw.LabelledQueries(replay, config)
-    trainer = lw.ImageQueryEvaluatorTrainer if cameras else lw.QueryEvaluatorTrainer
+            lw.data.add_pictures(root, **pictures, every=config.every)
+        replay.add_column("pixels", lw.data.load_pictures(replay, **pictures, every=config.every))
+    labelled = lw.training.LabelledQueries(replay, config)
+    trainer = lw.training.ImageQueryEvaluatorTrainer if cameras else lw.training.QueryEvaluatorTrainer
     loss = trainer(evaluator, labelled, config, checkpoint=out / "evaluator.zip").train()
     output = Output(json)
     output.show("evaluator", out / "evaluator.zip")

@@ -92,9 +92,9 @@ def add_pictures(
         >>> import tempfile, lw_torchrl as lw
         >>> with tempfile.TemporaryDirectory() as root:
         ...     _ = lw.collect_demonstrations("reach", episodes_per_task=1, root=root + "/demos", max_steps=20)
-        ...     lw.add_pictures(root + "/demos", "corner", every=10)
+        ...     lw.data.add_pictures(root + "/demos", "corner", every=10)
         ...     replay = lw.LanguageWorldExperienceReplay(root + "/demos", batch_size=8)
-        ...     replay.add_column("pixels", lw.load_pictures(replay, "corner", every=10))
+        ...     replay.add_column("pixels", lw.data.load_pictures(replay, "corner", every=10))
         ...     replay.sample()["pixels"].shape
         torch.Size([8, 64, 64, 3])
     """
@@ -221,7 +221,7 @@ def load_pictures(
             raise DatasetError(
                 f"root: {str(root)!r} has no pictures of {episode.task}, episode {episode.episode}, by "
                 f"{', '.join(wanted.cameras)}, {height} times {width} pixels, every {every}; "
-                f"lw.add_pictures({str(root)!r}, ...) takes them"
+                f"lw.data.add_pictures({str(root)!r}, ...) takes them"
             )
         taken = _read(path, wanted, wanted.count(episode))
         found[row : row + length] = taken[torch.arange(length) // every]

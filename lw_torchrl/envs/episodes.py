@@ -13,8 +13,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv, step_mdp
 
-from lw_torchrl._blocks import in_blocks
-from lw_torchrl._devices import CPU, place
+from lw_torchrl._devices import CPU, in_blocks, place
 from lw_torchrl.envs.engine import ACTION_SIZE
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.envs.seeding import action_noise

@@ -71,7 +71,7 @@ def evaluate_plans(
     Example:
         >>> import lw_torchrl as lw
         >>> plan = lw.load_plans("MT10")["reach"]
-        >>> lw.evaluate_plans([plan, plan], episodes=2, seed=1_000)
+        >>> lw.evaluation.evaluate_plans([plan, plan], episodes=2, seed=1_000)
         [(True, True), (True, True)]
 
     Source: paper section 'LLM Experiments', 'Scripted Skills'.

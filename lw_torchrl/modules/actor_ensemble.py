@@ -19,9 +19,9 @@ from lw_torchrl.modules.policy import Policy, from_description
 
 
 class ActorEnsemble(Policy):
-    """The mean action of policies that were trained apart on the same demonstrations: where these do not say what to
-    do, each fills the gap in its own way, and the mean strays less than one of them. Members that see different
-    features, or were trained on other augmentations, differ most.
+    """The mean action of policies that were trained separately on the same demonstrations. Where these do not say what
+    to do, each member errs in its own way, and the mean errs less. Members with different features or augmentations
+    differ most.
 
     Reads what a member reads; writes ``action`` (B, 4) float32, and ``skill_weights`` (B, S) float32 where the members
     have plans: the mean of the members' own.
@@ -41,7 +41,7 @@ class ActorEnsemble(Policy):
     Example:
         >>> import lw_torchrl as lw
         >>> env = lw.LanguageWorldEnv("reach")
-        >>> actor = lw.ActorEnsemble([lw.DescriptorConditionedActor("MT10") for _ in range(4)])
+        >>> actor = lw.modules.ActorEnsemble([lw.DescriptorConditionedActor("MT10") for _ in range(4)])
         >>> actor(env.reset())["action"].shape
         torch.Size([1, 4])
         >>> env.close()
@@ -55,8 +55,8 @@ class ActorEnsemble(Policy):
         if not members:
             raise ValueError("members must be at least one policy, got none")
         first = members[0]
-        for name, of in (("plans", _fingerprint), ("tasks", _tasks), ("in_keys", _read), ("out_keys", _written)):
-            if any(of(one) != of(first) for one in members):
+        for name, own in _shared(first).items():
+            if any(_shared(one)[name] != own for one in members):
                 raise ValueError(f"members must have the same {name}")
         self.members = nn.ModuleList(members)
         if any(isinstance(part, HeldEvaluator) for one in members for part in one.modules()):
@@ -89,12 +89,12 @@ class ActorEnsemble(Policy):
         return write(tensordict, self, written)
 
     def fit_normalization(self, observation: Tensor, weights: Tensor | None = None) -> None:
-        """That of each member."""
+        """As :meth:`Policy.fit_normalization`, of each member."""
         for member in self._each:
             member.fit_normalization(observation, weights)
 
     def fit_contacts(self, observation: Tensor, task_id: Tensor) -> None:
-        """Those of each member."""
+        """As :meth:`Policy.fit_contacts`, of each member."""
         for member in self._each:
             member.fit_contacts(observation, task_id)
 
@@ -109,25 +109,12 @@ class ActorEnsemble(Policy):
         return cls([from_description(member, text_encoder) for member in members])
 
     def with_plans(self, plans: Plans | Mapping[str, ConditionalPlan]) -> ActorEnsemble:
-        """An ensemble that carries out other plans with the same weights: training either trains both.
-
-        Raises:
-            TypeError: the members are conditioned on descriptions.
-        """
+        """An ensemble on the same weights for other plans: training either trains both; :class:`TypeError` if the
+        members are conditioned on descriptions."""
         return ActorEnsemble([member.with_plans(plans) for member in self._each]).train(self.training)
 
 
-def _fingerprint(policy: Policy) -> str | None:
-    return None if policy.plans is None else policy.plans.fingerprint
-
-
-def _tasks(policy: Policy) -> tuple[str, ...]:
-    return policy.tasks
-
-
-def _read(policy: Policy) -> list:
-    return policy.in_keys
-
-
-def _written(policy: Policy) -> list:
-    return policy.out_keys_source
+def _shared(policy: Policy) -> dict[str, Any]:
+    """What the members of an ensemble must have in common."""
+    plans = None if policy.plans is None else policy.plans.fingerprint
+    return {"plans": plans, "tasks": policy.tasks, "in_keys": policy.in_keys, "out_keys": policy.out_keys_source}

@@ -1,41 +1,102 @@
-"""ClauseEvaluator: a network that answers conditions clause by clause, whatever it sees of a state."""
+"""ClauseEvaluator: answers conditions by a network, clause by clause; and plans' clauses as tensors."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
 
-from lw_torchrl._checks import shown
-from lw_torchrl.language.plans import Plans
+from lw_torchrl._checks import shown, unknown_name
+from lw_torchrl.language.observation import OBSERVATION_SIZE, OPENING
+from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.language.queries import Clause
 from lw_torchrl.language.relations import PREDICATES
 from lw_torchrl.language.task_index import TaskIndex, TaskTables
 from lw_torchrl.language.tasks import Task
 from lw_torchrl.language.text import TextEncoder, encoded
-from lw_torchrl.modules.clause_network import conjunction
-from lw_torchrl.modules.clauses import Clauses, PlanClauses, clauses_of, code_clauses, code_plans, texts_of
 from lw_torchrl.modules.networks import unit_scale
 from lw_torchrl.modules.query_evaluator import QueryEvaluator
 
+NOTHING = OBSERVATION_SIZE
+"""The index of a 0 that stands behind an observation's 39 numbers."""
 _PADDING = -1e4  # as QueryProgram.logits has it
+
+
+class Clauses(NamedTuple):
+    """Clauses (...,), of whatever tasks. The tasks' table says where the objects stand, the answer does not: the
+    difference of a clause's two positions is ``observation[first] - observation[second] + shift``."""
+
+    first: Tensor  # (..., 3) int64, indices into the observation and the 0 behind it
+    second: Tensor  # (..., 3) int64
+    shift: Tensor  # (..., 3) float32, metres
+    predicate: Tensor  # (...) int64, its number in the list of predicates
+    negated: Tensor  # (...) bool
+    text: Tensor  # (...) int64, its number in the list of texts
+    subject: Tensor  # (...) int64, its name's number in the list of names
+    object: Tensor  # (...) int64, likewise; the number behind the last for none
+
+    def pick(self, which: Tensor) -> Clauses:
+        """Of (G,) clauses those of these numbers, (...) int64."""
+        return Clauses(*(table[which] for table in self))
+
+
+class PlanClauses(NamedTuple):
+    """The clauses (T, C) of T tasks' plans, each once, and which of them make up each condition; the first eight
+    are those of :class:`Clauses`."""
+
+    first: Tensor
+    second: Tensor
+    shift: Tensor
+    predicate: Tensor
+    negated: Tensor
+    text: Tensor
+    subject: Tensor
+    object: Tensor
+    parts: Tensor  # (T, S, K) int64, which of its task's clauses
+    mask: Tensor  # (T, S, K) bool, the parts that there are
+
+    @property
+    def clauses(self) -> Clauses:
+        return Clauses(*self[:8])
+
+
+def conjunction(logits: Tensor, mask: Tensor) -> Tensor:
+    """The logit of all of some statements, whose errors are taken to be independent of one another.
+
+    Each statement has the probability sigmoid(l), all of them their product p, whose logit log(p / (1 - p)) is
+    -log(expm1(sum(softplus(-l)))). Of one statement that is its own logit; of several sure ones nearly the least. Two
+    of 0.6 each make 0.36: where all are barely true, the conjunction is not.
+
+    Args:
+        logits: (..., K) float32, of size 30 at most.
+        mask: (..., K) bool, the statements that there are; of none at all the logit is 30.
+
+    Returns:
+        (...) float32.
+
+    Example:
+        >>> import torch
+        >>> conjunction(torch.tensor([8.0, -3.0]), torch.tensor([True, True])).round(decimals=2)
+        tensor(-3.)
+    """
+    doubt = torch.where(mask, nn.functional.softplus(-logits), 0.0).sum(-1).clamp(min=1e-13)
+    return -(doubt + torch.log(-torch.expm1(-doubt)))
 
 
 class ClauseEvaluator(QueryEvaluator):
     """Answers conditions by a network that was trained on the query answering function's answers, and never asks it.
 
-    A condition's clauses are answered one by one, each once in a task, and put together as
-    :func:`~lw_torchrl.modules.clause_network.conjunction` says, so that new conjunctions need no training. The logits
-    are -1e4 beyond a plan's last step. A subclass gives ``network``, whose call takes what is seen of B states, their
-    clauses (B, C) and the texts' vectors, to logits (B, C), and says in ``seen_dims`` how many dimensions a state has.
+    A condition's clauses are answered one by one, each once in a task, and put together as :func:`conjunction` says,
+    so that new conjunctions need no training. The logits are -1e4 beyond a plan's last step. A subclass gives
+    ``network``, whose call takes what is seen of B states, their clauses (B, C) and the texts' vectors, to logits
+    (B, C), and says in ``seen_dims`` how many dimensions a state has.
 
     Args:
         plans: whose conditions it answers.
-        structure: a clause is read as the query language parses it; False: all that is known of it is its text's
-            vector.
+        structure: a clause is read as the query language parses it; False: only its text's vector is known.
         predicates: with ``structure``, the relations and predicates that it can tell; None for all that there are.
         names: with ``structure``, the things that it can tell; empty where they are not told apart by name.
         text_encoder: without ``structure``, texts to vectors (n, E) float32; None for the sentence encoder.
@@ -59,16 +120,15 @@ class ClauseEvaluator(QueryEvaluator):
         text_encoder: TextEncoder | None,
     ) -> None:
         super().__init__(plans)
-        if not isinstance(structure, bool):
-            raise TypeError(f"structure must be True or False, got {shown(structure)}")
         if not structure and predicates is not None:
             raise ValueError("predicates is for structure=True; without, an evaluator reads texts alone")
         self.predicates = _checked("predicates", sorted(PREDICATES) if predicates is None else predicates, structure)
         self.names = _checked("names", names, structure and bool(names))
         self.text_encoder = text_encoder
         index = TaskIndex(plans)
-        texts = None if structure else texts_of(clauses_of(plans))
-        tables = code_plans(plans, index.tasks, self.predicates, texts, self.names)
+        asked = [(plan.definition, clause) for plan in plans.values() for clause in _of(plan)]
+        texts = None if structure else _texts(asked)
+        tables = _plan_clauses(plans, index.tasks, self.predicates, texts, self.names)
         vectors = None if texts is None else unit_scale(_vectors(texts, text_encoder))
         self.register_buffer("text_vectors", vectors, persistent=False)
         self.tables: TaskTables[PlanClauses] = TaskTables(index, tables, f"tasks without a plan in {plans!r}")
@@ -95,7 +155,7 @@ class ClauseEvaluator(QueryEvaluator):
         tables = self.tables.select(task_id.reshape(-1), rows)
         clauses = self.network(rows, tables.clauses, self.text_vectors)
         parts = clauses.gather(-1, tables.parts.flatten(1)).reshape(tables.parts.shape)
-        found = torch.where(tables.said.any(-1), conjunction(parts, tables.said), _PADDING)
+        found = torch.where(tables.mask.any(-1), conjunction(parts, tables.mask), _PADDING)
         return found.reshape(*task_id.shape, self.plans.num_steps)
 
     def code(self, clauses: Sequence[tuple[Task, Clause]]) -> tuple[Clauses, Tensor | None]:
@@ -106,10 +166,10 @@ class ClauseEvaluator(QueryEvaluator):
             ValueError: one has a predicate or a thing that it cannot tell.
         """
         if self.predicates:
-            return code_clauses(clauses, self.predicates, None, self.names), None
+            return _as_tensors(clauses, self.predicates, None, self.names), None
         both = [*clauses, *((task, replace(clause, negated=not clause.negated)) for task, clause in clauses)]
-        texts = texts_of(both)
-        return code_clauses(both, (), texts), unit_scale(_vectors(texts, self.text_encoder))
+        texts = _texts(both)
+        return _as_tensors(both, (), texts), unit_scale(_vectors(texts, self.text_encoder))
 
     def made_for(self, plans: Plans) -> Self:
         return type(self)(plans, text_encoder=self.text_encoder, **self.config)
@@ -136,3 +196,86 @@ def _vectors(texts: Sequence[str], encoder: TextEncoder | None) -> Tensor:
             f"structure=False reads the vectors of clauses' texts, which are not shipped: {error}; or give a "
             "text_encoder of yours, or take structure=True, which reads no texts"
         ) from error
+
+
+def _position(task: Task, name: str) -> tuple[list[int], list[float]]:
+    """Where in an observation an object's three numbers stand, and what is added to them."""
+    found = task.object(name)
+    index = [at if isinstance(at, int) else NOTHING for at in found.position]
+    fixed = [0.0 if isinstance(at, int) else at for at in found.position]
+    return index, [one + offset for one, offset in zip(fixed, found.offset, strict=True)]
+
+
+def _ends(clause: Clause, task: Task) -> tuple[list[int], list[int], list[float]]:
+    nothing = [NOTHING] * 3
+    if clause.predicate in ("open", "closed"):
+        return [NOTHING, NOTHING, OPENING], nothing, [0.0] * 3
+    first, shift = _position(task, clause.subject)
+    if clause.object is None:
+        return first, nothing, shift
+    second, other = _position(task, clause.object)
+    return first, second, [a - b for a, b in zip(shift, other, strict=True)]
+
+
+def _as_tensors(
+    clauses: Sequence[tuple[Task, Clause]],
+    predicates: Sequence[str],
+    texts: Sequence[str] | None,
+    names: Sequence[str] = (),
+) -> Clauses:
+    """Clauses of tasks as tensors, (G,); where a list of what is numbered is empty or None, all are number 0.
+
+    Raises:
+        ValueError: a predicate, or a thing's name, is not in the list.
+    """
+    predicate, text, place = ({name: at for at, name in enumerate(those or ())} for those in (predicates, texts, names))
+    for task, clause in clauses:
+        if predicates and clause.predicate not in predicate:
+            error = unknown_name(f"predicate of {str(clause)!r}, in {task.name}", clause.predicate, predicates)
+            raise ValueError(f"{error}; an evaluator answers what it was made for: make and train one that has it")
+        for thing in (clause.subject, clause.object):
+            if names and thing is not None and thing not in place:
+                error = unknown_name(f"thing in {str(clause)!r}, in {task.name}", thing, names)
+                raise ValueError(f"{error}; an evaluator sees what it was made for: make and train one that has it")
+    ends = [_ends(clause, task) for task, clause in clauses]
+    return Clauses(
+        first=torch.tensor([first for first, _, _ in ends]),
+        second=torch.tensor([second for _, second, _ in ends]),
+        shift=torch.tensor([shift for _, _, shift in ends], dtype=torch.float32),
+        predicate=torch.tensor([predicate.get(clause.predicate, 0) for _, clause in clauses]),
+        negated=torch.tensor([clause.negated for _, clause in clauses]),
+        text=torch.tensor([text.get(str(clause), 0) for _, clause in clauses]),
+        subject=torch.tensor([place.get(clause.subject, 0) for _, clause in clauses]),
+        object=torch.tensor([place.get(clause.object or "", len(names)) for _, clause in clauses]),
+    )
+
+
+def _texts(clauses: Iterable[tuple[Task, Clause]]) -> list[str]:
+    """The different texts of clauses, sorted."""
+    return sorted({str(clause) for _, clause in clauses})
+
+
+def _of(plan: ConditionalPlan) -> list[Clause]:
+    """The clauses of a plan's conditions, each once."""
+    return list(dict.fromkeys(clause for step in plan.steps for clause in step.condition.clauses))
+
+
+def _plan_clauses(
+    plans: Plans, tasks: Sequence[str], predicates: Sequence[str], texts: Sequence[str] | None, names: Sequence[str]
+) -> PlanClauses:
+    """The clauses of plans as tensors, with a row for each of ``tasks``; errors as of :func:`_as_tensors`."""
+    listed = [_of(plans[task]) for task in tasks]
+    flat = [(plans[task].definition, clause) for task, found in zip(tasks, listed, strict=True) for clause in found]
+    width = max(len({*step.condition.clauses}) for task in tasks for step in plans[task].steps)
+    number = torch.zeros(len(tasks), max(map(len, listed)), dtype=torch.int64)
+    parts = torch.zeros(len(tasks), plans.num_steps, width, dtype=torch.int64)
+    mask = torch.zeros(len(tasks), plans.num_steps, width, dtype=torch.bool)
+    start = 0
+    for row, (task, found) in enumerate(zip(tasks, listed, strict=True)):
+        number[row, : len(found)] = torch.arange(start, start + len(found))
+        start += len(found)
+        for column, step in enumerate(plans[task].steps):
+            own = [found.index(clause) for clause in dict.fromkeys(step.condition.clauses)]
+            parts[row, column, : len(own)] = torch.tensor(own)
+            mask[row, column, : len(own)] = True
+    return PlanClauses(*_as_tensors(flat, predicates, texts, names).pick(number), parts, mask)

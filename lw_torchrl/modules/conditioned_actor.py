@@ -21,12 +21,11 @@ from torchrl.envs import Transform
 
 from lw_torchrl._keys import as_keys, check_apart, dispatched, key_beside, read, write
 from lw_torchrl.language.tasks import Task
-from lw_torchrl.modules.action_head import ActionHead, DistributionName
 from lw_torchrl.modules.encoder import Encoder, Encoding
+from lw_torchrl.modules.networks import DISTRIBUTIONS, ActionHead, DistributionName
 from lw_torchrl.modules.policy import Policy
 
 _ALTERING = ("jitter", "swap_unmentioned", "hide_opening")
-_RANDOM_IN_TRAINING = ("feature_noise", *_ALTERING)
 
 
 def noise_of_features(asked: float | None, distribution: str | None) -> float:
@@ -37,17 +36,17 @@ def noise_of_features(asked: float | None, distribution: str | None) -> float:
 
 
 class ConditionedActor(Policy):
-    """What every actor of ours shares, whatever it is conditioned on; a subclass makes the encoder.
+    """What all our actors share, whatever they are conditioned on; a subclass makes the encoder.
 
-    Reads what the encoder reads; writes ``action`` (B, 4) float32 and what the encoder tells. With a distribution it
+    Reads what the encoder reads; writes ``action`` (B, 4) float32 and what the encoder gives. With a distribution it
     writes ``loc`` and ``scale`` (B, 4) float32 and ``action_log_prob`` (B,) float32 too, and ``action`` is drawn from
     it under ``set_exploration_type(ExplorationType.RANDOM)``, as collectors do, and its mode otherwise.
 
     Args:
         encoder: what it is conditioned on.
-        told: the keys of what the encoder tells beside the action, of ("skill_weights", "skill_latent").
-        width, depth, squash, distribution, init_std: as for :class:`ActionHead`.
+        extras: the keys of what the encoder gives beside the action, of ("skill_weights", "skill_latent").
         out_keys: other names for what it writes, in the order above; nested ones too.
+        **head: of :class:`ActionHead`.
 
     Source: ``torchrl.modules.ProbabilisticActor``, without its wrapping.
     """
@@ -58,18 +57,10 @@ class ConditionedActor(Policy):
     _dist_sample = ProbabilisticTensorDictModule._dist_sample
 
     def __init__(
-        self,
-        encoder: Encoder,
-        told: Sequence[str],
-        *,
-        width: int | Sequence[int],
-        depth: int,
-        squash: bool,
-        distribution: DistributionName | None,
-        init_std: float,
-        out_keys: Sequence[NestedKey] | None,
+        self, encoder: Encoder, extras: Sequence[str], *, out_keys: Sequence[NestedKey] | None, **head: Any
     ) -> None:
         super().__init__()
+        distribution = head["distribution"]
         if distribution is not None and any(encoder.config.get(name) for name in _ALTERING):
             raise ValueError(
                 f"{', '.join(_ALTERING[:-1])} and {_ALTERING[-1]} must be 0 with a distribution: in training mode they "
@@ -77,18 +68,11 @@ class ConditionedActor(Policy):
                 "actor.stochastic()"
             )
         self.encoder = encoder
-        self.head = ActionHead(encoder.width, width, depth, squash, distribution, init_std)
+        self.head = ActionHead(encoder.width, **head)
         self.plans, self.tasks, self.in_keys = encoder.plans, encoder.tasks, encoder.in_keys
         drawn = () if distribution is None else ("loc", "scale", "action_log_prob")
-        self._written = ("action", *told, *drawn)
-        self.config = {
-            **encoder.config,
-            "width": width,
-            "depth": depth,
-            "squash": squash,
-            "distribution": distribution,
-            "init_std": init_std,
-        }
+        self._written = ("action", *extras, *drawn)
+        self.config = {**encoder.config, **head}
         self.out_keys = as_keys("out_keys", out_keys, self._written)
 
     @property
@@ -103,7 +87,14 @@ class ConditionedActor(Policy):
         self._out_keys = self._out_keys_apparent = self.config["out_keys"] = named
         if self.head.distribution is not None:  # where KLPENPPOLoss looks for it
             action, *_, loc, scale, log_prob = named
-            self.sampler = self.head.sampler(loc, scale, action, log_prob)
+            self.sampler = ProbabilisticTensorDictModule(
+                in_keys={"loc": loc, "scale": scale},
+                out_keys=[action],
+                distribution_class=DISTRIBUTIONS[self.head.distribution],
+                default_interaction_type=InteractionType.DETERMINISTIC,
+                return_log_prob=True,
+                log_prob_key=log_prob,
+            )
 
     def definition(self, task: str) -> Task | None:
         return self.encoder.definition(task)
@@ -115,32 +106,28 @@ class ConditionedActor(Policy):
         """What no trained parameter touches, see the encoder's."""
         return self.encoder.prepare(tensordict)
 
-    def told(self, encoding: Encoding) -> tuple[Tensor, ...]:
-        """What is written beside the action, of an encoding."""
+    def extras(self, encoding: Encoding) -> tuple[Tensor, ...]:
+        """What is written of an encoding beside the action."""
         return ()
 
     def act(self, *prepared: Tensor) -> tuple[Tensor, ...]:
         """From what :meth:`prepare` gives to a tensor for each of ``out_keys``."""
         if self.head.distribution is None:
             encoding = self.encoder.encode(*prepared)
-            return self.head(encoding.joined), *self.told(encoding)
-        *told, loc, scale = self.undrawn(*prepared)
+            return self.head(encoding.joined), *self.extras(encoding)
+        *extras, loc, scale = self.before_sampling(*prepared)
         dist = self.head.dist(loc, scale)
         action = dist.rsample() if interaction_type() is InteractionType.RANDOM else self.head.mode(loc)
         # PyTorch's log_prob raises for no rows.
-        return action, *told, loc, scale, dist.log_prob(action) if action.numel() else action.sum(-1)
+        return action, *extras, loc, scale, dist.log_prob(action) if action.numel() else action.sum(-1)
 
-    def undrawn(self, *prepared: Tensor) -> tuple[Tensor, ...]:
-        """From what :meth:`prepare` gives to what is told, ``loc`` and ``scale``."""
+    def before_sampling(self, *prepared: Tensor) -> tuple[Tensor, ...]:
+        """From what :meth:`prepare` gives to the extras, ``loc`` and ``scale``."""
         encoding = self.encoder.encode(*prepared)
-        return *self.told(encoding), *self.head.loc_scale(encoding.joined)
+        return *self.extras(encoding), *self.head.loc_scale(encoding.joined)
 
     def get_dist(self, tensordict: TensorDictBase) -> Distribution:
-        """The distribution of actions in these states, as losses ask for it.
-
-        Raises:
-            TypeError: the actor was made without one.
-        """
+        """The distribution of actions in these states, as losses ask for it; :class:`TypeError` without one."""
         return self.head.dist(*self._loc_scale(tensordict))
 
     def get_dist_params(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -160,10 +147,8 @@ class ConditionedActor(Policy):
         return dist.log_prob(action)
 
     def as_sequential(self) -> ProbabilisticTensorDictSequential:
-        """The same actor as a ProbabilisticTensorDictSequential, for code that wants one; its weights are these.
-
-        Raises:
-            TypeError: the actor was made without a distribution.
+        """The same actor as a ProbabilisticTensorDictSequential, on the same weights; :class:`TypeError` without a
+        distribution.
 
         Example:
             >>> import lw_torchrl as lw
@@ -172,7 +157,7 @@ class ConditionedActor(Policy):
             ['loc', 'scale']
         """
         self._require_distribution()
-        made = ProbabilisticTensorDictSequential(_Undrawn(self), self.sampler)
+        made = ProbabilisticTensorDictSequential(_BeforeSampling(self), self.sampler)
         made.spec = self.spec
         return made
 
@@ -188,36 +173,36 @@ class ConditionedActor(Policy):
         return self.head.loc_scale(self.encoder.encode(*self.prepare(tensordict)).joined)
 
     @property
-    def _drawn(self) -> list[NestedKey]:
+    def _sampling_keys(self) -> list[NestedKey]:
         return [] if self.head.distribution is None else self.out_keys_source[-3:]
 
     @property
     def dist_params_keys(self) -> list[NestedKey]:
         """Where ``loc`` and ``scale`` are written; none without a distribution."""
-        return self._drawn[:2]
+        return self._sampling_keys[:2]
 
     @property
     def log_prob_keys(self) -> list[NestedKey]:
         """Where the action's log-probability is written; none without a distribution."""
-        return self._drawn[2:]
+        return self._sampling_keys[2:]
 
     @property
     def dist_sample_keys(self) -> list[NestedKey]:
         """Where the action is written, if it is drawn."""
-        return self.out_keys_source[:1] if self._drawn else []
+        return self.out_keys_source[:1] if self._sampling_keys else []
 
     def stochastic(self, distribution: DistributionName = "tanh_normal", init_std: float = 0.3) -> Self:
-        """An actor with a distribution, whose mode is what this one does, as it is now: a copy, to be trained by RL.
+        """A copy with a distribution, whose mode is what this actor does, to be trained by RL.
 
         Its features have no noise, jitter, swaps nor hidden opening, which would change its likelihoods from call to
         call.
 
         Args:
             distribution: "tanh_normal", or "normal", whose actions the environment clips.
-            init_std: the standard deviation at first, as for :class:`PlanConditionedActor`.
+            init_std: the initial standard deviation, as for :class:`PlanConditionedActor`.
 
         Raises:
-            ValueError: it has a distribution already, or a wrong option.
+            ValueError: it has a distribution already.
 
         Example:
             >>> import lw_torchrl as lw
@@ -231,7 +216,7 @@ class ConditionedActor(Policy):
         found["options"] = self.config | {
             "distribution": distribution,
             "init_std": init_std,
-            **{name: 0.0 for name in _RANDOM_IN_TRAINING if name in self.config},
+            **{name: 0.0 for name in ("feature_noise", *_ALTERING) if name in self.config},
             "out_keys": [*self.out_keys_source, "loc", "scale", key_beside(self.out_keys_source[0], "_log_prob")],
         }
         with torch.random.fork_rng(devices=[]):
@@ -250,7 +235,7 @@ class ConditionedActor(Policy):
         self.encoder.fit_contacts(observation, task_id)
 
 
-class _Undrawn(TensorDictModuleBase):
+class _BeforeSampling(TensorDictModuleBase):
     """All of an actor but the draw of its action, which reads ``loc`` and ``scale``."""
 
     def __init__(self, actor: ConditionedActor) -> None:
@@ -260,4 +245,4 @@ class _Undrawn(TensorDictModuleBase):
 
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return write(tensordict, self, self.actor.undrawn(*self.actor.prepare(tensordict)))
+        return write(tensordict, self, self.actor.before_sampling(*self.actor.prepare(tensordict)))

@@ -15,11 +15,12 @@ from torchrl.envs import Transform
 from lw_torchrl._checks import check_int, checked
 from lw_torchrl._keys import as_keys, check_apart, check_key, dispatched, read, write
 from lw_torchrl.language.plans import ConditionalPlan, Plans
-from lw_torchrl.modules.action_head import DistributionName
 from lw_torchrl.modules.encoder import Encoder
-from lw_torchrl.modules.networks import ACTION_SIZE, check_width, head
+from lw_torchrl.modules.networks import ACTION_SIZE, DistributionName, check_width, head
 from lw_torchrl.modules.plan_conditioned_actor import PlanConditionedActor
 from lw_torchrl.modules.plan_encoder import PlanEncoder
+
+_OWN = ("ensemble", "width", "depth", "layer_norm", "out_keys")  # options of a critic, not of its encoder
 
 
 class Value(TensorDictModuleBase):
@@ -30,14 +31,11 @@ class Value(TensorDictModuleBase):
 
     Args:
         encoder: what it is conditioned on; one that is an actor's too is trained by both.
-        ensemble: E, networks on the one encoder. TorchRL's losses copy the whole critic themselves, as often as their
-            ``num_qvalue_nets`` says, and draw the copies' weights anew.
+        ensemble: E, networks on the one encoder. TorchRL's losses copy the whole critic ``num_qvalue_nets`` times
+            themselves, and draw the copies' weights anew.
         width, depth: hidden layers; a tuple of widths says both.
         layer_norm: a LayerNorm behind each hidden layer.
         out_keys: other names for what it writes, in the order above; nested ones too.
-
-    Raises:
-        ValueError: a wrong option.
 
     Example:
         >>> import lw_torchrl as lw, torch
@@ -76,7 +74,7 @@ class Value(TensorDictModuleBase):
         )
 
     def transform(self) -> Transform | None:
-        """A new transform that writes what it reads and the environment does not give; None for none."""
+        """As :meth:`Policy.transform`."""
         return self.encoder.transform()
 
     def fit_normalization(self, observation: Tensor, weights: Tensor | None = None) -> None:
@@ -106,11 +104,8 @@ class QValue(Value):
     Args:
         encoder, ensemble, width, depth, layer_norm, out_keys: as for :class:`Value`.
         action_key: where the action is; may be nested.
-        quantiles: Q, how many quantiles of the return are the value, as ``torchrl.objectives.TQCLoss`` wants it; 1 for
+        quantiles: Q, how many quantiles of the return are the value, as ``torchrl.objectives.TQCLoss`` needs it; 1 for
             its mean.
-
-    Raises:
-        ValueError: a wrong option.
 
     Source: ``torchrl.modules.ValueOperator``.
     """
@@ -146,14 +141,13 @@ class QValue(Value):
 
 
 class PlanConditionedValue(Value):
-    """:class:`Value` on a :class:`PlanEncoder`: of a state, for who carries out a plan.
+    """:class:`Value` on a :class:`PlanEncoder`.
 
     Reads ``observation`` (B, 39) float32, ``task_id`` (B,) int64 and ``qaf`` (B, S) bool; writes as :class:`Value`.
 
     Args:
         plans: a plan for each task that will be seen.
-        ensemble, width, depth, layer_norm, out_keys: as for :class:`Value`.
-        **options: of :class:`PlanEncoder`, ``features`` say.
+        **options: of :class:`Value` and of :class:`PlanEncoder`; ``out_keys`` are the value's.
 
     Example:
         >>> import lw_torchrl as lw
@@ -163,32 +157,20 @@ class PlanConditionedValue(Value):
     Source: ``torchrl.modules.ValueOperator``.
     """
 
-    @checked
-    def __init__(
-        self,
-        plans: Plans | Mapping[str, ConditionalPlan],
-        *,
-        ensemble: int = 1,
-        width: int | tuple[int, ...] = 256,
-        depth: int = 2,
-        layer_norm: bool = True,
-        out_keys: Sequence[NestedKey] | None = None,
-        **options: Any,
-    ) -> None:
-        networks: dict[str, Any] = {"ensemble": ensemble, "width": width, "depth": depth, "layer_norm": layer_norm}
-        super().__init__(PlanEncoder(plans, **options), out_keys=out_keys, **networks)
+    def __init__(self, plans: Plans | Mapping[str, ConditionalPlan], **options: Any) -> None:
+        own = {name: options.pop(name) for name in _OWN if name in options}
+        super().__init__(PlanEncoder(plans, **options), **own)
 
 
 class PlanConditionedQValue(QValue):
-    """:class:`QValue` on a :class:`PlanEncoder`: of an action, for who carries out a plan.
+    """:class:`QValue` on a :class:`PlanEncoder`.
 
     Reads ``observation`` (B, 39) float32, ``task_id`` (B,) int64, ``qaf`` (B, S) bool and ``action`` (B, 4) float32;
     writes as :class:`QValue`.
 
     Args:
         plans: a plan for each task that will be seen.
-        ensemble, width, depth, layer_norm, action_key, quantiles, out_keys: as for :class:`QValue`.
-        **options: of :class:`PlanEncoder`, ``features`` say.
+        **options: of :class:`QValue` and of :class:`PlanEncoder`; ``out_keys`` are the value's.
 
     Example:
         >>> import lw_torchrl as lw
@@ -199,23 +181,9 @@ class PlanConditionedQValue(QValue):
     Source: ``torchrl.modules.ValueOperator``.
     """
 
-    @checked
-    def __init__(
-        self,
-        plans: Plans | Mapping[str, ConditionalPlan],
-        *,
-        ensemble: int = 1,
-        width: int | tuple[int, ...] = 256,
-        depth: int = 2,
-        layer_norm: bool = True,
-        action_key: NestedKey = "action",
-        quantiles: int = 1,
-        out_keys: Sequence[NestedKey] | None = None,
-        **options: Any,
-    ) -> None:
-        networks: dict[str, Any] = {"ensemble": ensemble, "width": width, "depth": depth, "layer_norm": layer_norm}
-        networks |= {"action_key": action_key, "quantiles": quantiles}
-        super().__init__(PlanEncoder(plans, **options), out_keys=out_keys, **networks)
+    def __init__(self, plans: Plans | Mapping[str, ConditionalPlan], **options: Any) -> None:
+        own = {name: options.pop(name) for name in (*_OWN, "action_key", "quantiles") if name in options}
+        super().__init__(PlanEncoder(plans, **options), **own)
 
 
 @checked
@@ -241,7 +209,7 @@ def plan_actor_value(
     Example:
         >>> import lw_torchrl as lw
         >>> from torchrl.objectives import ClipPPOLoss
-        >>> loss = ClipPPOLoss(*lw.plan_actor_value(lw.load_plans("MT10")))
+        >>> loss = ClipPPOLoss(*lw.modules.plan_actor_value(lw.load_plans("MT10")))
 
     Source: ``torchrl.modules.ActorValueOperator``.
     """

@@ -37,34 +37,18 @@ class Encoding(NamedTuple):
         return torch.cat((self.latent, self.features), -1)
 
 
-class Encoder(TensorDictModuleBase):
-    """From what is to be done, and where things are, to a latent and features.
-
-    A subclass splits its work in two, :meth:`prepare`, which no trained parameter touches and which checks the values,
-    and :meth:`encode`, which can be vmapped over parameters. As a module of its own it writes ``encoding``
-    (B, D + F) float32, for networks of yours.
+class Prepared(TensorDictModuleBase):
+    """What policies and encoders share: they read ``in_keys``, know tasks, and say what must run before them.
 
     Attributes:
         config: the keyword arguments that make it again, as JSON.
         plans: the plans that it is conditioned on; None for none.
         tasks: the names of the tasks that it knows.
-        features: what it sees of the observation.
-        latent_size: D.
-
-    Source: paper section 'Plan Conditioning'.
     """
 
     config: dict[str, Any]
     plans: Plans | None = None
     tasks: tuple[str, ...]
-    features: ObservationFeatures
-    latent_size: int
-    text_encoder: TextEncoder | None = None
-
-    @property
-    def width(self) -> int:
-        """D + F, the width of ``encoding``."""
-        return self.latent_size + self.features.width
 
     def definition(self, task: str) -> Task | None:
         """What it knows of a task: its plan's definition, or the shipped one; None if it knows none."""
@@ -79,23 +63,49 @@ class Encoder(TensorDictModuleBase):
         return read(tensordict, self.in_keys)
 
     def prepare(self, tensordict: TensorDictBase) -> tuple[Tensor, ...]:
-        """What no trained parameter touches; all checks of values are here."""
-        raise NotImplementedError(f"{type(self).__name__} must override prepare and encode")
+        """What no trained parameter touches, and all checks of values, outside of vmap."""
+        raise NotImplementedError(f"{type(self).__name__} must override prepare")
+
+    def fit_contacts(self, observation: Tensor, task_id: Tensor) -> None:
+        """Take from demonstrations, (R, 39) float32 and (R,) int64, where the hand touches things, in place; by default
+        there is nothing to take."""
+
+
+class Encoder(Prepared):
+    """From what is to be done, and where things are, to a latent and features.
+
+    A subclass splits its work into :meth:`prepare`, which no trained parameter touches and which checks the values,
+    and :meth:`encode`, which can be vmapped over parameters. As a module it writes ``encoding`` (B, D + F) float32,
+    for networks of yours.
+
+    Attributes:
+        config, plans, tasks: as for :class:`Prepared`.
+        features: what it sees of the observation.
+        latent_size: D.
+
+    Source: paper section 'Plan Conditioning'.
+    """
+
+    features: ObservationFeatures
+    latent_size: int
+    text_encoder: TextEncoder | None = None
+
+    @property
+    def width(self) -> int:
+        """D + F, the width of ``encoding``."""
+        return self.latent_size + self.features.width
 
     def encode(self, *prepared: Tensor) -> Encoding:
         """From what :meth:`prepare` gives."""
-        raise NotImplementedError(f"{type(self).__name__} must override prepare and encode")
+        raise NotImplementedError(f"{type(self).__name__} must override encode")
 
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``encoding``."""
         return write(tensordict, self, [self.encode(*self.prepare(tensordict)).joined])
 
-    def fit_contacts(self, observation: Tensor, task_id: Tensor) -> None:
-        """Take from demonstrations where the hand touches things, in place; here there is nothing to take."""
-
     def describe(self) -> dict[str, Any]:
-        """What a description of its actor needs beside the options, as JSON: the plans, say."""
+        """What a description of its actor needs beside the options, as JSON."""
         return {}
 
     def with_plans(self, plans: Plans | Mapping[str, ConditionalPlan]) -> Encoder:

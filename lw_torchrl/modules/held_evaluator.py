@@ -10,9 +10,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import Compose, Transform
 
-from lw_torchrl._blocks import in_blocks
 from lw_torchrl._checks import check_int, checked
-from lw_torchrl._devices import device_of
+from lw_torchrl._devices import device_of, in_blocks
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.networks import evaluating
@@ -24,27 +23,26 @@ _MOST = 2**16  # steps; a policy file with more would be refused
 
 
 class HeldEvaluator(QueryEvaluator):
-    """Another evaluator, asked now and then, as one acts with a costly one: in step t of its episode, 0 at the reset, a
-    row is given the answers of step every · ⌊max(t - delay, 0) / every⌋.
+    """Another evaluator, asked every k steps, as suits a costly one: in step t of its episode, 0 at the reset, a row is
+    given the answers of step every · ⌊max(t - delay, 0) / every⌋.
 
-    Reads ``qaf_held_logits`` (B, S) float32 and gives them as they are. ``transform()`` writes them: it runs the
-    evaluator, in eval mode and without gradients, on the rows of the environment whose answers are due, in blocks of
-    one size, so that results do not depend on the number of rows. Behind the evaluator's own transform, whose cameras
-    then draw no picture in vain. Steps are those of the environment; a ``_step`` or ``_reset`` mask counts for its rows
-    alone; after ``load_state_dict`` the environment must be reset.
+    Reads ``qaf_held_logits`` (B, S) float32 and gives them as they are. ``transform()`` writes them, behind the
+    evaluator's own transform: it runs the evaluator, in eval mode and without gradients, on the rows of the environment
+    whose answers are due, in blocks of one size, so that results do not depend on the number of rows. Cameras draw
+    only the pictures that are looked at. A ``_step`` or ``_reset`` mask counts for its rows alone; after
+    ``load_state_dict`` the environment must be reset.
 
     Rows of a replay buffer have no such steps: train with the evaluator itself, and hold it when acting.
 
     Args:
-        evaluator: what is asked; with :attr:`plans`, its plans.
-        every: steps of a row's episode from one asking to the next, from 1 to 65,536.
+        evaluator: what is asked; its plans are ``plans``.
+        every: steps of a row's episode between questions, from 1 to 65,536.
         delay: steps until answers are shown, from 0 to 65,536; until then a row is given those of its reset.
 
     Attributes:
         evaluator: what is asked.
 
     Raises:
-        TypeError: ``evaluator`` is no :class:`QueryEvaluator`, or a number is no integer.
         ValueError: it is a HeldEvaluator, or a number is out of its range; at call time, there are no held answers.
 
     Example:
@@ -63,8 +61,6 @@ class HeldEvaluator(QueryEvaluator):
 
     @checked
     def __init__(self, evaluator: QueryEvaluator, *, every: int = 1, delay: int = 0) -> None:
-        if not isinstance(evaluator, QueryEvaluator):
-            raise TypeError(f"evaluator must be a QueryEvaluator, got {type(evaluator).__name__}")
         if isinstance(evaluator, HeldEvaluator):
             raise ValueError("evaluator must be no HeldEvaluator: hold the one inside it, its .evaluator")
         super().__init__(evaluator.plans)
@@ -75,7 +71,7 @@ class HeldEvaluator(QueryEvaluator):
 
     @property
     def text_encoder(self) -> TextEncoder | None:
-        """That of what is asked, if it reads texts; files are checked by it."""
+        """The evaluator's, if it reads texts; files are checked by it."""
         return getattr(self.evaluator, "text_encoder", None)
 
     @property
@@ -94,14 +90,14 @@ class HeldEvaluator(QueryEvaluator):
         return held
 
     def ask(self, tensordict: TensorDictBase) -> Tensor:
-        """What the evaluator says of n rows with what it reads, (n, S) float32, of each whatever rows stand beside."""
+        """The evaluator's logits (n, S) float32 of n rows; each row's do not depend on the other rows."""
         with torch.no_grad(), evaluating(self.evaluator):
             asked = in_blocks(self.evaluator)(tensordict.to(device_of(self.evaluator)))
         found: Tensor = asked.get(self.evaluator.out_keys_source[0])
         return found
 
     def transform(self) -> Transform:
-        """A new one, which asks; behind that of the evaluator, if it has one."""
+        """A new transform that asks, behind the evaluator's own."""
         asks = HeldAnswers(
             self.ask,
             self.plans.num_steps,
@@ -123,7 +119,7 @@ class HeldEvaluator(QueryEvaluator):
         return HeldEvaluator(self.evaluator.made_for(plans), **self.config)
 
     def with_plans(self, plans: Plans) -> HeldEvaluator:
-        """One that asks the same weights about other plans' conditions: training either trains both."""
+        """As :meth:`QueryEvaluator.with_plans`."""
         return HeldEvaluator(self.evaluator.with_plans(plans), **self.config).train(self.training)
 
     def describe(self) -> dict[str, Any]:

@@ -3,18 +3,149 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from math import sqrt
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torchrl.modules import MLP
 
 from lw_torchrl._checks import check_choice, check_int, checked
 from lw_torchrl._rendering import check_cameras
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.text import TextEncoder
-from lw_torchrl.modules.clause_evaluator import ClauseEvaluator
-from lw_torchrl.modules.pointing_network import PointingNetwork, SmallImageEncoder
+from lw_torchrl.modules.clause_evaluator import ClauseEvaluator, Clauses
+from lw_torchrl.modules.state_query_evaluator import ClauseNetwork
 from lw_torchrl.transforms.camera import CameraTransform
+
+KEYS = 32  # numbers by which a thing is found in a picture
+_KEPT = 16  # numbers of what is seen there that tell where it is
+_LANDMARKS = 32  # that are sought in a picture whatever is asked
+_SHARP = 30.0  # what scores count in the softmax over a picture's places: at 1 a fresh network looks everywhere at once
+
+
+class SmallImageEncoder(nn.Module):
+    """Pictures (n, 3, H, W) float32 in [0, 1] to a map of features (n, 32, H/2, W/2): five convolutions, the inner ones
+    at a quarter of the size, to see further."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.fine = nn.Sequential(_conv(3, 16, stride=2), _conv(16, 24))
+        self.coarse = nn.Sequential(_conv(24, 48, stride=2), _conv(48, 48), _conv(48, 48))
+        self.joined = nn.Conv2d(24 + 48, 32, 1)
+
+    def forward(self, pictures: Tensor) -> Tensor:
+        fine = self.fine(pictures - 0.5)
+        coarse = nn.functional.interpolate(self.coarse(fine), fine.shape[-2:], mode="bilinear", align_corners=False)
+        return self.joined(torch.cat((fine, coarse), -3)).relu()
+
+
+def _conv(before: int, after: int, stride: int = 1) -> nn.Sequential:
+    return nn.Sequential(nn.Conv2d(before, after, 3, stride, 1), nn.GroupNorm(4, after), nn.ReLU())
+
+
+class PointingNetwork(ClauseNetwork):
+    """Points at things in pictures, and judges clauses by where they are.
+
+    A thing is a vector of its own, or, of a clause's text, two that the text gives. In each camera's picture it is
+    compared with the features of every place; the softmax over the places is where it points. From the places' mean
+    coordinates and features in all pictures, and from the mean coordinates of some landmarks, which are the same for
+    all things, an MLP gives the thing's four numbers: its position in metres, and how far it is open. Clauses are
+    judged by the difference of the two things' numbers, as by :class:`ClauseNetwork`.
+
+    Source: the spatial softmax of 'Deep spatial autoencoders for visuomotor learning' (Finn et al., 2016).
+
+    Args:
+        encoder: pictures (n, 3, H, W) float32 in [0, 1] to a map of features (n, F, h, w).
+        features: F, the size of a place's features.
+        cameras: C, side by side in a row's pictures.
+        names: N, how many things there are; 0 for a network that reads texts.
+        width, depth, predicates, text_size: as for :class:`ClauseNetwork`.
+    """
+
+    numbers = 4
+    ends = 2 * KEYS + 2
+
+    def __init__(
+        self,
+        encoder: nn.Module,
+        features: int,
+        *,
+        cameras: int,
+        names: int,
+        width: int,
+        depth: int,
+        predicates: int,
+        text_size: int,
+    ) -> None:
+        super().__init__(width, depth, predicates=predicates, text_size=text_size)
+        self.encoder, self.cameras = encoder, cameras
+        self.key = nn.Conv2d(features, KEYS, 1)
+        self.seen = nn.Conv2d(features, _KEPT, 1)
+        self.landmarks = nn.Conv2d(features, _LANDMARKS, 1)
+        if names:
+            self.names = nn.Embedding(names, KEYS)
+        self.place = MLP(
+            in_features=cameras * (2 + _KEPT + 2 * _LANDMARKS) + KEYS,
+            out_features=self.numbers,
+            num_cells=[width, width],
+            activation_class=nn.ReLU,
+        )
+
+    def forward(self, seen: Tensor, clauses: Clauses, text_vectors: Tensor | None = None) -> Tensor:
+        """As :class:`ClauseNetwork`, of pictures (B, H, W·C, 3) uint8 side by side."""
+        if not self.reads_text:
+            return self.tell(self.places(seen, self.names.weight)[0], clauses)
+        assert text_vectors is not None
+        read = self.texts(text_vectors)
+        things, gates, shift, asked = read.split([2 * KEYS, 2, self.numbers, self.width + 1], -1)
+        places = self.places(seen, things.unflatten(-1, (2, -1)).flatten(0, 1))[0].unflatten(-2, (-1, 2))
+        ends = gates.sigmoid().unsqueeze(-1) * places  # (B, U, 2, 4)
+        d = ends[..., 0, :] - ends[..., 1, :] + 0.1 * shift
+        picked = d.gather(-2, clauses.text.unsqueeze(-1).expand(*clauses.text.shape, self.numbers))
+        return self.judge(picked, asked[clauses.text], None)
+
+    def tell(self, places: Tensor, clauses: Clauses) -> Tensor:
+        """The logits (B, Q) of clauses (B, Q) about named things at places (B, N, 4)."""
+        known = torch.cat((places, torch.zeros_like(places[:, :1])), -2)
+        first, second = (
+            known.gather(-2, which.unsqueeze(-1).expand(*which.shape, self.numbers))
+            for which in (clauses.subject, clauses.object)
+        )
+        return self.judge(first - second, self.predicates.weight[clauses.predicate], clauses.negated)
+
+    def places(self, seen: Tensor, things: Tensor) -> tuple[Tensor, Tensor]:
+        """Where things are.
+
+        Args:
+            seen: (B, H, W·C, 3) uint8.
+            things: (N, 32) float32, their vectors.
+
+        Returns:
+            (B, N, 4) float32, positions in metres and how far they are open; and where they are seen,
+            (B, C, N, h, w) float32, which sums to 1 over each picture.
+        """
+        rows = len(seen)
+        pictures = seen.unflatten(-2, (self.cameras, -1)).permute(0, 2, 4, 1, 3).flatten(0, 1)
+        features = self.encoder(pictures.to(torch.float32) / 255.0)
+        height, width = features.shape[-2:]
+        scores = torch.einsum("nk,bkp->bnp", things, self.key(features).flatten(-2))
+        pointed = (_SHARP / sqrt(KEYS) * scores).softmax(-1)
+        grid = torch.stack(
+            torch.meshgrid(
+                torch.linspace(-1.0, 1.0, height, device=seen.device),
+                torch.linspace(-1.0, 1.0, width, device=seen.device),
+                indexing="ij",
+            )
+        ).flatten(-2)
+        values = torch.cat((grid.expand(len(features), -1, -1), self.seen(features).flatten(-2)), -2)
+        there = torch.einsum("bnp,bfp->bnf", pointed, values)  # (B·C, N, 2 + 16)
+        there = there.unflatten(0, (rows, self.cameras)).transpose(1, 2).flatten(-2)
+        marks = (_SHARP * self.landmarks(features).flatten(-2)).softmax(-1) @ grid.T  # (B·C, 32, 2)
+        marks = marks.reshape(rows, 1, -1).expand(-1, len(things), -1)
+        places = self.place(torch.cat((there, marks, things.expand(rows, -1, -1)), -1))
+        return places, pointed.unflatten(0, (rows, self.cameras)).unflatten(-1, (height, width))
+
 
 IMAGE_ENCODERS: dict[str, Callable[[], nn.Module]] = {"small": SmallImageEncoder}
 """What makes an encoder of pictures, by name: a module from (n, 3, H, W) float32 in [0, 1] to a map of features
@@ -24,21 +155,20 @@ _LARGEST = 512
 
 
 class ImageQueryEvaluator(ClauseEvaluator):
-    """Answers conditions from pictures, trained on the query answering function's answers, which it never asks.
+    """Answers conditions from pictures, by a network that was trained on the query answering function's answers.
 
     Reads ``pixels`` (B, height, width·C, 3) uint8, of C cameras side by side, and ``task_id`` (B,) int64; writes
     ``qaf_logits`` (B, S) float32, positive where a condition of the row's plan holds, -1e4 beyond its last step. A
     condition's clauses are answered one by one, by pointing at the things that they name, see
-    :class:`~lw_torchrl.modules.pointing_network.PointingNetwork`. ``transform()`` is the :class:`CameraTransform` that
-    takes its pictures.
+    :class:`PointingNetwork`. ``transform()`` is the :class:`CameraTransform` that takes its pictures.
 
     Args:
         plans: whose conditions it answers.
         cameras, height, width: as for :class:`CameraTransform`; at most 512 pixels.
         every: steps from one picture to the next when it acts; in between its answers stay.
         encoder: a name in :data:`IMAGE_ENCODERS`.
-        structure: a clause is read as the query language parses it, its things by name. False: all that is known of a
-            clause is its text's vector.
+        structure: a clause is read as the query language parses it, its things by name. False: only its text's vector
+            is known.
         hidden, depth: hidden layers of what judges differences.
         predicates: with ``structure``, the relations and predicates that it can tell; None for all that there are.
         names: with ``structure``, the things that it can tell; None for those of the plans' tasks.
@@ -52,7 +182,7 @@ class ImageQueryEvaluator(ClauseEvaluator):
     Example:
         >>> import lw_torchrl as lw
         >>> plans = lw.load_plans("MT10")
-        >>> actor = lw.ScriptedSkillActor(plans, evaluator=lw.ImageQueryEvaluator(plans))
+        >>> actor = lw.ScriptedSkillActor(plans, evaluator=lw.modules.ImageQueryEvaluator(plans))
         >>> actor.in_keys
         ['observation', 'task_id', 'pixels']
         >>> actor.transform().shape
@@ -64,7 +194,7 @@ class ImageQueryEvaluator(ClauseEvaluator):
     network: PointingNetwork
     seen_dims = 3
     rows_at_once = 4
-    """As many rows are evaluated together when it acts, whatever else there is, so that results hang on no other."""
+    """So many rows are evaluated together when it acts, so that results do not depend on other rows."""
 
     @checked
     def __init__(
@@ -96,10 +226,10 @@ class ImageQueryEvaluator(ClauseEvaluator):
         self.height, self.width = height, width
         self.in_keys = ["pixels", "task_id"]
         check_choice("encoder", encoder, IMAGE_ENCODERS)
-        eye = IMAGE_ENCODERS[encoder]()
+        image_encoder = IMAGE_ENCODERS[encoder]()
         self.network = PointingNetwork(
-            eye,
-            _features(eye, encoder, height, width),
+            image_encoder,
+            _num_features(image_encoder, encoder, height, width),
             cameras=len(self.cameras),
             names=len(self.names),
             width=hidden,
@@ -121,7 +251,7 @@ class ImageQueryEvaluator(ClauseEvaluator):
             self.config |= {"predicates": list(self.predicates), "names": list(self.names)}
 
     def transform(self) -> CameraTransform:
-        """A new one, which takes its pictures."""
+        """A new transform that takes its pictures."""
         return CameraTransform(self.cameras, height=self.height, width=self.width, every=self.every)
 
     def check_seen(self, seen: Tensor) -> None:
@@ -135,9 +265,9 @@ class ImageQueryEvaluator(ClauseEvaluator):
 
 
 @torch.no_grad()
-def _features(eye: nn.Module, name: str, height: int, width: int) -> int:
-    """F, of an encoder's map of features, at which it is looked once."""
-    found = eye(torch.zeros(1, 3, height, width))
+def _num_features(encoder: nn.Module, name: str, height: int, width: int) -> int:
+    """F, of the map of features that an encoder gives for a picture of zeros."""
+    found = encoder(torch.zeros(1, 3, height, width))
     if not isinstance(found, Tensor) or found.dim() != 4 or len(found) != 1 or not found.is_floating_point():
         shape = tuple(found.shape) if isinstance(found, Tensor) else type(found).__name__
         raise ValueError(

@@ -1,22 +1,25 @@
-"""The networks that policies and critics are made of."""
+"""The networks that policies and critics are made of, and the head from an encoding to an action."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
-from torchrl.modules import MLP
+from torch.distributions import Distribution
+from torchrl.modules import MLP, IndependentNormal, TanhNormal
 
-from lw_torchrl._checks import check_int
+from lw_torchrl._checks import check_choice, check_flag, check_int, check_scale
 
 ACTION_SIZE = 4
 
 
 @contextmanager
 def evaluating(network: nn.Module) -> Iterator[None]:
-    """The network is in evaluation's mode meanwhile, and each of its modules in its own again afterwards."""
+    """Within the block the network is in eval mode; afterwards each of its modules is in its own mode again."""
     modes = [(module, module.training) for module in network.modules()]
     network.eval()
     try:
@@ -27,8 +30,8 @@ def evaluating(network: nn.Module) -> Iterator[None]:
 
 
 def unit_scale(vectors: Tensor) -> Tensor:
-    """Texts' vectors (n, E), rescaled so that their numbers are of size 1; encoders give vectors of length 1, whose
-    numbers are so small that a fresh network hardly tells texts apart."""
+    """Texts' vectors (n, E), rescaled to numbers of size 1: those of vectors of length 1 are so small that a fresh
+    network hardly tells texts apart."""
     vectors = vectors.to(torch.float32)
     return vectors / vectors.square().mean(-1, keepdim=True).sqrt().clamp(min=1e-6)
 
@@ -63,3 +66,80 @@ def head(size: int, out: int, width: int | Sequence[int], depth: int, *, layer_n
         norm_class=nn.LayerNorm if layer_norm else None,
         norm_kwargs=[{"normalized_shape": cells} for cells in widths] if layer_norm else None,
     )
+
+
+_LEAST_STD = 1e-3
+
+DistributionName = Literal["tanh_normal", "normal"]
+DISTRIBUTIONS: dict[str, Callable[[Tensor, Tensor], Distribution]] = {
+    "tanh_normal": TanhNormal,
+    "normal": IndependentNormal,
+}
+
+
+class ActionHead(nn.Module):
+    """An MLP to the action, and to its standard deviation where there is a distribution.
+
+    Args:
+        size: of the encoding.
+        width, depth: hidden layers; a tuple of widths says both.
+        squash: keep each number of the action in (-1, 1) by tanh; a "tanh_normal" does so itself.
+        distribution: None, "tanh_normal" or "normal".
+        init_std: the initial standard deviation of the Normal: before tanh for "tanh_normal".
+    """
+
+    def __init__(
+        self,
+        size: int,
+        width: int | Sequence[int],
+        depth: int,
+        squash: bool = True,
+        distribution: DistributionName | None = None,
+        init_std: float = 0.3,
+    ) -> None:
+        super().__init__()
+        check_flag("squash", squash)
+        if distribution is not None:
+            check_choice("distribution", distribution, DISTRIBUTIONS)
+        if distribution == "tanh_normal" and not squash:
+            raise ValueError("squash must be true for the distribution 'tanh_normal', which squashes; take 'normal'")
+        if check_scale("init_std", init_std) <= _LEAST_STD:
+            raise ValueError(f"init_std must be over {_LEAST_STD}, got {init_std}")
+        self.squash, self.distribution = squash, distribution
+        self.network = head(size, ACTION_SIZE * (1 if distribution is None else 2), width, depth)
+        self._first = math.log(math.expm1(init_std - _LEAST_STD)) if init_std < 20 else init_std
+        if distribution is not None:  # the same at every state, until it is trained
+            with torch.no_grad():
+                self.network[-1].weight[ACTION_SIZE:] = 0.0
+                self.network[-1].bias[ACTION_SIZE:] = 0.0
+
+    def forward(self, encoding: Tensor) -> Tensor:
+        """(..., size) float32 to the action (..., 4) float32, the distribution's mode where there is one."""
+        return self.mode(self.loc_scale(encoding)[0]) if self.distribution else self._squashed(self.network(encoding))
+
+    def loc_scale(self, encoding: Tensor) -> tuple[Tensor, Tensor]:
+        """(..., size) float32 to the Normal's mean and standard deviation, (..., 4) float32 each."""
+        loc, scale = self.network(encoding).chunk(2, -1)
+        if self.distribution == "normal":
+            loc = self._squashed(loc)
+        return loc, nn.functional.softplus(scale + self._first) + _LEAST_STD
+
+    def mode(self, loc: Tensor) -> Tensor:
+        """The action that the Normal's mean stands for."""
+        return torch.tanh(loc) if self.distribution == "tanh_normal" else loc
+
+    def dist(self, loc: Tensor, scale: Tensor) -> Distribution:
+        """The distribution of actions."""
+        assert self.distribution is not None
+        return DISTRIBUTIONS[self.distribution](loc, scale)
+
+    def _squashed(self, action: Tensor) -> Tensor:
+        return torch.tanh(action) if self.squash else action
+
+    def copy_from(self, other: ActionHead) -> None:
+        """Take the weights of a head without a distribution; the standard deviation stays as it is."""
+        for own, theirs in zip([*self.network][:-1], [*other.network][:-1], strict=True):
+            own.load_state_dict(theirs.state_dict())
+        with torch.no_grad():
+            self.network[-1].weight[:ACTION_SIZE] = other.network[-1].weight
+            self.network[-1].bias[:ACTION_SIZE] = other.network[-1].bias

@@ -15,13 +15,7 @@ from lw_torchrl.language.value_checks import check_finite
 
 Features = Literal["raw", "differences", "relative", "opening", "both"]
 _FINE, _COARSE = 0.02, 0.1  # metres: where the two squashed copies of each difference bend
-_WIDTH = {
-    "raw": OBSERVATION_SIZE,
-    "differences": 54 + 2,
-    "relative": 54,
-    "opening": 1,
-    "both": OBSERVATION_SIZE + 54 + 2,
-}
+_WIDTH = {"raw": OBSERVATION_SIZE, "differences": 56, "relative": 54, "opening": 1, "both": OBSERVATION_SIZE + 56}
 
 
 def relative(observation: Tensor) -> Tensor:
@@ -56,9 +50,8 @@ class ObservationFeatures(nn.Module):
     In training mode Gaussian noise is added to the normalised features, drawn from PyTorch's global generator.
 
     Args:
-        kind: "raw", the 39 numbers; "differences", see :func:`differences`; "relative", these without the
-            hand's height and the gripper's opening; "opening", the last alone; "both", the 39 numbers and the
-            differences.
+        kind: "raw", the 39 numbers; "differences", see :func:`differences`; "relative", see :func:`relative`;
+            "opening", the gripper's opening alone; "both", the 39 numbers and the differences.
         noise: standard deviation of the noise, in standard deviations of each feature.
 
     Attributes:
@@ -95,16 +88,11 @@ class ObservationFeatures(nn.Module):
 
     @torch.no_grad()
     def fit(self, observation: Tensor, weights: Tensor | None = None) -> None:
-        """Take mean and standard deviation from observations, in place.
-
-        A feature that hardly varies is centred and left at its scale.
+        """Take mean and standard deviation from observations, in place. A feature that hardly varies keeps its scale.
 
         Args:
-            observation: (..., 39) float32, R in all.
-            weights: how much each counts, (R,) float32, with the sum 1; None for all alike.
-
-        Raises:
-            ValueError: the observations hold NaN or infinity.
+            observation: (..., 39) float32, R in all; finite.
+            weights: of each, (R,) float32, with the sum 1; None for equal ones.
         """
         found = self._select(observation.reshape(-1, OBSERVATION_SIZE))
         if weights is None:

@@ -26,14 +26,14 @@ def attend(logits: Tensor, steps: Tensor) -> Tensor:
     return logits.masked_fill(~steps, -torch.inf).softmax(-1)
 
 
-def strength(logits: Tensor, answers: Answers, scale: float) -> Tensor:
-    """What an evaluator's logits (...,) count in the softmax, where exact truth counts 5 and -5.
+def attention_logits(logits: Tensor, answers: Answers, scale: float) -> Tensor:
+    """What an evaluator's logits (...,) count in the attention's softmax, where exact truth counts 5 and -5.
 
     "logit": what they are. "tanh": 5·tanh(scale·logit), which at 0.5 is the paper's 10·p - 5 of the probability p.
     "hard": 5 above 0 and else -5; its gradient is that of "tanh", straight through.
 
     Example:
-        >>> strength(torch.tensor([0.4, -8.0]), "hard", 0.5)
+        >>> attention_logits(torch.tensor([0.4, -8.0]), "hard", 0.5)
         tensor([ 5., -5.])
     """
     if answers == "logit":
@@ -45,7 +45,7 @@ def strength(logits: Tensor, answers: Answers, scale: float) -> Tensor:
 
 
 def check_truth(qaf: Tensor, shape: tuple[int, ...]) -> None:
-    """Raise :class:`ValueError` unless truth has one column for each step, and soft truth is of numbers from 0 to 1."""
+    """Raise :class:`ValueError` unless truth has a column for each step, and soft truth is from 0 to 1."""
     if qaf.shape != shape:
         raise ValueError(
             f"qaf must have shape {shape}, one column for each step of the actor's plans, got {tuple(qaf.shape)}; give "
@@ -67,7 +67,7 @@ class PlanAttention(TensorDictModuleBase):
         in_keys, out_keys: other names for what it reads and writes, in the order above; nested ones too.
 
     Raises:
-        ValueError: at call time, ``qaf`` of another number of steps, outside of [0, 1] or, where ``qaf_plan`` says so,
+        ValueError: at call time, ``qaf`` of another number of steps, outside [0, 1] or, as ``qaf_plan`` tells,
             of other plans; a task_id without a plan.
 
     Example:

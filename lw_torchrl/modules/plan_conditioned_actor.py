@@ -12,18 +12,18 @@ from torch import Tensor
 from lw_torchrl._checks import check_choice, checked
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.text import TextEncoder
-from lw_torchrl.modules.action_head import DistributionName
 from lw_torchrl.modules.conditioned_actor import ConditionedActor, noise_of_features
 from lw_torchrl.modules.encoder import Encoding
+from lw_torchrl.modules.networks import DistributionName
 from lw_torchrl.modules.observation_features import Features
 from lw_torchrl.modules.plan_attention import Answers
 from lw_torchrl.modules.plan_encoder import PlanEncoder
-from lw_torchrl.modules.query_evaluator import QueryEvaluator, evaluator_from_description
+from lw_torchrl.modules.query_evaluator import QueryEvaluator, evaluator_from_description, plans_and_evaluator
 
 
 class PlanConditionedActor(ConditionedActor):
     """Plan Conditioned Behavioral Cloning's policy: each skill's text is encoded to a latent, the conditions' truth
-    gives attention over the steps, the mixed latent and the observation give the action.
+    gives attention over the steps, and the mixed latent and the observation give the action.
 
     Reads ``observation`` (B, 39) float32, ``task_id`` (B,) int64 and ``qaf`` (B, S) bool; writes ``action`` (B, 4)
     float32 in (-1, 1), ``skill_weights`` (B, S) float32 and ``skill_latent`` (B, D) float32; with a distribution also
@@ -35,31 +35,30 @@ class PlanConditionedActor(ConditionedActor):
             actions.
         features: what the decoder sees of the observation: "raw", the 39 numbers; "differences", the pairwise
             differences between hand, objects and goal, the hand's height and the gripper's opening; "relative", the
-            differences alone; "opening", the gripper's opening alone, for ``roles``; "both", see
-            :class:`ObservationFeatures`.
+            differences alone; "opening", the gripper's opening alone, for ``roles``; "both", raw and differences.
         feature_noise: standard deviation of the noise on the normalised features while training; None for 0.05, or 0
             with a distribution, whose likelihoods must not change from call to call.
-        focus: the decoder also sees the way between the things that the steps in force compare, see :class:`PlanFocus`.
-        roles: the decoder also sees the way from the thing that the step in force moves to its target, see
-            :class:`PlanRoles`: for tasks that were not demonstrated.
-        jitter: metres by which that way is moved at random while training, where the gripper pushes.
-        swap_unmentioned: the probability with which, in training, an object or the goal is put where it is in another
-            row, where no step in force mentions it, or with ``roles`` moves it or to it.
-        hide_opening: the probability with which, in training, the gripper's opening is another row's, where no step in
-            force closes it: it often tells which task this is.
+        focus: the decoder also sees the relative positions of what the steps in force compare, see :class:`PlanFocus`.
+        roles: the decoder also sees the target's position relative to what the step in force moves, see
+            :class:`~lw_torchrl.modules.relative_positions.PlanRoles`: for tasks that were not demonstrated.
+        jitter: standard deviation, in metres, of noise on that position while training, where the gripper pushes.
+        swap_unmentioned: the probability, in training, that an object or the goal is put where it is in another row,
+            if no step in force mentions it, or with ``roles`` moves it or to it.
+        hide_opening: the probability, in training, that the gripper's opening is another row's, if no step in force
+            closes it: it often tells which task this is.
         latent_size: D.
         width, depth: hidden layers of the action decoder; a tuple of widths says both.
         encoder_width, encoder_depth: hidden layers of the skill encoder.
         squash: keep each number of the action in (-1, 1) by tanh; without, as in the paper, the environment clips.
-        distribution: None, for an actor that is sure of itself; for RL "tanh_normal", a Normal through tanh, or
-            "normal", about the action, clipped by the environment: ``action`` is then drawn from it under
+        distribution: None for a deterministic actor; for RL "tanh_normal", a Normal through tanh, or "normal", about
+            the action, clipped by the environment: ``action`` is then drawn from it under
             ``set_exploration_type(ExplorationType.RANDOM)``, as collectors do, and its mode otherwise.
-        init_std: the Normal's standard deviation at first, in every state.
+        init_std: the Normal's initial standard deviation, in every state.
         evaluator: answers the conditions in the place of ``qaf``, which is then not read; see :class:`QueryEvaluator`.
         answers: what an evaluator's logit counts in the attention's softmax, where exact truth counts 5 and -5:
             "logit", what it is; "tanh", 5·tanh(answer_scale·logit); "hard", 5 or -5 by its sign, with the gradient of
             "tanh".
-        answer_scale: of these; 0.5 makes "tanh" the paper's 10·p - 5 of the probability p.
+        answer_scale: the scale in "tanh" and "hard"; 0.5 makes "tanh" the paper's 10·p - 5 of the probability p.
         text_encoder: texts to vectors (n, E) float32; None for the shipped sentence encoder.
         in_keys, out_keys: other names for what it reads and writes, in the order above; nested ones too.
 
@@ -152,7 +151,7 @@ class PlanConditionedActor(ConditionedActor):
 
     @property
     def evaluator(self) -> QueryEvaluator | None:
-        """What answers the conditions in the place of ``qaf``."""
+        """What answers the conditions in the place of ``qaf``; None for nothing."""
         return self.encoder.evaluator
 
     @classmethod
@@ -164,7 +163,7 @@ class PlanConditionedActor(ConditionedActor):
             options["evaluator"] = evaluator_from_description(asked, plans, text_encoder)
         return cls(plans, text_encoder=text_encoder, **options)
 
-    def told(self, encoding: Encoding) -> tuple[Tensor, ...]:
+    def extras(self, encoding: Encoding) -> tuple[Tensor, ...]:
         """Attention (B, S) and the mixed latent (B, D)."""
         assert encoding.weights is not None
         return encoding.weights, encoding.latent
@@ -177,26 +176,23 @@ class PlanConditionedActor(ConditionedActor):
         steps = self.encoder.latents()[prepared[1]]  # (B, S, D)
         seen = encoding.features.unsqueeze(-2).expand(*steps.shape[:-1], -1)
         actions = self.head(encoding._replace(latent=steps, features=seen).joined)
-        return (encoding.weights.unsqueeze(-1) * actions).sum(-2), *self.told(encoding)
+        return (encoding.weights.unsqueeze(-1) * actions).sum(-2), *self.extras(encoding)
 
     @classmethod
     def from_description(
         cls, found: Mapping[str, Any], text_encoder: TextEncoder | None = None
     ) -> PlanConditionedActor:
-        plans = Plans.from_json(found["plans"])
-        asked = found.get("evaluator")
-        evaluator = None if asked is None else evaluator_from_description(asked, plans, text_encoder)
+        plans, evaluator = plans_and_evaluator(found, text_encoder)
         return cls(plans, evaluator=evaluator, text_encoder=text_encoder, **found["options"])
 
     def with_evaluator(
         self, evaluator: QueryEvaluator, *, answers: Answers = "hard", answer_scale: float = 0.5
     ) -> PlanConditionedActor:
-        """An actor with the same weights that reads its conditions from an evaluator in the place of ``qaf``: training
-        either trains both.
+        """An actor on the same weights that asks an evaluator in the place of ``qaf``: training either trains both.
 
         Args:
             evaluator: of its plans; the actor's own is replaced.
-            answers, answer_scale: as for the class; "hard", since the weights know truth of 5 and -5 alone.
+            answers, answer_scale: as for the class; "hard", since the weights only know truth of 5 and -5.
 
         Example:
             >>> import lw_torchrl as lw

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, get_args
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -11,37 +11,28 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import Transform
 
-from lw_torchrl._checks import check_choice, check_probability, check_scale, checked
+from lw_torchrl._checks import check_probability, check_scale, checked
 from lw_torchrl._keys import as_keys, check_apart
-from lw_torchrl.language.observation import OPENING
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.skill_words import closes
 from lw_torchrl.language.text import TextEncoder, encoded
+from lw_torchrl.modules.augmentation import hide_opening, mentioned, swap_unmentioned
 from lw_torchrl.modules.encoder import Encoder, Encoding
-from lw_torchrl.modules.mentions import mentioned, swap_unmentioned
 from lw_torchrl.modules.networks import text_to_latent, unit_scale
 from lw_torchrl.modules.observation_features import Features, ObservationFeatures
-from lw_torchrl.modules.plan_attention import Answers, PlanAttention, attend, strength
-from lw_torchrl.modules.plan_focus import PlanFocus
-from lw_torchrl.modules.plan_roles import PlanRoles
-from lw_torchrl.modules.plan_ways import PlanWays
-from lw_torchrl.modules.query_evaluator import QueryEvaluator
-from lw_torchrl.transforms.qaf import QAFTransform, plan_number_key, plan_program
+from lw_torchrl.modules.plan_attention import Answers, PlanAttention, attend, attention_logits
+from lw_torchrl.modules.query_evaluator import (
+    QueryEvaluator,
+    check_evaluator,
+    condition_keys,
+    condition_transform,
+    describe_plans,
+)
+from lw_torchrl.modules.relative_positions import PlanFocus, PlanRoles, RelativePositions
+from lw_torchrl.transforms.qaf import plan_number_key, plan_program
 from lw_torchrl.transforms.random_yaw import yaw_key
 
 IN_FORCE = 0.01  # a step whose condition does not hold beside one that does has a weight of 1e-4
-
-
-def check_evaluator(evaluator: Any, plans: Plans) -> QueryEvaluator | None:
-    """Return what is given as an actor's evaluator, if it is one of the actor's plans, or None."""
-    if evaluator is None:
-        return None
-    if not isinstance(evaluator, QueryEvaluator):
-        given = f"the class {evaluator.__name__}" if isinstance(evaluator, type) else type(evaluator).__name__
-        raise TypeError(f"evaluator must be a QueryEvaluator, made for the plans: MyEvaluator(plans); got {given}")
-    if evaluator.plans.fingerprint != plans.fingerprint:
-        raise ValueError("evaluator must be of the actor's plans, it answers the conditions of others")
-    return evaluator
 
 
 class PlanEncoder(Encoder):
@@ -63,7 +54,7 @@ class PlanEncoder(Encoder):
 
     Raises:
         ValueError: as for :class:`PlanConditionedActor`; at call time, an evaluator's logits of another shape.
-        TypeError: an evaluator that is none; at call time, one whose logits are no floats.
+        TypeError: an evaluator that is none; at call time, logits that are no floats.
 
     Example:
         >>> import lw_torchrl as lw
@@ -119,13 +110,10 @@ class PlanEncoder(Encoder):
             raise ValueError(f"hide_opening: features='relative' do not show the opening; got {hide_opening}")
         if jitter and not roles:
             raise ValueError(f"jitter moves the way of the roles, and roles is False; got jitter={jitter}")
-        check_choice("answers", answers, get_args(Answers))
         if evaluator is None and (answers, answer_scale) != ("logit", 0.5):
             raise ValueError("answers and answer_scale are of an evaluator's logits, and evaluator is None")
         self.tasks = tuple(self.plans)
-        read = ("observation", "task_id") if evaluator is not None else ("observation", "task_id", "qaf")
-        own = as_keys("in_keys", in_keys, read)
-        self.in_keys = list(dict.fromkeys([*own, *([] if evaluator is None else evaluator.in_keys)]))
+        own, self.in_keys = condition_keys(in_keys, evaluator)
         self.out_keys = as_keys("out_keys", out_keys, ("encoding",))
         check_apart(self.in_keys, self.out_keys)
         self._answered = plan_number_key(own[-1])
@@ -163,21 +151,19 @@ class PlanEncoder(Encoder):
 
     @property
     def width(self) -> int:
-        return super().width + sum(part.width for part in self._ways)
+        return super().width + sum(part.width for part in self._relative)
 
     @property
-    def _ways(self) -> list[PlanWays]:
+    def _relative(self) -> list[RelativePositions]:
         return [part for part in (self.focus, self.roles) if part is not None]
 
     def transform(self) -> Transform | None:
         """Query answers, or what the evaluator reads."""
-        if self.evaluator is not None:
-            return self.evaluator.transform()
-        return QAFTransform(self.plans, in_keys=self.in_keys[:2], out_keys=self.in_keys[2:])
+        return condition_transform(self.plans, self.in_keys, self.evaluator)
 
     def prepare(self, tensordict: TensorDictBase) -> tuple[Tensor, ...]:
         """What no trained parameter touches: attention (B, S), the index of each step's skill (B, S) int64, and the
-        observation's features (B, F). With an evaluator, in the attention's place the steps that there are (B, S) bool,
+        observation's features (B, F). With an evaluator, the mask of real steps (B, S) bool in the attention's place,
         and behind the features what the evaluator reads."""
         observation, task, *rest = self.read(tensordict)
         rows = self.attention.tables.rows(task)
@@ -187,28 +173,24 @@ class PlanEncoder(Encoder):
         self.attention.tables.refuse_others(tensordict.get(self._answered, None), rows)
         weights = self.attention.over_steps(rest[0], rows)
         if self.training:
-            observation = self._altered(observation, weights, rows)
+            observation = self._augmented(observation, weights, rows)
         yaw = tensordict.get(yaw_key(self.in_keys[0]), None)
-        ways = [part(observation, weights, rows, yaw) for part in self._ways]
-        seen = torch.cat((self.features(observation), *ways), -1) if ways else self.features(observation)
+        relative = [part(observation, weights, rows, yaw) for part in self._relative]
+        seen = torch.cat((self.features(observation), *relative), -1) if relative else self.features(observation)
         return weights, self.skill_index[rows], seen
 
-    def _altered(self, observation: Tensor, weights: Tensor, rows: Tensor) -> Tensor:
-        """Training observations without what the steps in force say nothing of."""
+    def _augmented(self, observation: Tensor, weights: Tensor, rows: Tensor) -> Tensor:
+        """Training observations in which what the steps in force do not mention is another row's."""
         in_force = weights > IN_FORCE
         if probability := self.config["swap_unmentioned"]:
             kept = (in_force.unsqueeze(-1) & self.mentioned[rows]).any(-2)
             observation = swap_unmentioned(observation, kept, probability)
         if probability := self.config["hide_opening"]:
-            opening = observation[..., OPENING]
-            others = opening.flatten()[torch.randint(opening.numel(), opening.shape, device=opening.device)]
-            hidden = torch.rand_like(opening) < probability
-            observation = observation.clone()
-            observation[..., OPENING] = torch.where(hidden & ~(in_force & self.closing[rows]).any(-1), others, opening)
+            observation = hide_opening(observation, (in_force & self.closing[rows]).any(-1), probability)
         return observation
 
     def fit_contacts(self, observation: Tensor, task_id: Tensor) -> None:
-        """Take from demonstrations where the hand touches things, in place, see :meth:`PlanRoles.fit`."""
+        """As :meth:`PlanRoles.fit`."""
         if self.roles is not None:
             truth = plan_program(self.plans)(observation, task_id)
             rows = self.attention.tables.rows(task_id)
@@ -226,7 +208,7 @@ class PlanEncoder(Encoder):
                 f"logits of {type(self.evaluator).__name__} must be {tuple(steps.shape)}, a row for each observation, "
                 f"got shape {tuple(logits.shape)}"
             )
-        return attend(strength(logits, self.config["answers"], self.config["answer_scale"]), steps)
+        return attend(attention_logits(logits, self.config["answers"], self.config["answer_scale"]), steps)
 
     def encode(self, *prepared: Tensor) -> Encoding:
         """From what :meth:`prepare` gives."""
@@ -241,13 +223,12 @@ class PlanEncoder(Encoder):
         return self.texts(self.text_vectors)
 
     def describe(self) -> dict[str, Any]:
-        found = {"plans": self.plans.to_json()}
-        return found if self.evaluator is None else found | {"evaluator": self.evaluator.describe()}
+        return describe_plans(self.plans, self.evaluator)
 
     def with_plans(self, plans: Plans | Mapping[str, ConditionalPlan]) -> PlanEncoder:
         evaluator = None if self.evaluator is None else self.evaluator.with_plans(as_plans(plans))
         other = PlanEncoder(plans, evaluator=evaluator, text_encoder=self.text_encoder, **self.config)
         other.texts, other.features = self.texts, self.features
         if self.roles is not None and other.roles is not None:
-            other.roles.take_contact(self.roles)
+            other.roles.share_contact(self.roles)
         return other.train(self.training)

@@ -8,16 +8,15 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite
 from torchrl.envs import Compose, Transform
 
 from lw_torchrl._checks import check_choice, checked
-from lw_torchrl._keys import dispatched, read, write
+from lw_torchrl._keys import dispatched, write
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
-from lw_torchrl.language.tasks import TASKS, Task
 from lw_torchrl.language.text import TextEncoder
+from lw_torchrl.modules.encoder import Prepared
 from lw_torchrl.modules.networks import ACTION_SIZE
 from lw_torchrl.transforms.qaf import QAFTransform
 
@@ -31,7 +30,7 @@ POLICIES: dict[str, str | type[Policy]] = {
     "ResidualActor": "lw_torchrl.modules.residual_actor",
     "ScriptedSkillActor": "lw_torchrl.modules.scripted_skill_actor",
 }
-"""The class's name, as policy files say it, to the module that has the class, or to the class itself."""
+"""The name of a class, as in policy files, to the module that has the class, or to the class itself."""
 
 
 @dataclass(frozen=True)
@@ -52,28 +51,28 @@ METHODS: dict[str, Method] = {
     "dc": Method("DescriptorConditionedActor", {"condition": "description"}),
     "one-hot": Method("DescriptorConditionedActor", {"condition": "one-hot"}),
 }
-"""What ``train --method`` and ``reproduce --methods`` offer: on plans, on the task's description, on its number."""
+"""The choices of ``train --method`` and ``reproduce --methods``: on plans, the task's description, its number."""
 
 
-class Policy(TensorDictModuleBase):
+class Policy(Prepared):
     """A module that acts, and knows what it was made of.
 
-    A subclass splits its work in two, :meth:`prepare` and :meth:`act`; ``out_keys`` names what :meth:`act` returns, in
+    A subclass splits its work into :meth:`prepare` and :meth:`act`; ``out_keys`` names what :meth:`act` returns, in
     its order, the action first.
 
     Attributes:
-        config: the options that make it again, as JSON; what else it needs is for :meth:`describe` to tell and for
-            :meth:`from_description` to read, its tasks say.
+        config: the options that make it again, as JSON; :meth:`describe` adds what else it needs, its tasks for
+            example, and :meth:`from_description` reads that.
         plans: what it carries out; None where it is not conditioned on plans.
         tasks: the names of the tasks that it can act in.
-        plan_options: whether its class has options that speak of a plan's steps, ``focus`` say.
-        row_by_row: whether a row's action is the same to the last bit whatever rows stand beside it; networks' are
-            not, and are run on blocks of one size.
-        draws: whether its actions, without exploration, hang on numbers that it drew before, for other episodes too.
+        plan_options: whether its class has options about a plan's steps, like ``focus``.
+        row_by_row: whether a row's action is the same to the last bit whatever the other rows are; networks' are not,
+            and run on blocks of one size.
+        draws: whether its actions, without exploration, depend on random numbers drawn before, for other episodes too.
 
     Example:
-        A way of conditioning of one's own, here on nothing at all. Named in ``METHODS`` as well, it is trained and
-        evaluated by the command line; ``tests/test_extending.py`` has one that learns a vector for each task.
+        Your own way of conditioning, here on nothing at all. With an entry in ``METHODS`` the command line trains and
+        evaluates it; ``tests/test_extending.py`` has one that learns a vector for each task.
 
         >>> import lw_torchrl as lw, torch
         >>> from lw_torchrl.modules import POLICIES
@@ -102,9 +101,6 @@ class Policy(TensorDictModuleBase):
     Source: the contract that ``torchrl.objectives`` and :func:`lw_torchrl.evaluate` rely on.
     """
 
-    config: dict[str, Any]
-    plans: Plans | None = None
-    tasks: tuple[str, ...]
     plan_options: ClassVar[bool] = False
     row_by_row: ClassVar[bool] = False
     draws: bool = False
@@ -121,41 +117,21 @@ class Policy(TensorDictModuleBase):
         """One for the tasks of ``plans``."""
         raise NotImplementedError(f"{cls.__name__} must say how it is made for plans: override for_plans")
 
-    def definition(self, task: str) -> Task | None:
-        """What the policy knows of a task: its plan's definition, or the shipped one; None if it knows none."""
-        return TASKS.get(task) if self.plans is None else self.plans[task].definition
-
-    def transform(self) -> Transform | None:
-        """A new transform that writes what the policy reads and the environment does not give; None for none."""
-        return None
-
-    def prepare(self, tensordict: TensorDictBase) -> tuple[Tensor, ...]:
-        """What no trained parameter touches; all checks of values are here, outside of vmap."""
-        raise NotImplementedError(f"{type(self).__name__} must override prepare and act")
-
     def act(self, *prepared: Tensor) -> tuple[Tensor, ...]:
-        """From what :meth:`prepare` gives to a tensor for each of ``out_keys``; can be vmapped over parameters."""
-        raise NotImplementedError(f"{type(self).__name__} must override prepare and act")
+        """From what :meth:`prepare` gives to a tensor for each of ``out_keys``; it can be vmapped over parameters."""
+        raise NotImplementedError(f"{type(self).__name__} must override act")
 
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``out_keys``."""
         return write(tensordict, self, self.act(*self.prepare(tensordict)))
 
-    def read(self, tensordict: TensorDictBase) -> list[Tensor]:
-        """The tensors of ``in_keys``; :class:`ValueError` names those that are missing."""
-        return read(tensordict, self.in_keys)
-
     def fit_normalization(self, observation: Tensor, weights: Tensor | None = None) -> None:
-        """Take the statistics of observations (R, 39) float32, in place; ``weights`` (R,) float32, with the sum 1, tell
-        how much each counts. Here: there is nothing to normalise."""
-
-    def fit_contacts(self, observation: Tensor, task_id: Tensor) -> None:
-        """Take from demonstrations where the hand touches things, in place: ``observation`` (R, 39) float32,
-        ``task_id`` (R,) int64. Here: there is nothing to take."""
+        """Take the statistics of observations (R, 39) float32, each with a weight (R,) float32 of sum 1, in place; by
+        default there is nothing to normalise."""
 
     def describe(self) -> dict[str, Any]:
-        """All that :meth:`from_description` needs to make it again, its weights aside, as JSON."""
+        """All that :meth:`from_description` needs to make it again, but its weights, as JSON."""
         return {"kind": type(self).__name__, "options": self.config}
 
     @classmethod
@@ -164,23 +140,15 @@ class Policy(TensorDictModuleBase):
         return cls(**found["options"])
 
     def with_evaluator(self, evaluator: QueryEvaluator) -> Policy:
-        """The same weights, with the conditions answered by an evaluator.
-
-        Raises:
-            TypeError: the policy reads no conditions, or not so.
-        """
+        """The same weights, with the conditions answered by an evaluator; :class:`TypeError` if it reads none."""
         raise TypeError(
             f"with_evaluator is for PlanConditionedActor and ScriptedSkillActor, {type(self).__name__} has none; "
             "evaluate(..., evaluator=) answers any policy's conditions"
         )
 
     def with_plans(self, plans: Plans | Mapping[str, ConditionalPlan]) -> Policy:
-        """The same weights under other plans.
-
-        Raises:
-            TypeError: the policy is not conditioned on plans.
-        """
-        raise TypeError(f"with_plans is for policies with plans, {type(self).__name__} is conditioned on descriptions")
+        """The same weights under other plans; :class:`TypeError` if it is not conditioned on plans."""
+        raise TypeError(f"with_plans is for policies with plans, {type(self).__name__} has none")
 
 
 def policy_class(kind: Any) -> type[Policy]:
@@ -200,13 +168,10 @@ def make_policy(
     """A policy of a method for the tasks of some plans.
 
     Args:
-        method: one of :data:`METHODS`.
+        method: one of :data:`METHODS`; :class:`ValueError` names the nearest.
         plans: what it carries out, or, where the method knows no plans, the tasks that it is for.
         text_encoder: texts to vectors (n, E) float32; None for the shipped sentence encoder.
         **options: of the policy's class.
-
-    Raises:
-        ValueError: another method (with the nearest), or a wrong option.
 
     Example:
         >>> import lw_torchrl as lw
@@ -220,11 +185,8 @@ def make_policy(
 
 
 def from_description(found: Any, text_encoder: TextEncoder | None = None) -> Policy:
-    """Make the policy that :meth:`Policy.describe` described, with fresh weights.
-
-    Raises:
-        ValueError: it is no description, or of a kind that :data:`POLICIES` lacks.
-    """
+    """Make the policy that :meth:`Policy.describe` described, with fresh weights; :class:`ValueError` if it is no
+    description, or of a kind that :data:`POLICIES` lacks."""
     if not isinstance(found, Mapping) or not isinstance(found.get("options"), Mapping):
         raise ValueError(f"a policy's description must have kind and options, got {found!r:.80}")
     return policy_class(found.get("kind")).from_description(found, text_encoder)

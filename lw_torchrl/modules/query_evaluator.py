@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from typing import Any
 
@@ -14,16 +14,17 @@ from torch import Tensor
 from torchrl.envs import Transform
 
 from lw_torchrl._checks import check_choice, checked
-from lw_torchrl._keys import dispatched, write
+from lw_torchrl._keys import as_keys, dispatched, write
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.text import TextEncoder
+from lw_torchrl.transforms.qaf import QAFTransform
 
 EVALUATORS: dict[str, str | type[QueryEvaluator]] = {
     "HeldEvaluator": "lw_torchrl.modules.held_evaluator",
     "ImageQueryEvaluator": "lw_torchrl.modules.image_query_evaluator",
     "StateQueryEvaluator": "lw_torchrl.modules.state_query_evaluator",
 }
-"""The class's name, as policy files say it, to the module that has the class, or to the class itself."""
+"""The name of a class, as in policy files, to the module that has the class, or to the class itself."""
 
 
 class QueryEvaluator(TensorDictModuleBase):
@@ -31,7 +32,7 @@ class QueryEvaluator(TensorDictModuleBase):
 
     A subclass gives :meth:`logits` and, in ``config``, the keyword arguments that make it again beside the plans.
 
-    Reads ``in_keys``, ``observation`` (B, 39) float32 and ``task_id`` (B,) int64 unless it says otherwise; writes
+    Reads ``in_keys``, by default ``observation`` (B, 39) float32 and ``task_id`` (B,) int64; writes
     ``qaf_logits`` (B, S) float32, positive where a condition of the row's plan holds, in the order of its steps. The
     policy's attention is a softmax of the logits over the steps that there are, or of what ``answers`` of
     :class:`PlanConditionedActor` makes of them; exact truth is worth 5 and -5.
@@ -67,12 +68,8 @@ class QueryEvaluator(TensorDictModuleBase):
         raise NotImplementedError(f"{type(self).__name__} must override logits")
 
     def answers(self, *read: Tensor) -> Tensor:
-        """:meth:`logits`, as float32.
-
-        Raises:
-            TypeError: they are no floats.
-            ValueError: they have not a column for each of the plans' steps.
-        """
+        """:meth:`logits` as float32; :class:`TypeError` if they are no floats, :class:`ValueError` if they have not a
+        column for each of the plans' steps."""
         found = self.logits(*read)
         if not isinstance(found, Tensor) or not found.is_floating_point():
             given = found.dtype if isinstance(found, Tensor) else type(found).__name__
@@ -87,7 +84,7 @@ class QueryEvaluator(TensorDictModuleBase):
         return found.to(torch.float32)
 
     def transform(self) -> Transform | None:
-        """A new transform that writes what it reads and the environment does not give, pictures say; None for none."""
+        """A new transform that writes what it reads and the environment does not give; None for none."""
         return None
 
     @dispatched
@@ -96,11 +93,8 @@ class QueryEvaluator(TensorDictModuleBase):
         return write(tensordict, self, [self.answers(*(tensordict.get(key) for key in self.in_keys))])
 
     def with_plans(self, plans: Plans) -> QueryEvaluator:
-        """One with the same weights for the conditions of other plans: training either trains both.
-
-        Raises:
-            RuntimeError: the weights have other names or shapes there.
-        """
+        """One on the same weights for other plans' conditions: training either trains both. :class:`RuntimeError` if
+        the weights have other names or shapes there."""
         other = self.made_for(plans)
         other.load_state_dict(self.state_dict())
         for name, module in other.named_modules():
@@ -124,14 +118,55 @@ class QueryEvaluator(TensorDictModuleBase):
 
 
 def evaluator_from_description(found: Any, plans: Plans, text_encoder: TextEncoder | None = None) -> QueryEvaluator:
-    """Make the evaluator that :meth:`QueryEvaluator.describe` described, with fresh weights.
-
-    Raises:
-        ValueError: it is no description, or of a kind that :data:`EVALUATORS` lacks.
-    """
+    """Make the evaluator that :meth:`QueryEvaluator.describe` described, with fresh weights; :class:`ValueError` if it
+    is no description, or of a kind that :data:`EVALUATORS` lacks."""
     if not isinstance(found, Mapping) or not isinstance(found.get("options"), Mapping):
         raise ValueError(f"an evaluator's description must have kind and options, got {found!r:.80}")
     kind: str = check_choice("kind of evaluator", found.get("kind"), EVALUATORS)
     entry = EVALUATORS[kind]
     made = getattr(import_module(entry), kind) if isinstance(entry, str) else entry
     return made.from_options(plans, found["options"], text_encoder)
+
+
+def check_evaluator(evaluator: Any, plans: Plans) -> QueryEvaluator | None:
+    """Return what is given as an actor's evaluator, if it is one of the actor's plans, or None."""
+    if evaluator is None:
+        return None
+    if not isinstance(evaluator, QueryEvaluator):
+        given = f"the class {evaluator.__name__}" if isinstance(evaluator, type) else type(evaluator).__name__
+        raise TypeError(f"evaluator must be a QueryEvaluator, made for the plans: MyEvaluator(plans); got {given}")
+    if evaluator.plans.fingerprint != plans.fingerprint:
+        raise ValueError("evaluator must be of the actor's plans, it answers the conditions of others")
+    return evaluator
+
+
+def describe_plans(plans: Plans, evaluator: QueryEvaluator | None) -> dict[str, Any]:
+    """What a policy's description says of its plans and of what answers their conditions, as JSON."""
+    found: dict[str, Any] = {"plans": plans.to_json()}
+    return found if evaluator is None else found | {"evaluator": evaluator.describe()}
+
+
+def plans_and_evaluator(
+    found: Mapping[str, Any], text_encoder: TextEncoder | None
+) -> tuple[Plans, QueryEvaluator | None]:
+    """What :func:`describe_plans` described."""
+    plans, asked = Plans.from_json(found["plans"]), found.get("evaluator")
+    return plans, None if asked is None else evaluator_from_description(asked, plans, text_encoder)
+
+
+def condition_keys(
+    given: Sequence[NestedKey] | None, evaluator: QueryEvaluator | None
+) -> tuple[list[NestedKey], list[NestedKey]]:
+    """A policy's own ``in_keys``, and these with those of what answers its conditions."""
+    if evaluator is None:
+        own = as_keys("in_keys", given, ("observation", "task_id", "qaf"))
+        return own, own
+    own = as_keys("in_keys", given, ("observation", "task_id"))
+    return own, list(dict.fromkeys([*own, *evaluator.in_keys]))
+
+
+def condition_transform(plans: Plans, in_keys: list[NestedKey], evaluator: QueryEvaluator | None) -> Transform | None:
+    """A new transform that writes the query answers, or what the evaluator reads."""
+    if evaluator is not None:
+        return evaluator.transform()
+    return QAFTransform(plans, in_keys=in_keys[:2], out_keys=in_keys[2:])

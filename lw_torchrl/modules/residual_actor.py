@@ -10,35 +10,35 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs import Transform
 
-from lw_torchrl._checks import check_scale, checked
+from lw_torchrl._checks import check_choice, check_int, check_scale, checked, shown
 from lw_torchrl._keys import key_beside, read
+from lw_torchrl.language.plan_tables import PlanTables
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.tasks import Task
 from lw_torchrl.language.text import TextEncoder
-from lw_torchrl.modules.chosen_steps import as_table, check_same_skills, check_steps, weight_in_force
 from lw_torchrl.modules.conditioned_actor import ConditionedActor
 from lw_torchrl.modules.networks import ACTION_SIZE, head
-from lw_torchrl.modules.plan_encoder import PlanEncoder
+from lw_torchrl.modules.plan_encoder import IN_FORCE, PlanEncoder
 from lw_torchrl.modules.policy import Policy, from_description
 
 
 class ResidualActor(Policy):
-    """A policy that stays as it is, and a small network that corrects its actions; at first by nothing.
+    """A policy that stays as it is, and a small network that corrects its actions, at first by 0.
 
     Reads what the policy reads; writes ``action`` (B, 4) float32 in [-1, 1], the policy's plus ``scale`` times tanh of
     the network, cut off at ±1. The network sees the policy's encoding and its action.
 
-    Of ``steps`` of plans alone, the correction is multiplied by the attention to these steps. Where none of them is in
-    force, in other tasks too, the action is the policy's, bit for bit. Then ``skill_weights`` (B, S) float32, the
-    policy's, and ``action_corrected`` (B, 1) float32, what the correction is multiplied by, are written too.
+    With ``steps``, the correction is multiplied by the attention to these steps. Where none of them is in force, as in
+    other tasks, the action is the policy's, bit for bit. ``skill_weights`` (B, S) float32, the policy's, and
+    ``action_corrected`` (B, 1) float32, what the correction is multiplied by, are then written too.
 
     Args:
         base: a :class:`~lw_torchrl.PlanConditionedActor` or :class:`~lw_torchrl.DescriptorConditionedActor` without a
-            distribution. It is not trained any more, nor noisy, and not copied.
-        scale: how far an action can be corrected.
+            distribution. It is not trained any more, has no noise, and is not copied.
+        scale: the largest correction of a number of the action.
         width, depth: hidden layers of the network; a tuple of widths says both.
         steps: task name to the numbers of its plan's steps, counted from 0, where actions are corrected; None for
-            everywhere. A step also counts as in force where no condition of the plan holds, as for the policy.
+            everywhere. All steps are in force where no condition of the plan holds, as for the policy.
 
     Attributes:
         base: the policy.
@@ -47,7 +47,7 @@ class ResidualActor(Policy):
 
     Raises:
         TypeError: a base that is none of these.
-        ValueError: a base with a distribution, or that mixes actions; steps that its plans do not have; a wrong option.
+        ValueError: a base with a distribution, or that mixes actions; steps that its plans do not have.
 
     Example:
         >>> import lw_torchrl as lw
@@ -100,11 +100,11 @@ class ResidualActor(Policy):
             self.steps = self.config["steps"] = check_steps(steps, base.encoder.plans)
             action, weights, *_ = base.out_keys_source
             self.out_keys = [action, weights, key_beside(action, "_corrected")]
-            table = as_table(self.steps, base.encoder.attention.tables)
+            table = step_table(self.steps, base.encoder.attention.tables)
             self.register_buffer("chosen", table, persistent=False)
 
     def train(self, mode: bool = True) -> ResidualActor:
-        """As a module's, but for the base, whose features stay without noise."""
+        """As a module's, but the base stays in eval mode: its features have no noise."""
         super().train(mode)
         self.base.eval()
         return self
@@ -116,7 +116,7 @@ class ResidualActor(Policy):
         return self.base.transform()
 
     def prepare(self, tensordict: TensorDictBase) -> tuple[Tensor, ...]:
-        """As the base's; of steps, behind it which of each row's steps they are, (B, S) bool."""
+        """As the base's; with ``steps``, followed by the mask (B, S) bool of these among each row's steps."""
         prepared = self.base.prepare(tensordict)
         if self.steps is None:
             return prepared
@@ -126,21 +126,15 @@ class ResidualActor(Policy):
 
     def act(self, *prepared: Tensor) -> tuple[Tensor, ...]:
         """From what :meth:`prepare` gives to a tensor for each of ``out_keys``."""
+        encoding = self.base.encoder.encode(*(prepared if self.steps is None else prepared[:-1]))
+        action = self.base.head(encoding.joined)
+        more = self.config["scale"] * torch.tanh(self.network(torch.cat((encoding.joined, action), -1)))
         if self.steps is None:
-            encoding = self.base.encoder.encode(*prepared)
-            action, more = self._corrections(encoding.joined)
             return ((action + more).clamp(-1.0, 1.0),)
-        encoding = self.base.encoder.encode(*prepared[:-1])
         assert encoding.weights is not None
-        action, more = self._corrections(encoding.joined)
         weight = weight_in_force(encoding.weights, prepared[-1])
         corrected = (action + weight * more).clamp(-1.0, 1.0)
         return torch.where(weight > 0, corrected, action), encoding.weights, weight
-
-    def _corrections(self, encoding: Tensor) -> tuple[Tensor, Tensor]:
-        """The base's action, and what may be added to it, (B, 4) each."""
-        action = self.base.head(encoding)
-        return action, self.config["scale"] * torch.tanh(self.network(torch.cat((encoding, action), -1)))
 
     def describe(self) -> dict[str, Any]:
         return super().describe() | {"base": self.base.describe()}
@@ -153,12 +147,8 @@ class ResidualActor(Policy):
         return cls(from_description(base, text_encoder), **found["options"])
 
     def with_plans(self, plans: Plans | Mapping[str, ConditionalPlan]) -> ResidualActor:
-        """One that carries out other plans with the same weights: training either trains both.
-
-        Raises:
-            TypeError: the base is not conditioned on plans.
-            ValueError: the other plans do not have the steps where actions are corrected, with the same skills.
-        """
+        """One on the same weights for other plans: training either trains both; :class:`ValueError` if these lack the
+        steps where actions are corrected, with the same skills."""
         if self.steps is not None:
             assert self.plans is not None
             check_same_skills(self.steps, self.plans, as_plans(plans))
@@ -167,3 +157,60 @@ class ResidualActor(Policy):
         other = ResidualActor(base, **self.config)
         other.network = self.network
         return other.train(self.training)
+
+
+def check_steps(steps: Any, plans: Plans) -> dict[str, list[int]]:
+    """Steps of plans as JSON, with tasks and steps sorted, if the plans have them.
+
+    Example:
+        >>> import lw_torchrl as lw
+        >>> check_steps({"pick-place": (3, 1)}, lw.load_plans("MT10"))
+        {'pick-place': [1, 3]}
+    """
+    if not isinstance(steps, Mapping):
+        raise TypeError(f"steps must map names of tasks to steps of their plans, got {shown(steps)}")
+    if not steps:
+        raise ValueError("steps must name a step of a plan at least, got none")
+    found = {}
+    for task, numbers in steps.items():
+        there = len(plans[check_choice("steps: task", task, plans)].steps)
+        where = f"steps of {task!r}"
+        if isinstance(numbers, str) or not isinstance(numbers, Sequence):
+            raise TypeError(f"{where} must be a list of numbers, got {shown(numbers)}")
+        if len(numbers) > there:
+            raise ValueError(f"{where} must be different ones of its plan's {there}, got {len(numbers)}")
+        found[task] = sorted(check_int(where, number, minimum=0) for number in numbers)
+        if not found[task] or len(set(found[task])) != len(found[task]):
+            raise ValueError(f"{where} must be different ones of its plan's {there}, got {shown(numbers)}")
+        if found[task][-1] >= there:
+            raise ValueError(f"{where} must be from 0 to {there - 1}, got {shown(found[task][-1])}")
+    return dict(sorted(found.items()))
+
+
+def check_same_skills(steps: Mapping[str, Sequence[int]], plans: Plans, others: Plans) -> None:
+    """Raise :class:`ValueError` unless the steps are in other plans too, with the same skills."""
+    for task, numbers in check_steps(steps, others).items():
+        for number in numbers:
+            ours, theirs = plans[task].steps[number].skill, others[task].steps[number].skill
+            if ours != theirs:
+                raise ValueError(f"steps of {task!r}: step {number} must have the skill {ours!r}, got {theirs!r}")
+
+
+def step_table(steps: Mapping[str, Sequence[int]], tables: PlanTables) -> Tensor:
+    """(T, S) bool, a row for each task as in ``tables``: true of the steps."""
+    found = torch.zeros_like(tables.mask)
+    for task, numbers in steps.items():
+        found[tables.index.tasks.index(task), list(numbers)] = True
+    return found
+
+
+def weight_in_force(weights: Tensor, chosen: Tensor) -> Tensor:
+    """How much of the attention (B, S) float32 is on chosen steps (B, S) bool: (B, 1) float32 from 0 to 1, and exactly
+    0 where none of them is in force.
+
+    Example:
+        >>> weights = torch.tensor([[1e-4, 0.9999], [0.5, 0.5]])
+        >>> weight_in_force(weights, torch.tensor([True, False]).expand(2, 2)).flatten().tolist()
+        [0.0, 0.5]
+    """
+    return weights.masked_fill(~chosen | (weights <= IN_FORCE), 0.0).sum(-1, keepdim=True)

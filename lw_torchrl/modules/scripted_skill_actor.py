@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import Transform
 
-from lw_torchrl._checks import check_choice, check_int, checked, shown
+from lw_torchrl._checks import checked, shown
 from lw_torchrl._keys import as_keys, check_apart
 from lw_torchrl.language.plan_tables import PlanTables
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
@@ -19,10 +19,16 @@ from lw_torchrl.language.skill_program import SkillProgram
 from lw_torchrl.language.skills import ScriptedSkill
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.plan_attention import check_truth
-from lw_torchrl.modules.plan_encoder import check_evaluator
 from lw_torchrl.modules.policy import Policy
-from lw_torchrl.modules.query_evaluator import QueryEvaluator, evaluator_from_description
-from lw_torchrl.transforms.qaf import QAFTransform, plan_number_key
+from lw_torchrl.modules.query_evaluator import (
+    QueryEvaluator,
+    check_evaluator,
+    condition_keys,
+    condition_transform,
+    describe_plans,
+    plans_and_evaluator,
+)
+from lw_torchrl.transforms.qaf import plan_number_key
 
 
 class ScriptedSkillActor(Policy):
@@ -35,18 +41,18 @@ class ScriptedSkillActor(Policy):
 
     Args:
         plans: a plan for each task it is to act in; every step's skill is the text of a scripted one.
-        select: of several true steps, "first" takes the first, "random" any, the paper's way, and "mix" all of
-            them, in equal parts.
+        select: of several true steps, "first" takes the first, "random" any, as in the paper, and "mix" all of them,
+            in equal parts.
         skills: the scripted skills by text, as from :func:`load_skills`; None for the shipped ones.
-        seed: of the random choice, from 0 to 2**64 - 1, or down to -2**63.
+        seed: of the random choice, from -2**63 to 2**64 - 1.
         evaluator: answers the conditions in the place of ``qaf``, which is then not read: a step is true where its
             logit is positive; see :class:`QueryEvaluator`.
         in_keys, out_keys: other names for what it reads and writes, in the order above; nested ones too.
 
     Raises:
-        ValueError: a wrong option, a skill text that is no scripted skill (with the nearest), or one that speaks of
-            objects that its task lacks; at call time, ``qaf`` of another number of steps, outside of [0, 1], or of
-            other plans, as ``qaf_plan`` beside it tells.
+        ValueError: a skill text that is no scripted skill (with the nearest), or that names objects that its task
+            lacks; at call time, ``qaf`` of another number of steps, outside [0, 1], or of other plans, as ``qaf_plan``
+            beside it tells.
 
     Example:
         >>> import lw_torchrl as lw
@@ -73,15 +79,13 @@ class ScriptedSkillActor(Policy):
         self.plans: Plans = as_plans(plans)
         self.tasks = tuple(self.plans)
         self.evaluator = check_evaluator(evaluator, self.plans)
-        read = ("observation", "task_id") if evaluator is not None else ("observation", "task_id", "qaf")
-        own = as_keys("in_keys", in_keys, read)
-        self.in_keys = list(dict.fromkeys([*own, *([] if evaluator is None else evaluator.in_keys)]))
+        own, self.in_keys = condition_keys(in_keys, evaluator)
         self.out_keys = as_keys("out_keys", out_keys, ("action", "skill_weights"))
         check_apart(self.in_keys, self.out_keys)
         self.config = {"select": select, "seed": seed, "in_keys": own, "out_keys": self.out_keys}
-        if not -(2**63) <= check_int("seed", seed) < 2**64:
+        if not -(2**63) <= seed < 2**64:
             raise ValueError(f"seed must be from -2**63 to 2**64 - 1, got {shown(seed)}")
-        self.select = check_choice("select", select, ("first", "random", "mix"))
+        self.select = select
         self.draws = self.select == "random"
         self._skills = skills
         self.program = SkillProgram(
@@ -97,9 +101,7 @@ class ScriptedSkillActor(Policy):
 
     def transform(self) -> Transform | None:
         """Query answers, or what the evaluator reads."""
-        if self.evaluator is not None:
-            return self.evaluator.transform()
-        return QAFTransform(self.plans, in_keys=self.in_keys[:2], out_keys=self.in_keys[2:])
+        return condition_transform(self.plans, self.in_keys, self.evaluator)
 
     def with_plans(self, plans: Plans | Mapping[str, ConditionalPlan]) -> ScriptedSkillActor:
         """The same skills under other plans."""
@@ -115,14 +117,11 @@ class ScriptedSkillActor(Policy):
         """As :meth:`Policy.describe`; :class:`TypeError` with skills of one's own, which no policy file holds."""
         if self._skills is not None:
             raise TypeError("a ScriptedSkillActor with skills of your own cannot be saved: keep their file instead")
-        found = super().describe() | {"plans": self.plans.to_json()}
-        return found if self.evaluator is None else found | {"evaluator": self.evaluator.describe()}
+        return super().describe() | describe_plans(self.plans, self.evaluator)
 
     @classmethod
     def from_description(cls, found: Mapping[str, Any], text_encoder: TextEncoder | None = None) -> ScriptedSkillActor:
-        plans = Plans.from_json(found["plans"])
-        asked = found.get("evaluator")
-        evaluator = None if asked is None else evaluator_from_description(asked, plans, text_encoder)
+        plans, evaluator = plans_and_evaluator(found, text_encoder)
         return cls(plans, evaluator=evaluator, **found["options"])
 
     def _weights(self, qaf: Tensor, rows: Tensor) -> Tensor:

@@ -3,16 +3,107 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import sqrt
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torchrl.modules import MLP
 
-from lw_torchrl._checks import checked
-from lw_torchrl.language.observation import OBSERVATION_SIZE
+from lw_torchrl._checks import check_int, checked
+from lw_torchrl.language.observation import OBSERVATION_SIZE, OPENING, POSITIONS
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.text import TextEncoder
-from lw_torchrl.modules.clause_evaluator import ClauseEvaluator
-from lw_torchrl.modules.clause_network import ClauseNetwork
+from lw_torchrl.modules.clause_evaluator import ClauseEvaluator, Clauses
+from lw_torchrl.modules.networks import text_to_latent
+
+MOST = 30.0
+"""The size of the largest logit of a clause: a probability of 1e-13."""
+_SCALES = (0.005, 0.02, 0.1, 0.5)  # metres: where the squashed copies of d bend
+_SLOTS = len(POSITIONS) + 2  # the opening, and nothing, beside the positions
+
+
+class ClauseNetwork(nn.Module):
+    """What tells a clause's truth: a trunk on the difference d of two positions, and a vector of what is asked of it.
+
+    The logit is the product of the trunk's output and that vector. Both parts of a clause come
+
+    - from its structure: the two positions are those of the subject and the object, read where the tasks' table says
+      that they stand; each predicate has a vector of its own; "not" turns the sign. What is learned is the predicates,
+      as classes of d, whatever the objects are called;
+    - or from its text alone: its vector says which of the observation's positions (hand, first, second, goal, the
+      gripper's opening or none) the two are, by attention, what is added to d, and what is asked of it, "not" too. A
+      network then has to find out from examples what every name stands for.
+
+    Args:
+        width, depth: hidden layers of the trunk, and the width of the text's.
+        predicates: P, how many there are; 0 for a network that reads texts.
+        text_size: E, the numbers of a text's vector, where it reads texts.
+    """
+
+    numbers: int = 3  # of a difference
+    ends: int = 2 * _SLOTS  # numbers of a text's vector that say which two things it is about
+
+    def __init__(self, width: int, depth: int, *, predicates: int = 0, text_size: int = 0) -> None:
+        super().__init__()
+        check_int("width", width, minimum=1)
+        check_int("depth", depth, minimum=1)
+        self.width, self.reads_text = width, not predicates
+        self.trunk = MLP(
+            in_features=self.numbers * len(_SCALES),
+            out_features=width,
+            num_cells=[width] * (depth - 1),
+            activation_class=nn.ReLU,
+            activate_last_layer=True,
+        )
+        if predicates:
+            self.predicates = nn.Embedding(predicates, width + 1)
+        else:
+            self.texts = text_to_latent(text_size, self.ends + self.numbers + width + 1, width, 1)
+
+    def forward(self, observation: Tensor, clauses: Clauses, text_vectors: Tensor | None = None) -> Tensor:
+        """Answer.
+
+        Args:
+            observation: (B, 39) float32.
+            clauses: (B, C), those that are asked of each row.
+            text_vectors: (U, E) float32, of the texts that ``clauses.text`` numbers, where it reads texts.
+
+        Returns:
+            (B, C) float32, logits of size 30 at most, positive where the clause holds.
+        """
+        if self.reads_text:
+            assert text_vectors is not None
+            d, asked = self._from_text(observation, self.texts(text_vectors)[clauses.text])
+        else:
+            d, asked = _difference(observation, clauses), self.predicates.weight[clauses.predicate]
+        return self.judge(d, asked, None if self.reads_text else clauses.negated)
+
+    def judge(self, d: Tensor, asked: Tensor, negated: Tensor | None) -> Tensor:
+        """The logits (B, C) of differences d (B, C, 3) and what is asked of them (B, C, W + 1), with the opposite sign
+        where ``negated`` (B, C) bool."""
+        features = torch.cat([torch.tanh(d / scale) for scale in _SCALES], -1)
+        logits = (self.trunk(features.to(asked.dtype)) * asked[..., :-1]).sum(-1) / sqrt(self.width) + asked[..., -1]
+        if negated is not None:
+            logits = torch.where(negated, -logits, logits)
+        return logits.clamp(-MOST, MOST)
+
+    def _from_text(self, observation: Tensor, read: Tensor) -> tuple[Tensor, Tensor]:
+        """d (B, C, 3), and what is asked of it (B, C, W + 1), of what is read of texts (B, C, ...)."""
+        first, second, shift, asked = read.split([_SLOTS, _SLOTS, 3, self.width + 1], -1)
+        opening = observation[..., OPENING]
+        zero = torch.zeros_like(opening)
+        positions = [observation[..., place] for place in POSITIONS]
+        gripper, nothing = (torch.stack((zero, zero, last), -1) for last in (opening, zero))
+        slots = torch.stack([*positions, gripper, nothing], -2)
+        chosen = (first.softmax(-1) - second.softmax(-1)).unsqueeze(-1) * slots.unsqueeze(-3)
+        return chosen.sum(-2) + 0.1 * shift, asked
+
+
+def _difference(observation: Tensor, clauses: Clauses) -> Tensor:
+    """d (B, C, 3), metres, where the tasks' table says that the two things stand."""
+    numbers = torch.cat((observation, torch.zeros_like(observation[..., :1])), -1)
+    first, second = (numbers.gather(-1, index.flatten(-2)) for index in (clauses.first, clauses.second))
+    return (first - second).unflatten(-1, (-1, 3)) + clauses.shift
 
 
 class StateQueryEvaluator(ClauseEvaluator):
@@ -20,18 +111,17 @@ class StateQueryEvaluator(ClauseEvaluator):
 
     Reads ``observation`` (B, 39) float32 and ``task_id`` (B,) int64; writes ``qaf_logits`` (B, S) float32, positive
     where a condition of the row's plan holds, -1e4 beyond its last step. A condition's clauses are answered one by one,
-    each once in a task, and put together as :func:`~lw_torchrl.modules.clause_network.conjunction` says, so that new
-    conjunctions need no training.
+    see :class:`~lw_torchrl.modules.clause_evaluator.ClauseEvaluator`, so that new conjunctions need no training.
 
     Args:
         plans: whose conditions it answers.
         structure: a clause is read as the query language parses it: its predicate by number, its objects' positions
             where the tasks' table says that they stand in the observation, "not" as the opposite. Only what the
-            predicates mean is learned. False: all that is known of a clause is its text's vector.
+            predicates mean is learned. False: only a clause's text vector is known.
         width, depth: hidden layers.
         predicates: with ``structure``, the relations and predicates that it can tell; None for all that there are.
         text_encoder: without ``structure``, texts to vectors (n, E) float32; None for the sentence encoder, which
-            wants the extra ``[text]``: clauses' vectors are not shipped.
+            needs the extra ``[text]``: clauses' vectors are not shipped.
 
     Raises:
         ValueError: a wrong option; a plan asks for a predicate that is not among ``predicates``; at call time, an

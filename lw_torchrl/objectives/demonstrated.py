@@ -101,7 +101,7 @@ class DemonstratedTD3Loss(TD3BCLoss):
         >>> from torchrl.objectives import SoftUpdate
         >>> plans = lw.load_plans("MT10")
         >>> actor, critic = lw.PlanConditionedActor(plans), lw.PlanConditionedQValue(plans)
-        >>> loss = lw.DemonstratedTD3Loss(actor, critic, bounds=(-1.0, 1.0))
+        >>> loss = lw.objectives.DemonstratedTD3Loss(actor, critic, bounds=(-1.0, 1.0))
         >>> loss.make_value_estimator(gamma=0.99)
         >>> targets = SoftUpdate(loss, eps=0.995)
         >>> "is_demonstration" in loss.in_keys
@@ -198,7 +198,7 @@ class DemonstratedSACLoss(SACLoss):
         >>> from torchrl.objectives import SoftUpdate
         >>> plans = lw.load_plans("MT10")
         >>> actor = lw.PlanConditionedActor(plans).stochastic("tanh_normal", init_std=0.2)
-        >>> loss = lw.DemonstratedSACLoss(actor, lw.PlanConditionedQValue(plans), bc_weight=2.0)
+        >>> loss = lw.objectives.DemonstratedSACLoss(actor, lw.PlanConditionedQValue(plans), bc_weight=2.0)
         >>> loss.make_value_estimator(gamma=0.99)
         >>> targets = SoftUpdate(loss, eps=0.995)
 

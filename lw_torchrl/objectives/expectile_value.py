@@ -52,7 +52,7 @@ class ExpectileValueLoss(LossModule):
         >>> from tensordict import TensorDict
         >>> from torchrl.objectives import SoftUpdate
         >>> from lw_torchrl.modules import DescriptorEncoder, Value
-        >>> loss = lw.ExpectileValueLoss(Value(DescriptorEncoder("MT10"), ensemble=2), expectile=0.7)
+        >>> loss = lw.objectives.ExpectileValueLoss(Value(DescriptorEncoder("MT10"), ensemble=2), expectile=0.7)
         >>> loss = loss.make_value_estimator(gamma=0.99)
         >>> targets = SoftUpdate(loss, eps=0.995)
         >>> state = {"observation": torch.rand(5, 39), "task_id": torch.full((5,), lw.task_id("reach"))}

@@ -43,7 +43,7 @@ class SkillLatentLoss(LossModule):
     Example:
         >>> import lw_torchrl as lw
         >>> actor = lw.PlanConditionedActor(lw.load_plans("MT10"))
-        >>> sorted(lw.SkillLatentLoss(actor)().keys())
+        >>> sorted(lw.objectives.SkillLatentLoss(actor)().keys())
         ['loss_latents']
 
     Source: paper, what it leaves to future work: 'regularization or contrastive learning'. "consistency": Tung, Mori,

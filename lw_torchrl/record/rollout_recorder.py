@@ -58,7 +58,7 @@ class RolloutRecorder(Transform):
         >>> import lw_torchrl as lw
         >>> logger = lw.RerunLogger(tempfile.mkdtemp() + "/reach.rrd")
         >>> base = lw.LanguageWorldEnv("reach", num_envs=3, max_steps=10)
-        >>> env = TransformedEnv(base, lw.RolloutRecorder(logger, rows=[1], policy="expert"))
+        >>> env = TransformedEnv(base, lw.record.RolloutRecorder(logger, rows=[1], policy="expert"))
         >>> _ = env.rollout(10, lw.ExpertActor("reach"))
         >>> env.close()
         >>> logger.episodes

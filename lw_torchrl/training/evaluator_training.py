@@ -17,8 +17,7 @@ from lw_torchrl._checks import checked_but, differences
 from lw_torchrl._progress import Progress
 from lw_torchrl._state_tree import check_optimizer_state, join
 from lw_torchrl._versions import warn_of_other_versions
-from lw_torchrl.modules.clause_evaluator import ClauseEvaluator
-from lw_torchrl.modules.clauses import Clauses
+from lw_torchrl.modules.clause_evaluator import ClauseEvaluator, Clauses
 from lw_torchrl.modules.state_query_evaluator import StateQueryEvaluator
 from lw_torchrl.training.evaluator_files import check_evaluator_can_be_saved, open_evaluator, write_evaluator
 from lw_torchrl.training.interrupts import interrupts_between_steps
@@ -57,10 +56,10 @@ class QueryEvaluatorTrainer:
         >>> with tempfile.TemporaryDirectory() as root:
         ...     _ = lw.collect_demonstrations("reach", episodes_per_task=2, root=root + "/demos", max_steps=80)
         ...     replay = lw.LanguageWorldExperienceReplay(root + "/demos", label="executed")
-        ...     config = lw.QueryEvaluatorConfig(steps=200, batch_size=64, held_out_pairs=0.0)
-        ...     data = lw.LabelledQueries(replay, config)
+        ...     config = lw.training.QueryEvaluatorConfig(steps=200, batch_size=64, held_out_pairs=0.0)
+        ...     data = lw.training.LabelledQueries(replay, config)
         ...     evaluator = lw.StateQueryEvaluator(lw.load_plans("MT10"))
-        ...     lw.QueryEvaluatorTrainer(evaluator, data, config).train() < 0.65
+        ...     lw.training.QueryEvaluatorTrainer(evaluator, data, config).train() < 0.65
         True
     """
 

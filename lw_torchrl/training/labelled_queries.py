@@ -104,8 +104,8 @@ class Asked:
             return self.observation
         if key != "pixels" or self.pixels is None:
             raise ValueError(
-                f"data must have the column {key!r}, which the evaluator reads: lw.add_pictures(root, ...) draws a "
-                "dataset's rows, replay.add_column('pixels', lw.load_pictures(replay, ...)) shows them"
+                f"data must have the column {key!r}, which the evaluator reads: lw.data.add_pictures(root, ...) draws "
+                "a dataset's rows, replay.add_column('pixels', lw.data.load_pictures(replay, ...)) shows them"
             )
         return self.pixels
 

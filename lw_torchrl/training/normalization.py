@@ -15,8 +15,8 @@ from torchrl.objectives import LossModule
 from lw_torchrl._checks import checked
 from lw_torchrl.modules.critics import Value
 from lw_torchrl.modules.observation_features import ObservationFeatures
-from lw_torchrl.modules.plan_roles import PlanRoles
 from lw_torchrl.modules.policy import Policy
+from lw_torchrl.modules.relative_positions import PlanRoles
 
 
 @checked

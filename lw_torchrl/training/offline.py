@@ -133,7 +133,7 @@ class OfflineTrainer:
         ...     replay = lw.LanguageWorldExperienceReplay(
         ...         root + "/data", label="executed", n_steps=5, gamma=0.99, transform=lw.QAFTransform(plans)
         ...     )
-        ...     loss = lw.ExpectileValueLoss(lw.PlanConditionedValue(plans)).make_value_estimator(gamma=0.99)
+        ...     loss = lw.objectives.ExpectileValueLoss(lw.PlanConditionedValue(plans)).make_value_estimator(gamma=0.99)
         ...     trainer = lw.OfflineTrainer(loss, replay, lw.OfflineConfig(steps=5, batch_size=16), progress=False)
         ...     trainer.train()
         >>> sorted(trainer.last)

@@ -101,7 +101,7 @@ class StackedBehavioralCloning:
         >>> with tempfile.TemporaryDirectory() as root:
         ...     _ = lw.collect_demonstrations("reach", episodes_per_task=1, root=root + "/demos", max_steps=80)
         ...     load = lambda: lw.LanguageWorldExperienceReplay(root + "/demos", transform=lw.QAFTransform(plans))
-        ...     trainer = lw.StackedBehavioralCloning(
+        ...     trainer = lw.training.StackedBehavioralCloning(
         ...         [lw.PlanConditionedActor(plans), lw.PlanConditionedActor(plans)],
         ...         [load(), load()],
         ...         lw.BehavioralCloningConfig(steps=5, batch_size=16),

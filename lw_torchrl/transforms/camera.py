@@ -44,7 +44,7 @@ class CameraTransform(KeepsEnvState):
     Example:
         >>> from torchrl.envs import TransformedEnv
         >>> import lw_torchrl as lw
-        >>> env = TransformedEnv(lw.LanguageWorldEnv("reach"), lw.CameraTransform(("corner", "corner3")))
+        >>> env = TransformedEnv(lw.LanguageWorldEnv("reach"), lw.transforms.CameraTransform(("corner", "corner3")))
         >>> env.reset()["pixels"].shape
         torch.Size([1, 64, 128, 3])
         >>> env.close()
@@ -137,8 +137,8 @@ class CameraTransform(KeepsEnvState):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Raise: rows of a replay buffer are in no simulation."""
         raise ValueError(
-            "CameraTransform draws an environment's rows; a dataset's are drawn by lw.add_pictures(root, ...), and "
-            "replay.add_column('pixels', lw.load_pictures(replay, ...)) shows them"
+            "CameraTransform draws an environment's rows; a dataset's are drawn by lw.data.add_pictures(root, ...), "
+            "and replay.add_column('pixels', lw.data.load_pictures(replay, ...)) shows them"
         )
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:

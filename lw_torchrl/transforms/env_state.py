@@ -62,7 +62,7 @@ class EnvState(KeepsEnvState):
     Example:
         >>> from torchrl.envs import TransformedEnv
         >>> import lw_torchrl as lw
-        >>> env, other = (TransformedEnv(lw.LanguageWorldEnv("reach"), lw.EnvState()) for _ in range(2))
+        >>> env, other = (TransformedEnv(lw.LanguageWorldEnv("reach"), lw.transforms.EnvState()) for _ in range(2))
         >>> env.reset()["episode"], env.reset()["episode"]
         (tensor([0]), tensor([1]))
         >>> other.load_state_dict(env.state_dict())

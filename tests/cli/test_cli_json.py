@@ -16,6 +16,7 @@ from commands import check_documented, document, documented, run
 import lw_torchrl as lw
 from lw_torchrl.cli.main import COMMANDS, GROUPS, main
 from lw_torchrl.cli.tables import Output
+from lw_torchrl.language.query_search import nearest_query
 
 PLAN = """def push(robot):
     if check("the gripper is near the puck"):
@@ -68,7 +69,7 @@ def test_numbers_are_those_of_the_library(capsys):
     task = document(capsys, "skills", "push")["skills"][0]
     skill = lw.load_skills()[task["skill"]].for_task("push")
     assert (task["offset"], task["gain"], task["gripper"]) == ([*skill.offset], [*skill.gain], skill.gripper)
-    score = lw.nearest_query("touching", "push").score
+    score = nearest_query("touching", "push").score
     assert document(capsys, "queries", "push", "touching")["nearest"]["similarity"] == score
     (told,) = document(capsys, "query", "reach", "is the gripper open?")["queries"]
     assert told == {"query": "the robot's gripper is open", "holds": True}

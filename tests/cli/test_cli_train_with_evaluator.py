@@ -28,7 +28,7 @@ def trained(demos, tmp_path_factory):
     actor = lw.PlanConditionedActor(plans, width=8, depth=1)
     config = lw.BehavioralCloningConfig(steps=5, batch_size=8)
     lw.BehavioralCloningTrainer(actor, replay, config, checkpoint=path / "policy.zip", progress=False).train()
-    lw.save_evaluator(lw.StateQueryEvaluator(plans, width=8), path / "evaluator.zip")
+    lw.training.save_evaluator(lw.StateQueryEvaluator(plans, width=8), path / "evaluator.zip")
     return path
 
 
@@ -110,11 +110,11 @@ def test_what_cannot_be_begun_with_is_named(capsys, demos, trained, tmp_path):
 def test_held_answers_are_not_trained(capsys, demos, trained, tmp_path):
     """Of pictures it was told to draw a dataset's, which could not mend it."""
     actor = lw.load_actor(trained / "policy.zip")
-    eyes = lw.ImageQueryEvaluator(actor.plans, height=16, width=24, hidden=8, depth=1)
+    eyes = lw.modules.ImageQueryEvaluator(actor.plans, height=16, width=24, hidden=8, depth=1)
     out = ["--out", tmp_path / "x.zip", *SMALL]
     for name, inside in (("state", lw.StateQueryEvaluator(actor.plans, width=8)), ("eyes", eyes)):
         held = lw.HeldEvaluator(inside, every=5)
-        lw.save_evaluator(held, tmp_path / f"{name}.zip")
+        lw.training.save_evaluator(held, tmp_path / f"{name}.zip")
         refused = fails(capsys, "train", demos, *out, "--evaluator", tmp_path / f"{name}.zip", *NET)
         assert "error: --evaluator must be no HeldEvaluator" in refused
         lw.save_actor(actor.with_evaluator(held), tmp_path / f"{name}-policy.zip")

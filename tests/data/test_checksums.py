@@ -186,7 +186,7 @@ def cloning(replay, checkpoint):
 
 def stacked(replay, checkpoint):
     config = lw.BehavioralCloningConfig(steps=4, batch_size=8)
-    return lw.StackedBehavioralCloning([make_actor()], [replay], config, checkpoint=checkpoint, progress=False)
+    return lw.training.StackedBehavioralCloning([make_actor()], [replay], config, checkpoint=checkpoint, progress=False)
 
 
 def offline(replay, checkpoint):

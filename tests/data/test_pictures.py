@@ -29,7 +29,7 @@ def made(tmp_path_factory):
     lw.collect_demonstrations(
         ["drawer-open", "reach"], episodes_per_task=2, root=root, noise_scale=0.1, seed=4, max_steps=30, progress=False
     )
-    lw.add_pictures(root, ("corner", "topview"), every=1, progress=False, **SIZE)
+    lw.data.add_pictures(root, ("corner", "topview"), every=1, progress=False, **SIZE)
     return root
 
 
@@ -39,7 +39,7 @@ def root(made, tmp_path):
 
 
 def load(replay, **options):
-    return lw.load_pictures(replay, ("corner", "topview"), **SIZE, **options)
+    return lw.data.load_pictures(replay, ("corner", "topview"), **SIZE, **options)
 
 
 def files(root):
@@ -52,7 +52,7 @@ def test_they_are_what_a_camera_saw(made):
     assert found.shape == (len(replay), 24, 64, 3)
     for task in ("drawer-open", "reach"):
         own = (rows["task_id"] == lw.task_id(task)) & (rows["episode"] == 1)
-        camera = lw.CameraTransform(("corner", "topview"), **SIZE)
+        camera = lw.transforms.CameraTransform(("corner", "topview"), **SIZE)
         env = TransformedEnv(lw.LanguageWorldEnv(task, seed=4), camera)
         state = env.reset(episode=1)
         for row in own.nonzero().flatten().tolist():
@@ -74,7 +74,7 @@ def test_they_follow_the_rows_that_a_buffer_shows(made):
 
 def test_pictures_every_few_steps_are_held(made, tmp_path):
     root = shutil.copytree(made, tmp_path / "demos")
-    lw.add_pictures(root, ("corner", "topview"), every=7, progress=False, **SIZE)
+    lw.data.add_pictures(root, ("corner", "topview"), every=7, progress=False, **SIZE)
     replay = lw.LanguageWorldExperienceReplay(root, label="executed")
     each, held = load(replay), load(replay, every=7)
     step = torch.cat([torch.arange(one.length) for one in replay.demonstrations.episodes])
@@ -92,7 +92,7 @@ def test_what_is_there_is_not_taken_again_and_what_is_damaged_is(root, monkeypat
         archive.writestr("more.png", b"")
     kept, written = pictures._write, []
     monkeypatch.setattr(pictures, "_write", lambda path, taken: written.append(path) or kept(path, taken))
-    lw.add_pictures(root, ("corner", "topview"), progress=False, **SIZE)
+    lw.data.add_pictures(root, ("corner", "topview"), progress=False, **SIZE)
     assert sorted(written) == sorted([first, second, third])
     assert {file: file.read_bytes() for file in files(root)} == before
 
@@ -109,24 +109,24 @@ def test_a_killed_call_leaves_whole_files(root, monkeypatch):
 
     monkeypatch.setattr(pictures, "_write", stop)
     with pytest.raises(KeyboardInterrupt):
-        lw.add_pictures(root, ("corner", "topview"), progress=False, **SIZE)
+        lw.data.add_pictures(root, ("corner", "topview"), progress=False, **SIZE)
     assert files(root) == written
     with pytest.raises(ValueError, match=r"has no pictures of .*lw\.add_pictures"):
         load(lw.LanguageWorldExperienceReplay(root))
     monkeypatch.setattr(pictures, "_write", kept)
-    lw.add_pictures(root, ("corner", "topview"), progress=False, **SIZE)
+    lw.data.add_pictures(root, ("corner", "topview"), progress=False, **SIZE)
     assert len(load(lw.LanguageWorldExperienceReplay(root))) == 120
 
 
 def test_other_pictures_or_damaged_ones_are_refused(root):
     replay = lw.LanguageWorldExperienceReplay(root)
     with pytest.raises(ValueError, match=r"no pictures of .* by corner, 24 times 32 pixels, every 1"):
-        lw.load_pictures(replay, "corner", **SIZE)
+        lw.data.load_pictures(replay, "corner", **SIZE)
     file = files(root)[0]
     with zipfile.ZipFile(file) as archive:
         names = archive.namelist()
         content = {name: archive.read(name) for name in names}
-    lw.add_pictures(root, ("corner", "topview"), height=12, width=16, progress=False)
+    lw.data.add_pictures(root, ("corner", "topview"), height=12, width=16, progress=False)
     other = next(path for path in files(root) if "12x16" in str(path))
     with zipfile.ZipFile(other) as archive:
         content["3.png"] = archive.read("3.png")
@@ -162,8 +162,8 @@ def test_episodes_that_go_otherwise_are_refused(root):
     content[16 * 10 : 16 * 11] = torch.tensor([0.3, 0.2, 0.1, 0.0]).numpy().tobytes()
     actions.write_bytes(content)
     with pytest.raises(ValueError, match=r"not as they were written: 1 episode of 4 differ .*, 0 of 'drawer-open'"):
-        lw.add_pictures(root, "corner", progress=False, **SIZE)
+        lw.data.add_pictures(root, "corner", progress=False, **SIZE)
     restate_checksums(root)
     with pytest.raises(ValueError, match=r"go otherwise when they are run again, from step 11 on"):
-        lw.add_pictures(root, "corner", progress=False, **SIZE)
+        lw.data.add_pictures(root, "corner", progress=False, **SIZE)
     assert not files(root)

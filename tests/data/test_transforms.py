@@ -181,7 +181,10 @@ def test_what_is_not_made_for_samples_says_so(root, name):
     [
         (lambda: lw.QAFTransform(lw.load_plans("MT10"), every=2), "counts the steps of an environment's episodes"),
         (lambda: lw.CorruptQAF(lw.load_plans("MT10"), lag=1), "counts the steps of an environment's episodes"),
-        (lambda: lw.CameraTransform("corner2", height=8, width=8), "a dataset's are drawn by lw.add_pictures"),
+        (
+            lambda: lw.transforms.CameraTransform("corner2", height=8, width=8),
+            "a dataset's are drawn by lw.data.add_pictures",
+        ),
     ],
 )
 def test_so_is_what_we_have_for_environments(root, make, message):

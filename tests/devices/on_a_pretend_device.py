@@ -155,7 +155,7 @@ def make_stack(demos, device, checkpoint=None, actor="plan", **config):
     replays = [make_replay(demos, device) for _ in range(3)]
     options = {"checkpoint": checkpoint, "progress": False, "device": device}
     actors = [ACTORS[actor]() for _ in replays]
-    return lw.StackedBehavioralCloning(actors, replays, replace(CONFIG, **config), **options)
+    return lw.training.StackedBehavioralCloning(actors, replays, replace(CONFIG, **config), **options)
 
 
 def test_many_at_once_wait_for_nothing(demos):
@@ -267,7 +267,7 @@ def test_an_evaluation_there_is_the_cpus(kind):
 
     made = {
         "scripted": lambda: lw.ScriptedSkillActor(PLANS),
-        "ensemble": lambda: lw.ActorEnsemble([ACTORS["plan"](), ACTORS["mixed actions"]()]),
+        "ensemble": lambda: lw.modules.ActorEnsemble([ACTORS["plan"](), ACTORS["mixed actions"]()]),
         "evaluator": lambda: seeded(lw.PlanConditionedActor, PLANS, evaluator=Guess(PLANS), **SMALL),
     }
     actor = made.get(kind, ACTORS.get(kind))()

@@ -71,7 +71,7 @@ def test_without_a_gpu_there_is_the_cpu(demos, tmp_path):
     for refused in (
         lambda: make_replay(demos, "cuda"),
         lambda: lw.BehavioralCloningTrainer(actor, replay, device="cuda"),
-        lambda: lw.StackedBehavioralCloning([actor], [replay], device="cuda"),
+        lambda: lw.training.StackedBehavioralCloning([actor], [replay], device="cuda"),
         lambda: lw.evaluate(actor, tasks="reach", seed=0, device="cuda"),
     ):
         with pytest.raises(

@@ -16,7 +16,7 @@ from torch import nn
 from torchrl.envs import GymLikeEnv, TransformedEnv
 
 import lw_torchrl as lw
-from lw_torchrl._blocks import in_blocks
+from lw_torchrl._devices import in_blocks
 from lw_torchrl.envs.episodes import FinishedEpisode, run_episodes
 from lw_torchrl.envs.seeding import action_noise
 

@@ -31,13 +31,14 @@ def make_transformed(seed: int = 5) -> TransformedEnv:
 MAKERS = {
     "plain": make_env,
     "transformed": make_transformed,
-    "EnvState": lambda seed=5: TransformedEnv(make_env(seed), lw.EnvState()),
+    "EnvState": lambda seed=5: TransformedEnv(make_env(seed), lw.transforms.EnvState()),
     "serial": lambda seed=5: SerialEnv(2, make_transformed, create_env_kwargs={"seed": seed}),
     "outside": lambda seed=5: TransformedEnv(
         SerialEnv(2, make_env, create_env_kwargs={"seed": seed}), lw.QAFTransform(lw.load_plans("MT10"))
     ),
     "parallel": lambda seed=5: TransformedEnv(
-        ParallelEnv(2, make_transformed, create_env_kwargs={"seed": seed}, mp_start_method="fork"), lw.EnvState()
+        ParallelEnv(2, make_transformed, create_env_kwargs={"seed": seed}, mp_start_method="fork"),
+        lw.transforms.EnvState(),
     ),
     "parallel, no buffers": lambda seed=5: ParallelEnv(
         2,

@@ -161,7 +161,7 @@ def still(plans=PLANS, **options):
     return Still(plans, width=8, depth=1, **options)
 
 
-@pytest.mark.parametrize("wrapped", [lambda a: a, lambda a: lw.ActorEnsemble([a, still()])])
+@pytest.mark.parametrize("wrapped", [lambda a: a, lambda a: lw.modules.ActorEnsemble([a, still()])])
 def test_a_network_s_skills_are_exchanged_and_its_mode_stays(wrapped):
     actor = wrapped(still()).train()
     actor.get_submodule(next(name for name, _ in actor.named_modules() if name)).eval()

@@ -4,7 +4,7 @@ import numpy as np
 
 from lw_torchrl.envs import engine
 from lw_torchrl.language import observation as layout
-from lw_torchrl.modules.mentions import _PLACES
+from lw_torchrl.modules.augmentation import _PLACES
 from lw_torchrl.transforms.random_yaw import _STARTS
 
 

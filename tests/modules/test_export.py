@@ -31,8 +31,11 @@ ACTORS = {
     "scripted": lambda: lw.ScriptedSkillActor(PLANS),
     "residual": lambda: moved(lw.ResidualActor(lw.PlanConditionedActor(PLANS, **SMALL), **SMALL)),
     "steps": lambda: moved(lw.ResidualActor(lw.PlanConditionedActor(PLANS, **SMALL), steps={"push": [0, 2]}, **SMALL)),
-    "ensemble": lambda: lw.ActorEnsemble([lw.PlanConditionedActor(PLANS, **SMALL) for _ in range(2)]),
+    "ensemble": lambda: lw.modules.ActorEnsemble([lw.PlanConditionedActor(PLANS, **SMALL) for _ in range(2)]),
 }
+
+
+NAMES = [name if name in ("plan", "scripted") else pytest.param(name, marks=pytest.mark.slow) for name in ACTORS]
 
 
 class Deployed(nn.Module):
@@ -58,7 +61,7 @@ def make_rows(rows):
     return torch.rand(rows, 39, generator=generator), ids
 
 
-@pytest.mark.parametrize("name", ACTORS)
+@pytest.mark.parametrize("name", NAMES)
 def test_exported_it_gives_the_same_bits_at_every_number_of_rows(name):
     module = Deployed(ACTORS[name]().eval())
     run = exported(module).module()
@@ -70,7 +73,7 @@ def test_exported_it_gives_the_same_bits_at_every_number_of_rows(name):
         run(observation, torch.full_like(ids, lw.task_id("soccer")))
 
 
-@pytest.mark.parametrize("name", ACTORS)
+@pytest.mark.parametrize("name", NAMES)
 def test_the_bare_actor_is_exported(name):
     actor = ACTORS[name]().eval()
     read = lw.QAFTransform(PLANS)(TensorDict(dict(zip(("observation", "task_id"), make_rows(7), strict=True)), [7]))
@@ -87,7 +90,7 @@ def test_the_bare_actor_is_exported(name):
         assert all(torch.equal(one, expected[key]) for one, key in zip(found, actor.out_keys, strict=True))
 
 
-@pytest.mark.parametrize("name", ACTORS)
+@pytest.mark.parametrize("name", NAMES)
 def test_compiled_it_is_one_graph(name):
     torch._dynamo.reset()  # all share one forward, which is compiled eight times at most
     module = Deployed(ACTORS[name]().eval())

@@ -12,7 +12,7 @@ from torch import nn
 from torchrl.envs import Compose, SerialEnv, TransformedEnv, check_env_specs
 
 import lw_torchrl as lw
-from lw_torchrl._blocks import BLOCK
+from lw_torchrl._devices import BLOCK
 from lw_torchrl.evaluation.drift import condition_drift
 from lw_torchrl.evaluation.swaps import TrueAnswers, own_evaluators, with_true_answers
 from lw_torchrl.record.rollouts import run_recorded
@@ -48,7 +48,9 @@ def test_at_every_step_it_is_what_it_holds(kind):
     assert same(runs[0][0], runs[1][0])
 
 
-@pytest.mark.parametrize(("every", "delay"), [(1, 0), (5, 0), (1, 3), (5, 2)])
+@pytest.mark.parametrize(
+    ("every", "delay"), [(1, 0), *(pytest.param(*one, marks=pytest.mark.slow) for one in ((5, 0), (1, 3))), (5, 2)]
+)
 def test_exact_answers_are_held_as_those_of_qaf_transform(every, delay):
     actor = lw.ScriptedSkillActor(PLANS)
     transform = lw.QAFTransform(PLANS, every=every, delay=delay)
@@ -225,7 +227,7 @@ SMALL = {"height": 16, "width": 24, "hidden": 8, "depth": 1}
 
 @pytest.mark.parametrize(("own", "every", "drawn"), [(1, 4, 4), (2, 4, 4), (4, 4, 4), (8, 4, 8), (2, 3, 2)])
 def test_cameras_draw_what_is_looked_at(own, every, drawn):
-    eyes = lw.ImageQueryEvaluator(PLANS, every=own, **SMALL)
+    eyes = lw.modules.ImageQueryEvaluator(PLANS, every=own, **SMALL)
     camera, asks = lw.HeldEvaluator(eyes, every=every, delay=1).transform().transforms
     assert (camera.every, asks.every, asks.delay) == (drawn, every, 1)
     assert asks.in_keys == ["pixels", "task_id"]
@@ -238,10 +240,10 @@ class TestPictures:
         if missing := why_no_pictures():
             pytest.skip(missing)
 
-    @pytest.mark.parametrize("inside", [True, False])
+    @pytest.mark.parametrize("inside", [True, pytest.param(False, marks=pytest.mark.slow)])
     def test_at_every_step_it_is_what_it_holds(self, inside):
         torch.manual_seed(0)
-        eyes, actor = lw.ImageQueryEvaluator(PLANS, **SMALL), lw.PlanConditionedActor(PLANS, width=8)
+        eyes, actor = lw.modules.ImageQueryEvaluator(PLANS, **SMALL), lw.PlanConditionedActor(PLANS, width=8)
         settings = {"episodes_per_task": 1, "max_steps": 6}
         runs = []
         for one in (eyes, lw.HeldEvaluator(eyes)):
@@ -253,7 +255,7 @@ class TestPictures:
 
     def test_the_answers_are_of_the_pictures_of_steps_that_are_due(self):
         torch.manual_seed(0)
-        eyes, actor = lw.ImageQueryEvaluator(PLANS, **SMALL), lw.PlanConditionedActor(PLANS, width=8)
+        eyes, actor = lw.modules.ImageQueryEvaluator(PLANS, **SMALL), lw.PlanConditionedActor(PLANS, width=8)
         held = actor.with_evaluator(lw.HeldEvaluator(eyes, every=4), answers="logit")
         keys = ["pixels", "task_id", "qaf_held_logits"]
         _, seen = evaluated(held, episodes_per_task=1, also_record=keys)

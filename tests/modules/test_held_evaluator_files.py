@@ -25,13 +25,15 @@ def test_files_keep_it(structure, tmp_path):
     again = lw.load_actor(tmp_path / "policy.zip", text_encoder=letters)
     assert again.evaluator.describe() == held.describe()
     assert same(evaluated(again)[0], evaluated(actor)[0])
-    lw.save_evaluator(held, tmp_path / "evaluator.zip")
-    other = lw.load_evaluator(tmp_path / "evaluator.zip", PLANS, text_encoder=letters)
+    lw.training.save_evaluator(held, tmp_path / "evaluator.zip")
+    other = lw.training.load_evaluator(tmp_path / "evaluator.zip", PLANS, text_encoder=letters)
     assert (other.every, other.delay) == (5, 2)
     assert same(other.state_dict().values(), held.state_dict().values())
     if not structure:
         with pytest.raises(ValueError, match="text_encoder is not the one"):
-            lw.load_evaluator(tmp_path / "evaluator.zip", PLANS, text_encoder=lambda texts: letters(texts).flip(-1))
+            lw.training.load_evaluator(
+                tmp_path / "evaluator.zip", PLANS, text_encoder=lambda texts: letters(texts).flip(-1)
+            )
 
 
 def hostile(options, nest=0):
@@ -61,16 +63,16 @@ def hostile(options, nest=0):
 )
 def test_a_strangers_file_is_refused(described, tmp_path):
     held = lw.HeldEvaluator(learned())
-    lw.save_evaluator(held, tmp_path / "good.zip")
+    lw.training.save_evaluator(held, tmp_path / "good.zip")
     with zipfile.ZipFile(tmp_path / "good.zip") as archive:
         description = json.loads(archive.read("description.json"))
     groups = {"weights": held.state_dict(), "texts": {}}
     for name, one in (("good", description["evaluator"]), ("bad", described)):
         kept = {key: value for key, value in description.items() if key != "sha256"} | {"evaluator": one}
         write_archive(tmp_path / f"{name}.zip", kept, groups)
-    assert lw.load_evaluator(tmp_path / "good.zip", PLANS).every == 1
+    assert lw.training.load_evaluator(tmp_path / "good.zip", PLANS).every == 1
     with pytest.raises(ValueError, match="cannot be made"):
-        lw.load_evaluator(tmp_path / "bad.zip", PLANS)
+        lw.training.load_evaluator(tmp_path / "bad.zip", PLANS)
 
 
 # --- bad input -----------------------------------------------------------------------------------------------------
@@ -121,4 +123,4 @@ def test_two_of_them_in_one_environment_are_refused():
     residual = lw.ResidualActor(lw.PlanConditionedActor(PLANS, evaluator=held, width=8))
     for member in (actor, residual):
         with pytest.raises(ValueError, match="members must have no HeldEvaluator"):
-            lw.ActorEnsemble([member, member])
+            lw.modules.ActorEnsemble([member, member])

@@ -27,7 +27,7 @@ def letters(texts):
 def make(kind="structure", plans=PLANS, seed=0, **options):
     torch.manual_seed(seed)
     encoder = {} if kind == "structure" else {"text_encoder": letters}
-    return lw.ImageQueryEvaluator(plans, **SMALL, **KINDS[kind], **encoder, **options)
+    return lw.modules.ImageQueryEvaluator(plans, **SMALL, **KINDS[kind], **encoder, **options)
 
 
 def states(rows=10, shape=(16, 48)):
@@ -79,7 +79,7 @@ def test_a_thing_that_moves_in_the_picture_is_pointed_at():
     IMAGE_ENCODERS["red"] = lambda: nn.AvgPool2d(2)
     try:
         torch.manual_seed(0)
-        red = lw.ImageQueryEvaluator(PLANS, cameras="corner", encoder="red", **SMALL)
+        red = lw.modules.ImageQueryEvaluator(PLANS, cameras="corner", encoder="red", **SMALL)
     finally:
         del IMAGE_ENCODERS["red"]
     assert network.key.weight.shape[1] == 32
@@ -123,8 +123,8 @@ def test_a_policy_with_it_is_made_again_from_its_file(kind, tmp_path):
     lw.save_actor(actor, tmp_path / "policy.zip")
     again = lw.load_actor(tmp_path / "policy.zip", text_encoder=letters)
     assert torch.equal(again(states())["action"], actor(states())["action"])
-    lw.save_evaluator(actor.evaluator, tmp_path / "evaluator.zip")
-    other = lw.load_evaluator(tmp_path / "evaluator.zip", PLANS, text_encoder=letters)
+    lw.training.save_evaluator(actor.evaluator, tmp_path / "evaluator.zip")
+    other = lw.training.load_evaluator(tmp_path / "evaluator.zip", PLANS, text_encoder=letters)
     assert torch.equal(other(states())["qaf_logits"], actor.evaluator(states())["qaf_logits"])
 
 
@@ -153,7 +153,7 @@ def test_what_cannot_be_is_named():
     with pytest.raises(ValueError, match=r"names is for structure=True"):
         make("texts", names=("puck",))
     with pytest.raises(ValueError, match=r"height and width must be at most 512 pixels, got 513 and 8"):
-        lw.ImageQueryEvaluator(PLANS, height=513, width=8)
+        lw.modules.ImageQueryEvaluator(PLANS, height=513, width=8)
     with pytest.raises(ValueError, match=r"camera must be"):
         make(cameras="korner")
     IMAGE_ENCODERS["flat"] = lambda: nn.Flatten()

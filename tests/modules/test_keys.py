@@ -132,7 +132,7 @@ MODULES = {
     "with evaluator": lambda: plan_actor(evaluator=lw.StateQueryEvaluator(PLANS, width=8)),
     "scripted": lambda: lw.ScriptedSkillActor(PLANS),
     "expert": lambda: lw.ExpertActor("MT10"),
-    "ensemble": lambda: lw.ActorEnsemble([plan_actor(), plan_actor()]),
+    "ensemble": lambda: lw.modules.ActorEnsemble([plan_actor(), plan_actor()]),
     "residual": lambda: lw.ResidualActor(plan_actor(), **networks),
     "residual of steps": lambda: lw.ResidualActor(plan_actor(), steps={"push": [0]}, **networks),
     "plan encoder": lambda: PlanEncoder(PLANS),

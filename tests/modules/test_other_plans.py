@@ -36,7 +36,7 @@ ACTORS = {
     "actor": lambda plans, **keys: lw.PlanConditionedActor(plans, width=8, **keys),
     "focus": lambda plans, **keys: lw.PlanConditionedActor(plans, width=8, focus=True, swap_unmentioned=0.5, **keys),
     "scripted": lw.ScriptedSkillActor,
-    "ensemble": lambda plans, **keys: lw.ActorEnsemble([lw.PlanConditionedActor(plans, width=8, **keys)] * 2),
+    "ensemble": lambda plans, **keys: lw.modules.ActorEnsemble([lw.PlanConditionedActor(plans, width=8, **keys)] * 2),
     "attention": lambda plans: PlanAttention(plans),
 }
 

@@ -9,7 +9,7 @@ from tensordict import TensorDict
 import lw_torchrl as lw
 from lw_torchrl.language.plan_tables import PlanTables
 from lw_torchrl.language.plans import ConditionalPlan, Plans
-from lw_torchrl.modules.plan_focus import PlanFocus
+from lw_torchrl.modules.relative_positions import PlanFocus
 
 HAND, OBJECT, SECOND, GOAL = slice(0, 3), slice(4, 7), slice(11, 14), slice(36, 39)
 
@@ -19,7 +19,7 @@ def focus_of(task, *conditions):
     return PlanFocus(plans, PlanTables(plans))
 
 
-def ways(focus, observation, weights=None):
+def positions(focus, observation, weights=None):
     """(B, 2, 3) metres: of each step's first and last clause."""
     weights = torch.ones(len(observation), 1) if weights is None else weights
     found = focus(observation, weights, torch.zeros(len(observation), dtype=torch.int64))
@@ -34,19 +34,19 @@ def observation():
 
 def test_the_first_and_the_last_clause_that_compares_two_things(observation):
     condition = "the gripper is above the puck and the gripper is open and the puck is near the target location"
-    found = ways(focus_of("push", condition), observation)
+    found = positions(focus_of("push", condition), observation)
     torch.testing.assert_close(found[:, 0], observation[:, OBJECT] - observation[:, HAND])
     torch.testing.assert_close(found[:, 1], observation[:, GOAL] - observation[:, OBJECT])
-    found = ways(focus_of("push", "the gripper is not above the puck"), observation)
+    found = positions(focus_of("push", "the gripper is not above the puck"), observation)
     assert torch.equal(found[:, 0], found[:, 1])
-    assert not ways(focus_of("push", "the gripper is open"), observation).any()
+    assert not positions(focus_of("push", "the gripper is open"), observation).any()
 
 
 def test_points_have_offsets_and_fixed_places(observation):
-    found = ways(focus_of("hammer", "the hammer head is near the nail"), observation)
+    found = positions(focus_of("hammer", "the hammer head is near the nail"), observation)
     head = observation[:, OBJECT] + torch.tensor([0.16, 0.06, 0.0])
     torch.testing.assert_close(found[:, 0], observation[:, SECOND] - head)
-    found = ways(focus_of("bin-picking", "the gripper is near the other bin"), observation)
+    found = positions(focus_of("bin-picking", "the gripper is near the other bin"), observation)
     torch.testing.assert_close(found[:, 0], torch.tensor([0.12, 0.7, 0.02]) - observation[:, HAND])
 
 
@@ -57,8 +57,8 @@ def test_steps_are_mixed_by_attention(seed):
     observation = torch.randn(4, 39, generator=generator)
     weights = torch.rand(4, 2, generator=generator).softmax(-1)
     conditions = ("the gripper is above the puck", "the puck is near the target location")
-    each = [ways(focus_of("push", condition), observation) for condition in conditions]
-    mixed = ways(focus_of("push", *conditions), observation, weights)
+    each = [positions(focus_of("push", condition), observation) for condition in conditions]
+    mixed = positions(focus_of("push", *conditions), observation, weights)
     torch.testing.assert_close(mixed, weights[:, 0, None, None] * each[0] + weights[:, 1, None, None] * each[1])
 
 

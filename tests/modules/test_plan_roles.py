@@ -11,7 +11,7 @@ from torchrl.objectives import TD3Loss
 
 import lw_torchrl as lw
 from lw_torchrl.language.plan_tables import PlanTables
-from lw_torchrl.modules.plan_roles import PlanRoles
+from lw_torchrl.modules.relative_positions import PlanRoles
 from lw_torchrl.training.normalization import fit_normalization
 
 MT10 = lw.load_plans("MT10")
@@ -41,9 +41,9 @@ def in_step(plans, task, step, number=5, seed=0):
         ("peg-unplug-side", 2, lambda o: o[:, 36:39] - o[:, 4:7]),  # the goal, which that task has no name for
     ],
 )
-def test_the_way_goes_from_what_is_moved_to_the_target(task, step, way):
+def test_the_position_is_from_what_is_moved_to_the_target(task, step, way):
     seen = in_step(ZERO_SHOT, task, step)
-    found = roles_of(ZERO_SHOT).ways(*seen)
+    found = roles_of(ZERO_SHOT).positions(*seen)
     torch.testing.assert_close(found[:, 0], way(seen[0]))
 
 
@@ -69,7 +69,7 @@ def test_contacts_are_where_the_hand_is_when_it_acts():
     row = PlanTables(MT10).index.row("drawer-open")
     torch.testing.assert_close(roles.contact[row], torch.tensor([0.01, -0.02, 0.03]), atol=1e-5, rtol=0)
     assert roles.contact.count_nonzero() == 3
-    at_contact = roles.ways(observation[acting], weights[acting], rows[acting])
+    at_contact = roles.positions(observation[acting], weights[acting], rows[acting])
     torch.testing.assert_close(at_contact, torch.zeros_like(at_contact), atol=1e-5, rtol=0)
 
 
@@ -83,9 +83,9 @@ def test_contacts_do_not_move_the_way_of_what_is_carried_nor_of_named_points():
     roles = roles_of(ZERO_SHOT)
     roles.contact.fill_(1.0)
     carried, point = in_step(ZERO_SHOT, "push", 3), in_step(ZERO_SHOT, "coffee-pull", 0)
-    torch.testing.assert_close(roles.ways(*carried)[:, 0], carried[0][:, 36:39] - carried[0][:, 4:7])
+    torch.testing.assert_close(roles.positions(*carried)[:, 0], carried[0][:, 36:39] - carried[0][:, 4:7])
     rim = torch.tensor([-0.005, 0.0, 0.05])
-    torch.testing.assert_close(roles.ways(*point)[:, 0], point[0][:, 4:7] + rim - point[0][:, :3])
+    torch.testing.assert_close(roles.positions(*point)[:, 0], point[0][:, 4:7] + rim - point[0][:, :3])
 
 
 @pytest.mark.parametrize(("task", "step"), [("push", 0), ("peg-insert-side", 4), ("drawer-open", 2)])
@@ -97,8 +97,8 @@ def test_a_turned_scene_turns_the_way_fixed_places_and_contacts_too(task, step):
     sample = TensorDict(observation=observation, action=torch.zeros(5, 4), batch_size=[5])
     turned = lw.RandomYaw(0.7)(sample)
     yaw = turned["observation_yaw"]
-    before = roles.ways(observation, weights, rows)[:, 0]
-    after = roles.ways(turned["observation"], weights, rows, yaw)[:, 0]
+    before = roles.positions(observation, weights, rows)[:, 0]
+    after = roles.positions(turned["observation"], weights, rows, yaw)[:, 0]
     x, y = before[:, 0], before[:, 1]
     torch.testing.assert_close(after[:, 0], yaw.cos() * x - yaw.sin() * y)
     torch.testing.assert_close(after[:, 1], yaw.sin() * x + yaw.cos() * y)
@@ -108,12 +108,12 @@ def test_a_turned_scene_turns_the_way_fixed_places_and_contacts_too(task, step):
 def test_jitter_is_for_pushing_while_training():
     roles = roles_of(jitter=0.03)
     push, place = in_step(MT10, "drawer-open", 2, 4_000), in_step(MT10, "drawer-open", 0, 4_000)
-    still = roles.ways(*push)
-    assert torch.equal(still, roles.ways(*push))
+    still = roles.positions(*push)
+    assert torch.equal(still, roles.positions(*push))
     roles.train()
-    spread = (roles.ways(*push) - still).flatten(0, 1).std(0)
+    spread = (roles.positions(*push) - still).flatten(0, 1).std(0)
     torch.testing.assert_close(spread, torch.tensor([0.015, 0.015, 0.03]), atol=0.002, rtol=0)
-    assert torch.equal(roles.ways(*place), roles.eval().ways(*place))
+    assert torch.equal(roles.positions(*place), roles.eval().positions(*place))
 
 
 def make_replay(task="drawer-open"):
@@ -141,7 +141,7 @@ def test_training_takes_contacts_and_they_go_with_the_policy(tmp_path):
     wider = actor.with_plans(ZERO_SHOT).encoder.roles
     assert torch.equal(wider.contact[PlanTables(ZERO_SHOT).index.row("drawer-open")], contact[row])
     assert wider.contact.count_nonzero() == contact.count_nonzero()
-    ensemble = lw.ActorEnsemble([lw.PlanConditionedActor(MT10, **OPTIONS) for _ in range(2)])
+    ensemble = lw.modules.ActorEnsemble([lw.PlanConditionedActor(MT10, **OPTIONS) for _ in range(2)])
     fit_normalization(ensemble, replay)
     assert all(torch.equal(member.encoder.roles.contact, contact) for member in ensemble.members)
 
@@ -179,7 +179,7 @@ def test_training_without_statistics_wants_contacts_first():
     replay.append_transform(actor.transform())
     for make in (
         lambda: lw.BehavioralCloningTrainer(actor, replay, config, progress=False),
-        lambda: lw.StackedBehavioralCloning([actor], [replay], config, progress=False),
+        lambda: lw.training.StackedBehavioralCloning([actor], [replay], config, progress=False),
     ):
         with pytest.raises(ValueError, match=r"roles want to know .*; call fit_normalization\(actor, replay\)"):
             make()

@@ -12,7 +12,7 @@ from tensordict import TensorDict
 
 import lw_torchrl as lw
 from lw_torchrl.modules import make_policy
-from lw_torchrl.modules.chosen_steps import weight_in_force
+from lw_torchrl.modules.residual_actor import weight_in_force
 from lw_torchrl.training.policy_checks import check_can_be_saved
 
 PLANS = lw.load_plans("MT10")

@@ -12,7 +12,7 @@ import lw_torchrl as lw
 from lw_torchrl.evaluation.swaps import with_true_answers
 from lw_torchrl.language.plans import PlanStep
 from lw_torchrl.language.relations import RELATIONS, Comparison
-from lw_torchrl.modules.clause_network import conjunction
+from lw_torchrl.modules.clause_evaluator import conjunction
 
 PLANS = lw.load_plans("MT10")
 KINDS = {"structure": {}, "texts": {"structure": False}}
@@ -119,11 +119,11 @@ def test_hard_answers_act_as_exact_truth_does():
 
 
 def test_tanh_is_the_papers_ten_times_the_probability_less_five():
-    from lw_torchrl.modules.plan_attention import strength
+    from lw_torchrl.modules.plan_attention import attention_logits
 
     logits = torch.linspace(-8, 8, 33)
-    assert torch.allclose(strength(logits, "tanh", 0.5), 10 * logits.sigmoid() - 5, atol=1e-5)
-    assert torch.equal(strength(logits, "logit", 0.5), logits)
+    assert torch.allclose(attention_logits(logits, "tanh", 0.5), 10 * logits.sigmoid() - 5, atol=1e-5)
+    assert torch.equal(attention_logits(logits, "logit", 0.5), logits)
 
 
 def test_with_evaluator_shares_the_weights():

@@ -230,7 +230,7 @@ def test_new_names_move_them():
 
 
 def test_v_trace_takes_it():
-    actor, value = lw.plan_actor_value(PLANS, **SMALL)
+    actor, value = lw.modules.plan_actor_value(PLANS, **SMALL)
     rows = drawn(actor, make_state(6)).detach().reshape(1, 6)
     flag = torch.zeros(1, 6, 1, dtype=torch.bool)
     rows["next"] = (

@@ -62,7 +62,7 @@ def distance(given, wanted, name):
 @pytest.mark.parametrize("kind", ["plan", "description"])
 def test_it_is_what_is_written_by_hand(kind, name, distribution):
     actor, batch = make_actor(kind, distribution), make_batch()
-    loss = lw.AdvantageWeightedLoss(actor, beta=1.5, max_weight=5.0, loss_function=name)
+    loss = lw.objectives.AdvantageWeightedLoss(actor, beta=1.5, max_weight=5.0, loss_function=name)
     actions = actor(batch.copy())["action"].double().tolist()
     total, weights, clipped = 0.0, [], 0
     for row in range(len(batch)):
@@ -84,12 +84,12 @@ def test_without_a_difference_it_is_torchrls_bc(name):
     actor = make_actor(distribution="normal" if name == "log_prob" else None)
     batch = make_batch()
     wanted = bc(actor, loss_function=None if name == "log_prob" else name)(batch.copy())["loss_bc"]
-    weigh = lw.AdvantageWeightedLoss(actor, beta=2.0, loss_function=name)
+    weigh = lw.objectives.AdvantageWeightedLoss(actor, beta=2.0, loss_function=name)
     alike = batch.clone().set("advantage", torch.zeros(12, 1))
     torch.testing.assert_close(weigh(alike)["loss_actor"], wanted)
     assert weigh(alike)["ESS"] == 1
     assert not torch.isclose(weigh(batch)["loss_actor"], wanted)
-    never = lw.AdvantageWeightedLoss(actor, beta=0.0, loss_function=name)
+    never = lw.objectives.AdvantageWeightedLoss(actor, beta=0.0, loss_function=name)
     torch.testing.assert_close(never(batch)["loss_actor"], wanted)
     assert never(batch)["weight_clipped"] == 0
 
@@ -99,14 +99,14 @@ def test_by_likelihood_it_is_the_weighted_mean():
     likelihood = actor.get_dist(batch.copy()).log_prob(batch["action"])
     weights = batch["advantage"].squeeze(-1).exp().clamp(max=20.0)
     wanted = -(weights * likelihood).sum() / weights.sum()
-    found = lw.AdvantageWeightedLoss(actor, loss_function="log_prob")(batch)["loss_actor"]
+    found = lw.objectives.AdvantageWeightedLoss(actor, loss_function="log_prob")(batch)["loss_actor"]
     torch.testing.assert_close(found, wanted)
 
 
 @pytest.mark.parametrize("name", ["l2", "log_prob"])
 def test_gradients_reach_every_parameter_and_no_advantage(name):
     actor, batch = make_actor(distribution="tanh_normal" if name == "log_prob" else None), make_batch()
-    loss = lw.AdvantageWeightedLoss(actor, loss_function=name)
+    loss = lw.objectives.AdvantageWeightedLoss(actor, loss_function=name)
     batch["advantage"].requires_grad_()
     loss(batch)["loss_actor"].backward()
     assert all(p.grad.abs().sum() > 0 for p in loss.parameters())
@@ -118,7 +118,7 @@ def test_a_row_counts_as_its_weight_says():
     batch = make_batch(5)
     batch["advantage"] = torch.tensor([[-3.0], [0.0], [1.0], [4.0], [9.0]])
     actor = make_actor()
-    loss = lw.AdvantageWeightedLoss(actor, max_weight=20.0, loss_function="l1")
+    loss = lw.objectives.AdvantageWeightedLoss(actor, max_weight=20.0, loss_function="l1")
     shares = []
     for row in range(5):
         moved = batch.clone()
@@ -133,9 +133,9 @@ def test_a_row_counts_as_its_weight_says():
 def test_weights_are_monotone_and_the_loss_is_within_the_rows(advantages, beta):
     """Of any advantages, however large: never 0 / 0."""
     batch = make_batch(4).set("advantage", torch.tensor(advantages).unsqueeze(-1))
-    loss = lw.AdvantageWeightedLoss(ACTOR, beta=beta)
+    loss = lw.objectives.AdvantageWeightedLoss(ACTOR, beta=beta)
     found = loss(batch)
-    rows = [lw.AdvantageWeightedLoss(ACTOR)(batch[i : i + 1])["loss_actor"].item() for i in range(4)]
+    rows = [lw.objectives.AdvantageWeightedLoss(ACTOR)(batch[i : i + 1])["loss_actor"].item() for i in range(4)]
     assert min(rows) - 1e-5 <= found["loss_actor"] <= max(rows) + 1e-5
     assert 0.25 - 1e-5 <= found["ESS"] <= 1 + 1e-5
     order = np.argsort(rows)
@@ -147,14 +147,14 @@ def test_weights_are_monotone_and_the_loss_is_within_the_rows(advantages, beta):
 @settings(max_examples=20, deadline=None)
 @given(order=st.permutations(range(12)))
 def test_the_order_of_rows_changes_nothing(order):
-    batch, loss = make_batch(), lw.AdvantageWeightedLoss(ACTOR)
+    batch, loss = make_batch(), lw.objectives.AdvantageWeightedLoss(ACTOR)
     torch.testing.assert_close(loss(batch[list(order)])["loss_actor"], loss(batch)["loss_actor"])
 
 
 @settings(max_examples=20, deadline=None)
 @given(shift=st.floats(-1000, 1000, width=32))
 def test_without_a_largest_weight_a_shift_of_all_changes_nothing(shift):
-    batch, loss = make_batch(spread=0.5), lw.AdvantageWeightedLoss(ACTOR, max_weight=1e300, beta=0.5)
+    batch, loss = make_batch(spread=0.5), lw.objectives.AdvantageWeightedLoss(ACTOR, max_weight=1e300, beta=0.5)
     moved = batch.clone().set("advantage", batch["advantage"] + shift)
     torch.testing.assert_close(loss(moved)["loss_actor"], loss(batch)["loss_actor"], rtol=1e-3, atol=1e-4)
 
@@ -167,7 +167,7 @@ def test_without_a_largest_weight_a_shift_of_all_changes_nothing(shift):
 @pytest.mark.parametrize(("name", "distribution"), [("l2", None), ("smooth_l1", "normal"), ("log_prob", "normal")])
 def test_compiled_it_is_one_graph_with_the_same_gradients(name, distribution):
     torch._dynamo.reset()
-    loss = lw.AdvantageWeightedLoss(make_actor(distribution=distribution), loss_function=name)
+    loss = lw.objectives.AdvantageWeightedLoss(make_actor(distribution=distribution), loss_function=name)
     found = []
     for run in (loss, torch.compile(loss, fullgraph=True, backend="eager")):
         loss.zero_grad()
@@ -180,7 +180,7 @@ def test_compiled_it_is_one_graph_with_the_same_gradients(name, distribution):
 
 def test_its_state_goes_round_and_statistics_reach_it():
     batch = make_batch()
-    loss, other = (lw.AdvantageWeightedLoss(make_actor(encoder_width=w)) for w in (128, 128))
+    loss, other = (lw.objectives.AdvantageWeightedLoss(make_actor(encoder_width=w)) for w in (128, 128))
     for p in other.parameters():
         p.data += 0.1
     assert loss(batch)["loss_actor"] != other(batch)["loss_actor"]
@@ -198,8 +198,8 @@ def test_keys_by_other_names_nested_ones_too():
     batch = make_batch()
     keys = [("agent", "observation"), ("agent", "task_id")]
     out = [("agent", "action")]
-    plain = lw.AdvantageWeightedLoss(make_actor("description"))
-    other = lw.AdvantageWeightedLoss(make_actor("description", in_keys=keys, out_keys=out))
+    plain = lw.objectives.AdvantageWeightedLoss(make_actor("description"))
+    other = lw.objectives.AdvantageWeightedLoss(make_actor("description", in_keys=keys, out_keys=out))
     other.set_keys(action=("agent", "action"), advantage=("agent", "better"))
     renamed = batch.select("observation", "task_id", "action").set("better", batch["advantage"])
     renamed = TensorDict(agent=renamed, batch_size=[12])
@@ -210,7 +210,7 @@ def test_keys_by_other_names_nested_ones_too():
 
 
 def test_its_keys_are_enough_and_what_it_is_given_stays():
-    loss, batch = lw.AdvantageWeightedLoss(make_actor("description")), make_batch()
+    loss, batch = lw.objectives.AdvantageWeightedLoss(make_actor("description")), make_batch()
     before = batch.clone()
     wanted = loss(batch)
     assert set(batch.keys(True, True)) == set(before.keys(True, True))
@@ -223,7 +223,7 @@ def test_its_keys_are_enough_and_what_it_is_given_stays():
 
 def test_answers_to_other_plans_are_refused():
     other = lw.ConditionalPlan.from_pairs("reach", [(lw.supported_queries("reach")[0], "go there")])
-    loss = lw.AdvantageWeightedLoss(lw.PlanConditionedActor({**PLANS, "reach": other}, **SMALL))
+    loss = lw.objectives.AdvantageWeightedLoss(lw.PlanConditionedActor({**PLANS, "reach": other}, **SMALL))
     with pytest.raises(ValueError, match="other plans"):
         loss(make_batch())
 
@@ -234,17 +234,17 @@ def test_shapes_that_would_broadcast_are_refused(shape):
     wrong = TensorDict(dict(batch.items()) | {"advantage": torch.zeros(shape)}, batch_size=[])
     wrong.batch_size = [12] if shape[0] == 12 else []
     with pytest.raises(ValueError, match="advantage must be"):
-        lw.AdvantageWeightedLoss(make_actor())(wrong)
+        lw.objectives.AdvantageWeightedLoss(make_actor())(wrong)
 
 
 def test_what_is_refused():
     actor, batch = make_actor(), make_batch()
     for wrong in (dict(beta=-1.0), dict(beta=math.inf), dict(max_weight=0.0), dict(max_weight=math.nan)):
         with pytest.raises(ValueError, match=next(iter(wrong))):
-            lw.AdvantageWeightedLoss(actor, **wrong)
+            lw.objectives.AdvantageWeightedLoss(actor, **wrong)
     with pytest.raises(ValueError, match=r"loss_function must be one of .*did you mean 'l2'"):
-        lw.AdvantageWeightedLoss(actor, loss_function="L2")
-    loss = lw.AdvantageWeightedLoss(actor)
+        lw.objectives.AdvantageWeightedLoss(actor, loss_function="L2")
+    loss = lw.objectives.AdvantageWeightedLoss(actor)
     for wrong in (math.nan, math.inf, -math.inf):
         with pytest.raises(ValueError, match="advantage must hold finite numbers"):
             loss(batch.clone().set("advantage", torch.full((12, 1), wrong)))
@@ -253,7 +253,7 @@ def test_what_is_refused():
     with pytest.raises(RuntimeError, match="incompatible"):
         loss(batch.clone().set("action", torch.zeros(12, 1)))
     with pytest.raises(TypeError, match="has no distribution"):
-        lw.AdvantageWeightedLoss(actor, loss_function="log_prob")(batch)
+        lw.objectives.AdvantageWeightedLoss(actor, loss_function="log_prob")(batch)
 
 
 ADVANTAGES = st.lists(st.tuples(st.integers(0, 3), FLOATS), min_size=1, max_size=20)
@@ -267,7 +267,7 @@ def tensors(rows):
 @settings(max_examples=50, deadline=None)
 @given(rows=ADVANTAGES)
 def test_standardized_by_hand(rows):
-    found = lw.standardize_by_task(*tensors(rows))
+    found = lw.objectives.standardize_by_task(*tensors(rows))
     assert (found.shape, found.dtype) == ((len(rows), 1), torch.float32)
     for (task, advantage), one in zip(rows, found.squeeze(-1).tolist(), strict=True):
         own = np.array([np.float64(a) for t, a in rows if t == task])
@@ -284,12 +284,12 @@ def test_standardized_by_hand(rows):
 def test_a_tasks_unit_and_zero_change_nothing_nor_does_the_order(rows, maps, seed):
     advantage, ids = tensors([(task, float(number)) for task, number in rows])
     scale, shift = torch.tensor(maps, dtype=torch.float32).unbind(-1)
-    found = lw.standardize_by_task(advantage, ids)
-    other = lw.standardize_by_task(advantage * scale[ids].unsqueeze(-1) + shift[ids].unsqueeze(-1), ids)
+    found = lw.objectives.standardize_by_task(advantage, ids)
+    other = lw.objectives.standardize_by_task(advantage * scale[ids].unsqueeze(-1) + shift[ids].unsqueeze(-1), ids)
     torch.testing.assert_close(other, found, atol=1e-5, rtol=1e-5)
     order = torch.randperm(len(rows), generator=torch.Generator().manual_seed(seed))
-    torch.testing.assert_close(lw.standardize_by_task(advantage[order], ids[order]), found[order])
-    negative = lw.standardize_by_task(-advantage, ids)
+    torch.testing.assert_close(lw.objectives.standardize_by_task(advantage[order], ids[order]), found[order])
+    negative = lw.objectives.standardize_by_task(-advantage, ids)
     torch.testing.assert_close(negative, -found)
 
 
@@ -297,14 +297,14 @@ def test_a_tasks_unit_and_zero_change_nothing_nor_does_the_order(rows, maps, see
 def test_of_a_task_whose_rows_are_all_alike_there_is_nothing_to_tell(same):
     """0.1 has a mean over seven that is not 0.1, in rounding."""
     advantage = torch.full((7, 1), same)
-    assert (lw.standardize_by_task(advantage, torch.zeros(7, dtype=torch.int64)) == 0).all()
-    assert (lw.standardize_by_task(advantage, torch.arange(7)) == 0).all()
-    assert lw.standardize_by_task(torch.zeros(0, 1), torch.zeros(0, dtype=torch.int64)).shape == (0, 1)
+    assert (lw.objectives.standardize_by_task(advantage, torch.zeros(7, dtype=torch.int64)) == 0).all()
+    assert (lw.objectives.standardize_by_task(advantage, torch.arange(7)) == 0).all()
+    assert lw.objectives.standardize_by_task(torch.zeros(0, 1), torch.zeros(0, dtype=torch.int64)).shape == (0, 1)
 
 
 def test_of_huge_ones_too():
     advantage = torch.tensor([[3e38], [-3e38]])
-    assert lw.standardize_by_task(advantage, torch.zeros(2, dtype=torch.int64)).tolist() == [[1.0], [-1.0]]
+    assert lw.objectives.standardize_by_task(advantage, torch.zeros(2, dtype=torch.int64)).tolist() == [[1.0], [-1.0]]
 
 
 @pytest.mark.parametrize(
@@ -321,7 +321,7 @@ def test_of_huge_ones_too():
 )
 def test_standardize_refuses(advantage, ids, message):
     with pytest.raises(ValueError, match=message):
-        lw.standardize_by_task(advantage, ids)
+        lw.objectives.standardize_by_task(advantage, ids)
 
 
 def test_from_the_value_to_the_weights():
@@ -332,9 +332,9 @@ def test_from_the_value_to_the_weights():
     ended = torch.ones(40, 1, dtype=torch.bool)
     following = batch.select("observation", "task_id").set("done", ended).set("terminated", ended)
     batch["next"] = following.set("reward", torch.rand(40, 1))
-    value = lw.ExpectileValueLoss(Value(DescriptorEncoder("MT10"), ensemble=2, **SMALL), delay_value=False)
-    batch["advantage"] = lw.standardize_by_task(value.advantage(batch), batch["task_id"])
-    found = lw.AdvantageWeightedLoss(make_actor("description"), beta=3.0)(batch)
+    value = lw.objectives.ExpectileValueLoss(Value(DescriptorEncoder("MT10"), ensemble=2, **SMALL), delay_value=False)
+    batch["advantage"] = lw.objectives.standardize_by_task(value.advantage(batch), batch["task_id"])
+    found = lw.objectives.AdvantageWeightedLoss(make_actor("description"), beta=3.0)(batch)
     assert found["loss_actor"].isfinite()
     assert found["ESS"] < 0.9
 
@@ -347,7 +347,7 @@ def test_reduced_otherwise_each_row_has_its_own_weight(distribution):
     batch, found = make_batch(spread=3.0), {}
     name = "l2" if distribution is None else "log_prob"
     for reduction in ("none", "sum", "mean", None):
-        loss = lw.AdvantageWeightedLoss(
+        loss = lw.objectives.AdvantageWeightedLoss(
             make_actor(distribution=distribution).eval(), beta=1.5, loss_function=name, reduction=reduction
         )
         found[reduction] = loss(batch)["loss_actor"]
@@ -356,10 +356,12 @@ def test_reduced_otherwise_each_row_has_its_own_weight(distribution):
     torch.testing.assert_close(found["none"].sum(), found["sum"])
     torch.testing.assert_close(found["sum"] / weights.sum(), found["mean"])
     assert torch.equal(found["mean"], found[None])
-    alone = lw.AdvantageWeightedLoss(make_actor(distribution=distribution).eval(), loss_function=name, beta=0.0)
+    alone = lw.objectives.AdvantageWeightedLoss(
+        make_actor(distribution=distribution).eval(), loss_function=name, beta=0.0
+    )
     for row in range(12):  # with the weight 1
         torch.testing.assert_close(found["none"][row], weights[row] * alone(batch[row : row + 1])["loss_actor"])
     with pytest.raises(
         ValueError, match="reduction must be one of 'none', 'mean', 'sum', got 'men'; did you mean 'mean'"
     ):
-        lw.AdvantageWeightedLoss(make_actor(), reduction="men")
+        lw.objectives.AdvantageWeightedLoss(make_actor(), reduction="men")

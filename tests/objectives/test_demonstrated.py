@@ -14,9 +14,9 @@ from lw_torchrl.objectives.demonstrated import imitation
 
 def make(kind, bc_weight=2.0, seed=0, **options):
     torch.manual_seed(seed)
-    actor = make_actor("plan", "tanh_normal" if kind is lw.DemonstratedSACLoss else None).eval()
+    actor = make_actor("plan", "tanh_normal" if kind is lw.objectives.DemonstratedSACLoss else None).eval()
     critic = QValue(make_encoder("plan"), **SMALL)
-    more = BOUNDS if kind in (lw.DemonstratedTD3Loss, TD3Loss) else {}
+    more = BOUNDS if kind in (lw.objectives.DemonstratedTD3Loss, TD3Loss) else {}
     loss = kind(actor, critic, **({} if bc_weight is None else {"bc_weight": bc_weight}), **more, **options)
     loss.make_value_estimator(gamma=0.9)
     SoftUpdate(loss, eps=0.9)
@@ -34,7 +34,7 @@ def values(loss, critic, batch, action):
 
 @pytest.mark.parametrize("shape", [(24,), (24, 1)])
 def test_td3s_actor_is_torn_between_values_and_demonstrations(shape):
-    loss, actor, critic = make(lw.DemonstratedTD3Loss, bc_weight=0.7)
+    loss, actor, critic = make(lw.objectives.DemonstratedTD3Loss, bc_weight=0.7)
     batch = make_batch()
     batch["is_demonstration"] = batch["is_demonstration"].view(shape)
     found, about = loss.actor_loss(batch)
@@ -58,7 +58,7 @@ def test_td3s_actor_is_torn_between_values_and_demonstrations(shape):
 
 def test_td3s_critics_are_torchrls():
     batch = make_batch()
-    ours, _, _ = make(lw.DemonstratedTD3Loss)
+    ours, _, _ = make(lw.objectives.DemonstratedTD3Loss)
     theirs, _, _ = make(TD3Loss, None)
     found = []
     for loss in (ours, theirs):
@@ -70,7 +70,7 @@ def test_td3s_critics_are_torchrls():
 def test_sacs_actor_is_drawn_to_demonstrations_by_its_mode():
     batch = make_batch()
     batch["action"] = batch["action"].sign()  # where a likelihood explodes
-    ours, actor, _ = make(lw.DemonstratedSACLoss, bc_weight=0.7)
+    ours, actor, _ = make(lw.objectives.DemonstratedSACLoss, bc_weight=0.7)
     theirs = SACLoss(actor, QValue(make_encoder("plan"), **SMALL))
     theirs.make_value_estimator(gamma=0.9)
     SoftUpdate(theirs, eps=0.9)
@@ -92,7 +92,7 @@ def test_sacs_actor_is_drawn_to_demonstrations_by_its_mode():
     torch.testing.assert_close(different[1] - different[0], 0.7 * distance)
 
 
-@pytest.mark.parametrize("kind", [lw.DemonstratedTD3Loss, lw.DemonstratedSACLoss])
+@pytest.mark.parametrize("kind", [lw.objectives.DemonstratedTD3Loss, lw.objectives.DemonstratedSACLoss])
 def test_without_demonstrations_nothing_is_imitated(kind):
     batch = make_batch()
     batch["is_demonstration"] = torch.zeros(24, dtype=torch.bool)
@@ -102,7 +102,7 @@ def test_without_demonstrations_nothing_is_imitated(kind):
     assert total(make(kind, 5.0)[0], batch) > losses[0]
 
 
-@pytest.mark.parametrize("kind", [lw.DemonstratedTD3Loss, lw.DemonstratedSACLoss])
+@pytest.mark.parametrize("kind", [lw.objectives.DemonstratedTD3Loss, lw.objectives.DemonstratedSACLoss])
 def test_keys_are_obeyed(kind):
     batch, (loss, _, _), (other, _, _) = make_batch(), make(kind), make(kind)
     expected = total(loss, batch)
@@ -116,7 +116,7 @@ def test_keys_are_obeyed(kind):
         loss.set_keys(is_demonstrations="is_demonstration")
 
 
-@pytest.mark.parametrize("kind", [lw.DemonstratedTD3Loss, lw.DemonstratedSACLoss])
+@pytest.mark.parametrize("kind", [lw.objectives.DemonstratedTD3Loss, lw.objectives.DemonstratedSACLoss])
 def test_another_reduction_is_refused_when_the_loss_is_made(kind):
     with pytest.raises(ValueError, match="reduction must be one of 'none', 'mean', 'sum', got 'men'; did you mean"):
         make(kind, reduction="men")
@@ -124,8 +124,8 @@ def test_another_reduction_is_refused_when_the_loss_is_made(kind):
 
 def test_a_loss_for_each_row_has_the_same_mean():
     batch = make_batch()
-    loss, _, _ = make(lw.DemonstratedTD3Loss)
-    each, _, _ = make(lw.DemonstratedTD3Loss, reduction="none")
+    loss, _, _ = make(lw.objectives.DemonstratedTD3Loss)
+    each, _, _ = make(lw.objectives.DemonstratedTD3Loss, reduction="none")
     found = each.actor_loss(batch)[0]
     assert found.shape == (24,)
     torch.testing.assert_close(found.mean(), loss.actor_loss(batch)[0])
@@ -142,14 +142,14 @@ def test_imitation_is_of_demonstrated_rows_alone():
 
 def test_wrong_options_are_named():
     with pytest.raises(ValueError, match="bc_weight"):
-        make(lw.DemonstratedTD3Loss, -1.0)
+        make(lw.objectives.DemonstratedTD3Loss, -1.0)
     with pytest.raises(ValueError, match="bc_weight"):
-        make(lw.DemonstratedSACLoss, float("nan"))
+        make(lw.objectives.DemonstratedSACLoss, float("nan"))
     with pytest.raises(ValueError, match="alpha is 1 here: give bc_weight"):
-        make(lw.DemonstratedTD3Loss, alpha=2.5)
+        make(lw.objectives.DemonstratedTD3Loss, alpha=2.5)
 
 
-@pytest.mark.parametrize("kind", [lw.DemonstratedTD3Loss, lw.DemonstratedSACLoss])
+@pytest.mark.parametrize("kind", [lw.objectives.DemonstratedTD3Loss, lw.objectives.DemonstratedSACLoss])
 def test_what_says_which_rows_are_demonstrations_is_named_where_it_is_missing(kind):
     loss, batch = make(kind)[0], make_batch()
     batch["is_target"] = batch.pop("is_demonstration")  # of co-learning, which is another thing
@@ -170,22 +170,25 @@ def test_of_a_buffer_of_demonstrations_all_rows_are_imitated(tmp_path, sampler):
     replay = lw.LanguageWorldExperienceReplay(
         tmp_path / "d", label="executed", batch_size=8, sampler=sampler, transform=lw.QAFTransform(PLANS)
     )
-    loss, actor, _ = make(lw.DemonstratedTD3Loss)
+    loss, actor, _ = make(lw.objectives.DemonstratedTD3Loss)
     batch = replay.sample()
     found = loss.actor_loss(batch)[1]["bc_loss"]
     torch.testing.assert_close(found, (actor(batch.copy())["action"] - batch["action"]).square().mean())
 
 
 def test_with_and_without_vmap_it_is_the_same():
-    found = [total(make(lw.DemonstratedTD3Loss, deactivate_vmap=which)[0], make_batch()) for which in (False, True)]
+    found = [
+        total(make(lw.objectives.DemonstratedTD3Loss, deactivate_vmap=which)[0], make_batch())
+        for which in (False, True)
+    ]
     torch.testing.assert_close(*found)
 
 
-@pytest.mark.parametrize("kind", [lw.DemonstratedTD3Loss, lw.DemonstratedSACLoss])
+@pytest.mark.parametrize("kind", [lw.objectives.DemonstratedTD3Loss, lw.objectives.DemonstratedSACLoss])
 def test_a_sum_is_the_mean_times_the_rows(kind):
     batch, found = make_batch(), {}
     for reduction in ("mean", "sum", "none"):
-        more = {"scalar_output_mode": "exclude"} if kind is lw.DemonstratedSACLoss else {}
+        more = {"scalar_output_mode": "exclude"} if kind is lw.objectives.DemonstratedSACLoss else {}
         loss = make(kind, reduction=reduction, **more)[0]
         torch.manual_seed(3)
         found[reduction] = loss.actor_loss(batch.copy())[0]
@@ -196,12 +199,12 @@ def test_a_sum_is_the_mean_times_the_rows(kind):
 
 def test_an_action_spec_of_several_rows_is_refused():
     env = lw.LanguageWorldEnv("reach", num_envs=4)
-    for kind in (lw.DemonstratedTD3Loss, lw.DemonstratedSACLoss):
+    for kind in (lw.objectives.DemonstratedTD3Loss, lw.objectives.DemonstratedSACLoss):
         actor, critic = make_actor("plan"), QValue(make_encoder("plan"), **SMALL)
         with pytest.raises(
             ValueError, match=r"action_spec must be of one row, got one of shape \(4, 4\): take env.action"
         ):
             kind(actor, critic, action_spec=env.action_spec)
-    assert make(lw.DemonstratedSACLoss, action_spec=env.action_spec_unbatched)[0].target_entropy == -4
-    assert make(lw.DemonstratedSACLoss, action_spec=env.full_action_spec)[0].target_entropy == -4
+    assert make(lw.objectives.DemonstratedSACLoss, action_spec=env.action_spec_unbatched)[0].target_entropy == -4
+    assert make(lw.objectives.DemonstratedSACLoss, action_spec=env.full_action_spec)[0].target_entropy == -4
     env.close()

@@ -33,7 +33,7 @@ def make_loss(kind="plan", ensemble=2, seed=0, gamma=0.9, **options):
     """A loss whose targets differ from what it trains, as in the midst of a training."""
     torch.manual_seed(seed)
     noise = {"feature_noise": options.pop("feature_noise", 0.0)}
-    loss = lw.ExpectileValueLoss(CRITICS[kind](ensemble, **noise), **options)
+    loss = lw.objectives.ExpectileValueLoss(CRITICS[kind](ensemble, **noise), **options)
     loss.make_value_estimator(gamma=gamma)
     if options.get("delay_value", True):
         SoftUpdate(loss, eps=0.9)
@@ -122,7 +122,7 @@ def test_it_finds_the_expectile_of_what_followed():
         one=torch.ones(200, 1), next=TensorDict(one=torch.ones(200, 1), reward=rewards, done=ended, terminated=ended)
     ).auto_batch_size_(1)
     network = TensorDictModule(nn.Linear(1, 1, bias=False), in_keys=["one"], out_keys=["state_value"])
-    loss = lw.ExpectileValueLoss(network, expectile=0.9, delay_value=False).make_value_estimator(gamma=0.9)
+    loss = lw.objectives.ExpectileValueLoss(network, expectile=0.9, delay_value=False).make_value_estimator(gamma=0.9)
     optimizer = torch.optim.SGD(loss.parameters(), lr=0.5)
     for _ in range(300):
         optimizer.zero_grad()
@@ -163,7 +163,7 @@ def test_targets_follow():
 
 
 def test_without_an_updater_torchrl_warns():
-    loss = lw.ExpectileValueLoss(CRITICS["plan"](2)).make_value_estimator(gamma=0.9)
+    loss = lw.objectives.ExpectileValueLoss(CRITICS["plan"](2)).make_value_estimator(gamma=0.9)
     with pytest.warns(UserWarning, match="No target network updater"):
         loss(make_batch())
 
@@ -217,7 +217,9 @@ def test_keys_by_other_names_nested_ones_too():
     def make(in_keys=None, out_keys=None):
         torch.manual_seed(3)
         encoder = DescriptorEncoder("MT10", in_keys=in_keys)
-        loss = lw.ExpectileValueLoss(Value(encoder, ensemble=2, out_keys=out_keys, **SMALL), delay_value=False)
+        loss = lw.objectives.ExpectileValueLoss(
+            Value(encoder, ensemble=2, out_keys=out_keys, **SMALL), delay_value=False
+        )
         return loss
 
     plain, other = make().make_value_estimator(gamma=0.9), make(keys, [names["value"], names["values"]])
@@ -296,7 +298,7 @@ def test_other_estimators():
 
 
 def test_by_default_a_step_is_discounted_by_099():
-    loss = lw.ExpectileValueLoss(CRITICS["plan"](2), delay_value=False)
+    loss = lw.objectives.ExpectileValueLoss(CRITICS["plan"](2), delay_value=False)
     batch = make_batch()
     wanted = copy.deepcopy(loss).make_value_estimator(gamma=0.99).advantage(batch)
     assert torch.equal(loss.advantage(batch), wanted)
@@ -306,16 +308,16 @@ def test_what_is_refused():
     critic = CRITICS["plan"](2)
     for wrong in (-0.1, 1.5, float("nan")):
         with pytest.raises(ValueError, match="expectile must be"):
-            lw.ExpectileValueLoss(critic, expectile=wrong)
+            lw.objectives.ExpectileValueLoss(critic, expectile=wrong)
     with pytest.raises(TypeError, match="expectile must be a number"):
-        lw.ExpectileValueLoss(critic, expectile="0.7")
+        lw.objectives.ExpectileValueLoss(critic, expectile="0.7")
     loss, batch = make_loss(), make_batch()
     with pytest.raises(ValueError, match=r"are needed, got .*without qaf"):
         loss(batch.exclude("qaf"))
     with pytest.raises(RuntimeError, match="shape"):
         loss(batch.set(("next", "reward"), torch.rand(12)))
     renamed = Value(DescriptorEncoder("MT10"), ensemble=2, out_keys=["v", "vs"])
-    loss = lw.ExpectileValueLoss(renamed, delay_value=False)
+    loss = lw.objectives.ExpectileValueLoss(renamed, delay_value=False)
     with pytest.raises(ValueError, match=r"writes \['v', 'vs'\], which lack 'state_value'.*set_keys"):
         loss(make_batch())
     loss.set_keys(value="v")  # the least of the ensemble alone

@@ -44,14 +44,14 @@ DETERMINISTIC = {
     "DDPG": lambda actor, q, v: DDPGLoss(actor, q),
     "TD3": lambda actor, q, v: TD3Loss(actor, q, **BOUNDS),
     "TD3+BC": lambda actor, q, v: TD3BCLoss(actor, q, **BOUNDS),
-    "demonstrated TD3": lambda actor, q, v: lw.DemonstratedTD3Loss(actor, q, **BOUNDS),
+    "demonstrated TD3": lambda actor, q, v: lw.objectives.DemonstratedTD3Loss(actor, q, **BOUNDS),
 }
 STOCHASTIC = {
     "BC, likelihood": lambda actor, q, v: BCLoss(actor),
     "DT": lambda actor, q, v: DTLoss(actor),
     "online DT": lambda actor, q, v: OnlineDTLoss(actor),
     "SAC": lambda actor, q, v: SACLoss(actor, q),
-    "demonstrated SAC": lambda actor, q, v: lw.DemonstratedSACLoss(actor, q),
+    "demonstrated SAC": lambda actor, q, v: lw.objectives.DemonstratedSACLoss(actor, q),
     "REDQ": lambda actor, q, v: REDQLoss(actor, q),
     "CrossQ": lambda actor, q, v: CrossQLoss(actor, q),
     "IQL": lambda actor, q, v: IQLLoss(actor, q, v),
@@ -281,7 +281,7 @@ def test_the_ratio_is_one_before_an_update():
     from torchrl.envs import TransformedEnv
 
     for distribution in ("tanh_normal", "normal"):
-        actor, value = lw.plan_actor_value(PLANS, distribution=distribution, init_std=1.5, **SMALL)
+        actor, value = lw.modules.plan_actor_value(PLANS, distribution=distribution, init_std=1.5, **SMALL)
         env = TransformedEnv(lw.LanguageWorldEnv(["push", "reach"], num_envs=4, seed=0), actor.transform())
         with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
             data = env.rollout(20, actor)
@@ -296,7 +296,7 @@ def test_the_ratio_is_one_before_an_update():
 
 
 def test_a_shared_encoder_is_trained_by_both():
-    actor, value = lw.plan_actor_value(PLANS, **SMALL)
+    actor, value = lw.modules.plan_actor_value(PLANS, **SMALL)
     assert value.encoder is actor.encoder
     batch = ready("PPO", make_batch(), actor, value)
     loss = ClipPPOLoss(actor, value, separate_losses=False)

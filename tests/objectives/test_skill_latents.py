@@ -25,7 +25,7 @@ def make_actor(seed=0, plans=PLANS, **options):
 
 
 def term(network, kind):
-    return lw.SkillLatentLoss(network, kind)()["loss_latents"]
+    return lw.objectives.SkillLatentLoss(network, kind)()["loss_latents"]
 
 
 def cosine(one, other):
@@ -84,7 +84,7 @@ def test_the_latents_length_changes_nothing(seed, factor):
 @pytest.mark.parametrize("kind", KINDS)
 def test_it_trains_the_texts_encoder_of_the_actor_itself(kind):
     actor = make_actor()
-    loss = lw.SkillLatentLoss(actor, kind)
+    loss = lw.objectives.SkillLatentLoss(actor, kind)
     optimizer = torch.optim.Adam(loss.parameters(), lr=1e-2)
     before = term(actor, kind).item()
     for _ in range(100):
@@ -98,7 +98,7 @@ def test_it_trains_the_texts_encoder_of_the_actor_itself(kind):
 
 def test_consistency_makes_latents_alike_as_texts_are():
     actor = make_actor(latent_size=32, encoder_width=64)
-    loss = lw.SkillLatentLoss(actor)
+    loss = lw.objectives.SkillLatentLoss(actor)
 
     def likeness():
         both = (normalize(x, dim=-1) for x in (loss.encoder.latents(), loss.encoder.text_vectors))
@@ -122,7 +122,7 @@ def test_consistency_makes_latents_alike_as_texts_are():
 @pytest.mark.parametrize("kind", KINDS)
 def test_compiled_it_is_one_graph_with_the_same_gradients(kind):
     torch._dynamo.reset()
-    loss, found = lw.SkillLatentLoss(make_actor(), kind), []
+    loss, found = lw.objectives.SkillLatentLoss(make_actor(), kind), []
     for run in (loss, torch.compile(loss, fullgraph=True, backend="eager")):
         loss.zero_grad()
         value = run()["loss_latents"]
@@ -133,7 +133,7 @@ def test_compiled_it_is_one_graph_with_the_same_gradients(kind):
 
 
 def test_its_state_goes_round():
-    loss, other = lw.SkillLatentLoss(make_actor()), lw.SkillLatentLoss(make_actor(1))
+    loss, other = lw.objectives.SkillLatentLoss(make_actor()), lw.objectives.SkillLatentLoss(make_actor(1))
     assert loss()["loss_latents"] != other()["loss_latents"]
     other.load_state_dict(loss.state_dict())
     assert torch.equal(loss()["loss_latents"], other()["loss_latents"])
@@ -142,24 +142,27 @@ def test_its_state_goes_round():
 
 def test_what_is_refused():
     with pytest.raises(ValueError, match=r"network is for policies with plans, .* DescriptorConditionedActor has none"):
-        lw.SkillLatentLoss(lw.DescriptorConditionedActor("MT10"))
+        lw.objectives.SkillLatentLoss(lw.DescriptorConditionedActor("MT10"))
     with pytest.raises(ValueError, match=r"network is for policies with plans, .* Linear has none"):
-        lw.SkillLatentLoss(torch.nn.Linear(2, 2))
+        lw.objectives.SkillLatentLoss(torch.nn.Linear(2, 2))
     with pytest.raises(ValueError, match=r"kind must be one of .*did you mean 'contrastive'"):
-        lw.SkillLatentLoss(make_actor(), "contrast")
+        lw.objectives.SkillLatentLoss(make_actor(), "contrast")
     step = PLANS["reach"].steps[0]
     one = lw.ConditionalPlan.from_pairs("reach", [(str(step.condition), step.skill)])
     with pytest.raises(ValueError, match=f"network is for plans of at least two different skills, got {step.skill}"):
-        lw.SkillLatentLoss(make_actor(plans={"reach": one}))
+        lw.objectives.SkillLatentLoss(make_actor(plans={"reach": one}))
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_reduced_otherwise_each_skill_has_a_term(kind):
     actor = make_actor()
-    found = {r: lw.SkillLatentLoss(actor, kind, reduction=r)()["loss_latents"] for r in ("none", "sum", "mean", None)}
+    found = {
+        r: lw.objectives.SkillLatentLoss(actor, kind, reduction=r)()["loss_latents"]
+        for r in ("none", "sum", "mean", None)
+    }
     assert found["none"].shape == (len(actor.encoder.skills),)
     torch.testing.assert_close(found["none"].sum(), found["sum"])
     torch.testing.assert_close(found["none"].mean(), found["mean"])
     assert torch.equal(found["mean"], found[None])
     with pytest.raises(ValueError, match="reduction must be one of 'none', 'mean', 'sum', got 'max'"):
-        lw.SkillLatentLoss(actor, kind, reduction="max")
+        lw.objectives.SkillLatentLoss(actor, kind, reduction="max")

@@ -198,7 +198,7 @@ def test_the_policies_of_one_shot_are_kept_one_by_one(undisturbed):
 def test_an_ensemble_has_members_of_its_own_and_is_not_trained_twice(undisturbed, tmp_path, method, setting, file):
     one = a_run(method, setting=setting, preset=ENSEMBLE)
     policy = lw.load_actor(undisturbed / one.folder / file)
-    assert isinstance(policy, lw.ActorEnsemble)
+    assert isinstance(policy, lw.modules.ActorEnsemble)
     assert [actor.config["width"] for actor in policy.members] == [32, 16]
     shutil.copytree(undisturbed, tmp_path / "again")
     (tmp_path / "again" / one.folder / "results.json").unlink()

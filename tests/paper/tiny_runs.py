@@ -45,7 +45,7 @@ def rates(path):
 
 def stop_training(monkeypatch, setting, at):
     """Ctrl-C before the at-th step that is made; returns a list of the number of steps that were asked for."""
-    trainer = lw.BehavioralCloningTrainer if setting is TINY else lw.StackedBehavioralCloning
+    trainer = lw.BehavioralCloningTrainer if setting is TINY else lw.training.StackedBehavioralCloning
     step, count = trainer.step, [0]
 
     def stops(self):

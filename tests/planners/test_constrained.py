@@ -263,7 +263,7 @@ def test_a_server_that_knows_another_kind_of_schema(ask, status):
 def test_a_server_that_takes_no_schema_says_so(ask):
     server = FakeServer(lambda body: error(400, f"response_format {body['response_format']['type']} is not supported"))
     with pytest.raises(
-        lw.PlannerError, match=r"json_object is not supported.*did not take .*json_schema is not supported"
+        lw.planners.PlannerError, match=r"json_object is not supported.*did not take .*json_schema is not supported"
     ):
         ask(server, "push")
 

@@ -33,7 +33,7 @@ def folder(tmp_path):
 
 def test_a_folder(folder, tmp_path):
     planner = lw.FilePlanner(folder, "two/2")
-    assert isinstance(planner, lw.Planner)
+    assert isinstance(planner, lw.planners.Planner)
     assert planner.name == "two_2"
     assert planner.recorded == tuple(("chain_md", task, k) for task in ("drawer-open", "push") for k in (0, 1, 12))
     found = planner.plans(["push", "drawer-open"], format="chain_md", attempts=2, out=tmp_path / "copy")
@@ -46,9 +46,13 @@ def test_a_folder(folder, tmp_path):
 
 def test_what_is_not_there(folder, tmp_path):
     planner = lw.FilePlanner(folder, "one")
-    with pytest.raises(lw.PlannerError, match=r"'one' is recorded for push in chain_md, attempt 2.* attempts 0, 1, 12"):
+    with pytest.raises(
+        lw.planners.PlannerError, match=r"'one' is recorded for push in chain_md, attempt 2.* attempts 0, 1, 12"
+    ):
         planner.plans("push", format="chain_md", attempts=3)
-    with pytest.raises(lw.PlannerError, match="reach in chain_md, attempt 0; of reach there are none in chain_md"):
+    with pytest.raises(
+        lw.planners.PlannerError, match="reach in chain_md, attempt 0; of reach there are none in chain_md"
+    ):
         planner.plans("reach", format="chain_md")
     with pytest.raises(ValueError, match="has answers of one, two_2"):
         lw.FilePlanner(folder)

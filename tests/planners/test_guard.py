@@ -258,7 +258,7 @@ def test_a_planner_is_answered(served, tmp_path):
     asked = lw.OpenAIPlanner("mine", base_url=f"http://127.0.0.1:{served}/v1", constrain=True, cache=tmp_path)
     (answer,) = asked.plans("push", progress=False)
     assert json.loads(answer.raw)[1]["response_format"]["type"] == "json_object"
-    with pytest.raises(lw.PlannerError, match=r"no such model or address.*'mine' is served"):
+    with pytest.raises(lw.planners.PlannerError, match=r"no such model or address.*'mine' is served"):
         lw.OpenAIPlanner("other", base_url=f"http://127.0.0.1:{served}/v1", cache=tmp_path).plans(
             "push", progress=False
         )

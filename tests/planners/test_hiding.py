@@ -108,7 +108,7 @@ def test_a_key_in_an_error_reaches_nothing(tmp_path, monkeypatch, caplog, name):
     with caplog.at_level(logging.DEBUG):
         for failure in failures[some % 4 :: 4]:
             server = FakeServer(lambda _, failure=failure: failure)
-            with serving(server) as address, pytest.raises(lw.PlannerError) as caught:
+            with serving(server) as address, pytest.raises(lw.planners.PlannerError) as caught:
                 planner(address, tmp_path).plans("push", progress=False)
             seen += [str(caught.value), repr(caught.value), "".join(traceback.format_exception(caught.value))]
     seen.append(caplog.text)
@@ -121,7 +121,7 @@ def test_a_key_in_the_words_beside_a_status_reaches_no_log(tmp_path, monkeypatch
     content = b"HTTP/1.1 400 %b\r\nX-Key: %b\r\nContent-Length: 0\r\n\r\n" % (SECRET.encode(), SECRET.encode())
     with caplog.at_level(logging.DEBUG), talking(lambda: [content]) as address:
         secret = planner(address.replace("http://", "http://me:a-password-of-mine@"), tmp_path)
-        with pytest.raises(lw.PlannerError):
+        with pytest.raises(lw.planners.PlannerError):
             secret.plans("push", progress=False)
     assert "(the key)" in caplog.text
     assert SECRET not in caplog.text
@@ -192,6 +192,6 @@ def test_no_shipped_plan_holds_what_people_write_for_a_key():
 def test_a_key_that_no_header_can_hold_is_refused(tmp_path, monkeypatch):
     for key in ("sk-\u20ac9876543", "sk-98765\n43210"):
         monkeypatch.setenv("OPENAI_API_KEY", key)
-        with pytest.raises(lw.PlannerError, match="the key in OPENAI_API_KEY has characters") as caught:
+        with pytest.raises(lw.planners.PlannerError, match="the key in OPENAI_API_KEY has characters") as caught:
             planner("http://127.0.0.1:1/v1", tmp_path).plans("push", progress=False)
         assert "9876" not in str(caught.value)

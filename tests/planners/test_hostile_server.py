@@ -55,7 +55,7 @@ DRIPS = {
 def test_an_answers_time_is_one_whatever_drips(tmp_path, name):
     with talking(DRIPS[name]) as address:
         began = time.monotonic()
-        with pytest.raises(lw.PlannerError, match=r"no answer within 0\.5 s, asked 1 time.*longer timeout"):
+        with pytest.raises(lw.planners.PlannerError, match=r"no answer within 0\.5 s, asked 1 time.*longer timeout"):
             planner(address, tmp_path, timeout=0.5).plans("push", progress=False)
         assert time.monotonic() - began < 5
     assert not (tmp_path / "kept").exists()
@@ -68,7 +68,10 @@ def test_each_retry_has_the_same_time(tmp_path):
         asked.append(time.monotonic())
         yield from DRIPS["body"]()
 
-    with talking(talk) as address, pytest.raises(lw.PlannerError, match=r"no answer within 0\.3 s, asked 2 times"):
+    with (
+        talking(talk) as address,
+        pytest.raises(lw.planners.PlannerError, match=r"no answer within 0\.3 s, asked 2 times"),
+    ):
         planner(address, tmp_path, timeout=0.3, retries=1).plans("push", progress=False)
     assert len(asked) == 2
     assert asked[1] - asked[0] < 5
@@ -85,7 +88,7 @@ def test_a_connection_that_is_never_taken_ends(tmp_path):
                 one.connect_ex(full.getsockname())
             began = time.monotonic()
             address = f"http://127.0.0.1:{full.getsockname()[1]}/v1"
-            with pytest.raises(lw.PlannerError, match=r"no answer within 0\.5 s"):
+            with pytest.raises(lw.planners.PlannerError, match=r"no answer within 0\.5 s"):
                 planner(address, tmp_path, timeout=0.5).plans("push", progress=False)
             assert time.monotonic() - began < 5
         finally:
@@ -103,7 +106,7 @@ def test_the_others_are_answered_beside_one_that_drips(tmp_path):
             yield from DRIPS["body"]()
         yield HEAD + b"Content-Length: %d\r\n\r\n" % len(BODY) + BODY
 
-    with talking(talk) as address, pytest.raises(lw.PlannerError, match="4 of 5 answers are kept"):
+    with talking(talk) as address, pytest.raises(lw.planners.PlannerError, match="4 of 5 answers are kept"):
         planner(address, tmp_path, timeout=1.0, concurrency=2).plans("push", attempts=5, progress=False)
 
 
@@ -123,7 +126,7 @@ def test_a_reply_without_an_end_is_not_read_to_it(tmp_path, monkeypatch, status,
             sent.append(1)
 
     says = {200: "larger than|no JSON", 302: "sends on to nowhere", 500: "the server failed"}[status]
-    with talking(talk) as address, pytest.raises(lw.PlannerError, match=says) as caught:
+    with talking(talk) as address, pytest.raises(lw.planners.PlannerError, match=says) as caught:
         planner(address, tmp_path).plans("push", progress=False)
     assert len(str(caught.value)) < 1000
     assert len(sent) < 50  # what the sockets' buffers hold
@@ -133,7 +136,7 @@ def test_a_reply_that_is_too_large_is_named(tmp_path):
     body = json.dumps(completion("x" * bounded_client.REPLY_LIMIT))
     with (
         serving(FakeServer(lambda _: Failure(200, body))) as address,
-        pytest.raises(lw.PlannerError, match="the reply is larger than 4 MiB"),
+        pytest.raises(lw.planners.PlannerError, match="the reply is larger than 4 MiB"),
     ):
         planner(address, tmp_path).plans("push", progress=False)
 
@@ -144,7 +147,7 @@ def test_headers_without_an_end_are_a_fault(tmp_path):
         for number in range(20_000):
             yield b"X-%d: " % number + b"y" * 1000 + b"\r\n"
 
-    with talking(talk) as address, pytest.raises(lw.PlannerError, match="the connection failed"):
+    with talking(talk) as address, pytest.raises(lw.planners.PlannerError, match="the connection failed"):
         planner(address, tmp_path, timeout=20.0).plans("push", progress=False)
 
 
@@ -158,7 +161,10 @@ def test_a_redirect_is_not_followed(tmp_path):
     with talking(other) as there:
         for status in (301, 302, 303, 307, 308):
             server = FakeServer(lambda _, status=status: Failure(status, "", location=f"{there}?key=1"))
-            with serving(server) as address, pytest.raises(lw.PlannerError, match=f"sends on to {there}") as caught:
+            with (
+                serving(server) as address,
+                pytest.raises(lw.planners.PlannerError, match=f"sends on to {there}") as caught,
+            ):
                 planner(address, tmp_path).plans("push", progress=False)
             assert caught.value.fatal
     assert not asked
@@ -201,7 +207,7 @@ def test_what_is_no_answer_is_an_error(tmp_path, name, status):
         yield head % (status, len(NONE[name])) + NONE[name]
 
     began = time.monotonic()
-    with talking(talk) as address, pytest.raises(lw.PlannerError) as caught:
+    with talking(talk) as address, pytest.raises(lw.planners.PlannerError) as caught:
         planner(address, tmp_path).plans("push", progress=False)
     assert caught.value.__cause__ is caught.value.__context__ is None
     assert len(str(caught.value)) < 1500
@@ -227,7 +233,7 @@ def test_what_is_no_answer_is_an_error(tmp_path, name, status):
     ],
 )  # fmt: skip
 def test_what_is_no_http_is_an_error(tmp_path, head):
-    with talking(lambda: [head]) as address, pytest.raises(lw.PlannerError):
+    with talking(lambda: [head]) as address, pytest.raises(lw.planners.PlannerError):
         planner(address, tmp_path, timeout=5.0).plans("push", progress=False)
     assert not (tmp_path / "kept").exists()
 

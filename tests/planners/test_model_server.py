@@ -100,7 +100,7 @@ def test_from_the_prompt_to_the_robot_with_a_real_model(served, tmp_path):
 def test_it_answers_for_its_own_model_alone(served, tmp_path):
     name, address = served
     other = lw.OpenAIPlanner("gpt-4o", base_url=address, cache=tmp_path / "cache")
-    with pytest.raises(lw.PlannerError, match=f"no such model or address.*'{name}' is served"):
+    with pytest.raises(lw.planners.PlannerError, match=f"no such model or address.*'{name}' is served"):
         other.plans("reach", progress=False)
 
 

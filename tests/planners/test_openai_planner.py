@@ -48,7 +48,7 @@ def test_answers_become_plans(ask, tmp_path):
     files = {str(path.relative_to(tmp_path / "out")) for path in (tmp_path / "out").rglob("*.*")}
     assert files == {"a_model/settings.json"} | {f"a_model/chain_py/{task}-{k}.py" for task in lw.MT10 for k in (0, 1)}
     assert (tmp_path / "out/a_model/chain_py/push-1.py").read_text() == lw.encode_plan(PLANS["push"], "chain_py")
-    assert isinstance(lw.OpenAIPlanner("m"), lw.Planner)
+    assert isinstance(lw.OpenAIPlanner("m"), lw.planners.Planner)
 
 
 def test_what_is_sent(ask):
@@ -134,7 +134,7 @@ def test_a_failure_is_a_clear_message_and_nothing_is_lost(ask, name, constrain):
     respond, says, hint = ALWAYS[name]
     bad = lw.MT10[4]
     server = FakeServer(lambda body: respond(body) if asked_for(body) == bad else shipped(body))
-    with pytest.raises(lw.PlannerError, match=says) as caught:
+    with pytest.raises(lw.planners.PlannerError, match=says) as caught:
         ask(server, concurrency=1, constrain=constrain)
     message = str(caught.value)
     assert "'a/model' at http://127.0.0.1" in message
@@ -167,7 +167,7 @@ def test_what_passes_is_tried_again(ask, failure):
 
 def test_a_slow_server(ask):
     server = FakeServer(lambda body: Failure(200, completion("x"), wait=0.5))
-    with pytest.raises(lw.PlannerError, match=r"no answer within 0.1 s, asked 1 time.*longer timeout"):
+    with pytest.raises(lw.planners.PlannerError, match=r"no answer within 0.1 s, asked 1 time.*longer timeout"):
         ask(server, "push", timeout=0.1, retries=0)
 
 
@@ -177,7 +177,7 @@ def test_nobody_is_there(tmp_path):
         address = f"http://127.0.0.1:{taken.getsockname()[1]}/v1"
         planner = lw.OpenAIPlanner("m", base_url=address, cache=tmp_path, retries=0)
         with pytest.raises(
-            lw.PlannerError, match=f"'m' at {address}, push, attempt 0: the connection failed"
+            lw.planners.PlannerError, match=f"'m' at {address}, push, attempt 0: the connection failed"
         ) as caught:
             planner.plans("push", progress=False)
     assert caught.value.fatal
@@ -186,7 +186,7 @@ def test_nobody_is_there(tmp_path):
 
 def test_a_fatal_failure_ends_the_asking(ask):
     server = FakeServer(lambda body: error(401, "no"))
-    with pytest.raises(lw.PlannerError):
+    with pytest.raises(lw.planners.PlannerError):
         ask(server, "MT50", concurrency=2, retries=0)
     assert len(server.requests) <= 4
 
@@ -201,7 +201,7 @@ def test_no_extra(monkeypatch, tmp_path):
 
 
 def test_without_a_key_openai_is_not_asked(tmp_path):
-    with pytest.raises(lw.PlannerError, match="OPENAI_API_KEY"):
+    with pytest.raises(lw.planners.PlannerError, match="OPENAI_API_KEY"):
         lw.OpenAIPlanner("m", cache=tmp_path).plans("push")
 
 
@@ -213,11 +213,11 @@ def test_the_key_is_sent_and_nowhere_else(monkeypatch, ask, tmp_path, capsys):
     seen = [repr(answers), repr(lw.OpenAIPlanner("m")), *(p.read_text() for p in tmp_path.rglob("*") if p.is_file())]
     for status in (400, 401, 429, 500):
         refusing = FakeServer(lambda body, status=status: error(status, f"key {KEY} is wrong"))
-        with pytest.raises(lw.PlannerError) as caught:
+        with pytest.raises(lw.planners.PlannerError) as caught:
             ask(refusing, "reach")
         assert "(the key)" in str(caught.value)
         seen += [repr(caught.value), "".join(traceback.format_exception(caught.value))]
-    with pytest.raises(lw.PlannerError, match="the key in OPENAI_API_KEY is not accepted"):
+    with pytest.raises(lw.planners.PlannerError, match="the key in OPENAI_API_KEY is not accepted"):
         ask(FakeServer(lambda body: error(401, "no")), "reach")
     captured = capsys.readouterr()
     assert not any(KEY in text for text in (*seen, captured.out, captured.err))

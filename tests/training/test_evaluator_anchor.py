@@ -83,6 +83,6 @@ def test_what_has_no_evaluator_is_refused(root):
     with pytest.raises(ValueError, match="qaf_anchor is for a policy with an evaluator, this PlanConditionedActor"):
         lw.BehavioralCloningTrainer(make_actor(), replay, replace(CONFIG, qaf_anchor=1.0))
     with pytest.raises(ValueError, match="qaf_anchor is for BehavioralCloningTrainer"):
-        lw.StackedBehavioralCloning([make_actor()], [replay], replace(CONFIG, qaf_anchor=1.0))
+        lw.training.StackedBehavioralCloning([make_actor()], [replay], replace(CONFIG, qaf_anchor=1.0))
     with pytest.raises(ValueError, match="policy must have an evaluator"):
         condition_drift(make_actor(), replay[:])

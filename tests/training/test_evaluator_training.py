@@ -13,7 +13,7 @@ from lw_torchrl._tensor_archive import TensorArchive, write_archive
 from lw_torchrl.evaluation import plot_reliability, score_evaluator
 
 PLANS = lw.load_plans("MT10")
-SMALL = lw.QueryEvaluatorConfig(steps=12, batch_size=64, checkpoint_every=5)
+SMALL = lw.training.QueryEvaluatorConfig(steps=12, batch_size=64, checkpoint_every=5)
 PARTS = ("training", "states", "queries", "tasks")
 
 
@@ -48,8 +48,8 @@ def make(seed=0, **options):
 
 
 def make_trainer(replay, path=None, *, config=SMALL, **options):
-    data = lw.LabelledQueries(replay, config)
-    return lw.QueryEvaluatorTrainer(make(**options), data, config, checkpoint=path, progress=False)
+    data = lw.training.LabelledQueries(replay, config)
+    return lw.training.QueryEvaluatorTrainer(make(**options), data, config, checkpoint=path, progress=False)
 
 
 def everything(trainer):
@@ -67,8 +67,8 @@ def assert_same(found, expected):
 
 
 def test_what_is_held_out_is_nowhere_trained(replay):
-    config = lw.QueryEvaluatorConfig(held_out_tasks=("reach",), held_out_pairs=0.3, seed=3)
-    data = lw.LabelledQueries(replay, config)
+    config = lw.training.QueryEvaluatorConfig(held_out_tasks=("reach",), held_out_pairs=0.3, seed=3)
+    data = lw.training.LabelledQueries(replay, config)
     assert (data.tasks, data.held_out_tasks) == (("drawer-open", "push"), ("reach",))
     assert all(data.parts[part] for part in PARTS)
     assert {asked.task.name for asked in data.parts["tasks"]} == {"reach"}
@@ -85,7 +85,7 @@ def test_what_is_held_out_is_nowhere_trained(replay):
 
 
 def test_labels_are_the_query_answering_functions(replay):
-    data = lw.LabelledQueries(replay, SMALL)
+    data = lw.training.LabelledQueries(replay, SMALL)
     asked = data.parts["training"][0]
     program = lw.QueryProgram({asked.task: [str(clause) for clause in asked.clauses]})
     ids = torch.full((len(asked.observation),), lw.task_id(asked.task.name))
@@ -95,19 +95,21 @@ def test_labels_are_the_query_answering_functions(replay):
 
 def test_the_seed_says_what_is_held_out(replay):
     def drawn(seed):
-        found = lw.LabelledQueries(replay, lw.QueryEvaluatorConfig(held_out_tasks=1, seed=seed))
+        found = lw.training.LabelledQueries(replay, lw.training.QueryEvaluatorConfig(held_out_tasks=1, seed=seed))
         return found.held_out_tasks, found.held_out_pairs
 
     assert drawn(0) == drawn(0)
     assert len({drawn(seed) for seed in range(6)}) > 1
-    none = lw.LabelledQueries(replay, lw.QueryEvaluatorConfig(held_out_pairs=0.0, held_out_states=0.0))
+    none = lw.training.LabelledQueries(
+        replay, lw.training.QueryEvaluatorConfig(held_out_pairs=0.0, held_out_states=0.0)
+    )
     assert not any(none.parts[part] for part in PARTS[1:])
 
 
 def test_a_minibatch_has_equally_many_of_each_predicate_and_truth(replay):
     trainer = make_trainer(replay)
     groups = len(trainer._sizes)
-    trainer.config = lw.QueryEvaluatorConfig(batch_size=groups * 7)
+    trainer.config = lw.training.QueryEvaluatorConfig(batch_size=groups * 7)
     _, clauses, truth = trainer._draw()
     kinds = torch.stack((clauses.predicate[:, 0], truth[:, 0].long()), -1)
     _, counts = kinds.unique(dim=0, return_counts=True)
@@ -119,11 +121,11 @@ def test_a_minibatch_has_equally_many_of_each_predicate_and_truth(replay):
 
 
 def test_two_tasks_are_learned_quickly(replay):
-    config = lw.QueryEvaluatorConfig(steps=400, batch_size=512, learning_rate=1e-2, held_out_tasks=("reach",))
-    data = lw.LabelledQueries(replay, config)
+    config = lw.training.QueryEvaluatorConfig(steps=400, batch_size=512, learning_rate=1e-2, held_out_tasks=("reach",))
+    data = lw.training.LabelledQueries(replay, config)
     evaluator = make(width=64, depth=2)
     before = score_evaluator(evaluator, data).parts["states"].balanced_accuracy()
-    lw.QueryEvaluatorTrainer(evaluator, data, config, progress=False).train()
+    lw.training.QueryEvaluatorTrainer(evaluator, data, config, progress=False).train()
     found = score_evaluator(evaluator, data).parts
     assert before < 0.7
     assert found["states"].accuracy() > 0.98
@@ -133,15 +135,15 @@ def test_two_tasks_are_learned_quickly(replay):
 
 
 def test_from_texts_alone_it_learns_too_and_what_not_means(replay):
-    config = lw.QueryEvaluatorConfig(steps=400, batch_size=512, learning_rate=1e-2, held_out_tasks=("reach",))
-    data = lw.LabelledQueries(replay, config)
+    config = lw.training.QueryEvaluatorConfig(steps=400, batch_size=512, learning_rate=1e-2, held_out_tasks=("reach",))
+    data = lw.training.LabelledQueries(replay, config)
     evaluator = make(width=64, depth=2, structure=False, text_encoder=words)
-    lw.QueryEvaluatorTrainer(evaluator, data, config, progress=False).train()
+    lw.training.QueryEvaluatorTrainer(evaluator, data, config, progress=False).train()
     assert score_evaluator(evaluator, data).parts["states"].accuracy() > 0.85
 
 
 def test_a_report_counts_every_answer_once(replay, tmp_path):
-    data = lw.LabelledQueries(replay, SMALL)
+    data = lw.training.LabelledQueries(replay, SMALL)
     report = score_evaluator(make(), data)
     asked = data.parts["states"]
     states = report.parts["states"]
@@ -175,7 +177,7 @@ def test_training_that_was_stopped_goes_on_to_the_bit(replay, tmp_path, kind):
     assert_same(everything(second), everything(whole))
     again = make_trainer(replay, tmp_path / "e.zip", **options)
     assert again.done == SMALL.steps
-    loaded = lw.load_evaluator(tmp_path / "e.zip", PLANS, **({"text_encoder": words} if options else {}))
+    loaded = lw.training.load_evaluator(tmp_path / "e.zip", PLANS, **({"text_encoder": words} if options else {}))
     assert not loaded.training
     assert_same(flat(dict(loaded.state_dict())), flat(dict(whole.evaluator.state_dict())))
 
@@ -183,40 +185,40 @@ def test_training_that_was_stopped_goes_on_to_the_bit(replay, tmp_path, kind):
 def test_another_training_does_not_go_on(replay, tmp_path):
     make_trainer(replay, tmp_path / "e.zip").train()
     with pytest.raises(ValueError, match=r"of another training, which differs in .*batch_size"):
-        make_trainer(replay, tmp_path / "e.zip", config=lw.QueryEvaluatorConfig(steps=12, batch_size=32))
+        make_trainer(replay, tmp_path / "e.zip", config=lw.training.QueryEvaluatorConfig(steps=12, batch_size=32))
     with pytest.raises(ValueError, match=r"of another evaluator, which differs in .*width"):
         make_trainer(replay, tmp_path / "e.zip", width=17)
 
 
 def test_it_is_loaded_for_any_plans(tmp_path):
     evaluator = make()
-    lw.save_evaluator(evaluator, tmp_path / "e.zip", note="mine")
-    other = lw.load_evaluator(tmp_path / "e.zip", lw.load_plans("MT50"))
+    lw.training.save_evaluator(evaluator, tmp_path / "e.zip", note="mine")
+    other = lw.training.load_evaluator(tmp_path / "e.zip", lw.load_plans("MT50"))
     assert other.plans.fingerprint == lw.load_plans("MT50").fingerprint
-    actor = lw.PlanConditionedActor(PLANS, evaluator=lw.load_evaluator(tmp_path / "e.zip", PLANS), width=8)
+    actor = lw.PlanConditionedActor(PLANS, evaluator=lw.training.load_evaluator(tmp_path / "e.zip", PLANS), width=8)
     assert torch.equal(actor.evaluator.network.trunk[0].weight, evaluator.network.trunk[0].weight)
     with pytest.raises(ValueError, match="about must not be named state"):
-        lw.save_evaluator(evaluator, tmp_path / "e.zip", state=1)
+        lw.training.save_evaluator(evaluator, tmp_path / "e.zip", state=1)
 
 
 def test_what_is_no_evaluators_file_is_refused(tmp_path):
     path = tmp_path / "e.zip"
     with pytest.raises(FileNotFoundError, match="train-evaluator` writes one"):
-        lw.load_evaluator(path, PLANS)
+        lw.training.load_evaluator(path, PLANS)
     lw.save_actor(lw.PlanConditionedActor(PLANS, width=8), path)
     with pytest.raises(ValueError, match="it is a policy's, give the evaluator's"):
-        lw.load_evaluator(path, PLANS)
+        lw.training.load_evaluator(path, PLANS)
     path.write_bytes(b"PK")
     with pytest.raises(ValueError, match="is damaged or no evaluator's file"):
-        lw.load_evaluator(path, PLANS)
+        lw.training.load_evaluator(path, PLANS)
 
     class Mine(lw.QueryEvaluator):
         pass
 
     with pytest.raises(ValueError, match=r"cannot be kept in a file.*kind of evaluator must be one of"):
-        lw.save_evaluator(Mine(PLANS), path)
+        lw.training.save_evaluator(Mine(PLANS), path)
     with pytest.raises(TypeError, match="must be a QueryEvaluator to be kept"):
-        lw.save_evaluator(torch.nn.Linear(1, 1), path)
+        lw.training.save_evaluator(torch.nn.Linear(1, 1), path)
 
 
 @pytest.mark.parametrize(
@@ -225,19 +227,19 @@ def test_what_is_no_evaluators_file_is_refused(tmp_path):
 )
 def test_options_that_the_weights_do_not_have_are_refused(tmp_path, part, value):
     path = tmp_path / "e.zip"
-    lw.save_evaluator(make(), path)
+    lw.training.save_evaluator(make(), path)
     found = TensorArchive(path)
     found.description["evaluator"]["options"][part] = value
     groups = {name: found.tensors(name) for name in found.groups}
     write_archive(path, {k: v for k, v in found.description.items() if k != "sha256"}, groups)
     with pytest.raises(ValueError, match=r"evaluator: that of .* cannot be made"):
-        lw.load_evaluator(path, PLANS)
+        lw.training.load_evaluator(path, PLANS)
 
 
 def test_another_text_encoder_is_found_out(tmp_path):
-    lw.save_evaluator(make(structure=False, text_encoder=words), tmp_path / "e.zip")
+    lw.training.save_evaluator(make(structure=False, text_encoder=words), tmp_path / "e.zip")
     with pytest.raises(ValueError, match="text_encoder"):
-        lw.load_evaluator(tmp_path / "e.zip", PLANS, text_encoder=lambda texts: words(texts).flip(-1))
+        lw.training.load_evaluator(tmp_path / "e.zip", PLANS, text_encoder=lambda texts: words(texts).flip(-1))
 
 
 # ---- refusals
@@ -245,17 +247,20 @@ def test_another_text_encoder_is_found_out(tmp_path):
 
 def test_what_cannot_be_is_named(replay):
     with pytest.raises(ValueError, match="held_out_tasks must leave tasks to train on, got 3 of 3"):
-        lw.LabelledQueries(replay, lw.QueryEvaluatorConfig(held_out_tasks=3))
+        lw.training.LabelledQueries(replay, lw.training.QueryEvaluatorConfig(held_out_tasks=3))
     with pytest.raises(ValueError, match=r"held_out_tasks must be one of .*'reach'.*got 'reech'; did you mean 'reach'"):
-        lw.LabelledQueries(replay, lw.QueryEvaluatorConfig(held_out_tasks=("reech",)))
+        lw.training.LabelledQueries(replay, lw.training.QueryEvaluatorConfig(held_out_tasks=("reech",)))
     with pytest.raises(ValueError, match="held_out_states must leave a tenth"):
-        lw.QueryEvaluatorConfig(held_out_states=0.95)
+        lw.training.QueryEvaluatorConfig(held_out_states=0.95)
     with pytest.raises(ValueError, match="tasks must have all tasks of the rows"):
-        lw.LabelledQueries(replay, SMALL, [lw.TASKS["reach"]])
-    data = lw.LabelledQueries(replay, SMALL)
+        lw.training.LabelledQueries(replay, SMALL, [lw.TASKS["reach"]])
+    data = lw.training.LabelledQueries(replay, SMALL)
     with pytest.raises(TypeError, match="must be of class StateQueryEvaluator, got QueryEvaluator"):
-        lw.QueryEvaluatorTrainer(lw.QueryEvaluator(PLANS), data)
+        lw.training.QueryEvaluatorTrainer(lw.QueryEvaluator(PLANS), data)
     with pytest.raises(ValueError, match="must hold out states, queries or tasks"):
         score_evaluator(
-            make(), lw.LabelledQueries(replay, lw.QueryEvaluatorConfig(held_out_pairs=0.0, held_out_states=0.0))
+            make(),
+            lw.training.LabelledQueries(
+                replay, lw.training.QueryEvaluatorConfig(held_out_pairs=0.0, held_out_states=0.0)
+            ),
         )

@@ -14,7 +14,7 @@ from lw_torchrl.evaluation import plot_wrong_answers, score_evaluator, wrong_ans
 
 PLANS = lw.Plans({task: lw.load_plans("MT10")[task] for task in ("drawer-open", "reach")})
 PICTURES = {"cameras": ("corner", "corner3"), "height": 24, "width": 24}
-CONFIG = lw.ImageQueryEvaluatorConfig(steps=6, batch_size=8, checkpoint_every=2, held_out_pairs=0.0)
+CONFIG = lw.training.ImageQueryEvaluatorConfig(steps=6, batch_size=8, checkpoint_every=2, held_out_pairs=0.0)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -27,9 +27,9 @@ def _needs_open_gl():
 def replay(tmp_path_factory):
     root = tmp_path_factory.mktemp("states") / "demos"
     lw.collect_demonstrations([*PLANS], episodes_per_task=3, root=root, max_steps=60, progress=False)
-    lw.add_pictures(root, **PICTURES, every=5, progress=False)
+    lw.data.add_pictures(root, **PICTURES, every=5, progress=False)
     replay = lw.LanguageWorldExperienceReplay(root, label="executed")
-    replay.add_column("pixels", lw.load_pictures(replay, **PICTURES, every=5))
+    replay.add_column("pixels", lw.data.load_pictures(replay, **PICTURES, every=5))
     return replay
 
 
@@ -39,12 +39,12 @@ def letters(texts):
 
 def make(seed=0, **options):
     torch.manual_seed(seed)
-    return lw.ImageQueryEvaluator(PLANS, **PICTURES, hidden=16, depth=1, **options)
+    return lw.modules.ImageQueryEvaluator(PLANS, **PICTURES, hidden=16, depth=1, **options)
 
 
 def make_trainer(replay, path=None, config=CONFIG, **options):
-    data = lw.LabelledQueries(replay, config)
-    return lw.ImageQueryEvaluatorTrainer(make(**options), data, config, checkpoint=path, progress=False)
+    data = lw.training.LabelledQueries(replay, config)
+    return lw.training.ImageQueryEvaluatorTrainer(make(**options), data, config, checkpoint=path, progress=False)
 
 
 def everything(trainer):
@@ -73,7 +73,7 @@ def test_a_policy_that_sees_is_tuned_and_goes_on_bit_for_bit(replay, tmp_path):
         actor = lw.PlanConditionedActor(PLANS, evaluator=make(), answers="hard", width=8, depth=1)
         config = lw.BehavioralCloningConfig(steps=6, batch_size=8, qaf_anchor=0.1, checkpoint_every=2)
         buffer = lw.LanguageWorldExperienceReplay(replay.root, sampler=lw.TaskBalancedSampler())
-        buffer.add_column("pixels", lw.load_pictures(buffer, **PICTURES, every=5))
+        buffer.add_column("pixels", lw.data.load_pictures(buffer, **PICTURES, every=5))
         trainer = lw.BehavioralCloningTrainer(actor, buffer, config, checkpoint=path, progress=False)
         for _ in range(stop or 0):
             trainer.step()
@@ -92,7 +92,7 @@ def test_a_policy_that_sees_is_tuned_and_goes_on_bit_for_bit(replay, tmp_path):
 @pytest.mark.slow
 def test_it_learns_where_things_are_and_what_holds(replay):
     config = replace(CONFIG, steps=400, batch_size=16, learning_rate=3e-3, held_out_states=0.0)
-    data = lw.LabelledQueries(replay, config)
+    data = lw.training.LabelledQueries(replay, config)
 
     def right(evaluator):
         found = []
@@ -105,7 +105,7 @@ def test_it_learns_where_things_are_and_what_holds(replay):
 
     evaluator = make()
     before = right(evaluator)
-    lw.ImageQueryEvaluatorTrainer(evaluator, data, config, progress=False).train()
+    lw.training.ImageQueryEvaluatorTrainer(evaluator, data, config, progress=False).train()
     assert (right(evaluator) > before + 0.15).all()
     for asked in data.parts["training"]:
         with torch.no_grad():
@@ -117,24 +117,26 @@ def test_it_learns_where_things_are_and_what_holds(replay):
 def test_texts_alone_are_asked_both_ways(replay):
     trainer = make_trainer(replay, structure=False, text_encoder=letters)
     assert trainer.train() < 5.0
-    report = score_evaluator(trainer.evaluator, lw.LabelledQueries(replay, CONFIG))
-    clauses = sum(len(asked.clauses) * len(asked.truth) for asked in lw.LabelledQueries(replay, CONFIG).parts["states"])
+    report = score_evaluator(trainer.evaluator, lw.training.LabelledQueries(replay, CONFIG))
+    clauses = sum(
+        len(asked.clauses) * len(asked.truth) for asked in lw.training.LabelledQueries(replay, CONFIG).parts["states"]
+    )
     assert report.parts["states"].answers == 2 * clauses
 
 
 def test_only_states_with_a_picture_of_their_own_are_asked(replay):
-    data = lw.LabelledQueries(replay, CONFIG)
+    data = lw.training.LabelledQueries(replay, CONFIG)
     states = sum(len(asked.observation) for part in ("training", "states") for asked in data.parts[part])
     assert states == 2 * 3 * 12  # tasks, episodes, 60 steps at 5 apart
     held = lw.LanguageWorldExperienceReplay(replay.root, label="executed")
-    pictures = lw.load_pictures(held, **PICTURES, every=5)
+    pictures = lw.data.load_pictures(held, **PICTURES, every=5)
     held.add_column("pixels", pictures[torch.arange(len(held)) // 20 * 20])
     with pytest.raises(ValueError, match=r"every must be as many steps as the pictures are apart"):
-        lw.LabelledQueries(held, CONFIG)
+        lw.training.LabelledQueries(held, CONFIG)
 
 
 def test_wrong_answers_are_wrong_and_drawn(replay, tmp_path):
-    data, evaluator = lw.LabelledQueries(replay, CONFIG), make()
+    data, evaluator = lw.training.LabelledQueries(replay, CONFIG), make()
     found = wrong_answers(evaluator, data, most=5)
     assert 0 < len(found) <= 5
     for one in found:
@@ -152,16 +154,18 @@ def test_what_does_not_fit_is_named(replay, tmp_path):
     with pytest.raises(ValueError, match=r"data must have the column 'pixels'.*lw\.add_pictures"):
         make_trainer(plain)
     with pytest.raises(TypeError, match=r"config must be an ImageQueryEvaluatorConfig"):
-        lw.ImageQueryEvaluatorTrainer(make(), lw.LabelledQueries(replay, CONFIG), lw.QueryEvaluatorConfig(every=5))
+        lw.training.ImageQueryEvaluatorTrainer(
+            make(), lw.training.LabelledQueries(replay, CONFIG), lw.training.QueryEvaluatorConfig(every=5)
+        )
     with pytest.raises(TypeError, match=r"evaluator must be of class ImageQueryEvaluator"):
-        lw.ImageQueryEvaluatorTrainer(
-            lw.StateQueryEvaluator(PLANS, width=8), lw.LabelledQueries(replay, CONFIG), CONFIG, progress=False
+        lw.training.ImageQueryEvaluatorTrainer(
+            lw.StateQueryEvaluator(PLANS, width=8), lw.training.LabelledQueries(replay, CONFIG), CONFIG, progress=False
         )
     with pytest.raises(ValueError, match=r"pixels must be uint8 of shape"):
-        lw.ImageQueryEvaluatorTrainer(
-            lw.ImageQueryEvaluator(PLANS, cameras="corner", height=24, width=24),
-            lw.LabelledQueries(replay, CONFIG),
+        lw.training.ImageQueryEvaluatorTrainer(
+            lw.modules.ImageQueryEvaluator(PLANS, cameras="corner", height=24, width=24),
+            lw.training.LabelledQueries(replay, CONFIG),
             CONFIG,
         )
     with pytest.raises(ValueError, match=r"position_weight must be"):
-        lw.ImageQueryEvaluatorConfig(position_weight=-1.0)
+        lw.training.ImageQueryEvaluatorConfig(position_weight=-1.0)

@@ -48,7 +48,7 @@ def make(demos, checkpoint, stacked, *, times=0):
     torch.manual_seed(0)
     actors = [lw.DescriptorConditionedActor(["push", "reach"], **SMALL) for _ in range(1 + stacked)]
     if stacked:
-        return lw.StackedBehavioralCloning(
+        return lw.training.StackedBehavioralCloning(
             actors, [replay(times), replay(0)], CONFIG, checkpoint=checkpoint, progress=False
         )
     return lw.BehavioralCloningTrainer(actors[0], replay(times), CONFIG, checkpoint=checkpoint, progress=False)

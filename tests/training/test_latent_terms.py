@@ -28,7 +28,9 @@ def demos(tmp_path_factory):
 
 
 def terms(actor, consistency=0.5, contrast=0.25):
-    near, apart = (lw.SkillLatentLoss(actor, kind)()["loss_latents"] for kind in ("consistency", "contrastive"))
+    near, apart = (
+        lw.objectives.SkillLatentLoss(actor, kind)()["loss_latents"] for kind in ("consistency", "contrastive")
+    )
     return consistency * near + contrast * apart
 
 

@@ -67,8 +67,8 @@ def bc(made):
 
 LOSSES = {
     "bc": bc,
-    "value": lambda made: lw.ExpectileValueLoss(made.value(ensemble=2)),
-    "advantage": lambda made: lw.AdvantageWeightedLoss(made.actor()),
+    "value": lambda made: lw.objectives.ExpectileValueLoss(made.value(ensemble=2)),
+    "advantage": lambda made: lw.objectives.AdvantageWeightedLoss(made.actor()),
     "iql": lambda made: IQLLoss(made.actor(distribution="normal"), made.qvalue(), made.value()),
     "td3-bc": lambda made: TD3BCLoss(made.actor(), made.qvalue(), bounds=(-1.0, 1.0), delay_actor=True),
     "cql": lambda made: CQLLoss(made.actor(distribution="tanh_normal"), made.qvalue(), num_random=2),
@@ -228,13 +228,15 @@ def test_statistics_of_the_rows_reach_networks_and_their_targets(demos, name):
 
 def test_a_policy_that_was_trained_keeps_its_statistics(demos):
     actor = Networks(0.0, "cpu").actor()
-    OfflineTrainer(lw.AdvantageWeightedLoss(actor), make_replay(demos), CONFIG, progress=False).train()
+    OfflineTrainer(lw.objectives.AdvantageWeightedLoss(actor), make_replay(demos), CONFIG, progress=False).train()
     before = {name: tensor.clone() for name, tensor in actor.state_dict().items()}
-    OfflineTrainer(lw.AdvantageWeightedLoss(actor), make_replay(demos), CONFIG, progress=False)  # of the same rows
+    OfflineTrainer(
+        lw.objectives.AdvantageWeightedLoss(actor), make_replay(demos), CONFIG, progress=False
+    )  # of the same rows
     others = make_replay(demos, episodes={"reach": 1}, sampler=RandomSampler())
     with pytest.raises(ValueError, match="has the statistics of other rows"):
-        OfflineTrainer(lw.AdvantageWeightedLoss(actor), others, CONFIG, progress=False)
-    OfflineTrainer(lw.AdvantageWeightedLoss(actor), others, replace(CONFIG, normalize=False), progress=False)
+        OfflineTrainer(lw.objectives.AdvantageWeightedLoss(actor), others, CONFIG, progress=False)
+    OfflineTrainer(lw.objectives.AdvantageWeightedLoss(actor), others, replace(CONFIG, normalize=False), progress=False)
     assert_same(actor.state_dict(), before)
 
 
@@ -298,7 +300,7 @@ def test_a_checkpoint_of_another_training_is_refused(demos, checkpoint, change, 
         value = lw.PlanConditionedValue(
             PLANS, ensemble=2, feature_noise=0.05, **{**CRITIC, "width": change.get("width", 16)}
         )
-        loss = lw.ExpectileValueLoss(value, expectile=change.get("expectile", 0.7))
+        loss = lw.objectives.ExpectileValueLoss(value, expectile=change.get("expectile", 0.7))
         loss.make_value_estimator(gamma=change.get("gamma", GAMMA))
     shown = ("sampler", "episodes", "reward", "n_steps", "terminate_on_success", "advantage")
     options = {name: change[name] for name in shown if name in change}
@@ -310,7 +312,7 @@ def test_a_checkpoint_of_another_training_is_refused(demos, checkpoint, change, 
 
 def test_a_checkpoint_of_other_plans_is_refused(demos, checkpoint):
     others = lw.Plans([lw.ConditionalPlan(plan.task, plan.steps[::-1]) for plan in PLANS.values()])
-    loss = lw.ExpectileValueLoss(lw.PlanConditionedValue(others, ensemble=2, feature_noise=0.02, **CRITIC))
+    loss = lw.objectives.ExpectileValueLoss(lw.PlanConditionedValue(others, ensemble=2, feature_noise=0.02, **CRITIC))
     loss.make_value_estimator(gamma=GAMMA)
     with pytest.raises(ValueError, match=r"its loss differs in fixed|replay differs"):
         OfflineTrainer(loss, make_replay(demos, others), CONFIG, checkpoint=checkpoint, progress=False)

@@ -17,7 +17,7 @@ from lw_torchrl._versions import package_versions
 from lw_torchrl.training.loss_state import bc_loss
 
 OFFLINE = lw.OfflineConfig(steps=12, batch_size=8, checkpoint_every=5)
-EVALUATOR = lw.QueryEvaluatorConfig(steps=12, batch_size=8, held_out_pairs=0.0)
+EVALUATOR = lw.training.QueryEvaluatorConfig(steps=12, batch_size=8, held_out_pairs=0.0)
 
 
 @pytest.fixture(scope="module")
@@ -31,14 +31,14 @@ def offline(demos, path):
 
 def stacked(demos, path):
     actors, replays = [make_actor(0), make_actor(1)], [make_replay(demos), make_replay(demos)]
-    return lw.StackedBehavioralCloning(actors, replays, CONFIG, checkpoint=path, progress=False)
+    return lw.training.StackedBehavioralCloning(actors, replays, CONFIG, checkpoint=path, progress=False)
 
 
 def evaluator(demos, path):
-    data = lw.LabelledQueries(lw.LanguageWorldExperienceReplay(demos, label="executed"), EVALUATOR)
+    data = lw.training.LabelledQueries(lw.LanguageWorldExperienceReplay(demos, label="executed"), EVALUATOR)
     torch.manual_seed(0)
     asked = lw.StateQueryEvaluator(PLANS, width=8, depth=1)
-    return lw.QueryEvaluatorTrainer(asked, data, EVALUATOR, checkpoint=path, progress=False)
+    return lw.training.QueryEvaluatorTrainer(asked, data, EVALUATOR, checkpoint=path, progress=False)
 
 
 def online(demos, path):

@@ -36,7 +36,7 @@ def make(kind, seed):
 
 @pytest.mark.parametrize("kind", ["plan", "focused plan", "mixed actions", "description", "one-hot"])
 def test_every_loss_is_the_one_it_has_alone(demos, kind):
-    together = lw.StackedBehavioralCloning(
+    together = lw.training.StackedBehavioralCloning(
         [make(kind, seed) for seed in range(3)], [replay(demos) for _ in range(3)], CONFIG, progress=False
     )
     losses = torch.stack([together.step() for _ in range(CONFIG.steps)])
@@ -51,7 +51,7 @@ def test_every_loss_is_the_one_it_has_alone(demos, kind):
 def test_the_actors_get_their_weights(demos):
     actors = [make("plan", seed) for seed in range(2)]
     config = lw.BehavioralCloningConfig(steps=3, batch_size=30)
-    trainer = lw.StackedBehavioralCloning(actors, [replay(demos) for _ in range(2)], config, progress=False)
+    trainer = lw.training.StackedBehavioralCloning(actors, [replay(demos) for _ in range(2)], config, progress=False)
     before = [actor.head.network[0].weight.clone() for actor in actors]
     assert trainer.train().shape == (2,)
     for number, actor in enumerate(actors):
@@ -64,16 +64,16 @@ def test_the_actors_get_their_weights(demos):
 
 def test_what_it_refuses(demos):
     with pytest.raises(ValueError, match="replays must be as many as actors, at least one, got 1 and 2"):
-        lw.StackedBehavioralCloning([make("plan", 0), make("plan", 1)], [replay(demos)])
+        lw.training.StackedBehavioralCloning([make("plan", 0), make("plan", 1)], [replay(demos)])
     ahead = lw.LanguageWorldExperienceReplay(demos, prefetch=1, batch_size=10)
     with pytest.raises(ValueError, match="replay must not prefetch"):
-        lw.StackedBehavioralCloning([make("one-hot", 0)], [ahead], CONFIG)
+        lw.training.StackedBehavioralCloning([make("one-hot", 0)], [ahead], CONFIG)
     odd = lw.PlanConditionedActor(PLANS, width=16)
     with pytest.raises(ValueError, match="actors must be of one architecture"):
-        lw.StackedBehavioralCloning([make("plan", 0), odd], [replay(demos), replay(demos)])
+        lw.training.StackedBehavioralCloning([make("plan", 0), odd], [replay(demos), replay(demos)])
     broken = make("plan", 0)
     torch.nn.init.constant_(broken.head.network[0].weight, float("nan"))
-    trainer = lw.StackedBehavioralCloning([make("plan", 0), broken], [replay(demos), replay(demos)], CONFIG)
+    trainer = lw.training.StackedBehavioralCloning([make("plan", 0), broken], [replay(demos), replay(demos)], CONFIG)
     with pytest.raises(ValueError, match="the loss of actor 1 is nan at step 0"):
         trainer.step()
 
@@ -85,18 +85,18 @@ def test_actors_of_other_options_are_refused(demos, options, different):
     """Of the same shapes, they would be trained as the first one is."""
     actors = [lw.PlanConditionedActor(PLANS, width=32), lw.PlanConditionedActor(PLANS, width=32, **options)]
     with pytest.raises(ValueError, match=f"actors must be of one architecture, 0 and 1 differ in {different}"):
-        lw.StackedBehavioralCloning(actors, [replay(demos), replay(demos)], CONFIG)
+        lw.training.StackedBehavioralCloning(actors, [replay(demos), replay(demos)], CONFIG)
 
 
 def test_what_comes_twice_is_refused(demos):
     actor, rows = make("plan", 0), replay(demos)
     for other in (actor, actor.with_plans(PLANS)):
         with pytest.raises(ValueError, match="actors must have weights of their own"):
-            lw.StackedBehavioralCloning([actor, other], [rows, replay(demos)], CONFIG)
+            lw.training.StackedBehavioralCloning([actor, other], [rows, replay(demos)], CONFIG)
     sharing = lw.LanguageWorldExperienceReplay(demos, sampler=rows.sampler, transform=lw.QAFTransform(PLANS))
     for other in (rows, sharing):
         with pytest.raises(ValueError, match="replays must be different buffers, each with a sampler of its own"):
-            lw.StackedBehavioralCloning([actor, make("plan", 1)], [rows, other], CONFIG)
+            lw.training.StackedBehavioralCloning([actor, make("plan", 1)], [rows, other], CONFIG)
 
 
 def test_a_checkpoint_is_of_all_its_actors(demos, tmp_path):
@@ -109,7 +109,7 @@ def test_a_checkpoint_is_of_all_its_actors(demos, tmp_path):
         answered = lw.LanguageWorldExperienceReplay(
             demos, sampler=lw.TaskBalancedSampler(), transform=lw.QAFTransform(second)
         )
-        return lw.StackedBehavioralCloning(
+        return lw.training.StackedBehavioralCloning(
             actors, [replay(demos), answered], CONFIG, checkpoint=tmp_path / "c.zip", progress=False
         )
 
@@ -123,7 +123,7 @@ def test_it_carries_on_from_its_checkpoint(demos, tmp_path):
     def trainer(config, checkpoint=None):
         actors = [make("focused plan", seed) for seed in range(2)]
         replays = [replay(demos) for _ in range(2)]
-        return lw.StackedBehavioralCloning(actors, replays, config, checkpoint=checkpoint, progress=False)
+        return lw.training.StackedBehavioralCloning(actors, replays, config, checkpoint=checkpoint, progress=False)
 
     config = lw.BehavioralCloningConfig(steps=20, batch_size=30, checkpoint_every=10)
     whole, path = trainer(config), tmp_path / "deep" / "checkpoint.zip"

@@ -20,7 +20,7 @@ def _needs_open_gl():
 
 
 def opened(tasks=("reach", "drawer-open"), cameras="corner", every=1, **options):
-    camera = lw.CameraTransform(cameras, every=every, **SIZE)
+    camera = lw.transforms.CameraTransform(cameras, every=every, **SIZE)
     return TransformedEnv(lw.LanguageWorldEnv(list(tasks), seed=5, **options), camera)
 
 
@@ -120,7 +120,7 @@ def test_it_goes_into_each_worker():
     assert env.reset()["pixels"].shape == (2, 1, 24, 32, 3)
     env.close()
     with pytest.raises(TypeError, match=r"workers of a SerialEnv: put it into each of them"):
-        TransformedEnv(SerialEnv(2, lambda: lw.LanguageWorldEnv("reach")), lw.CameraTransform())
+        TransformedEnv(SerialEnv(2, lambda: lw.LanguageWorldEnv("reach")), lw.transforms.CameraTransform())
 
 
 @pytest.mark.parametrize(
@@ -136,11 +136,11 @@ def test_it_goes_into_each_worker():
 )
 def test_what_cannot_be_is_named(options, message):
     with pytest.raises(ValueError, match=message):
-        lw.CameraTransform(**options)
+        lw.transforms.CameraTransform(**options)
 
 
 def test_a_replay_buffer_is_told_of_add_pictures():
-    buffer = ReplayBuffer(storage=LazyTensorStorage(4), transform=lw.CameraTransform(), batch_size=2)
+    buffer = ReplayBuffer(storage=LazyTensorStorage(4), transform=lw.transforms.CameraTransform(), batch_size=2)
     env = lw.LanguageWorldEnv("reach")
     buffer.extend(env.rollout(4).reshape(-1))
     env.close()
@@ -150,7 +150,8 @@ def test_a_replay_buffer_is_told_of_add_pictures():
 
 def test_it_stands_beside_query_answers():
     env = TransformedEnv(
-        lw.LanguageWorldEnv("reach"), Compose(lw.QAFTransform(lw.load_plans("MT10")), lw.CameraTransform(**SIZE))
+        lw.LanguageWorldEnv("reach"),
+        Compose(lw.QAFTransform(lw.load_plans("MT10")), lw.transforms.CameraTransform(**SIZE)),
     )
     state = env.rollout(2)
     assert {"qaf", "pixels"} <= {*state.keys()}

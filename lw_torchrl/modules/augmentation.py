@@ -1,4 +1,4 @@
-"""What a plan's steps mention, and training observations in which the rest is somewhere else."""
+"""Training observations in which what a plan's steps do not mention stands somewhere else."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from lw_torchrl.language.observation import (
     FIRST,
     FIRST_QUATERNION,
     GOAL,
+    OPENING,
     SECOND,
     SECOND_QUATERNION,
     a_step_before,
@@ -19,7 +20,7 @@ from lw_torchrl.language.observation import (
 from lw_torchrl.language.plan_tables import PlanTables
 from lw_torchrl.language.plans import Plans, PlanStep
 from lw_torchrl.language.tasks import Task
-from lw_torchrl.modules.plan_roles import PlanRoles
+from lw_torchrl.modules.relative_positions import PlanRoles
 
 # The numbers of each thing that an observation tells of, now and a step before: two objects, with their quaternions,
 # and the goal, which has no past.
@@ -58,7 +59,7 @@ def mentioned(plans: Plans, tables: PlanTables, roles: PlanRoles | None = None) 
 def swap_unmentioned(observation: Tensor, kept: Tensor, probability: float) -> Tensor:
     """Put what no step in force mentions where it is in another row of the batch.
 
-    So a policy cannot lean on it: in one demonstration everything stands in one constellation, and the hand's way to
+    So a policy cannot rely on it: in one demonstration everything stands in one constellation, and the hand's way to
     the goal can as well be told from an object that has nothing to do with it. Drawn from PyTorch's global generator.
 
     Args:
@@ -77,3 +78,14 @@ def swap_unmentioned(observation: Tensor, kept: Tensor, probability: float) -> T
         for part in parts:
             swapped[:, part] = torch.where(away.unsqueeze(-1), others[:, part], rows[:, part])
     return swapped.reshape(observation.shape)
+
+
+def hide_opening(observation: Tensor, kept: Tensor, probability: float) -> Tensor:
+    """A copy of observations (..., 39) float32 where the gripper's opening may be that of another row, but where it is
+    ``kept`` (...) bool."""
+    opening = observation[..., OPENING]
+    others = opening.flatten()[torch.randint(opening.numel(), opening.shape, device=opening.device)]
+    hidden = torch.rand_like(opening) < probability
+    observation = observation.clone()
+    observation[..., OPENING] = torch.where(hidden & ~kept, others, opening)
+    return observation

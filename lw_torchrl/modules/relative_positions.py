@@ -1,0 +1,241 @@
+"""Relative positions of the things that a plan's steps speak of, as features of a policy: PlanFocus and PlanRoles."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+from weakref import WeakSet
+
+import torch
+from torch import Tensor, nn
+
+from lw_torchrl._checks import check_scale
+from lw_torchrl.language.named_objects import GRIPPER, NamedObject, coordinate_index
+from lw_torchrl.language.observation import FIRST, HAND, OBSERVATION_SIZE, places
+from lw_torchrl.language.plan_tables import PlanTables
+from lw_torchrl.language.plans import ConditionalPlan, Plans
+from lw_torchrl.language.roles import plan_roles, role_object
+from lw_torchrl.language.skill_words import closes, presses, pushes
+from lw_torchrl.modules.observation_features import squash
+from lw_torchrl.transforms.random_yaw import turn_observation, turn_vectors
+
+_SCALE = 0.1  # metres
+Pair = tuple[NamedObject, NamedObject]
+
+
+class RelativePositions(nn.Module):
+    """The positions of things relative to others, mixed by the attention over the steps.
+
+    Args:
+        plans: the plans.
+        tables: theirs.
+        pairs: of a plan, for each step up to P pairs: the thing from which, and the thing to which. A step that has
+            fewer has 0 there.
+        number: P.
+        noise: standard deviation of the noise on each feature while training.
+
+    Attributes:
+        width: 9·P features: three differences of each pair, in units of 10 cm, and through tanh at 2 cm and at 10 cm.
+    """
+
+    begin: Tensor
+    end: Tensor
+    offset: Tensor
+    constants: Tensor
+
+    def __init__(
+        self,
+        plans: Plans,
+        tables: PlanTables,
+        pairs: Callable[[ConditionalPlan], Sequence[Sequence[Pair]]],
+        number: int,
+        noise: float = 0.0,
+    ) -> None:
+        super().__init__()
+        self.noise = check_scale("feature_noise", noise)
+        self.width = 9 * number
+        constants = [0.0]
+        shape = (len(plans), plans.num_steps, number, 3)
+        index = torch.full((2, *shape), OBSERVATION_SIZE)  # the constant 0
+        offset = torch.zeros(shape)
+        for task, plan in plans.items():
+            for step, found in enumerate(pairs(plan)):
+                for one, ends in enumerate(found):
+                    at = (tables.index.row(task), step, one)
+                    for side, thing in enumerate(ends):
+                        index[(side, *at)] = torch.tensor([coordinate_index(c, constants) for c in thing.position])
+                        offset[at] += torch.tensor(thing.offset) * (2 * side - 1)
+        # The tables come from the plans, not from training: they are not part of the state that is saved.
+        self.register_buffer("begin", index[0], persistent=False)
+        self.register_buffer("end", index[1], persistent=False)
+        self.register_buffer("offset", offset, persistent=False)
+        self.register_buffer("constants", torch.tensor(constants), persistent=False)
+
+    def positions(self, observation: Tensor, weights: Tensor, rows: Tensor, yaw: Tensor | None = None) -> Tensor:
+        """(..., 39) float32, attention (..., S) float32 and rows (...) int64, as from :meth:`PlanTables.rows`, to
+        (..., P, 3) float32 metres.
+
+        Args:
+            yaw: (...) float32, the angle by which :class:`RandomYaw` turned the observation: fixed places and offsets
+                are turned with it.
+        """
+        if yaw is not None:
+            observation = turn_observation(observation, -yaw)
+        known = torch.cat((observation, self.constants.expand(*observation.shape[:-1], -1)), -1)
+        begin, end = self.begin[rows], self.end[rows]  # (..., S, P, 3)
+        flat = (*begin.shape[: rows.ndim], -1)
+        found = (known.gather(-1, end.reshape(flat)) - known.gather(-1, begin.reshape(flat))).reshape(begin.shape)
+        found = (weights[..., None, None] * (found + self.offset[rows])).sum(-3)
+        return found if yaw is None else turn_vectors(found, yaw.unsqueeze(-1))
+
+    def forward(self, observation: Tensor, weights: Tensor, rows: Tensor, yaw: Tensor | None = None) -> Tensor:
+        """As :meth:`positions`, to (..., 9·P) float32 features."""
+        position = self.positions(observation, weights, rows, yaw).flatten(-2)
+        found = torch.cat((position / _SCALE, *squash(position)), -1)
+        return found + self.noise * torch.randn_like(found) if self.training and self.noise else found
+
+
+def _compared(plan: ConditionalPlan) -> list[list[Pair]]:
+    of = plan.definition.object
+    each = [[(of(c.subject), of(c.object)) for c in step.condition.clauses if c.object] for step in plan.steps]
+    return [[found[0], found[-1]] if found else [] for found in each]
+
+
+class PlanFocus(RelativePositions):
+    """From the subject to the object of the conditions' clauses, mixed by the attention over the steps.
+
+    A step's condition names what its skill is about: "the gripper is above the handle and not near the handle". So the
+    position of the handle relative to the gripper stands in the same place as that of the puck in another task, and
+    what was learned there is of use here. Of each step the first and the last clause with two things: 18 features, 0
+    for a step without such a clause.
+
+    Args:
+        plans: the plans.
+        tables: theirs.
+        noise: standard deviation of the noise on each feature while training.
+    """
+
+    def __init__(self, plans: Plans, tables: PlanTables, noise: float = 0.0) -> None:
+        super().__init__(plans, tables, _compared, 2, noise)
+
+
+class PlanRoles(RelativePositions):
+    """From the thing that a step moves to its target, mixed by the attention over the steps.
+
+    "lower the gripper around the puck" and "lower the gripper around the mug" are the same motion in this relative
+    position, so that what was learned in one task is of use in another: 9 features, 0 for a step without roles (see
+    :func:`plan_roles`).
+
+    Where the gripper acts on a thing that is touched beside its position, the relative position is that of the
+    *contact*, which demonstrations of the task show, see :meth:`fit`. A task that was never demonstrated has the points
+    that its plan's conditions name.
+
+    Args:
+        plans: the plans.
+        tables: theirs.
+        noise: standard deviation of the noise on each feature while training.
+        jitter: standard deviation, in metres, of the noise on the position's height while training, and half of it to
+            the sides, where the gripper pushes or pulls: things are touched at other places in other tasks.
+
+    Attributes:
+        contact: (T, 3) float32 buffer, metres, a row for each task as in ``tables``: from the first object to the hand
+            while this acts on it; saved with the module.
+        fitted: () bool buffer, whether demonstrations were asked for contacts; saved with the module.
+
+    Source: ours; as the keypoints of task-axis controllers, read from words.
+    """
+
+    contact: Tensor
+    fitted: Tensor
+    at_contact: Tensor
+    acts: Tensor
+    pushes: Tensor
+
+    def __init__(self, plans: Plans, tables: PlanTables, noise: float = 0.0, jitter: float = 0.0) -> None:
+        roles = {task: plan_roles(plan) for task, plan in plans.items()}
+
+        def moved_to_target(plan: ConditionalPlan) -> list[list[Pair]]:
+            task, of = plan.definition, role_object
+            return [
+                [(of(task, one.moved), of(task, one.target))] if one.moved and one.target else []
+                for one in roles[plan.task]
+            ]
+
+        super().__init__(plans, tables, moved_to_target, 1, noise)
+        self.jitter = check_scale("jitter", jitter)
+        self.tables = tables
+        at_contact, acts, pushing = (torch.zeros(len(plans), plans.num_steps, dtype=torch.bool) for _ in range(3))
+        for task, plan in plans.items():
+            for number, (step, role) in enumerate(zip(plan.steps, roles[task], strict=True)):
+                if not role.moved or not role.target:
+                    continue
+                at = (tables.index.row(task), number)
+                first = {name: _is_first(plan, name) for name in (role.target, role.moved)}
+                by_hand = role.moved == GRIPPER
+                at_contact[at] = by_hand and first[role.target]
+                pushing[at] = by_hand and pushes(step.skill)
+                touches = closes(step.skill) or (pushes(step.skill) and not presses(step.skill))
+                acts[at] = first[role.moved] or (at_contact[at] and touches)
+        self.register_buffer("at_contact", at_contact, persistent=False)
+        self.register_buffer("acts", acts, persistent=False)
+        self.register_buffer("pushes", pushing, persistent=False)
+        self.register_buffer("contact", torch.zeros(len(plans), 3))
+        self.register_buffer("fitted", torch.tensor(False))
+        self._sharing: WeakSet[PlanRoles] = WeakSet([self])  # those of actors with the same weights
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_sharing": None}  # a copy has weights of its own
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        self._sharing = WeakSet([self])
+
+    @torch.no_grad()
+    def fit(self, observation: Tensor, weights: Tensor, rows: Tensor) -> None:
+        """Take the contacts from demonstrations, in place: the median of hand minus object while a step is in force
+        that closes the gripper around the first object, pushes or pulls it, or moves it. What is pressed from above
+        has none, since the gripper goes through it.
+
+        Args:
+            observation: (R, 39) float32.
+            weights: (R, S) float32, the attention.
+            rows: (R,) int64, as from :meth:`PlanTables.rows`.
+        """
+        held = (weights * self.acts[rows]).sum(-1) > 0.5
+        away = observation[:, HAND] - observation[:, FIRST]
+        for row in rows[held].unique().tolist():
+            self.contact[row] = away[held & (rows == row)].median(0).values
+        self.fitted.fill_(True)
+        for one in self._sharing:
+            if one is not self:
+                one._copy(self)
+
+    @torch.no_grad()
+    def share_contact(self, other: PlanRoles) -> None:
+        """Have the contacts of the same tasks under other plans, now and whenever either is fitted."""
+        self._sharing = other._sharing
+        self._sharing.add(self)
+        self._copy(other)
+
+    def _copy(self, other: PlanRoles) -> None:
+        self.fitted.copy_(other.fitted)
+        for task in {*self.tables.index.tasks} & {*other.tables.index.tasks}:
+            self.contact[self.tables.index.row(task)] = other.contact[other.tables.index.row(task)]
+
+    def positions(self, observation: Tensor, weights: Tensor, rows: Tensor, yaw: Tensor | None = None) -> Tensor:
+        """As :meth:`RelativePositions.positions`, of the contact where there is one."""
+        found = super().positions(observation, weights, rows, yaw)
+        share = (weights * self.at_contact[rows]).sum(-1, keepdim=True)
+        contact = share * self.contact[rows]
+        found = found + (contact if yaw is None else turn_vectors(contact, yaw)).unsqueeze(-2)
+        if self.training and self.jitter:
+            scale = self.jitter * found.new_tensor([0.5, 0.5, 1.0])
+            pushed = (weights * self.pushes[rows]).sum(-1)[..., None, None] > 0.5
+            found = found + pushed * scale * torch.randn_like(found)
+        return found
+
+
+def _is_first(plan: ConditionalPlan, name: str) -> bool:
+    """Whether a name is that of the first object itself, not of a point beside it."""
+    thing = role_object(plan.definition, name)
+    return thing.position == places(FIRST) and not any(thing.offset)
