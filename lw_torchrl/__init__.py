@@ -24,11 +24,13 @@ if TYPE_CHECKING:  # the table below, for type checkers and editors
     from lw_torchrl.evaluation import evaluate as evaluate
     from lw_torchrl.evaluation import evaluate_plans as evaluate_plans
     from lw_torchrl.evaluation import plot_success as plot_success
-    from lw_torchrl.language.decoded import DecodedPlan as DecodedPlan
-    from lw_torchrl.language.decoded import DecodedStep as DecodedStep
+    from lw_torchrl.language.decoding import DecodedPlan as DecodedPlan
+    from lw_torchrl.language.decoding import DecodedStep as DecodedStep
     from lw_torchrl.language.decoding import decode_plan as decode_plan
     from lw_torchrl.language.formats import PLAN_FORMATS as PLAN_FORMATS
     from lw_torchrl.language.formats import encode_plan as encode_plan
+    from lw_torchrl.language.nearest import nearest_query as nearest_query
+    from lw_torchrl.language.nearest import nearest_skill as nearest_skill
     from lw_torchrl.language.plan_files import load_plans as load_plans
     from lw_torchrl.language.plan_files import save_plans as save_plans
     from lw_torchrl.language.plans import ConditionalPlan as ConditionalPlan
@@ -39,14 +41,12 @@ if TYPE_CHECKING:  # the table below, for type checkers and editors
     from lw_torchrl.language.queries import parse_query as parse_query
     from lw_torchrl.language.queries import supported_queries as supported_queries
     from lw_torchrl.language.query_program import QueryProgram as QueryProgram
-    from lw_torchrl.language.query_search import nearest_query as nearest_query
     from lw_torchrl.language.skills import load_skills as load_skills
-    from lw_torchrl.language.skills import nearest_skill as nearest_skill
-    from lw_torchrl.language.task_files import load_tasks as load_tasks
     from lw_torchrl.language.tasks import MT10 as MT10
     from lw_torchrl.language.tasks import MT50 as MT50
     from lw_torchrl.language.tasks import TASKS as TASKS
     from lw_torchrl.language.tasks import Task as Task
+    from lw_torchrl.language.tasks import load_tasks as load_tasks
     from lw_torchrl.language.tasks import resolve_tasks as resolve_tasks
     from lw_torchrl.language.tasks import task_id as task_id
     from lw_torchrl.modules import ActorEnsemble as ActorEnsemble
@@ -105,17 +105,15 @@ _NAMES = {
     "add_pictures collect_demonstrations load_pictures",
     "lw_torchrl.envs": "ExpertActor LanguageWorldEnv",
     "lw_torchrl.evaluation": "EvaluationResult attribute_failures evaluate evaluate_plans plot_success",
-    "lw_torchrl.language.decoded": "DecodedPlan DecodedStep",
-    "lw_torchrl.language.decoding": "decode_plan",
+    "lw_torchrl.language.decoding": "DecodedPlan DecodedStep decode_plan",
     "lw_torchrl.language.formats": "PLAN_FORMATS encode_plan",
+    "lw_torchrl.language.nearest": "nearest_query nearest_skill",
     "lw_torchrl.language.plan_files": "load_plans save_plans",
     "lw_torchrl.language.plans": "ConditionalPlan PlanError Plans PlanStep",
     "lw_torchrl.language.queries": "QueryError parse_query supported_queries",
     "lw_torchrl.language.query_program": "QueryProgram",
-    "lw_torchrl.language.query_search": "nearest_query",
-    "lw_torchrl.language.skills": "load_skills nearest_skill",
-    "lw_torchrl.language.task_files": "load_tasks",
-    "lw_torchrl.language.tasks": "MT10 MT50 TASKS Task resolve_tasks task_id",
+    "lw_torchrl.language.skills": "load_skills",
+    "lw_torchrl.language.tasks": "MT10 MT50 TASKS Task load_tasks resolve_tasks task_id",
     "lw_torchrl.modules": "ActorEnsemble DescriptorConditionedActor HeldEvaluator ImageQueryEvaluator "
     "PlanConditionedActor PlanConditionedQValue PlanConditionedValue Policy QueryEvaluator ResidualActor "
     "ScriptedSkillActor StateQueryEvaluator plan_actor_value",

@@ -101,7 +101,7 @@ def _check_plan(
 ) -> tuple[list[str], int, list[str]]:
     """Every fault of a plan, the steps it has if there is none, and what the scripted skills make of it."""
     import lw_torchrl as lw
-    from lw_torchrl.language.formats.chain_py import check_plan
+    from lw_torchrl.language.plan_files import check_plan
     from lw_torchrl.language.skills import skills_for
 
     plan, faults = check_plan(text, task, source, tasks)

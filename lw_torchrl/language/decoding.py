@@ -1,28 +1,87 @@
-"""decode_plan: what a language model wrote, as a plan of one task, and all that was left out or changed."""
+"""decode_plan: what a language model wrote, as a plan of one task, with notes of what was left out or changed."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from lw_torchrl._checks import check_choice, check_probability, checked, counted, shown
-from lw_torchrl.language.decoded import DecodedPlan, DecodedStep
 from lw_torchrl.language.formats import PLAN_FORMATS
-from lw_torchrl.language.formats.prose_reader import read_prose
-from lw_torchrl.language.formats.python_reader import read_python
-from lw_torchrl.language.formats.written import Clause, Note, Reading, Section, listed_steps
+from lw_torchrl.language.formats.plan_format import Clause, Note, Reading, Section, listed_steps
+from lw_torchrl.language.formats.prose import read_prose
+from lw_torchrl.language.formats.python import read_python
+from lw_torchrl.language.nearest import StepMapper
 from lw_torchrl.language.plans import MOST_STEPS, ConditionalPlan, PlanStep
-from lw_torchrl.language.queries import read_query
-from lw_torchrl.language.skill_text import canonical_skill
+from lw_torchrl.language.queries import Query, read_query
+from lw_torchrl.language.skill_words import canonical_skill
 from lw_torchrl.language.skills import ScriptedSkill
-from lw_torchrl.language.step_mapping import StepMapper
 from lw_torchrl.language.tasks import TASKS, Task, check_task
-from lw_torchrl.language.thoughts import without_thoughts
+
+
+@dataclass(frozen=True)
+class DecodedStep:
+    """One clause of a text, and what became of it.
+
+    Distances are 0 for a text that is itself a query or a skill, and at most 1.
+
+    Attributes:
+        line: where it stands in the text, from 1.
+        written_condition: the condition in the text's words.
+        written_skill: the skill in the text's words, as a sentence: ``robot.put("gripper above mug")`` is "put gripper
+            above mug".
+        condition: the query it was mapped to; None if nothing is near enough.
+        condition_distance: of the clause that is furthest from what it was taken for.
+        scripted: the text of the scripted skill it was mapped to; None if nothing is near enough.
+        skill_distance: between the skill and that one.
+        written_goal: the state to reach in the text's words, "" if it says none.
+        goal: the query that was mapped to; None if nothing is near enough.
+        goal_distance: as ``condition_distance``.
+        dropped: why it is no step of the plan; "" if it is one.
+    """
+
+    line: int
+    written_condition: str
+    written_skill: str
+    condition: Query | None
+    condition_distance: float
+    scripted: str | None
+    skill_distance: float
+    written_goal: str = ""
+    goal: Query | None = None
+    goal_distance: float = 0.0
+    dropped: str = ""
+
+
+@dataclass(frozen=True)
+class DecodedPlan:
+    """What :func:`decode_plan` made of a text.
+
+    Attributes:
+        plan: the plan, its conditions as queries and its skills in the text's words; None if there is none.
+        scripted: the same with the nearest scripted skills, what :class:`~lw_torchrl.ScriptedSkillActor` runs; steps
+            whose skill is near none are left out. None if no step is left.
+        reason: why there is no plan; "" if there is one.
+        notes: what was left out and what was changed, each with its line, in the order of the lines.
+        steps: the clauses for the task, those that were dropped included.
+    """
+
+    plan: ConditionalPlan | None
+    scripted: ConditionalPlan | None
+    reason: str
+    notes: tuple[Note, ...]
+    steps: tuple[DecodedStep, ...]
+
+    @property
+    def all_scripted(self) -> bool:
+        """Whether there is a plan, and every step of it has a scripted skill."""
+        return self.plan is not None and self.scripted is not None and len(self.scripted.steps) == len(self.plan.steps)
+
 
 LIMIT, SKILL_LIMIT = 0.4, 0.7
 """Distances beyond which a condition and a skill are taken for nothing; docs/planners.md says what that leaves out."""
+
 _LONGEST = 65_536  # characters of a text that are read
 
 
@@ -229,3 +288,55 @@ def _why_none(reading: Reading, section: Section, steps: list[DecodedStep], task
     if others:
         return f"it has no steps for {task.name}, but some for {', '.join(map(shown, others))}"
     return f"it has no steps, neither for {task.name} nor for another task"
+
+
+_OPENS = r"<think(?:ing)?>|\[think\]|<\|channel\|>(?:analysis|commentary)"
+_CLOSES = r"</think(?:ing)?>|\[/think\]|<\|channel\|>final[^\n]{0,80}?<\|message\|>"
+_TAG = re.compile(f"(?P<opens>{_OPENS})|{_CLOSES}", re.IGNORECASE)
+_LINE_ENDS = re.compile(r"[ \t\r]*(?:\n|\Z)")
+_COMMENT = re.compile(r"#(?!\w)")  # "#2" is none
+_IS_JSON = re.compile(r"\s*(?:```\w*\s*)?\{")
+
+
+def without_thoughts(text: str, notes: list[Note]) -> str:
+    """The text without thoughts, which get a note; every line keeps its number.
+
+    A closing tag alone closes what began before the text did, if it ends its line and stands in no comment of a plan;
+    an opening tag in a comment or a string opens nothing. The tags of gpt-oss, which are no text, always count.
+
+    Args:
+        text: an answer; one that begins as JSON has no thoughts.
+        notes: where the note goes.
+
+    Example:
+        >>> without_thoughts("<think>A draft.\\n</think>Done.", [])
+        '\\nDone.'
+        >>> without_thoughts("A draft. [/THINK]\\nDone. # </think>", [])
+        '\\nDone. # </think>'
+    """
+    spans, opened, at, comment, quotes = list[tuple[int, int]](), None, 0, False, 0
+    for tag in _TAG.finditer("" if _IS_JSON.match(text) else text):
+        *lines, before = text[at : tag.start()].split("\n")
+        if lines:
+            comment, quotes = False, 0
+        comment, quotes = comment or _COMMENT.search(before) is not None, quotes + before.count('"')
+        at, special = tag.end(), tag[0].startswith("<|")
+        if tag["opens"]:
+            if opened is None and (special or not (comment or quotes % 2)):
+                opened = tag.start()
+        elif opened is not None:
+            spans.append((opened, at))
+            opened = None
+        elif special or (not comment and _LINE_ENDS.match(text, at)):
+            spans = [(0, at)]
+    if opened is not None:
+        spans.append((opened, len(text)))
+    if not spans:
+        return text
+    how = "" if opened is None else ", and is cut off there"
+    notes.append(Note(text.count("\n", 0, spans[0][0]) + 1, f"thinks aloud; that is left out{how}"))
+    kept, at = list[str](), 0
+    for start, end in spans:
+        kept += [text[at:start], "\n" * text.count("\n", start, end)]
+        at = end
+    return "".join([*kept, text[at:]])

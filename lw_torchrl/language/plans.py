@@ -16,7 +16,7 @@ from typing import Any
 from lw_torchrl._checks import check_fields, checked, shown
 from lw_torchrl.language.queries import Query, check_query, read_query
 from lw_torchrl.language.relations import PREDICATES
-from lw_torchrl.language.skill_text import canonical_skill
+from lw_torchrl.language.skill_words import canonical_skill
 from lw_torchrl.language.skills import load_skills
 from lw_torchrl.language.tasks import TASKS, Task, check_task, get_task
 
@@ -28,6 +28,11 @@ PLAN_LIMIT = 2**18
 
 class PlanError(ValueError):
     """A text or a list of steps that is no conditional plan."""
+
+
+def one_line(text: str) -> str:
+    """A description or a reason with its line ends as spaces."""
+    return " ".join(text.split())
 
 
 def too_many_steps(what: str, number: int) -> PlanError:
@@ -134,7 +139,7 @@ class ConditionalPlan:
         return tuple(step.goal or usual_goal(step.skill, self.definition) for step in self.steps)
 
     def __str__(self) -> str:
-        from lw_torchrl.language.formats.chain_py import format_plan
+        from lw_torchrl.language.plan_files import format_plan
 
         return format_plan(self)
 
@@ -236,7 +241,7 @@ class Plans(Mapping[str, ConditionalPlan]):
     @classmethod
     def from_json(cls, found: Any) -> Plans:
         """The plans of :meth:`to_json`; anything else, whatever it is, is a :class:`PlanError`."""
-        from lw_torchrl.language.formats.chain_py import parse_plan
+        from lw_torchrl.language.plan_files import parse_plan
 
         if not isinstance(found, dict):
             raise PlanError(f"plans must be an object of task names and plans, got {shown(found)}")

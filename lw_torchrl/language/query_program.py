@@ -13,8 +13,7 @@ from torch import Tensor, nn
 from lw_torchrl._checks import check_choice, checked, shown
 from lw_torchrl.language.observation import OBSERVATION_SIZE
 from lw_torchrl.language.queries import Query, check_query
-from lw_torchrl.language.query_facts import compile_facts
-from lw_torchrl.language.query_tables import QueryTables, compile_queries
+from lw_torchrl.language.query_tables import QueryTables, compile_facts, compile_queries
 from lw_torchrl.language.task_index import TaskIndex, TaskTables
 from lw_torchrl.language.tasks import TASKS, Task, get_task
 from lw_torchrl.language.value_checks import check_finite

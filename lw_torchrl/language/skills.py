@@ -1,26 +1,25 @@
-"""Scripted skills: stateless linear controllers with a name in plain English. The table itself is data/skills.toml."""
+"""Scripted skills: stateless linear controllers with a name in plain English. Their table is data/skills.toml."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from functools import cache, lru_cache
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
-from rapidfuzz import fuzz, process
-
-from lw_torchrl._checks import check_choice, checked, nearest, shown
+from lw_torchrl._checks import checked, nearest, shown
 from lw_torchrl._files import read_toml
 from lw_torchrl.language.named_objects import GRIPPER, is_number
 from lw_torchrl.language.tasks import TASKS, Task, check_task, get_task
 
 if TYPE_CHECKING:
-    from torch import Tensor
+    pass
+
 
 Triple = tuple[float, float, float]
 
@@ -198,59 +197,3 @@ def _for(task: Task, skills: Mapping[str, ScriptedSkill]) -> dict[str, ScriptedS
         for text, skill in skills.items()
         if skill.suits(task) and (task.name in skill.variants or not foreign & set(text.split()))
     }
-
-
-@lru_cache(maxsize=64)
-def _vectors(texts: tuple[str, ...]) -> Tensor:
-    from lw_torchrl.language.text import encode_texts
-
-    return encode_texts(texts)
-
-
-@checked
-def nearest_skill(
-    text: str,
-    task: str | Task | None = None,
-    skills: Mapping[str, ScriptedSkill] | Iterable[str] | None = None,
-    by: Literal["edit", "embedding"] = "edit",
-) -> tuple[ScriptedSkill, float]:
-    """The scripted skill whose text is closest, and how close it is, in [0, 1].
-
-    Args:
-        text: what to do, in any words.
-        task: consider only skills whose objects this task has.
-        skills: to choose from; None for the shipped ones.
-        by: "edit", closest in spelling; "embedding", closest in meaning, by the sentence encoder.
-
-    Raises:
-        TypeError: ``text`` is no string.
-        SkillError: (a ValueError) no skill suits the task.
-        ValueError: another value for ``by``.
-        ImportError: by="embedding" without the extra ``[text]``.
-
-    Example:
-        >>> nearest_skill("put gripper above puck", task="push")[0].text
-        'place the gripper above the puck'
-
-    Source: paper section 'Conditional Plan Generation', which takes the nearest description.
-    """
-    if not isinstance(text, str):
-        raise TypeError(f"text must be a string, got {type(text).__name__}")
-    check_choice("by", by, ("edit", "embedding"))
-    table = _shipped() if skills is None else skills
-    if not isinstance(table, Mapping):
-        table = {check_choice("skills", name, _shipped()): _shipped()[name] for name in table}
-    for name, skill in table.items():
-        if not isinstance(skill, ScriptedSkill):
-            raise TypeError(f"skills[{name!r}] must be a ScriptedSkill, got {shown(skill)} ({type(skill).__name__})")
-    allowed = [name for name, skill in table.items() if task is None or skill.suits(task)]
-    if not allowed:
-        raise SkillError(f"no scripted skill suits task {task!r}")
-    said = " ".join(text.lower().replace("_", " ").split())
-    if by == "embedding":
-        from lw_torchrl.language.text import encode_texts
-
-        alike = _vectors(tuple(allowed)) @ encode_texts([said.encode("utf-8", "replace").decode()])[0]
-        return table[allowed[int(alike.argmax())]], float(alike.max().clamp(0.0, 1.0))
-    found = process.extractOne(said, allowed, scorer=fuzz.ratio)
-    return table[found[0]], found[1] / 100

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from hashlib import blake2b
 from importlib.resources import files
+from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from lw_torchrl._checks import check_fields, checked, shown, unknown_name
+from lw_torchrl._checks import check_fields, checked, nearest, shown, unknown_name
 from lw_torchrl._files import read_toml
 from lw_torchrl.language.named_objects import GRIPPER, NamedObject, read_objects, write_objects
 
 if TYPE_CHECKING:
     from torch import Tensor
+
 
 _NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
 _OWN_IDS = 2**31 - 50  # so that an id is an int32 too
@@ -153,7 +156,9 @@ def _load() -> tuple[Mapping[str, Task], tuple[str, ...]]:
 
 TASKS, MT10 = _load()
 """TASKS maps the 50 names, sorted, to their :class:`Task`; MT10 names the ten of the MT10 set."""
+
 MT50: tuple[str, ...] = tuple(TASKS)
+
 _RANK = {name: rank for rank, name in enumerate(MT50)}
 
 
@@ -261,3 +266,46 @@ def named_tasks(tasks: str | Task | Iterable[str | Task], *, known: Mapping[str,
 def get_task(task: str | Task) -> Task:
     """The :class:`Task` of a name of the 50; a Task is returned as it is."""
     return task if isinstance(task, Task) else TASKS[check_task(task)]
+
+
+@checked
+def load_tasks(path: str | os.PathLike[str]) -> Mapping[str, Task]:
+    """All 50 tasks and those of a file of one's own: some of the 50 with other objects, points or words, or tasks that
+    the simulator does not have.
+
+    Args:
+        path: a file in the format of data/tasks.toml. A task with a new name must name its objects.
+
+    Returns:
+        Task name to :class:`Task`, sorted; pass one wherever a task is asked for, or all of them to
+        :func:`~lw_torchrl.load_plans` and :func:`~lw_torchrl.resolve_tasks`.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        TaskError: (a ValueError) it is no TOML, or a task in it is malformed.
+
+    Example:
+        >>> import os, tempfile
+        >>> folder = tempfile.TemporaryDirectory()
+        >>> path = os.path.join(folder.name, "mine.toml")
+        >>> lines = ["[push]", "description = 'Push the disc.'", "objects.disc = 'obs[4:7]'"]
+        >>> with open(path, "w") as file:
+        ...     print(*lines, sep=os.linesep, file=file)
+        >>> load_tasks(path)["push"].object_names
+        ("robot's gripper", 'disc')
+        >>> folder.cleanup()
+    """
+    file = Path(path)
+    found = dict(TASKS)
+    for name, row in read_toml(file, TaskError).items():
+        try:
+            found[name] = Task.from_json(name, row)
+            if name not in TASKS and len(found[name].objects) == 1:
+                close = nearest(name, TASKS, n=1)
+                raise TaskError(
+                    f"task {name!r}: is none of the 50, so it must name its objects"
+                    + (f"; did you mean {close[0]!r}?" if close else "")
+                )
+        except TaskError as error:
+            raise TaskError(f"{file}, {error}") from error
+    return MappingProxyType(dict(sorted(found.items())))

@@ -1,20 +1,25 @@
-"""Text encoders: English to vectors. The shipped texts' vectors are data of the package; other texts need the extra.
+"""Text encoders: English to vectors. Those of the shipped texts come with the package; other texts need the extra.
 
-The vectors were made once by all-MiniLM-L6-v2 through sentence-transformers; :mod:`lw_torchrl.language.shipped_texts`
-makes them again, after a description or a plan has changed.
+The vectors come from all-MiniLM-L6-v2, through sentence-transformers; after a description or a plan has changed,
+``python -m lw_torchrl.language.text`` makes them again.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from importlib.resources import as_file, files
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
+
+from lw_torchrl._files import replacing
+from lw_torchrl.language.plan_files import load_plans
+from lw_torchrl.language.tasks import TASKS
 
 TEXT_DIMENSION = 384
 TABLE = "embeddings.npz"
@@ -112,3 +117,24 @@ def encoded(texts: Sequence[str], encoder: TextEncoder | None) -> Tensor:
         wrong = texts[int((~found.isfinite()).any(-1).nonzero()[0])]
         raise ValueError(f"text_encoder must give finite numbers, it gives NaN or infinity for {wrong!r}")
     return found.detach().to(torch.float32)
+
+
+def shipped_texts() -> list[str]:
+    """The task descriptions and the skills of the shipped plans, sorted."""
+    skills = {*load_plans("MT50").skills, *load_plans("MT50", skills="MT10").skills}
+    return sorted({task.description for task in TASKS.values()} | skills)
+
+
+def write_table(path: Path, texts: Iterable[str]) -> None:
+    """Encode ``texts`` and write them with their vectors, half precision, as an .npz without pickles."""
+    listed = list(texts)
+    with replacing(path) as temporary:
+        np.savez_compressed(
+            temporary, texts=np.array(listed), vectors=sentence_encoder(listed).numpy().astype(np.float16)
+        )
+
+
+if __name__ == "__main__":
+    target = Path(__file__).parent / "data" / TABLE
+    write_table(target, shipped_texts())
+    print(f"{len(shipped_texts())} texts written to {target.name}")

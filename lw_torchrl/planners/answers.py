@@ -1,18 +1,50 @@
-"""Answers of planners, and the folder that holds them: ``DIR/<model>/<format>/<task>-<attempt>.<ext>``."""
+"""Answers of planners: what a server replied, the plan in it, and the error where there is none."""
 
 from __future__ import annotations
 
-import os
-import re
-from collections.abc import Iterable, Sequence
+import json
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeGuard, overload
+from typing import Any, TypeGuard, overload
 
-from lw_torchrl._checks import checked
-from lw_torchrl._files import write_text
-from lw_torchrl.language.decoded import DecodedPlan
-from lw_torchrl.language.formats import PLAN_FORMATS
+from lw_torchrl._checks import counted, shown
+from lw_torchrl.language.decoding import LIMIT, SKILL_LIMIT, DecodedPlan, decode_as
+from lw_torchrl.language.formats import PLAN_FORMATS, encode_plan
+from lw_torchrl.language.formats.structured import read_structured
+from lw_torchrl.language.nearest import StepMapper
+from lw_torchrl.language.skills import ScriptedSkill
+from lw_torchrl.language.tasks import Task
+from lw_torchrl.planners.plan_schema import passes
+
+
+class PlannerError(RuntimeError):
+    """A planner has no answer to a question: it says whose, to which question, what came, and what to try.
+
+    Attributes:
+        fatal: any other question to the same planner would end the same way, so none was asked after it.
+    """
+
+    def __init__(self, message: str, *, fatal: bool = False) -> None:
+        super().__init__(message)
+        self.fatal = fatal
+
+
+def unanswered(errors: Sequence[Exception], came: int, total: int, folder: Path) -> Exception:
+    """The error for questions of which some have no answer; the caller raises it.
+
+    Args:
+        errors: what each of these met with; one that is no :class:`PlannerError` goes first, as it is.
+        came: how many answers there are.
+        total: how many were wanted.
+        folder: where those that came are kept.
+    """
+    first = next((error for error in errors if not isinstance(error, PlannerError)), errors[0])
+    if not isinstance(first, PlannerError):
+        return first
+    others = f" So did {counted(len(errors) - 1, 'other question')}." if len(errors) > 1 else ""
+    kept = f"{came} of {counted(total, 'answer')} are kept in {str(folder)!r}; the same again asks the rest"
+    return PlannerError(f"{first}{others} {kept}.", fatal=first.fatal)
 
 
 @dataclass(frozen=True)
@@ -110,28 +142,68 @@ class Answers(Sequence[Answer]):
         return f"Answers({len(self)} answers, {plans} plans, {self.tokens.total} tokens)"
 
 
-@checked
-def folder_name(model: str) -> str:
-    """A model's name as that of a folder.
+CUT_OFF = "it was cut off at max_tokens"
 
-    Example:
-        >>> folder_name("meta-llama/Llama-3.1-8B"), folder_name("PaLM 2")
-        ('meta-llama_Llama-3.1-8B', 'PaLM 2')
+
+def read_reply(
+    reply: Reply,
+    task: Task,
+    format: str,
+    attempt: int = 0,
+    skills: Mapping[str, ScriptedSkill] | None = None,
+    schema: Mapping[str, Any] | None = None,
+) -> Answer:
+    """The answer in a reply; whatever the server claims, it is read as any text is.
+
+    Args:
+        reply: what the server said.
+        task: the task that was asked for.
+        format: the format that was asked for.
+        attempt: which of several answers it is.
+        skills: the scripted skills to choose from; None for the shipped ones.
+        schema: what the model was to be held to; JSON is expected then, and becomes a text in the format.
     """
-    return re.sub(r"[^\w .+-]+", "_", model).strip(" ._")[:100].rstrip(" .") or "model"
+    read = PLAN_FORMATS[format].read if schema is None else read_structured
+    raw = storable(reply.text)
+    decoded = decode_as(raw, read, StepMapper(task, skills, "edit", LIMIT, SKILL_LIMIT))
+    text = encode_plan(decoded.plan, format) if schema and decoded.plan is not None else raw
+    notes = []
+    if reply.finish == "length":
+        notes.append(CUT_OFF)
+    elif reply.finish == "content_filter":
+        notes.append("a filter of the server cut it off")
+    if reply.refusal:
+        notes.append(f"the model refused: {shown(reply.refusal)}")
+    elif not raw.strip():
+        notes.append("it is empty")
+    elif schema and reply.finish != "length" and not _passes(raw, schema):
+        notes.append("the server did not keep to the schema")
+    return Answer(
+        task.name, format, attempt, storable(text), raw, decoded, reply.tokens, notes=(*notes, *reply.notes)
+    )  # fmt: skip
 
 
-@checked
-def answer_path(folder: str | os.PathLike[str], model: str, format: str, task: str, attempt: int) -> Path:
-    """Where the answer of a model is kept."""
-    return Path(folder) / folder_name(model) / format / f"{task}-{attempt}.{PLAN_FORMATS[format].extension}"
+def _passes(text: str, schema: Mapping[str, Any]) -> bool:
+    try:
+        return passes(json.loads(text), schema)
+    except (ValueError, RecursionError):
+        return False
 
 
-@checked
-def write_answer(folder: str | os.PathLike[str], model: str, answer: Answer) -> Path:
-    """Write an answer to its place, whole or not at all; one that came in another form beside it, as .json."""
-    path = answer_path(folder, model, answer.format, answer.task, answer.attempt)
-    if answer.raw != answer.text:
-        write_text(path.with_suffix(".json"), answer.raw)
-    write_text(path, answer.text)
-    return path
+@dataclass(frozen=True)
+class Reply:
+    """What a server said.
+
+    Attributes:
+        text: the answer; "" if there is none.
+        finish: why it ends, in the server's words: "stop", "length", "content_filter", "".
+        refusal: what the model said instead of an answer, "".
+        tokens: what it cost.
+        notes: what was different from what was asked.
+    """
+
+    text: str
+    finish: str = ""
+    refusal: str = ""
+    tokens: Tokens = NO_TOKENS
+    notes: tuple[str, ...] = ()

@@ -1,4 +1,4 @@
-"""One question to an OpenAI-compatible server: what is sent, what may come back, and what each failure means."""
+"""Questions to an OpenAI-compatible server: what is sent, what may come back, and what each failure means."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ import asyncio
 import os
 import re
 import threading
-from collections.abc import Coroutine, Mapping
+from collections import deque
+from collections.abc import Callable, Coroutine, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from queue import SimpleQueue
 from types import TracebackType
-from typing import Any
+from typing import Any, TypeVar
 from urllib.parse import parse_qsl, unquote, urlsplit
 
 from lw_torchrl._checks import counted, shown
-from lw_torchrl.planners.answer_cache import Reply
-from lw_torchrl.planners.bounded_client import bounded_client
-from lw_torchrl.planners.completion import NoCompletion, in_a_line, read_completion
-from lw_torchrl.planners.errors import PlannerError
+from lw_torchrl.planners.answers import PlannerError, Reply
+from lw_torchrl.planners.chat_reply import NoCompletion, bounded_client, in_a_line, read_completion
 from lw_torchrl.planners.hiding import Hider
 
 OPENAI = "https://api.openai.com/v1"
@@ -276,3 +276,47 @@ class ChatServer:
 
     def _clean(self, text: str) -> str:
         return in_a_line(text, self._hidden)
+
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+def ask_at_once(
+    work: Callable[[Item], Result], items: Iterable[Item], concurrency: int
+) -> Iterator[tuple[Item, Result | Exception]]:
+    """Each item with what ``work`` gives of it, or raises, in the order in which they end.
+
+    After an error that is no :class:`PlannerError`, or a fatal one, no further item is begun; those that are under way
+    are waited for. Where the caller stops listening they end by themselves.
+    """
+    waiting, ended = deque(items), SimpleQueue[tuple[Item, Result | Exception] | None]()
+    stop = threading.Event()
+
+    def worker() -> None:
+        while not stop.is_set():
+            try:
+                item = waiting.popleft()
+            except IndexError:
+                break
+            try:
+                ended.put((item, work(item)))
+            except Exception as error:
+                if not isinstance(error, PlannerError) or error.fatal:
+                    stop.set()
+                ended.put((item, error))
+        ended.put(None)
+
+    threads = [threading.Thread(target=worker, daemon=True) for _ in range(min(concurrency, len(waiting)))]
+    try:
+        for thread in threads:
+            thread.start()
+        left = len(threads)
+        while left:
+            found = ended.get()
+            if found is None:
+                left -= 1
+            else:
+                yield found
+    finally:
+        stop.set()

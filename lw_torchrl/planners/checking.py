@@ -10,8 +10,7 @@ from torch import Tensor
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.evaluation.plan_use import PlanUse, TaskUse, expert_use
 from lw_torchrl.evaluation.protocol import evaluate
-from lw_torchrl.language.decoded import DecodedPlan
-from lw_torchrl.language.decoding import decode_plan
+from lw_torchrl.language.decoding import DecodedPlan, decode_plan
 from lw_torchrl.language.skills import ScriptedSkill
 from lw_torchrl.language.tasks import TASKS, Task, check_task
 from lw_torchrl.modules.scripted_skill_actor import ScriptedSkillActor

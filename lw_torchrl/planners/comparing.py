@@ -18,7 +18,7 @@ from lw_torchrl.evaluation.statistics import mean_rate
 from lw_torchrl.language.decoding import decode_plan
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.language.tasks import TASKS, Task
-from lw_torchrl.planners.file_planner import answer_text, recorded_answers
+from lw_torchrl.planners.answer_files import answer_text, recorded_answers
 
 _SAVE_SECONDS = 5.0
 Group = tuple[str, str]  # model, format

@@ -16,16 +16,18 @@ from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.skills import ScriptedSkill
 from lw_torchrl.language.tasks import TASKS, Task, check_task, named_tasks
-from lw_torchrl.planners.answer_cache import AnswerCache, Reply
-from lw_torchrl.planners.answer_folder import already_answered, recorded_answer, settle_folder
-from lw_torchrl.planners.answers import Answer, Answers, folder_name, storable, write_answer
-from lw_torchrl.planners.asking import ask_at_once
-from lw_torchrl.planners.chat_server import ChatServer, Dialect, server_address
-from lw_torchrl.planners.errors import unanswered
+from lw_torchrl.planners.answer_files import (
+    AnswerCache,
+    already_answered,
+    folder_name,
+    recorded_answer,
+    settle_folder,
+    write_answer,
+)
+from lw_torchrl.planners.answers import Answer, Answers, Reply, read_reply, storable, unanswered
+from lw_torchrl.planners.chat_server import ChatServer, Dialect, ask_at_once, server_address
 from lw_torchrl.planners.plan_schema import plan_schema
-from lw_torchrl.planners.prompts import example_plans
-from lw_torchrl.planners.questions import Question, chat_messages, request_options
-from lw_torchrl.planners.replies import read_reply
+from lw_torchrl.planners.prompts import Question, chat_messages, example_plans, request_options
 
 
 class OpenAIPlanner:

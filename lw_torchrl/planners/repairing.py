@@ -14,10 +14,9 @@ from lw_torchrl._checks import check_int
 from lw_torchrl._progress import Progress
 from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.language.tasks import TASKS, Task, check_task
-from lw_torchrl.planners.answers import Answer
+from lw_torchrl.planners.answers import CUT_OFF, Answer
 from lw_torchrl.planners.checking import PlanCheck, check_decoded
 from lw_torchrl.planners.openai_planner import OpenAIPlanner
-from lw_torchrl.planners.replies import CUT_OFF
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from plan_texts import conditional_plans, queries
 
 import lw_torchrl as lw
-from lw_torchrl.language.formats.chain_py import format_plan, parse_plan
+from lw_torchrl.language.plan_files import format_plan, parse_plan
 from lw_torchrl.language.plans import ConditionalPlan, PlanStep
 from lw_torchrl.language.queries import parse_query
 

@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 from plan_texts import DRAWER, HEAD, plan
 
 from lw_torchrl.language.formats import chain_py
-from lw_torchrl.language.formats.chain_py import check_plan, format_plan, parse_plan
-from lw_torchrl.language.plan_files import load_plans
+from lw_torchrl.language.plan_files import check_plan, format_plan, load_plans, parse_plan
 from lw_torchrl.language.plans import MOST_STEPS, PLAN_LIMIT, ConditionalPlan, PlanError
 from lw_torchrl.language.queries import check_query, parse_query
 

@@ -3,7 +3,7 @@
 from hypothesis import given, settings
 from plan_texts import conditional_plans, plan
 
-from lw_torchrl.language.formats.chain_py import format_plan, parse_plan
+from lw_torchrl.language.plan_files import format_plan, parse_plan
 from lw_torchrl.language.plans import ConditionalPlan, PlanStep
 from lw_torchrl.language.queries import parse_query
 from lw_torchrl.language.tasks import TASKS, Task

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from plan_texts import DRAWER, conditional_plans, plan
 
-from lw_torchrl.language.formats.chain_py import format_plan, parse_plan
 from lw_torchrl.language.named_objects import GRIPPER
+from lw_torchrl.language.plan_files import format_plan, parse_plan
 from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans, PlanStep, as_plans
 from lw_torchrl.language.queries import Clause, Query, QueryError, parse_query
 

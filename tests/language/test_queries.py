@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from lw_torchrl.language import queries
 from lw_torchrl.language.named_objects import GRIPPER, NamedObject
+from lw_torchrl.language.nearest import nearest_query
 from lw_torchrl.language.queries import (
     ARTICLES,
     Clause,
@@ -19,7 +20,6 @@ from lw_torchrl.language.queries import (
     parse_query,
     supported_queries,
 )
-from lw_torchrl.language.query_search import nearest_query
 from lw_torchrl.language.relations import RELATIONS, TOUCHING
 from lw_torchrl.language.tasks import MT50, TASKS, Task, get_task
 

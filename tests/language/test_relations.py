@@ -10,10 +10,10 @@ import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from lw_torchrl.language.nearest import nearest_query
 from lw_torchrl.language.plans import ConditionalPlan
 from lw_torchrl.language.queries import QueryError, parse_query, supported_queries
 from lw_torchrl.language.query_program import QueryProgram
-from lw_torchrl.language.query_search import nearest_query
 from lw_torchrl.language.relations import (
     PREDICATES,
     PUBLISHED,

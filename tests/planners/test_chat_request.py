@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 import lw_torchrl as lw
 from lw_torchrl.planners import guard
-from lw_torchrl.planners.chat_request import Refused, read_request
+from lw_torchrl.planners.guard import Refused, read_request
 
 
 def read(**fields):

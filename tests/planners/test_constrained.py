@@ -12,9 +12,8 @@ import lw_torchrl as lw
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.formats.structured import read_structured, write_structured
 from lw_torchrl.planners import plan_schema
-from lw_torchrl.planners.answer_cache import Reply
+from lw_torchrl.planners.answers import Reply, read_reply
 from lw_torchrl.planners.plan_schema import passes
-from lw_torchrl.planners.replies import read_reply
 
 OTHER_WORDS = lw.load_plans("MT50", skills="MT10")
 PUSH = plan_schema("push")

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 import lw_torchrl as lw
 from lw_torchrl.planners import bounded_client
-from lw_torchrl.planners.answer_cache import AnswerCache
-from lw_torchrl.planners.completion import NoCompletion, read_completion
+from lw_torchrl.planners.answer_files import AnswerCache
+from lw_torchrl.planners.chat_reply import NoCompletion, read_completion
 from lw_torchrl.planners.hiding import Hider
 
 pytestmark = pytest.mark.usefixtures("no_account")

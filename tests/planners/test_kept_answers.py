@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import lw_torchrl as lw
-from lw_torchrl.planners.answer_cache import AnswerCache, Reply
-from lw_torchrl.planners.answers import Tokens
+from lw_torchrl.planners.answer_files import AnswerCache
+from lw_torchrl.planners.answers import Reply, Tokens
 
 pytestmark = pytest.mark.usefixtures("no_account")
 
@@ -43,7 +43,7 @@ def test_a_text_that_is_too_large_is_not_written(tmp_path):
 
 
 def test_an_answer_that_cannot_be_kept_is_given_with_a_note(tmp_path, monkeypatch):
-    monkeypatch.setattr("lw_torchrl.planners.answer_cache.JSON_LIMIT", 10)
+    monkeypatch.setattr("lw_torchrl.planners.answer_files.JSON_LIMIT", 10)
     with serving(FakeServer()) as address:
         (answer,) = planner(address, tmp_path).plans("push", progress=False)
     assert answer.decoded.plan == PLANS["push"]

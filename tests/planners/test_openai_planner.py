@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import lw_torchrl as lw
-from lw_torchrl.planners.answer_cache import answer_key
+from lw_torchrl.planners.answer_files import answer_key
 
 
 @pytest.fixture(autouse=True)

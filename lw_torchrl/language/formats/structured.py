@@ -16,9 +16,8 @@ import re
 from typing import Any
 
 from lw_torchrl._checks import shown
-from lw_torchrl.language.formats.plan_format import Style, one_line
-from lw_torchrl.language.formats.written import Clause, Reading
-from lw_torchrl.language.plans import ConditionalPlan
+from lw_torchrl.language.formats.plan_format import Clause, Reading, Style
+from lw_torchrl.language.plans import ConditionalPlan, one_line
 from lw_torchrl.language.queries import Query
 
 _STEPS = re.compile(r'"steps"\s*:\s*\[')

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from lw_torchrl.language import query_search
+from lw_torchrl.language import nearest
 from lw_torchrl.language.named_objects import GRIPPER, NamedObject
+from lw_torchrl.language.nearest import QueryMatch, nearest_query
 from lw_torchrl.language.queries import QueryError, parse_query, supported_queries
-from lw_torchrl.language.query_search import QueryMatch, nearest_query
 from lw_torchrl.language.tasks import MT50, Task
 
 tasks = st.sampled_from(MT50)
@@ -133,7 +133,7 @@ def test_by_embedding_finds_the_meaning_and_encodes_a_tasks_list_once(monkeypatc
     sizes = []
     encode = text.sentence_encoder
     monkeypatch.setattr(text, "sentence_encoder", lambda texts: sizes.append(len(texts)) or encode(texts))
-    query_search._vectors.cache_clear()
+    nearest._vectors.cache_clear()
     match = nearest_query("Has the gripper arrived at the reach target?", "reach", by="embedding")
     assert str(match.query) == "the robot's gripper is near the reach target"
     assert 0.3 < match.score < 1.0

@@ -1,0 +1,359 @@
+"""Plans that look like Python: ``if check("…"):`` and ``robot.verb("…")`` for each step, written and read.
+
+In the goal style a skill is ``robot.move_gripper("above the puck", close_gripper=True)``, the place that the gripper is
+to reach, or ``robot.move_gripper(until="the puck is near the target location")`` for any other state.
+
+The reader takes such text as models really write it. Nothing is executed, and nothing is an error. Lines are matched
+against a few forms, ``def name(``, ``if check("…"):``, ``robot.verb("…")`` and comments; all others are passed over and
+noted. Blocks follow the indentation, also where it is broken: an ``if`` in the block of another one asks for both.
+Source: paper section 'Conditional Plan Generation' and its figure of a plan.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from lw_torchrl._checks import shown
+from lw_torchrl.language.formats.plan_format import END, Clause, PlanFormat, Reading, Style, item
+from lw_torchrl.language.named_objects import GRIPPER
+from lw_torchrl.language.plan_files import function_head, quote
+from lw_torchrl.language.plans import ConditionalPlan, PlanStep, one_line
+from lw_torchrl.language.queries import Query
+from lw_torchrl.language.tasks import TASKS, Task
+
+
+def py(style: Style) -> PlanFormat:
+    """The format of a style as a bare function."""
+
+    def prompt(examples: Sequence[ConditionalPlan], task: Task, hints: Sequence[str]) -> str:
+        said = "".join(f"# {line}\n" for line in hints)
+        return "\n".join([*(_write(plan, style) for plan in examples), said + function_head(task)])
+
+    return PlanFormat("py", lambda plan: _write(plan, style), read_python, prompt, style)
+
+
+def _write(plan: ConditionalPlan, style: Style) -> str:
+    """The plan as a function."""
+    lines = []
+    if style.explains:
+        lines += ["# Steps:", *(f"#  {number}. {step.skill}" for number, step in enumerate(plan.steps, 1))]
+    for number, (step, goal) in enumerate(zip(plan.steps, plan.goals, strict=True)):
+        if style.explains and (reason := one_line(step.reason).lstrip("# ")):
+            if number == 0 and re.match(r"\[?\d", reason):
+                lines.append("#")  # it would go on with the list
+            lines.append(f"# {reason}")
+        lines += [f"if check({quote(str(step.condition))}):", f"    robot.{_call(step, goal if style.goals else None)}"]
+    return function_head(plan.definition) + "".join(f"    {line}\n" for line in lines)
+
+
+def _call(step: PlanStep, goal: Query | None) -> str:
+    if goal is None:
+        verb, _, details = step.skill.partition(" ")
+        return f"{verb}({quote(details)})"
+    first, *others = goal.clauses
+    held = _HELD.get(" and ".join(map(str, others)))
+    if first.subject != GRIPPER or first.object is None or held is None:
+        return f"move_gripper(until={quote(str(goal))})"
+    return f"move_gripper({quote(str(first).removeprefix(f'the {GRIPPER} is '))}{held})"
+
+
+_HELD = {
+    "": "",
+    f"the {GRIPPER} is open": ", open_gripper=True",
+    f"the {GRIPPER} is closed": ", close_gripper=True",
+}
+
+
+def py_md(style: Style) -> PlanFormat:
+    """The format of a style as a chat message with functions in fenced blocks."""
+
+    def encode(plan: ConditionalPlan) -> str:
+        return f"This function does the task `{plan.task}`:\n\n{_fenced(_write(plan, style))}"
+
+    def prompt(examples: Sequence[ConditionalPlan], task: Task, hints: Sequence[str]) -> str:
+        return (
+            "I control a robot that has one arm with a gripper. A function says what the robot does: each `if` asks "
+            "about the state, and its skill is carried out while the answer is yes. These functions do other tasks:\n\n"
+            + _fenced("\n".join(_write(plan, style) for plan in examples))
+            + "".join(f"\n{line}" for line in hints)
+            + ("\n" if hints else "")
+            + f"\nPlease write the function for `{task.name}` in the same way, the whole of it in one block:\n\n"
+            + _fenced(function_head(task))
+        )
+
+    return PlanFormat("md", encode, read_python, prompt, style)
+
+
+def _fenced(code: str) -> str:
+    return f"```python\n{code}```\n"
+
+
+_STRING = r'(?:[fFrRbBuU]{0,2}(?:"(?:[^"\\]|\\.)*+"|\'(?:[^\'\\]|\\.)*+\'))'
+
+_STRINGS = re.compile(_STRING)
+
+_LITERAL = re.compile(r'"(?:[^"\\]|\\.?)*+("|\Z)|\'(?:[^\'\\]|\\.?)*+(\'|\Z)')  # also one that is cut off
+
+_BRANCH = re.compile(r"(if|elif|while)\b\s*|(else)\s*:")
+
+_ARGUMENT = re.compile(rf"(?:(\w+)\s*=\s*)?(?:({_STRING}(?:[\s+]*{_STRING})*)|([^\s,()\"'][^,()\"']*))\s*(?:,\s*)?")
+
+_PRINTED = re.compile(r"\s*print\(\s*(\"|')(.*)\1\s*\)\s*;?")
+
+_MOST_JOINED = 6  # lines of one statement
+
+
+def _arguments(code: str, at: int) -> tuple[list[str], dict[str, str], bool]:
+    """The arguments of a call from where they begin: in order, by name, and whether none is cut off."""
+    words, named = [], {}
+    while match := _ARGUMENT.match(code, at):
+        value = _unquoted(match[2]) if match[2] else match[3].strip()
+        if match[1]:
+            named[match[1]] = value
+        else:
+            words.append(value)
+        at = match.end()
+    return words, named, code[at : at + 1] == ")" or (bool(words or named) and at == len(code))
+
+
+def _unquoted(strings: str) -> str:
+    """The text of one or more string literals in a row."""
+    parts = []
+    for found in _STRINGS.findall(strings):
+        body = found.lstrip("fFrRbBuU")[1:-1]
+        parts.append(re.sub(r"\\(.)", r"\1", body))
+    return " ".join("".join(parts).split())
+
+
+def _task_name(name: str) -> str:
+    """The task that a function is for: "door-lock", of "door_lock" and "DoorLock"."""
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "-", name).replace("_", "-").strip("-").lower() or "?"
+
+
+def _statements(text: str) -> Iterator[tuple[int, str]]:
+    """The lines of a text, with their numbers; those of one call are joined, and what is printed is taken as it is."""
+    lines = text.expandtabs(4).splitlines()
+    at = 0
+    while at < len(lines):
+        line = lines[at]
+        start = at
+        if printed := _PRINTED.fullmatch(line):
+            line = re.sub(r"\\(.)", r"\1", printed[2])
+        at += 1
+        if "check" in line or "robot." in line:
+            while at < len(lines) and at - start < _MOST_JOINED and _depth(line) > 0 and not _begins(lines[at]):
+                line += " " + lines[at].strip()
+                at += 1
+        yield start + 1, line
+
+
+def _begins(line: str) -> bool:
+    """Whether a line begins a statement of its own."""
+    code = line.strip()
+    return not code or code.startswith(("#", "```", "def ", "robot.")) or _BRANCH.match(code) is not None
+
+
+def _is_cut(code: str) -> bool:
+    """Whether a string that begins in a line does not end in it, or a condition has no end."""
+    found = _bare(code)
+    return '"' in found or not found.rstrip().endswith(":")
+
+
+def _depth(line: str) -> int:
+    """How many parentheses are open at the end of a line; 0 if a string is."""
+    found = _bare(line)
+    return 0 if '"' in found else found.count("(") - found.count(")")
+
+
+def _bare(code: str) -> str:
+    """A line without its strings and its comment; of a string that is cut off a quote is left."""
+    return _LITERAL.sub(lambda found: "" if found[1] or found[2] else '"', code).partition("#")[0]
+
+
+_DEF = re.compile(r"(?:async\s+)?def\b\s*(\w*)")
+
+_CHECK = re.compile(
+    rf"(and\b|or\b)?\s*(not\b)?\s*\(?\s*(?:self\.|robot\.)?check\s*\(\s*({_STRING}(?:[\s+]*{_STRING})*)\s*\)?\s*"
+)
+
+_CALL = re.compile(r"(?:self\.)?robot\.(\w+)\s*\(\s*")
+
+_HEADING = re.compile(r"#+\s*([A-Za-z][\w-]*)\s*:")
+
+
+@dataclass
+class _Block:
+    """An ``if``: where it stands, what it asks (None: nothing that could be read), and its block's indentation."""
+
+    indent: int
+    line: int
+    condition: str | None
+    body: int | None = None
+
+
+def read_python(text: str) -> Reading:
+    """What a text says in Python, for :attr:`PlanFormat.read`."""
+    return _Reader(text).reading
+
+
+class _Reader:
+    def __init__(self, text: str) -> None:
+        self.reading = Reading()
+        self.section = self.reading.sections[0]
+        self.blocks: list[_Block] = []
+        self.reason: list[str] = []
+        self.listing = False
+        self.ignored: tuple[int, int, str] | None = None  # lines that are no part of a plan: from, to, the first
+        for number, line in _statements(text):
+            if not self.read(number, line):
+                break
+        self.flush()
+
+    def note(self, line: int, text: str) -> None:
+        self.flush()
+        self.reading.note(line, text)
+
+    def ignore(self, number: int, line: str) -> None:
+        first = self.ignored or (number, number, line)
+        self.ignored = (first[0], number, first[2])
+
+    def flush(self) -> None:
+        """Note the lines that were passed over."""
+        if self.ignored is not None:
+            first, last, line = self.ignored
+            self.ignored = None
+            which = "is" if first == last else f"and what follows up to line {last} is"
+            self.reading.note(first, f"{which} no part of a plan: {shown(line.strip())}")
+
+    def read(self, number: int, line: str) -> bool:
+        """Take a line in; False if the answer ends with it."""
+        code = line.strip()
+        if END.match(code):
+            self.note(number, "the answer ends here")
+            return False
+        if code.startswith("#"):
+            self.comment(number, line)
+        elif code.startswith(("```", "~~~")):
+            self.flush()
+            self.blocks.clear()
+        elif code:
+            self.listing = False
+            self.code(number, line, code)
+        return END.search(_bare(code)) is None
+
+    def comment(self, number: int, line: str) -> None:
+        said = line.strip().lstrip("#")
+        found = item(said)
+        heading = _HEADING.match(line)
+        if heading and (name := _task_name(heading[1])) in TASKS:
+            self.open(name, number)
+        elif re.fullmatch(r"\s*steps\s*:?\s*", said, re.IGNORECASE):
+            self.listing = True
+        elif self.listing and found:
+            self.section.listed += f"  {found[0]}. {found[1]}"
+        else:
+            self.listing = False
+            if said.strip():
+                self.reason.append(said.strip())
+
+    def open(self, name: str, number: int) -> None:
+        self.section = self.reading.open(name, number)
+        self.blocks.clear()
+        self.reason.clear()
+        self.listing = False
+
+    def code(self, number: int, line: str, code: str) -> None:
+        indent = len(line) - len(line.lstrip())
+        call, branch = _CALL.match(code), _BRANCH.match(code)
+        waiting = bool(call and self.blocks and self.blocks[-1].body is None and indent == self.blocks[-1].indent)
+        if not waiting:  # a call right below its condition belongs to it, however it is indented
+            self.leave(indent)
+        if found := _DEF.match(code):
+            self.open(_task_name(found[1]), number)
+        elif branch:
+            self.flush()
+            self.branch(number, indent, code, branch)
+        elif call:
+            self.flush()
+            self.call(number, indent, code, call)
+        elif code.startswith("robot."):
+            self.note(number, f"is cut off: {shown(code)}")
+        else:
+            self.ignore(number, line)
+
+    def leave(self, indent: int) -> None:
+        """End the blocks that a line of this indentation is not in."""
+        while self.blocks:
+            last = self.blocks[-1]
+            if indent > last.indent and (last.body is None or indent >= last.body):
+                return
+            self.blocks.pop()
+
+    def branch(self, number: int, indent: int, code: str, branch: re.Match[str]) -> None:
+        condition, rest = (None, code[branch.end() :]) if branch[2] else self.asked(number, code, branch.end())
+        if branch[2]:
+            self.note(number, "an 'else' says no condition; what follows from it is left out")
+        if branch[1] == "elif":
+            self.note(number, "'elif' is taken for 'if': that what is above it does not hold is left out")
+        if self.blocks and self.blocks[-1].body is None:
+            self.blocks[-1].body = indent
+        self.blocks.append(_Block(indent, number, condition))
+        if call := _CALL.match(rest):
+            self.call(number, indent + 1, rest, call)
+
+    def asked(self, number: int, code: str, at: int) -> tuple[str | None, str]:
+        """What an ``if`` asks, None if it cannot be read, and what stands behind its colon."""
+        asked: list[str] = []
+        fault = ""
+        while match := _CHECK.match(code, at):
+            text = _unquoted(match[3])
+            if match[1] == "or":
+                fault = "an 'or' of conditions cannot be said in a plan"
+            if match[2] and re.search(r"\band\b", text):
+                fault = "the opposite of several conditions cannot be said in a plan"
+            asked.append(f"not {text}" if match[2] else text)
+            at = match.end()
+        rest = code[at:].lstrip(" )")
+        if not asked:
+            cut = _is_cut(code)
+            fault = f"is cut off: {shown(code)}" if cut else f'asks nothing by check("..."): {shown(code)}'
+        elif not rest.startswith(":") and not rest.startswith("#"):
+            fault = fault or (f'is more than check("..."): {shown(code)}' if rest else "")
+        if fault:
+            self.note(number, fault)
+        return (None if fault else " and ".join(asked)), rest.lstrip(": ")
+
+    def call(self, number: int, indent: int, code: str, call: re.Match[str]) -> None:
+        words, named, whole = _arguments(code, call.end())
+        if not whole:
+            self.note(number, f"is cut off: {shown(code)}")
+            return
+        if not self.blocks:
+            self.note(number, f"a skill without a condition is left out: {shown(code)}")
+            return
+        block = self.blocks[-1]
+        if self.section.clauses and self.section.clauses[-1].line == block.line:
+            self.note(number, "a second skill under the same condition is a step of its own")
+        block.body = indent if block.body is None else block.body
+        asked = [above.condition for above in self.blocks]
+        if any(condition is None for condition in asked):
+            return  # its `if` is noted
+        skill, goal = _said(call[1], words, named)
+        condition = " and ".join(condition for condition in asked if condition is not None)
+        self.section.clauses.append(Clause(block.line, condition, skill, goal, " ".join(self.reason)))
+        self.reason.clear()
+
+
+def _said(verb: str, words: list[str], named: dict[str, str]) -> tuple[str, str]:
+    """The skill and the goal of a call; either may be ""."""
+    if verb != "move_gripper":
+        return f"{verb} {' '.join(words)}", named.get("goal", "")
+    place = " ".join(words)
+    parts = [f"the {GRIPPER} is {place}"] if place else []
+    parts += [text for name in ("until", "goal") if (text := named.get(name, ""))]
+    for name, state in (("close_gripper", "closed"), ("open_gripper", "open")):
+        if named.get(name) == "True":
+            parts.append(f"the {GRIPPER} is {state}")
+    return ("" if parts else "move gripper"), " and ".join(parts)
