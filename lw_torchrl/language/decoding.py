@@ -24,20 +24,18 @@ from lw_torchrl.language.tasks import TASKS, Task, check_task
 class DecodedStep:
     """One clause of a text, and what became of it.
 
-    Distances are 0 for a text that is itself a query or a skill, and at most 1.
+    Distances are from 0, a text that is itself a query or a skill, to 1.
 
     Attributes:
         line: where it stands in the text, from 1.
         written_condition: the condition in the text's words.
-        written_skill: the skill in the text's words, as a sentence: ``robot.put("gripper above mug")`` is "put gripper
-            above mug".
-        condition: the query it was mapped to; None if nothing is near enough.
-        condition_distance: of the clause that is furthest from what it was taken for.
-        scripted: the text of the scripted skill it was mapped to; None if nothing is near enough.
+        written_skill: the skill in the text's words: ``robot.put("gripper above mug")`` is "put gripper above mug".
+        condition: the nearest query; None if none is near enough.
+        condition_distance: the largest distance of a clause of the condition.
+        scripted: the text of the nearest scripted skill; None if none is near enough.
         skill_distance: between the skill and that one.
         written_goal: the state to reach in the text's words, "" if it says none.
-        goal: the query that was mapped to; None if nothing is near enough.
-        goal_distance: as ``condition_distance``.
+        goal, goal_distance: as ``condition`` and ``condition_distance``.
         dropped: why it is no step of the plan; "" if it is one.
     """
 
@@ -60,11 +58,11 @@ class DecodedPlan:
 
     Attributes:
         plan: the plan, its conditions as queries and its skills in the text's words; None if there is none.
-        scripted: the same with the nearest scripted skills, what :class:`~lw_torchrl.ScriptedSkillActor` runs; steps
-            whose skill is near none are left out. None if no step is left.
+        scripted: the same with the nearest scripted skills, for :class:`~lw_torchrl.ScriptedSkillActor`, without the
+            steps whose skill is near none; None if no step is left.
         reason: why there is no plan; "" if there is one.
-        notes: what was left out and what was changed, each with its line, in the order of the lines.
-        steps: the clauses for the task, those that were dropped included.
+        notes: what was left out or changed, in the order of the lines.
+        steps: the clauses for the task, also those that were dropped.
     """
 
     plan: ConditionalPlan | None
@@ -80,7 +78,7 @@ class DecodedPlan:
 
 
 LIMIT, SKILL_LIMIT = 0.4, 0.7
-"""Distances beyond which a condition and a skill are taken for nothing; docs/planners.md says what that leaves out."""
+"""Distances beyond which a condition and a skill are taken for nothing; docs/planners.md shows the effect."""
 
 _LONGEST = 65_536  # characters of a text that are read
 
@@ -99,30 +97,24 @@ def decode_plan(
 ) -> DecodedPlan:
     """Read a plan from whatever a language model wrote. No text is an error, and none is executed.
 
-    Only clauses for ``task`` count: those of functions and headings of its name, and those before any other name, which
-    go on from where the prompt ended. What a model thinks first, up to ``</think>`` or as others mark it, is left out.
-    Where a text has several versions the longest counts, of equals the first. A text in Python where prose was asked
-    for, or the other way round, is read as what it is.
+    Only clauses for ``task`` count: those of functions and headings of its name, and those before any name, which go
+    on where the prompt ended. Thoughts, up to ``</think>`` or as other models mark them, are left out. Of several
+    versions the longest counts, of equals the first. Python where prose was asked for, or the reverse, is read too.
 
-    A condition outside the query language is taken for the nearest query, clause by clause, and one beyond ``limit`` is
+    A condition outside the query language is taken for the nearest query, clause by clause; one beyond ``limit`` is
     dropped with its step. Skills stay as they are written in ``plan``; ``scripted`` has the nearest scripted ones.
 
     Args:
-        text: the answer; of more than 65,536 characters, and of more than 1,000 steps, the rest is left out.
+        text: the answer; what follows 65,536 characters or 1,000 steps is left out.
         task: the task that was asked for, or its name.
         format: the format that was asked for, a name in :data:`~lw_torchrl.PLAN_FORMATS`.
-        by: nearest in spelling ("edit"), or in meaning ("embedding"), which wants the extra ``[text]``.
+        by: nearest in spelling ("edit"), or in meaning ("embedding"), which needs the extra ``[text]``.
         limit: the largest distance, from 0 to 1, at which a condition or a goal is taken for a query.
-        skill_limit: the same of skills and scripted ones.
+        skill_limit: the same for scripted skills.
         skills: the scripted skills to choose from; None for the shipped ones.
         tasks: where a task's name is looked up, as from :func:`~lw_torchrl.load_tasks`.
 
-    Returns:
-        The plan or the reason why there is none, notes, and the steps.
-
     Raises:
-        TypeError: ``text`` is no string.
-        ValueError: an unknown task or format, another value for ``by``, or a limit outside [0, 1].
         ImportError: by="embedding" without the extra ``[text]``.
 
     Example:
@@ -139,11 +131,8 @@ def decode_plan(
 
     Source: paper sections 'Conditional Plan Generation' and 'LLM Experiments'.
     """
-    if not isinstance(text, str):
-        raise TypeError(f"text must be a string, got {shown(text)} ({type(text).__name__})")
     owner = task if isinstance(task, Task) else tasks[check_task(task, tasks)]
     read = PLAN_FORMATS[check_choice("format", format, PLAN_FORMATS)].read
-    check_choice("by", by, ("edit", "embedding"))
     limits = check_probability("limit", limit), check_probability("skill_limit", skill_limit)
     return decode_as(text, read, StepMapper(owner, skills, by, *limits))
 
@@ -192,8 +181,7 @@ def _read(text: str, task: Task, read: Callable[[str], Reading]) -> tuple[Readin
 
 
 def _named(section: Section) -> list[Clause]:
-    """The clauses; one that only says a state to reach has its skill's name from the list of steps, if that has one for
-    each clause, else from the state."""
+    """The clauses; if one only says a state to reach, its skill is worded as in the list of steps, or as that state."""
     listed = listed_steps(section.listed, len(section.clauses)) or [""] * len(section.clauses)
     return [
         clause if clause.skill else replace(clause, skill=name or _in_words(clause.goal))
@@ -299,14 +287,10 @@ _IS_JSON = re.compile(r"\s*(?:```\w*\s*)?\{")
 
 
 def without_thoughts(text: str, notes: list[Note]) -> str:
-    """The text without thoughts, which get a note; every line keeps its number.
+    """An answer without the model's thoughts, which may hold drafts. They get a note; every line keeps its number.
 
-    A closing tag alone closes what began before the text did, if it ends its line and stands in no comment of a plan;
-    an opening tag in a comment or a string opens nothing. The tags of gpt-oss, which are no text, always count.
-
-    Args:
-        text: an answer; one that begins as JSON has no thoughts.
-        notes: where the note goes.
+    A closing tag alone closes what began before the text, if it ends its line outside of a plan's comments. An opening
+    tag in a comment or a string opens nothing. The tags of gpt-oss always count. JSON has no thoughts.
 
     Example:
         >>> without_thoughts("<think>A draft.\\n</think>Done.", [])

@@ -1,5 +1,7 @@
 """The nine formats: each reads back what it wrote, and looks as it should."""
 
+from dataclasses import replace
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -33,8 +35,24 @@ def plans_with_goals(draw):
 
 def test_the_formats_by_name():
     assert list(lw.PLAN_FORMATS) == NINE
-    with pytest.raises(TypeError):
-        lw.PLAN_FORMATS["mine"] = lw.PLAN_FORMATS["chain_py"]
+
+
+def test_a_format_of_ones_own(monkeypatch):
+    shouted = replace(lw.PLAN_FORMATS["chain_py"], extension="txt", encode=lambda plan: str(plan).replace("#", "##"))
+    monkeypatch.setitem(lw.PLAN_FORMATS, "shouted", shouted)
+    text = lw.encode_plan(SHIPPED[0], "shouted")
+    assert text.startswith("## ")
+    assert lw.decode_plan(text, SHIPPED[0].task, "shouted").plan == SHIPPED[0]
+    assert lw.plan_prompt("push", "shouted") == lw.plan_prompt("push", "chain_py")
+
+
+@pytest.mark.parametrize("name", ["", "a b", "../up", "Mine", 3])
+def test_a_format_needs_a_name_that_a_folder_can_have(name):
+    with pytest.raises(ValueError, match="basic_py"):
+        lw.PLAN_FORMATS[name] = lw.PLAN_FORMATS["chain_py"]
+    with pytest.raises(TypeError, match="'mine' must be a PlanFormat"):
+        lw.PLAN_FORMATS["mine"] = "chain_py"
+    assert list(lw.PLAN_FORMATS) == NINE
 
 
 @pytest.mark.parametrize("format", NINE)

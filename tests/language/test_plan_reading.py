@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from plan_texts import DRAWER, HEAD, plan
 
-from lw_torchrl.language.formats import chain_py
+from lw_torchrl.language import plan_files
 from lw_torchrl.language.plan_files import check_plan, format_plan, load_plans, parse_plan
 from lw_torchrl.language.plans import MOST_STEPS, PLAN_LIMIT, ConditionalPlan, PlanError
 from lw_torchrl.language.queries import check_query, parse_query
@@ -199,7 +199,7 @@ def test_any_text_is_a_plan_or_a_plan_error(text):
 
 def test_all_faults_come_in_one_pass(monkeypatch):
     asked = []
-    monkeypatch.setattr(chain_py, "check_query", lambda text, task: asked.append(text) or check_query(text, task))
+    monkeypatch.setattr(plan_files, "check_query", lambda text, task: asked.append(text) or check_query(text, task))
     step = "    if check('the gripper is {} the pluck'):\n        robot.wait()\n"
     found, faults = check_plan("def push(robot):\n" + "".join(step.format("near") for _ in range(50)), source="my.plan")
     assert found is None

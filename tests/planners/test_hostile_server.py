@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import lw_torchrl as lw
-from lw_torchrl.planners import bounded_client
+from lw_torchrl.planners import chat_reply
 from lw_torchrl.planners.answer_files import AnswerCache
 from lw_torchrl.planners.chat_reply import NoCompletion, read_completion
 from lw_torchrl.planners.hiding import Hider
@@ -113,7 +113,7 @@ def test_the_others_are_answered_beside_one_that_drips(tmp_path):
 @pytest.mark.parametrize("status", [200, 302, 500])
 @pytest.mark.parametrize("length", ["Content-Length: 99999999999", "Connection: close"])
 def test_a_reply_without_an_end_is_not_read_to_it(tmp_path, monkeypatch, status, length):
-    monkeypatch.setattr(bounded_client, "REPLY_LIMIT", 2**20)
+    monkeypatch.setattr(chat_reply, "REPLY_LIMIT", 2**20)
     sent = []
 
     def talk():
@@ -130,7 +130,7 @@ def test_a_reply_without_an_end_is_not_read_to_it(tmp_path, monkeypatch, status,
 
 
 def test_a_reply_that_is_too_large_is_named(tmp_path):
-    body = json.dumps(completion("x" * bounded_client.REPLY_LIMIT))
+    body = json.dumps(completion("x" * chat_reply.REPLY_LIMIT))
     with (
         serving(FakeServer(lambda _: Failure(200, body))) as address,
         pytest.raises(lw.PlannerError, match="the reply is larger than 4 MiB"),

@@ -59,143 +59,59 @@ def _call(step: PlanStep, goal: Query | None) -> str:
     return f"move_gripper({quote(str(first).removeprefix(f'the {GRIPPER} is '))}{held})"
 
 
-_HELD = {
-    "": "",
-    f"the {GRIPPER} is open": ", open_gripper=True",
-    f"the {GRIPPER} is closed": ", close_gripper=True",
-}
+_OPENED, _CLOSED = f"the {GRIPPER} is open", f"the {GRIPPER} is closed"
+_HELD = {"": "", _OPENED: ", open_gripper=True", _CLOSED: ", close_gripper=True"}
 
 
 def py_md(style: Style) -> PlanFormat:
     """The format of a style as a chat message with functions in fenced blocks."""
 
+    def fenced(code: str) -> str:
+        return f"```python\n{code}```\n"
+
     def encode(plan: ConditionalPlan) -> str:
-        return f"This function does the task `{plan.task}`:\n\n{_fenced(_write(plan, style))}"
+        return f"This function does the task `{plan.task}`:\n\n{fenced(_write(plan, style))}"
 
     def prompt(examples: Sequence[ConditionalPlan], task: Task, hints: Sequence[str]) -> str:
         return (
             "I control a robot that has one arm with a gripper. A function says what the robot does: each `if` asks "
             "about the state, and its skill is carried out while the answer is yes. These functions do other tasks:\n\n"
-            + _fenced("\n".join(_write(plan, style) for plan in examples))
+            + fenced("\n".join(_write(plan, style) for plan in examples))
             + "".join(f"\n{line}" for line in hints)
             + ("\n" if hints else "")
             + f"\nPlease write the function for `{task.name}` in the same way, the whole of it in one block:\n\n"
-            + _fenced(function_head(task))
+            + fenced(function_head(task))
         )
 
     return PlanFormat("md", encode, read_python, prompt, style)
 
 
-def _fenced(code: str) -> str:
-    return f"```python\n{code}```\n"
-
-
 _STRING = r'(?:[fFrRbBuU]{0,2}(?:"(?:[^"\\]|\\.)*+"|\'(?:[^\'\\]|\\.)*+\'))'
-
-_STRINGS = re.compile(_STRING)
-
+_STRINGS = rf"{_STRING}(?:[\s+]*{_STRING})*"
 _LITERAL = re.compile(r'"(?:[^"\\]|\\.?)*+("|\Z)|\'(?:[^\'\\]|\\.?)*+(\'|\Z)')  # also one that is cut off
-
 _BRANCH = re.compile(r"(if|elif|while)\b\s*|(else)\s*:")
-
-_ARGUMENT = re.compile(rf"(?:(\w+)\s*=\s*)?(?:({_STRING}(?:[\s+]*{_STRING})*)|([^\s,()\"'][^,()\"']*))\s*(?:,\s*)?")
-
+_ARGUMENT = re.compile(rf"(?:(\w+)\s*=\s*)?(?:({_STRINGS})|([^\s,()\"'][^,()\"']*))\s*(?:,\s*)?")
 _PRINTED = re.compile(r"\s*print\(\s*(\"|')(.*)\1\s*\)\s*;?")
-
-_MOST_JOINED = 6  # lines of one statement
-
-
-def _arguments(code: str, at: int) -> tuple[list[str], dict[str, str], bool]:
-    """The arguments of a call from where they begin: in order, by name, and whether none is cut off."""
-    words, named = [], {}
-    while match := _ARGUMENT.match(code, at):
-        value = _unquoted(match[2]) if match[2] else match[3].strip()
-        if match[1]:
-            named[match[1]] = value
-        else:
-            words.append(value)
-        at = match.end()
-    return words, named, code[at : at + 1] == ")" or (bool(words or named) and at == len(code))
-
-
-def _unquoted(strings: str) -> str:
-    """The text of one or more string literals in a row."""
-    parts = []
-    for found in _STRINGS.findall(strings):
-        body = found.lstrip("fFrRbBuU")[1:-1]
-        parts.append(re.sub(r"\\(.)", r"\1", body))
-    return " ".join("".join(parts).split())
-
-
-def _task_name(name: str) -> str:
-    """The task that a function is for: "door-lock", of "door_lock" and "DoorLock"."""
-    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "-", name).replace("_", "-").strip("-").lower() or "?"
-
-
-def _statements(text: str) -> Iterator[tuple[int, str]]:
-    """The lines of a text, with their numbers; those of one call are joined, and what is printed is taken as it is."""
-    lines = text.expandtabs(4).splitlines()
-    at = 0
-    while at < len(lines):
-        line = lines[at]
-        start = at
-        if printed := _PRINTED.fullmatch(line):
-            line = re.sub(r"\\(.)", r"\1", printed[2])
-        at += 1
-        if "check" in line or "robot." in line:
-            while at < len(lines) and at - start < _MOST_JOINED and _depth(line) > 0 and not _begins(lines[at]):
-                line += " " + lines[at].strip()
-                at += 1
-        yield start + 1, line
-
-
-def _begins(line: str) -> bool:
-    """Whether a line begins a statement of its own."""
-    code = line.strip()
-    return not code or code.startswith(("#", "```", "def ", "robot.")) or _BRANCH.match(code) is not None
-
-
-def _is_cut(code: str) -> bool:
-    """Whether a string that begins in a line does not end in it, or a condition has no end."""
-    found = _bare(code)
-    return '"' in found or not found.rstrip().endswith(":")
-
-
-def _depth(line: str) -> int:
-    """How many parentheses are open at the end of a line; 0 if a string is."""
-    found = _bare(line)
-    return 0 if '"' in found else found.count("(") - found.count(")")
-
-
-def _bare(code: str) -> str:
-    """A line without its strings and its comment; of a string that is cut off a quote is left."""
-    return _LITERAL.sub(lambda found: "" if found[1] or found[2] else '"', code).partition("#")[0]
-
-
 _DEF = re.compile(r"(?:async\s+)?def\b\s*(\w*)")
-
-_CHECK = re.compile(
-    rf"(and\b|or\b)?\s*(not\b)?\s*\(?\s*(?:self\.|robot\.)?check\s*\(\s*({_STRING}(?:[\s+]*{_STRING})*)\s*\)?\s*"
-)
-
+_CHECK = re.compile(rf"(and\b|or\b)?\s*(not\b)?\s*\(?\s*(?:self\.|robot\.)?check\s*\(\s*({_STRINGS})\s*\)?\s*")
 _CALL = re.compile(r"(?:self\.)?robot\.(\w+)\s*\(\s*")
-
 _HEADING = re.compile(r"#+\s*([A-Za-z][\w-]*)\s*:")
-
-
-@dataclass
-class _Block:
-    """An ``if``: where it stands, what it asks (None: nothing that could be read), and its block's indentation."""
-
-    indent: int
-    line: int
-    condition: str | None
-    body: int | None = None
+_MOST_JOINED = 6  # lines of one statement
 
 
 def read_python(text: str) -> Reading:
     """What a text says in Python, for :attr:`PlanFormat.read`."""
     return _Reader(text).reading
+
+
+@dataclass
+class _Block:
+    """An ``if``: its indentation, its line, what it asks (None if it cannot be read), and its block's indentation."""
+
+    indent: int
+    line: int
+    condition: str | None
+    body: int | None = None
 
 
 class _Reader:
@@ -214,10 +130,6 @@ class _Reader:
     def note(self, line: int, text: str) -> None:
         self.flush()
         self.reading.note(line, text)
-
-    def ignore(self, number: int, line: str) -> None:
-        first = self.ignored or (number, number, line)
-        self.ignored = (first[0], number, first[2])
 
     def flush(self) -> None:
         """Note the lines that were passed over."""
@@ -244,19 +156,18 @@ class _Reader:
         return END.search(_bare(code)) is None
 
     def comment(self, number: int, line: str) -> None:
-        said = line.strip().lstrip("#")
-        found = item(said)
-        heading = _HEADING.match(line)
+        words = line.strip().lstrip("#")
+        numbered, heading = item(words), _HEADING.match(line)
         if heading and (name := _task_name(heading[1])) in TASKS:
             self.open(name, number)
-        elif re.fullmatch(r"\s*steps\s*:?\s*", said, re.IGNORECASE):
+        elif re.fullmatch(r"\s*steps\s*:?\s*", words, re.IGNORECASE):
             self.listing = True
-        elif self.listing and found:
-            self.section.listed += f"  {found[0]}. {found[1]}"
+        elif self.listing and numbered:
+            self.section.listed += f"  {numbered[0]}. {numbered[1]}"
         else:
             self.listing = False
-            if said.strip():
-                self.reason.append(said.strip())
+            if words.strip():
+                self.reason.append(words.strip())
 
     def open(self, name: str, number: int) -> None:
         self.section = self.reading.open(name, number)
@@ -267,9 +178,13 @@ class _Reader:
     def code(self, number: int, line: str, code: str) -> None:
         indent = len(line) - len(line.lstrip())
         call, branch = _CALL.match(code), _BRANCH.match(code)
-        waiting = bool(call and self.blocks and self.blocks[-1].body is None and indent == self.blocks[-1].indent)
-        if not waiting:  # a call right below its condition belongs to it, however it is indented
-            self.leave(indent)
+        while self.blocks:  # end the blocks that the line is not in
+            last = self.blocks[-1]
+            if last.body is None and call and indent == last.indent:
+                break  # a call right below its condition belongs to it, however it is indented
+            if indent > last.indent and (last.body is None or indent >= last.body):
+                break
+            self.blocks.pop()
         if found := _DEF.match(code):
             self.open(_task_name(found[1]), number)
         elif branch:
@@ -281,15 +196,8 @@ class _Reader:
         elif code.startswith("robot."):
             self.note(number, f"is cut off: {shown(code)}")
         else:
-            self.ignore(number, line)
-
-    def leave(self, indent: int) -> None:
-        """End the blocks that a line of this indentation is not in."""
-        while self.blocks:
-            last = self.blocks[-1]
-            if indent > last.indent and (last.body is None or indent >= last.body):
-                return
-            self.blocks.pop()
+            first = self.ignored or (number, number, line)
+            self.ignored = (first[0], number, first[2])
 
     def branch(self, number: int, indent: int, code: str, branch: re.Match[str]) -> None:
         condition, rest = (None, code[branch.end() :]) if branch[2] else self.asked(number, code, branch.end())
@@ -317,17 +225,25 @@ class _Reader:
             at = match.end()
         rest = code[at:].lstrip(" )")
         if not asked:
-            cut = _is_cut(code)
+            bare = _bare(code)
+            cut = '"' in bare or not bare.rstrip().endswith(":")
             fault = f"is cut off: {shown(code)}" if cut else f'asks nothing by check("..."): {shown(code)}'
-        elif not rest.startswith(":") and not rest.startswith("#"):
+        elif not rest.startswith((":", "#")):
             fault = fault or (f'is more than check("..."): {shown(code)}' if rest else "")
         if fault:
             self.note(number, fault)
         return (None if fault else " and ".join(asked)), rest.lstrip(": ")
 
     def call(self, number: int, indent: int, code: str, call: re.Match[str]) -> None:
-        words, named, whole = _arguments(code, call.end())
-        if not whole:
+        words, named, at = list[str](), dict[str, str](), call.end()
+        while match := _ARGUMENT.match(code, at):
+            value = _unquoted(match[2]) if match[2] else match[3].strip()
+            if match[1]:
+                named[match[1]] = value
+            else:
+                words.append(value)
+            at = match.end()
+        if code[at : at + 1] != ")" and (at < len(code) or not (words or named)):
             self.note(number, f"is cut off: {shown(code)}")
             return
         if not self.blocks:
@@ -337,23 +253,61 @@ class _Reader:
         if self.section.clauses and self.section.clauses[-1].line == block.line:
             self.note(number, "a second skill under the same condition is a step of its own")
         block.body = indent if block.body is None else block.body
-        asked = [above.condition for above in self.blocks]
-        if any(condition is None for condition in asked):
-            return  # its `if` is noted
-        skill, goal = _said(call[1], words, named)
-        condition = " and ".join(condition for condition in asked if condition is not None)
-        self.section.clauses.append(Clause(block.line, condition, skill, goal, " ".join(self.reason)))
+        conditions = [above.condition for above in self.blocks if above.condition is not None]
+        if len(conditions) < len(self.blocks):
+            return  # the `if` is noted
+        skill, goal = f"{call[1]} {' '.join(words)}", named.get("goal", "")
+        if call[1] == "move_gripper":
+            skill, goal = _state_to_reach(" ".join(words), named)
+        self.section.clauses.append(Clause(block.line, " and ".join(conditions), skill, goal, " ".join(self.reason)))
         self.reason.clear()
 
 
-def _said(verb: str, words: list[str], named: dict[str, str]) -> tuple[str, str]:
-    """The skill and the goal of a call; either may be ""."""
-    if verb != "move_gripper":
-        return f"{verb} {' '.join(words)}", named.get("goal", "")
-    place = " ".join(words)
+def _state_to_reach(place: str, named: dict[str, str]) -> tuple[str, str]:
+    """The skill and the goal of ``robot.move_gripper``; one of them is ""."""
     parts = [f"the {GRIPPER} is {place}"] if place else []
     parts += [text for name in ("until", "goal") if (text := named.get(name, ""))]
     for name, state in (("close_gripper", "closed"), ("open_gripper", "open")):
         if named.get(name) == "True":
             parts.append(f"the {GRIPPER} is {state}")
     return ("" if parts else "move gripper"), " and ".join(parts)
+
+
+def _unquoted(strings: str) -> str:
+    """The text of one or more string literals in a row."""
+    bodies = [literal.lstrip("fFrRbBuU")[1:-1] for literal in re.findall(_STRING, strings)]
+    return " ".join("".join(re.sub(r"\\(.)", r"\1", body) for body in bodies).split())
+
+
+def _task_name(name: str) -> str:
+    """The task that a function is for: "door-lock", of "door_lock" and "DoorLock"."""
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "-", name).replace("_", "-").strip("-").lower() or "?"
+
+
+def _statements(text: str) -> Iterator[tuple[int, str]]:
+    """The numbered lines of a text; those of one call are joined, and what is printed is taken as it is."""
+    lines = text.expandtabs(4).splitlines()
+    at = 0
+    while at < len(lines):
+        line, start = lines[at], at
+        if printed := _PRINTED.fullmatch(line):
+            line = re.sub(r"\\(.)", r"\1", printed[2])
+        at += 1
+        if "check" in line or "robot." in line:
+            while at < len(lines) and at - start < _MOST_JOINED and _is_open(line):
+                code = lines[at].strip()
+                if not code or code.startswith(("#", "```", "def ", "robot.")) or _BRANCH.match(code):
+                    break  # a statement of its own
+                line, at = f"{line} {code}", at + 1
+        yield start + 1, line
+
+
+def _is_open(line: str) -> bool:
+    """Whether a parenthesis, and no string, is open at the end of a line."""
+    bare = _bare(line)
+    return '"' not in bare and bare.count("(") > bare.count(")")
+
+
+def _bare(code: str) -> str:
+    """A line without its strings and its comment; of a string that is cut off a quote is left."""
+    return _LITERAL.sub(lambda found: "" if found[1] or found[2] else '"', code).partition("#")[0]
