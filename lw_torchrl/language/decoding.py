@@ -147,28 +147,36 @@ def decode_as(text: str, read: Callable[[str], Reading], mapper: StepMapper) -> 
     if further := section.clauses[MOST_STEPS:]:
         reading.note(further[0].line, f"begins what is more than {MOST_STEPS} steps; {len(further)} are left out")
         del section.clauses[MOST_STEPS:]
-    steps = [_mapped(clause, mapper, notes) for clause in _named(section)]
+    listed = listed_steps(section.listed, len(section.clauses)) or [""] * len(section.clauses)
+    clauses = [  # a clause may only say a state to reach
+        clause if clause.skill else replace(clause, skill=words or _in_words(clause.goal))
+        for clause, words in zip(section.clauses, listed, strict=True)
+    ]
+    steps = [_mapped(clause, mapper, notes) for clause in clauses]
     notes += _about(reading, section, owner)
-    plan = _plan(owner, steps, [step.written_skill for step in steps], section)
-    return DecodedPlan(
-        plan,
-        _plan(owner, steps, [step.scripted for step in steps], section),
-        "" if plan is not None else _why_none(reading, section, steps, owner, text),
-        tuple(sorted(notes, key=lambda note: note.line)),
-        tuple(steps),
-    )
+
+    def plan(skills: Sequence[str | None]) -> ConditionalPlan | None:
+        kept = tuple(
+            PlanStep(step.condition, skill, clause.reason, step.goal)
+            for step, skill, clause in zip(steps, skills, clauses, strict=True)
+            if not step.dropped and step.condition is not None and skill is not None
+        )
+        return ConditionalPlan(owner.name, kept, owner) if kept else None
+
+    written, scripted = plan([step.written_skill for step in steps]), plan([step.scripted for step in steps])
+    reason = "" if written is not None else _why_none(reading, steps, owner, text)
+    return DecodedPlan(written, scripted, reason, tuple(sorted(notes, key=lambda note: note.line)), tuple(steps))
 
 
 def _same(name: str, task: Task) -> bool:
-    """Whether a text means the task by a name: spelling aside."""
+    """Whether a name in a text means the task, whatever its spelling."""
     return re.sub(r"[^a-z0-9]", "", name.lower()) == task.name.replace("-", "")
 
 
 def _read(text: str, task: Task, read: Callable[[str], Reading]) -> tuple[Reading, Section]:
     """What the text says, by the reader that finds something for the task, and the section that is taken."""
-    readers = [read, *(other for other in (read_python, read_prose) if other is not read)]
     found: list[tuple[Reading, Section]] = []
-    for reader in readers:
+    for reader in dict.fromkeys((read, read_python, read_prose)):
         reading = reader(text)
         asked = [reading.sections[0], *(section for section in reading.sections[1:] if _same(section.task, task))]
         section = max(asked, key=lambda section: len(section.clauses))
@@ -178,15 +186,6 @@ def _read(text: str, task: Task, read: Callable[[str], Reading]) -> tuple[Readin
             return reading, section
         found.append((reading, section))
     return found[0]
-
-
-def _named(section: Section) -> list[Clause]:
-    """The clauses; if one only says a state to reach, its skill is worded as in the list of steps, or as that state."""
-    listed = listed_steps(section.listed, len(section.clauses)) or [""] * len(section.clauses)
-    return [
-        clause if clause.skill else replace(clause, skill=name or _in_words(clause.goal))
-        for clause, name in zip(section.clauses, listed, strict=True)
-    ]
 
 
 def _in_words(goal: str) -> str:
@@ -231,26 +230,12 @@ def _mapped(clause: Clause, mapper: StepMapper, notes: list[Note]) -> DecodedSte
             note(f"no scripted skill is near enough to {shown(words)} (distance {skill_distance:.2f})")
         elif scripted != words:
             note(f"the skill {shown(words)} is nearest to the scripted {scripted!r} (distance {skill_distance:.2f})")
-    return DecodedStep(
-        clause.line, written, words, condition, distance, scripted, skill_distance, clause.goal, goal, goal_distance,
-        dropped,
-    )  # fmt: skip
-
-
-def _plan(
-    task: Task, steps: Sequence[DecodedStep], skills: Sequence[str | None], section: Section
-) -> ConditionalPlan | None:
-    """The plan of the steps that are not dropped and have a skill."""
-    kept = tuple(
-        PlanStep(step.condition, skill, clause.reason, step.goal)
-        for step, skill, clause in zip(steps, skills, section.clauses, strict=True)
-        if not step.dropped and step.condition is not None and skill is not None
-    )
-    return ConditionalPlan(task.name, kept, task) if kept else None
+    mapped = (condition, distance, scripted, skill_distance, clause.goal, goal, goal_distance, dropped)
+    return DecodedStep(clause.line, written, words, *mapped)
 
 
 def _about(reading: Reading, section: Section, task: Task) -> list[Note]:
-    """The reader's notes of what stands in the section that counts, and one for each other section."""
+    """The reader's notes on the section that counts, and one note for each other section."""
     ends = [later.line for later in reading.sections[1:]]
     notes = []
     for found, end in zip(reading.sections, [*ends, float("inf")], strict=True):
@@ -258,22 +243,19 @@ def _about(reading: Reading, section: Section, task: Task) -> list[Note]:
         if found is section or (not found.task and not found.clauses):
             notes += own
         elif found.clauses:
-            steps = counted(len(found.clauses), "step")
-            what = "was not asked for" if not _same(found.task, task) else "is another version"
+            what = "is another version" if _same(found.task, task) else "was not asked for"
             named = repr(found.task) if found.task else "what stands before any name"
-            notes.append(Note(found.line, f"{named} {what}; {steps} left out"))
+            notes.append(Note(found.line, f"{named} {what}; {counted(len(found.clauses), 'step')} left out"))
     return notes
 
 
-def _why_none(reading: Reading, section: Section, steps: list[DecodedStep], task: Task, text: str) -> str:
+def _why_none(reading: Reading, steps: list[DecodedStep], task: Task, text: str) -> str:
     if steps:
-        return (
-            f"none of its {counted(len(steps), 'step')} for {task.name} could be kept; of the first: {steps[0].dropped}"
-        )
+        kept = f"none of its {counted(len(steps), 'step')} for {task.name} could be kept"
+        return f"{kept}; of the first: {steps[0].dropped}"
     if not text.strip():
         return "the text is empty"
-    others = sorted({other.task for other in reading.sections if other.clauses})
-    if others:
+    if others := sorted({other.task for other in reading.sections if other.clauses}):
         return f"it has no steps for {task.name}, but some for {', '.join(map(shown, others))}"
     return f"it has no steps, neither for {task.name} nor for another task"
 

