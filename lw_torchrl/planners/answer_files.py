@@ -18,151 +18,10 @@ from lw_torchrl.language.skills import ScriptedSkill
 from lw_torchrl.planners.answers import Answer, Reply, Tokens, is_count, read_reply, storable
 from lw_torchrl.planners.prompts import Question
 
-_VERSION = 1
-
-
-def answer_key(request: dict[str, Any]) -> str:
-    """The name of an answer: 64 hex digits of all that determines it.
-
-    Example:
-        >>> answer_key({"model": "a", "attempt": 0}) == answer_key({"attempt": 0, "model": "a"})
-        True
-    """
-    return sha256(json.dumps([_VERSION, request], sort_keys=True).encode()).hexdigest()
-
-
-class AnswerCache:
-    """Answers in a folder, a file of JSON each, with the question beside the answer.
-
-    Args:
-        folder: where they are; it is made at the first answer.
-    """
-
-    def __init__(self, folder: str | os.PathLike[str]) -> None:
-        self.folder = Path(folder)
-
-    def path(self, request: dict[str, Any]) -> Path:
-        """The file of the answer to a request."""
-        key = answer_key(request)
-        return self.folder / key[:2] / f"{key}.json"
-
-    def read(self, request: dict[str, Any]) -> Reply | None:
-        """The answer to a request, None if there is none yet.
-
-        Raises:
-            ValueError: there is a file that holds no answer to this request.
-        """
-        path = self.path(request)
-        try:
-            found = read_json(path, "the kept answer")
-        except FileNotFoundError:
-            return None
-        try:
-            return _reply(found, request)
-        except ValueError as error:
-            raise ValueError(f"the kept answer {str(path)!r} cannot be read: {error}") from error
-
-    def write(self, request: dict[str, Any], reply: Reply) -> None:
-        """Keep an answer, whole or not at all.
-
-        Raises:
-            ValueError: it could not be read back, so it is not written.
-        """
-        try:
-            text = json.dumps({"request": request, "answer": asdict(reply)}, indent=2, allow_nan=False) + "\n"
-            if len(text) > JSON_LIMIT:
-                raise ValueError(f"it is larger than {JSON_LIMIT} bytes")
-            if _reply(parse_json(text.encode()), request) != reply:
-                raise ValueError("it would be read back as another")
-        except (TypeError, ValueError, RecursionError) as error:
-            raise ValueError(f"the answer cannot be kept: {error}") from error
-        write_text(self.path(request), text)
-
-
-def _reply(found: dict[str, Any], request: dict[str, Any]) -> Reply:
-    """The reply in what a file holds; :class:`ValueError` if it is none to this request."""
-    try:
-        if answer_key(found["request"]) != answer_key(request):
-            raise ValueError("it answers another request")
-        said = found["answer"]
-        reply = Reply(said["text"], said["finish"], said["refusal"], Tokens(**said["tokens"]), tuple(said["notes"]))
-    except (KeyError, TypeError, RecursionError) as error:
-        raise ValueError(repr(error)) from error
-    texts = (reply.text, reply.finish, reply.refusal, *reply.notes)
-    if not all(isinstance(text, str) for text in texts):
-        raise ValueError("its texts must be strings")
-    "".join(texts).encode()  # a lone surrogate goes into no file of an answer
-    if not (is_count(reply.tokens.prompt) and is_count(reply.tokens.completion)):
-        raise ValueError("its tokens must be integers from 0 to 2**53")
-    return reply
-
-
-SETTINGS = "settings.json"
-
-
-def settle_folder(folder: Path, settings: Mapping[str, Any], *, reading: bool = False) -> None:
-    """Write what determines answers beside them, as ``folder/settings.json``, unless it is there.
-
-    Args:
-        folder: of one model's answers, ``out/<name>``.
-        settings: what determines them, as JSON has it.
-        reading: nothing is to be written to it, so that the model alone has to be the same.
-
-    Raises:
-        ValueError: there are answers in it of other settings, or of settings that are not recorded.
-    """
-    file = folder / SETTINGS
-    there = read_json(file, "out: the settings") if file.is_file() else {}
-    if there == settings:
-        return
-    if any(path for format, known in PLAN_FORMATS.items() for path in folder.glob(f"{format}/*.{known.extension}")):
-        if reading and there.get("model", settings["model"]) == settings["model"]:
-            return
-        differ = ", ".join(differences(there, settings)) if there else f"it has no {SETTINGS} that says which"
-        raise ValueError(
-            f"out: {str(folder)!r} holds answers of other settings: {differ}; give these again, or the new answers "
-            "another name (--name) or out"
-        )
-    if not reading:
-        write_json(file, dict(settings))
-
-
-def recorded_answer(
-    out: str | os.PathLike[str],
-    model: str,
-    question: Question,
-    format: str,
-    kept: Reply | None,
-    skills: Mapping[str, ScriptedSkill] | None = None,
-) -> Answer | None:
-    """The answer to a question that is recorded in ``out/<model>``, None if there is none.
-
-    Args:
-        out, model, question, format: which one.
-        kept: the reply it may come from, which knows more of it than the file; None if there is none.
-        skills: as for :func:`~lw_torchrl.planners.replies.read_reply`.
-    """
-    path = answer_path(out, model, format, question.task.name, question.attempt)
-    if not path.is_file():
-        return None
-    text, raw, schema = read_text(path, ValueError), path.with_suffix(".json"), question.request["schema"]
-    replies = [] if kept is None else [(kept, schema)]
-    if schema and raw.is_file():
-        replies.append((Reply(read_text(raw, ValueError)), schema))
-    for reply, held_to in [*replies, (Reply(text), None)]:
-        answer = read_reply(reply, question.task, format, question.attempt, skills, held_to)
-        if answer.text == text:
-            break  # else the file was changed since
-    return replace(answer, cached=True)
-
-
-def already_answered(out: str | os.PathLike[str], model: str, answer: Answer) -> ValueError:
-    """The error for an answer that another one would replace; the caller raises it."""
-    path = answer_path(out, model, answer.format, answer.task, answer.attempt)
-    return ValueError(
-        f"out: {str(path)!r} is there already, the answer to another question; it is not replaced: give the new ones "
-        "another name (--name) or out"
-    )
+_VERSION = 1  # of the cache
+_SETTINGS = "settings.json"
+_FIELDS = {"llm": str, "format": str, "task": str, "attempt": int, "completion": str}
+_Place = tuple[str, str, int]  # format, task, attempt
 
 
 @checked
@@ -192,8 +51,57 @@ def write_answer(folder: str | os.PathLike[str], model: str, answer: Answer) -> 
     return path
 
 
-_FIELDS = {"llm": str, "format": str, "task": str, "attempt": int, "completion": str}
-_Place = tuple[str, str, int]  # format, task, attempt
+def settle_folder(folder: Path, settings: Mapping[str, Any], *, reading: bool = False) -> None:
+    """Write what determines a model's answers to ``folder/settings.json``, unless it is there.
+
+    Args:
+        folder: of one model's answers, ``out/<name>``.
+        settings: what determines them, as JSON has it.
+        reading: nothing will be written, so only the model has to be the same.
+
+    Raises:
+        ValueError: the folder has answers of other settings, or of settings that are not recorded.
+    """
+    file = folder / _SETTINGS
+    there = read_json(file, "out: the settings") if file.is_file() else {}
+    if there == settings:
+        return
+    if any(path for format, known in PLAN_FORMATS.items() for path in folder.glob(f"{format}/*.{known.extension}")):
+        if reading and there.get("model", settings["model"]) == settings["model"]:
+            return
+        differ = ", ".join(differences(there, settings)) if there else f"it has no {_SETTINGS} that says which"
+        raise ValueError(
+            f"out: {str(folder)!r} holds answers of other settings: {differ}; give these again, or the new answers "
+            "another name (--name) or out"
+        )
+    if not reading:
+        write_json(file, dict(settings))
+
+
+def recorded_answer(
+    out: str | os.PathLike[str],
+    model: str,
+    question: Question,
+    format: str,
+    kept: Reply | None,
+    skills: Mapping[str, ScriptedSkill] | None = None,
+) -> Answer | None:
+    """The answer to a question that is recorded in ``out/<model>``, None if there is none.
+
+    ``kept`` is the reply in the cache, if any, which knows more about the answer than its file.
+    """
+    path = answer_path(out, model, format, question.task.name, question.attempt)
+    if not path.is_file():
+        return None
+    text, raw, schema = read_text(path, ValueError), path.with_suffix(".json"), question.request["schema"]
+    replies = [] if kept is None else [(kept, schema)]
+    if schema and raw.is_file():
+        replies.append((Reply(read_text(raw, ValueError)), schema))
+    for reply, held_to in [*replies, (Reply(text), None)]:
+        answer = read_reply(reply, question.task, format, question.attempt, skills, held_to)
+        if answer.text == text:
+            break  # else the file was changed since
+    return replace(answer, cached=True)
 
 
 def recorded_answers(source: str | os.PathLike[str]) -> dict[str, dict[_Place, str | Path]]:
@@ -208,7 +116,7 @@ def recorded_answers(source: str | os.PathLike[str]) -> dict[str, dict[_Place, s
 
 
 def ignored_files(source: str | os.PathLike[str]) -> list[Path]:
-    """Files of a folder that lie where answers do and look like some, but have another name or ending."""
+    """Files that look like answers and lie where answers do, but have another name or ending."""
     root = Path(source)
     if not root.is_dir():
         return []
@@ -244,26 +152,83 @@ def _of_lines(file: Path) -> dict[str, dict[_Place, str | Path]]:
     for number, line in enumerate(read_text(file, ValueError).split("\n"), 1):
         if not line.strip():
             continue
-        row = _row(line, f"{file.name}, line {number}")
+        where = f"{file.name}, line {number}"
+        try:
+            row = json.loads(line)
+        except (ValueError, RecursionError) as error:
+            raise ValueError(f"{where}: it is no JSON: {error}") from error
+        if not isinstance(row, dict) or any(type(row.get(name)) is not kind for name, kind in _FIELDS.items()):
+            raise ValueError(f"{where}: an answer has {', '.join(_FIELDS)}, got {shown(row)}")
+        check_choice(f"{where}: format", row["format"], PLAN_FORMATS)
+        if not 0 <= row["attempt"] < 10**9:
+            raise ValueError(f"{where}: attempt must be from 0 to 999999999, got {shown(row['attempt'])}")
         name = folder_name(row["llm"])
         if named.setdefault(name, row["llm"]) != row["llm"]:
-            raise ValueError(
-                f"{file.name}, line {number}: the models {named[name]!r} and {row['llm']!r} would both be {name!r}; "
-                "give one of them another name"
-            )
+            both = f"the models {named[name]!r} and {row['llm']!r} would both be {name!r}"
+            raise ValueError(f"{where}: {both}; give one of them another name")
         found.setdefault(name, {})[row["format"], row["task"], row["attempt"]] = row["completion"]
     return found
 
 
-def _row(line: str, where: str) -> dict[str, Any]:
+def answer_key(request: dict[str, Any]) -> str:
+    """The name of an answer in the cache: 64 hex digits of all that determines it.
+
+    Example:
+        >>> answer_key({"model": "a", "attempt": 0}) == answer_key({"attempt": 0, "model": "a"})
+        True
+    """
+    return sha256(json.dumps([_VERSION, request], sort_keys=True).encode()).hexdigest()
+
+
+class AnswerCache:
+    """Answers in a folder, each a JSON file with its question, so that nothing is asked twice."""
+
+    def __init__(self, folder: str | os.PathLike[str]) -> None:
+        self.folder = Path(folder)
+
+    def path(self, request: dict[str, Any]) -> Path:
+        """The file of the answer to a request."""
+        key = answer_key(request)
+        return self.folder / key[:2] / f"{key}.json"
+
+    def read(self, request: dict[str, Any]) -> Reply | None:
+        """The answer to a request, None if there is none yet; a file without it is a :class:`ValueError`."""
+        path = self.path(request)
+        try:
+            found = read_json(path, "the kept answer")
+        except FileNotFoundError:
+            return None
+        try:
+            return _reply(found, request)
+        except ValueError as error:
+            raise ValueError(f"the kept answer {str(path)!r} cannot be read: {error}") from error
+
+    def write(self, request: dict[str, Any], reply: Reply) -> None:
+        """Keep an answer, whole or not at all; one that could not be read back is a :class:`ValueError`."""
+        try:
+            text = json.dumps({"request": request, "answer": asdict(reply)}, indent=2, allow_nan=False) + "\n"
+            if len(text) > JSON_LIMIT:
+                raise ValueError(f"it is larger than {JSON_LIMIT} bytes")
+            if _reply(parse_json(text.encode()), request) != reply:
+                raise ValueError("it would be read back as another")
+        except (TypeError, ValueError, RecursionError) as error:
+            raise ValueError(f"the answer cannot be kept: {error}") from error
+        write_text(self.path(request), text)
+
+
+def _reply(found: dict[str, Any], request: dict[str, Any]) -> Reply:
+    """The reply in what a file holds; :class:`ValueError` if it is none to this request."""
     try:
-        row = json.loads(line)
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{where}: it is no JSON: {error}") from error
-    for name, kind in _FIELDS.items():
-        if not isinstance(row, dict) or type(row.get(name)) is not kind:
-            raise ValueError(f"{where}: an answer has {', '.join(_FIELDS)}, got {shown(row)}")
-    check_choice(f"{where}: format", row["format"], PLAN_FORMATS)
-    if not 0 <= row["attempt"] < 10**9:
-        raise ValueError(f"{where}: attempt must be from 0 to 999999999, got {shown(row['attempt'])}")
-    return dict(row)
+        if answer_key(found["request"]) != answer_key(request):
+            raise ValueError("it answers another request")
+        said = found["answer"]
+        reply = Reply(said["text"], said["finish"], said["refusal"], Tokens(**said["tokens"]), tuple(said["notes"]))
+    except (KeyError, TypeError, RecursionError) as error:
+        raise ValueError(repr(error)) from error
+    texts = (reply.text, reply.finish, reply.refusal, *reply.notes)
+    if not all(isinstance(text, str) for text in texts):
+        raise ValueError("its texts must be strings")
+    "".join(texts).encode()  # a lone surrogate goes into no file of an answer
+    if not (is_count(reply.tokens.prompt) and is_count(reply.tokens.completion)):
+        raise ValueError("its tokens must be integers from 0 to 2**53")
+    return reply

@@ -17,6 +17,8 @@ from lw_torchrl.language.skills import ScriptedSkill
 from lw_torchrl.language.tasks import Task
 from lw_torchrl.planners.plan_schema import passes
 
+CUT_OFF = "it was cut off at max_tokens"
+
 
 class PlannerError(RuntimeError):
     """A planner has no answer to a question: it says whose, to which question, what came, and what to try.
@@ -31,13 +33,9 @@ class PlannerError(RuntimeError):
 
 
 def unanswered(errors: Sequence[Exception], came: int, total: int, folder: Path) -> Exception:
-    """The error for questions of which some have no answer; the caller raises it.
+    """The error for questions without an answer; ``came`` of ``total`` answers are kept in ``folder``.
 
-    Args:
-        errors: what each of these met with; one that is no :class:`PlannerError` goes first, as it is.
-        came: how many answers there are.
-        total: how many were wanted.
-        folder: where those that came are kept.
+    One of ``errors`` that is no :class:`PlannerError` goes first, as it is.
     """
     first = next((error for error in errors if not isinstance(error, PlannerError)), errors[0])
     if not isinstance(first, PlannerError):
@@ -49,12 +47,7 @@ def unanswered(errors: Sequence[Exception], came: int, total: int, folder: Path)
 
 @dataclass(frozen=True)
 class Tokens:
-    """What was read and written, as the server counts it; 0 where it does not.
-
-    Attributes:
-        prompt: tokens of questions.
-        completion: tokens of answers.
-    """
+    """How many tokens of questions and of answers there were, as the server counts them; 0 if it does not."""
 
     prompt: int = 0
     completion: int = 0
@@ -76,8 +69,7 @@ def is_count(value: object) -> TypeGuard[int]:
 
 
 def storable(text: str) -> str:
-    r"""A text as it reads once it was in a file: without half characters and marks of byte order, and its lines end in
-    one way.
+    r"""A text as a file gives it back: without half characters and byte order marks, and with "\n" as line ends.
 
     Example:
         >>> storable("\ufeffone\r\ntwo \ud800")
@@ -85,109 +77,6 @@ def storable(text: str) -> str:
     """
     whole = text.encode("utf-8", "replace").decode()
     return whole.replace("\r\n", "\n").replace("\r", "\n").lstrip("\ufeff")
-
-
-@dataclass(frozen=True)
-class Answer:
-    """What a planner answered to one question.
-
-    Attributes:
-        task: the task's name.
-        format: the format that was asked for.
-        attempt: which of several answers to the same question, from 0.
-        text: the answer in the format, for :func:`~lw_torchrl.decode_plan`.
-        raw: as it came; JSON where the model was held to a schema, else the same as ``text``.
-        decoded: what was made of it.
-        tokens: what it cost when it was asked for.
-        cached: it had been asked for before.
-        notes: what else there is to say: that it was cut off, that the server did not keep to the schema.
-    """
-
-    task: str
-    format: str
-    attempt: int
-    text: str
-    raw: str
-    decoded: DecodedPlan
-    tokens: Tokens = NO_TOKENS
-    cached: bool = False
-    notes: tuple[str, ...] = ()
-
-
-class Answers(Sequence[Answer]):
-    """Answers in the order of tasks and attempts."""
-
-    def __init__(self, answers: Iterable[Answer]) -> None:
-        self._answers = tuple(sorted(answers, key=lambda answer: (answer.format, answer.task, answer.attempt)))
-
-    @overload
-    def __getitem__(self, index: int) -> Answer: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[Answer]: ...
-
-    def __getitem__(self, index: int | slice) -> Answer | Sequence[Answer]:
-        return self._answers[index]
-
-    def __len__(self) -> int:
-        return len(self._answers)
-
-    @property
-    def tokens(self) -> Tokens:
-        """Of all answers, whether they were cached or not."""
-        return sum((answer.tokens for answer in self), NO_TOKENS)
-
-    def __repr__(self) -> str:
-        plans = sum(answer.decoded.plan is not None for answer in self)
-        return f"Answers({len(self)} answers, {plans} plans, {self.tokens.total} tokens)"
-
-
-CUT_OFF = "it was cut off at max_tokens"
-
-
-def read_reply(
-    reply: Reply,
-    task: Task,
-    format: str,
-    attempt: int = 0,
-    skills: Mapping[str, ScriptedSkill] | None = None,
-    schema: Mapping[str, Any] | None = None,
-) -> Answer:
-    """The answer in a reply; whatever the server claims, it is read as any text is.
-
-    Args:
-        reply: what the server said.
-        task: the task that was asked for.
-        format: the format that was asked for.
-        attempt: which of several answers it is.
-        skills: the scripted skills to choose from; None for the shipped ones.
-        schema: what the model was to be held to; JSON is expected then, and becomes a text in the format.
-    """
-    read = PLAN_FORMATS[format].read if schema is None else read_structured
-    raw = storable(reply.text)
-    decoded = decode_as(raw, read, StepMapper(task, skills, "edit", LIMIT, SKILL_LIMIT))
-    text = encode_plan(decoded.plan, format) if schema and decoded.plan is not None else raw
-    notes = []
-    if reply.finish == "length":
-        notes.append(CUT_OFF)
-    elif reply.finish == "content_filter":
-        notes.append("a filter of the server cut it off")
-    if reply.refusal:
-        notes.append(f"the model refused: {shown(reply.refusal)}")
-    elif not raw.strip():
-        notes.append("it is empty")
-    elif schema and reply.finish != "length" and not _passes(raw, schema):
-        notes.append("the server did not keep to the schema")
-    return Answer(
-        task.name, format, attempt, storable(text), raw, decoded, reply.tokens, notes=(*notes, *reply.notes)
-    )  # fmt: skip
-
-
-def _passes(text: str, schema: Mapping[str, Any]) -> bool:
-    try:
-        return passes(json.loads(text), schema)
-    except (ValueError, RecursionError):
-        return False
 
 
 @dataclass(frozen=True)
@@ -207,3 +96,97 @@ class Reply:
     refusal: str = ""
     tokens: Tokens = NO_TOKENS
     notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a planner answered to one question.
+
+    Attributes:
+        task: the task's name.
+        format: the format that was asked for.
+        attempt: which of several answers to the same question, from 0.
+        text: the answer in the format, for :func:`~lw_torchrl.decode_plan`.
+        raw: as it came; JSON if the model was held to a schema, else the same as ``text``.
+        decoded: what was made of it.
+        tokens: what it cost when it was asked for.
+        cached: it had been asked for before.
+        notes: further remarks: that it was cut off, that the server did not keep to the schema.
+    """
+
+    task: str
+    format: str
+    attempt: int
+    text: str
+    raw: str
+    decoded: DecodedPlan
+    tokens: Tokens = NO_TOKENS
+    cached: bool = False
+    notes: tuple[str, ...] = ()
+
+
+class Answers(Sequence[Answer]):
+    """Answers in the order of formats, tasks and attempts."""
+
+    def __init__(self, answers: Iterable[Answer]) -> None:
+        self._answers = tuple(sorted(answers, key=lambda answer: (answer.format, answer.task, answer.attempt)))
+
+    @overload
+    def __getitem__(self, index: int) -> Answer: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[Answer]: ...
+
+    def __getitem__(self, index: int | slice) -> Answer | Sequence[Answer]:
+        return self._answers[index]
+
+    def __len__(self) -> int:
+        return len(self._answers)
+
+    @property
+    def tokens(self) -> Tokens:
+        """Of all answers, cached ones included."""
+        return sum((answer.tokens for answer in self), NO_TOKENS)
+
+    def __repr__(self) -> str:
+        plans = sum(answer.decoded.plan is not None for answer in self)
+        return f"Answers({len(self)} answers, {plans} plans, {self.tokens.total} tokens)"
+
+
+def read_reply(
+    reply: Reply,
+    task: Task,
+    format: str,
+    attempt: int = 0,
+    skills: Mapping[str, ScriptedSkill] | None = None,
+    schema: Mapping[str, Any] | None = None,
+) -> Answer:
+    """The answer in a reply to a question for a plan; whatever the server claims, it is read as any text is.
+
+    Args:
+        reply: what the server said.
+        task, format, attempt: what was asked for.
+        skills: the scripted skills to choose from; None for the shipped ones.
+        schema: what the model was to be held to; JSON is expected then, and becomes a text in the format.
+    """
+    read = PLAN_FORMATS[format].read if schema is None else read_structured
+    raw = storable(reply.text)
+    decoded = decode_as(raw, read, StepMapper(task, skills, "edit", LIMIT, SKILL_LIMIT))
+    text = encode_plan(decoded.plan, format) if schema and decoded.plan is not None else raw
+    notes = []
+    if reply.finish == "length":
+        notes.append(CUT_OFF)
+    elif reply.finish == "content_filter":
+        notes.append("a filter of the server cut it off")
+    if reply.refusal:
+        notes.append(f"the model refused: {shown(reply.refusal)}")
+    elif not raw.strip():
+        notes.append("it is empty")
+    elif schema and reply.finish != "length":
+        try:
+            kept = passes(json.loads(raw), schema)
+        except (ValueError, RecursionError):
+            kept = False
+        notes += [] if kept else ["the server did not keep to the schema"]
+    notes += reply.notes
+    return Answer(task.name, format, attempt, storable(text), raw, decoded, reply.tokens, notes=tuple(notes))

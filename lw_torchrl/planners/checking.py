@@ -1,4 +1,4 @@
-"""check_plan: what a plan was taken for, and which of its steps hold in states that were really visited."""
+"""check_plan: what a plan was taken for, and which of its conditions hold in the states of episodes."""
 
 from __future__ import annotations
 
@@ -20,15 +20,14 @@ _GAPS = 3  # the longest are told of
 
 @dataclass(frozen=True)
 class PlanCheck:
-    """What there is to say of a plan.
+    """What became of a plan.
 
     Attributes:
         task: the task's name.
         decoded: what the text was taken for.
-        expert: how its conditions fare in the states that Meta-World's expert visits; None without a plan.
-        own: how its steps fare where scripted skills carry it out, the first true one in each state; None without one
-            that they can.
-        success: of these episodes.
+        expert: how often its conditions hold in the states that Meta-World's expert visits; None without a plan.
+        own: how its steps fare if scripted skills carry it out; None if they cannot.
+        success: the success rate of these episodes.
         failed: the observations of each of these that failed, (T, 39) float32.
     """
 
@@ -73,9 +72,8 @@ class PlanCheck:
         return "\n".join(lines)
 
     def _in_force(self, step: int) -> str:
-        return (
-            "" if self.own is None else f", {self.own.true[step]:.0%} of its own; acts in {self.own.chosen[step]:.0%}"
-        )
+        own = self.own
+        return "" if own is None else f", {own.true[step]:.0%} of its own; acts in {own.chosen[step]:.0%}"
 
 
 def _said(written: str, distance: float) -> str:
@@ -96,11 +94,7 @@ def check_plan(
 
     Args:
         text, task, format, skills, tasks: as for :func:`~lw_torchrl.decode_plan`; the task is one of Meta-World's.
-        episodes: of the expert, and of the plan by scripted skills.
-        seed: of these.
-
-    Raises:
-        ValueError: an unknown task or format.
+        episodes, seed: of the expert, and of the plan by scripted skills.
 
     Example:
         >>> import lw_torchrl as lw

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -18,12 +18,7 @@ _Check = tuple[Callable[[Any], bool], str]
 
 
 class Refused(ValueError):
-    """A request that is not answered.
-
-    Attributes:
-        status: the HTTP status that says why.
-        code: the same in a word, as OpenAI's server says it.
-    """
+    """A request that is not answered, with its HTTP status and the same in a word, as OpenAI's server says it."""
 
     def __init__(self, status: int, message: str, code: str = "invalid_request") -> None:
         super().__init__(message)
@@ -31,7 +26,7 @@ class Refused(ValueError):
 
 
 def read_request(body: bytes, model: str, context: int) -> bytes:
-    """A request to a model, as llama-cpp-python's server takes it: a schema is ``json_object`` there.
+    """The body of a request, checked and rewritten for llama-cpp-python's server: a schema is ``json_object`` there.
 
     Args:
         body: as it came.
@@ -39,7 +34,7 @@ def read_request(body: bytes, model: str, context: int) -> bytes:
         context: tokens that an answer may have.
 
     Raises:
-        Refused: it is no JSON, has a field that is not known, or one with something that is not allowed.
+        Refused: it is no JSON, or has an unknown field or a value that is not allowed.
     """
     try:
         request = parse_json(body)
@@ -75,24 +70,13 @@ def _number(least: float, most: float, whole: bool = False) -> _Check:
 
 
 def _one_of(*allowed: Any) -> _Check:
-    return (
-        lambda value: any(type(value) is type(one) and value == one for one in allowed),
-        " or ".join(map(json.dumps, allowed)),
-    )
+    words = " or ".join(map(json.dumps, allowed))
+    return (lambda value: any(type(value) is type(one) and value == one for one in allowed)), words
 
 
-def _are_messages(value: Any) -> bool:
-    return (
-        isinstance(value, list)
-        and 1 <= len(value) <= MESSAGES
-        and all(
-            isinstance(one, dict)
-            and {*one} == {"role", "content"}
-            and one["role"] in ("system", "user", "assistant")
-            and isinstance(one["content"], str)
-            for one in value
-        )
-    )
+def _is_message(value: Any) -> bool:
+    whole = isinstance(value, dict) and {*value} == {"role", "content"} and isinstance(value["content"], str)
+    return whole and value["role"] in ("system", "user", "assistant")
 
 
 def _are_stops(value: Any) -> bool:
@@ -103,21 +87,20 @@ def _are_stops(value: Any) -> bool:
 def _is_format(value: Any) -> bool:
     if not isinstance(value, dict):
         return False
-    kind, rest = value.get("type"), {*value} - {"type"}
+    kind, rest, holder = value.get("type"), {*value} - {"type"}, value
+    if not rest:
+        return kind in ("text", "json_object")
     if kind == "json_schema" and rest == {"json_schema"}:
-        inside = value["json_schema"]
-        return isinstance(inside, dict) and {"schema"} <= {*inside} <= {"name", "schema", "strict"} and _fits(inside)
-    return (kind in ("text", "json_object") and not rest) or (
-        kind == "json_object" and rest == {"schema"} and _fits(value)
-    )
-
-
-def _fits(holder: Mapping[str, Any]) -> bool:
+        holder = value["json_schema"]
+        if not isinstance(holder, dict) or not {"schema"} <= {*holder} <= {"name", "schema", "strict"}:
+            return False
+    elif kind != "json_object" or rest != {"schema"}:
+        return False
     return _is_schema(holder["schema"], _SCHEMA_DEPTH)
 
 
 def _is_schema(value: Any, depth: int) -> bool:
-    """Whether it is one as :func:`plan_schema` makes them: others make grammars that fill the memory."""
+    """Whether it is a schema like those of :func:`plan_schema`: others make grammars that fill the memory."""
     if not isinstance(value, dict) or depth == 0:
         return False
     names, kind = {*value}, value.get("type")
@@ -125,31 +108,28 @@ def _is_schema(value: Any, depth: int) -> bool:
         return _listed(value["anyOf"], lambda one: _is_schema(one, depth - 1))
     if kind == "object" and names == {"type", "properties", "required", "additionalProperties"}:
         inside = value["properties"]
-        return (
-            isinstance(inside, dict)
-            and 1 <= len(inside) <= _ITEMS
-            and value["required"] == list(inside)
-            and value["additionalProperties"] is False
-            and all(_is_schema(one, depth - 1) for one in inside.values())
-        )
+        if not isinstance(inside, dict) or not 1 <= len(inside) <= _ITEMS or value["required"] != list(inside):
+            return False
+        closed = value["additionalProperties"] is False
+        return closed and all(_is_schema(one, depth - 1) for one in inside.values())
     if kind == "array" and names == {"type", "items", "minItems", "maxItems"}:
-        counts = value["minItems"], value["maxItems"]
-        return (
-            all(type(count) is int for count in counts)
-            and 0 <= counts[0] <= counts[1] <= _ITEMS
-            and _is_schema(value["items"], depth - 1)
-        )
+        least, most = value["minItems"], value["maxItems"]
+        counts = type(least) is int and type(most) is int and 0 <= least <= most <= _ITEMS
+        return counts and _is_schema(value["items"], depth - 1)
     if kind == "string" and names == {"type", "enum"}:
         return _listed(value["enum"], lambda one: isinstance(one, str) and len(one) <= 200)
     return kind == "string" and names == {"type", "pattern"} and value["pattern"] in [*PATTERNS]
 
 
-def _listed(value: Any, right: Callable[[Any], bool]) -> bool:
-    return isinstance(value, list) and 1 <= len(value) <= _CHOICES and all(map(right, value))
+def _listed(value: Any, right: Callable[[Any], bool], most: int = _CHOICES) -> bool:
+    return isinstance(value, list) and 1 <= len(value) <= most and all(map(right, value))
 
 
 _FIELDS: dict[str, _Check] = {
-    "messages": (_are_messages, f"1 to {MESSAGES} objects with role (system, user or assistant) and content, a text"),
+    "messages": (
+        lambda value: _listed(value, _is_message, MESSAGES),
+        f"1 to {MESSAGES} objects with role (system, user or assistant) and content, a text",
+    ),
     "response_format": (_is_format, "text, json_object, or json_schema with a schema as plan_schema makes it"),
     "stop": (_are_stops, f"up to {STOPS} texts of 1 to 100 characters"),
     "n": _one_of(1),
@@ -175,14 +155,14 @@ WAITING = 32
 class Guard:
     """An ASGI application before that of llama-cpp-python.
 
-    It takes ``GET /v1/models`` and ``POST /v1/chat/completions`` and nothing else, reads a request whole, and lets it
-    on in its turn if :func:`read_request` knows all of it. One whose client has gone while it waited is dropped.
+    It takes only ``GET /v1/models`` and ``POST /v1/chat/completions``, reads a request whole, and passes it on in its
+    turn if :func:`read_request` allows it. A request whose client has gone while it waited is dropped.
 
     Args:
         app: the application behind it.
         model: the name of its model.
         context: tokens of a question and its answer.
-        names: what the machine may be called in a request, so that no web page can ask by another name; None for any.
+        names: what a request may call this machine, so that no web page can ask by another name; None for any.
     """
 
     def __init__(self, app: Any, model: str, context: int, names: Collection[str] | None = None) -> None:
@@ -210,8 +190,11 @@ class Guard:
                 await self._in_turn({**scope, "headers": list(told.items())}, body, receive, answer)
             else:
                 raise Refused(404, "this server has GET /v1/models and POST /v1/chat/completions alone", "not_found")
-        except Refused as refused:
-            await _refuse(answer, refused)
+        except Refused as refused:  # in the form of OpenAI's server
+            error = {"message": str(refused), "type": "invalid_request_error", "param": None, "code": refused.code}
+            start = {"type": "http.response.start", "status": refused.status}
+            await answer(start | {"headers": [(b"content-type", b"application/json")]})
+            await answer({"type": "http.response.body", "body": json.dumps({"error": error}).encode()})
         except _Gone:
             pass
 
@@ -249,7 +232,7 @@ class Guard:
 
 
 class _Gone(Exception):
-    """Nobody waits for an answer any more."""
+    """The client has gone."""
 
 
 async def _whole(headers: dict[bytes, str], receive: Any) -> bytes:
@@ -281,14 +264,6 @@ def _given(body: bytes, then: Any) -> Any:
         return {"type": "http.request", "body": left.pop(), "more_body": False} if left else await then()
 
     return receive
-
-
-async def _refuse(send: Any, refused: Refused) -> None:
-    """As OpenAI's server refuses."""
-    error = {"message": str(refused), "type": "invalid_request_error", "param": None, "code": refused.code}
-    headers = [(b"content-type", b"application/json")]
-    await send({"type": "http.response.start", "status": refused.status, "headers": headers})
-    await send({"type": "http.response.body", "body": json.dumps({"error": error}).encode()})
 
 
 def run_server(app: Any, listener: Any) -> None:

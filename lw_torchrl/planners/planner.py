@@ -33,7 +33,7 @@ class Planner(Protocol):
         attempts: int = 1,
         out: str | os.PathLike[str] | None = None,
     ) -> Answers:
-        """Plans of tasks.
+        """Plans of tasks, an answer for each task and attempt.
 
         Args:
             tasks: "MT10", "MT50", a task's name, a :class:`~lw_torchrl.Task`, or a list of names and tasks.
@@ -41,12 +41,8 @@ class Planner(Protocol):
             attempts: answers to each question.
             out: a folder; each answer is written to ``out/<name>/<format>/<task>-<attempt>.<ext>`` as it comes.
 
-        Returns:
-            An answer for each task and attempt.
-
         Raises:
             PlannerError: an answer is missing. Those that came before it are kept.
-            ValueError: an unknown task or format.
         """
         ...
 
@@ -64,15 +60,14 @@ class FilePlanner:
         recorded: (format, task, attempt) of each answer there is, sorted.
 
     Raises:
-        FileNotFoundError: there is no such file or folder.
-        ValueError: no answers in it, or of several models and none is named; a line that is no answer; or two models
-            whose names differ in what no folder's name can have.
+        ValueError: there are no answers, or of several models and none is named; a line is no answer; or two models
+            have the same name for a folder.
 
     Example:
-        >>> import json, lw_torchrl as lw
+        >>> import json, pathlib, lw_torchrl as lw
         >>> row = {"llm": "by hand", "format": "chain_py", "task": "push", "attempt": 0}
         >>> row["completion"] = lw.encode_plan(lw.load_plans("MT10")["push"], "chain_py")
-        >>> _ = Path("answers.jsonl").write_text(json.dumps(row))
+        >>> _ = pathlib.Path("answers.jsonl").write_text(json.dumps(row))
         >>> planner = FilePlanner("answers.jsonl")
         >>> planner.name, planner.recorded
         ('by hand', (('chain_py', 'push', 0),))
@@ -102,12 +97,7 @@ class FilePlanner:
         attempts: int = 1,
         out: str | os.PathLike[str] | None = None,
     ) -> Answers:
-        """The recorded answers, see :meth:`Planner.plans`.
-
-        Raises:
-            PlannerError: one is not recorded.
-            ValueError: an unknown task or format, or a file that is no text.
-        """
+        """The recorded answers, see :meth:`Planner.plans`; one that is not recorded is a :class:`PlannerError`."""
         check_choice("format", format, PLAN_FORMATS)
         wanted = range(check_int("attempts", attempts, minimum=1))
         found = []
@@ -117,10 +107,8 @@ class FilePlanner:
                 if text is None:
                     there = [str(number) for style, other, number in self.recorded if (style, other) == (format, name)]
                     known = f"attempts {', '.join(there)}" if there else f"none in {format}"
-                    raise PlannerError(
-                        f"no answer of {self.name!r} is recorded for {name} in {format}, attempt {attempt}; of {name} "
-                        f"there are {known}"
-                    )
+                    what = f"no answer of {self.name!r} is recorded for {name} in {format}, attempt {attempt}"
+                    raise PlannerError(f"{what}; of {name} there are {known}")
                 said = answer_text(text)
                 found.append(Answer(name, format, attempt, said, said, decode_plan(said, task, format), cached=True))
                 if out is not None:
