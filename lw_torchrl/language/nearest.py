@@ -22,13 +22,11 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 _NEGATIONS = frozenset(("not", "no", "never", "without", "cannot"))
-# What says nothing about which query is meant: articles, the gripper's owner, the verb of a question.
+# Words that do not tell which query is meant.
 _EMPTY = frozenset(("the", "a", "an", "is", "are", "be", "does", "do", "did", "has", "have", "robot's", "robot"))
-
-# Limits to the time that an answer takes.
 _LONGEST = 400  # characters of a text that is compared
 _MOST_CLAUSES = 8  # of a condition outside the language
-_MOST_COMPARED = 64  # conditions and goals of an answer outside the language
+_MOST_COMPARED = 64  # conditions and goals of an answer outside the language, a limit to its time
 _TARGETS = ("target location", "reach target")
 _TARGET = re.compile(
     r"\b(?:the\s)?(?:reach\s)?(?:goal|target)(?:\s(?:location|position|area|place|point|destination))?\b"
@@ -45,17 +43,11 @@ class QueryPart(NamedTuple):
 
 @dataclass(frozen=True)
 class QueryMatch:
-    """The nearest query to a text.
-
-    Attributes:
-        query: the query.
-        score: the mean of its parts' scores, in [0, 1]; 1 for a text that is a query itself.
-        parts: what each clause of the text was taken for.
-    """
+    """The nearest query to a text."""
 
     query: Query
-    score: float
-    parts: tuple[QueryPart, ...]
+    score: float  # the mean of its parts' scores, in [0, 1]; 1 for a text that is a query itself
+    parts: tuple[QueryPart, ...]  # what each clause of the text was taken for
 
 
 @checked

@@ -1,28 +1,14 @@
-"""Plans as text, and on disk: .plan files, folders of them, and JSON files as language models wrote them.
-
-A .plan file is chain_py, read strictly: a function that looks like Python.
-
-    # drawer-open: Take hold of the drawer handle and pull the drawer open.
-    def drawer_open(robot):
-        # The gripper has to come from above.
-        if check("the robot's gripper is not vertically aligned with the drawer handle"):
-            robot.place("the gripper above the drawer handle")
-
-It is never executed: every line is matched against the few forms above. If a step's goal is not the usual one of its
-skill, the skill ends with it: ``robot.place("the gripper above the puck", goal="the puck is near the gripper")``.
-:func:`~lw_torchrl.decode_plan` reads what models write, and is more tolerant.
-Source: paper section 'Conditional Plan Generation' and its figure of a chain_py plan.
-"""
+"""Plans as text and on disk: .plan files (chain_py, read strictly), folders of them, JSON of language models' pairs."""
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Generator, Mapping
+from collections.abc import Callable, Mapping
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NoReturn
 
 from lw_torchrl._checks import check_text, checked, nearest, shown
 from lw_torchrl._files import parse_json, read_text, write_text
@@ -48,30 +34,22 @@ _ASKS = re.compile(r"^[ \t]*+if[ \t]+check\b", re.MULTILINE)
 _SKILL = re.compile(rf"robot\.([A-Za-z]\w*)\s*\(\s*+(?:{_TEXT})?\s*+(?:,?\s*+goal\s*=\s*(?:{_TEXT}))?\s*+\)")
 
 
-def _unquote(match: re.Match[str], group: int) -> str:
-    return re.sub(r"\\(.)", r"\1", match[group] or match[group + 1] or "").strip()
-
-
 def _read(
-    text: str, task: str | None, source: str, tasks: Mapping[str, Task]
-) -> Generator[PlanError, None, ConditionalPlan | None]:
-    """Yields every fault, line by line, and returns the plan if there is none."""
+    text: str, task: str | None, source: str, tasks: Mapping[str, Task], report: Callable[[str], Any]
+) -> ConditionalPlan | None:
+    """Report every fault, line by line, and return the plan if there is none."""
     check_text("text", text)
     if (asked := len(_ASKS.findall(text))) > MOST_STEPS:
-        yield too_many_steps(source, asked)
-        return None
+        return report(str(too_many_steps(source, asked)))
     if len(text) > PLAN_LIMIT:
-        yield PlanError(f"{source}: a plan's text must have at most {PLAN_LIMIT} characters, got {len(text)}")
-        return None
+        return report(f"{source}: a plan's text must have at most {PLAN_LIMIT} characters, got {len(text)}")
     found: str | None = None
     condition: Query | None = None
     opened, sound = False, True  # opened: a condition, sound or not, waits for its skill
     steps: list[PlanStep] = []
     reason: list[str] = []
     for number, raw in enumerate(text.splitlines(), 1):
-        line = raw.strip()
-        where = f"{source}, line {number}"
-        fault = ""
+        line, where, fault = raw.strip(), f"{source}, line {number}", ""
         if not line:
             continue
         if line.startswith("#"):
@@ -79,15 +57,12 @@ def _read(
                 reason.append(line.lstrip("# "))
         elif match := _DEF.fullmatch(line):
             if found is not None:
-                yield PlanError(f"{where}: a second plan begins; a plan file holds one")
-                return None
+                return report(f"{where}: a second plan begins; a plan file holds one")
             found = match[1].replace("_", "-")
             if found not in tasks:
-                yield _no_task(where, found, tasks)
-                return None
+                return report(_no_task(where, found, tasks))
             if task is not None and found != task:
-                yield PlanError(f"{where}: this is a plan for {found!r}, expected one for {task!r}")
-                return None
+                return report(f"{where}: this is a plan for {found!r}, expected one for {task!r}")
         elif found is None:
             fault = f"expected 'def task_name(robot):' before {shown(line)}"
         elif match := _CHECK.fullmatch(line):
@@ -115,51 +90,52 @@ def _read(
                 opened, condition = True, None
         if fault:
             sound = False
-            yield PlanError(f"{where}: {fault}")
+            report(f"{where}: {fault}")
     if not sound:
         return None
     if found is None:
-        yield PlanError(f"{source}: no plan found; a plan begins with 'def task_name(robot):'")
-        return None
+        return report(f"{source}: no plan found; a plan begins with 'def task_name(robot):'")
     if opened:
-        yield PlanError(f"{source}: the last condition has no skill")
-        return None
+        return report(f"{source}: the last condition has no skill")
     try:
         return ConditionalPlan(found, tuple(steps), tasks[found])
     except PlanError as error:
-        yield error
-        return None
+        return report(str(error))
 
 
-def _no_task(where: str, name: str, tasks: Mapping[str, Task]) -> PlanError:
+def _unquote(match: re.Match[str], group: int) -> str:
+    return re.sub(r"\\(.)", r"\1", match[group] or match[group + 1] or "").strip()
+
+
+def _no_task(where: str, name: str, tasks: Mapping[str, Task]) -> str:
     near = nearest(name, tasks)
-    return PlanError(f"{where}: {shown(name)} is no task" + (f"; did you mean {near[0]!r}?" if near else ""))
+    return f"{where}: {shown(name)} is no task" + (f"; did you mean {near[0]!r}?" if near else "")
 
 
 def check_plan(
     text: str, task: str | None = None, source: str = "plan", tasks: Mapping[str, Task] = TASKS
 ) -> tuple[ConditionalPlan | None, list[str]]:
-    """Read a plan as :func:`parse_plan` does, and tell all its faults instead of raising the first.
-
-    Returns:
-        The plan, None if it has faults; and the faults, in the order of the lines.
+    """As :func:`parse_plan`, but the plan, None if it has faults, and all its faults in the order of the lines.
 
     Example:
         >>> check_plan("nonsense")
         (None, ["plan, line 1: expected 'def task_name(robot):' before 'nonsense'"])
     """
-    faults, reading = [], _read(text, task, source, tasks)
-    while True:
-        try:
-            faults.append(str(next(reading)))
-        except StopIteration as done:
-            return done.value, faults
+    faults: list[str] = []
+    return _read(text, task, source, tasks, faults.append), faults
 
 
 def parse_plan(
     text: str, task: str | None = None, source: str = "plan", tasks: Mapping[str, Task] = TASKS
 ) -> ConditionalPlan:
-    """Read one plan in the chain_py format.
+    """Read one plan in the chain_py format. It is not executed: every line is matched against a few forms::
+
+        def drawer_open(robot):
+            # The gripper has to come from above.
+            if check("the robot's gripper is not vertically aligned with the drawer handle"):
+                robot.place("the gripper above the drawer handle")
+
+    A skill ends with its goal if that is not the usual one, ``robot.place("...", goal="the puck is near the gripper")``.
 
     Args:
         text: the plan.
@@ -168,15 +144,18 @@ def parse_plan(
         tasks: whose objects the conditions name, by task name, as from :func:`~lw_torchrl.load_tasks`.
 
     Raises:
-        PlanError: (a ValueError) with the line: a line of another form, a condition outside the query language,
-            a plan without steps, or one for another task.
-        TypeError: ``text`` is no string.
+        PlanError: (a ValueError) the first fault, with its line: a line of another form, a condition outside the query
+            language, a plan without steps, or one for another task.
+
+    Source: paper section 'Conditional Plan Generation' and its figure of a chain_py plan.
     """
-    try:
-        fault = next(_read(text, task, source, tasks))
-    except StopIteration as done:
-        return done.value
-    raise fault
+
+    def refuse(fault: str) -> NoReturn:
+        raise PlanError(fault)
+
+    plan = _read(text, task, source, tasks, refuse)
+    assert plan is not None  # or a fault was refused
+    return plan
 
 
 def quote(text: str) -> str:
@@ -286,7 +265,7 @@ def _read_pairs(path: Path, tasks: Mapping[str, Task]) -> Plans:
     plans = []
     for name, pairs in found.items():
         if name not in tasks:
-            raise _no_task(path.name, name, tasks)
+            raise PlanError(_no_task(path.name, name, tasks))
         if not isinstance(pairs, list):
             raise PlanError(f"{path.name}, {name}: expected a list of (condition, skill) pairs, got {shown(pairs)}")
         if len(pairs) > MOST_STEPS:

@@ -1,7 +1,4 @@
-"""Conditional plans: (condition, skill) pairs in English. :mod:`lw_torchrl.language.formats` writes and reads them.
-
-Source: paper section 'Conditional Plan Generation'.
-"""
+"""Conditional plans: (condition, skill) pairs in English. :mod:`lw_torchrl.language.formats` writes and reads them."""
 
 from __future__ import annotations
 
@@ -69,7 +66,7 @@ class PlanStep:
 
 @dataclass(frozen=True)
 class ConditionalPlan:
-    """The steps that carry out one task.
+    """The steps that carry out one task, as in the paper's section 'Conditional Plan Generation'.
 
     Attributes:
         task: the task's name.

@@ -1,10 +1,4 @@
-"""The query language: English conditions on a state, "the robot's gripper is not above the puck".
-
-A query is a conjunction of clauses; a clause is a subject, possibly "not", and a predicate. The parser accepts
-questions ("Is the gripper open?"), capitals, articles or none, "the gripper", "isn't", and clauses that leave out a
-repeated subject ("... is open and not above the puck"). ``str`` gives the one canonical spelling.
-Source: paper section 'Query Answering Function'.
-"""
+"""The query language: English conditions on a state, "the robot's gripper is not above the puck"."""
 
 from __future__ import annotations
 
@@ -29,19 +23,12 @@ _MOST_COMPARED = 8  # objects of a task whose queries are compared with the text
 
 @dataclass(frozen=True)
 class Clause:
-    """One statement about one or two objects.
-
-    Attributes:
-        subject: an object's name.
-        predicate: one of the relations, "touching the table", "open" or "closed".
-        object: the second object of a relation, else None.
-        negated: whether the clause says that the predicate does not hold.
-    """
+    """One statement about one or two objects."""
 
     subject: str
-    predicate: str
-    object: str | None = None
-    negated: bool = False
+    predicate: str  # one of the relations, "touching the table", "open" or "closed"
+    object: str | None = None  # the second object of a relation
+    negated: bool = False  # whether it says that the predicate does not hold
 
     def __str__(self) -> str:
         words = f"the {self.subject} is {'not ' if self.negated else ''}{self.predicate}"
@@ -213,6 +200,9 @@ class _ClauseParser:
 def parse_query(text: str, task: str | Task) -> Query:
     """Read an English condition about a state of ``task``.
 
+    Questions, capitals, articles or none, "the gripper", "isn't" are accepted, and clauses without the repeated subject
+    ("... is open and not above the puck").
+
     Args:
         text: "Is the gripper open and not above the puck?", or any other accepted spelling, of at most 64 clauses.
         task: the task whose objects the query names.
@@ -223,6 +213,8 @@ def parse_query(text: str, task: str | Task) -> Query:
     Example:
         >>> str(parse_query("the gripper above the puck", task="push"))
         "the robot's gripper is above the puck"
+
+    Source: paper section 'Query Answering Function'.
     """
     return _parse(text, get_task(task), explain=True)
 

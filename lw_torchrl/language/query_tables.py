@@ -1,7 +1,4 @@
-"""Queries compiled: to tensors, and to bits for one compiled pass. :class:`~lw_torchrl.QueryProgram` answers from them.
-
-Both hold *atoms*: comparisons of the difference of two positions with a threshold.
-"""
+"""What :class:`~lw_torchrl.QueryProgram` answers from: queries compiled to tensors, and to bits for its kernel."""
 
 from __future__ import annotations
 
@@ -84,10 +81,7 @@ def clause_atoms(clause: Clause, task: Task) -> list[Atom]:
 
 
 class QueryTables(NamedTuple):
-    """A task's atoms (A), and which J of them make up each clause (K) of each query (S).
-
-    The first dimension is of tasks (T) where compiled, of rows where selected.
-    """
+    """A task's atoms (A), and which J of them make up each clause (K) of each query (S); of tasks (T), or of rows."""
 
     first: Tensor  # (T, 3*A) int64, index of each coordinate of the first position; of 0 for an axis left out
     second: Tensor  # (T, 3*A) int64
@@ -169,38 +163,28 @@ class QueryFacts(NamedTuple):
         return self._replace(metres=self.metres.astype(dtype), constants=self.constants.astype(dtype))
 
 
-class _TaskFacts:
-    """The facts of one task, and the bits of its queries."""
+def _task_facts(task: Task, queries: Sequence[Query]) -> tuple[dict[Atom, int], dict[int, int], list[tuple[int, int]]]:
+    """The places of a task's atoms; the bit that says that all atoms of some bits hold; and of each query the bits that
+    it cares for, and which of them must be true."""
+    places: dict[Atom, int] = {}
 
-    def __init__(self, task: Task, queries: Sequence[Query]) -> None:
-        self.atoms: dict[Atom, int] = {}
-        self.conjunctions: dict[int, int] = {}  # the bits of some atoms to the bit that says that all hold
-        asked = [self._clauses(query, task) for query in queries]
-        self.queries = [self._literals(clauses) for clauses in asked]
+    def bits(clause: Clause) -> int:
+        return sum({1 << places.setdefault(atom, len(places)) for atom in clause_atoms(clause, task)})
 
-    @property
-    def count(self) -> int:
-        return len(self.atoms) + len(self.conjunctions)
-
-    def _clauses(self, query: Query, task: Task) -> list[tuple[list[int], bool]]:
-        """The bits of the atoms of each clause, and whether it is negated."""
-        return [
-            ([1 << self.atoms.setdefault(atom, len(self.atoms)) for atom in clause_atoms(clause, task)], clause.negated)
-            for clause in query.clauses
-        ]
-
-    def _literals(self, clauses: list[tuple[list[int], bool]]) -> tuple[int, int]:
-        """The bits that a query cares for, and which of them must be true."""
+    asked = [[(bits(clause), clause.negated) for clause in query.clauses] for query in queries]
+    conjunctions: dict[int, int] = {}
+    literals = []
+    for clauses in asked:
         true = false = 0
-        for bits, negated in clauses:
-            together = sum({*bits})
+        for together, negated in clauses:
             if not negated:
                 true |= together
             elif together.bit_count() == 1:
                 false |= together
             else:
-                false |= self.conjunctions.setdefault(together, 1 << self.count)
-        return (_FALSE, _FALSE) if true & false else (true | false, true)
+                false |= conjunctions.setdefault(together, 1 << len(places) + len(conjunctions))
+        literals.append((_FALSE, _FALSE) if true & false else (true | false, true))
+    return places, conjunctions, literals
 
 
 def compile_facts(queries: Mapping[Task, Sequence[Query]]) -> QueryFacts | None:
@@ -210,30 +194,28 @@ def compile_facts(queries: Mapping[Task, Sequence[Query]]) -> QueryFacts | None:
     for row, number in enumerate(ids):
         if number < len(MT50):
             row_of[number] = row
-    tasks = [_TaskFacts(task, listed) for task, listed in queries.items()]
-    if max(task.count for task in tasks) > MOST_FACTS:
+    tasks = [_task_facts(task, listed) for task, listed in queries.items()]
+    if max(len(atoms) + len(together) for atoms, together, _ in tasks) > MOST_FACTS:
         return None
     constants = [0.0]
     places: list[list[int]] = []
     conjunctions: list[tuple[int, int]] = []
     ends, metres, bits, flipped = [], [], [], []
-    for task in tasks:
+    for atoms, together, _ in tasks:
         begin = len(places)
-        for atom in sorted(task.atoms, key=lambda atom: not atom.part.length):
+        for atom in sorted(atoms, key=lambda atom: not atom.part.length):
             first, second = (atom.coordinates(side, constants) for side in (0, 1))
             axes = [0, 1, 2] if atom.part.length else ["xyz".index(atom.part.axes)] * 3
             places.append([place for axis in axes for place in (first[axis], second[axis])])
             metres.append([*(atom.offset[axis] for axis in axes), -1.0 if atom.far else 1.0, atom.threshold])
-            bits.append(task.atoms[atom])
-        lengths = sum(atom.part.length for atom in task.atoms)
-        flipped.append(sum(1 << bit for atom, bit in task.atoms.items() if atom.flipped))
-        ends.append(
-            [begin, begin + lengths, len(places), len(conjunctions), len(conjunctions) + len(task.conjunctions)]
-        )
-        conjunctions += task.conjunctions.items()
-    steps = max(len(task.queries) for task in tasks)
-    literals = [task.queries + [(_FALSE, _FALSE)] * (steps - len(task.queries)) for task in tasks]
-    care, want = np.moveaxis(np.array(literals, np.uint64), 2, 0)
+            bits.append(atoms[atom])
+        lengths = sum(atom.part.length for atom in atoms)
+        flipped.append(sum(1 << bit for atom, bit in atoms.items() if atom.flipped))
+        ends.append([begin, begin + lengths, len(places), len(conjunctions), len(conjunctions) + len(together)])
+        conjunctions += together.items()
+    steps = max(len(literals) for *_, literals in tasks)
+    padded = [literals + [(_FALSE, _FALSE)] * (steps - len(literals)) for *_, literals in tasks]
+    care, want = np.moveaxis(np.array(padded, np.uint64), 2, 0)
     return QueryFacts(
         ids=np.array(ids),
         row_of=row_of,

@@ -1,9 +1,4 @@
-"""What the relations mean: each is one comparison or more of d = first position - second position, in metres.
-
-The predicates of one object have the origin as second position: "touching the table" compares the z of an object,
-"open" and "closed" the gripper's opening in place of z.
-Source: paper section 'Query Answering Function'; the thresholds are the published ones.
-"""
+"""What the relations mean: comparisons of d = first position - second position, in metres."""
 
 from __future__ import annotations
 
@@ -83,7 +78,8 @@ UNARY = MappingProxyType(
         "closed": (_along("z", "<=", 0.75, temperature=0.05),),
     }
 )
-"""The predicates of one object; "open" and "closed" are the gripper's."""
+"""The predicates of one object, with the origin as second position: "touching the table" compares the object's z,
+"open" and "closed" the gripper's opening in place of z."""
 
 
 class Relations(UserDict[str, tuple[Comparison, ...]]):
@@ -117,7 +113,10 @@ RELATIONS = Relations(
         "forward aligned with": (_within("xz", 0.03),),
     }
 )
-"""The relations between two objects: the 13 published ones, and those that you add (docs/queries.md shows how)."""
+"""The relations between two objects: the 13 published ones, and those that you add (docs/queries.md shows how).
+
+Source: paper section 'Query Answering Function'; the thresholds are the published ones.
+"""
 PUBLISHED = (
     "near", "around", "left of", "right of", "behind", "in front of", "above", "below", "vertically aligned with",
     "almost vertically aligned with", "mostly below", "horizontally aligned with", "forward aligned with",

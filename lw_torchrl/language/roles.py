@@ -23,18 +23,11 @@ _TOOL = re.compile(r"(?<!in line )(?<!level )(?<!aligned )\bwith (the )?(?=<)")
 
 @dataclass(frozen=True)
 class Roles:
-    """What a step is about.
+    """What a step is about."""
 
-    Attributes:
-        target: the object or point to go to; None if unknown.
-        moved: what is to arrive there, the robot's gripper or a thing; None if unknown.
-        source: what told it: "skill", a scripted skill; "words", the step's text; "condition", what the condition
-            compares; "nothing".
-    """
-
-    target: str | None
-    moved: str | None
-    source: Source
+    target: str | None  # the object or point to go to; None if unknown
+    moved: str | None  # what is to arrive there, the robot's gripper or a thing; None if unknown
+    source: Source  # what told it: a scripted skill, the step's text, or what the condition compares
 
 
 _NOTHING = Roles(None, None, "nothing")

@@ -1,8 +1,4 @@
-"""Text encoders: English to vectors. Those of the shipped texts come with the package; other texts need the extra.
-
-The vectors come from all-MiniLM-L6-v2, through sentence-transformers; after a description or a plan has changed,
-``python -m lw_torchrl.language.text`` makes them again.
-"""
+"""Text encoders: English to vectors. Those of the shipped texts come with the package; other texts need the extra."""
 
 from __future__ import annotations
 
@@ -37,8 +33,7 @@ def _shipped() -> dict[str, Tensor]:
         if not path.is_file():
             return {}
         with np.load(path, allow_pickle=False) as table:
-            vectors = torch.from_numpy(table["vectors"].astype(np.float32))
-            return dict(zip(table["texts"].tolist(), vectors, strict=True))
+            return dict(zip(table["texts"].tolist(), torch.from_numpy(table["vectors"]).float(), strict=True))
 
 
 @lru_cache(maxsize=1)
@@ -93,7 +88,7 @@ def encode_texts(texts: Sequence[str]) -> Tensor:
 
 def encoded(texts: Sequence[str], encoder: TextEncoder | None) -> Tensor:
     """The vectors of texts by an encoder, None for the default one, checked: (n, E) float32."""
-    if encoder is not None and not callable(encoder):
+    if not callable(encoder or encode_texts):
         raise TypeError(f"text_encoder must be a function of texts, got {encoder!r:.80}")
     found = (encoder or encode_texts)(texts)
     if not isinstance(found, Tensor) or not found.is_floating_point():

@@ -81,21 +81,13 @@ def storable(text: str) -> str:
 
 @dataclass(frozen=True)
 class Reply:
-    """What a server said.
+    """What a server said."""
 
-    Attributes:
-        text: the answer; "" if there is none.
-        finish: why it ends, in the server's words: "stop", "length", "content_filter", "".
-        refusal: what the model said instead of an answer, "".
-        tokens: what it cost.
-        notes: what was different from what was asked.
-    """
-
-    text: str
-    finish: str = ""
-    refusal: str = ""
+    text: str  # the answer; "" if there is none
+    finish: str = ""  # why it ends, in the server's words: "stop", "length", "content_filter", ""
+    refusal: str = ""  # what the model said instead of an answer
     tokens: Tokens = NO_TOKENS
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # what was different from what was asked
 
 
 @dataclass(frozen=True)

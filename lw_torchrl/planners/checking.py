@@ -20,23 +20,14 @@ _GAPS = 3  # the longest are told of
 
 @dataclass(frozen=True)
 class PlanCheck:
-    """What became of a plan.
-
-    Attributes:
-        task: the task's name.
-        decoded: what the text was taken for.
-        expert: how often its conditions hold in the states that Meta-World's expert visits; None without a plan.
-        own: how its steps fare if scripted skills carry it out; None if they cannot.
-        success: the success rate of these episodes.
-        failed: the observations of each of these that failed, (T, 39) float32.
-    """
+    """What became of a plan."""
 
     task: str
-    decoded: DecodedPlan
-    expert: TaskUse | None = None
-    own: TaskUse | None = None
-    success: float = 0.0
-    failed: tuple[Tensor, ...] = ()
+    decoded: DecodedPlan  # what the text was taken for
+    expert: TaskUse | None = None  # how its conditions fare in the states of Meta-World's expert; None without a plan
+    own: TaskUse | None = None  # how its steps fare if scripted skills carry it out; None if they cannot
+    success: float = 0.0  # the success rate of these episodes
+    failed: tuple[Tensor, ...] = ()  # the observations of those that failed, (T, 39) float32
 
     @property
     def never(self) -> tuple[int, ...]:

@@ -26,26 +26,17 @@ Group = tuple[str, str]  # model, format
 
 @dataclass(frozen=True)
 class ComparedAnswer:
-    """How an answer fared.
-
-    Attributes:
-        model, format, task, attempt: which answer it is.
-        steps: how many steps of the plan scripted skills can carry out.
-        dropped: how many clauses for the task were left out.
-        reason: why there is no plan; "" if there is one.
-        success: of each episode; all False without a plan.
-        plan: what was carried out, with scripted skills; None without a plan.
-    """
+    """How an answer fared."""
 
     model: str
     format: str
     task: str
     attempt: int
-    steps: int
-    dropped: int
-    reason: str
-    success: tuple[bool, ...]
-    plan: ConditionalPlan | None = field(default=None, repr=False)
+    steps: int  # of the plan that scripted skills can carry out
+    dropped: int  # clauses for the task that were left out
+    reason: str  # why there is no plan; "" if there is one
+    success: tuple[bool, ...]  # of each episode; all False without a plan
+    plan: ConditionalPlan | None = field(default=None, repr=False)  # what was carried out
 
     @property
     def rate(self) -> float:

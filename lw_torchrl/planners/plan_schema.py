@@ -1,9 +1,4 @@
-"""A JSON Schema that only plans of one task pass: its base queries as conditions, its scripted skills.
-
-It uses only what the strict modes of OpenAI, vLLM, Ollama, llama.cpp and llama-cpp-python all know: objects whose names
-are all required, anyOf, enum, pattern, and numbers of items. A clause is three choices, not one of hundreds: OpenAI
-takes at most 1,000 words to choose from, and the largest task has 164, with goals 320.
-"""
+"""A JSON Schema that only plans of one task pass: its base queries as conditions, its scripted skills."""
 
 from __future__ import annotations
 
@@ -35,6 +30,9 @@ def plan_schema(
     tasks: Mapping[str, Task] = TASKS,
 ) -> dict[str, Any]:
     """The JSON Schema of plans of a task, as :mod:`~lw_torchrl.language.formats.structured` writes them.
+
+    It uses only what the strict modes of OpenAI, vLLM, Ollama, llama.cpp and llama-cpp-python all know. A clause is
+    three choices, not one of hundreds: OpenAI takes at most 1,000 words to choose from; the largest task has 320.
 
     Args:
         task: the task, or its name.

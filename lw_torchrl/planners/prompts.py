@@ -1,8 +1,4 @@
-"""What a model is asked: a prompt, for chat models the messages around it, and further fields of a request.
-
-A prompt has the plans of three other tasks, then the name and the description of the one that a plan is wanted for.
-Source: paper section 'Conditional Plan Generation'.
-"""
+"""What a model is asked: prompts, for chat models the messages around them, and further fields of a request."""
 
 from __future__ import annotations
 
@@ -43,6 +39,8 @@ def prompt_examples(
     Example:
         >>> [plan.task for plan in prompt_examples("coffee-push")]
         ['pick-place', 'reach', 'push']
+
+    Source: paper section 'Conditional Plan Generation'.
     """
     owner = task if isinstance(task, Task) else tasks[check_task(task, tasks)]
     known = example_plans(plans)

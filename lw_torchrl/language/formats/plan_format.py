@@ -12,15 +12,10 @@ from lw_torchrl.language.tasks import Task
 
 @dataclass(frozen=True)
 class Style:
-    """What is said of each step.
+    """What is said of each step."""
 
-    Attributes:
-        explains: the steps are listed first, and a reason stands before each clause.
-        goals: a skill is written as the state that it is to reach, where it has one.
-    """
-
-    explains: bool = False
-    goals: bool = False
+    explains: bool = False  # the steps are listed first, and a reason stands before each clause
+    goals: bool = False  # a skill is written as the state that it is to reach, if it has one
 
 
 @dataclass(frozen=True)
@@ -65,38 +60,23 @@ class Note:
 
 @dataclass(frozen=True)
 class Clause:
-    """A condition and what to do, in the words of the text.
+    """A condition and what to do, in the words of the text."""
 
-    Attributes:
-        line: where the condition stands, from 1.
-        condition: "the robot's gripper is not above mug".
-        skill: "put gripper above mug"; "" if only a state to reach is said.
-        goal: that state, "the robot's gripper is above mug"; "" if there is none.
-        reason: what the text says before the clause.
-    """
-
-    line: int
-    condition: str
-    skill: str
-    goal: str = ""
-    reason: str = ""
+    line: int  # where the condition stands, from 1
+    condition: str  # "the robot's gripper is not above mug"
+    skill: str  # "put gripper above mug"; "" if only a state to reach is said
+    goal: str = ""  # that state, "the robot's gripper is above mug"
+    reason: str = ""  # what the text says before the clause
 
 
 @dataclass
 class Section:
-    """What a text says for one task.
+    """What a text says for one task."""
 
-    Attributes:
-        task: the name it gives; "" where it gives none, but goes on from what the prompt began.
-        line: where it begins.
-        clauses: in the order of the text.
-        listed: the steps it lists before the clauses, "1. first  2. second".
-    """
-
-    task: str
-    line: int
-    clauses: list[Clause] = field(default_factory=list)
-    listed: str = ""
+    task: str  # "" without a name: what goes on from where the prompt ended
+    line: int  # where it begins
+    clauses: list[Clause] = field(default_factory=list)  # in the order of the text
+    listed: str = ""  # the steps listed before the clauses, "1. first  2. second"
 
 
 @dataclass

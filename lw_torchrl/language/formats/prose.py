@@ -1,12 +1,4 @@
-"""Plans in prose, a bullet for each step: "- When C, the robot should S.", written and read.
-
-In the goal style a bullet is "- When C, move the robot's gripper until G."
-
-The reader takes prose as models really write it; nothing is an error. A clause is a bullet that begins with "When",
-"If", "Once" and the like. Where a text has no such bullets, sentences like "When C, the robot should S" count. Other
-sentences before a clause are its reason.
-Source: paper section 'Conditional Plan Generation', which tried plans in prose beside those in code.
-"""
+"""Plans in prose, "- When C, the robot should S.", written, and read as models really write them."""
 
 from __future__ import annotations
 
@@ -22,7 +14,10 @@ from lw_torchrl.language.tasks import TASKS, Task
 
 
 def md(style: Style) -> PlanFormat:
-    """The format of a style in prose."""
+    """The format of a style in prose; in the goal style "- When C, move the robot's gripper until G."
+
+    Source: paper section 'Conditional Plan Generation', which tried plans in prose beside those in code.
+    """
 
     def prompt(examples: Sequence[ConditionalPlan], task: Task, hints: Sequence[str]) -> str:
         about = "A robot that has one arm with a gripper does each task by the rules below it.\n"
@@ -76,7 +71,11 @@ _NO_SKILL = frozenset(("the", "a", "an", "it", "this", "that", "you", "we", "the
 
 
 def read_prose(text: str) -> Reading:
-    """What a text says in prose, for :attr:`PlanFormat.read`."""
+    """What a text says in prose, for :attr:`PlanFormat.read`.
+
+    A clause is a bullet that begins with "When", "If", "Once" and the like; in a text without such bullets, sentences
+    like "When C, the robot should S" count. Other sentences before a clause are its reason.
+    """
     return _Reader(text).reading
 
 

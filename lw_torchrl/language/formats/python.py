@@ -1,13 +1,4 @@
-"""Plans that look like Python: ``if check("…"):`` and ``robot.verb("…")`` for each step, written and read.
-
-In the goal style a skill is ``robot.move_gripper("above the puck", close_gripper=True)``, the place that the gripper is
-to reach, or ``robot.move_gripper(until="the puck is near the target location")`` for any other state.
-
-The reader takes such text as models really write it. Nothing is executed, and nothing is an error. Lines are matched
-against a few forms, ``def name(``, ``if check("…"):``, ``robot.verb("…")`` and comments; all others are passed over and
-noted. Blocks follow the indentation, also where it is broken: an ``if`` in the block of another one asks for both.
-Source: paper section 'Conditional Plan Generation' and its figure of a plan.
-"""
+"""Plans that look like Python, written, and read as models really write them; never executed."""
 
 from __future__ import annotations
 
@@ -25,7 +16,12 @@ from lw_torchrl.language.tasks import TASKS, Task
 
 
 def py(style: Style) -> PlanFormat:
-    """The format of a style as a bare function."""
+    """The format of a style as a bare function, ``if check("…"):`` and ``robot.verb("…")`` for each step.
+
+    In the goal style a skill is ``robot.move_gripper("above the puck", close_gripper=True)``, the place to reach, or
+    ``robot.move_gripper(until="the puck is near the target location")`` for any other state.
+    Source: paper section 'Conditional Plan Generation' and its figure of a plan.
+    """
 
     def prompt(examples: Sequence[ConditionalPlan], task: Task, hints: Sequence[str]) -> str:
         said = "".join(f"# {line}\n" for line in hints)
@@ -115,6 +111,8 @@ class _Block:
 
 
 class _Reader:
+    """Matches lines against a few forms; blocks follow the indentation, and an ``if`` in a block asks for both."""
+
     def __init__(self, text: str) -> None:
         self.reading = Reading()
         self.section = self.reading.sections[0]
