@@ -135,7 +135,7 @@ def parse_plan(
             if check("the robot's gripper is not vertically aligned with the drawer handle"):
                 robot.place("the gripper above the drawer handle")
 
-    A skill ends with its goal if that is not the usual one, ``robot.place("...", goal="the puck is near the gripper")``.
+    A goal that is not the skill's usual one stands behind it: ``robot.place("...", goal="the gripper is open")``.
 
     Args:
         text: the plan.
@@ -187,10 +187,7 @@ _MOST_PAIRS = 2_000  # of a file, each compared with all queries of its task
 
 @checked
 def load_plans(
-    source: str | os.PathLike[str],
-    *,
-    skills: Literal["own", "MT10"] = "own",
-    tasks: Mapping[str, Task] = TASKS,
+    source: str | os.PathLike[str], *, skills: Literal["own", "MT10"] = "own", tasks: Mapping[str, Task] = TASKS
 ) -> Plans:
     """Load plans.
 

@@ -62,6 +62,8 @@ class QueryProgram(nn.Module):
 
     @checked
     def __init__(self, queries: Mapping[str | Task, Sequence[str | Query]]) -> None:
+        if not isinstance(queries, Mapping):
+            raise TypeError(f"queries must map task names to lists of queries, got {type(queries).__name__}")
         if not queries:
             raise ValueError("queries must name at least one task, got an empty mapping")
         compiled: dict[Task, tuple[Query, ...]] = {}

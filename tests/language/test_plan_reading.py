@@ -52,17 +52,9 @@ def test_comments_play_no_part_in_what_a_plan_does():
 @pytest.mark.parametrize(
     ("task", "written", "skill"),
     [
-        (
-            "push",
-            'robot.place("gripper above puck")',
-            "place the gripper above the puck",
-        ),  # the paper's example
+        ("push", 'robot.place("gripper above puck")', "place the gripper above the puck"),  # the paper's example
         ("push", 'robot.place("the gripper above the puck")', "place the gripper above the puck"),
-        (
-            "push",
-            'robot.place("the robot\'s gripper above the  puck")',
-            "place the robot's gripper above the puck",
-        ),
+        ("push", 'robot.place("the robot\'s gripper above the  puck")', "place the robot's gripper above the puck"),
         ("push", 'robot.move("its gripper to an open pose")', "move its gripper to an open pose"),
         ("push", 'robot.slide("puck to target location")', "slide the puck to the target location"),
         ("push", 'robot.move("puckish things")', "move puckish things"),

@@ -121,8 +121,7 @@ def test_a_wrong_offset_is_refused(offset):
 
 
 @pytest.mark.parametrize(
-    "position",
-    [("obs", 1, 2), (True, 1, 2), (None, 1, 2), (float("nan"), 0.0, 0.0), (0.0, 0.0, float("inf"))],
+    "position", [("obs", 1, 2), (True, 1, 2), (None, 1, 2), (float("nan"), 0.0, 0.0), (0.0, 0.0, float("inf"))]
 )
 def test_a_wrong_coordinate_is_refused(position):
     with pytest.raises(ValueError, match="position of 'place' must hold"):

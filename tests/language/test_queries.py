@@ -11,15 +11,7 @@ from hypothesis import strategies as st
 from lw_torchrl.language import queries
 from lw_torchrl.language.named_objects import GRIPPER, NamedObject
 from lw_torchrl.language.nearest import nearest_query
-from lw_torchrl.language.queries import (
-    ARTICLES,
-    Clause,
-    Query,
-    QueryError,
-    check_query,
-    parse_query,
-    supported_queries,
-)
+from lw_torchrl.language.queries import ARTICLES, Clause, Query, QueryError, check_query, parse_query, supported_queries
 from lw_torchrl.language.relations import RELATIONS, TOUCHING
 from lw_torchrl.language.tasks import MT50, TASKS, Task, get_task
 
@@ -70,11 +62,7 @@ def spelled(draw):
     text = " and ".join(parts)
     text = draw(st.sampled_from([text, text.capitalize(), text.upper(), text.title(), text.replace("'", "’")]))
     text = draw(st.sampled_from(["", " ", "\n\t"])) + text + draw(st.sampled_from(["", "?", " ?", ".", "  ", "?\n"]))
-    return (
-        task,
-        query,
-        draw(st.sampled_from([text, text.replace(" ", "  "), text.replace(" and ", "\n and\t")])),
-    )
+    return (task, query, draw(st.sampled_from([text, text.replace(" ", "  "), text.replace(" and ", "\n and\t")])))
 
 
 def without_articles(text):
@@ -401,10 +389,7 @@ own_names = st.lists(words, min_size=1, max_size=3).map(" ".join)
 
 
 @settings(max_examples=200, deadline=None)
-@given(
-    data=st.data(),
-    names=st.lists(own_names.filter(lambda n: n != GRIPPER), min_size=1, max_size=4, unique=True),
-)
+@given(data=st.data(), names=st.lists(own_names.filter(lambda n: n != GRIPPER), min_size=1, max_size=4, unique=True))
 def test_the_objects_of_a_task_of_ones_own_may_have_any_allowed_name(data, names):
     named = (NamedObject(GRIPPER, (0, 1, 2)), *(NamedObject(name, (4, 5, 6)) for name in names))
     task = Task("mine", "Mine.", named)

@@ -112,11 +112,7 @@ def test_queries_that_are_answered_and_not_listed():
         ("gripper closed", {"opening": 0.75}, True),
         ("gripper open", {"opening": np.nextafter(np.float32(0.75), np.float32(1))}, True),
         ("puck touching the table", {"one": [0.0, 0.6, 0.02]}, True),
-        (
-            "puck touching the table",
-            {"one": [0.0, 0.6, np.nextafter(np.float32(0.02), np.float32(1))]},
-            False,
-        ),
+        ("puck touching the table", {"one": [0.0, 0.6, np.nextafter(np.float32(0.02), np.float32(1))]}, False),
         ("gripper above puck", {"hand": [0.1, 0.6, 0.2], "one": [0.1, 0.6, 0.2]}, False),
         ("gripper below puck", {"hand": [0.1, 0.6, 0.2], "one": [0.1, 0.6, 0.2]}, False),
         ("gripper left of puck", {"hand": [0.04, 0.0, 0.0]}, False),

@@ -116,10 +116,7 @@ def test_why_answers_have_no_plan(answers):
     (answers / "good/chain_py/push-3.txt").write_text("?")
     (answers / "good/chain_py/push-3.json").write_text("?")
     found = no_plans(compare_plans(answers, **SHORT))
-    assert found == [
-        "5 answers have no plan:",
-        "5: it has no steps, neither for the task nor for another task",
-    ]
+    assert found == ["5 answers have no plan:", "5: it has no steps, neither for the task nor for another task"]
     assert [path.name for path in ignored_files(answers)] == ["push-3.txt", "push_2.py"]
     assert no_plans(module.PlanComparison([], {})) == []
 
