@@ -196,7 +196,7 @@ class QueryProgram(nn.Module):
 def _check_batch(observation: Tensor, task_id: Tensor) -> None:
     for name, given in (("observation", observation), ("task_id", task_id)):
         if not isinstance(given, Tensor):
-            raise TypeError(f"{name} must be a tensor, as torch.as_tensor makes one, got {type(given).__name__}")
+            raise TypeError(f"{name} must be a tensor, got {type(given).__name__}; torch.as_tensor makes one")
     shape, ids = tuple(observation.shape), tuple(task_id.shape)
     if shape[-1:] != (OBSERVATION_SIZE,) or not observation.is_floating_point():
         raise ValueError(

@@ -299,7 +299,7 @@ any_text = st.text(st.characters()) | st.lists(st.sampled_from(LINES) | st.text(
 @example("- When x, move the robot's gripper until .", "goal_md")
 @example("Steps:  1.", "goal_md")
 @example("\ud800 if \x00", "basic_py_md")
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=120, deadline=None)
 @given(any_text, formats)
 def test_any_text_is_a_plan_or_a_reason(text, format):
     found = lw.decode_plan(text, "push", format)

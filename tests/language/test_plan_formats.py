@@ -61,19 +61,19 @@ def test_shipped_plans_are_read_back(format):
         assert read_back(plan, format) == plan
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(conditional_plans(), st.sampled_from(NINE))
 def test_any_plan_is_read_back(plan, format):
     assert read_back(plan, format) == plan
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(plans_with_goals(), st.sampled_from(NINE[6:]))
 def test_goals_are_read_back_where_they_have_a_place(plan, format):
     assert read_back(plan, format) == plan
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(plans_with_goals())
 def test_plan_files_hold_goals(plan):
     assert parse_plan(format_plan(plan)) == plan

@@ -179,7 +179,7 @@ plan_lines = st.lists(
 ).map("\n".join)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=120, deadline=None)
 @given(plan_lines | st.text(st.characters()))
 def test_any_text_is_a_plan_or_a_plan_error(text):
     try:

@@ -45,7 +45,7 @@ def on_thresholds(states):
     return states
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(data=st.data())
 def test_the_compiled_pass_gives_the_bits_of_the_tables(data):
     names = data.draw(st.lists(st.sampled_from(MT50), min_size=1, max_size=4, unique=True))

@@ -23,7 +23,7 @@ for _ in range(900):
 REQUEST = st.fixed_dictionaries({"model": TEXT, "options": ANYTHING | st.just(DEEP_LIST) | st.just([[DEEP_LIST] * 2])})
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(REQUEST, st.builds(Reply, ANYTHING, ANYTHING, TEXT, st.builds(Tokens, COUNT, COUNT), st.tuples(ANYTHING)))
 def test_what_is_written_can_be_read_and_the_rest_is_not_written(tmp_path_factory, request_, reply):
     cache = AnswerCache(tmp_path_factory.mktemp("kept"))
