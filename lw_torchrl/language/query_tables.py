@@ -27,7 +27,7 @@ class Atom(NamedTuple):
 
     def coordinates(self, side: int, constants: list[float]) -> list[int]:
         """Where the coordinates of one position stand; those of 0 for an axis left out."""
-        position = self[side if self.part.sense == "<" else 1 - side]
+        position = (self.first, self.second)[side if self.part.sense == "<" else 1 - side]
         used = [c if axis in self.part.axes else 0.0 for axis, (_, c) in zip("xyz", position, strict=True)]
         return [coordinate_index(c, constants) for c in used]
 

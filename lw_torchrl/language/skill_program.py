@@ -61,8 +61,8 @@ class SkillProgram(nn.Module):
             raise ValueError("skills must name at least one task, got an empty mapping")
         for name, listed in skills.items():
             if isinstance(listed, (str, ScriptedSkill)) or not listed:
-                task = get_task(name).name
-                raise ValueError(f"skills[{task!r}] must be a list of at least one skill, got {listed!r}")
+                given = get_task(name).name
+                raise ValueError(f"skills[{given!r}] must be a list of at least one skill, got {listed!r}")
 
         def look_up(skill: str | ScriptedSkill) -> ScriptedSkill:
             return skill if isinstance(skill, ScriptedSkill) else known[check_choice("skill", skill, known)]

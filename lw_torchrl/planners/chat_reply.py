@@ -106,7 +106,8 @@ def read_completion(content: bytes, hide: Callable[[str], str]) -> tuple[Reply, 
     prompt, written = (count if is_count(count) else 0 for count in counts)
     model = found.get("model")
     answered = in_a_line(model, hide) if isinstance(model, str) else ""
-    return Reply(*map(storable, hidden), Tokens(prompt, written), tuple(notes)), answered
+    said, ended, refused = map(storable, hidden)
+    return Reply(said, ended, refused, Tokens(prompt, written), tuple(notes)), answered
 
 
 def in_a_line(text: str, hide: Callable[[str], str]) -> str:

@@ -71,9 +71,10 @@ def test_the_truth_is_the_oracles_in_all_tasks():
     assert not wrong
 
 
-@pytest.mark.parametrize(
-    "task", ["reach", *(pytest.param(task, marks=pytest.mark.slow) for task in MT50 if task != "reach")]
-)
+OTHERS = [pytest.param(task, marks=pytest.mark.slow) for task in MT50 if task != "reach"]
+
+
+@pytest.mark.parametrize("task", ["reach", *OTHERS])
 def test_the_truth_is_the_oracles_on_random_states(task):
     states = random_states(task)
     expected = agree(task, states, slice(DIRECT))
