@@ -45,11 +45,11 @@ if TYPE_CHECKING:  # the tables below, for type checkers and editors
     from lw_torchrl.language.queries import supported_queries as supported_queries
     from lw_torchrl.language.query_program import QueryProgram as QueryProgram
     from lw_torchrl.language.skills import load_skills as load_skills
-    from lw_torchrl.language.task_files import load_tasks as load_tasks
     from lw_torchrl.language.tasks import MT10 as MT10
     from lw_torchrl.language.tasks import MT50 as MT50
     from lw_torchrl.language.tasks import TASKS as TASKS
     from lw_torchrl.language.tasks import Task as Task
+    from lw_torchrl.language.tasks import load_tasks as load_tasks
     from lw_torchrl.language.tasks import task_id as task_id
     from lw_torchrl.modules import DescriptorConditionedActor as DescriptorConditionedActor
     from lw_torchrl.modules import HeldEvaluator as HeldEvaluator
@@ -93,8 +93,7 @@ _NAMES = {
     "lw_torchrl.language.queries": "QueryError parse_query supported_queries",
     "lw_torchrl.language.query_program": "QueryProgram",
     "lw_torchrl.language.skills": "load_skills",
-    "lw_torchrl.language.task_files": "load_tasks",
-    "lw_torchrl.language.tasks": "MT10 MT50 TASKS Task task_id",
+    "lw_torchrl.language.tasks": "MT10 MT50 TASKS Task load_tasks task_id",
     "lw_torchrl.modules": "DescriptorConditionedActor HeldEvaluator PlanConditionedActor PlanConditionedQValue "
     "PlanConditionedValue Policy QueryEvaluator ResidualActor ScriptedSkillActor StateQueryEvaluator",
     "lw_torchrl.planners": "FilePlanner OpenAIPlanner plan_prompt",
@@ -106,10 +105,9 @@ _NAMES = {
 _MOVED = {  # names that were here in 0.2.0
     "lw_torchrl.data": "Behaviour add_pictures load_pictures",
     "lw_torchrl.evaluation": "evaluate_plans",
-    "lw_torchrl.language.decoded": "DecodedPlan DecodedStep",
+    "lw_torchrl.language.decoding": "DecodedPlan DecodedStep",
     "lw_torchrl.language.plans": "PlanStep",
-    "lw_torchrl.language.query_search": "nearest_query",
-    "lw_torchrl.language.skills": "nearest_skill",
+    "lw_torchrl.language.nearest": "nearest_query nearest_skill",
     "lw_torchrl.language.tasks": "resolve_tasks",
     "lw_torchrl.modules": "ActorEnsemble ImageQueryEvaluator plan_actor_value",
     "lw_torchrl.objectives": "AdvantageWeightedLoss DemonstratedSACLoss DemonstratedTD3Loss ExpectileValueLoss "

@@ -100,8 +100,9 @@ def _check_plan(
     text: str, task: str | None, source: str, skills: Mapping[str, ScriptedSkill], tasks: Mapping[str, Task]
 ) -> tuple[list[str], int, list[str]]:
     """Every fault of a plan, the steps it has if there is none, and what the scripted skills make of it."""
-    from lw_torchrl.language.formats.chain_py import check_plan
-    from lw_torchrl.language.skills import nearest_skill, skills_for
+    from lw_torchrl.language.nearest import nearest_skill
+    from lw_torchrl.language.plan_files import check_plan
+    from lw_torchrl.language.skills import skills_for
 
     plan, faults = check_plan(text, task, source, tasks)
     if plan is None:

@@ -46,7 +46,7 @@ def compare(
         json: print one JSON document instead, see docs/cli.md.
     """
     check_folder("--out", out)
-    from lw_torchrl.planners.file_planner import ignored_files, recorded_answers
+    from lw_torchrl.planners.answer_files import ignored_files, recorded_answers
 
     known = read_tasks(task_file)
     recorded_answers(source)

@@ -41,8 +41,7 @@ def read_tasks(task_file: Path | None) -> Mapping[str, Task]:
         FileNotFoundError: there is no such file.
         ValueError: it holds no valid tasks.
     """
-    from lw_torchrl.language.task_files import load_tasks
-    from lw_torchrl.language.tasks import TASKS
+    from lw_torchrl.language.tasks import TASKS, load_tasks
 
     if task_file is None:
         return TASKS

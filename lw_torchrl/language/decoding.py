@@ -1,28 +1,85 @@
-"""decode_plan: what a language model wrote, as a plan of one task, and all that was left out or changed."""
+"""decode_plan: what a language model wrote, as a plan of one task, with notes of what was left out or changed."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from lw_torchrl._checks import check_choice, check_probability, checked, counted, shown
-from lw_torchrl.language.decoded import DecodedPlan, DecodedStep
 from lw_torchrl.language.formats import PLAN_FORMATS
-from lw_torchrl.language.formats.prose_reader import read_prose
-from lw_torchrl.language.formats.python_reader import read_python
-from lw_torchrl.language.formats.written import Clause, Note, Reading, Section, listed_steps
+from lw_torchrl.language.formats.plan_format import Clause, Note, Reading, Section, listed_steps
+from lw_torchrl.language.formats.prose import read_prose
+from lw_torchrl.language.formats.python import read_python
+from lw_torchrl.language.nearest import StepMapper
 from lw_torchrl.language.plans import MOST_STEPS, ConditionalPlan, PlanStep
-from lw_torchrl.language.queries import read_query
-from lw_torchrl.language.skill_text import canonical_skill
+from lw_torchrl.language.queries import Query, read_query
+from lw_torchrl.language.skill_words import canonical_skill
 from lw_torchrl.language.skills import ScriptedSkill
-from lw_torchrl.language.step_mapping import StepMapper
 from lw_torchrl.language.tasks import TASKS, Task, check_task
-from lw_torchrl.language.thoughts import without_thoughts
+
+
+@dataclass(frozen=True)
+class DecodedStep:
+    """One clause of a text, and what became of it.
+
+    Distances are from 0, a text that is itself a query or a skill, to 1.
+
+    Attributes:
+        line: where it stands in the text, from 1.
+        written_condition: the condition in the text's words.
+        written_skill: the skill in the text's words: ``robot.put("gripper above mug")`` is "put gripper above mug".
+        condition: the nearest query; None if none is near enough.
+        condition_distance: the largest distance of a clause of the condition.
+        scripted: the text of the nearest scripted skill; None if none is near enough.
+        skill_distance: between the skill and that one.
+        written_goal: the state to reach in the text's words, "" if it says none.
+        goal, goal_distance: as ``condition`` and ``condition_distance``.
+        dropped: why it is no step of the plan; "" if it is one.
+    """
+
+    line: int
+    written_condition: str
+    written_skill: str
+    condition: Query | None
+    condition_distance: float
+    scripted: str | None
+    skill_distance: float
+    written_goal: str = ""
+    goal: Query | None = None
+    goal_distance: float = 0.0
+    dropped: str = ""
+
+
+@dataclass(frozen=True)
+class DecodedPlan:
+    """What :func:`decode_plan` made of a text.
+
+    Attributes:
+        plan: the plan, its conditions as queries and its skills in the text's words; None if there is none.
+        scripted: the same with the nearest scripted skills, for :class:`~lw_torchrl.ScriptedSkillActor`, without the
+            steps whose skill is near none; None if no step is left.
+        reason: why there is no plan; "" if there is one.
+        notes: what was left out or changed, in the order of the lines.
+        steps: the clauses for the task, also those that were dropped.
+    """
+
+    plan: ConditionalPlan | None
+    scripted: ConditionalPlan | None
+    reason: str
+    notes: tuple[Note, ...]
+    steps: tuple[DecodedStep, ...]
+
+    @property
+    def all_scripted(self) -> bool:
+        """Whether there is a plan, and every step of it has a scripted skill."""
+        return self.plan is not None and self.scripted is not None and len(self.scripted.steps) == len(self.plan.steps)
+
 
 LIMIT, SKILL_LIMIT = 0.4, 0.7
-"""Distances beyond which a condition and a skill are taken for nothing; docs/planners.md says what that leaves out."""
+"""Distances beyond which a condition and a skill are taken for nothing; docs/planners.md shows the effect."""
+
 _LONGEST = 65_536  # characters of a text that are read
 
 
@@ -40,30 +97,24 @@ def decode_plan(
 ) -> DecodedPlan:
     """Read a plan from whatever a language model wrote. No text is an error, and none is executed.
 
-    Only clauses for ``task`` count: those of functions and headings of its name, and those before any other name, which
-    go on from where the prompt ended. What a model thinks first, up to ``</think>`` or as others mark it, is left out.
-    Where a text has several versions the longest counts, of equals the first. A text in Python where prose was asked
-    for, or the other way round, is read as what it is.
+    Only clauses for ``task`` count: those of functions and headings of its name, and those before any name, which go
+    on where the prompt ended. Thoughts, up to ``</think>`` or as other models mark them, are left out. Of several
+    versions the longest counts, of equals the first. Python where prose was asked for, or the reverse, is read too.
 
-    A condition outside the query language is taken for the nearest query, clause by clause, and one beyond ``limit`` is
+    A condition outside the query language is taken for the nearest query, clause by clause; one beyond ``limit`` is
     dropped with its step. Skills stay as they are written in ``plan``; ``scripted`` has the nearest scripted ones.
 
     Args:
-        text: the answer; of more than 65,536 characters, and of more than 1,000 steps, the rest is left out.
+        text: the answer; what follows 65,536 characters or 1,000 steps is left out.
         task: the task that was asked for, or its name.
         format: the format that was asked for, a name in :data:`~lw_torchrl.PLAN_FORMATS`.
-        by: nearest in spelling ("edit"), or in meaning ("embedding"), which wants the extra ``[text]``.
+        by: nearest in spelling ("edit"), or in meaning ("embedding"), which needs the extra ``[text]``.
         limit: the largest distance, from 0 to 1, at which a condition or a goal is taken for a query.
-        skill_limit: the same of skills and scripted ones.
+        skill_limit: the same for scripted skills.
         skills: the scripted skills to choose from; None for the shipped ones.
         tasks: where a task's name is looked up, as from :func:`~lw_torchrl.load_tasks`.
 
-    Returns:
-        The plan or the reason why there is none, notes, and the steps.
-
     Raises:
-        TypeError: ``text`` is no string.
-        ValueError: an unknown task or format, another value for ``by``, or a limit outside [0, 1].
         ImportError: by="embedding" without the extra ``[text]``.
 
     Example:
@@ -80,11 +131,8 @@ def decode_plan(
 
     Source: paper sections 'Conditional Plan Generation' and 'LLM Experiments'.
     """
-    if not isinstance(text, str):
-        raise TypeError(f"text must be a string, got {shown(text)} ({type(text).__name__})")
     owner = task if isinstance(task, Task) else tasks[check_task(task, tasks)]
     read = PLAN_FORMATS[check_choice("format", format, PLAN_FORMATS)].read
-    check_choice("by", by, ("edit", "embedding"))
     limits = check_probability("limit", limit), check_probability("skill_limit", skill_limit)
     return decode_as(text, read, StepMapper(owner, skills, by, *limits))
 
@@ -99,28 +147,36 @@ def decode_as(text: str, read: Callable[[str], Reading], mapper: StepMapper) -> 
     if further := section.clauses[MOST_STEPS:]:
         reading.note(further[0].line, f"begins what is more than {MOST_STEPS} steps; {len(further)} are left out")
         del section.clauses[MOST_STEPS:]
-    steps = [_mapped(clause, mapper, notes) for clause in _named(section)]
+    listed = listed_steps(section.listed, len(section.clauses)) or [""] * len(section.clauses)
+    clauses = [  # a clause may only say a state to reach
+        clause if clause.skill else replace(clause, skill=words or _in_words(clause.goal))
+        for clause, words in zip(section.clauses, listed, strict=True)
+    ]
+    steps = [_mapped(clause, mapper, notes) for clause in clauses]
     notes += _about(reading, section, owner)
-    plan = _plan(owner, steps, [step.written_skill for step in steps], section)
-    return DecodedPlan(
-        plan,
-        _plan(owner, steps, [step.scripted for step in steps], section),
-        "" if plan is not None else _why_none(reading, section, steps, owner, text),
-        tuple(sorted(notes, key=lambda note: note.line)),
-        tuple(steps),
-    )
+
+    def plan(skills: Sequence[str | None]) -> ConditionalPlan | None:
+        kept = tuple(
+            PlanStep(step.condition, skill, clause.reason, step.goal)
+            for step, skill, clause in zip(steps, skills, clauses, strict=True)
+            if not step.dropped and step.condition is not None and skill is not None
+        )
+        return ConditionalPlan(owner.name, kept, owner) if kept else None
+
+    written, scripted = plan([step.written_skill for step in steps]), plan([step.scripted for step in steps])
+    reason = "" if written is not None else _why_none(reading, steps, owner, text)
+    return DecodedPlan(written, scripted, reason, tuple(sorted(notes, key=lambda note: note.line)), tuple(steps))
 
 
 def _same(name: str, task: Task) -> bool:
-    """Whether a text means the task by a name: spelling aside."""
+    """Whether a name in a text means the task, whatever its spelling."""
     return re.sub(r"[^a-z0-9]", "", name.lower()) == task.name.replace("-", "")
 
 
 def _read(text: str, task: Task, read: Callable[[str], Reading]) -> tuple[Reading, Section]:
     """What the text says, by the reader that finds something for the task, and the section that is taken."""
-    readers = [read, *(other for other in (read_python, read_prose) if other is not read)]
     found: list[tuple[Reading, Section]] = []
-    for reader in readers:
+    for reader in dict.fromkeys((read, read_python, read_prose)):
         reading = reader(text)
         asked = [reading.sections[0], *(section for section in reading.sections[1:] if _same(section.task, task))]
         section = max(asked, key=lambda section: len(section.clauses))
@@ -130,16 +186,6 @@ def _read(text: str, task: Task, read: Callable[[str], Reading]) -> tuple[Readin
             return reading, section
         found.append((reading, section))
     return found[0]
-
-
-def _named(section: Section) -> list[Clause]:
-    """The clauses; one that only says a state to reach has its skill's name from the list of steps, if that has one for
-    each clause, else from the state."""
-    listed = listed_steps(section.listed, len(section.clauses)) or [""] * len(section.clauses)
-    return [
-        clause if clause.skill else replace(clause, skill=name or _in_words(clause.goal))
-        for clause, name in zip(section.clauses, listed, strict=True)
-    ]
 
 
 def _in_words(goal: str) -> str:
@@ -184,26 +230,12 @@ def _mapped(clause: Clause, mapper: StepMapper, notes: list[Note]) -> DecodedSte
             note(f"no scripted skill is near enough to {shown(words)} (distance {skill_distance:.2f})")
         elif scripted != words:
             note(f"the skill {shown(words)} is nearest to the scripted {scripted!r} (distance {skill_distance:.2f})")
-    return DecodedStep(
-        clause.line, written, words, condition, distance, scripted, skill_distance, clause.goal, goal, goal_distance,
-        dropped,
-    )  # fmt: skip
-
-
-def _plan(
-    task: Task, steps: Sequence[DecodedStep], skills: Sequence[str | None], section: Section
-) -> ConditionalPlan | None:
-    """The plan of the steps that are not dropped and have a skill."""
-    kept = tuple(
-        PlanStep(step.condition, skill, clause.reason, step.goal)
-        for step, skill, clause in zip(steps, skills, section.clauses, strict=True)
-        if not step.dropped and step.condition is not None and skill is not None
-    )
-    return ConditionalPlan(task.name, kept, task) if kept else None
+    mapped = (condition, distance, scripted, skill_distance, clause.goal, goal, goal_distance, dropped)
+    return DecodedStep(clause.line, written, words, *mapped)
 
 
 def _about(reading: Reading, section: Section, task: Task) -> list[Note]:
-    """The reader's notes of what stands in the section that counts, and one for each other section."""
+    """The reader's notes on the section that counts, and one note for each other section."""
     ends = [later.line for later in reading.sections[1:]]
     notes = []
     for found, end in zip(reading.sections, [*ends, float("inf")], strict=True):
@@ -211,21 +243,66 @@ def _about(reading: Reading, section: Section, task: Task) -> list[Note]:
         if found is section or (not found.task and not found.clauses):
             notes += own
         elif found.clauses:
-            steps = counted(len(found.clauses), "step")
-            what = "was not asked for" if not _same(found.task, task) else "is another version"
+            what = "is another version" if _same(found.task, task) else "was not asked for"
             named = repr(found.task) if found.task else "what stands before any name"
-            notes.append(Note(found.line, f"{named} {what}; {steps} left out"))
+            notes.append(Note(found.line, f"{named} {what}; {counted(len(found.clauses), 'step')} left out"))
     return notes
 
 
-def _why_none(reading: Reading, section: Section, steps: list[DecodedStep], task: Task, text: str) -> str:
+def _why_none(reading: Reading, steps: list[DecodedStep], task: Task, text: str) -> str:
     if steps:
-        return (
-            f"none of its {counted(len(steps), 'step')} for {task.name} could be kept; of the first: {steps[0].dropped}"
-        )
+        kept = f"none of its {counted(len(steps), 'step')} for {task.name} could be kept"
+        return f"{kept}; of the first: {steps[0].dropped}"
     if not text.strip():
         return "the text is empty"
-    others = sorted({other.task for other in reading.sections if other.clauses})
-    if others:
+    if others := sorted({other.task for other in reading.sections if other.clauses}):
         return f"it has no steps for {task.name}, but some for {', '.join(map(shown, others))}"
     return f"it has no steps, neither for {task.name} nor for another task"
+
+
+_OPENS = r"<think(?:ing)?>|\[think\]|<\|channel\|>(?:analysis|commentary)"
+_CLOSES = r"</think(?:ing)?>|\[/think\]|<\|channel\|>final[^\n]{0,80}?<\|message\|>"
+_TAG = re.compile(f"(?P<opens>{_OPENS})|{_CLOSES}", re.IGNORECASE)
+_LINE_ENDS = re.compile(r"[ \t\r]*(?:\n|\Z)")
+_COMMENT = re.compile(r"#(?!\w)")  # "#2" is none
+_IS_JSON = re.compile(r"\s*(?:```\w*\s*)?\{")
+
+
+def without_thoughts(text: str, notes: list[Note]) -> str:
+    """An answer without the model's thoughts, which may hold drafts. They get a note; every line keeps its number.
+
+    A closing tag alone closes what began before the text, if it ends its line outside of a plan's comments. An opening
+    tag in a comment or a string opens nothing. The tags of gpt-oss always count. JSON has no thoughts.
+
+    Example:
+        >>> without_thoughts("<think>A draft.\\n</think>Done.", [])
+        '\\nDone.'
+        >>> without_thoughts("A draft. [/THINK]\\nDone. # </think>", [])
+        '\\nDone. # </think>'
+    """
+    spans, opened, at, comment, quotes = list[tuple[int, int]](), None, 0, False, 0
+    for tag in _TAG.finditer("" if _IS_JSON.match(text) else text):
+        *lines, before = text[at : tag.start()].split("\n")
+        if lines:
+            comment, quotes = False, 0
+        comment, quotes = comment or _COMMENT.search(before) is not None, quotes + before.count('"')
+        at, special = tag.end(), tag[0].startswith("<|")
+        if tag["opens"]:
+            if opened is None and (special or not (comment or quotes % 2)):
+                opened = tag.start()
+        elif opened is not None:
+            spans.append((opened, at))
+            opened = None
+        elif special or (not comment and _LINE_ENDS.match(text, at)):
+            spans = [(0, at)]
+    if opened is not None:
+        spans.append((opened, len(text)))
+    if not spans:
+        return text
+    how = "" if opened is None else ", and is cut off there"
+    notes.append(Note(text.count("\n", 0, spans[0][0]) + 1, f"thinks aloud; that is left out{how}"))
+    kept, at = list[str](), 0
+    for start, end in spans:
+        kept += [text[at:start], "\n" * text.count("\n", start, end)]
+        at = end
+    return "".join([*kept, text[at:]])

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from lw_torchrl._checks import shown, unknown_name
+from lw_torchrl._checks import check_choice, shown
 from lw_torchrl.language.observation import OBSERVATION_SIZE
 
 GRIPPER = "robot's gripper"
@@ -20,18 +20,17 @@ _INDEX = re.compile(r"obs\[([0-9]{1,4})\]")
 
 
 def is_number(value: object) -> bool:
-    """Whether ``value`` is a number that is plausible in metres, gains or efforts: neither bool nor NaN, and not
-    huge."""
+    """Whether ``value`` is a plausible number of metres, gain or effort: neither bool nor NaN, and below 1e9."""
     return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e9
 
 
 def typed(position: Sequence[Coordinate]) -> TypedPosition:
-    """A position that equals no other: index 1 and metre 1.0 are equal numbers."""
+    """A position that tells index 1 from metre 1.0, which are equal numbers."""
     return tuple((isinstance(coordinate, int), coordinate) for coordinate in position)
 
 
 def coordinate_index(coordinate: Coordinate, constants: list[float]) -> int:
-    """Where a coordinate stands in the 39 numbers of an observation followed by ``constants``, which grow at need."""
+    """The index of a coordinate in the 39 numbers of an observation followed by ``constants``, which grow at need."""
     if isinstance(coordinate, int):
         return coordinate
     if coordinate not in constants:
@@ -45,10 +44,9 @@ class NamedObject:
 
     Attributes:
         name: "drawer handle", in lower case and without an article.
-        position: where x, y and z are found: an int is an index into the 39 numbers of the observation,
-            a float is a fixed place in metres.
-        offset: added to it, metres; a point beside an object has one.
-        ours: a point that we named, and the published object list has not.
+        position: x, y and z: an int is an index into the 39 numbers of the observation, a float is in metres.
+        offset: added to it, metres; for a point beside an object.
+        ours: a point that we named, which the published object list lacks.
 
     Raises:
         ValueError: the name is not plain lower-case words, or a coordinate lies outside the observation.
@@ -66,11 +64,9 @@ class NamedObject:
             raise ValueError(f"name may not contain 'and', 'is', 'not' or 'the', got {shown(self.name)}")
         if len(self.position) != 3:
             raise ValueError(f"position of {self.name!r} must have 3 coordinates, got {shown(self.position)}")
+        if not all(map(is_number, self.position)):
+            raise ValueError(f"position of {self.name!r} must hold ints and finite floats, got {shown(self.position)}")
         for coordinate in self.position:
-            if not is_number(coordinate):
-                raise ValueError(
-                    f"position of {self.name!r} must hold ints and finite floats, got {shown(self.position)}"
-                )
             if isinstance(coordinate, int) and not 0 <= coordinate < OBSERVATION_SIZE:
                 raise ValueError(f"position of {self.name!r}: obs[{coordinate}] is outside the 39 numbers, 0 to 38")
         if len(self.offset) != 3 or not all(map(is_number, self.offset)):
@@ -78,7 +74,7 @@ class NamedObject:
 
 
 def read_position(name: str, at: Any) -> tuple[Coordinate, Coordinate, Coordinate]:
-    """The position that "obs[4:7]" or [0.1, "obs[37]", 0.0] stand for in tasks.toml."""
+    """The position that "obs[4:7]" or [0.1, "obs[37]", 0.0] means in tasks.toml."""
     if isinstance(at, str) and (match := _SLICE.fullmatch(at)):
         start, stop = map(int, match.groups())
         if stop - start == 3:
@@ -104,33 +100,31 @@ def read_point(name: str, at: Any, objects: Mapping[str, NamedObject]) -> NamedO
     if not isinstance(at, Mapping):
         return NamedObject(name, read_position(name, at), ours=True)
     for key in at:
-        if key not in ("object", "offset"):
-            raise unknown_name(f"key of point {name!r}", key, ("object", "offset"))
-    if set(at) != {"object", "offset"}:
+        check_choice(f"key of point {name!r}", key, ("object", "offset"))
+    if len(at) != 2:
         raise ValueError(f"point {name!r} must have object and offset, got {', '.join(at) or 'neither'}")
-    if at["object"] not in list(objects):
-        raise unknown_name(f"object of point {name!r}", at["object"], objects)
+    check_choice(f"object of point {name!r}", at["object"], objects)
     offset = at["offset"]
     if not isinstance(offset, list) or len(offset) != 3 or not all(map(is_number, offset)):
         raise ValueError(f"offset of {name!r} must be three numbers in metres, got {shown(offset)}")
     return NamedObject(name, objects[at["object"]].position, (offset[0], offset[1], offset[2]), ours=True)
 
 
-def _table(key: str, row: Mapping[str, Any]) -> Mapping[str, Any]:
-    found = row.get(key, {})
-    if not isinstance(found, Mapping) or not all(isinstance(name, str) for name in found):
-        raise ValueError(f"{key} must be a table of names and positions, got {shown(found)}")
-    return found
-
-
 def read_objects(row: Mapping[str, Any]) -> tuple[NamedObject, ...]:
     """The gripper, then the objects and the points of a row of tasks.toml."""
+
+    def table(key: str) -> Mapping[str, Any]:
+        found = row.get(key, {})
+        if not isinstance(found, Mapping) or not all(isinstance(name, str) for name in found):
+            raise ValueError(f"{key} must be a table of names and positions, got {shown(found)}")
+        return found
+
     objects = {GRIPPER: NamedObject(GRIPPER, (0, 1, 2))}
-    for named, at in _table("objects", row).items():
+    for named, at in table("objects").items():
         if named in objects:
             raise ValueError(f"objects may not name {named!r}, which every task has")
         objects[named] = NamedObject(named, read_position(named, at))
-    points = [read_point(named, at, objects) for named, at in _table("points", row).items()]
+    points = [read_point(named, at, objects) for named, at in table("points").items()]
     return (*objects.values(), *points)
 
 

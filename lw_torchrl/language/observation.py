@@ -1,9 +1,4 @@
-"""Where things stand in Meta-World's observation, and how many numbers it and an action have.
-
-Positions are in metres; the gripper's opening is between 0, closed, and 1. A task with one object has zeros for the
-second. The goal is where the task's target is.
-Source: ``metaworld.sawyer_xyz_env.SawyerXYZEnv._get_obs``.
-"""
+"""Where things stand in Meta-World's observation (metres, source: ``SawyerXYZEnv._get_obs``), and its size."""
 
 from __future__ import annotations
 
@@ -11,13 +6,13 @@ OBSERVATION_SIZE = 39
 ACTION_SIZE = 4
 
 HAND = slice(0, 3)
-OPENING = 3
+OPENING = 3  # of the gripper, from 0, closed, to 1
 FIRST = slice(4, 7)
 FIRST_QUATERNION = slice(7, 11)
-SECOND = slice(11, 14)
+SECOND = slice(11, 14)  # zeros in a task with one object
 SECOND_QUATERNION = slice(14, 18)
 BEFORE = slice(18, 36)  # all of the above, a step before
-GOAL = slice(36, 39)
+GOAL = slice(36, 39)  # where the task's target is
 
 POSITIONS = (HAND, FIRST, SECOND, GOAL)
 """The positions of this step."""

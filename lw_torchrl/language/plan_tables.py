@@ -43,15 +43,14 @@ class PlanTables:
         self.number = torch.tensor([numbers[task] for task in self.index.tasks])
 
     def rows(self, task_id: Tensor) -> Tensor:
-        """The row of each task, (...) int64 to (...) int64; :class:`ValueError` for a task without a plan."""
+        """The row of each task, (...) int64 to (...) int64; a task without a plan is a :class:`ValueError`."""
         return self.index.rows(task_id, self._problem)
 
     def refuse_others(self, number: Tensor | None, rows: Tensor) -> None:
         """Raise :class:`ValueError` where queries were answered of other plans.
 
         Args:
-            number: (...) int64, the number of the plan whose queries were answered; 0, or None for all, where it is
-                not known.
+            number: (...) int64, the number of the plan whose queries were answered; 0 where unknown, None for all.
             rows: (...) int64, as from :meth:`rows`.
         """
         if number is None:

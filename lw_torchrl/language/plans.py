@@ -1,8 +1,4 @@
-"""Conditional plans: (condition, skill) pairs in English.
-
-How they are written is for :mod:`lw_torchrl.language.formats`.
-Source: paper section 'Conditional Plan Generation'.
-"""
+"""Conditional plans: (condition, skill) pairs in English. :mod:`lw_torchrl.language.formats` writes and reads them."""
 
 from __future__ import annotations
 
@@ -16,7 +12,7 @@ from typing import Any
 from lw_torchrl._checks import check_fields, checked, shown
 from lw_torchrl.language.queries import Query, check_query, read_query
 from lw_torchrl.language.relations import PREDICATES
-from lw_torchrl.language.skill_text import canonical_skill
+from lw_torchrl.language.skill_words import canonical_skill
 from lw_torchrl.language.skills import load_skills
 from lw_torchrl.language.tasks import TASKS, Task, check_task, get_task
 
@@ -28,6 +24,11 @@ PLAN_LIMIT = 2**18
 
 class PlanError(ValueError):
     """A text or a list of steps that is no conditional plan."""
+
+
+def one_line(text: str) -> str:
+    """A description or a reason with its line ends as spaces."""
+    return " ".join(text.split())
 
 
 def too_many_steps(what: str, number: int) -> PlanError:
@@ -49,9 +50,9 @@ class PlanStep:
     Attributes:
         condition: a query of the plan's task.
         skill: plain English, "place the gripper above the puck".
-        reason: why, a comment for the reader; it plays no part in what the plan does.
-        goal: the state that the skill is to reach, a query of the plan's task, where it is another than
-            :func:`usual_goal` gives for the skill; :attr:`ConditionalPlan.goals` has them all.
+        reason: why, a comment for the reader; it does not change what the plan does.
+        goal: the state that the skill is to reach, a query of the plan's task, if it differs from the skill's usual
+            one; :attr:`ConditionalPlan.goals` has them all.
     """
 
     condition: Query
@@ -65,19 +66,18 @@ class PlanStep:
 
 @dataclass(frozen=True)
 class ConditionalPlan:
-    """The steps that carry out one task.
+    """The steps that carry out one task, as in the paper's section 'Conditional Plan Generation'.
 
     Attributes:
         task: the task's name.
-        steps: at least one :class:`PlanStep`, in canonical spelling, so that the plan's text reads back as
-            the same plan: conditions as ``str(query)`` gives them, skills with "the" before the task's nouns. Plans
-            are equal whose conditions, skills and goals are.
+        steps: 1 to 1,000 of :class:`PlanStep`, in canonical spelling, so that the plan's text reads back as the same
+            plan: conditions as ``str(query)`` gives them, skills with "the" before the task's nouns. Plans with equal
+            conditions, skills and goals are equal.
         definition: the :class:`Task` whose objects the conditions name; None for ours of that name.
 
     Raises:
-        PlanError: (a ValueError) the plan has no steps, or more than 1,000, a skill does not begin with a plain word,
-            or a condition or a goal names objects of another task.
-        TypeError: a step is no PlanStep, or its skill no string.
+        PlanError: (a ValueError) too few or many steps, a skill that does not begin with a plain word, or a condition
+            or a goal that names objects of another task.
 
     Example:
         >>> plan = ConditionalPlan.from_pairs("reach", [("gripper is open", "move the gripper to the target")])
@@ -129,12 +129,11 @@ class ConditionalPlan:
 
     @property
     def goals(self) -> tuple[Query | None, ...]:
-        """The state that each step's skill is to reach: its own goal, or the usual one of the skill; None where there
-        is neither."""
+        """The state that each step's skill is to reach: its own goal, else the skill's usual one; None without both."""
         return tuple(step.goal or usual_goal(step.skill, self.definition) for step in self.steps)
 
     def __str__(self) -> str:
-        from lw_torchrl.language.formats.chain_py import format_plan
+        from lw_torchrl.language.plan_files import format_plan
 
         return format_plan(self)
 
@@ -193,10 +192,10 @@ class Plans(Mapping[str, ConditionalPlan]):
 
     @property
     def fingerprint(self) -> str:
-        """32 hex digits of all that queries and attention hang on: each step's condition and skill, the number of
-        steps, the objects of each task with their positions and offsets, and what each relation used means now.
+        """32 hex digits of all that queries and attention depend on: each step's condition and skill, the number of
+        steps, the objects of each task with their positions and offsets, and what each used relation means now.
 
-        Plans with the same fingerprint give the same ``qaf``. Reasons and descriptions play no part.
+        Plans with the same fingerprint give the same ``qaf``. Reasons and descriptions do not count.
         """
         used = {clause.predicate for plan in self.values() for step in plan.steps for clause in step.condition.clauses}
         told = {
@@ -216,10 +215,7 @@ class Plans(Mapping[str, ConditionalPlan]):
         return sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:32]
 
     def to_json(self) -> dict[str, Any]:
-        """Each task's plan as chain_py text, with the task where it is not the shipped one of that name.
-
-        Raises:
-            TaskError: (a ValueError) a task cannot be written, see :meth:`Task.to_json`.
+        """Each task's plan as chain_py text, with the task if it is not the shipped one (see :meth:`Task.to_json`).
 
         Example:
             >>> from lw_torchrl.language.plan_files import load_plans
@@ -235,8 +231,8 @@ class Plans(Mapping[str, ConditionalPlan]):
 
     @classmethod
     def from_json(cls, found: Any) -> Plans:
-        """The plans of :meth:`to_json`; anything else, whatever it is, is a :class:`PlanError`."""
-        from lw_torchrl.language.formats.chain_py import parse_plan
+        """The plans of :meth:`to_json`; any other value is a :class:`PlanError`."""
+        from lw_torchrl.language.plan_files import parse_plan
 
         if not isinstance(found, dict):
             raise PlanError(f"plans must be an object of task names and plans, got {shown(found)}")
@@ -255,17 +251,15 @@ class Plans(Mapping[str, ConditionalPlan]):
         return cls(plans)
 
     def differences(self, other: Plans) -> list[str]:
-        """The tasks of both whose plans differ in what their fingerprint tells."""
+        """The common tasks whose plans have other fingerprints."""
         theirs = other.numbers
         return [task for task, number in self.numbers.items() if number != theirs.get(task, number)]
 
     def require(self, tasks: Iterable[str]) -> None:
         """Raise :class:`PlanError` if one of ``tasks`` has no plan here."""
         if missing := [task for task in tasks if task not in self]:
-            raise PlanError(
-                f"plans lack {', '.join(missing)}; they cover {', '.join(self)}. Load or write a plan for "
-                "each task, or leave the task out."
-            )
+            what = f"plans lack {', '.join(missing)}; they cover {', '.join(self)}"
+            raise PlanError(f"{what}. Load or write a plan for each task, or leave the task out.")
 
 
 def as_plans(plans: Plans | Mapping[str, ConditionalPlan], argument: str = "plans") -> Plans:

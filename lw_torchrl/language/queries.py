@@ -1,10 +1,4 @@
-"""The query language: English conditions on a state, "the robot's gripper is not above the puck".
-
-A query is a conjunction of clauses; a clause is a subject, possibly "not", and a predicate. The parser accepts a
-question ("Is the gripper open?"), capitals, articles or none, "the gripper", "isn't", and clauses that leave the
-repeated subject out ("... is open and not above the puck"). One canonical spelling comes out of ``str``.
-Source: paper section 'Query Answering Function'.
-"""
+"""The query language: English conditions on a state, "the robot's gripper is not above the puck"."""
 
 from __future__ import annotations
 
@@ -24,24 +18,17 @@ from lw_torchrl.language.tasks import Task, get_task
 ARTICLES = ("the", "a", "an")
 _ALIASES = {"gripper": GRIPPER, "robot gripper": GRIPPER}
 _MOST_CLAUSES = 64  # the tables have room for as many in every step
-_MOST_COMPARED = 8  # of a task's objects, those whose queries an error's text is compared with
+_MOST_COMPARED = 8  # objects of a task whose queries are compared with the text of an error
 
 
 @dataclass(frozen=True)
 class Clause:
-    """One statement about one or two objects.
-
-    Attributes:
-        subject: an object's name.
-        predicate: one of the relations, "touching the table", "open" or "closed".
-        object: the second object of a relation, else None.
-        negated: whether the clause says that the predicate does not hold.
-    """
+    """One statement about one or two objects."""
 
     subject: str
-    predicate: str
-    object: str | None = None
-    negated: bool = False
+    predicate: str  # one of the relations, "touching the table", "open" or "closed"
+    object: str | None = None  # the second object of a relation
+    negated: bool = False  # whether it says that the predicate does not hold
 
     def __str__(self) -> str:
         words = f"the {self.subject} is {'not ' if self.negated else ''}{self.predicate}"
@@ -83,8 +70,7 @@ def base_clauses(task: Task, relations: tuple[str, ...]) -> tuple[Clause, ...]:
             for relation in relations:
                 if relation == "around" and first != GRIPPER:
                     continue
-                for negated in (False, True):
-                    clauses.append(Clause(first, relation, second, negated))
+                clauses += [Clause(first, relation, second, negated) for negated in (False, True)]
     for thing in task.objects:
         if not thing.ours and thing.position in (places(FIRST), places(SECOND)):
             clauses += [Clause(thing.name, TOUCHING), Clause(thing.name, TOUCHING, negated=True)]
@@ -101,16 +87,12 @@ def _supported(task: Task, relations: tuple[str, ...]) -> tuple[str, ...]:
 def supported_queries(task: str | Task, published_only: bool = False) -> tuple[str, ...]:
     """The base queries of a task, in canonical spelling.
 
-    :func:`parse_query` answers more: any relation between two different objects, "touching the table" for any
-    object, the negations of open and closed, and conjunctions of all these.
+    :func:`parse_query` reads more: any relation between two different objects, "touching the table" for any object,
+    the negations of open and closed, and conjunctions of all these.
 
     Args:
         task: a task or its name.
-        published_only: leave out the points that we named, and relations that were added; what remains is the
-            published enumeration.
-
-    Raises:
-        ValueError: the task is unknown.
+        published_only: the paper's queries alone, without the points that we named and relations that were added.
 
     Example:
         >>> len(supported_queries("reach")), supported_queries("reach")[0]
@@ -125,11 +107,11 @@ def _cut(text: str, most: int = 80) -> str:
 
 
 class _ClauseParser:
-    """Reads one clause from left to right; every failure says at which word."""
+    """Reads one clause from left to right; an error points at the word."""
 
     def __init__(self, words: Sequence[str], task: Task, text: str, explain: bool) -> None:
         self.words, self.task, self.text, self.explain, self.at = words, task, text, explain, 0
-        self.inferred = ""  # of a clause that leaves its subject out, what it says by that
+        self.inferred = ""  # "the puck is", of a clause that leaves its subject out
         self.names = {name: name for name in task.object_names}
         self.names.update({alias: name for alias, name in _ALIASES.items() if alias not in self.names})
 
@@ -145,15 +127,15 @@ class _ClauseParser:
         )
 
     def comparable(self) -> tuple[str, ...]:
-        """The queries to find the nearest of; where a task has many objects, of those that the text may mean."""
+        """The queries to compare with; if a task has many objects, those of objects that the text may mean."""
         named = self.task.object_names
-        if len(named) > _MOST_COMPARED:
-            said = (self.inferred + " ".join(self.words))[:300]
-            found = process.extract(said, named[1:], scorer=fuzz.partial_ratio, limit=_MOST_COMPARED - 1)
-            kept = {GRIPPER, *(name for name, _, _ in found)}
-            fewer = replace(self.task, objects=tuple(one for one in self.task.objects if one.name in kept))
-            return tuple(map(str, base_clauses(fewer, tuple(RELATIONS))))
-        return supported_queries(self.task)
+        if len(named) <= _MOST_COMPARED:
+            return supported_queries(self.task)
+        said = (self.inferred + " ".join(self.words))[:300]
+        found = process.extract(said, named[1:], scorer=fuzz.partial_ratio, limit=_MOST_COMPARED - 1)
+        kept = {GRIPPER, *(name for name, _, _ in found)}
+        fewer = replace(self.task, objects=tuple(one for one in self.task.objects if one.name in kept))
+        return tuple(map(str, base_clauses(fewer, tuple(RELATIONS))))
 
     def take(self, phrase: str) -> bool:
         words = phrase.split()
@@ -218,30 +200,27 @@ class _ClauseParser:
 def parse_query(text: str, task: str | Task) -> Query:
     """Read an English condition about a state of ``task``.
 
+    Questions, capitals, articles or none, "the gripper", "isn't" are accepted, and clauses without the repeated subject
+    ("... is open and not above the puck").
+
     Args:
-        text: "Is the gripper open and not above the puck?", or any other accepted spelling.
+        text: "Is the gripper open and not above the puck?", or any other accepted spelling, of at most 64 clauses.
         task: the task whose objects the query names.
 
-    Returns:
-        The query; ``str(query)`` is its canonical spelling, and parses to the same query.
-
     Raises:
-        QueryError: (a ValueError) the text is no query of the task; it points at the word and names the nearest
-            query. Or it has more than 64 clauses.
-        TypeError: ``text`` is no string.
+        QueryError: (a ValueError) the text is no query of the task; it points at the word and names the nearest query.
 
     Example:
         >>> str(parse_query("the gripper above the puck", task="push"))
         "the robot's gripper is above the puck"
+
+    Source: paper section 'Query Answering Function'.
     """
-    if not isinstance(text, str):
-        raise TypeError(f"text must be a string, got {text!r} ({type(text).__name__})")
     return _parse(text, get_task(task), explain=True)
 
 
 def read_query(text: str, task: Task) -> Query | None:
-    """As :func:`parse_query`, and None for a text that is no query: looking for the nearest one takes most of the
-    time of an error."""
+    """As :func:`parse_query`, but None for a text that is no query: most of an error's time goes to the nearest."""
     try:
         return _parse(text, task, explain=False)
     except QueryError:

@@ -13,8 +13,7 @@ from torch import Tensor, nn
 from lw_torchrl._checks import check_choice, checked, shown
 from lw_torchrl.language.observation import OBSERVATION_SIZE
 from lw_torchrl.language.queries import Query, check_query
-from lw_torchrl.language.query_facts import compile_facts
-from lw_torchrl.language.query_tables import QueryTables, compile_queries
+from lw_torchrl.language.query_tables import QueryTables, compile_facts, compile_queries
 from lw_torchrl.language.task_index import TaskIndex, TaskTables
 from lw_torchrl.language.tasks import TASKS, Task, get_task
 from lw_torchrl.language.value_checks import check_finite
@@ -25,7 +24,7 @@ _COMPILED = {torch.float32: np.float32, torch.float64: np.float64}
 
 @cache
 def find_kernel() -> Callable[..., bool] | None:
-    """What answers in one compiled pass, where Numba is installed and can compile."""
+    """The kernel of one compiled pass, if Numba is installed and can compile."""
     try:
         from lw_torchrl.language.query_kernel import answer
     except (ImportError, RuntimeError):  # the latter where it finds no folder to keep what it compiled
@@ -37,8 +36,7 @@ class QueryProgram(nn.Module):
     """Queries compiled once, answered for any batch of mixed tasks in one call.
 
     Its tables are buffers that are not saved and keep their precision. With Numba installed (``lw_torchrl[fast]``) a
-    batch on the processor is answered by a loop that Numba compiles, with the same bits; the first call of an
-    installation waits about a second for it.
+    compiled loop answers batches on the CPU, with the same bits; its first call takes about a second to compile.
 
     Args:
         queries: task name (or :class:`Task`) to its queries, each a :class:`Query` or any accepted spelling.
@@ -48,8 +46,7 @@ class QueryProgram(nn.Module):
         num_queries: S, the length of the longest list.
 
     Raises:
-        ValueError: an unknown task, the same task twice, a text outside the query language, or a task without
-            queries.
+        ValueError: an unknown task or one given twice, a text outside the query language, a task without queries.
 
     Example:
         >>> import torch
@@ -107,7 +104,7 @@ class QueryProgram(nn.Module):
             task_id: (...) int64.
 
         Returns:
-            (..., S) bool on the observation's device, on the order of the task's list; padding is false.
+            (..., S) bool on the observation's device, in the order of the task's list; padding is false.
 
         Raises:
             ValueError: wrong shape or dtype, NaN or infinity in the observation, or a task without queries.
@@ -126,9 +123,9 @@ class QueryProgram(nn.Module):
         """Soft truth: how far each query is from changing its truth, differentiable in the observation.
 
         A comparison's margin is the distance to its threshold, divided by its temperature (see
-        :class:`~lw_torchrl.language.relations.Comparison`); a conjunction has the least margin of its parts, a
-        negation the opposite one. The sign is the hard truth: positive where the query holds, negative where it does
-        not, never zero. The gradient is that of the comparison that decides; it is finite everywhere.
+        :class:`~lw_torchrl.language.relations.Comparison`). A conjunction has the least margin of its parts, a
+        negation the opposite one. The sign is the hard truth, never zero: positive where the query holds. The
+        gradient is that of the comparison that decides; it is finite everywhere.
 
         Args:
             observation: (..., 39) float, Meta-World's vector, metres.
@@ -163,7 +160,7 @@ class QueryProgram(nn.Module):
         return soft - soft.detach() + torch.where(holds, size, -size)
 
     def _kernel(self, observation: Tensor, task_id: Tensor) -> Callable[..., bool] | None:
-        """What answers this batch in one compiled pass, if anything can."""
+        """The kernel, if it can answer this batch."""
         here = observation.dtype in self._facts and observation.is_cpu and task_id.is_cpu
         if here and self._tables.plain(observation, task_id) and not observation.is_neg():
             return find_kernel()
@@ -185,8 +182,7 @@ class QueryProgram(nn.Module):
         return atoms.gather(1, tables.atoms).unflatten(1, (-1, *tables.negated.shape[1:])).unbind(1)
 
     def _values(self, observation: Tensor, tables: QueryTables, floor: float = 0.0) -> Tensor:
-        """What each atom compares, (B, A) metres. The length of nothing has no gradient: ``floor`` keeps away from
-        it."""
+        """What each atom compares, (B, A) metres; a length of 0 has no gradient, so ``floor`` bounds it from below."""
         numbers = torch.cat((observation.reshape(-1, OBSERVATION_SIZE), tables.constants), 1)
         d = (numbers.gather(1, tables.first) - numbers.gather(1, tables.second)).unflatten(1, (3, -1)) + tables.shift
         x, y, z = d.unbind(1)
@@ -200,16 +196,11 @@ class QueryProgram(nn.Module):
 def _check_batch(observation: Tensor, task_id: Tensor) -> None:
     for name, given in (("observation", observation), ("task_id", task_id)):
         if not isinstance(given, Tensor):
-            raise TypeError(
-                f"{name} must be a tensor, got {type(given).__name__}; torch.as_tensor makes one of an array"
-            )
-    if observation.shape[-1:] != (OBSERVATION_SIZE,) or not observation.is_floating_point():
+            raise TypeError(f"{name} must be a tensor, got {type(given).__name__}; torch.as_tensor makes one")
+    shape, ids = tuple(observation.shape), tuple(task_id.shape)
+    if shape[-1:] != (OBSERVATION_SIZE,) or not observation.is_floating_point():
         raise ValueError(
-            f"observation must be float of shape (..., {OBSERVATION_SIZE}), got {observation.dtype} of shape "
-            f"{tuple(observation.shape)}"
+            f"observation must be float of shape (..., {OBSERVATION_SIZE}), got {observation.dtype} of shape {shape}"
         )
-    if task_id.shape != observation.shape[:-1] or task_id.dtype not in (torch.int64, torch.int32):
-        raise ValueError(
-            f"task_id must be int64 of shape {tuple(observation.shape[:-1])}, one per observation, got "
-            f"{task_id.dtype} of shape {tuple(task_id.shape)}"
-        )
+    if ids != shape[:-1] or task_id.dtype not in (torch.int64, torch.int32):
+        raise ValueError(f"task_id must be int64 of shape {shape[:-1]}, got {task_id.dtype} of shape {ids}")

@@ -1,33 +1,87 @@
-"""Queries compiled to tables of comparisons: what :class:`~lw_torchrl.QueryProgram` answers from."""
+"""What :class:`~lw_torchrl.QueryProgram` answers from: queries compiled to tensors, and to bits for its kernel."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from lw_torchrl.language.named_objects import TypedPosition, coordinate_index, typed
 from lw_torchrl.language.observation import OPENING
 from lw_torchrl.language.queries import Clause, Query
 from lw_torchrl.language.relations import PREDICATES, Comparison
-from lw_torchrl.language.tasks import Task
+from lw_torchrl.language.tasks import MT50, Task, task_id
 
-# Of the origin and itself, the padding of the tables: far from changing its truth at any temperature.
-_ALWAYS = Comparison("xyz", "<", 1e4, temperature=1e-6)
-_NEVER = Comparison("xyz", "<", -1e4, temperature=1e-6)
 
-Atom = tuple[TypedPosition, TypedPosition, tuple[float, float, float], Comparison]
-_NO_SHIFT = (0.0, 0.0, 0.0)
+class Atom(NamedTuple):
+    """A comparison of two positions. Where its sense is not "<", the opposite of its value is compared."""
+
+    first: TypedPosition
+    second: TypedPosition
+    shift: tuple[float, float, float]  # metres, added to first - second
+    part: Comparison
+
+    def coordinates(self, side: int, constants: list[float]) -> list[int]:
+        """Where the coordinates of one position stand; those of 0 for an axis left out."""
+        position = (self.first, self.second)[side if self.part.sense == "<" else 1 - side]
+        used = [c if axis in self.part.axes else 0.0 for axis, (_, c) in zip("xyz", position, strict=True)]
+        return [coordinate_index(c, constants) for c in used]
+
+    @property
+    def _sign(self) -> int:
+        return 1 if self.part.sense == "<" else -1
+
+    @property
+    def offset(self) -> list[float]:
+        """What is added to the difference of the positions, metres."""
+        moved = (self.shift[0], self.shift[1], self.shift[2] + self.part.raise_z)
+        return [
+            self._sign * metres if axis in self.part.axes else 0.0 for axis, metres in zip("xyz", moved, strict=True)
+        ]
+
+    @property
+    def threshold(self) -> float:
+        """The atom's value is below it where it holds, metres."""
+        return self.part.threshold * self._sign
+
+    @property
+    def far(self) -> bool:
+        """Whether the opposite of a length is compared."""
+        return self.part.length and self.part.sense != "<"
+
+    @property
+    def flipped(self) -> bool:
+        """Whether the atom holds where its value is not below the threshold."""
+        return self.part.sense == "<="
 
 
 _ORIGIN = typed((0.0, 0.0, 0.0))
+_NO_SHIFT = (0.0, 0.0, 0.0)
+# Of the origin and itself, the padding of the tables: far from changing its truth at any temperature.
+_ALWAYS = Atom(_ORIGIN, _ORIGIN, _NO_SHIFT, Comparison("xyz", "<", 1e4, temperature=1e-6))
+_NEVER = Atom(_ORIGIN, _ORIGIN, _NO_SHIFT, Comparison("xyz", "<", -1e4, temperature=1e-6))
+
+
+def clause_atoms(clause: Clause, task: Task) -> list[Atom]:
+    """The atoms that must all hold for a clause without its "not"."""
+    first, second, shift = typed((0.0, 0.0, OPENING)), _ORIGIN, _NO_SHIFT
+    if clause.predicate not in ("open", "closed"):
+        subject = task.object(clause.subject)
+        first, shift = typed(subject.position), subject.offset
+        if clause.object is not None:
+            other = task.object(clause.object)
+            second = typed(other.position)
+            x, y, z = (a - b for a, b in zip(shift, other.offset, strict=True))
+            shift = (x, y, z)
+    return [Atom(first, second, shift, part) for part in PREDICATES[clause.predicate]]
 
 
 class QueryTables(NamedTuple):
-    """A task's atoms (A), each a comparison of the difference of two positions, and which J atoms make up
-    each clause (K) of each query (S). The first dimension is of tasks (T) where compiled, of rows where selected."""
+    """A task's atoms (A), and which J of them make up each clause (K) of each query (S); of tasks (T), or of rows."""
 
     first: Tensor  # (T, 3*A) int64, index of each coordinate of the first position; of 0 for an axis left out
     second: Tensor  # (T, 3*A) int64
@@ -42,63 +96,6 @@ class QueryTables(NamedTuple):
     constants: Tensor  # (T, C) float64, read as if they followed the observation
 
 
-def clause_atoms(clause: Clause, task: Task) -> list[Atom]:
-    first, second = typed((0.0, 0.0, OPENING)), _ORIGIN
-    shift = _NO_SHIFT
-    if clause.predicate not in ("open", "closed"):
-        subject = task.object(clause.subject)
-        first, shift = typed(subject.position), subject.offset
-        if clause.object is not None:
-            other = task.object(clause.object)
-            second = typed(other.position)
-            x, y, z = (a - b for a, b in zip(shift, other.offset, strict=True))
-            shift = (x, y, z)
-    return [(first, second, shift, part) for part in PREDICATES[clause.predicate]]
-
-
-def atom_index(atom: Atom, side: int, constants: list[float]) -> list[int]:
-    """Where the coordinates of an atom's first or second position stand; those of 0 for an axis left out."""
-    first, second, _, part = atom
-    position = (first, second)[side if part.sense == "<" else 1 - side]
-    used = [c if axis in part.axes else 0.0 for axis, (_, c) in zip("xyz", position, strict=True)]
-    return [coordinate_index(c, constants) for c in used]
-
-
-def atom_shift(atom: Atom) -> list[float]:
-    """What is added to the difference of an atom's positions, metres."""
-    *_, shift, part = atom
-    sign = 1.0 if part.sense == "<" else -1.0
-    moved = (shift[0], shift[1], shift[2] + part.raise_z)
-    return [sign * metres if axis in part.axes else 0.0 for axis, metres in zip("xyz", moved, strict=True)]
-
-
-def is_far(atom: Atom) -> bool:
-    """Whether the opposite of the atom's length is compared."""
-    return atom[3].length and atom[3].sense != "<"
-
-
-def atom_threshold(atom: Atom) -> float:
-    """What the atom's value is below where it holds, metres."""
-    return atom[3].threshold * (1 if atom[3].sense == "<" else -1)
-
-
-def is_flipped(atom: Atom) -> bool:
-    """Whether the atom holds where its value is not below the threshold."""
-    return atom[3].sense == "<="
-
-
-def _task_atoms(task: Task, queries: Sequence[Query], steps: int, width: int) -> tuple[list[Atom], list, list]:
-    """The atoms of one task, each once; those of each clause (steps, width, J); what is negated (steps, width)."""
-    clauses = [[(clause_atoms(clause, task), clause.negated) for clause in query.clauses] for query in queries]
-    clauses += [[([(_ORIGIN, _ORIGIN, _NO_SHIFT, _NEVER)], False)]] * (steps - len(queries))
-    always = (_ORIGIN, _ORIGIN, _NO_SHIFT, _ALWAYS)
-    padded = [[*listed, *[([], False)] * (width - len(listed))] for listed in clauses]
-    atoms = dict.fromkeys([always, *(atom for listed in padded for found, _ in listed for atom in found)])
-    place = {atom: number for number, atom in enumerate(atoms)}
-    places = [[[place[atom] for atom in found] for found, _ in row] for row in padded]
-    return list(atoms), places, [[negated for _, negated in row] for row in padded]
-
-
 def compile_queries(queries: Mapping[Task, Sequence[Query]]) -> QueryTables:
     """The tables of the queries of tasks, which have a row for each task, in the mapping's order."""
     steps = max(map(len, queries.values()))
@@ -107,7 +104,7 @@ def compile_queries(queries: Mapping[Task, Sequence[Query]]) -> QueryTables:
     most = max(len(atoms) for atoms, _, _ in found)
     parts = max(2, *(len(each) for _, places, _ in found for row in places for each in row))
     filled = [[[[*each, *[0] * (parts - len(each))] for each in row] for row in places] for _, places, _ in found]
-    listed = [atoms + [(_ORIGIN, _ORIGIN, _NO_SHIFT, _ALWAYS)] * (most - len(atoms)) for atoms, _, _ in found]
+    listed = [atoms + [_ALWAYS] * (most - len(atoms)) for atoms, _, _ in found]
     constants = [0.0]
 
     def table(value: Callable[[Atom], Any], dtype: torch.dtype = torch.int64) -> Tensor:
@@ -115,15 +112,120 @@ def compile_queries(queries: Mapping[Task, Sequence[Query]]) -> QueryTables:
         return values.movedim(1, -1).contiguous()
 
     return QueryTables(
-        first=table(lambda atom: atom_index(atom, 0, constants)).flatten(1),
-        second=table(lambda atom: atom_index(atom, 1, constants)).flatten(1),
-        shift=table(atom_shift, torch.float64),
-        length=table(lambda atom: atom[3].length, torch.bool),
-        far=table(is_far, torch.bool),
-        threshold=table(atom_threshold, torch.float64),
-        flipped=table(is_flipped, torch.bool),
-        temperature=table(lambda atom: atom[3].temperature, torch.float64),
+        first=table(lambda atom: atom.coordinates(0, constants)).flatten(1),
+        second=table(lambda atom: atom.coordinates(1, constants)).flatten(1),
+        shift=table(lambda atom: atom.offset, torch.float64),
+        length=table(lambda atom: atom.part.length, torch.bool),
+        far=table(lambda atom: atom.far, torch.bool),
+        threshold=table(lambda atom: atom.threshold, torch.float64),
+        flipped=table(lambda atom: atom.flipped, torch.bool),
+        temperature=table(lambda atom: atom.part.temperature, torch.float64),
         atoms=torch.tensor(filled).permute(0, 3, 2, 1).flatten(1),
         negated=torch.tensor([negated for _, _, negated in found]).transpose(1, 2).contiguous(),
         constants=torch.tensor([constants] * len(listed), dtype=torch.float64),
+    )
+
+
+def _task_atoms(task: Task, queries: Sequence[Query], steps: int, width: int) -> tuple[list[Atom], list, list]:
+    """The atoms of one task, each once; those of each clause (steps, width, J); what is negated (steps, width)."""
+    clauses = [[(clause_atoms(clause, task), clause.negated) for clause in query.clauses] for query in queries]
+    clauses += [[([_NEVER], False)]] * (steps - len(queries))
+    padded = [[*listed, *[([], False)] * (width - len(listed))] for listed in clauses]
+    atoms = dict.fromkeys([_ALWAYS, *(atom for listed in padded for found, _ in listed for atom in found)])
+    place = {atom: number for number, atom in enumerate(atoms)}
+    places = [[[place[atom] for atom in found] for found, _ in row] for row in padded]
+    return list(atoms), places, [[negated for _, negated in row] for row in padded]
+
+
+MOST_FACTS = 63  # of a task; the last bit of 64 is never true
+_FALSE = 1 << MOST_FACTS
+Bits = NDArray[np.uint64]
+
+
+class QueryFacts(NamedTuple):
+    """The facts (F) of all tasks, one after another: a task's comparisons of lengths, then those of one coordinate;
+    then its conjunctions (D). A query holds where the bits of its task's facts that it cares for are those it wants."""
+
+    ids: NDArray[np.int64]  # (T,), of the tasks, ascending
+    row_of: NDArray[np.int64]  # (50,), the row of each of the 50 tasks, -1 for one without
+    ends: Bits  # (T, 5): a task's lengths begin and end, its coordinates end, its conjunctions begin and end
+    places: Bits  # (F, 6), of x, y and z of both positions in turn; of a coordinate's, the first two alone
+    metres: NDArray[np.floating[Any]]  # (F, 5): the shift along x, y and z, the length's sign, the threshold
+    bit: Bits  # (F,)
+    flipped: Bits  # (T,)
+    conjunction: Bits  # (D, 2): the bits that must be true, and the bit that this makes true
+    care: Bits  # (T, S)
+    want: Bits  # (T, S)
+    constants: NDArray[np.floating[Any]]  # (C,), read as if they followed the observation
+
+    def of(self, dtype: Any) -> QueryFacts:
+        """The same for observations of another precision."""
+        return self._replace(metres=self.metres.astype(dtype), constants=self.constants.astype(dtype))
+
+
+def _task_facts(task: Task, queries: Sequence[Query]) -> tuple[dict[Atom, int], dict[int, int], list[tuple[int, int]]]:
+    """The places of a task's atoms; the bit that says that all atoms of some bits hold; and of each query the bits that
+    it cares for, and which of them must be true."""
+    places: dict[Atom, int] = {}
+
+    def bits(clause: Clause) -> int:
+        return sum({1 << places.setdefault(atom, len(places)) for atom in clause_atoms(clause, task)})
+
+    asked = [[(bits(clause), clause.negated) for clause in query.clauses] for query in queries]
+    conjunctions: dict[int, int] = {}
+    literals = []
+    for clauses in asked:
+        true = false = 0
+        for together, negated in clauses:
+            if not negated:
+                true |= together
+            elif together.bit_count() == 1:
+                false |= together
+            else:
+                false |= conjunctions.setdefault(together, 1 << len(places) + len(conjunctions))
+        literals.append((_FALSE, _FALSE) if true & false else (true | false, true))
+    return places, conjunctions, literals
+
+
+def compile_facts(queries: Mapping[Task, Sequence[Query]]) -> QueryFacts | None:
+    """The facts of the queries of tasks, in the order of their ids; None where a task has too many for 64 bits."""
+    ids = [task_id(task.name) for task in queries]
+    row_of = np.full(len(MT50), -1)
+    for row, number in enumerate(ids):
+        if number < len(MT50):
+            row_of[number] = row
+    tasks = [_task_facts(task, listed) for task, listed in queries.items()]
+    if max(len(atoms) + len(together) for atoms, together, _ in tasks) > MOST_FACTS:
+        return None
+    constants = [0.0]
+    places: list[list[int]] = []
+    conjunctions: list[tuple[int, int]] = []
+    ends, metres, bits, flipped = [], [], [], []
+    for atoms, together, _ in tasks:
+        begin = len(places)
+        for atom in sorted(atoms, key=lambda atom: not atom.part.length):
+            first, second = (atom.coordinates(side, constants) for side in (0, 1))
+            axes = [0, 1, 2] if atom.part.length else ["xyz".index(atom.part.axes)] * 3
+            places.append([place for axis in axes for place in (first[axis], second[axis])])
+            metres.append([*(atom.offset[axis] for axis in axes), -1.0 if atom.far else 1.0, atom.threshold])
+            bits.append(atoms[atom])
+        lengths = sum(atom.part.length for atom in atoms)
+        flipped.append(sum(1 << bit for atom, bit in atoms.items() if atom.flipped))
+        ends.append([begin, begin + lengths, len(places), len(conjunctions), len(conjunctions) + len(together)])
+        conjunctions += together.items()
+    steps = max(len(literals) for *_, literals in tasks)
+    padded = [literals + [(_FALSE, _FALSE)] * (steps - len(literals)) for *_, literals in tasks]
+    care, want = np.moveaxis(np.array(padded, np.uint64), 2, 0)
+    return QueryFacts(
+        ids=np.array(ids),
+        row_of=row_of,
+        ends=np.array(ends, np.uint64),
+        places=np.array(places, np.uint64),
+        metres=np.array(metres),
+        bit=np.array(bits, np.uint64),
+        flipped=np.array(flipped, np.uint64),
+        conjunction=np.array(conjunctions, np.uint64).reshape(-1, 2),
+        care=np.ascontiguousarray(care),
+        want=np.ascontiguousarray(want),
+        constants=np.array(constants),
     )

@@ -1,9 +1,4 @@
-"""What the relations mean: each is comparisons, one or more, on d = first position - second position, in metres.
-
-The unary predicates fit the same form with the origin as second position: "touching the table" compares the z
-of an object, "open" and "closed" the gripper's opening, put in place of z.
-Source: paper section 'Query Answering Function'; the thresholds are the published ones.
-"""
+"""What the relations mean: comparisons of d = first position - second position, in metres."""
 
 from __future__ import annotations
 
@@ -33,8 +28,8 @@ class Comparison:
         temperature: of the soft truth, metres (or shares of the gripper's opening) to one logit.
 
     Raises:
-        ValueError: axes that are none of x, y, z, each once; a signed coordinate of several axes; another sense; a
-            threshold that is no finite number, or a temperature that is not above 0.
+        ValueError: other axes, a signed coordinate of several axes, another sense, a threshold that is no finite
+            number, or a temperature that is not above 0.
     """
 
     axes: str
@@ -71,28 +66,24 @@ def _within(axes: str, radius: float, raise_z: float = 0.0) -> Comparison:
     return Comparison(axes, "<", radius, raise_z=raise_z)
 
 
-def _more(axis: str, threshold: float) -> Comparison:
-    return Comparison(axis, ">", threshold, length=False)
-
-
-def _less(axis: str, threshold: float) -> Comparison:
-    return Comparison(axis, "<", threshold, length=False)
+def _along(axis: str, sense: Literal["<", ">", "<="], threshold: float, temperature: float = 0.01) -> Comparison:
+    return Comparison(axis, sense, threshold, length=False, temperature=temperature)
 
 
 TOUCHING = "touching the table"
 UNARY = MappingProxyType(
     {
-        TOUCHING: (Comparison("z", "<=", 0.02, length=False),),
-        "open": (Comparison("z", ">", 0.75, length=False, temperature=0.05),),
-        "closed": (Comparison("z", "<=", 0.75, length=False, temperature=0.05),),
+        TOUCHING: (_along("z", "<=", 0.02),),
+        "open": (_along("z", ">", 0.75, temperature=0.05),),
+        "closed": (_along("z", "<=", 0.75, temperature=0.05),),
     }
 )
-"""The predicates of one object; "open" and "closed" are the gripper's."""
+"""The predicates of one object, with the origin as second position: "touching the table" compares the object's z,
+"open" and "closed" the gripper's opening in place of z."""
 
 
 class Relations(UserDict[str, tuple[Comparison, ...]]):
-    """Relations by name, to which others may be added; one whose name or meaning the query language cannot hold is a
-    ValueError."""
+    """Relations by name, to which others may be added; a name that a query cannot hold is a ValueError."""
 
     def __setitem__(self, name: str, parts: tuple[Comparison, ...]) -> None:
         words = name.split() if isinstance(name, str) else []
@@ -109,40 +100,35 @@ RELATIONS = Relations(
     {
         "near": (_within("xyz", 0.04),),
         "around": (_within("xyz", 0.03, raise_z=0.02),),
-        "left of": (_more("x", 0.04),),
-        "right of": (_less("x", -0.04),),
-        "behind": (_more("y", 0.04), _within("xz", 0.04)),
-        "in front of": (_less("y", -0.04), _within("xz", 0.04)),
-        "above": (_within("xy", 0.02), _more("z", 0.0)),
-        "below": (_within("xy", 0.02), _less("z", 0.0)),
+        "left of": (_along("x", ">", 0.04),),
+        "right of": (_along("x", "<", -0.04),),
+        "behind": (_along("y", ">", 0.04), _within("xz", 0.04)),
+        "in front of": (_along("y", "<", -0.04), _within("xz", 0.04)),
+        "above": (_within("xy", 0.02), _along("z", ">", 0.0)),
+        "below": (_within("xy", 0.02), _along("z", "<", 0.0)),
         "vertically aligned with": (_within("xy", 0.06),),
         "almost vertically aligned with": (_within("xy", 0.12),),
-        "mostly below": (_less("z", 0.23),),
+        "mostly below": (_along("z", "<", 0.23),),
         "horizontally aligned with": (_within("yz", 0.03),),
         "forward aligned with": (_within("xz", 0.03),),
     }
 )
-"""The relations between two objects: the 13 published ones, and those that you add (docs/queries.md shows how)."""
-PUBLISHED = tuple(RELATIONS)
-"""The names of the 13."""
+"""The relations between two objects: the 13 published ones, and those that you add (docs/queries.md shows how).
+
+Source: paper section 'Query Answering Function'; the thresholds are the published ones.
+"""
+PUBLISHED = (
+    "near", "around", "left of", "right of", "behind", "in front of", "above", "below", "vertically aligned with",
+    "almost vertically aligned with", "mostly below", "horizontally aligned with", "forward aligned with",
+)  # fmt: skip
+"""The names of the paper's 13, whatever else :data:`RELATIONS` holds."""
 
 PREDICATES = ChainMap[str, tuple[Comparison, ...]](UNARY, RELATIONS)  # type: ignore[arg-type]
-"""All that a clause can say: the relations, then the predicates of one object; it sees what is added to
-:data:`RELATIONS`."""
+"""All that a clause can say: the relations, also those that are added, then the predicates of one object."""
 
 
 def relation_holds(relation: str, first: Tensor, second: Tensor) -> Tensor:
-    """Whether ``relation`` holds between positions.
-
-    Args:
-        relation: one of :data:`RELATIONS`.
-        first, second: (..., 3) float, metres; they broadcast.
-
-    Returns:
-        (...) bool.
-
-    Raises:
-        ValueError: the relation is unknown (with the nearest name).
+    """Whether one of :data:`RELATIONS` holds between two positions: (..., 3) float, metres, to (...) bool.
 
     Example:
         >>> import torch

@@ -1,8 +1,4 @@
-"""Roles: which thing each step of a plan is to bring where.
-
-A step has a *target*, the object or point to go to, and a thing that is *moved* there: the robot's gripper, or what it
-holds or pushes. Who knows them knows where a step leads without knowing the task.
-"""
+"""Roles: which thing each step of a plan moves (the gripper, or what it holds or pushes) to which target."""
 
 from __future__ import annotations
 
@@ -27,40 +23,32 @@ _TOOL = re.compile(r"(?<!in line )(?<!level )(?<!aligned )\bwith (the )?(?=<)")
 
 @dataclass(frozen=True)
 class Roles:
-    """What a step is about.
+    """What a step is about."""
 
-    Attributes:
-        target: the object or point to go to; None where nothing tells.
-        moved: what is to arrive there, the robot's gripper or a thing; None where nothing tells.
-        source: what told: "skill", the text is a scripted skill's; "words", those of the text; "condition", the things
-            that the condition compares; "nothing".
-    """
-
-    target: str | None
-    moved: str | None
-    source: Source
+    target: str | None  # the object or point to go to; None if unknown
+    moved: str | None  # what is to arrive there, the robot's gripper or a thing; None if unknown
+    source: Source  # what told it: a scripted skill, the step's text, or what the condition compares
 
 
 _NOTHING = Roles(None, None, "nothing")
 
 
 def role_object(task: Task, name: str) -> NamedObject:
-    """The object of a role: the task's, or the goal, which every observation tells, as "target location"."""
+    """The object of a role: the task's, or the goal as "target location", which every observation has."""
     return _GOAL if name == _TARGET and name not in task.object_names else task.object(name)
 
 
 def plan_roles(plan: ConditionalPlan, skills: Mapping[str, ScriptedSkill] | None = None) -> tuple[Roles, ...]:
     """The roles of each step of a plan.
 
-    Where the text is a scripted skill's that the task may use, the skill's ``target`` and ``moved`` count; nothing else
-    of skills is read, neither offsets nor gains nor efforts. Otherwise the text's own words tell. Where they name
-    nothing of the task ("close the gripper around the puck" for a mug), the condition tells. Where the gripper goes to
-    a thing and the condition compares it with a point on that thing, the point is the target. Where the text moves a
-    thing that the condition says is held, the thing is moved, though a script steers the gripper. "the target location"
-    is the goal in every task, also in one that has no object there.
+    If the text is that of a scripted skill for the task, the skill's ``target`` and ``moved`` count, and nothing else
+    of it. Otherwise the words of the text decide; if they name nothing of the task ("close the gripper around the puck"
+    for a mug), the condition does. If the gripper goes to a thing and the condition compares it with a point on that
+    thing, the point is the target. If the text moves a thing that the condition says is held, the thing is moved,
+    though a script steers the gripper. "the target location" is the goal in every task.
 
     Args:
-        plan: a shipped one or yours; its ``definition`` says which objects and points there are.
+        plan: the plan; its ``definition`` says which objects and points there are.
         skills: the scripted skills by their text; None for the shipped ones, an empty mapping for words alone.
 
     Example:
@@ -71,14 +59,12 @@ def plan_roles(plan: ConditionalPlan, skills: Mapping[str, ScriptedSkill] | None
         robot's gripper -> mug rim
         mug -> target location
     """
-    allowed = skills_for(plan.definition, skills)
-    return tuple(_roles(step, plan.definition, allowed) for step in plan.steps)
-
-
-def _roles(step: PlanStep, task: Task, skills: Mapping[str, ScriptedSkill]) -> Roles:
-    found = _of_skill(step, task, skills) or _of_words(step, task)
-    found = _carried(found or _of_condition(step) or _NOTHING, step, task)
-    return replace(found, target=_point(found, step, task))
+    task, allowed, found = plan.definition, skills_for(plan.definition, skills), []
+    for step in plan.steps:
+        roles = _of_skill(step, task, allowed) or _of_words(step, task) or _of_condition(step) or _NOTHING
+        roles = _carried(roles, step, task)
+        found.append(replace(roles, target=_point(roles, step, task)))
+    return tuple(found)
 
 
 def _of_skill(step: PlanStep, task: Task, skills: Mapping[str, ScriptedSkill]) -> Roles | None:
@@ -143,8 +129,7 @@ def _of_condition(step: PlanStep) -> Roles | None:
 
 
 def _carried(roles: Roles, step: PlanStep, task: Task) -> Roles:
-    """The roles, or, where the gripper is at a thing already, what the text says is done with it: it is brought to the
-    goal, or, held, to the target."""
+    """The roles; if the gripper is at a thing already, the text may bring that to the goal, or, held, to the target."""
     at = [name for name in _compared(step, gripper=True) if _holds(step, "near", name)]
     if roles.moved != GRIPPER or roles.target is None or not at:
         return roles

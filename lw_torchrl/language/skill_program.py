@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from lw_torchrl._checks import unknown_name
+from lw_torchrl._checks import check_choice
 from lw_torchrl.language.named_objects import coordinate_index
 from lw_torchrl.language.observation import OBSERVATION_SIZE
 from lw_torchrl.language.skills import ScriptedSkill, load_skills
@@ -17,7 +17,7 @@ from lw_torchrl.language.tasks import Task, get_task
 
 
 class _Tables(NamedTuple):
-    """The skills (S) of a task; the first dimension is of tasks (T) where compiled, of rows where selected."""
+    """The skills (S) of each task; the first dimension is of tasks (T) where compiled, of rows where selected."""
 
     target: Tensor  # (T, 3*S) int64, index of each coordinate of where to
     moved: Tensor  # (T, 3*S) int64, of what is to arrive there
@@ -38,8 +38,8 @@ class SkillProgram(nn.Module):
         num_skills: S, the length of the longest list.
 
     Raises:
-        SkillError: (a ValueError) a skill speaks of objects that its task lacks.
-        ValueError: an unknown task or text (with the nearest).
+        SkillError: (a ValueError) a skill names objects that its task lacks.
+        ValueError: an unknown task or text, with the nearest.
 
     Example:
         >>> import torch
@@ -61,13 +61,13 @@ class SkillProgram(nn.Module):
             raise ValueError("skills must name at least one task, got an empty mapping")
         for name, listed in skills.items():
             if isinstance(listed, (str, ScriptedSkill)) or not listed:
-                raise ValueError(
-                    f"skills[{get_task(name).name!r}] must be a list of at least one skill, got {listed!r}"
-                )
-        found = {
-            get_task(task): [_look_up(skill, known).for_task(task) for skill in listed]
-            for task, listed in skills.items()
-        }
+                given = get_task(name).name
+                raise ValueError(f"skills[{given!r}] must be a list of at least one skill, got {listed!r}")
+
+        def look_up(skill: str | ScriptedSkill) -> ScriptedSkill:
+            return skill if isinstance(skill, ScriptedSkill) else known[check_choice("skill", skill, known)]
+
+        found = {get_task(task): [look_up(one).for_task(task) for one in listed] for task, listed in skills.items()}
         super().__init__()
         self.num_skills = max(map(len, found.values()))
         index = TaskIndex(task.name for task in found)
@@ -115,11 +115,3 @@ class SkillProgram(nn.Module):
         action = tables.effort.clone()
         action[..., :3] = shift.unflatten(1, (-1, 3))
         return action.reshape(*task_id.shape, self.num_skills, 4)
-
-
-def _look_up(skill: str | ScriptedSkill, table: Mapping[str, ScriptedSkill]) -> ScriptedSkill:
-    if isinstance(skill, ScriptedSkill):
-        return skill
-    if skill not in table:
-        raise unknown_name("skill", skill, table)
-    return table[skill]

@@ -1,26 +1,25 @@
-"""Scripted skills: stateless linear controllers with a name in plain English. The table itself is data/skills.toml."""
+"""Scripted skills: stateless linear controllers with a name in plain English. Their table is data/skills.toml."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from functools import cache, lru_cache
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
-from rapidfuzz import fuzz, process
-
-from lw_torchrl._checks import check_choice, checked, nearest, shown
+from lw_torchrl._checks import checked, nearest, shown
 from lw_torchrl._files import read_toml
 from lw_torchrl.language.named_objects import GRIPPER, is_number
 from lw_torchrl.language.tasks import TASKS, Task, check_task, get_task
 
 if TYPE_CHECKING:
-    from torch import Tensor
+    pass
+
 
 Triple = tuple[float, float, float]
 
@@ -31,22 +30,20 @@ class SkillError(ValueError):
 
 @dataclass(frozen=True)
 class ScriptedSkill:
-    """A linear controller: action xyz = clip(gain · (target + offset - moved), -1, 1), with a constant effort of the
-    gripper.
+    """A linear controller: action xyz = clip(gain · (target + offset - moved), -1, 1), with a constant gripper effort.
 
     Attributes:
         text: what it does, in plain English: "place the gripper above the puck".
         target: the object or point to go to; the robot's gripper makes the offset relative to the hand.
         moved: what is to arrive there: the robot's gripper, or an object that it holds or pushes.
         offset: added to the target, metres. x points to the robot's right, y away from it, z up.
-        gain: per axis, action per metre; 0 leaves an axis alone.
+        gain: per axis, at least 0, action per metre; 0 leaves an axis alone.
         gripper: effort in [-1, 1]; -1 opens, 1 closes.
         goal: the state it steers to, as a query of the tasks that it suits; "" where the language has no words for it.
         variants: task name to what differs there, any of the above but the text.
 
     Raises:
-        SkillError: (a ValueError) a number is not finite, a negative gain, an effort outside [-1, 1], a goal
-            that is no text, or a variant for an unknown task.
+        SkillError: (a ValueError) a number is not finite or out of range, or a name or the goal is no text.
 
     Example:
         >>> skill = ScriptedSkill("place the gripper above the puck", "puck", offset=(0.0, 0.0, 0.1), gripper=-1.0)
@@ -66,43 +63,45 @@ class ScriptedSkill:
     variants: Mapping[str, ScriptedSkill] = field(default_factory=dict, hash=False, repr=False)
 
     def __post_init__(self) -> None:
+        def check(name: str, allowed: str, holds: Callable[[Any], bool]) -> None:
+            if not holds(given := getattr(self, name)):
+                raise SkillError(f"{name} of skill {self.text!r} must {allowed}, got {shown(given)}")
+
         for name in ("target", "moved"):
-            if not isinstance(getattr(self, name), str):
-                raise SkillError(
-                    f"{name} of skill {self.text!r} must be the name of an object, got {shown(getattr(self, name))}"
-                )
+            check(name, "be the name of an object", lambda given: isinstance(given, str))
         for name in ("offset", "gain"):
-            numbers = getattr(self, name)
-            if not isinstance(numbers, (list, tuple)) or len(numbers) != 3 or not all(map(is_number, numbers)):
-                raise SkillError(f"{name} of skill {self.text!r} must be three numbers, got {shown(numbers)}")
-        if min(self.gain) < 0:
-            raise SkillError(f"gain of skill {self.text!r} must not be negative, got {self.gain!r}")
-        if not isinstance(self.goal, str):
-            raise SkillError(f"goal of skill {self.text!r} must be a query in words, got {shown(self.goal)}")
-        if not is_number(self.gripper) or not -1 <= self.gripper <= 1:
-            raise SkillError(f"gripper of skill {self.text!r} must lie in [-1, 1], got {shown(self.gripper)}")
+            check(name, "be three numbers", _is_triple)
+        check("gain", "not be negative", lambda given: min(given) >= 0)
+        check("goal", "be a query in words", lambda given: isinstance(given, str))
+        check("gripper", "lie in [-1, 1]", lambda given: is_number(given) and -1 <= given <= 1)
 
     def for_task(self, task: str | Task) -> ScriptedSkill:
-        """The skill as this task has it; :class:`SkillError` if it speaks of objects that the task lacks."""
+        """The skill as this task has it; :class:`SkillError` if it names objects that the task lacks."""
         found = get_task(task)
         skill = self.variants.get(found.name, self)
         for name in (skill.target, skill.moved):
             if name not in found.object_names:
-                close = nearest(name, found.object_names, n=1)
-                raise SkillError(
-                    f"skill {self.text!r} needs {name!r}, which task {found.name!r} lacks; it has "
-                    f"{', '.join(found.object_names)}" + (f"; did you mean {close[0]!r}?" if close else "")
-                )
+                lacks = f"needs {name!r}, which task {found.name!r} lacks; it has {', '.join(found.object_names)}"
+                raise SkillError(f"skill {self.text!r} {lacks}{_did_you_mean(name, found.object_names)}")
         return skill
 
     def suits(self, task: str | Task) -> bool:
-        """Whether the task has the objects that the skill speaks of."""
+        """Whether the task has the objects that the skill names."""
         found = get_task(task)
         skill = self.variants.get(found.name, self)
         return {skill.target, skill.moved} <= set(found.object_names)
 
 
 _KEYS = tuple(f.name for f in fields(ScriptedSkill) if f.name not in ("text", "variants"))
+
+
+def _is_triple(given: Any) -> bool:
+    return isinstance(given, (list, tuple)) and len(given) == 3 and all(map(is_number, given))
+
+
+def _did_you_mean(name: str, allowed: Iterable[str]) -> str:
+    close = nearest(name, allowed, n=1)
+    return f"; did you mean {close[0]!r}?" if close else ""
 
 
 def _skill(text: str, row: Any, source: str, tasks: Mapping[str, Task]) -> ScriptedSkill:
@@ -121,18 +120,13 @@ def _skill(text: str, row: Any, source: str, tasks: Mapping[str, Task]) -> Scrip
         variants[task] = _skill(text, {**given, **change}, f"{source}, for {task}", tasks)
     for key in given:
         if key not in _KEYS:
-            close = nearest(key, _KEYS, n=1)
-            raise SkillError(
-                f"{source}: skill {text!r} may have {', '.join(_KEYS)} and for, got {key!r}"
-                + (f"; did you mean {close[0]!r}?" if close else "")
-            )
+            allowed = f"may have {', '.join(_KEYS)} and for, got {key!r}{_did_you_mean(key, _KEYS)}"
+            raise SkillError(f"{source}: skill {text!r} {allowed}")
     if "target" not in given:
         raise SkillError(f"{source}: skill {text!r} must name a target")
     gain = given.get("gain", 10.0)
     given["gain"] = (gain,) * 3 if isinstance(gain, (int, float)) else gain
-    for key in ("gain", "offset"):
-        if isinstance(given.get(key), list):
-            given[key] = tuple(given[key])
+    given |= {key: tuple(given[key]) for key in ("gain", "offset") if isinstance(given.get(key), list)}
     try:
         return ScriptedSkill(text, **given, variants=MappingProxyType(variants))
     except SkillError as error:
@@ -161,8 +155,7 @@ def load_skills(
         tasks: whose names its ``for`` tables may have, as from :func:`~lw_torchrl.load_tasks`.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        SkillError: (a ValueError) it is no TOML in UTF-8, or a skill in it is malformed.
+        SkillError: (a ValueError) the file is no TOML in UTF-8, or a skill in it is malformed.
 
     Example:
         >>> load_skills()["place the gripper above the puck"].target
@@ -175,23 +168,16 @@ def load_skills(
 
 @lru_cache(maxsize=256)
 def _foreign_words(task: Task) -> frozenset[str]:
-    """The words for things of the 50 tasks that this one lacks. Points of things are none: "front", "center"."""
+    """The words for things of the 50 tasks that this one lacks; points of things ("front", "center") do not count."""
     own = {word for name in task.object_names for word in name.split()}
     return frozenset(thing.name.split()[-1] for one in TASKS.values() for thing in one.published.objects) - own
 
 
 def skills_for(task: Task, skills: Mapping[str, ScriptedSkill] | None = None) -> Mapping[str, ScriptedSkill]:
-    """The skills that a task may use, of the shipped ones if none are given: it has the objects that they speak of, and
-    their texts name nothing that other tasks have and it has not, or they have a variant for it."""
-    return _shipped_for(task) if skills is None else _for(task, skills)
-
-
-@lru_cache(maxsize=256)
-def _shipped_for(task: Task) -> Mapping[str, ScriptedSkill]:
-    return MappingProxyType(_for(task, _shipped()))
-
-
-def _for(task: Task, skills: Mapping[str, ScriptedSkill]) -> dict[str, ScriptedSkill]:
+    """The skills that a task may use, of the shipped ones if none are given: it has the objects that they name, and
+    their texts name nothing that only other tasks have, or they have a variant for it."""
+    if skills is None:
+        return _shipped_for(task)
     foreign = _foreign_words(task)
     return {
         text: skill
@@ -200,57 +186,6 @@ def _for(task: Task, skills: Mapping[str, ScriptedSkill]) -> dict[str, ScriptedS
     }
 
 
-@lru_cache(maxsize=64)
-def _vectors(texts: tuple[str, ...]) -> Tensor:
-    from lw_torchrl.language.text import encode_texts
-
-    return encode_texts(texts)
-
-
-@checked
-def nearest_skill(
-    text: str,
-    task: str | Task | None = None,
-    skills: Mapping[str, ScriptedSkill] | Iterable[str] | None = None,
-    by: Literal["edit", "embedding"] = "edit",
-) -> tuple[ScriptedSkill, float]:
-    """The scripted skill whose text is closest, and how close it is, in [0, 1].
-
-    Args:
-        text: what to do, in any words.
-        task: consider only skills whose objects this task has.
-        skills: to choose from; None for the shipped ones.
-        by: "edit", closest in spelling; "embedding", closest in meaning, by the sentence encoder.
-
-    Raises:
-        TypeError: ``text`` is no string.
-        SkillError: (a ValueError) no skill suits the task.
-        ValueError: another value for ``by``.
-        ImportError: by="embedding" without the extra ``[text]``.
-
-    Example:
-        >>> nearest_skill("put gripper above puck", task="push")[0].text
-        'place the gripper above the puck'
-
-    Source: paper section 'Conditional Plan Generation', which takes the nearest description.
-    """
-    if not isinstance(text, str):
-        raise TypeError(f"text must be a string, got {type(text).__name__}")
-    check_choice("by", by, ("edit", "embedding"))
-    table = _shipped() if skills is None else skills
-    if not isinstance(table, Mapping):
-        table = {check_choice("skills", name, _shipped()): _shipped()[name] for name in table}
-    for name, skill in table.items():
-        if not isinstance(skill, ScriptedSkill):
-            raise TypeError(f"skills[{name!r}] must be a ScriptedSkill, got {shown(skill)} ({type(skill).__name__})")
-    allowed = [name for name, skill in table.items() if task is None or skill.suits(task)]
-    if not allowed:
-        raise SkillError(f"no scripted skill suits task {task!r}")
-    said = " ".join(text.lower().replace("_", " ").split())
-    if by == "embedding":
-        from lw_torchrl.language.text import encode_texts
-
-        alike = _vectors(tuple(allowed)) @ encode_texts([said.encode("utf-8", "replace").decode()])[0]
-        return table[allowed[int(alike.argmax())]], float(alike.max().clamp(0.0, 1.0))
-    found = process.extractOne(said, allowed, scorer=fuzz.ratio)
-    return table[found[0]], found[1] / 100
+@lru_cache(maxsize=256)
+def _shipped_for(task: Task) -> Mapping[str, ScriptedSkill]:
+    return MappingProxyType(dict(skills_for(task, _shipped())))

@@ -17,9 +17,7 @@ Tables = TypeVar("Tables", bound=tuple[Tensor, ...])
 
 
 class TaskIndex:
-    """The rows that tasks have in a table: they are in the order of their ids, the 50 before any others.
-
-    It follows the ids to their device.
+    """The rows that tasks have in a table, in the order of their ids. It follows the ids to their device.
 
     Args:
         tasks: names, in any order.
@@ -28,7 +26,7 @@ class TaskIndex:
         tasks: the names in the order of their rows.
 
     Raises:
-        ValueError: a name that is none, one given twice, or two that have the same id.
+        ValueError: two names have the same id, or one is given twice.
 
     Example:
         >>> index = TaskIndex(["reach", "stack-blocks", "push"])
@@ -58,13 +56,13 @@ class TaskIndex:
 
         Args:
             task_id: (...) int64.
-            problem: what is the matter with an id that has no row, "tasks without a plan".
+            problem: what the error says of an id that has no row, "tasks without a plan".
 
         Returns:
-            (...) int64. Where an unknown id cannot be told, inside ``torch.vmap``, it gets a row beyond the last.
+            (...) int64. Inside ``torch.vmap`` an unknown id gets a row beyond the last.
 
         Raises:
-            ValueError: another dtype, or an id that has no row; compiled, or on a GPU, a RuntimeError when it is run.
+            ValueError: another dtype, or an id that has no row; compiled or on a GPU, a RuntimeError when it runs.
         """
         if task_id.dtype not in (torch.int64, torch.int32):
             raise ValueError(f"task_id must be int64, got {task_id.dtype}")
@@ -97,13 +95,13 @@ class TaskIndex:
 class TaskTables(nn.Module, Generic[Tables]):
     """Tables with a row for each task, and their rows for a batch.
 
-    The tables are buffers, which follow the module to a device and keep their precision, whatever the module is cast
-    to; none is saved. The rows of an environment keep their tasks, so what a batch selected is kept for the next.
+    The tables are buffers that follow the module to a device, keep their precision and are not saved. What a batch
+    selected is kept for the next, since the rows of an environment keep their tasks.
 
     Args:
         index: which row is whose.
         tables: a named tuple of tensors, each (T, ...).
-        problem: what is the matter with an id that has no row, as for :meth:`TaskIndex.rows`.
+        problem: as for :meth:`TaskIndex.rows`.
     """
 
     def __init__(self, index: TaskIndex, tables: Tables, problem: str) -> None:
@@ -120,7 +118,7 @@ class TaskTables(nn.Module, Generic[Tables]):
         return self._make(self.buffers(recurse=False))
 
     def plain(self, *tensors: Tensor) -> bool:
-        """Whether the tensors are, and the tables: a loss may give each member of an ensemble tables of its own."""
+        """Whether the tensors are plain, and the tables: a loss may give each member of an ensemble its own tables."""
         return plain(*tensors, next(iter(self._buffers.values())))  # type: ignore[arg-type]
 
     def select(self, task_id: Tensor, observation: Tensor) -> Tables:
@@ -128,13 +126,10 @@ class TaskTables(nn.Module, Generic[Tables]):
 
         Args:
             task_id: (B,) int64.
-            observation: whose device the tables are moved to; tables of floats take its dtype.
+            observation: gives the tables its device, and tables of floats its dtype.
 
         Returns:
             The tables, each (B, ...).
-
-        Raises:
-            ValueError: as for :meth:`TaskIndex.rows`.
         """
         device, dtype = observation.device, observation.dtype
         if not self.plain(observation, task_id):

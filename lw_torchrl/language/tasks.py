@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from hashlib import blake2b
 from importlib.resources import files
+from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from lw_torchrl._checks import check_fields, checked, shown, unknown_name
+from lw_torchrl._checks import check_choice, check_fields, checked, nearest, shown, unknown_name
 from lw_torchrl._files import read_toml
-from lw_torchrl.language.named_objects import GRIPPER, NamedObject, read_objects, write_objects
+from lw_torchrl.language.named_objects import GRIPPER, Coordinate, NamedObject, read_objects, write_objects
 
 if TYPE_CHECKING:
     from torch import Tensor
+
 
 _NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
 _OWN_IDS = 2**31 - 50  # so that an id is an int32 too
@@ -32,13 +35,10 @@ class Task:
     """One manipulation task in words.
 
     Attributes:
-        name: "drawer-open", Meta-World's name without its version; of a task of your own, any lower-case words joined
-            by hyphens.
+        name: "drawer-open", Meta-World's name without its version; or your own, lower-case words joined by hyphens.
         description: one sentence that says what is to be done.
-        objects: the named objects, the robot's gripper first; then the points that we named. At most 64.
-
-    Raises:
-        ValueError: another kind of name, too many objects, two of the same name, or the first is not the gripper.
+        objects: at most 64 named objects with different names: the robot's gripper first, the points that we named
+            last.
     """
 
     name: str
@@ -51,10 +51,8 @@ class Task:
             raise TypeError(f"objects of task {self.name!r} must be a tuple of NamedObject, got {shown(self.objects)}")
         _check_name(self.name)
         if len(self.objects) > _MOST_OBJECTS:
-            raise ValueError(
-                f"objects of task {self.name!r} must be at most {_MOST_OBJECTS}, the gripper included, got "
-                f"{len(self.objects)}"
-            )
+            count = f"at most {_MOST_OBJECTS}, the gripper included, got {len(self.objects)}"
+            raise ValueError(f"objects of task {self.name!r} must be {count}")
         names = [named.name for named in self.objects]
         if not names or names[0] != GRIPPER:
             raise ValueError(f"objects of task {self.name!r} must begin with {GRIPPER!r}, got {names}")
@@ -63,7 +61,7 @@ class Task:
 
     @cached_property
     def object_names(self) -> tuple[str, ...]:
-        """The names of the objects, in the table's order."""
+        """The names of the objects, in their order."""
         return tuple(named.name for named in self.objects)
 
     @cached_property
@@ -82,23 +80,19 @@ class Task:
         """Where each object is: (..., 39) float, metres, to name -> (..., 3) of the same dtype, metres."""
         import torch  # here, since words alone should not wait for it
 
+        def coordinate(at: Coordinate, shift: float) -> Tensor:
+            return (observation[..., at] if isinstance(at, int) else torch.full_like(observation[..., 0], at)) + shift
+
         return {
-            named.name: torch.stack(
-                [
-                    (observation[..., c] if isinstance(c, int) else torch.full_like(observation[..., 0], c)) + shift
-                    for c, shift in zip(named.position, named.offset, strict=True)
-                ],
-                -1,
-            )
-            for named in self.objects
+            named.name: torch.stack(list(map(coordinate, named.position, named.offset)), -1) for named in self.objects
         }
 
     def to_json(self) -> dict[str, Any]:
         """The task as a row of tasks.toml.
 
         Raises:
-            TaskError: (a ValueError) such a row cannot hold it: a gripper elsewhere, a point with an offset from a
-                place where there is no object.
+            TaskError: (a ValueError) a row cannot hold it: the gripper is elsewhere, or a point has an offset from a
+                place without an object.
 
         Example:
             >>> TASKS["reach"].to_json()["objects"]
@@ -117,37 +111,27 @@ class Task:
     def from_json(cls, name: str, row: Any) -> Task:
         """The task of a row of tasks.toml, as :meth:`to_json` gives it; any other value is a :class:`TaskError`."""
         try:
-            return _task(name, row)
+            if not isinstance(row, Mapping):
+                raise ValueError(f"must be a table, got {shown(row)}")
+            for key in row:
+                check_choice("key", key, ("description", "objects", "points", "mt10"))
+            description = row.get("description")
+            if not isinstance(description, str) or not description.strip():
+                raise ValueError(f"description must be a sentence, got {shown(description)}")
+            return cls(name, description, read_objects(row))
         except (ValueError, TypeError) as error:
             raise TaskError(f"task {shown(name)}: {error}") from error
 
 
-_KEYS = ("description", "objects", "points", "mt10")
-
-
-def _check_name(name: object) -> str:
-    if not isinstance(name, str):
-        raise TypeError(f"task must be a task's name, got {shown(name)} ({type(name).__name__})")
+def _check_name(name: str) -> str:
     if not _NAME.fullmatch(name):
         raise ValueError(f"task must be lower-case words joined by hyphens, like 'drawer-open', got {shown(name)}")
     return name
 
 
-def _task(name: str, row: Any) -> Task:
-    if not isinstance(row, Mapping):
-        raise ValueError(f"must be a table, got {shown(row)}")
-    for key in row:
-        if key not in _KEYS:
-            raise unknown_name("key", key, _KEYS)
-    description = row.get("description")
-    if not isinstance(description, str) or not description.strip():
-        raise ValueError(f"description must be a sentence, got {shown(description)}")
-    return Task(name, description, read_objects(row))
-
-
 def _load() -> tuple[Mapping[str, Task], tuple[str, ...]]:
     table = read_toml(files("lw_torchrl.language") / "data" / "tasks.toml", TaskError)
-    tasks = {name: _task(name, row) for name, row in sorted(table.items())}
+    tasks = {name: Task.from_json(name, row) for name, row in sorted(table.items())}
     return MappingProxyType(tasks), tuple(sorted(name for name, row in table.items() if row.get("mt10")))
 
 
@@ -177,23 +161,18 @@ def _unknown_task(argument: str, name: str, tasks: Mapping[str, Task]) -> ValueE
 
 @checked
 def task_id(name: str) -> int:
-    """The integer of a task: of the 50, the rank of the name among the sorted names, from 0; of any other, a number
-    from 50 to 2³¹ - 1 that is made of the name alone.
-
-    So it is the same in every process and file, and a 51st task renumbers none. A misspelt name has an id too; whoever
-    is given it says which tasks it knows.
+    """The integer of a task: of the 50, the rank among the sorted names, from 0; of any other, a number from 50 to
+    2³¹ - 1 that depends only on the name. So it is the same in every process and file. A misspelt name has an id too.
 
     Raises:
         ValueError: the name is not lower-case words joined by hyphens.
-        TypeError: it is no string.
 
     Example:
         >>> task_id("assembly"), task_id("window-open"), task_id("stack-blocks")
         (0, 49, 650718257)
     """
-    known = _RANK.get(name) if isinstance(name, str) else None
-    if known is not None:
-        return known
+    if name in _RANK:
+        return _RANK[name]
     digest = blake2b(_check_name(name).encode(), digest_size=8).digest()
     return len(MT50) + int.from_bytes(digest, "big") % _OWN_IDS
 
@@ -205,12 +184,8 @@ def resolve_tasks(names: str | Iterable[str], *, tasks: Mapping[str, Task] = TAS
         names: "MT10", "MT50", one task's name, or an iterable of names.
         tasks: the tasks there are, by name, as from :func:`~lw_torchrl.load_tasks`.
 
-    Returns:
-        10, 50, 1 or n names.
-
     Raises:
         ValueError: a name is unknown (with the nearest allowed ones), repeated, or the list is empty.
-        TypeError: something other than strings was given.
 
     Example:
         >>> resolve_tasks(["push", "door-open"])
@@ -242,9 +217,6 @@ def named_tasks(tasks: str | Task | Iterable[str | Task], *, known: Mapping[str,
         tasks: as for :func:`resolve_tasks`; a :class:`Task` counts for itself, whatever else has its name.
         known: the tasks that names stand for, as from :func:`~lw_torchrl.load_tasks`.
 
-    Raises:
-        ValueError, TypeError: as for :func:`resolve_tasks`.
-
     Example:
         >>> list(named_tasks(["push", TASKS["door-open"]]))
         ['door-open', 'push']
@@ -261,3 +233,44 @@ def named_tasks(tasks: str | Task | Iterable[str | Task], *, known: Mapping[str,
 def get_task(task: str | Task) -> Task:
     """The :class:`Task` of a name of the 50; a Task is returned as it is."""
     return task if isinstance(task, Task) else TASKS[check_task(task)]
+
+
+@checked
+def load_tasks(path: str | os.PathLike[str]) -> Mapping[str, Task]:
+    """All 50 tasks and those of your own file: some of the 50 with other objects, points or words, or new tasks.
+
+    Args:
+        path: a file in the format of data/tasks.toml. A task with a new name must name its objects.
+
+    Returns:
+        Task name to :class:`Task`, sorted; pass one wherever a task is asked for, or all of them to
+        :func:`~lw_torchrl.load_plans` and :func:`~lw_torchrl.resolve_tasks`.
+
+    Raises:
+        TaskError: (a ValueError) the file is no TOML, or a task in it is malformed.
+
+    Example:
+        >>> import os, tempfile
+        >>> folder = tempfile.TemporaryDirectory()
+        >>> path = os.path.join(folder.name, "mine.toml")
+        >>> lines = ["[push]", "description = 'Push the disc.'", "objects.disc = 'obs[4:7]'"]
+        >>> with open(path, "w") as file:
+        ...     print(*lines, sep=os.linesep, file=file)
+        >>> load_tasks(path)["push"].object_names
+        ("robot's gripper", 'disc')
+        >>> folder.cleanup()
+    """
+    file = Path(path)
+    found = dict(TASKS)
+    for name, row in read_toml(file, TaskError).items():
+        try:
+            found[name] = Task.from_json(name, row)
+            if name not in TASKS and len(found[name].objects) == 1:
+                close = nearest(name, TASKS, n=1)
+                raise TaskError(
+                    f"task {name!r}: is none of the 50, so it must name its objects"
+                    + (f"; did you mean {close[0]!r}?" if close else "")
+                )
+        except TaskError as error:
+            raise TaskError(f"{file}, {error}") from error
+    return MappingProxyType(dict(sorted(found.items())))

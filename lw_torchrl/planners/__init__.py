@@ -3,12 +3,11 @@
 How answers fare needs the simulator: :mod:`~lw_torchrl.planners.checking`, :mod:`~lw_torchrl.planners.comparing`.
 """
 
-from lw_torchrl.planners.answers import Answer, Answers, Tokens, answer_path, folder_name, write_answer
-from lw_torchrl.planners.errors import PlannerError
-from lw_torchrl.planners.file_planner import FilePlanner
+from lw_torchrl.planners.answer_files import answer_path, folder_name, write_answer
+from lw_torchrl.planners.answers import Answer, Answers, PlannerError, Tokens
 from lw_torchrl.planners.openai_planner import OpenAIPlanner
 from lw_torchrl.planners.plan_schema import plan_schema
-from lw_torchrl.planners.planner import Planner
+from lw_torchrl.planners.planner import FilePlanner, Planner
 from lw_torchrl.planners.prompts import plan_prompt, prompt_examples
 
 __all__ = [

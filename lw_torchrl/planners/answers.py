@@ -1,28 +1,53 @@
-"""Answers of planners, and the folder that holds them: ``DIR/<model>/<format>/<task>-<attempt>.<ext>``."""
+"""Answers of planners: what a server replied, the plan in it, and the error where there is none."""
 
 from __future__ import annotations
 
-import os
-import re
-from collections.abc import Iterable, Sequence
+import json
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeGuard, overload
+from typing import Any, TypeGuard, overload
 
-from lw_torchrl._checks import checked
-from lw_torchrl._files import write_text
-from lw_torchrl.language.decoded import DecodedPlan
-from lw_torchrl.language.formats import PLAN_FORMATS
+from lw_torchrl._checks import counted, shown
+from lw_torchrl.language.decoding import LIMIT, SKILL_LIMIT, DecodedPlan, decode_as
+from lw_torchrl.language.formats import PLAN_FORMATS, encode_plan
+from lw_torchrl.language.formats.structured import read_structured
+from lw_torchrl.language.nearest import StepMapper
+from lw_torchrl.language.skills import ScriptedSkill
+from lw_torchrl.language.tasks import Task
+from lw_torchrl.planners.plan_schema import passes
+
+CUT_OFF = "it was cut off at max_tokens"
+
+
+class PlannerError(RuntimeError):
+    """A planner has no answer to a question: it says whose, to which question, what came, and what to try.
+
+    Attributes:
+        fatal: any other question to the same planner would end the same way, so none was asked after it.
+    """
+
+    def __init__(self, message: str, *, fatal: bool = False) -> None:
+        super().__init__(message)
+        self.fatal = fatal
+
+
+def unanswered(errors: Sequence[Exception], came: int, total: int, folder: Path) -> Exception:
+    """The error for questions without an answer; ``came`` of ``total`` answers are kept in ``folder``.
+
+    One of ``errors`` that is no :class:`PlannerError` goes first, as it is.
+    """
+    first = next((error for error in errors if not isinstance(error, PlannerError)), errors[0])
+    if not isinstance(first, PlannerError):
+        return first
+    others = f" So did {counted(len(errors) - 1, 'other question')}." if len(errors) > 1 else ""
+    kept = f"{came} of {counted(total, 'answer')} are kept in {str(folder)!r}; the same again asks the rest"
+    return PlannerError(f"{first}{others} {kept}.", fatal=first.fatal)
 
 
 @dataclass(frozen=True)
 class Tokens:
-    """What was read and written, as the server counts it; 0 where it does not.
-
-    Attributes:
-        prompt: tokens of questions.
-        completion: tokens of answers.
-    """
+    """How many tokens of questions and of answers there were, as the server counts them; 0 if it does not."""
 
     prompt: int = 0
     completion: int = 0
@@ -44,8 +69,7 @@ def is_count(value: object) -> TypeGuard[int]:
 
 
 def storable(text: str) -> str:
-    r"""A text as it reads once it was in a file: without half characters and marks of byte order, and its lines end in
-    one way.
+    r"""A text as a file gives it back: without half characters and byte order marks, and with "\n" as line ends.
 
     Example:
         >>> storable("\ufeffone\r\ntwo \ud800")
@@ -53,6 +77,17 @@ def storable(text: str) -> str:
     """
     whole = text.encode("utf-8", "replace").decode()
     return whole.replace("\r\n", "\n").replace("\r", "\n").lstrip("\ufeff")
+
+
+@dataclass(frozen=True)
+class Reply:
+    """What a server said."""
+
+    text: str  # the answer; "" if there is none
+    finish: str = ""  # why it ends, in the server's words: "stop", "length", "content_filter", ""
+    refusal: str = ""  # what the model said instead of an answer
+    tokens: Tokens = NO_TOKENS
+    notes: tuple[str, ...] = ()  # what was different from what was asked
 
 
 @dataclass(frozen=True)
@@ -64,11 +99,11 @@ class Answer:
         format: the format that was asked for.
         attempt: which of several answers to the same question, from 0.
         text: the answer in the format, for :func:`~lw_torchrl.decode_plan`.
-        raw: as it came; JSON where the model was held to a schema, else the same as ``text``.
+        raw: as it came; JSON if the model was held to a schema, else the same as ``text``.
         decoded: what was made of it.
         tokens: what it cost when it was asked for.
         cached: it had been asked for before.
-        notes: what else there is to say: that it was cut off, that the server did not keep to the schema.
+        notes: further remarks: that it was cut off, that the server did not keep to the schema.
     """
 
     task: str
@@ -83,7 +118,7 @@ class Answer:
 
 
 class Answers(Sequence[Answer]):
-    """Answers in the order of tasks and attempts."""
+    """Answers in the order of formats, tasks and attempts."""
 
     def __init__(self, answers: Iterable[Answer]) -> None:
         self._answers = tuple(sorted(answers, key=lambda answer: (answer.format, answer.task, answer.attempt)))
@@ -102,7 +137,7 @@ class Answers(Sequence[Answer]):
 
     @property
     def tokens(self) -> Tokens:
-        """Of all answers, whether they were cached or not."""
+        """Of all answers, cached ones included."""
         return sum((answer.tokens for answer in self), NO_TOKENS)
 
     def __repr__(self) -> str:
@@ -110,28 +145,40 @@ class Answers(Sequence[Answer]):
         return f"Answers({len(self)} answers, {plans} plans, {self.tokens.total} tokens)"
 
 
-@checked
-def folder_name(model: str) -> str:
-    """A model's name as that of a folder.
+def read_reply(
+    reply: Reply,
+    task: Task,
+    format: str,
+    attempt: int = 0,
+    skills: Mapping[str, ScriptedSkill] | None = None,
+    schema: Mapping[str, Any] | None = None,
+) -> Answer:
+    """The answer in a reply to a question for a plan; whatever the server claims, it is read as any text is.
 
-    Example:
-        >>> folder_name("meta-llama/Llama-3.1-8B"), folder_name("PaLM 2")
-        ('meta-llama_Llama-3.1-8B', 'PaLM 2')
+    Args:
+        reply: what the server said.
+        task, format, attempt: what was asked for.
+        skills: the scripted skills to choose from; None for the shipped ones.
+        schema: what the model was to be held to; JSON is expected then, and becomes a text in the format.
     """
-    return re.sub(r"[^\w .+-]+", "_", model).strip(" ._")[:100].rstrip(" .") or "model"
-
-
-@checked
-def answer_path(folder: str | os.PathLike[str], model: str, format: str, task: str, attempt: int) -> Path:
-    """Where the answer of a model is kept."""
-    return Path(folder) / folder_name(model) / format / f"{task}-{attempt}.{PLAN_FORMATS[format].extension}"
-
-
-@checked
-def write_answer(folder: str | os.PathLike[str], model: str, answer: Answer) -> Path:
-    """Write an answer to its place, whole or not at all; one that came in another form beside it, as .json."""
-    path = answer_path(folder, model, answer.format, answer.task, answer.attempt)
-    if answer.raw != answer.text:
-        write_text(path.with_suffix(".json"), answer.raw)
-    write_text(path, answer.text)
-    return path
+    read = PLAN_FORMATS[format].read if schema is None else read_structured
+    raw = storable(reply.text)
+    decoded = decode_as(raw, read, StepMapper(task, skills, "edit", LIMIT, SKILL_LIMIT))
+    text = encode_plan(decoded.plan, format) if schema and decoded.plan is not None else raw
+    notes = []
+    if reply.finish == "length":
+        notes.append(CUT_OFF)
+    elif reply.finish == "content_filter":
+        notes.append("a filter of the server cut it off")
+    if reply.refusal:
+        notes.append(f"the model refused: {shown(reply.refusal)}")
+    elif not raw.strip():
+        notes.append("it is empty")
+    elif schema and reply.finish != "length":
+        try:
+            kept = passes(json.loads(raw), schema)
+        except (ValueError, RecursionError):
+            kept = False
+        notes += [] if kept else ["the server did not keep to the schema"]
+    notes += reply.notes
+    return Answer(task.name, format, attempt, storable(text), raw, decoded, reply.tokens, notes=tuple(notes))

@@ -1,4 +1,4 @@
-"""One question to an OpenAI-compatible server: what is sent, what may come back, and what each failure means."""
+"""Questions to an OpenAI-compatible server: what is sent, what may come back, and what each failure means."""
 
 from __future__ import annotations
 
@@ -6,17 +6,16 @@ import asyncio
 import os
 import re
 import threading
-from collections.abc import Coroutine, Mapping
+from collections import deque
+from collections.abc import Callable, Coroutine, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from types import TracebackType
-from typing import Any
+from queue import SimpleQueue
+from typing import Any, TypeVar
 from urllib.parse import parse_qsl, unquote, urlsplit
 
 from lw_torchrl._checks import counted, shown
-from lw_torchrl.planners.answer_cache import Reply
-from lw_torchrl.planners.bounded_client import bounded_client
-from lw_torchrl.planners.completion import NoCompletion, in_a_line, read_completion
-from lw_torchrl.planners.errors import PlannerError
+from lw_torchrl.planners.answers import PlannerError, Reply
+from lw_torchrl.planners.chat_reply import NoCompletion, bounded_client, in_a_line, read_completion
 from lw_torchrl.planners.hiding import Hider
 
 OPENAI = "https://api.openai.com/v1"
@@ -24,10 +23,7 @@ _KEY = "OPENAI_API_KEY"
 
 
 def server_address(base_url: str | None) -> str:
-    """The address of a server, without what is no address: a name and a password, a query.
-
-    Raises:
-        ValueError: it is none.
+    """The address of a server, without a name and a password, or a query.
 
     Example:
         >>> server_address("http://me:secret@127.0.0.1:8000/v1/")
@@ -48,29 +44,16 @@ def _given(base_url: str | None) -> str:
     return base_url or os.environ.get("OPENAI_BASE_URL") or OPENAI
 
 
-def _secrets(key: str, base_url: str | None) -> list[str]:
-    """The key, and what an address has that :func:`server_address` leaves out."""
-    found = urlsplit(_given(base_url))
-    inside = [found.username, found.password, *(value for _, value in parse_qsl(found.query))]
-    return [key, *(unquote(text) for text in inside if text)]
-
-
 @dataclass(frozen=True)
 class Dialect:
-    """What servers write differently, as far as one has told by refusing it.
+    """What servers write differently, as far as the server has told by refusing it."""
 
-    Attributes:
-        limit: the name of the greatest number of tokens.
-        schema: the kind of response_format that holds a model to a schema.
-        refused: what the server said when it did not know "json_schema".
-    """
-
-    limit: str = "max_tokens"
-    schema: str = "json_schema"
-    refused: str = ""
+    limit: str = "max_tokens"  # the name of the greatest number of tokens
+    schema: str = "json_schema"  # the kind of response_format that holds a model to a schema
+    refused: str = ""  # what the server said when it did not know "json_schema"
 
     def after(self, status: int, said: str) -> Dialect:
-        """The dialect to go on with after an error; this one if the error says nothing of it."""
+        """The dialect to go on with after an error, or the same."""
         if self.limit == "max_tokens" and status == 400 and "max_completion_tokens" in said:
             return replace(self, limit="max_completion_tokens")
         named = "response_format" in said or "json_schema" in said
@@ -88,15 +71,12 @@ class ChatServer:
     """A server, while the block lasts; any number of threads may ask it at once.
 
     Args:
-        model: its name there.
-        base_url: None for what OPENAI_BASE_URL says, or OpenAI's.
-        timeout: seconds that one try may take as a whole, from the connection to the answer's last byte.
-        retries: how often a question is asked again after a rate limit, a fault of the server or of the connection.
-        dialect: what it is known to write.
+        model, base_url, timeout, retries: as for :class:`~lw_torchrl.OpenAIPlanner`.
+        dialect: what the server is known to write.
 
     Raises:
         ImportError: the extra ``[llm]`` is absent.
-        PlannerError: there is no key for a server that wants one, or it is none that can be sent.
+        PlannerError: OpenAI's server has no key, or the key cannot be sent.
     """
 
     def __init__(
@@ -105,22 +85,20 @@ class ChatServer:
         try:
             import openai
         except ImportError as error:
-            raise ImportError(
-                f"asking a model needs the extra [llm]: pip install 'lw_torchrl[llm]' ({error})"
-            ) from error
+            needs = "asking a model needs the extra [llm]: pip install 'lw_torchrl[llm]'"
+            raise ImportError(f"{needs} ({error})") from error
         self._openai, self.model, self.timeout, self.retries = openai, model, timeout, retries
         self.address = server_address(base_url)
         own = self.address == OPENAI
         self._key = os.environ.get(_KEY, "").strip()
         if own and not self._key:
-            raise PlannerError(
-                f"{model!r} at {self.address} wants a key: set the environment variable {_KEY}, or give the "
-                "base_url of a server that wants none",
-                fatal=True,
-            )
+            how = f"set the environment variable {_KEY}, or give the base_url of a server that wants none"
+            raise PlannerError(f"{model!r} at {self.address} wants a key: {how}", fatal=True)
         if not (self._key.isascii() and self._key.isprintable()):
             raise PlannerError(f"the key in {_KEY} has characters that no key has: set it anew", fatal=True)
-        self._hidden = Hider(_secrets(self._key, base_url))
+        given = urlsplit(_given(base_url))  # with what server_address leaves out
+        inside = [given.username, given.password, *(value for _, value in parse_qsl(given.query))]
+        self._hidden = Hider([self._key, *(unquote(text) for text in inside if text)])
         self.dialect = dialect or Dialect("max_completion_tokens" if own else "max_tokens")
         self._settled = False  # whether it has answered, so that its dialect is known
         self._client = openai.AsyncOpenAI(
@@ -134,9 +112,7 @@ class ChatServer:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Questions that are under way end unanswered."""
         self._wait(self._close())
         self._loop.call_soon_threadsafe(self._loop.stop)
@@ -158,15 +134,12 @@ class ChatServer:
             work.close()  # where the loop was closed before it began
 
     def ask(self, request: Mapping[str, Any], question: str) -> Reply:
-        """The answer to a request.
+        """The answer to a request; if none came that can be read, a :class:`PlannerError`.
 
         Args:
             request: "messages", "schema" (None for any text), "max_tokens", and "temperature", "seed" and "options",
-                None where the server's own are wanted.
+                None for the server's own.
             question: what to call it in an error.
-
-        Raises:
-            PlannerError: no answer came, or none that can be read.
         """
         fault: Exception
         while True:
@@ -175,7 +148,7 @@ class ChatServer:
                 retries = self.retries if settled or not request["schema"] else 0
                 content = self._wait(self._create(request, dialect, retries))
             except self._openai.APIStatusError as error:
-                adapted = dialect.after(error.status_code, self._clean(self._said(error)))
+                adapted = dialect.after(error.status_code, self._said(error))
                 if adapted != dialect:
                     self.dialect = adapted
                     continue
@@ -197,10 +170,8 @@ class ChatServer:
         if request["schema"]:
             fields["response_format"] = dialect.response_format(request["schema"])
         client = self._client.with_options(max_retries=retries).chat.completions.with_raw_response
-        found = await client.create(
-            model=self.model, messages=request["messages"], extra_body=request["options"], **fields
-        )
-        return bytes(found.content)
+        fields |= {"model": self.model, "messages": request["messages"]}
+        return bytes((await client.create(extra_body=request["options"], **fields)).content)
 
     def _reply(self, content: bytes, notes: list[str], question: str) -> Reply:
         try:
@@ -217,62 +188,88 @@ class ChatServer:
         return PlannerError(self._hidden(told), fatal=fatal)
 
     def _explained(self, fault: Exception, question: str) -> PlannerError:
-        """The error in our words: what came, and what to try."""
-        said, tried = self._clean(self._said(fault)), self._tried()
-        broken = fault.__cause__ or fault
-        cause = self._clean(str(broken)) or type(broken).__name__
+        """The error: what came, and what to try."""
+        said, tried = self._said(fault), f", asked {counted(self.retries + 1, 'time')}"
+        status, fatal = getattr(fault, "status_code", 0), False
         if isinstance(fault, self._openai.APITimeoutError):
-            what, hint = (
-                f"no answer within {self.timeout:g} s, {tried}",
-                "Give a longer timeout, or a lower concurrency",
-            )
+            what, hint = f"no answer within {self.timeout:g} s{tried}", "Give a longer timeout, or a lower concurrency"
         elif isinstance(fault, self._openai.APIConnectionError):
-            what = f"the connection failed or broke off, {tried}: {cause}"
-            return self._error(question, what, "See that the server runs, and that base_url is its address", fatal=True)
+            broken, fatal = fault.__cause__ or fault, True
+            cause = in_a_line(str(broken), self._hidden) or type(broken).__name__
+            what = f"the connection failed or broke off{tried}: {cause}"
+            hint = "See that the server runs, and that base_url is its address"
         elif not isinstance(fault, self._openai.APIStatusError):
             what, hint = f"it could not be asked ({type(fault).__name__}: {said})", "Ask again"
-        else:
-            return self._refused(fault, said, question)
-        return self._error(question, what, hint)
-
-    def _refused(self, fault: Any, said: str, question: str) -> PlannerError:
-        status = fault.status_code
-        tried, fatal = f", {self._tried()}", status < 400 or status in (401, 403, 404, 429)
-        if status < 400:
-            there = self._clean(str(fault.response.headers.get("location", "nowhere")))
+        elif status < 400:
+            there, fatal = in_a_line(str(fault.response.headers.get("location", "nowhere")), self._hidden), True
+            what = f"the server sends on to {there} (status {status})"
             hint = "Give the address that it really has as base_url; no redirect is followed"
-            return self._error(question, f"the server sends on to {there} (status {status})", hint, fatal)
-        if status in (401, 403):
+        elif status in (401, 403):
             known = f"the key in {_KEY} is not accepted" if self._key else f"it wants a key, in {_KEY}"
-            return self._error(question, f"{known} ({said})", "Give the key of this server", fatal)
-        if status == 404:
-            return self._error(
-                question, f"no such model or address ({said})", f"`GET {self.address}/models` lists its models", fatal
-            )
-        if status == 429:
-            return self._error(
-                question, f"too many requests{tried} ({said})", "Go on later, or with a lower concurrency", fatal
-            )
-        if re.search(r"context|too long|max_tokens|maximum.{0,20}length", said, re.IGNORECASE):
+            what, hint, fatal = f"{known} ({said})", "Give the key of this server", True
+        elif status == 404:
+            hint = f"`GET {self.address}/models` lists its models"
+            what, fatal = f"no such model or address ({said})", True
+        elif status == 429:
+            hint = "Go on later, or with a lower concurrency"
+            what, fatal = f"too many requests{tried} ({said})", True
+        elif re.search(r"context|too long|max_tokens|maximum.{0,20}length", said, re.IGNORECASE):
             hint = "Give fewer max_tokens, a shorter format (basic_py), or the server a longer context"
-            return self._error(question, f"the question does not fit ({said})", hint)
-        if status >= 500:
-            return self._error(question, f"the server failed{tried} ({said})", "Its own log may say why; ask again")
-        return self._error(question, f"the request is refused ({said})", "Leave out what it does not know")
-
-    def _tried(self) -> str:
-        return f"asked {counted(self.retries + 1, 'time')}"
+            what = f"the question does not fit ({said})"
+        elif status >= 500:
+            what, hint = f"the server failed{tried} ({said})", "Its own log may say why; ask again"
+        else:
+            what, hint = f"the request is refused ({said})", "Leave out what it does not know"
+        return self._error(question, what, hint, fatal)
 
     def _said(self, fault: Exception) -> str:
-        """What a fault says; of a refusal in a form that the client does not know, what came."""
+        """What a fault says, or what came if the client does not know its form; without secrets, in a line."""
         said = str(fault)
-        if (
-            isinstance(fault, self._openai.APIStatusError)
-            and " - " not in said
-            and (came := fault.response.text.strip())
-        ):
-            return f"{said} - {came}"
-        return said
+        if isinstance(fault, self._openai.APIStatusError) and " - " not in said:
+            came = fault.response.text.strip()
+            said += f" - {came}" if came else ""
+        return in_a_line(said, self._hidden)
 
-    def _clean(self, text: str) -> str:
-        return in_a_line(text, self._hidden)
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+def ask_at_once(
+    work: Callable[[Item], Result], items: Iterable[Item], concurrency: int
+) -> Iterator[tuple[Item, Result | Exception]]:
+    """Each item with what ``work`` gives of it, or raises, in the order in which they end.
+
+    After an error that is no :class:`PlannerError`, or a fatal one, no further item is begun; those under way are
+    waited for, unless the caller stops listening.
+    """
+    waiting, ended = deque(items), SimpleQueue[tuple[Item, Result | Exception] | None]()
+    stop = threading.Event()
+
+    def worker() -> None:
+        while not stop.is_set():
+            try:
+                item = waiting.popleft()
+            except IndexError:
+                break
+            try:
+                ended.put((item, work(item)))
+            except Exception as error:
+                if not isinstance(error, PlannerError) or error.fatal:
+                    stop.set()
+                ended.put((item, error))
+        ended.put(None)
+
+    threads = [threading.Thread(target=worker, daemon=True) for _ in range(min(concurrency, len(waiting)))]
+    try:
+        for thread in threads:
+            thread.start()
+        left = len(threads)
+        while left:
+            found = ended.get()
+            if found is None:
+                left -= 1
+            else:
+                yield found
+    finally:
+        stop.set()

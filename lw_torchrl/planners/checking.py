@@ -1,4 +1,4 @@
-"""check_plan: what a plan was taken for, and which of its steps hold in states that were really visited."""
+"""check_plan: what a plan was taken for, and which of its conditions hold in the states of episodes."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from torch import Tensor
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.evaluation.plan_use import PlanUse, TaskUse, expert_use
 from lw_torchrl.evaluation.protocol import evaluate
-from lw_torchrl.language.decoded import DecodedPlan
-from lw_torchrl.language.decoding import decode_plan
+from lw_torchrl.language.decoding import DecodedPlan, decode_plan
 from lw_torchrl.language.skills import ScriptedSkill
 from lw_torchrl.language.tasks import TASKS, Task, check_task
 from lw_torchrl.modules.scripted_skill_actor import ScriptedSkillActor
@@ -21,24 +20,14 @@ _GAPS = 3  # the longest are told of
 
 @dataclass(frozen=True)
 class PlanCheck:
-    """What there is to say of a plan.
-
-    Attributes:
-        task: the task's name.
-        decoded: what the text was taken for.
-        expert: how its conditions fare in the states that Meta-World's expert visits; None without a plan.
-        own: how its steps fare where scripted skills carry it out, the first true one in each state; None without one
-            that they can.
-        success: of these episodes.
-        failed: the observations of each of these that failed, (T, 39) float32.
-    """
+    """What became of a plan."""
 
     task: str
-    decoded: DecodedPlan
-    expert: TaskUse | None = None
-    own: TaskUse | None = None
-    success: float = 0.0
-    failed: tuple[Tensor, ...] = ()
+    decoded: DecodedPlan  # what the text was taken for
+    expert: TaskUse | None = None  # how its conditions fare in the states of Meta-World's expert; None without a plan
+    own: TaskUse | None = None  # how its steps fare if scripted skills carry it out; None if they cannot
+    success: float = 0.0  # the success rate of these episodes
+    failed: tuple[Tensor, ...] = ()  # the observations of those that failed, (T, 39) float32
 
     @property
     def never(self) -> tuple[int, ...]:
@@ -74,9 +63,8 @@ class PlanCheck:
         return "\n".join(lines)
 
     def _in_force(self, step: int) -> str:
-        return (
-            "" if self.own is None else f", {self.own.true[step]:.0%} of its own; acts in {self.own.chosen[step]:.0%}"
-        )
+        own = self.own
+        return "" if own is None else f", {own.true[step]:.0%} of its own; acts in {own.chosen[step]:.0%}"
 
 
 def _said(written: str, distance: float) -> str:
@@ -97,11 +85,7 @@ def check_plan(
 
     Args:
         text, task, format, skills, tasks: as for :func:`~lw_torchrl.decode_plan`; the task is one of Meta-World's.
-        episodes: of the expert, and of the plan by scripted skills.
-        seed: of these.
-
-    Raises:
-        ValueError: an unknown task or format.
+        episodes, seed: of the expert, and of the plan by scripted skills.
 
     Example:
         >>> import lw_torchrl as lw

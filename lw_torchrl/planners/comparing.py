@@ -18,7 +18,7 @@ from lw_torchrl.evaluation.statistics import mean_rate
 from lw_torchrl.language.decoding import decode_plan
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.language.tasks import TASKS, Task
-from lw_torchrl.planners.file_planner import answer_text, recorded_answers
+from lw_torchrl.planners.answer_files import answer_text, recorded_answers
 
 _SAVE_SECONDS = 5.0
 Group = tuple[str, str]  # model, format
@@ -26,26 +26,17 @@ Group = tuple[str, str]  # model, format
 
 @dataclass(frozen=True)
 class ComparedAnswer:
-    """How an answer fared.
-
-    Attributes:
-        model, format, task, attempt: which answer it is.
-        steps: of the plan that scripted skills can carry out; 0 where nothing is left of it.
-        dropped: clauses for the task that were left out.
-        reason: why there is no plan; "" if there is one.
-        success: of each episode; all False where there is no plan.
-        plan: what was carried out, with scripted skills; None where there is no plan.
-    """
+    """How an answer fared."""
 
     model: str
     format: str
     task: str
     attempt: int
-    steps: int
-    dropped: int
-    reason: str
-    success: tuple[bool, ...]
-    plan: ConditionalPlan | None = field(default=None, repr=False)
+    steps: int  # of the plan that scripted skills can carry out
+    dropped: int  # clauses for the task that were left out
+    reason: str  # why there is no plan; "" if there is one
+    success: tuple[bool, ...]  # of each episode; all False without a plan
+    plan: ConditionalPlan | None = field(default=None, repr=False)  # what was carried out
 
     @property
     def rate(self) -> float:
@@ -77,10 +68,12 @@ class PlanComparison:
     def rates(self, model: str, format: str) -> dict[str, list[float]]:
         """Task to the success rate of each of its answers."""
         found: dict[str, list[float]] = {}
-        for one in self.answers:
-            if (one.model, one.format) == (model, format):
-                found.setdefault(one.task, []).append(one.rate)
+        for one in self._of(model, format):
+            found.setdefault(one.task, []).append(one.rate)
         return found
+
+    def _of(self, model: str, format: str) -> list[ComparedAnswer]:
+        return [one for one in self.answers if (one.model, one.format) == (model, format)]
 
     def mean(self, model: str, format: str) -> float:
         """The mean success rate, of each task over its answers, then over tasks."""
@@ -91,23 +84,20 @@ class PlanComparison:
         return max((format for name, format in self.groups if name == model), key=lambda one: self.mean(model, one))
 
     def best_of(self, model: str, format: str) -> float:
-        """What choosing among the answers gives: of each task the answer that does best in the even episodes, by its
-        success in the odd ones; then the mean over tasks. NaN with one episode."""
+        """The mean over tasks of the odd episodes' success, of the answer that does best in the even ones; NaN with
+        one episode."""
         chosen: dict[str, tuple[float, float]] = {}
-        for one in self.answers:
-            if (one.model, one.format) == (model, format):
-                tried, fresh = one.success[::2], one.success[1::2]
-                if one.task not in chosen or _mean(tried) > chosen[one.task][0]:
-                    chosen[one.task] = _mean(tried), _mean(fresh)
+        for one in self._of(model, format):
+            tried, fresh = _mean(one.success[::2]), _mean(one.success[1::2])
+            if one.task not in chosen or tried > chosen[one.task][0]:
+                chosen[one.task] = tried, fresh
         return _mean([fresh for _, fresh in chosen.values()])
 
     def best_plans(self, model: str, format: str) -> dict[str, ConditionalPlan]:
-        """Of each task the plan that succeeded most often, of equals the first; a task without any is left out."""
+        """The plan of each task that succeeded most often, of equals the first."""
         best: dict[str, tuple[float, ConditionalPlan]] = {}
-        for one in self.answers:
-            if (one.model, one.format) != (model, format) or one.plan is None:
-                continue
-            if one.task not in best or one.rate > best[one.task][0]:
+        for one in self._of(model, format):
+            if one.plan is not None and (one.task not in best or one.rate > best[one.task][0]):
                 best[one.task] = one.rate, one.plan
         return {task: plan for task, (_, plan) in best.items()}
 
@@ -115,20 +105,11 @@ class PlanComparison:
         """Markdown: a line for each model and format."""
         rows = []
         for model, format in self.groups:
-            found = [one for one in self.answers if (one.model, one.format) == (model, format)]
-            rates = self.rates(model, format)
+            found, rates = self._of(model, format), self.rates(model, format)
             runs = sum(bool(one.steps) for one in found)
-            rows.append(
-                [
-                    model,
-                    format,
-                    str(len(rates)),
-                    str(len(found)),
-                    str(runs),
-                    str(mean_rate([[_mean(one)] for one in rates.values()])),
-                    f"{self.best_of(model, format):.3f}",
-                ]
-            )
+            success = str(mean_rate([[_mean(one)] for one in rates.values()]))
+            counts = map(str, (len(rates), len(found), runs))
+            rows.append([model, format, *counts, success, f"{self.best_of(model, format):.3f}"])
         head = ["model", "format", "tasks", "answers", "with a plan that runs", "success", "best answer of a task"]
         return markdown_table(head, rows)
 
@@ -146,11 +127,8 @@ class PlanComparison:
     def to_json(self) -> dict[str, Any]:
         """Settings and answers, with the success of each episode as 0 and 1."""
         names = [one.name for one in fields(ComparedAnswer) if one.name not in ("success", "plan")]
-        answers = [
-            {name: getattr(one, name) for name in names} | {"success": "".join(map(str, map(int, one.success)))}
-            for one in self.answers
-        ]
-        return {"format_version": 1, "settings": self.settings, "answers": answers}
+        rows = [{name: getattr(one, name) for name in names} | {"success": _bits(one.success)} for one in self.answers]
+        return {"format_version": 1, "settings": self.settings, "answers": rows}
 
 
 def compare_plans(
@@ -178,13 +156,8 @@ def compare_plans(
         resume: a file that keeps how plans fared, every few seconds; what it has is not run again.
         progress: show progress bars.
 
-    Returns:
-        Each answer with how it fared.
-
     Raises:
-        FileNotFoundError: there is no such folder.
-        ValueError: there are no answers in it, one is of an unknown task, a wrong option, or ``resume`` is of other
-            settings or damaged.
+        ValueError: there are no answers, one is of an unknown task, or ``resume`` is of other settings or damaged.
 
     Example:
         >>> import tempfile, lw_torchrl as lw
@@ -198,13 +171,7 @@ def compare_plans(
     Source: paper section 'LLM Experiments'.
     """
     found = recorded_answers(source)
-    settings = {
-        "episodes": episodes,
-        "seed": seed,
-        "choose": choose,
-        "noise_scale": noise_scale,
-        "max_steps": max_steps,
-    }
+    settings = dict(episodes=episodes, seed=seed, choose=choose, noise_scale=noise_scale, max_steps=max_steps)
     fared = _read(resume, settings)
     listed = [(model, *place, text) for model, answers in found.items() for place, text in answers.items()]
     decoded = []
@@ -261,5 +228,9 @@ def _read(file: str | os.PathLike[str] | None, settings: Mapping[str, Any]) -> d
 
 
 def _write(file: str | os.PathLike[str], settings: Mapping[str, Any], fared: Mapping[str, Sequence[bool]]) -> None:
-    shortened = {key: "".join(map(str, map(int, success))) for key, success in fared.items()}
-    write_json(Path(file), {"settings": dict(settings), "fared": shortened})
+    bits = {key: _bits(success) for key, success in fared.items()}
+    write_json(Path(file), {"settings": dict(settings), "fared": bits})
+
+
+def _bits(success: Sequence[bool]) -> str:
+    return "".join(map(str, map(int, success)))

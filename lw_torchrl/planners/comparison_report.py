@@ -19,14 +19,10 @@ _REASONS = 3  # the commonest are told of
 
 
 def write_report(comparison: PlanComparison, folder: Path) -> list[Path]:
-    """Write results.json, summary.md, models.png (each model in its best format) and formats.png (of the model that
-    does best) to a folder, and the best plan of each task to best/<model>/<format>/<task>.plan, also one that never
-    succeeds.
+    """Write results.json, summary.md, models.png (each model in its best format) and formats.png (of the best model)
+    to a folder, and the best plan of each task to best/<model>/<format>/<task>.plan; returns what was written.
 
     The figures leave out tasks that some of their curves lack.
-
-    Returns:
-        What was written.
 
     Source: the paper's figures of section 'LLM Experiments'.
     """
@@ -56,7 +52,7 @@ are 95 % intervals over tasks. The best answer of a task is chosen by the even e
 
 
 def no_plans(comparison: PlanComparison) -> list[str]:
-    """Lines that say how many answers have no plan, and the commonest reasons; none if all have one."""
+    """Lines that say how many answers have no plan, and the commonest reasons."""
     reasons = [one.reason.replace(f" for {one.task}", " for the task") for one in comparison.answers if one.reason]
     if not reasons:
         return []

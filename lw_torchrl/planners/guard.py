@@ -1,18 +1,152 @@
-"""What stands before a model's server: it takes few kinds of requests, of a greatest size and time, one by one."""
+"""What a model on this machine may be asked, and the guard before its server: few kinds of requests, one by one."""
 
 from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from typing import Any
 from urllib.parse import urlsplit
 
-from lw_torchrl._checks import shown
-from lw_torchrl.planners.chat_request import Refused, read_request
+from lw_torchrl._checks import nearest, shown
+from lw_torchrl._files import parse_json
+from lw_torchrl.planners.plan_schema import PATTERNS
+
+MESSAGES, STOPS = 100, 8
+_SCHEMA_DEPTH, _CHOICES, _ITEMS = 12, 1000, 64
+_Check = tuple[Callable[[Any], bool], str]
+
+
+class Refused(ValueError):
+    """A request that is not answered, with its HTTP status and the same in a word, as OpenAI's server says it."""
+
+    def __init__(self, status: int, message: str, code: str = "invalid_request") -> None:
+        super().__init__(message)
+        self.status, self.code = status, code
+
+
+def read_request(body: bytes, model: str, context: int) -> bytes:
+    """The body of a request, checked and rewritten for llama-cpp-python's server: a schema is ``json_object`` there.
+
+    Args:
+        body: as it came.
+        model: the only one there is; a request without a name means it too.
+        context: tokens that an answer may have.
+
+    Raises:
+        Refused: it is no JSON, or has an unknown field or a value that is not allowed.
+    """
+    try:
+        request = parse_json(body)
+    except ValueError as error:
+        raise Refused(400, f"the body must be an object in JSON: {error}") from None
+    if request.get("model") not in (None, model):
+        said = f"the model {shown(request['model'])} does not exist here; {model!r} is served"
+        raise Refused(404, said, "model_not_found")
+    if request.get("messages") is None:
+        raise Refused(400, "messages must be given")
+    known = _FIELDS | {"model": _one_of(None, model), "max_tokens": _number(1, context, whole=True)}
+    for name, value in request.items():
+        if name not in known:
+            near = "".join(f"; did you mean {other!r}?" for other in nearest(name[:100], known, n=1))
+            raise Refused(400, f"{shown(name)} is no field that this server knows, {', '.join(sorted(known))}{near}")
+        right, allowed = known[name]
+        if value is not None and not right(value):
+            raise Refused(400, f"{name} must be {allowed}, got {shown(value)}")
+    asked = request.get("response_format") or {}
+    if asked.get("type") == "json_schema":
+        request["response_format"] = {"type": "json_object", "schema": asked["json_schema"]["schema"]}
+    given = {name: value for name, value in request.items() if value is not None}
+    try:
+        return json.dumps(given, ensure_ascii=False).encode()
+    except UnicodeEncodeError:
+        raise Refused(400, "the body has half of a surrogate pair, which UTF-8 cannot hold") from None
+
+
+def _number(least: float, most: float, whole: bool = False) -> _Check:
+    kinds = (int,) if whole else (int, float)
+    what = "an integer" if whole else "a number"
+    return (lambda value: type(value) in kinds and least <= value <= most), f"{what} from {least} to {most}"
+
+
+def _one_of(*allowed: Any) -> _Check:
+    words = " or ".join(map(json.dumps, allowed))
+    return (lambda value: any(type(value) is type(one) and value == one for one in allowed)), words
+
+
+def _is_message(value: Any) -> bool:
+    whole = isinstance(value, dict) and {*value} == {"role", "content"} and isinstance(value["content"], str)
+    return whole and value["role"] in ("system", "user", "assistant")
+
+
+def _are_stops(value: Any) -> bool:
+    stops = value if isinstance(value, list) else [value]
+    return len(stops) <= STOPS and all(isinstance(stop, str) and 1 <= len(stop) <= 100 for stop in stops)
+
+
+def _is_format(value: Any) -> bool:
+    if not isinstance(value, dict):
+        return False
+    kind, rest, holder = value.get("type"), {*value} - {"type"}, value
+    if not rest:
+        return kind in ("text", "json_object")
+    if kind == "json_schema" and rest == {"json_schema"}:
+        holder = value["json_schema"]
+        if not isinstance(holder, dict) or not {"schema"} <= {*holder} <= {"name", "schema", "strict"}:
+            return False
+    elif kind != "json_object" or rest != {"schema"}:
+        return False
+    return _is_schema(holder["schema"], _SCHEMA_DEPTH)
+
+
+def _is_schema(value: Any, depth: int) -> bool:
+    """Whether it is a schema like those of :func:`plan_schema`: others make grammars that fill the memory."""
+    if not isinstance(value, dict) or depth == 0:
+        return False
+    names, kind = {*value}, value.get("type")
+    if names == {"anyOf"}:
+        return _listed(value["anyOf"], lambda one: _is_schema(one, depth - 1))
+    if kind == "object" and names == {"type", "properties", "required", "additionalProperties"}:
+        inside = value["properties"]
+        if not isinstance(inside, dict) or not 1 <= len(inside) <= _ITEMS or value["required"] != list(inside):
+            return False
+        closed = value["additionalProperties"] is False
+        return closed and all(_is_schema(one, depth - 1) for one in inside.values())
+    if kind == "array" and names == {"type", "items", "minItems", "maxItems"}:
+        least, most = value["minItems"], value["maxItems"]
+        counts = type(least) is int and type(most) is int and 0 <= least <= most <= _ITEMS
+        return counts and _is_schema(value["items"], depth - 1)
+    if kind == "string" and names == {"type", "enum"}:
+        return _listed(value["enum"], lambda one: isinstance(one, str) and len(one) <= 200)
+    return kind == "string" and names == {"type", "pattern"} and value["pattern"] in [*PATTERNS]
+
+
+def _listed(value: Any, right: Callable[[Any], bool], most: int = _CHOICES) -> bool:
+    return isinstance(value, list) and 1 <= len(value) <= most and all(map(right, value))
+
+
+_FIELDS: dict[str, _Check] = {
+    "messages": (
+        lambda value: _listed(value, _is_message, MESSAGES),
+        f"1 to {MESSAGES} objects with role (system, user or assistant) and content, a text",
+    ),
+    "response_format": (_is_format, "text, json_object, or json_schema with a schema as plan_schema makes it"),
+    "stop": (_are_stops, f"up to {STOPS} texts of 1 to 100 characters"),
+    "n": _one_of(1),
+    "stream": _one_of(False),
+    "seed": _number(-(2**63), 2**63, whole=True),
+    "temperature": _number(0, 100),
+    "top_p": _number(0, 1),
+    "min_p": _number(0, 1),
+    "top_k": _number(0, 10**6, whole=True),
+    "presence_penalty": _number(-2, 2),
+    "frequency_penalty": _number(-2, 2),
+    "repeat_penalty": _number(0, 10),
+}
 
 BODY_LIMIT = 2**20
 """Bytes of a request; the longest prompt with its schema has some 25,000."""
+
 HEAD_SECONDS, BODY_SECONDS = 10.0, 30.0
 WAITING = 32
 """Questions that wait for their turn; more are told to come again."""
@@ -21,14 +155,14 @@ WAITING = 32
 class Guard:
     """An ASGI application before that of llama-cpp-python.
 
-    It takes ``GET /v1/models`` and ``POST /v1/chat/completions`` and nothing else, reads a request whole, and lets it
-    on in its turn if :func:`read_request` knows all of it. One whose client has gone while it waited is dropped.
+    It takes only ``GET /v1/models`` and ``POST /v1/chat/completions``, reads a request whole, and passes it on in its
+    turn if :func:`read_request` allows it. A request whose client has gone while it waited is dropped.
 
     Args:
         app: the application behind it.
         model: the name of its model.
         context: tokens of a question and its answer.
-        names: what the machine may be called in a request, so that no web page can ask by another name; None for any.
+        names: what a request may call this machine, so that no web page can ask by another name; None for any.
     """
 
     def __init__(self, app: Any, model: str, context: int, names: Collection[str] | None = None) -> None:
@@ -56,8 +190,11 @@ class Guard:
                 await self._in_turn({**scope, "headers": list(told.items())}, body, receive, answer)
             else:
                 raise Refused(404, "this server has GET /v1/models and POST /v1/chat/completions alone", "not_found")
-        except Refused as refused:
-            await _refuse(answer, refused)
+        except Refused as refused:  # in the form of OpenAI's server
+            error = {"message": str(refused), "type": "invalid_request_error", "param": None, "code": refused.code}
+            start = {"type": "http.response.start", "status": refused.status}
+            await answer(start | {"headers": [(b"content-type", b"application/json")]})
+            await answer({"type": "http.response.body", "body": json.dumps({"error": error}).encode()})
         except _Gone:
             pass
 
@@ -95,7 +232,7 @@ class Guard:
 
 
 class _Gone(Exception):
-    """Nobody waits for an answer any more."""
+    """The client has gone."""
 
 
 async def _whole(headers: dict[bytes, str], receive: Any) -> bytes:
@@ -127,14 +264,6 @@ def _given(body: bytes, then: Any) -> Any:
         return {"type": "http.request", "body": left.pop(), "more_body": False} if left else await then()
 
     return receive
-
-
-async def _refuse(send: Any, refused: Refused) -> None:
-    """As OpenAI's server refuses."""
-    error = {"message": str(refused), "type": "invalid_request_error", "param": None, "code": refused.code}
-    headers = [(b"content-type", b"application/json")]
-    await send({"type": "http.response.start", "status": refused.status, "headers": headers})
-    await send({"type": "http.response.body", "body": json.dumps({"error": error}).encode()})
 
 
 def run_server(app: Any, listener: Any) -> None:

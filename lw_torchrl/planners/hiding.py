@@ -25,10 +25,7 @@ class Hider(logging.Filter):
 
     A secret is found whole or broken by white space, punctuation, invisible characters or tags, in either case, with
     its characters escaped (JSON, URL, HTML; up to twice), in base64 and as hex digits. One of fewer than eight letters
-    and digits is found where it stands alone, as it is; one of fewer than four characters is no secret.
-
-    Args:
-        secrets: what to hide.
+    and digits is found only as it is, as a word; one of fewer than four characters is no secret.
 
     Example:
         >>> hide = Hider(["sk-2f9c41d07a"])

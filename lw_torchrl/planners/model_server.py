@@ -20,11 +20,7 @@ LOCAL = "127.0.0.1"
 
 
 def small_model() -> Path:
-    """The file of the model that the extra ``[serve]`` brings, SmolLM2 of 135 million weights, 98 MB.
-
-    Raises:
-        ImportError: the extra is absent.
-    """
+    """The file of the model that the extra ``[serve]`` brings, SmolLM2 of 135 million weights, 98 MB."""
     files = sorted(folder.glob("*.gguf")) if (folder := _small_folder()) else []
     if not files:
         raise ImportError(INSTALL)
@@ -52,15 +48,15 @@ def serve_model(
 ) -> None:
     """Serve a language model until Ctrl-C, one question at a time.
 
-    It takes ``POST /v1/chat/completions`` and ``GET /v1/models`` alone, with the fields and sizes that
-    :class:`~lw_torchrl.planners.guard.Guard` lets pass. By default it refuses who calls this machine by another name.
+    It takes only ``POST /v1/chat/completions`` and ``GET /v1/models``, with the fields and sizes that
+    :class:`~lw_torchrl.planners.guard.Guard` allows. By default it refuses requests that name another machine.
 
     Args:
         model: a GGUF file; None for the small one of the extra ``[serve]``.
-        host: the address to listen at; the default is heard by this machine alone, and there is no key.
-        port: where; 0 takes a free one.
-        context: tokens of a question and its answer, at most; the prompts take up to some 2,000.
-        threads: of the processor; None for llama.cpp's own choice, half of the processors.
+        host: the address to listen at; by default only this machine can ask. There is no key.
+        port: 0 takes a free one.
+        context: tokens of a question and its answer, at most; prompts take up to some 2,000.
+        threads: CPU threads; None for llama.cpp's own choice, half of the processors.
         ready: called with the model's name and the ``base_url`` as soon as questions are taken.
 
     Raises:
@@ -100,7 +96,7 @@ def serve_model(
 
 
 def local_names(host: str) -> set[str] | None:
-    """What a request may call a machine that is heard by itself alone; None where others hear it, by any name."""
+    """What a request may call this machine, if only the machine itself can ask; None for any name."""
     return {"localhost", host} if host == "localhost" or host.startswith("127.") else None
 
 

@@ -10,56 +10,55 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, Literal
 
-from lw_torchrl._checks import check_choice, check_int, check_scale, checked, counted, shown
+from lw_torchrl._checks import check_choice, check_int, check_positive, check_scale, checked, counted, shown
 from lw_torchrl._progress import Progress
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.skills import ScriptedSkill
 from lw_torchrl.language.tasks import TASKS, Task, check_task, named_tasks
-from lw_torchrl.planners.answer_cache import AnswerCache, Reply
-from lw_torchrl.planners.answer_folder import already_answered, recorded_answer, settle_folder
-from lw_torchrl.planners.answers import Answer, Answers, folder_name, storable, write_answer
-from lw_torchrl.planners.asking import ask_at_once
-from lw_torchrl.planners.chat_server import ChatServer, Dialect, server_address
-from lw_torchrl.planners.errors import unanswered
+from lw_torchrl.planners.answer_files import (
+    AnswerCache,
+    answer_path,
+    folder_name,
+    recorded_answer,
+    settle_folder,
+    write_answer,
+)
+from lw_torchrl.planners.answers import Answer, Answers, Reply, read_reply, storable, unanswered
+from lw_torchrl.planners.chat_server import ChatServer, Dialect, ask_at_once, server_address
 from lw_torchrl.planners.plan_schema import plan_schema
-from lw_torchrl.planners.prompts import example_plans
-from lw_torchrl.planners.questions import Question, chat_messages, request_options
-from lw_torchrl.planners.replies import read_reply
+from lw_torchrl.planners.prompts import Question, chat_messages, example_plans, request_options
 
 
 class OpenAIPlanner:
     """Asks a model behind an OpenAI-compatible server: OpenAI's own, vLLM, Ollama, llama.cpp's.
 
-    A key is taken from the environment variable OPENAI_API_KEY alone, when something is asked; a server of your own
-    wants none. Every answer is kept in ``cache``, under a key of all that determines it: the server, the model, the
-    messages, the schema, ``max_tokens``, ``temperature``, ``seed``, ``options`` and the attempt. What is there is not
-    asked for again.
+    The key comes from the environment variable OPENAI_API_KEY alone; a server of your own needs none. Every answer is
+    kept in ``cache``, under a key of all that determines it: the server, the model, the messages, the schema,
+    ``max_tokens``, ``temperature``, ``seed``, ``options`` and the attempt. What is there is not asked for again.
 
     Args:
         model: the model's name at the server.
         base_url: the server, "http://127.0.0.1:8000/v1"; None for what OPENAI_BASE_URL says, or OpenAI's.
-        constrain: hold the model to a schema that only plans of the task pass (:func:`plan_schema`). The answer is
-            JSON, and becomes a text in the format.
+        constrain: hold the model to a schema that only plans of the task pass (:func:`plan_schema`); it answers in
+            JSON, which becomes a text in the format.
         free_skills: with ``constrain``, skills in any words instead of the scripted ones.
         skills: the scripted skills to choose from; None for the shipped ones.
         plans: the plans that prompts show examples of; None for the hand-written ones of MT10.
-        vocabulary: prompts also say which things the task has, and what can be asked of them.
+        vocabulary: prompts also say which things the task has, and what can be asked about them.
         temperature: None for the server's own.
-        max_tokens: of an answer, at most; models that think first want more.
+        max_tokens: of an answer, at most; models that think first need more.
         seed: attempt k is sent ``seed + k``; None sends none.
         options: further fields of the request, ``{"top_p": 0.9}``.
-        name: of the folder for its answers; None for the model's, with "-constrained" behind it where it is.
+        name: of the folder for its answers; None for the model's, with "-constrained" if it is.
         cache: the folder where answers are kept.
         concurrency: questions at once.
-        retries: how often a question is asked again after a rate limit, a fault of the server or of the connection,
-            after a wait that doubles from half a second to 8, or as long as the server says, up to two minutes.
-        timeout: seconds that one try may take as a whole, from the connection to the answer's last byte; each of the
-            ``retries`` has as long.
+        retries: how often a question is asked again after a rate limit or a fault of the server or the connection.
+            The wait doubles from half a second to 8, or is what the server says, up to two minutes.
+        timeout: seconds that each try may take as a whole, from the connection to the answer's last byte.
 
     Raises:
-        ValueError: a number that is too small, ``base_url`` is no address, or ``free_skills`` without ``constrain``.
-        TypeError: an argument of another type.
+        ValueError: a number is too small, ``base_url`` is no address, or ``free_skills`` without ``constrain``.
 
     Example:
         >>> planner = OpenAIPlanner("meta-llama/Llama-3.1-8B", base_url="http://127.0.0.1:8000/v1", constrain=True)
@@ -92,13 +91,10 @@ class OpenAIPlanner:
         retries: int = 6,
         timeout: float = 300.0,
     ) -> None:
-        if not isinstance(model, str) or not model.strip():
+        if not model.strip():
             raise TypeError(f"model must be a model's name, got {shown(model)}")
         if storable(model) != model:
             raise ValueError(f"model must be a name that UTF-8 can hold, in one line, got {shown(model)}")
-        for argument, given in (("constrain", constrain), ("free_skills", free_skills), ("vocabulary", vocabulary)):
-            if not isinstance(given, bool):
-                raise TypeError(f"{argument} must be True or False, got {shown(given)}")
         if free_skills and not constrain:
             raise ValueError("free_skills=True is for constrain alone: without, skills are in any words")
         self.model, self.base_url, self.constrain, self.free_skills = model, base_url, constrain, free_skills
@@ -113,9 +109,7 @@ class OpenAIPlanner:
         self.cache = AnswerCache(cache)
         self.concurrency = check_int("concurrency", concurrency, minimum=1)
         self.retries = check_int("retries", retries, minimum=0)
-        self.timeout = check_scale("timeout", timeout)
-        if not self.timeout:
-            raise ValueError("timeout must be above 0 s, got 0")
+        self.timeout = check_positive("timeout", timeout)
         self._dialect: Dialect | None = None
 
     def __repr__(self) -> str:
@@ -127,9 +121,7 @@ class OpenAIPlanner:
         return {
             "server": self.address,
             "model": self.model,
-            "messages": chat_messages(
-                task, format, plans=self.examples, vocabulary=self.vocabulary, constrain=self.constrain
-            ),
+            "messages": chat_messages(task, format, self.examples, self.vocabulary, self.constrain),
             "schema": schema,
             "max_tokens": self.max_tokens,
             "temperature": self.temperature,
@@ -139,7 +131,7 @@ class OpenAIPlanner:
         }
 
     def settings(self) -> dict[str, Any]:
-        """What determines all its answers beside the question, as JSON has it; it is written beside them."""
+        """What determines all its answers beside the question, as JSON has it."""
         skills = None if self.skills is None else sha256("\n".join(sorted(self.skills)).encode()).hexdigest()[:32]
         return {
             "model": self.model,
@@ -168,9 +160,7 @@ class OpenAIPlanner:
         """Ask for plans; several questions at a time.
 
         Args:
-            tasks: "MT10", "MT50", a task's name, a :class:`~lw_torchrl.Task`, or a list of names and tasks.
-            format: a name in :data:`~lw_torchrl.PLAN_FORMATS`.
-            attempts: answers to each question.
+            tasks, format, attempts: as for :meth:`Planner.plans`.
             out: a folder; each answer is written to ``out/<name>/<format>/<task>-<attempt>.<ext>`` as it comes, the
                 JSON of a constrained one beside it, and in ``out/<name>/settings.json`` what determines them all.
             recorded: take the answers that ``out`` has as they are, and ask only for the others.
@@ -180,11 +170,9 @@ class OpenAIPlanner:
             An answer for each task and attempt.
 
         Raises:
-            PlannerError: an answer did not come. Those that came are kept; called again it asks for those that are
-                missing.
+            PlannerError: an answer did not come. Those that came are kept; called again it asks for the others.
             ImportError: something is to be asked, and the extra ``[llm]`` is absent.
-            ValueError: an unknown task or format, no scripted skill suits a task, or the folder has answers of other
-                settings.
+            ValueError: no scripted skill suits a task, or the folder has answers of other settings.
         """
         check_choice("format", format, PLAN_FORMATS)
         count = check_int("attempts", attempts, minimum=1)
@@ -205,7 +193,7 @@ class OpenAIPlanner:
         out: str | os.PathLike[str] | None = None,
         progress: bool = True,
     ) -> Answers:
-        """Ask for other plans in the place of answers of this planner, which are told what became of them.
+        """Tell the model what became of its answers, and ask for another in the place of each.
 
         Args:
             answers: of one format.
@@ -213,32 +201,23 @@ class OpenAIPlanner:
             round: of several; the name of the folder ends with it.
             tasks: where the tasks' names are looked up.
             out: a folder; answers are written to ``out/<name>-round<round>/<format>/<task>-<attempt>.<ext>``.
-            progress: as for :meth:`plans`.
-
-        Returns:
-            An answer in the place of each.
+            progress: as for :meth:`plans`, as are the errors.
 
         Raises:
-            ValueError: answers of several formats, not as many facts, or one is in ``out`` already, and another.
-            PlannerError, ImportError: as for :meth:`plans`.
+            ValueError: answers of several formats, not as many facts, or ``out`` has another answer to a question.
         """
         before, told = list(answers), list(facts)
         formats = {answer.format for answer in before}
         if len(formats) != 1 or len(told) != len(before):
-            raise ValueError(
-                f"answers must be of one format, each with its facts, got {counted(len(before), 'answer')} of "
-                f"{', '.join(sorted(formats)) or 'none'} and {len(told)} facts"
-            )
+            got = f"{counted(len(before), 'answer')} of {', '.join(sorted(formats)) or 'none'} and {len(told)} facts"
+            raise ValueError(f"answers must be of one format, each with its facts, got {got}")
         (format,) = formats
         questions = []
         for answer, fact in zip(before, told, strict=True):
             task = tasks[check_task(answer.task, tasks)]
             request = self.request(task, format, answer.attempt)
-            request["messages"] = [
-                *request["messages"],
-                {"role": "assistant", "content": answer.raw},
-                {"role": "user", "content": fact},
-            ]
+            talk = {"assistant": answer.raw, "user": fact}
+            request["messages"] += [{"role": role, "content": content} for role, content in talk.items()]
             questions.append(Question(task, answer.attempt, request))
         name = f"{self.name}-round{check_int('round', round, minimum=1)}"
         return self._answers(questions, format, name, out, progress, "refused")
@@ -266,7 +245,9 @@ class OpenAIPlanner:
                     found.append(there)
                     continue
                 if there is not None and (reply is None or self._read(reply, question, format).text != there.text):
-                    raise already_answered(out, name, there)
+                    path = str(answer_path(out, name, format, there.task, there.attempt))
+                    what = f"{path!r} is there already, the answer to another question; it is not replaced"
+                    raise ValueError(f"out: {what}: give the new ones another name (--name) or out")
             if reply is None:
                 missing[str(question)] = question, note
             else:

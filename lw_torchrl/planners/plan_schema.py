@@ -1,9 +1,4 @@
-"""A JSON Schema that only plans of one task pass: its base queries as conditions, its scripted skills.
-
-It keeps to what the strict mode of OpenAI, vLLM, Ollama, llama.cpp and llama-cpp-python all know: objects whose names
-are all required, anyOf, enum, pattern, a least and a greatest number of items. A clause is three choices, not one of
-hundreds of sentences: OpenAI takes 1,000 words to choose from at most, and the largest task has 164, with goals 320.
-"""
+"""A JSON Schema that only plans of one task pass: its base queries as conditions, its scripted skills."""
 
 from __future__ import annotations
 
@@ -36,16 +31,19 @@ def plan_schema(
 ) -> dict[str, Any]:
     """The JSON Schema of plans of a task, as :mod:`~lw_torchrl.language.formats.structured` writes them.
 
+    It uses only what the strict modes of OpenAI, vLLM, Ollama, llama.cpp and llama-cpp-python all know. A clause is
+    three choices, not one of hundreds: OpenAI takes at most 1,000 words to choose from; the largest task has 320.
+
     Args:
         task: the task, or its name.
-        format: whose style it has: a reason before each clause where that explains, and the state to reach in the goal
-            formats.
+        format: gives the style: with a reason before each clause if it explains, with the state to reach if it is a
+            goal format.
         skills: the scripted skills to choose from; None for the shipped ones.
         free_skills: skills in any words instead.
         tasks: where a task's name is looked up, as from :func:`~lw_torchrl.load_tasks`.
 
     Raises:
-        ValueError: an unknown task or format, or no scripted skill suits the task.
+        SkillError: (a ValueError) no scripted skill suits the task.
 
     Example:
         >>> schema = plan_schema("reach")
@@ -76,9 +74,8 @@ def passes(value: Any, schema: Mapping[str, Any]) -> bool:
         return value in schema["enum"]
     if schema["type"] == "object":
         known = schema["properties"]
-        return (
-            isinstance(value, dict) and {*value} == {*known} and all(passes(value[name], known[name]) for name in known)
-        )
+        whole = isinstance(value, dict) and {*value} == {*known}
+        return whole and all(passes(value[name], known[name]) for name in known)
     if schema["type"] == "array":
         fits = isinstance(value, list) and schema["minItems"] <= len(value) <= schema["maxItems"]
         return fits and all(passes(one, schema["items"]) for one in value)
@@ -112,9 +109,5 @@ def _listed(items: dict[str, Any], most: int) -> dict[str, Any]:
 
 
 def _object(properties: dict[str, Any]) -> dict[str, Any]:
-    return {
-        "type": "object",
-        "properties": properties,
-        "required": list(properties),
-        "additionalProperties": False,
-    }
+    rules = {"required": list(properties), "additionalProperties": False}
+    return {"type": "object", "properties": properties, **rules}

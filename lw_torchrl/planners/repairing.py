@@ -1,4 +1,4 @@
-"""repair_plans: what became of a plan goes back to the model that wrote it, and it writes another."""
+"""repair_plans: the model that wrote a plan is told what became of it, and writes another."""
 
 from __future__ import annotations
 
@@ -14,20 +14,14 @@ from lw_torchrl._checks import check_int
 from lw_torchrl._progress import Progress
 from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.language.tasks import TASKS, Task, check_task
-from lw_torchrl.planners.answers import Answer
+from lw_torchrl.planners.answers import CUT_OFF, Answer
 from lw_torchrl.planners.checking import PlanCheck, check_decoded
 from lw_torchrl.planners.openai_planner import OpenAIPlanner
-from lw_torchrl.planners.replies import CUT_OFF
 
 
 @dataclass(frozen=True)
 class Repair:
-    """An answer and those that came in its place.
-
-    Attributes:
-        answers: the first, then one of each round.
-        checks: what became of each.
-    """
+    """An answer and those that came in its place, one a round, with what became of each."""
 
     answers: tuple[Answer, ...]
     checks: tuple[PlanCheck, ...]
@@ -42,10 +36,7 @@ class Repair:
 def plan_facts(check: PlanCheck, task: Task, notes: Sequence[str] = ()) -> str:
     """What became of a plan, in words for the model that wrote it.
 
-    Args:
-        check: of the plan, with how near things came.
-        task: the task, whose points are named.
-        notes: of the answer; the model is told of those that it can mend: that it was cut off.
+    ``notes`` are those of the answer; the model is told the one that it can mend, that it was cut off.
 
     Example:
         >>> from lw_torchrl.language.tasks import TASKS
@@ -80,8 +71,7 @@ def plan_facts(check: PlanCheck, task: Task, notes: Sequence[str] = ()) -> str:
 
 
 def _distances(task: Task, failed: Iterable[Tensor]) -> list[str]:
-    """How near things came to one another in failed episodes, the median over these: the gripper to each, and things
-    that move to those that stay."""
+    """How near the gripper came to each thing, and things that move to those that stay: medians of failed episodes."""
     episodes = [task.published.positions(observation) for observation in failed]
     if not episodes:
         return []
@@ -114,24 +104,21 @@ def repair_plans(
 ) -> list[Repair]:
     """Carry out plans, tell the model what became of those that fail, and ask for others, round by round.
 
-    Every answer of every round is kept: ``out`` is a folder for :func:`~lw_torchrl.planners.comparing.compare_plans`,
-    in which rounds are models of their own.
+    Every answer is kept: ``out`` is a folder for :func:`~lw_torchrl.planners.comparing.compare_plans`, in which each
+    round counts as a model.
 
     Args:
         planner: who wrote the answers.
         answers: its answers, of one format.
         rounds: at most.
         enough: the success rate from which a plan is left as it is.
-        episodes, seed: in which plans are carried out by scripted skills. Compare repaired plans on another seed.
+        episodes, seed: in which scripted skills carry out plans. Compare repaired plans on another seed.
         tasks: where tasks' names are looked up.
         out: as for :meth:`OpenAIPlanner.revise`.
         progress: show progress bars.
 
-    Returns:
-        For each answer what came of it.
-
     Raises:
-        ValueError: a wrong option, or answers of several formats.
+        ValueError: answers of several formats.
         PlannerError: an answer did not come; those that came are kept.
     """
     check_int("rounds", rounds, minimum=1)

@@ -14,14 +14,13 @@ from hypothesis import strategies as st
 
 import lw_torchrl as lw
 from benchmarks.decoding import mutated
-from lw_torchrl.language import query_search, skills, step_mapping
+from lw_torchrl.language import nearest
 from lw_torchrl.language import text as text_encoders
-from lw_torchrl.language.decoding import decode_as
+from lw_torchrl.language.decoding import decode_as, without_thoughts
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.formats.structured import read_structured, write_structured
+from lw_torchrl.language.nearest import StepMapper
 from lw_torchrl.language.skills import ScriptedSkill
-from lw_torchrl.language.step_mapping import StepMapper
-from lw_torchrl.language.thoughts import without_thoughts
 
 formats = st.sampled_from(list(lw.PLAN_FORMATS))
 
@@ -234,7 +233,7 @@ def test_limits():
 @pytest.fixture
 def _no_vectors_kept():
     def forget():
-        for cached in (query_search._vectors, skills._vectors, step_mapping._nearest):
+        for cached in (nearest._vectors, nearest._nearest_condition):
             cached.cache_clear()
 
     forget()
@@ -300,7 +299,7 @@ any_text = st.text(st.characters()) | st.lists(st.sampled_from(LINES) | st.text(
 @example("- When x, move the robot's gripper until .", "goal_md")
 @example("Steps:  1.", "goal_md")
 @example("\ud800 if \x00", "basic_py_md")
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=120, deadline=None)
 @given(any_text, formats)
 def test_any_text_is_a_plan_or_a_reason(text, format):
     found = lw.decode_plan(text, "push", format)

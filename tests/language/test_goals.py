@@ -74,7 +74,7 @@ def test_a_goal_is_checked():
     with pytest.raises(PlanError, match=r"step 1 of plan 'push'.*drawer"):
         ConditionalPlan("push", (PlanStep(condition, "x", goal="the gripper is near the drawer handle"),))
     text = 'def push(robot):\n    if check("gripper open"):\n        robot.place("x", goal="the gripper is wet")\n'
-    from lw_torchrl.language.formats.chain_py import check_plan
+    from lw_torchrl.language.plan_files import check_plan
 
     plan, faults = check_plan(text)
     assert plan is None

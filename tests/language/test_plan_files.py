@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lw_torchrl.language.nearest import nearest_query
 from lw_torchrl.language.plan_files import load_plans, save_plans
 from lw_torchrl.language.plans import PlanError
-from lw_torchrl.language.query_search import nearest_query
 from lw_torchrl.language.tasks import MT50
 
 PAIRS = {

@@ -1,12 +1,14 @@
 """The nine formats: each reads back what it wrote, and looks as it should."""
 
+from dataclasses import replace
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from plan_texts import conditional_plans, queries
 
 import lw_torchrl as lw
-from lw_torchrl.language.formats.chain_py import format_plan, parse_plan
+from lw_torchrl.language.plan_files import format_plan, parse_plan
 from lw_torchrl.language.plans import ConditionalPlan, PlanStep
 from lw_torchrl.language.queries import parse_query
 
@@ -33,8 +35,24 @@ def plans_with_goals(draw):
 
 def test_the_formats_by_name():
     assert list(lw.PLAN_FORMATS) == NINE
-    with pytest.raises(TypeError):
-        lw.PLAN_FORMATS["mine"] = lw.PLAN_FORMATS["chain_py"]
+
+
+def test_a_format_of_ones_own(monkeypatch):
+    shouted = replace(lw.PLAN_FORMATS["chain_py"], extension="txt", encode=lambda plan: str(plan).replace("#", "##"))
+    monkeypatch.setitem(lw.PLAN_FORMATS, "shouted", shouted)
+    text = lw.encode_plan(SHIPPED[0], "shouted")
+    assert text.startswith("## ")
+    assert lw.decode_plan(text, SHIPPED[0].task, "shouted").plan == SHIPPED[0]
+    assert lw.plan_prompt("push", "shouted") == lw.plan_prompt("push", "chain_py")
+
+
+@pytest.mark.parametrize("name", ["", "a b", "../up", "Mine", 3])
+def test_a_format_needs_a_name_that_a_folder_can_have(name):
+    with pytest.raises(ValueError, match="basic_py"):
+        lw.PLAN_FORMATS[name] = lw.PLAN_FORMATS["chain_py"]
+    with pytest.raises(TypeError, match="'mine' must be a PlanFormat"):
+        lw.PLAN_FORMATS["mine"] = "chain_py"
+    assert list(lw.PLAN_FORMATS) == NINE
 
 
 @pytest.mark.parametrize("format", NINE)
@@ -43,19 +61,19 @@ def test_shipped_plans_are_read_back(format):
         assert read_back(plan, format) == plan
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(conditional_plans(), st.sampled_from(NINE))
 def test_any_plan_is_read_back(plan, format):
     assert read_back(plan, format) == plan
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(plans_with_goals(), st.sampled_from(NINE[6:]))
 def test_goals_are_read_back_where_they_have_a_place(plan, format):
     assert read_back(plan, format) == plan
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(plans_with_goals())
 def test_plan_files_hold_goals(plan):
     assert parse_plan(format_plan(plan)) == plan

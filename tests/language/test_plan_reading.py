@@ -7,9 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from plan_texts import DRAWER, HEAD, plan
 
-from lw_torchrl.language.formats import chain_py
-from lw_torchrl.language.formats.chain_py import check_plan, format_plan, parse_plan
-from lw_torchrl.language.plan_files import load_plans
+from lw_torchrl.language import plan_files
+from lw_torchrl.language.plan_files import check_plan, format_plan, load_plans, parse_plan
 from lw_torchrl.language.plans import MOST_STEPS, PLAN_LIMIT, ConditionalPlan, PlanError
 from lw_torchrl.language.queries import check_query, parse_query
 
@@ -53,17 +52,9 @@ def test_comments_play_no_part_in_what_a_plan_does():
 @pytest.mark.parametrize(
     ("task", "written", "skill"),
     [
-        (
-            "push",
-            'robot.place("gripper above puck")',
-            "place the gripper above the puck",
-        ),  # the paper's example
+        ("push", 'robot.place("gripper above puck")', "place the gripper above the puck"),  # the paper's example
         ("push", 'robot.place("the gripper above the puck")', "place the gripper above the puck"),
-        (
-            "push",
-            'robot.place("the robot\'s gripper above the  puck")',
-            "place the robot's gripper above the puck",
-        ),
+        ("push", 'robot.place("the robot\'s gripper above the  puck")', "place the robot's gripper above the puck"),
         ("push", 'robot.move("its gripper to an open pose")', "move its gripper to an open pose"),
         ("push", 'robot.slide("puck to target location")', "slide the puck to the target location"),
         ("push", 'robot.move("puckish things")', "move puckish things"),
@@ -188,7 +179,7 @@ plan_lines = st.lists(
 ).map("\n".join)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=120, deadline=None)
 @given(plan_lines | st.text(st.characters()))
 def test_any_text_is_a_plan_or_a_plan_error(text):
     try:
@@ -200,7 +191,7 @@ def test_any_text_is_a_plan_or_a_plan_error(text):
 
 def test_all_faults_come_in_one_pass(monkeypatch):
     asked = []
-    monkeypatch.setattr(chain_py, "check_query", lambda text, task: asked.append(text) or check_query(text, task))
+    monkeypatch.setattr(plan_files, "check_query", lambda text, task: asked.append(text) or check_query(text, task))
     step = "    if check('the gripper is {} the pluck'):\n        robot.wait()\n"
     found, faults = check_plan("def push(robot):\n" + "".join(step.format("near") for _ in range(50)), source="my.plan")
     assert found is None

@@ -3,13 +3,13 @@
 from hypothesis import given, settings
 from plan_texts import conditional_plans, plan
 
-from lw_torchrl.language.formats.chain_py import format_plan, parse_plan
+from lw_torchrl.language.plan_files import format_plan, parse_plan
 from lw_torchrl.language.plans import ConditionalPlan, PlanStep
 from lw_torchrl.language.queries import parse_query
 from lw_torchrl.language.tasks import TASKS, Task
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=120, deadline=None)
 @given(conditional_plans())
 def test_the_text_of_a_plan_reads_back_as_the_same_plan(given):
     text = format_plan(given)

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from plan_texts import DRAWER, conditional_plans, plan
 
-from lw_torchrl.language.formats.chain_py import format_plan, parse_plan
 from lw_torchrl.language.named_objects import GRIPPER
+from lw_torchrl.language.plan_files import format_plan, parse_plan
 from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans, PlanStep, as_plans
 from lw_torchrl.language.queries import Clause, Query, QueryError, parse_query
 
@@ -52,11 +52,7 @@ def test_a_skill_is_kept_in_canonical_spelling_or_refused(given, skill):
 
 
 def test_a_condition_is_kept_in_canonical_spelling():
-    for condition in (
-        "Gripper open?",
-        Query((Clause("gripper", "open"),)),
-        Query((Clause(GRIPPER, "open"),)),
-    ):
+    for condition in ("Gripper open?", Query((Clause("gripper", "open"),)), Query((Clause(GRIPPER, "open"),))):
         step = ConditionalPlan("push", (PlanStep(condition, "push the puck"),)).steps[0]
         assert step.condition == Query((Clause(GRIPPER, "open"),))
 
@@ -77,12 +73,7 @@ def test_reasons_play_no_part_in_equality():
         ("push", (PlanStep("gripper open", "push"), None), TypeError, "step 2"),
         ("push", (PlanStep(None, "push"),), TypeError, "string"),
         ("push", (PlanStep("gripper open", "push"), PlanStep("gripper flies", "push")), PlanError, "step 2"),
-        (
-            "push",
-            (PlanStep(parse_query("gripper near drawer handle", "drawer-open"), "x"),),
-            PlanError,
-            "step 1",
-        ),
+        ("push", (PlanStep(parse_query("gripper near drawer handle", "drawer-open"), "x"),), PlanError, "step 1"),
         ("push", (PlanStep(Query(()), "push"),), PlanError, "step 1"),
     ],
 )

@@ -43,18 +43,20 @@ def test_published_only_leaves_them_out_and_the_rest_stays_as_it_is(name):
     assert all(str(parse_query(text, task)) == text for text in everything)
 
 
-@pytest.mark.parametrize("name", MT50)
-def test_the_truth_of_published_queries_does_not_change(name):
-    states, ids = states_of(name)
-    published = list(supported_queries(name, published_only=True))
-    alone = QueryProgram({TASKS[name].published: published})(states, ids)
-    beside = QueryProgram({with_points(name): [*published, "gripper near fixed place"]})(states, ids)
-    assert torch.equal(alone, beside[:, :-1])
-    shipped = QueryProgram({name: published})(states, ids)
-    assert torch.equal(alone, shipped)
+def test_the_truth_of_published_queries_does_not_change():
+    changed = []
+    for name in MT50:
+        states, ids = states_of(name)
+        published = list(supported_queries(name, published_only=True))
+        alone = QueryProgram({TASKS[name].published: published})(states, ids)
+        beside = QueryProgram({with_points(name): [*published, "gripper near fixed place"]})(states, ids)
+        shipped = QueryProgram({name: published})(states, ids)
+        if not (torch.equal(alone, beside[:, :-1]) and torch.equal(alone, shipped)):
+            changed.append(name)
+    assert not changed
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(st.sampled_from(MT50), st.tuples(metres, metres, metres), st.sampled_from(sorted(RELATIONS)))
 def test_a_point_is_where_positions_say(name, offset, relation):
     task = with_points(name, offset)
@@ -121,8 +123,7 @@ def test_a_wrong_offset_is_refused(offset):
 
 
 @pytest.mark.parametrize(
-    "position",
-    [("obs", 1, 2), (True, 1, 2), (None, 1, 2), (float("nan"), 0.0, 0.0), (0.0, 0.0, float("inf"))],
+    "position", [("obs", 1, 2), (True, 1, 2), (None, 1, 2), (float("nan"), 0.0, 0.0), (0.0, 0.0, float("inf"))]
 )
 def test_a_wrong_coordinate_is_refused(position):
     with pytest.raises(ValueError, match="position of 'place' must hold"):

@@ -10,16 +10,8 @@ from hypothesis import strategies as st
 
 from lw_torchrl.language import queries
 from lw_torchrl.language.named_objects import GRIPPER, NamedObject
-from lw_torchrl.language.queries import (
-    ARTICLES,
-    Clause,
-    Query,
-    QueryError,
-    check_query,
-    parse_query,
-    supported_queries,
-)
-from lw_torchrl.language.query_search import nearest_query
+from lw_torchrl.language.nearest import nearest_query
+from lw_torchrl.language.queries import ARTICLES, Clause, Query, QueryError, check_query, parse_query, supported_queries
 from lw_torchrl.language.relations import RELATIONS, TOUCHING
 from lw_torchrl.language.tasks import MT50, TASKS, Task, get_task
 
@@ -70,11 +62,7 @@ def spelled(draw):
     text = " and ".join(parts)
     text = draw(st.sampled_from([text, text.capitalize(), text.upper(), text.title(), text.replace("'", "’")]))
     text = draw(st.sampled_from(["", " ", "\n\t"])) + text + draw(st.sampled_from(["", "?", " ?", ".", "  ", "?\n"]))
-    return (
-        task,
-        query,
-        draw(st.sampled_from([text, text.replace(" ", "  "), text.replace(" and ", "\n and\t")])),
-    )
+    return (task, query, draw(st.sampled_from([text, text.replace(" ", "  "), text.replace(" and ", "\n and\t")])))
 
 
 def without_articles(text):
@@ -90,7 +78,7 @@ def test_the_canonical_spelling_parses_to_the_same_query(given):
     assert parse_query(str(query), TASKS[task]) == query
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=120, deadline=None)
 @given(spelled())
 def test_every_spelling_parses_to_the_same_query(given):
     task, query, text = given
@@ -219,13 +207,13 @@ def is_query_or_error(text, task):
 @example("\ud800", "reach")
 @example("\x00", "reach")
 @example("İs the gripper open", "reach")
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=120, deadline=None)
 @given(any_text | word_salad, tasks)
 def test_any_text_is_a_query_or_a_query_error(text, task):
     is_query_or_error(text, task)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=120, deadline=None)
 @given(st.data())
 def test_a_shuffled_query_is_a_query_or_a_query_error(data):
     task, query = data.draw(task_queries())
@@ -349,7 +337,7 @@ def test_the_nearest_query_of_a_clause_without_subject_is_about_the_one_before()
         parse_query("the puck is near the gripper and not over the target location", "push")
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(st.text(min_size=300, max_size=2000) | st.lists(st.sampled_from(VOCABULARY), min_size=60).map(" ".join), tasks)
 def test_an_error_quotes_little_of_a_long_text(text, task):
     with pytest.raises(QueryError) as caught:
@@ -400,11 +388,8 @@ words = st.sampled_from(
 own_names = st.lists(words, min_size=1, max_size=3).map(" ".join)
 
 
-@settings(max_examples=200, deadline=None)
-@given(
-    data=st.data(),
-    names=st.lists(own_names.filter(lambda n: n != GRIPPER), min_size=1, max_size=4, unique=True),
-)
+@settings(max_examples=80, deadline=None)
+@given(data=st.data(), names=st.lists(own_names.filter(lambda n: n != GRIPPER), min_size=1, max_size=4, unique=True))
 def test_the_objects_of_a_task_of_ones_own_may_have_any_allowed_name(data, names):
     named = (NamedObject(GRIPPER, (0, 1, 2)), *(NamedObject(name, (4, 5, 6)) for name in names))
     task = Task("mine", "Mine.", named)

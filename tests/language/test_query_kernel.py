@@ -14,8 +14,8 @@ from states import all_tasks, random_states
 from lw_torchrl.language import query_program
 from lw_torchrl.language.named_objects import GRIPPER, NamedObject
 from lw_torchrl.language.queries import supported_queries
-from lw_torchrl.language.query_facts import MOST_FACTS
 from lw_torchrl.language.query_program import QueryProgram, find_kernel
+from lw_torchrl.language.query_tables import MOST_FACTS
 from lw_torchrl.language.tasks import MT50, Task, task_id
 
 
@@ -45,7 +45,7 @@ def on_thresholds(states):
     return states
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(data=st.data())
 def test_the_compiled_pass_gives_the_bits_of_the_tables(data):
     names = data.draw(st.lists(st.sampled_from(MT50), min_size=1, max_size=4, unique=True))

@@ -44,15 +44,18 @@ def same_sign(program, observation, ids):
     return sum(len(program.queries[MT50[i]]) for i in ids.reshape(-1).tolist())
 
 
-def test_soft_and_hard_truth_agree_on_a_million_pairs_of_state_and_query():
+@pytest.mark.parametrize(
+    ("seeds", "n", "pairs"), [((11,), 10, 150_000), pytest.param((11, 12), 40, 1_000_000, marks=pytest.mark.slow)]
+)
+def test_soft_and_hard_truth_agree(seeds, n, pairs):
     compared = 0
-    for seed in (11, 12):
-        states = [random_states(task, seed=seed, n=40) for task in MT50]
-        ids = torch.arange(50).repeat_interleave(40)
+    for seed in seeds:
+        states = [random_states(task, seed=seed, n=n) for task in MT50]
+        ids = torch.arange(50).repeat_interleave(n)
         for found in (np.concatenate(states), on_thresholds(np.concatenate(states))):
             for dtype in (torch.float32, torch.float64):
                 compared += same_sign(everything(), torch.from_numpy(found).to(dtype), ids)
-    assert compared > 1_000_000
+    assert compared > pairs
 
 
 @pytest.mark.slow
@@ -81,7 +84,7 @@ numbers = st.floats(-0.25, 0.25, width=32) | st.sampled_from([0.0, 0.02, 0.03, 0
 large = st.floats(allow_nan=False, allow_infinity=False, width=32)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40, deadline=None)
 @example([0.0] * 39, 3)
 @example([3.4e38] * 20 + [-3.4e38] * 19, 12)
 @given(st.lists(numbers | large, min_size=39, max_size=39), st.integers(0, 49))
@@ -171,10 +174,10 @@ def test_following_the_gradient_makes_a_query_true():
     query = "the gripper is above the puck and the puck is near the target location and the gripper is open"
     program, ids = QueryProgram({"push": [query]}), torch.full((64,), task_id("push"))
     state = torch.from_numpy(random_states("push", n=64)).requires_grad_()
-    for _ in range(4000):
+    for _ in range(1000):
         logits = program.logits(state, ids)
         (gradient,) = torch.autograd.grad(logits.clamp(max=0.2).sum(), state)
-        state = (state + 2e-5 * gradient).detach().requires_grad_()
+        state = (state + 8e-5 * gradient).detach().requires_grad_()
     assert program(state.detach(), ids).float().mean() > 0.95
 
 

@@ -10,19 +10,11 @@ import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from lw_torchrl.language.nearest import nearest_query
 from lw_torchrl.language.plans import ConditionalPlan
 from lw_torchrl.language.queries import QueryError, parse_query, supported_queries
 from lw_torchrl.language.query_program import QueryProgram
-from lw_torchrl.language.query_search import nearest_query
-from lw_torchrl.language.relations import (
-    PREDICATES,
-    PUBLISHED,
-    RELATIONS,
-    TOUCHING,
-    UNARY,
-    Comparison,
-    relation_holds,
-)
+from lw_torchrl.language.relations import PREDICATES, PUBLISHED, RELATIONS, TOUCHING, UNARY, Comparison, relation_holds
 from lw_torchrl.language.tasks import task_id
 
 # Every relation as (value, sense, threshold) on d = first - second in metres, from the published semantics.
@@ -241,10 +233,7 @@ OWN = {
     ),
     "far from": (Comparison("xyz", ">", 0.2),),
     "level with": (Comparison("z", "<=", 0.0, length=False), Comparison("yz", "<=", 0.05, raise_z=0.01)),
-    "somewhere over": (
-        *(Comparison(axis, ">", -0.05, length=False) for axis in "xyz"),
-        Comparison("xy", ">", 0.05),
-    ),
+    "somewhere over": (*(Comparison(axis, ">", -0.05, length=False) for axis in "xyz"), Comparison("xy", ">", 0.05)),
 }
 
 

@@ -25,12 +25,7 @@ BY_EYE = [
     ("stick-pull", 5, "target location", "thermos"),
     ("plate-slide", 2, "target location", "plate"),
     ("peg-insert-side", 0, "peg", G),
-    (
-        "peg-insert-side",
-        4,
-        "hole",
-        "peg",
-    ),  # held, though its script steers the gripper
+    ("peg-insert-side", 4, "hole", "peg"),  # held, though its script steers the gripper
     ("pick-place", 3, "target location", "puck"),
     ("reach-wall", 0, "target location", G),
 ]

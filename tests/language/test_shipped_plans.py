@@ -7,7 +7,7 @@ import pytest
 import lw_torchrl as lw
 from lw_torchrl.evaluation.plan_use import expert_use
 from lw_torchrl.language import text
-from lw_torchrl.language.formats.chain_py import format_plan, parse_plan
+from lw_torchrl.language.plan_files import format_plan, parse_plan
 
 EPISODES = 30
 

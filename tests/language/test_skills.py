@@ -6,7 +6,8 @@ from hypothesis import strategies as st
 
 import lw_torchrl as lw
 from lw_torchrl.language.named_objects import GRIPPER
-from lw_torchrl.language.skills import ScriptedSkill, SkillError, load_skills, nearest_skill, skills_for
+from lw_torchrl.language.nearest import nearest_skill
+from lw_torchrl.language.skills import ScriptedSkill, SkillError, load_skills, skills_for
 
 
 def written(tmp_path, text):

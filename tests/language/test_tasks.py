@@ -8,10 +8,9 @@ import pytest
 import torch
 
 from lw_torchrl.language.named_objects import GRIPPER, NamedObject
+from lw_torchrl.language.nearest import nearest_query
 from lw_torchrl.language.queries import parse_query, supported_queries
 from lw_torchrl.language.query_program import QueryProgram
-from lw_torchrl.language.query_search import nearest_query
-from lw_torchrl.language.task_files import load_tasks
 from lw_torchrl.language.tasks import (
     MT10,
     MT50,
@@ -20,6 +19,7 @@ from lw_torchrl.language.tasks import (
     TaskError,
     check_task,
     get_task,
+    load_tasks,
     resolve_tasks,
     task_id,
 )

@@ -10,8 +10,8 @@ import torch
 
 from lw_torchrl.language import text
 from lw_torchrl.language.plan_files import load_plans
-from lw_torchrl.language.shipped_texts import shipped_texts, write_table
 from lw_torchrl.language.tasks import TASKS
+from lw_torchrl.language.text import shipped_texts, write_table
 
 NEW = "juggle three drawers while whistling"
 DESCRIPTIONS = [task.description for task in TASKS.values()]
@@ -95,7 +95,7 @@ def test_a_new_text_without_the_extra_says_what_to_install(without_extra):
 def test_writing_the_table_gives_what_is_shipped(tmp_path, encoded, monkeypatch):
     path = tmp_path / "embeddings.npz"
     texts, vectors = encoded
-    monkeypatch.setattr("lw_torchrl.language.shipped_texts.sentence_encoder", lambda listed: vectors)
+    monkeypatch.setattr("lw_torchrl.language.text.sentence_encoder", lambda listed: vectors)
     write_table(path, texts)
     with text.np.load(path, allow_pickle=False) as table:
         assert table["texts"].tolist() == texts

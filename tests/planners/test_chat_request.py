@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 import lw_torchrl as lw
 from lw_torchrl.planners import guard
-from lw_torchrl.planners.chat_request import Refused, read_request
+from lw_torchrl.planners.guard import Refused, read_request
 
 
 def read(**fields):
@@ -89,7 +89,7 @@ ANY = st.recursive(
 )
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(st.dictionaries(st.sampled_from([*WRONG, *ASKED, "seed", "stop", "response_format"]), ANY, max_size=4))
 def test_any_request_is_read_or_refused(fields):
     try:

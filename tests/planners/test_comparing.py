@@ -9,9 +9,9 @@ import pytest
 import lw_torchrl as lw
 from lw_torchrl.planners import answer_path
 from lw_torchrl.planners import comparing as module
+from lw_torchrl.planners.answer_files import ignored_files
 from lw_torchrl.planners.comparing import compare_plans
 from lw_torchrl.planners.comparison_report import no_plans, write_report
-from lw_torchrl.planners.file_planner import ignored_files
 
 PLANS = lw.load_plans("MT10")
 SHORT = {"episodes": 4, "max_steps": 60, "progress": False}
@@ -116,10 +116,7 @@ def test_why_answers_have_no_plan(answers):
     (answers / "good/chain_py/push-3.txt").write_text("?")
     (answers / "good/chain_py/push-3.json").write_text("?")
     found = no_plans(compare_plans(answers, **SHORT))
-    assert found == [
-        "5 answers have no plan:",
-        "5: it has no steps, neither for the task nor for another task",
-    ]
+    assert found == ["5 answers have no plan:", "5: it has no steps, neither for the task nor for another task"]
     assert [path.name for path in ignored_files(answers)] == ["push-3.txt", "push_2.py"]
     assert no_plans(module.PlanComparison([], {})) == []
 

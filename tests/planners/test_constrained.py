@@ -12,9 +12,8 @@ import lw_torchrl as lw
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.formats.structured import read_structured, write_structured
 from lw_torchrl.planners import plan_schema
-from lw_torchrl.planners.answer_cache import Reply
+from lw_torchrl.planners.answers import Reply, read_reply
 from lw_torchrl.planners.plan_schema import passes
-from lw_torchrl.planners.replies import read_reply
 
 OTHER_WORDS = lw.load_plans("MT50", skills="MT10")
 PUSH = plan_schema("push")
@@ -50,7 +49,7 @@ def parts(schema):
 
 @pytest.mark.parametrize("format", FORMATS)
 def test_the_schema_of_every_task_is_one_that_servers_know(format):
-    for task in lw.MT50:
+    for task in lw.MT50 if PLAN_FORMATS[format].style.goals else lw.MT10:
         schema = plan_schema(task, format)
         jsonschema.Draft202012Validator.check_schema(schema)
         found = list(parts(schema))
@@ -71,7 +70,7 @@ def test_the_schema_of_every_task_is_one_that_servers_know(format):
 @pytest.mark.parametrize("format", FORMATS)
 def test_every_shipped_plan_passes_and_comes_back(format):
     style = PLAN_FORMATS[format].style
-    for task, plan in PLANS.items():
+    for task, plan in list(PLANS.items())[:: 1 if style.goals else 5]:
         text = write_structured(plan, style)
         jsonschema.validate(json.loads(text), plan_schema(task, format))
         answer = read_reply(Reply(text), lw.TASKS[task], format, schema=plan_schema(task, format))
@@ -182,7 +181,7 @@ def test_answers_are_validated_as_the_standard_says(found, value, draw):
     assert passes(answer, schema) == validator.is_valid(answer)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(ANY_JSON, st.text(max_size=10), st.none() | st.integers(0, 60))
 def test_any_other_text_is_a_plan_or_a_reason(value, before, cut):
     text = (before + json.dumps({"steps": value}))[:cut]

@@ -87,12 +87,7 @@ def test_a_body_has_a_size_and_a_time(monkeypatch):
     slow = {"type": "http.request", "body": b" ", "more_body": True}
     length = {"headers": [(b"content-length", b"9999999")]}
     requests = ({}, [part] * 5), ({}, [slow, 0.05] * 50), (length, [whole()]), ({}, [part, GONE])
-    assert called(*requests) == [
-        413,
-        408,
-        413,
-        None,
-    ]
+    assert called(*requests) == [413, 408, 413, None]
     assert (
         called(*[({"headers": [(b"content-length", wrong)]}, []) for wrong in (b"-1", b"1e3", b"9" * 5000)])
         == [413] * 3

@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import lw_torchrl as lw
-from lw_torchrl.planners import bounded_client
-from lw_torchrl.planners.answer_cache import AnswerCache
-from lw_torchrl.planners.completion import NoCompletion, read_completion
+from lw_torchrl.planners import chat_reply
+from lw_torchrl.planners.answer_files import AnswerCache
+from lw_torchrl.planners.chat_reply import NoCompletion, read_completion
 from lw_torchrl.planners.hiding import Hider
 
 pytestmark = pytest.mark.usefixtures("no_account")
@@ -116,7 +116,7 @@ def test_the_others_are_answered_beside_one_that_drips(tmp_path):
 @pytest.mark.parametrize("status", [200, 302, 500])
 @pytest.mark.parametrize("length", ["Content-Length: 99999999999", "Connection: close"])
 def test_a_reply_without_an_end_is_not_read_to_it(tmp_path, monkeypatch, status, length):
-    monkeypatch.setattr(bounded_client, "REPLY_LIMIT", 2**20)
+    monkeypatch.setattr(chat_reply, "REPLY_LIMIT", 2**20)
     sent = []
 
     def talk():
@@ -133,7 +133,7 @@ def test_a_reply_without_an_end_is_not_read_to_it(tmp_path, monkeypatch, status,
 
 
 def test_a_reply_that_is_too_large_is_named(tmp_path):
-    body = json.dumps(completion("x" * bounded_client.REPLY_LIMIT))
+    body = json.dumps(completion("x" * chat_reply.REPLY_LIMIT))
     with (
         serving(FakeServer(lambda _: Failure(200, body))) as address,
         pytest.raises(lw.planners.PlannerError, match="the reply is larger than 4 MiB"),
@@ -291,7 +291,7 @@ def test_a_field_of_a_wrong_type_is_an_error_or_a_note(place):
 NEW = st.binary(max_size=6) | st.sampled_from([DEEP, b"\\ud800", b"NaN", b"1e999", b'"', b"}", b","])
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=160, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, len(BODY)), st.integers(0, 9), NEW), max_size=4))
 def test_a_mutated_reply_is_an_answer_or_no_completion(tmp_path_factory, mutations):
     content = BODY

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import lw_torchrl as lw
-from lw_torchrl.planners.answer_cache import AnswerCache, Reply
-from lw_torchrl.planners.answers import Tokens
+from lw_torchrl.planners.answer_files import AnswerCache
+from lw_torchrl.planners.answers import Reply, Tokens
 
 pytestmark = pytest.mark.usefixtures("no_account")
 
@@ -23,7 +23,7 @@ for _ in range(900):
 REQUEST = st.fixed_dictionaries({"model": TEXT, "options": ANYTHING | st.just(DEEP_LIST) | st.just([[DEEP_LIST] * 2])})
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(REQUEST, st.builds(Reply, ANYTHING, ANYTHING, TEXT, st.builds(Tokens, COUNT, COUNT), st.tuples(ANYTHING)))
 def test_what_is_written_can_be_read_and_the_rest_is_not_written(tmp_path_factory, request_, reply):
     cache = AnswerCache(tmp_path_factory.mktemp("kept"))
@@ -43,7 +43,7 @@ def test_a_text_that_is_too_large_is_not_written(tmp_path):
 
 
 def test_an_answer_that_cannot_be_kept_is_given_with_a_note(tmp_path, monkeypatch):
-    monkeypatch.setattr("lw_torchrl.planners.answer_cache.JSON_LIMIT", 10)
+    monkeypatch.setattr("lw_torchrl.planners.answer_files.JSON_LIMIT", 10)
     with serving(FakeServer()) as address:
         (answer,) = planner(address, tmp_path).plans("push", progress=False)
     assert answer.decoded.plan == PLANS["push"]

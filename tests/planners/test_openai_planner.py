@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import lw_torchrl as lw
-from lw_torchrl.planners.answer_cache import answer_key
+from lw_torchrl.planners.answer_files import answer_key
 
 
 @pytest.fixture(autouse=True)
@@ -313,7 +313,7 @@ def key(changes, asked):
     return answer_key(lw.OpenAIPlanner(**{**BASE, **changes}).request(lw.TASKS[task], format, attempt))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(st.fixed_dictionaries({}, optional=OTHER), st.fixed_dictionaries({}, optional=OTHER), ASKED, ASKED)
 def test_the_key_tells_all_that_determines_an_answer(one, other, asked, also_asked):
     same = {**BASE, **one} == {**BASE, **other} and asked == also_asked

@@ -1,28 +1,36 @@
-"""How plans are written: the nine formats of the paper, by name, and what else one adds to the table.
-
-A style (what is said) in a container (how): ``basic_py`` to ``goal_md``. docs/planners.md shows them.
-"""
+"""The plan formats by name: the paper's nine, a style (what is said) in a container (how), and those that you add."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from types import MappingProxyType
+import re
+from collections import UserDict
 
-from lw_torchrl._checks import check_choice, checked
-from lw_torchrl.language.formats.md import md
+from lw_torchrl._checks import check_choice, checked, shown
 from lw_torchrl.language.formats.plan_format import STYLES, PlanFormat
-from lw_torchrl.language.formats.py import py
-from lw_torchrl.language.formats.py_md import py_md
+from lw_torchrl.language.formats.prose import md
+from lw_torchrl.language.formats.python import py, py_md
 from lw_torchrl.language.plans import ConditionalPlan
 
-PLAN_FORMATS: Mapping[str, PlanFormat] = MappingProxyType(
+
+class PlanFormats(UserDict[str, PlanFormat]):
+    """Plan formats by name, to which others may be added; a name that no folder can have is a ValueError."""
+
+    def __setitem__(self, name: str, format: PlanFormat) -> None:
+        if not isinstance(name, str) or not re.fullmatch(r"[a-z][a-z0-9_]*", name):
+            raise ValueError(f"a plan format must be named in lower case, like 'basic_py', got {shown(name)}")
+        if not isinstance(format, PlanFormat):
+            raise TypeError(f"plan format {name!r} must be a PlanFormat, got {shown(format)}")
+        super().__setitem__(name, format)
+
+
+PLAN_FORMATS = PlanFormats(
     {
         f"{name}_{container}": make(style)
         for name, style in STYLES.items()
         for container, make in {"py": py, "py_md": py_md, "md": md}.items()
     }
 )
-"""The formats by name."""
+"""The formats by name: the nine of the paper, and those that you add, ``PLAN_FORMATS["mine"] = PlanFormat(...)``."""
 
 
 @checked
@@ -37,10 +45,6 @@ def encode_plan(plan: ConditionalPlan, format: str) -> str:
         plan: the plan.
         format: a name in :data:`PLAN_FORMATS`.
 
-    Raises:
-        TypeError: ``plan`` is no ConditionalPlan.
-        ValueError: an unknown format.
-
     Example:
         >>> from lw_torchrl.language.plan_files import load_plans
         >>> print(encode_plan(load_plans("MT10")["window-open"], "basic_md").splitlines()[2])
@@ -49,6 +53,4 @@ gripper above the window handle.
 
     Source: paper section 'Conditional Plan Generation'.
     """
-    if not isinstance(plan, ConditionalPlan):
-        raise TypeError(f"plan must be a ConditionalPlan, got {type(plan).__name__}")
     return PLAN_FORMATS[check_choice("format", format, PLAN_FORMATS)].encode(plan)

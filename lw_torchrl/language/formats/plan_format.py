@@ -1,26 +1,21 @@
-"""What a plan format is, and the three styles that each container has."""
+"""What a plan format is: how a plan is written and asked for, and what a reader finds in a text."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
-from lw_torchrl.language.formats.written import Reading
 from lw_torchrl.language.plans import ConditionalPlan
 from lw_torchrl.language.tasks import Task
 
 
 @dataclass(frozen=True)
 class Style:
-    """What is said of each step, whatever contains it.
+    """What is said of each step."""
 
-    Attributes:
-        explains: the steps are listed first, and a reason stands before each clause.
-        goals: a skill is written as the state that it is to reach, where it has one.
-    """
-
-    explains: bool = False
-    goals: bool = False
+    explains: bool = False  # the steps are listed first, and a reason stands before each clause
+    goals: bool = False  # a skill is written as the state that it is to reach, if it has one
 
 
 @dataclass(frozen=True)
@@ -29,11 +24,11 @@ class PlanFormat:
 
     Attributes:
         extension: of files that hold such texts, "py" or "md".
-        encode: a plan to its text.
-        read: any text to what it says, clause by clause; it never raises. ``decode_plan`` makes a plan of it.
+        encode: writes a plan.
+        read: finds the clauses in any text; it never raises. ``decode_plan`` makes a plan of them.
         prompt: ``(examples, task, hints)`` to the text that asks a model for a plan of the task: the plans of other
             tasks, lines of hints, then the task's name and description.
-        style: what it says of each step, for models that are held to a schema.
+        style: what it says of each step, for models that must keep to a schema.
     """
 
     extension: str
@@ -47,6 +42,75 @@ STYLES = {"basic": Style(), "chain": Style(explains=True), "goal": Style(explain
 """The paper's three styles by name."""
 
 
-def one_line(text: str) -> str:
-    """A text without the ends of its lines: a description or a reason."""
-    return " ".join(text.split())
+END = re.compile(r"\[eod\]|<\|(?:endoftext|end_of_text|im_end|eot_id)\|>")
+"""What some models write where their answer ends; what follows is no part of it."""
+_ITEM = re.compile(r"\s*\[?(\d{1,4})[.):\]]\s*(\S.*)")
+
+
+@dataclass(frozen=True)
+class Note:
+    """A remark on a line (from 1) of a text: that something was left out, or taken for something else."""
+
+    line: int
+    text: str
+
+    def __str__(self) -> str:
+        return f"line {self.line}: {self.text}"
+
+
+@dataclass(frozen=True)
+class Clause:
+    """A condition and what to do, in the words of the text."""
+
+    line: int  # where the condition stands, from 1
+    condition: str  # "the robot's gripper is not above mug"
+    skill: str  # "put gripper above mug"; "" if only a state to reach is said
+    goal: str = ""  # that state, "the robot's gripper is above mug"
+    reason: str = ""  # what the text says before the clause
+
+
+@dataclass
+class Section:
+    """What a text says for one task."""
+
+    task: str  # "" without a name: what goes on from where the prompt ended
+    line: int  # where it begins
+    clauses: list[Clause] = field(default_factory=list)  # in the order of the text
+    listed: str = ""  # the steps listed before the clauses, "1. first  2. second"
+
+
+@dataclass
+class Reading:
+    """All that a reader found in a text: at least one section, and what it left out."""
+
+    sections: list[Section] = field(default_factory=lambda: [Section("", 1)])
+    notes: list[Note] = field(default_factory=list)
+
+    def note(self, line: int, text: str) -> None:
+        self.notes.append(Note(line, text))
+
+    def open(self, task: str, line: int) -> Section:
+        """The section of a task that is named here; a heading and a ``def`` right below it open one together."""
+        last = self.sections[-1]
+        if last.task != task or last.clauses:
+            last = Section(task, line)
+            self.sections.append(last)
+        return last
+
+
+def listed_steps(text: str, count: int) -> list[str]:
+    """The items of a list of ``count`` steps, "1. first  2. second"; empty if it is no such list.
+
+    Two spaces stand between items; one space is accepted too.
+    """
+    for gap in (r"\s\s+(?=\[?\d)", r"\s(?=\[?\d{1,3}[.):\]]\s)"):
+        items = [item(part) for part in re.split(gap, text.strip())]
+        if len(items) == count and all(found and found[0] == number for number, found in enumerate(items, 1)):
+            return [found[1] for found in items if found]
+    return []
+
+
+def item(text: str) -> tuple[int, str] | None:
+    """The number and the words of an item of a list, "1. Put the gripper above the mug"."""
+    found = _ITEM.fullmatch(text)
+    return (int(found[1]), found[2].strip()) if found else None

@@ -1,13 +1,4 @@
-"""Plans as JSON: what a model writes that is held to a schema, and what else looks like it.
-
-    {"steps": [{"because": "It has to come from above.",
-                "condition": [{"first": "the robot's gripper", "is": "not above", "second": "the puck"}],
-                "goal": [{"first": "the robot's gripper", "is": "above", "second": "the puck"}],
-                "skill": "place the gripper above the puck"}]}
-
-"because" is there in the styles that explain, "goal" in the goal style, empty where there is none. Names are in the
-order of the alphabet, since some servers write them so.
-"""
+"""Plans as JSON: what a model writes that is held to a schema, and what else looks like it."""
 
 from __future__ import annotations
 
@@ -16,9 +7,8 @@ import re
 from typing import Any
 
 from lw_torchrl._checks import shown
-from lw_torchrl.language.formats.plan_format import Style, one_line
-from lw_torchrl.language.formats.written import Clause, Reading
-from lw_torchrl.language.plans import ConditionalPlan
+from lw_torchrl.language.formats.plan_format import Clause, Reading, Style
+from lw_torchrl.language.plans import ConditionalPlan, one_line
 from lw_torchrl.language.queries import Query
 
 _STEPS = re.compile(r'"steps"\s*:\s*\[')
@@ -26,7 +16,15 @@ _BETWEEN = re.compile(r"\s*,?\s*")
 
 
 def write_structured(plan: ConditionalPlan, style: Style) -> str:
-    """The plan as JSON in one line; :func:`read_structured` reads it back."""
+    """The plan as JSON in one line; :func:`read_structured` reads it back::
+
+        {"steps": [{"because": "It has to come from above.",
+                    "condition": [{"first": "the robot's gripper", "is": "not above", "second": "the puck"}],
+                    "goal": [{"first": "the robot's gripper", "is": "above", "second": "the puck"}],
+                    "skill": "place the gripper above the puck"}]}
+
+    "because" is in the styles that explain, "goal" in the goal style. Some servers write names in alphabetical order.
+    """
     steps = []
     for step, goal in zip(plan.steps, plan.goals, strict=True):
         said: dict[str, Any] = {"because": one_line(step.reason) or "It comes next"} if style.explains else {}

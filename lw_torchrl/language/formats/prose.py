@@ -1,51 +1,88 @@
-"""Reads plans in prose as models really write it: "- When C, the robot should S." Nothing is an error.
-
-A clause is a bullet that begins with "When", "If", "Once" and the like. Where a text has no such bullets, sentences
-count that say "When C, the robot should S". Other sentences before a clause are its reason.
-"""
+"""Plans in prose, "- When C, the robot should S.", written, and read as models really write them."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 
 from lw_torchrl._checks import shown
-from lw_torchrl.language.formats.written import END, Clause, Reading, item
+from lw_torchrl.language.formats.plan_format import END, Clause, PlanFormat, Reading, Style, item
 from lw_torchrl.language.named_objects import GRIPPER
-from lw_torchrl.language.tasks import TASKS
+from lw_torchrl.language.plans import ConditionalPlan, one_line
+from lw_torchrl.language.tasks import TASKS, Task
+
+
+def md(style: Style) -> PlanFormat:
+    """The format of a style in prose; in the goal style "- When C, move the robot's gripper until G."
+
+    Source: paper section 'Conditional Plan Generation', which tried plans in prose beside those in code.
+    """
+
+    def prompt(examples: Sequence[ConditionalPlan], task: Task, hints: Sequence[str]) -> str:
+        about = "A robot that has one arm with a gripper does each task by the rules below it.\n"
+        said = "".join(f"{line}\n" for line in hints)
+        return "\n".join([about, *(_write(plan, style) for plan in examples), said + _opening(task)])
+
+    return PlanFormat("md", lambda plan: _write(plan, style), read_prose, prompt, style)
+
+
+def _opening(task: Task) -> str:
+    return f"The task `{task.name}`: {one_line(task.description)}\nThe robot does it reliably by these rules:\n"
+
+
+def _write(plan: ConditionalPlan, style: Style) -> str:
+    lines = []
+    if style.explains:
+        lines.append("Steps:  " + "  ".join(f"{number}. {step.skill}" for number, step in enumerate(plan.steps, 1)))
+    for step, goal in zip(plan.steps, plan.goals, strict=True):
+        reason = one_line(step.reason)
+        if style.explains and reason and _is_comment(reason):  # else it would be read as a step
+            lines.append(reason)
+        if style.goals and goal is not None:
+            lines.append(f"- When {step.condition}, move the robot's gripper until {goal}.")
+        else:
+            lines.append(f"- When {step.condition}, the robot should {step.skill}.")
+    return _opening(plan.definition) + "".join(f"{line}\n" for line in lines)
+
 
 _NAMED = re.compile(r"[\s#>*\"'`]*(?:the\s+)?task\b[\s:]*([`\"'“‘*]*)([A-Za-z0-9][\w-]*)", re.IGNORECASE)
+
 _ALONE = re.compile(r"[\s#>*\"'`]*([a-z0-9]+(?:[-_][a-z0-9]+)*)[\s\"'`:,*]*")
+
 _BULLET = re.compile(r"\s*(?:[-*•–+>]|\(?\[?\d{1,3}[.)\]]|[a-z]\))\s+")
+
 _WHEN = re.compile(
     r"(?:<[^<>]*>|[\"'`*])*(?:(?:finally|then|next|first|lastly|and|or|else),?\s+)?"
     r"(when|whenever|if|once|while|as long as|as soon as|after)\s+(.+)",
     re.IGNORECASE,
 )
+
 _SHOULD = re.compile(
     r",?\s(?:then\s)?(?:the\s)?(?:robot|it)\s(?:should|must|needs to|has to|will|can|shall)\s(?:then\s|just\s)?",
     re.IGNORECASE,
 )
+
 _UNTIL = re.compile(r",?\s(?:then\s)?move\s(?:the\s)?(?:robot's\s)?gripper\suntil\s", re.IGNORECASE)
+
 _COMMA = re.compile(r",\s(?:then\s)?")
+
 _NO_SKILL = frozenset(("the", "a", "an", "it", "this", "that", "you", "we", "they", "there", "and", "or"))
 
 
 def read_prose(text: str) -> Reading:
-    """What a text says in prose; see :class:`~lw_torchrl.language.formats.plan_format.PlanFormat`."""
+    """What a text says in prose, for :attr:`PlanFormat.read`.
+
+    A clause is a bullet that begins with "When", "If", "Once" and the like; in a text without such bullets, sentences
+    like "When C, the robot should S" count. Other sentences before a clause are its reason.
+    """
     return _Reader(text).reading
 
 
-def is_comment(line: str) -> bool:
-    """Whether a line is a sentence to the reader, by which a plan is not read otherwise."""
-    return not (
-        END.search(line)
-        or _heading(line)
-        or _BULLET.match(line)
-        or item(line)
-        or _listing(line) is not None
-        or _clause(1, line, bullet=False)
-    )
+def _is_comment(line: str) -> bool:
+    """Whether a line is only a sentence, which does not change how a plan is read."""
+    is_plan = END.search(line) or _heading(line) or _BULLET.match(line) or item(line) or _clause(1, line, bullet=False)
+    return not is_plan and _listing(line) is None
 
 
 class _Reader:

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from lw_torchrl.language import query_search
+from lw_torchrl.language import nearest
 from lw_torchrl.language.named_objects import GRIPPER, NamedObject
+from lw_torchrl.language.nearest import QueryMatch, nearest_query
 from lw_torchrl.language.queries import QueryError, parse_query, supported_queries
-from lw_torchrl.language.query_search import QueryMatch, nearest_query
 from lw_torchrl.language.tasks import MT50, Task
 
 tasks = st.sampled_from(MT50)
@@ -31,7 +31,7 @@ any_text = st.text(st.characters()) | st.lists(st.sampled_from(WORDS), max_size=
 @example("\x00 and \x00", "push")
 @example("x" * 100_000, "stick-pull")
 @example("İs the gripper open", "reach")
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=160, deadline=None)
 @given(any_text, tasks)
 def test_any_text_has_a_nearest_query(text, task):
     match = nearest_query(text, task)
@@ -49,7 +49,7 @@ def test_any_text_has_a_nearest_query(text, task):
         pass
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(st.data(), tasks)
 def test_a_text_that_is_a_query_is_found_as_it_is(data, task):
     picked = data.draw(st.lists(st.sampled_from(supported_queries(task)), min_size=1, max_size=3))
@@ -65,7 +65,7 @@ def test_a_query_that_is_answered_and_not_listed_keeps_its_meaning():
     assert str(nearest_query("Isn't the gripper open?", "push").query) == "the robot's gripper is not open"
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(st.data(), tasks)
 def test_one_wrong_letter_is_forgiven(data, task):
     meant = data.draw(st.sampled_from([text for text in supported_queries(task) if " above " in text]))
@@ -133,7 +133,7 @@ def test_by_embedding_finds_the_meaning_and_encodes_a_tasks_list_once(monkeypatc
     sizes = []
     encode = text.sentence_encoder
     monkeypatch.setattr(text, "sentence_encoder", lambda texts: sizes.append(len(texts)) or encode(texts))
-    query_search._vectors.cache_clear()
+    nearest._vectors.cache_clear()
     match = nearest_query("Has the gripper arrived at the reach target?", "reach", by="embedding")
     assert str(match.query) == "the robot's gripper is near the reach target"
     assert 0.3 < match.score < 1.0

@@ -1,0 +1,311 @@
+"""Plans that look like Python, written, and read as models really write them; never executed."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from lw_torchrl._checks import shown
+from lw_torchrl.language.formats.plan_format import END, Clause, PlanFormat, Reading, Style, item
+from lw_torchrl.language.named_objects import GRIPPER
+from lw_torchrl.language.plan_files import function_head, quote
+from lw_torchrl.language.plans import ConditionalPlan, PlanStep, one_line
+from lw_torchrl.language.queries import Query
+from lw_torchrl.language.tasks import TASKS, Task
+
+
+def py(style: Style) -> PlanFormat:
+    """The format of a style as a bare function, ``if check("…"):`` and ``robot.verb("…")`` for each step.
+
+    In the goal style a skill is ``robot.move_gripper("above the puck", close_gripper=True)``, the place to reach, or
+    ``robot.move_gripper(until="the puck is near the target location")`` for any other state.
+    Source: paper section 'Conditional Plan Generation' and its figure of a plan.
+    """
+
+    def prompt(examples: Sequence[ConditionalPlan], task: Task, hints: Sequence[str]) -> str:
+        said = "".join(f"# {line}\n" for line in hints)
+        return "\n".join([*(_write(plan, style) for plan in examples), said + function_head(task)])
+
+    return PlanFormat("py", lambda plan: _write(plan, style), read_python, prompt, style)
+
+
+def _write(plan: ConditionalPlan, style: Style) -> str:
+    """The plan as a function."""
+    lines = []
+    if style.explains:
+        lines += ["# Steps:", *(f"#  {number}. {step.skill}" for number, step in enumerate(plan.steps, 1))]
+    for number, (step, goal) in enumerate(zip(plan.steps, plan.goals, strict=True)):
+        if style.explains and (reason := one_line(step.reason).lstrip("# ")):
+            if number == 0 and re.match(r"\[?\d", reason):
+                lines.append("#")  # it would go on with the list
+            lines.append(f"# {reason}")
+        lines += [f"if check({quote(str(step.condition))}):", f"    robot.{_call(step, goal if style.goals else None)}"]
+    return function_head(plan.definition) + "".join(f"    {line}\n" for line in lines)
+
+
+def _call(step: PlanStep, goal: Query | None) -> str:
+    if goal is None:
+        verb, _, details = step.skill.partition(" ")
+        return f"{verb}({quote(details)})"
+    first, *others = goal.clauses
+    held = _HELD.get(" and ".join(map(str, others)))
+    if first.subject != GRIPPER or first.object is None or held is None:
+        return f"move_gripper(until={quote(str(goal))})"
+    return f"move_gripper({quote(str(first).removeprefix(f'the {GRIPPER} is '))}{held})"
+
+
+_OPENED, _CLOSED = f"the {GRIPPER} is open", f"the {GRIPPER} is closed"
+_HELD = {"": "", _OPENED: ", open_gripper=True", _CLOSED: ", close_gripper=True"}
+
+
+def py_md(style: Style) -> PlanFormat:
+    """The format of a style as a chat message with functions in fenced blocks."""
+
+    def fenced(code: str) -> str:
+        return f"```python\n{code}```\n"
+
+    def encode(plan: ConditionalPlan) -> str:
+        return f"This function does the task `{plan.task}`:\n\n{fenced(_write(plan, style))}"
+
+    def prompt(examples: Sequence[ConditionalPlan], task: Task, hints: Sequence[str]) -> str:
+        return (
+            "I control a robot that has one arm with a gripper. A function says what the robot does: each `if` asks "
+            "about the state, and its skill is carried out while the answer is yes. These functions do other tasks:\n\n"
+            + fenced("\n".join(_write(plan, style) for plan in examples))
+            + "".join(f"\n{line}" for line in hints)
+            + ("\n" if hints else "")
+            + f"\nPlease write the function for `{task.name}` in the same way, the whole of it in one block:\n\n"
+            + fenced(function_head(task))
+        )
+
+    return PlanFormat("md", encode, read_python, prompt, style)
+
+
+_STRING = r'(?:[fFrRbBuU]{0,2}(?:"(?:[^"\\]|\\.)*+"|\'(?:[^\'\\]|\\.)*+\'))'
+_STRINGS = rf"{_STRING}(?:[\s+]*{_STRING})*"
+_LITERAL = re.compile(r'"(?:[^"\\]|\\.?)*+("|\Z)|\'(?:[^\'\\]|\\.?)*+(\'|\Z)')  # also one that is cut off
+_BRANCH = re.compile(r"(if|elif|while)\b\s*|(else)\s*:")
+_ARGUMENT = re.compile(rf"(?:(\w+)\s*=\s*)?(?:({_STRINGS})|([^\s,()\"'][^,()\"']*))\s*(?:,\s*)?")
+_PRINTED = re.compile(r"\s*print\(\s*(\"|')(.*)\1\s*\)\s*;?")
+_DEF = re.compile(r"(?:async\s+)?def\b\s*(\w*)")
+_CHECK = re.compile(rf"(and\b|or\b)?\s*(not\b)?\s*\(?\s*(?:self\.|robot\.)?check\s*\(\s*({_STRINGS})\s*\)?\s*")
+_CALL = re.compile(r"(?:self\.)?robot\.(\w+)\s*\(\s*")
+_HEADING = re.compile(r"#+\s*([A-Za-z][\w-]*)\s*:")
+_MOST_JOINED = 6  # lines of one statement
+
+
+def read_python(text: str) -> Reading:
+    """What a text says in Python, for :attr:`PlanFormat.read`."""
+    return _Reader(text).reading
+
+
+@dataclass
+class _Block:
+    """An ``if``: its indentation, its line, what it asks (None if it cannot be read), and its block's indentation."""
+
+    indent: int
+    line: int
+    condition: str | None
+    body: int | None = None
+
+
+class _Reader:
+    """Matches lines against a few forms; blocks follow the indentation, and an ``if`` in a block asks for both."""
+
+    def __init__(self, text: str) -> None:
+        self.reading = Reading()
+        self.section = self.reading.sections[0]
+        self.blocks: list[_Block] = []
+        self.reason: list[str] = []
+        self.listing = False
+        self.ignored: tuple[int, int, str] | None = None  # lines that are no part of a plan: from, to, the first
+        for number, line in _statements(text):
+            if not self.read(number, line):
+                break
+        self.flush()
+
+    def note(self, line: int, text: str) -> None:
+        self.flush()
+        self.reading.note(line, text)
+
+    def flush(self) -> None:
+        """Note the lines that were passed over."""
+        if self.ignored is not None:
+            first, last, line = self.ignored
+            self.ignored = None
+            which = "is" if first == last else f"and what follows up to line {last} is"
+            self.reading.note(first, f"{which} no part of a plan: {shown(line.strip())}")
+
+    def read(self, number: int, line: str) -> bool:
+        """Take a line in; False if the answer ends with it."""
+        code = line.strip()
+        if END.match(code):
+            self.note(number, "the answer ends here")
+            return False
+        if code.startswith("#"):
+            self.comment(number, line)
+        elif code.startswith(("```", "~~~")):
+            self.flush()
+            self.blocks.clear()
+        elif code:
+            self.listing = False
+            self.code(number, line, code)
+        return END.search(_bare(code)) is None
+
+    def comment(self, number: int, line: str) -> None:
+        words = line.strip().lstrip("#")
+        numbered, heading = item(words), _HEADING.match(line)
+        if heading and (name := _task_name(heading[1])) in TASKS:
+            self.open(name, number)
+        elif re.fullmatch(r"\s*steps\s*:?\s*", words, re.IGNORECASE):
+            self.listing = True
+        elif self.listing and numbered:
+            self.section.listed += f"  {numbered[0]}. {numbered[1]}"
+        else:
+            self.listing = False
+            if words.strip():
+                self.reason.append(words.strip())
+
+    def open(self, name: str, number: int) -> None:
+        self.section = self.reading.open(name, number)
+        self.blocks.clear()
+        self.reason.clear()
+        self.listing = False
+
+    def code(self, number: int, line: str, code: str) -> None:
+        indent = len(line) - len(line.lstrip())
+        call, branch = _CALL.match(code), _BRANCH.match(code)
+        while self.blocks:  # end the blocks that the line is not in
+            last = self.blocks[-1]
+            if last.body is None and call and indent == last.indent:
+                break  # a call right below its condition belongs to it, however it is indented
+            if indent > last.indent and (last.body is None or indent >= last.body):
+                break
+            self.blocks.pop()
+        if found := _DEF.match(code):
+            self.open(_task_name(found[1]), number)
+        elif branch:
+            self.flush()
+            self.branch(number, indent, code, branch)
+        elif call:
+            self.flush()
+            self.call(number, indent, code, call)
+        elif code.startswith("robot."):
+            self.note(number, f"is cut off: {shown(code)}")
+        else:
+            first = self.ignored or (number, number, line)
+            self.ignored = (first[0], number, first[2])
+
+    def branch(self, number: int, indent: int, code: str, branch: re.Match[str]) -> None:
+        condition, rest = (None, code[branch.end() :]) if branch[2] else self.asked(number, code, branch.end())
+        if branch[2]:
+            self.note(number, "an 'else' says no condition; what follows from it is left out")
+        if branch[1] == "elif":
+            self.note(number, "'elif' is taken for 'if': that what is above it does not hold is left out")
+        if self.blocks and self.blocks[-1].body is None:
+            self.blocks[-1].body = indent
+        self.blocks.append(_Block(indent, number, condition))
+        if call := _CALL.match(rest):
+            self.call(number, indent + 1, rest, call)
+
+    def asked(self, number: int, code: str, at: int) -> tuple[str | None, str]:
+        """What an ``if`` asks, None if it cannot be read, and what stands behind its colon."""
+        asked: list[str] = []
+        fault = ""
+        while match := _CHECK.match(code, at):
+            text = _unquoted(match[3])
+            if match[1] == "or":
+                fault = "an 'or' of conditions cannot be said in a plan"
+            if match[2] and re.search(r"\band\b", text):
+                fault = "the opposite of several conditions cannot be said in a plan"
+            asked.append(f"not {text}" if match[2] else text)
+            at = match.end()
+        rest = code[at:].lstrip(" )")
+        if not asked:
+            bare = _bare(code)
+            cut = '"' in bare or not bare.rstrip().endswith(":")
+            fault = f"is cut off: {shown(code)}" if cut else f'asks nothing by check("..."): {shown(code)}'
+        elif not rest.startswith((":", "#")):
+            fault = fault or (f'is more than check("..."): {shown(code)}' if rest else "")
+        if fault:
+            self.note(number, fault)
+        return (None if fault else " and ".join(asked)), rest.lstrip(": ")
+
+    def call(self, number: int, indent: int, code: str, call: re.Match[str]) -> None:
+        words, named, at = list[str](), dict[str, str](), call.end()
+        while match := _ARGUMENT.match(code, at):
+            value = _unquoted(match[2]) if match[2] else match[3].strip()
+            if match[1]:
+                named[match[1]] = value
+            else:
+                words.append(value)
+            at = match.end()
+        if code[at : at + 1] != ")" and (at < len(code) or not (words or named)):
+            self.note(number, f"is cut off: {shown(code)}")
+            return
+        if not self.blocks:
+            self.note(number, f"a skill without a condition is left out: {shown(code)}")
+            return
+        block = self.blocks[-1]
+        if self.section.clauses and self.section.clauses[-1].line == block.line:
+            self.note(number, "a second skill under the same condition is a step of its own")
+        block.body = indent if block.body is None else block.body
+        conditions = [above.condition for above in self.blocks if above.condition is not None]
+        if len(conditions) < len(self.blocks):
+            return  # the `if` is noted
+        skill, goal = f"{call[1]} {' '.join(words)}", named.get("goal", "")
+        if call[1] == "move_gripper":
+            skill, goal = _state_to_reach(" ".join(words), named)
+        self.section.clauses.append(Clause(block.line, " and ".join(conditions), skill, goal, " ".join(self.reason)))
+        self.reason.clear()
+
+
+def _state_to_reach(place: str, named: dict[str, str]) -> tuple[str, str]:
+    """The skill and the goal of ``robot.move_gripper``; one of them is ""."""
+    parts = [f"the {GRIPPER} is {place}"] if place else []
+    parts += [text for name in ("until", "goal") if (text := named.get(name, ""))]
+    for name, state in (("close_gripper", "closed"), ("open_gripper", "open")):
+        if named.get(name) == "True":
+            parts.append(f"the {GRIPPER} is {state}")
+    return ("" if parts else "move gripper"), " and ".join(parts)
+
+
+def _unquoted(strings: str) -> str:
+    """The text of one or more string literals in a row."""
+    bodies = [literal.lstrip("fFrRbBuU")[1:-1] for literal in re.findall(_STRING, strings)]
+    return " ".join("".join(re.sub(r"\\(.)", r"\1", body) for body in bodies).split())
+
+
+def _task_name(name: str) -> str:
+    """The task that a function is for: "door-lock", of "door_lock" and "DoorLock"."""
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "-", name).replace("_", "-").strip("-").lower() or "?"
+
+
+def _statements(text: str) -> Iterator[tuple[int, str]]:
+    """The numbered lines of a text; those of one call are joined, and what is printed is taken as it is."""
+    lines = text.expandtabs(4).splitlines()
+    at = 0
+    while at < len(lines):
+        line, start = lines[at], at
+        if printed := _PRINTED.fullmatch(line):
+            line = re.sub(r"\\(.)", r"\1", printed[2])
+        at += 1
+        if "check" in line or "robot." in line:
+            while at < len(lines) and at - start < _MOST_JOINED and _is_open(line):
+                code = lines[at].strip()
+                if not code or code.startswith(("#", "```", "def ", "robot.")) or _BRANCH.match(code):
+                    break  # a statement of its own
+                line, at = f"{line} {code}", at + 1
+        yield start + 1, line
+
+
+def _is_open(line: str) -> bool:
+    """Whether a parenthesis, and no string, is open at the end of a line."""
+    bare = _bare(line)
+    return '"' not in bare and bare.count("(") > bare.count(")")
+
+
+def _bare(code: str) -> str:
+    """A line without its strings and its comment; of a string that is cut off a quote is left."""
+    return _LITERAL.sub(lambda found: "" if found[1] or found[2] else '"', code).partition("#")[0]

@@ -1,0 +1,277 @@
+"""From anyone's words to ours: the nearest query, the nearest scripted skill, and both for the steps of an answer."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from functools import cache, lru_cache
+from importlib.resources import files
+from typing import TYPE_CHECKING, Literal, NamedTuple
+
+from rapidfuzz import fuzz, process
+
+from lw_torchrl._checks import check_choice, checked, shown
+from lw_torchrl._files import read_toml
+from lw_torchrl.language.queries import Clause, Query, QueryError, base_clauses, check_length, parse_query, read_query
+from lw_torchrl.language.relations import PUBLISHED, RELATIONS, UNARY
+from lw_torchrl.language.skills import ScriptedSkill, SkillError, load_skills, skills_for
+from lw_torchrl.language.tasks import Task, get_task
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+_NEGATIONS = frozenset(("not", "no", "never", "without", "cannot"))
+# Words that do not tell which query is meant.
+_EMPTY = frozenset(("the", "a", "an", "is", "are", "be", "does", "do", "did", "has", "have", "robot's", "robot"))
+_LONGEST = 400  # characters of a text that is compared
+_MOST_CLAUSES = 8  # of a condition outside the language
+_MOST_COMPARED = 64  # conditions and goals of an answer outside the language, a limit to its time
+_TARGETS = ("target location", "reach target")
+_TARGET = re.compile(
+    r"\b(?:the\s)?(?:reach\s)?(?:goal|target)(?:\s(?:location|position|area|place|point|destination))?\b"
+)
+
+
+class QueryPart(NamedTuple):
+    """One clause of a text, the query it was taken for, and how alike they are, in [0, 1]."""
+
+    text: str
+    query: str
+    score: float
+
+
+@dataclass(frozen=True)
+class QueryMatch:
+    """The nearest query to a text."""
+
+    query: Query
+    score: float  # the mean of its parts' scores, in [0, 1]; 1 for a text that is a query itself
+    parts: tuple[QueryPart, ...]  # what each clause of the text was taken for
+
+
+@checked
+def nearest_query(
+    text: str, task: str | Task, by: Literal["edit", "embedding"] = "edit", published_only: bool = False
+) -> QueryMatch:
+    """The query of a task that is nearest to a text.
+
+    A text that is a query is found as it is. Otherwise it is split at "and" and "but", and each part is taken for the
+    nearest base query. A part without a subject takes that of the part before. A part with "not", "doesn't" or "never"
+    is taken for the negation of the base query nearest to the rest of it, so that truth is never inverted.
+
+    Args:
+        text: any words.
+        task: a task or its name, whose objects the query may name.
+        by: "edit", closest in spelling; "embedding", closest in meaning, by the sentence encoder.
+        published_only: leave out the points that we named, and relations that were added.
+
+    Raises:
+        ValueError: an unknown task, or a text of more than 64 parts.
+        ImportError: by="embedding" without the extra ``[text]``.
+
+    Example:
+        >>> match = nearest_query("the gripper isn't touching the puck", "push")
+        >>> str(match.query), match.score > 0.5
+        ("the robot's gripper is not around the puck", True)
+        >>> str(nearest_query("gripper open and over the target locaton", "push").query)
+        "the robot's gripper is open and the robot's gripper is above the target location"
+
+    Source: paper section 'Query Answering Function', which maps other queries to the nearest supported one by a
+    sentence embedding or by string edit distance.
+    """
+    owner = get_task(task).published if published_only else get_task(task)
+    relations = PUBLISHED if published_only else tuple(RELATIONS)
+    if (query := _parse(text, owner, relations)) is not None:
+        return QueryMatch(query, 1.0, tuple(QueryPart(str(clause), str(clause), 1.0) for clause in query.clauses))
+    split = [" ".join(part.split()) for part in re.split(r"\b(?:and|but)\b", text, flags=re.IGNORECASE)]
+    split = [part for part in split if _content(_affirmed(part)[0])] or [" ".join(text.split())]
+    check_length(text, split)
+    known: dict[tuple[str, str], QueryPart] = {}  # a text may repeat itself
+    parts: list[QueryPart] = []
+    subject = ""
+    for part in split:
+        if (part, subject) not in known:
+            found = _nearest_part(part, owner, relations, by)
+            if subject and found.score < 1.0:
+                joined = _nearest_part(f"the {subject} {part}", owner, relations, by)
+                found = joined._replace(text=part) if joined.score > found.score else found
+            known[part, subject] = found
+        parts.append(known[part, subject])
+        subject = parse_query(parts[-1].query, owner).clauses[0].subject
+    query = Query(tuple(clause for part in parts for clause in parse_query(part.query, owner).clauses))
+    return QueryMatch(query, sum(part.score for part in parts) / len(parts), tuple(parts))
+
+
+def _parse(text: str, task: Task, relations: tuple[str, ...]) -> Query | None:
+    """The query that a text is, if it has no other relations."""
+    query = read_query(text, task)
+    return query if query and all(clause.predicate in (*relations, *UNARY) for clause in query.clauses) else None
+
+
+def _nearest_part(part: str, task: Task, relations: tuple[str, ...], by: str) -> QueryPart:
+    if (query := _parse(part, task, relations)) is not None:
+        return QueryPart(part, str(query), 1.0)
+    words, negated = _affirmed(part)
+    clauses, contents = _choices(task, relations)
+    if by == "edit":
+        _, similarity, at = process.extractOne(_content(words), contents, scorer=fuzz.ratio)
+        score = similarity / 100
+    else:
+        from lw_torchrl.language.text import sentence_encoder
+
+        at, score = _nearest_meaning(" ".join(words), tuple(map(str, clauses)), sentence_encoder)
+    return QueryPart(part, str(replace(clauses[at], negated=negated)), score)
+
+
+def _affirmed(text: str) -> tuple[list[str], bool]:
+    """The words of a text but its negations, and whether it is a negation."""
+    plain = re.sub(r"(\w)n't\b", r"\1 not", text.replace("’", "'").casefold())
+    words = re.sub(r"[^\w\s'-]", " ", plain).split()
+    kept = [word for word in words if word not in _NEGATIONS]
+    return kept, (len(words) - len(kept)) % 2 == 1
+
+
+def _content(words: list[str]) -> str:
+    return " ".join(word for word in words if word not in _EMPTY)
+
+
+@lru_cache(maxsize=256)
+def _choices(task: Task, relations: tuple[str, ...]) -> tuple[tuple[Clause, ...], tuple[str, ...]]:
+    """The base clauses without negations, and the words of each that count."""
+    affirmed = tuple(clause for clause in base_clauses(task, relations) if not clause.negated)
+    return affirmed, tuple(_content(str(clause).split()) for clause in affirmed)
+
+
+def _nearest_meaning(text: str, choices: tuple[str, ...], encode: Callable[[list[str]], Tensor]) -> tuple[int, float]:
+    """The place of the choice that is nearest in meaning, and its cosine similarity, at least 0."""
+    # A surrogate alone is no text that an encoder could read.
+    alike = _vectors(choices, encode) @ encode([text.encode("utf-8", "replace").decode()])[0]
+    return int(alike.argmax()), float(alike.max().clamp(0.0, 1.0))
+
+
+@lru_cache(maxsize=256)
+def _vectors(texts: tuple[str, ...], encode: Callable[[list[str]], Tensor]) -> Tensor:
+    return encode(list(texts))
+
+
+@checked
+def nearest_skill(
+    text: str,
+    task: str | Task | None = None,
+    skills: Mapping[str, ScriptedSkill] | Iterable[str] | None = None,
+    by: Literal["edit", "embedding"] = "edit",
+) -> tuple[ScriptedSkill, float]:
+    """The scripted skill whose text is closest, and how close it is, in [0, 1].
+
+    Args:
+        text: what to do, in any words.
+        task: consider only skills whose objects this task has.
+        skills: to choose from; None for the shipped ones.
+        by: "edit", closest in spelling; "embedding", closest in meaning, by the sentence encoder.
+
+    Raises:
+        SkillError: (a ValueError) no skill suits the task.
+        ImportError: by="embedding" without the extra ``[text]``.
+
+    Example:
+        >>> nearest_skill("put gripper above puck", task="push")[0].text
+        'place the gripper above the puck'
+
+    Source: paper section 'Conditional Plan Generation', which takes the nearest description.
+    """
+    shipped = load_skills()
+    table = shipped if skills is None else skills
+    if not isinstance(table, Mapping):
+        table = {check_choice("skills", name, shipped): shipped[name] for name in table}
+    for name, skill in table.items():
+        if not isinstance(skill, ScriptedSkill):
+            raise TypeError(f"skills[{name!r}] must be a ScriptedSkill, got {shown(skill)} ({type(skill).__name__})")
+    allowed = tuple(name for name, skill in table.items() if task is None or skill.suits(task))
+    if not allowed:
+        raise SkillError(f"no scripted skill suits task {task!r}")
+    words = " ".join(text.lower().replace("_", " ").split())
+    if by == "embedding":
+        from lw_torchrl.language.text import encode_texts
+
+        at, score = _nearest_meaning(words, allowed, encode_texts)
+        return table[allowed[at]], score
+    found = process.extractOne(words, allowed, scorer=fuzz.ratio)
+    return table[found[0]], found[1] / 100
+
+
+class StepMapper:
+    """Maps the words of one answer to queries and scripted skills. A distance is 1 minus a similarity in [0, 1].
+
+    The words of data/words.toml and the names of the task's target are replaced by ours first.
+
+    Source: paper section 'LLM Experiments', which takes the nearest by string edit distance.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        skills: Mapping[str, ScriptedSkill] | None,
+        by: Literal["edit", "embedding"],
+        limit: float,
+        skill_limit: float,
+    ) -> None:
+        self.task, self.by, self.limit, self.skill_limit = task, by, limit, skill_limit
+        self.skills = skills_for(task, skills)
+        self.compared = 0
+
+    def query(self, text: str) -> tuple[Query | None, float]:
+        """The nearest query and the distance of its furthest clause; no query if that is beyond the limit."""
+        if (query := read_query(text, self.task)) is not None:
+            return query, 0.0
+        self.compared += 1
+        if self.compared > _MOST_COMPARED or len(text) > _LONGEST:
+            return None, 1.0
+        found, distance = _nearest_condition(text, self.task, self.by)
+        return (found if distance <= self.limit else None), distance
+
+    def skill(self, text: str) -> tuple[str | None, float]:
+        """The text of the nearest scripted skill and its distance; no text if that is beyond the limit."""
+        if text in self.skills:
+            return text, 0.0
+        if not self.skills or len(text) > _LONGEST:
+            return None, 1.0
+        words = _with_target(text, self.task)
+        if found := _phrases("skills").match(words):
+            words = _synonyms("skills")[found[0]] + words[found.end() :]
+        skill, score = nearest_skill(words, None, self.skills, by=self.by)
+        return (skill.text if 1.0 - score <= self.skill_limit else None), 1.0 - score
+
+
+@lru_cache(maxsize=4096)
+def _nearest_condition(text: str, task: Task, by: Literal["edit", "embedding"]) -> tuple[Query | None, float]:
+    words = _phrases("conditions").sub(lambda found: _synonyms("conditions")[found[0]], _with_target(text, task))
+    try:
+        match = nearest_query(words, task, by=by)
+    except QueryError:
+        return None, 1.0
+    if len(match.parts) > _MOST_CLAUSES:
+        return None, 1.0
+    return match.query, 1.0 - min(part.score for part in match.parts)
+
+
+def _with_target(text: str, task: Task) -> str:
+    """The text in lower case, with the task's own name for its goal, which models call "goal" or "target position"."""
+    lower = text.casefold()
+    name = next((name for name in _TARGETS if name in task.object_names), None)
+    if name is None:
+        return lower
+    return _TARGET.sub(lambda found: found[0] if found[0] in task.object_names else f"the {name}", lower)
+
+
+@cache
+def _synonyms(kind: str) -> Mapping[str, str]:
+    table: Mapping[str, str] = read_toml(files("lw_torchrl.language") / "data" / "words.toml", ValueError)[kind]
+    return table
+
+
+@cache
+def _phrases(kind: str) -> re.Pattern[str]:
+    """Any phrase of the table, the longest first; one that our own words begin with is left alone."""
+    longest = sorted(_synonyms(kind), key=len, reverse=True)
+    return re.compile(rf"\b(?:{'|'.join(map(re.escape, longest))})\b")

@@ -1,0 +1,234 @@
+"""Answers on disk: ``DIR/<model>/<format>/<task>-<attempt>.<ext>``, and the cache of what was asked."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+from lw_torchrl._checks import check_choice, checked, differences, shown
+from lw_torchrl._files import JSON_LIMIT, parse_json, read_json, read_text, write_json, write_text
+from lw_torchrl.language.formats import PLAN_FORMATS
+from lw_torchrl.language.skills import ScriptedSkill
+from lw_torchrl.planners.answers import Answer, Reply, Tokens, is_count, read_reply, storable
+from lw_torchrl.planners.prompts import Question
+
+_VERSION = 1  # of the cache
+_SETTINGS = "settings.json"
+_FIELDS = {"llm": str, "format": str, "task": str, "attempt": int, "completion": str}
+_Place = tuple[str, str, int]  # format, task, attempt
+
+
+@checked
+def folder_name(model: str) -> str:
+    """A model's name as that of a folder.
+
+    Example:
+        >>> folder_name("meta-llama/Llama-3.1-8B"), folder_name("PaLM 2")
+        ('meta-llama_Llama-3.1-8B', 'PaLM 2')
+    """
+    return re.sub(r"[^\w .+-]+", "_", model).strip(" ._")[:100].rstrip(" .") or "model"
+
+
+@checked
+def answer_path(folder: str | os.PathLike[str], model: str, format: str, task: str, attempt: int) -> Path:
+    """Where the answer of a model is kept."""
+    return Path(folder) / folder_name(model) / format / f"{task}-{attempt}.{PLAN_FORMATS[format].extension}"
+
+
+@checked
+def write_answer(folder: str | os.PathLike[str], model: str, answer: Answer) -> Path:
+    """Write an answer to its place, whole or not at all; one that came in another form beside it, as .json."""
+    path = answer_path(folder, model, answer.format, answer.task, answer.attempt)
+    if answer.raw != answer.text:
+        write_text(path.with_suffix(".json"), answer.raw)
+    write_text(path, answer.text)
+    return path
+
+
+def settle_folder(folder: Path, settings: Mapping[str, Any], *, reading: bool = False) -> None:
+    """Write what determines a model's answers to ``folder/settings.json``, unless it is there.
+
+    Args:
+        folder: of one model's answers, ``out/<name>``.
+        settings: what determines them, as JSON has it.
+        reading: nothing will be written, so only the model has to be the same.
+
+    Raises:
+        ValueError: the folder has answers of other settings, or of settings that are not recorded.
+    """
+    file = folder / _SETTINGS
+    there = read_json(file, "out: the settings") if file.is_file() else {}
+    if there == settings:
+        return
+    if any(path for format, known in PLAN_FORMATS.items() for path in folder.glob(f"{format}/*.{known.extension}")):
+        if reading and there.get("model", settings["model"]) == settings["model"]:
+            return
+        differ = ", ".join(differences(there, settings)) if there else f"it has no {_SETTINGS} that says which"
+        raise ValueError(
+            f"out: {str(folder)!r} holds answers of other settings: {differ}; give these again, or the new answers "
+            "another name (--name) or out"
+        )
+    if not reading:
+        write_json(file, dict(settings))
+
+
+def recorded_answer(
+    out: str | os.PathLike[str],
+    model: str,
+    question: Question,
+    format: str,
+    kept: Reply | None,
+    skills: Mapping[str, ScriptedSkill] | None = None,
+) -> Answer | None:
+    """The answer to a question that is recorded in ``out/<model>``, None if there is none.
+
+    ``kept`` is the reply in the cache, if any, which knows more about the answer than its file.
+    """
+    path = answer_path(out, model, format, question.task.name, question.attempt)
+    if not path.is_file():
+        return None
+    text, raw, schema = read_text(path, ValueError), path.with_suffix(".json"), question.request["schema"]
+    replies = [] if kept is None else [(kept, schema)]
+    if schema and raw.is_file():
+        replies.append((Reply(read_text(raw, ValueError)), schema))
+    for reply, held_to in [*replies, (Reply(text), None)]:
+        answer = read_reply(reply, question.task, format, question.attempt, skills, held_to)
+        if answer.text == text:
+            break  # else the file was changed since
+    return replace(answer, cached=True)
+
+
+def recorded_answers(source: str | os.PathLike[str]) -> dict[str, dict[_Place, str | Path]]:
+    """Models to their answers, or files of these, by format, task and attempt; errors as of :class:`FilePlanner`."""
+    path = Path(source)
+    if not path.exists():
+        raise FileNotFoundError(f"source: there is no file or folder {str(path)!r}")
+    found = _of_folder(path) if path.is_dir() else _of_lines(path)
+    if not found:
+        raise ValueError(f"source: {str(path)!r} holds no answers, <model>/<format>/<task>-<attempt>.<ext>")
+    return found
+
+
+def ignored_files(source: str | os.PathLike[str]) -> list[Path]:
+    """Files that look like answers and lie where answers do, but have another name or ending."""
+    root = Path(source)
+    if not root.is_dir():
+        return []
+    read = {path for answers in _of_folder(root).values() for path in answers.values()}
+    endings = {f".{known.extension}" for known in PLAN_FORMATS.values()} | {".txt"}
+    return sorted(
+        path
+        for format in PLAN_FORMATS
+        for path in root.glob(f"*/{format}/*")
+        if path.suffix in endings and path not in read and path.name[0] != "." and path.parts[-3][0] != "."
+    )
+
+
+def answer_text(found: str | Path) -> str:
+    """The text of an answer that :func:`recorded_answers` gives."""
+    return storable(read_text(found, ValueError) if isinstance(found, Path) else found)
+
+
+def _of_folder(root: Path) -> dict[str, dict[_Place, str | Path]]:
+    """Models to the files of their answers; whatever else is in the folder is left alone."""
+    found: dict[str, dict[_Place, str | Path]] = {}
+    for format, known in PLAN_FORMATS.items():
+        for path in root.glob(f"*/{format}/*.{known.extension}"):
+            named = re.fullmatch(r"([a-z][a-z0-9-]*)-(\d{1,9})", path.stem)
+            if named and path.parts[-3][0] != ".":
+                found.setdefault(path.parts[-3], {})[format, named[1], int(named[2])] = path
+    return found
+
+
+def _of_lines(file: Path) -> dict[str, dict[_Place, str | Path]]:
+    found: dict[str, dict[_Place, str | Path]] = {}
+    named: dict[str, str] = {}
+    for number, line in enumerate(read_text(file, ValueError).split("\n"), 1):
+        if not line.strip():
+            continue
+        where = f"{file.name}, line {number}"
+        try:
+            row = json.loads(line)
+        except (ValueError, RecursionError) as error:
+            raise ValueError(f"{where}: it is no JSON: {error}") from error
+        if not isinstance(row, dict) or any(type(row.get(name)) is not kind for name, kind in _FIELDS.items()):
+            raise ValueError(f"{where}: an answer has {', '.join(_FIELDS)}, got {shown(row)}")
+        check_choice(f"{where}: format", row["format"], PLAN_FORMATS)
+        if not 0 <= row["attempt"] < 10**9:
+            raise ValueError(f"{where}: attempt must be from 0 to 999999999, got {shown(row['attempt'])}")
+        name = folder_name(row["llm"])
+        if named.setdefault(name, row["llm"]) != row["llm"]:
+            both = f"the models {named[name]!r} and {row['llm']!r} would both be {name!r}"
+            raise ValueError(f"{where}: {both}; give one of them another name")
+        found.setdefault(name, {})[row["format"], row["task"], row["attempt"]] = row["completion"]
+    return found
+
+
+def answer_key(request: dict[str, Any]) -> str:
+    """The name of an answer in the cache: 64 hex digits of all that determines it.
+
+    Example:
+        >>> answer_key({"model": "a", "attempt": 0}) == answer_key({"attempt": 0, "model": "a"})
+        True
+    """
+    return sha256(json.dumps([_VERSION, request], sort_keys=True).encode()).hexdigest()
+
+
+class AnswerCache:
+    """Answers in a folder, each a JSON file with its question, so that nothing is asked twice."""
+
+    def __init__(self, folder: str | os.PathLike[str]) -> None:
+        self.folder = Path(folder)
+
+    def path(self, request: dict[str, Any]) -> Path:
+        """The file of the answer to a request."""
+        key = answer_key(request)
+        return self.folder / key[:2] / f"{key}.json"
+
+    def read(self, request: dict[str, Any]) -> Reply | None:
+        """The answer to a request, None if there is none yet; a file without it is a :class:`ValueError`."""
+        path = self.path(request)
+        try:
+            found = read_json(path, "the kept answer")
+        except FileNotFoundError:
+            return None
+        try:
+            return _reply(found, request)
+        except ValueError as error:
+            raise ValueError(f"the kept answer {str(path)!r} cannot be read: {error}") from error
+
+    def write(self, request: dict[str, Any], reply: Reply) -> None:
+        """Keep an answer, whole or not at all; one that could not be read back is a :class:`ValueError`."""
+        try:
+            text = json.dumps({"request": request, "answer": asdict(reply)}, indent=2, allow_nan=False) + "\n"
+            if len(text) > JSON_LIMIT:
+                raise ValueError(f"it is larger than {JSON_LIMIT} bytes")
+            if _reply(parse_json(text.encode()), request) != reply:
+                raise ValueError("it would be read back as another")
+        except (TypeError, ValueError, RecursionError) as error:
+            raise ValueError(f"the answer cannot be kept: {error}") from error
+        write_text(self.path(request), text)
+
+
+def _reply(found: dict[str, Any], request: dict[str, Any]) -> Reply:
+    """The reply in what a file holds; :class:`ValueError` if it is none to this request."""
+    try:
+        if answer_key(found["request"]) != answer_key(request):
+            raise ValueError("it answers another request")
+        said = found["answer"]
+        reply = Reply(said["text"], said["finish"], said["refusal"], Tokens(**said["tokens"]), tuple(said["notes"]))
+    except (KeyError, TypeError, RecursionError) as error:
+        raise ValueError(repr(error)) from error
+    texts = (reply.text, reply.finish, reply.refusal, *reply.notes)
+    if not all(isinstance(text, str) for text in texts):
+        raise ValueError("its texts must be strings")
+    "".join(texts).encode()  # a lone surrogate goes into no file of an answer
+    if not (is_count(reply.tokens.prompt) and is_count(reply.tokens.completion)):
+        raise ValueError("its tokens must be integers from 0 to 2**53")
+    return reply
