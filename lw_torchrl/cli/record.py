@@ -1,28 +1,33 @@
-"""``lw-torchrl record``: episodes of any policy, to look at in rerun."""
+"""``lw-torchrl record`` and ``view``: episodes of any policy, recorded and looked at in rerun."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from lw_torchrl.cli.outputs import check_file
-from lw_torchrl.cli.sources import (
+from lw_torchrl.cli.options import (
     ACTORS,
+    Json,
+    OwnEncoder,
+    TaskFile,
     check_actor,
     check_encoder,
+    check_file,
     check_plan_files,
     load_policy,
     one_or_many,
     read_plans,
     read_tasks,
     simulated,
+    use_one_thread,
 )
-from lw_torchrl.cli.tables import Output
-from lw_torchrl.cli.threads import use_one_thread
+from lw_torchrl.cli.output import Output
 
 if TYPE_CHECKING:
     from lw_torchrl.envs.episodes import FinishedEpisode
@@ -40,13 +45,13 @@ def record(
     plans: tuple[str, ...] = (),
     attribute: bool = False,
     reference: tuple[str, ...] = (),
-    task_file: Path | None = None,
-    text_encoder: str | None = None,
+    task_file: TaskFile = None,
+    text_encoder: OwnEncoder = None,
     seed: int = 1000,
     noise: float = 0.1,
     max_steps: int = 500,
     out: Path | None = None,
-    json: bool = False,
+    json: Json = False,
 ) -> Output:
     """Record episodes: the robot in 3-D, the plan as it goes, what held when, and how it ended.
 
@@ -63,13 +68,10 @@ def record(
         attribute: say of each failed episode whether a query, the plan or a skill was at fault, or time; it is run
             again a few times. For scripted and for policies with plans.
         reference: with --attribute, plans that are trusted, for failed episodes to be run again with.
-        task_file: tasks of yours, whose objects and points the plans may name.
-        text_encoder: the function that a policy was trained with, if it was one of yours, as my_texts:encode.
         seed: fixes initial states, goals and noise.
         noise: standard deviation of the noise on the executed action.
         max_steps: of an episode.
         out: the file; runs/recordings/TASK-POLICY.rrd if none is given. One that is there is replaced.
-        json: print one JSON document instead, see docs/cli.md.
     """
     if reference and not attribute:
         raise ValueError("--reference is for --attribute, which runs failed episodes again with these plans")
@@ -156,3 +158,56 @@ def _line(episode: FinishedEpisode, who: str, failure: Failure | None) -> str:
     ended = "failed" if first is None else f"success at step {first}"
     why = "" if failure is None else f", {failure.cause}: {failure.why}"
     return f"{episode.task}, episode {episode.episode}, {who}: {ended}{why}"
+
+
+def view(
+    recording: Positional[Annotated[Path, arg(metavar="RUN|FILE")]],
+    /,
+    episode: str | None = None,
+    screenshot: Path | None = None,
+    step: int | None = None,
+    window_size: str = "1400x900",
+    html: Path | None = None,
+    web: bool = False,
+    port: int = 0,
+) -> None:
+    """Open a recording in the rerun viewer; or take a picture of it, write it as one page, or serve it as one.
+
+    Example: lw-torchrl view runs/demo --episode drawer-open --screenshot picture.png --step 80
+
+    Args:
+        recording: an .rrd file, or a folder that holds one.
+        episode: open at this tab, by its title or its episode's name.
+        screenshot: write a .png here and open no window; wants Debian's mesa-vulkan-drivers and libvulkan1.
+        step: the step to open at; if none is given, the one that tells most, of a training the last.
+        window_size: of the picture or the window, WIDTHxHEIGHT.
+        html: write one self-contained page here, some 20 MB, that opens from disk in a browser.
+        web: serve a page on this machine and print its address, until Ctrl-C.
+        port: of the page; 0 takes a free one.
+    """
+    given = [f"--{name}" for name, value in (("screenshot", screenshot), ("html", html), ("web", web)) if value]
+    if len(given) > 1:
+        raise ValueError(f"give one of --screenshot, --html and --web, got {' and '.join(given)}")
+    for option, file, ending in (("--screenshot", screenshot, ".png"), ("--html", html, ".html")):
+        if file is not None:
+            check_file(option, file, ending)
+    if not re.fullmatch(r"[1-9]\d*x[1-9]\d*", window_size):
+        raise ValueError(f"window_size must be like '1400x900', got {window_size!r}")
+    if not recording.exists():
+        raise FileNotFoundError(f"recording: there is no file or folder {str(recording)!r}")
+    if recording.is_dir() and not any(recording.glob("*.rrd")):
+        raise FileNotFoundError(f"recording: the folder {str(recording)!r} holds no recording (*.rrd)")
+    from lw_torchrl.record import WebPage, open_viewer, write_html
+
+    if web:
+        with WebPage(recording, episode=episode, step=step, port=port) as page:
+            print(f"{page.address}  (Ctrl-C ends it)", flush=True)
+            with suppress(KeyboardInterrupt):
+                page.serve()
+        return
+    if html is not None:
+        write_html(recording, html, episode=episode, step=step)
+    else:
+        open_viewer(recording, screenshot, window_size, step=step, episode=episode)
+    if written := html or screenshot:
+        print(f"written to {written}")

@@ -9,20 +9,25 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from lw_torchrl._checks import check_choice
-from lw_torchrl.cli.outputs import check_file
-from lw_torchrl.cli.sources import (
+from lw_torchrl.cli.options import (
     METHODS,
+    Device,
+    Json,
+    PlanSources,
+    TaskFile,
+    TextEncoder,
     check_dataset,
     check_encoder,
+    check_file,
     check_saved,
     make_logger,
     one_or_many,
     read_encoder,
     read_plans,
     read_tasks,
+    use_one_thread,
 )
-from lw_torchrl.cli.tables import Output
-from lw_torchrl.cli.threads import use_one_thread
+from lw_torchrl.cli.output import Output
 
 if TYPE_CHECKING:
     from lw_torchrl.language.plans import Plans
@@ -36,9 +41,9 @@ def train(
     /,
     out: Path,
     tasks: tuple[str, ...] = (),
-    plans: tuple[str, ...] = ("MT10",),
-    task_file: Path | None = None,
-    text_encoder: str | None = None,
+    plans: PlanSources = ("MT10",),
+    task_file: TaskFile = None,
+    text_encoder: TextEncoder = None,
     method: str = "pcbc",
     mix: Literal["latents", "actions"] | None = None,
     features: Literal["raw", "differences", "relative", "both"] = "differences",
@@ -55,8 +60,8 @@ def train(
     qaf_anchor: float = 0.0,
     seed: int = 0,
     logger: Literal["csv", "tensorboard", "wandb"] | None = None,
-    device: str = "cpu",
-    json: bool = False,
+    device: Device = "cpu",
+    json: Json = False,
 ) -> Output:
     """Train a policy on demonstrations. Stopped and started again it carries on from its checkpoint.
 
@@ -68,10 +73,6 @@ def train(
         data: a dataset's folder, of `lw-torchrl collect`.
         out: the policy, one file.
         tasks: MT10, or names of tasks: only their demonstrations; all that the dataset has if none is given.
-        plans: MT10 or MT50 for the shipped plans, .plan files, .json files of pairs, or folders; where several have a
-            plan for a task, the last one's counts.
-        task_file: tasks of yours, whose objects and points the plans may name.
-        text_encoder: a function of yours that turns texts into vectors, as my_texts:encode; evaluate wants it again.
         method: pcbc, conditioned on the plan; or a baseline: dc, on the task's description, one-hot, on its number.
         mix: mix the skills' latents, as in the paper and by default, or their actions; of a policy with plans.
         features: what the policy sees: the raw observation; differences between hand, objects and goal; relative, these
@@ -91,10 +92,6 @@ def train(
             demonstrations holds a condition to its words, and a new evaluator needs it.
         seed: of the initial weights and the minibatches.
         logger: also write loss and learning rate there, below logs/ beside the policy.
-        device: where the networks work: cpu; cuda, or cuda:1 for the second of several; mps, a Mac's; or auto, the GPU
-            where there is one. Minibatches are the same everywhere, and the policy can be loaded
-            anywhere.
-        json: print one JSON document instead, see docs/cli.md.
     """
     check_file("--out", out)
     if begin is not None and out.resolve() == begin.resolve():

@@ -8,10 +8,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 from tyro.conf import Positional, arg
 
 from lw_torchrl._checks import check_choice
-from lw_torchrl.cli.outputs import check_folder
-from lw_torchrl.cli.sources import ACTORS, check_dataset, check_encoder, one_or_many, read_encoder, simulated
-from lw_torchrl.cli.tables import Output
-from lw_torchrl.cli.threads import use_one_thread
+from lw_torchrl.cli.options import (
+    ACTORS,
+    Json,
+    check_dataset,
+    check_encoder,
+    check_folder,
+    one_or_many,
+    read_encoder,
+    simulated,
+    use_one_thread,
+)
+from lw_torchrl.cli.output import Output
 
 if TYPE_CHECKING:
     from lw_torchrl.modules.clause_evaluator import ClauseEvaluator
@@ -46,7 +54,7 @@ def train_evaluator(
     states_per_task: int = 2000,
     seed: int = 0,
     num_envs: int | None = None,
-    json: bool = False,
+    json: Json = False,
 ) -> Output:
     """Train a network to answer conditions, on all base queries of tasks, and say how well it does. Stopped and started
     again it carries on.
@@ -81,7 +89,6 @@ def train_evaluator(
         states_per_task: at most so many of each task are labelled.
         seed: of the episodes, of what is held out, the initial weights and the minibatches.
         num_envs: environments stepped together; the result does not depend on it.
-        json: print one JSON document instead, see docs/cli.md.
     """
     check_folder("--out", out)
     if text_encoder is not None and structure:

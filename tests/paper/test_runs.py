@@ -11,10 +11,10 @@ from tiny_runs import ENSEMBLE, PLANS, PRESET, ROLES, TINY, TINY_ONE_SHOT, a_run
 
 import lw_torchrl as lw
 from lw_torchrl.modules.policy import METHODS
-from lw_torchrl.paper import execution, training
-from lw_torchrl.paper.execution import execute_run, load_result
+from lw_torchrl.paper import imitation, runs
+from lw_torchrl.paper.imitation import SCRIPTED, ImitationRun
 from lw_torchrl.paper.recipes import PRESETS, SETTINGS, Member
-from lw_torchrl.paper.runs import SCRIPTED, Run
+from lw_torchrl.paper.runs import execute_run, load_result
 from lw_torchrl.training.checkpoint import demonstration_seeds
 
 
@@ -62,7 +62,7 @@ def test_a_unit_leaves_its_result_and_is_not_done_twice(undisturbed, one, monkey
     episodes, config = rates(undisturbed / one.folder)
     assert [episode["task"] for episode in episodes] == [task_of(one)] * 2
     assert (config["seed"], config["noise_scale"], config["tasks"]) == (10_003, 0.1, [task_of(one)])
-    monkeypatch.setattr(execution, "evaluate", lambda *_, **__: pytest.fail("evaluated again"))
+    monkeypatch.setattr(runs, "evaluate", lambda *_, **__: pytest.fail("evaluated again"))
     assert len(execute(one, undisturbed).episodes) == 2
 
 
@@ -118,7 +118,7 @@ def test_a_result_of_other_tasks_is_refused(undisturbed):
             execute_run(one, PLANS, undisturbed, tasks="push", progress=False)
     one = a_run(setting=TINY_ONE_SHOT)
     assert execute_run(one, PLANS, undisturbed, tasks=["push", "reach"], progress=False).config["tasks"] == ["push"]
-    with pytest.raises(ValueError, match="tasks must name some of the run's targets, push, got reach"):
+    with pytest.raises(ValueError, match="tasks must name some of the run's, push, got reach"):
         execute_run(one, PLANS, undisturbed, tasks="reach", progress=False)
 
 
@@ -180,7 +180,7 @@ def test_stopped_in_training_and_resumed_it_ends_the_same(undisturbed, tmp_path,
 
 
 def test_scripts_are_the_same_in_every_setting_and_run_once(undisturbed, monkeypatch):
-    monkeypatch.setattr(execution, "evaluate", lambda *_, **__: pytest.fail("evaluated again"))
+    monkeypatch.setattr(runs, "evaluate", lambda *_, **__: pytest.fail("evaluated again"))
     other = a_run("scripted", setting=TINY_ONE_SHOT)
     assert load_result(other, PLANS, undisturbed) == load_result(a_run("scripted"), PLANS, undisturbed)
 
@@ -244,7 +244,7 @@ def test_settings_are_the_papers():
         assert preset.keys() == (SETTINGS.keys() if name != "evaluator" else {"few-shot"})
         assert "one-shot" not in preset or preset["one-shot"].training.batch_size % 180 == 0
     with pytest.raises(ValueError, match=r"method must be one of 'pcbc', .*did you mean 'pcbc'"):
-        Run(TINY, "pbc", 0, PRESET)
+        ImitationRun(TINY, "pbc", 0, PRESET)
 
 
 @pytest.mark.parametrize(
@@ -262,7 +262,7 @@ def test_passes_count_rows(undisturbed, tmp_path, monkeypatch, setting, trainer,
         steps.append(arguments[2].steps)
         stop()
 
-    monkeypatch.setattr(training, trainer, see)
+    monkeypatch.setattr(imitation, trainer, see)
     with pytest.raises(KeyboardInterrupt):
         execute(a_run(setting=setting), tmp_path, replace(PRESET, passes=2))
     rows = len(lw.LanguageWorldExperienceReplay(tmp_path / a_run().datasets[0].folder, after_success=20))

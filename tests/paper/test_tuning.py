@@ -7,8 +7,7 @@ import torch
 
 import lw_torchrl as lw
 from lw_torchrl.evaluation import PlanUse, weakest_step
-from lw_torchrl.paper.online import OnlineRun
-from lw_torchrl.paper.tuning import Elsewhere, tune_step
+from lw_torchrl.paper.online import Elsewhere, OnlineRun, tune_step
 
 PLANS = lw.load_plans("MT10")
 

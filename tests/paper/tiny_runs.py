@@ -4,9 +4,9 @@ import json
 from dataclasses import replace
 
 import lw_torchrl as lw
-from lw_torchrl.paper.execution import execute_run
+from lw_torchrl.paper.imitation import ImitationRun
 from lw_torchrl.paper.recipes import PRESETS, DataSetting, Execution, Member
-from lw_torchrl.paper.runs import Run
+from lw_torchrl.paper.runs import execute_run
 
 PLANS = lw.load_plans("MT50")
 TINY = DataSetting("tiny", "reach", 2)
@@ -25,7 +25,7 @@ ENSEMBLE = replace(PRESET, name="ensemble", members=(MEMBER, OTHER))
 
 
 def a_run(method="pcbc", seed=3, setting=TINY, preset=PRESET):
-    return Run(setting, method, seed, preset, episodes=2)
+    return ImitationRun(setting, method, seed, preset, episodes=2)
 
 
 def task_of(one):

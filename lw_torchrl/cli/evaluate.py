@@ -1,29 +1,34 @@
-"""The subcommands of ``lw-torchrl`` that make policies: demonstrations, training, evaluation."""
+"""``lw-torchrl evaluate``, trained policies and experts; ``lw-torchrl scripted``, plans carried out by scripts."""
 
 from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
 from lw_torchrl._checks import counted
-from lw_torchrl.cli.outputs import check_folder
-from lw_torchrl.cli.sources import (
-    ACTORS,
-    check_actor,
+from lw_torchrl.cli.options import (
+    Device,
+    Json,
+    OwnEncoder,
+    PlanSources,
+    SkillFile,
+    TaskFile,
     check_encoder,
+    check_folder,
     check_plan_files,
     check_saved,
     load_policy,
     one_or_many,
     read_plans,
+    read_skills,
     read_tasks,
     simulated,
+    use_one_thread,
 )
-from lw_torchrl.cli.tables import Columns, Output
-from lw_torchrl.cli.threads import use_one_thread
+from lw_torchrl.cli.output import Output
 from lw_torchrl.cli.train_evaluator import with_evaluator
 
 if TYPE_CHECKING:
@@ -31,85 +36,13 @@ if TYPE_CHECKING:
     from lw_torchrl.modules.policy import Policy
 
 
-def collect(
-    tasks: Positional[Annotated[tuple[str, ...], arg(metavar="TASKS ...")]],
-    /,
-    out: Path,
-    episodes: int = 10,
-    seed: int = 0,
-    noise: tuple[float, ...] = (0.0,),
-    noise_hold: int = 10,
-    gripper_noise: float = 0.2,
-    redraw_failures: bool = False,
-    policy: str = "expert",
-    behaviour: str | None = None,
-    num_envs: int | None = None,
-    json: bool = False,
-) -> Output:
-    """Collect demonstrations of the scripted experts, or of others. Stopped and started again it carries on.
-
-    Example: lw-torchrl collect MT10 --out demos/mt10 --noise 0 0.1 0.2 --redraw-failures
-
-    Args:
-        tasks: MT10, MT50, or names of tasks.
-        out: the dataset's folder.
-        episodes: kept for each task.
-        seed: evaluate on another one.
-        noise: standard deviations of the execution noise, gone through in turn, one an episode.
-        noise_hold: steps for which each draw of the noise is kept; longer leads further astray.
-        gripper_noise: what the noise on the gripper is multiplied by; noise there makes grasps fail.
-        redraw_failures: keep successful episodes only.
-        policy: who acts: expert, Meta-World's scripts; scripted, plans with scripted skills; spoilt-60 or spoilt-30,
-            the same in so many of 100 pieces of an episode; wrong, any skill of the plan; random; or a policy's file,
-            of `lw-torchrl train`.
-        behaviour: the label of its episodes; by default the name of who acts, of a policy its file's.
-        num_envs: environments stepped together; the dataset does not depend on it.
-        json: print one JSON document instead, see docs/cli.md.
-    """
-    check_folder("--out", out)
-    check_actor("policy", policy)
-    from lw_torchrl.language.tasks import TASKS
-
-    chosen = simulated("tasks", one_or_many(tasks), TASKS)
-    from lw_torchrl.data import collect_demonstrations
-
-    acts: str | Policy = policy
-    if policy not in ACTORS:
-        from lw_torchrl.training.checkpoint import load_actor
-
-        use_one_thread()
-        acts, behaviour = load_actor(policy), behaviour or Path(policy).stem
-    made = collect_demonstrations(
-        chosen,
-        episodes_per_task=episodes,
-        root=out,
-        seed=seed,
-        noise_scale=noise,
-        noise_hold=noise_hold,
-        gripper_noise_factor=gripper_noise,
-        redraw_failures=redraw_failures,
-        policy=acts,
-        behaviour=behaviour,
-        num_envs=num_envs,
-    )
-    output = Output(json)
-    rows = [
-        {"task": task, "success": rate, "episodes_run": made.attempts[task]} for task, rate in made.success_rate.items()
-    ]
-    columns: Columns = {"task": "task", "success": lambda row: f"{row['success']:.2f}", "episodes run": "episodes_run"}
-    output.table("tasks", rows, columns)
-    output.show("dataset", made.root)
-    output.show("steps", made.num_steps, f"{counted(made.num_steps, 'step')} in {made.root}")
-    return output
-
-
 def evaluate(
     checkpoint: Positional[Annotated[Path, arg(metavar="CHECKPOINT")]],
     /,
     tasks: tuple[str, ...] = (),
     plans: tuple[str, ...] = (),
-    task_file: Path | None = None,
-    text_encoder: str | None = None,
+    task_file: TaskFile = None,
+    text_encoder: OwnEncoder = None,
     episodes: int = 20,
     seed: int = 1000,
     noise: float = 0.1,
@@ -119,8 +52,8 @@ def evaluate(
     reference: tuple[str, ...] = (),
     evaluator: Path | None = None,
     out: Path | None = None,
-    device: str = "cpu",
-    json: bool = False,
+    device: Device = "cpu",
+    json: Json = False,
 ) -> Output:
     """Evaluate a trained policy, or the scripted experts, and write the result, a figure and a recording.
 
@@ -132,8 +65,6 @@ def evaluate(
             trained on.
         plans: carry out these instead of the policy's own: MT10, MT50, .plan or .json files, or folders; where several
             have a plan for a task, the last one's counts.
-        task_file: tasks of yours, whose objects and points the plans may name.
-        text_encoder: the function that the policy was trained with, if it was one of yours, as my_texts:encode.
         episodes: of each task.
         seed: fixes initial states, goals and noise; not one that the demonstrations used.
         noise: standard deviation of the noise on the executed action.
@@ -145,9 +76,6 @@ def evaluate(
             or .json files, or folders.
         evaluator: a network that answers the conditions, of `lw-torchrl train-evaluator`.
         out: folder for results.json, success.png and rollout.rrd; with --attribute also failures.png.
-        device: where the networks work: cpu; cuda, or cuda:1 for the second of several; mps, a Mac's; or auto, the GPU
-            where there is one. The simulation is always on the CPU.
-        json: print one JSON document instead, see docs/cli.md.
     """
     if out is not None:
         check_folder("--out", out)
@@ -240,3 +168,77 @@ def _default_tasks(policy: Policy, checkpoint: Path, *, trained: bool) -> tuple[
     if own:
         print(f"without {', '.join(own)}, which the simulator lacks")
     return tuple(task for task in chosen if task in TASKS)
+
+
+def scripted(
+    names: Positional[Annotated[tuple[str, ...], arg(metavar="[NAMES ...]")]] = ("MT10",),
+    /,
+    episodes: int = 50,
+    seed: int = 1000,
+    select: Literal["first", "random", "mix"] = "first",
+    noise: float = 0.0,
+    plans: PlanSources = ("MT50",),
+    skill_file: SkillFile = None,
+    task_file: TaskFile = None,
+    full: bool = False,
+    out: Path = Path("runs/scripted"),
+    json: Json = False,
+) -> Output:
+    """Carry out plans with scripted skills, and say how each step fared: no training, no expert.
+
+    Example: lw-torchrl scripted MT50 --episodes 50
+
+    Args:
+        names: MT10, MT50, or names of tasks.
+        episodes: of each task.
+        seed: fixes initial states and goals.
+        select: of several true steps, take the first, a random one, as in the paper, or mix them.
+        noise: standard deviation of the noise on the executed action.
+        full: run all 500 steps, instead of stopping at the first success.
+        out: folder for results.json, plan_use.json and success.png.
+    """
+    check_folder("--out", out)
+    known = read_tasks(task_file)
+    chosen = simulated("tasks", one_or_many(names), known)
+    loaded = read_plans(plans, known)
+    loaded.require(chosen)
+    loaded = type(loaded)({task: loaded[task] for task in chosen})
+    skills = read_skills(skill_file, known)
+    import lw_torchrl as lw
+    from lw_torchrl._files import held, write_json
+    from lw_torchrl.evaluation.plan_use import PlanUse
+
+    use = PlanUse(loaded)
+    result = lw.evaluate(
+        lw.ScriptedSkillActor(loaded, select, skills=skills),
+        tasks=chosen,
+        episodes_per_task=episodes,
+        seed=seed,
+        noise_scale=noise,
+        stop_at_success=not full,
+        also_record=["qaf", "skill_weights"],
+        on_episode=use,
+    )
+    seen = use.tasks()
+    steps = {
+        task: [
+            {"skill": step.skill, "true": true, "chosen": taken, "stuck": stuck}
+            for step, true, taken, stuck in zip(loaded[task].steps, found.true, found.chosen, found.stuck, strict=True)
+        ]
+        for task, found in seen.items()
+    }
+    if not json:
+        for task, found in seen.items():
+            print(f"{task}: success {result.success_once[task]:.2f}")
+            for one in steps[task]:
+                ended = f", stuck here in {one['stuck']} of {found.failed} failed episodes" if one["stuck"] else ""
+                print(f"    true {one['true']:4.0%}  chosen {one['chosen']:4.0%}  {one['skill']}{ended}")
+        print()
+    output = Output(json)
+    output.result(result, steps=steps)
+    with held(out, "out", folder=True, wait=True):
+        result.save(out / "results.json", plans=loaded.fingerprint)
+        write_json(out / "plan_use.json", {task: found.to_json() for task, found in seen.items()})
+        lw.plot_success(result, out / "success.png", title=f"plans and scripted skills, {episodes} episodes a task")
+    print(f"written to {out}")
+    return output

@@ -4,7 +4,7 @@ import sys
 
 import pytest
 
-from lw_torchrl.paper.launchers import run_command, run_commands
+from lw_torchrl.cli.runs import run_command, run_commands
 
 FAILS = ["plans", "no-such-folder"]
 
