@@ -16,6 +16,7 @@ from lw_torchrl.data.metadata import read_metadata
 from lw_torchrl.paper.offline import LOSSES, Advantages, BehaviourDataset, OfflineRun, offline_runs, write_table
 from lw_torchrl.paper.offline_recipes import (
     MIXTURES,
+    NOISE,
     OFFLINE_METHODS,
     OFFLINE_TABLES,
     TASK_SETS,
@@ -213,7 +214,7 @@ def test_damaged_advantages_are_refused(made, out):
     one.make(PLANS, out, progress=False)
     file = out / one.folder / "advantages.zip"
     file.write_bytes(file.read_bytes()[:-40])
-    with pytest.raises(ValueError, match=r"advantages.zip. is damaged .*delete it, and they are learned again"):
+    with pytest.raises(ValueError, match=r"advantages.zip. is damaged .*delete it to learn them again"):
         one.make(PLANS, out, progress=False)
 
 
@@ -255,9 +256,9 @@ def test_descriptions_tell_what_a_result_hangs_on():
     assert replace(run, episodes=3).describe(PLANS) == run.describe(PLANS)
     cloned = replace(run, method="bc")
     assert replace(cloned, critic="dc").describe(PLANS) == cloned.describe(PLANS)
-    noise = {**offline.NOISE, "wrong": {"noise_scale": 0.1}}
+    noise = {**NOISE, "wrong": {"noise_scale": 0.1}}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("lw_torchrl.paper.offline.NOISE", noise)
         assert run.describe(PLANS) != described
-    assert described["data"][0] == {"behaviour": "spoilt-30", "episodes": 20, **offline.NOISE["spoilt-30"]}
+    assert described["data"][0] == {"behaviour": "spoilt-30", "episodes": 20, **NOISE["spoilt-30"]}
     assert isinstance(Advantages("five", "B", 0).describe(PLANS)["recipe"], dict)
