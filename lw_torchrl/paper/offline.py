@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -32,11 +32,10 @@ from lw_torchrl.paper.offline_recipes import (
     OfflineTable,
     Portion,
 )
-from lw_torchrl.paper.runs import Dataset, Run, Work, compare, own_tasks, plain, write_summary
-from lw_torchrl.training import OfflineConfig, OfflineTrainer, load_actor, save_actor
-from lw_torchrl.training.checkpoint import describe_data
+from lw_torchrl.paper.runs import Dataset, Run, Work, compare, kept_policy, own_tasks, plain, write_summary
+from lw_torchrl.training import OfflineConfig, OfflineTrainer
 from lw_torchrl.training.loss_state import bc_loss
-from lw_torchrl.training.training_state import check_description, check_same_description
+from lw_torchrl.training.training_state import check_same_description
 from lw_torchrl.transforms import QAFTransform
 
 CONDITIONS: Mapping[str, str] = {"pcbc": "plan", "dc": "description", "one-hot": "one-hot"}
@@ -251,29 +250,24 @@ class OfflineRun(_Learned, Run):
         return described | {"how": plain(asdict(self.how))}
 
     def learn(self, work: Work) -> tuple[Policy, dict[str, Any]]:
-        folder, described, own = work.out / self.folder, self.describe(work.plans), self.own_plans(work.plans)
-        file, checkpoint = folder / "policy.zip", folder / "checkpoint.zip"
-        if file.is_file():
-            check_description(file, {"run": described})
-            checkpoint.unlink(missing_ok=True)
-            return load_actor(file), {}
-        recipe = self.recipe
-        make_loss, distribution = LOSSES[self.how.loss]
-        learns_values = self.how.critic and self.advantages is None
-        replay = self._replay(own, work.out, learns_values, keep=self.how.keep)
-        if (advantages := self.advantages) is not None:
-            replay.add_column("advantage", advantages.make(work.plans, work.out, work.progress)["advantage"])
-        torch.manual_seed(self.seed)
-        options: dict[str, Any] = {"width": recipe.width, "depth": recipe.depth, "feature_noise": recipe.feature_noise}
-        actor = make_policy(self.actor, own, distribution=distribution, **options)
-        loss = make_loss(actor, self, own)
-        if learns_values:
-            loss.make_value_estimator(gamma=recipe.gamma)
-        options = {"checkpoint": checkpoint, "progress": work.progress, "title": self.label}
-        OfflineTrainer(loss, replay, self._config(recipe.steps), **options).train()
-        save_actor(actor, file, data=describe_data(replay), run=described)
-        checkpoint.unlink(missing_ok=True)  # another process did the same run, where files cannot be locked
-        return actor.eval(), {}
+        def train(checkpoint: Path) -> dict[str, Any]:
+            recipe, own = self.recipe, self.own_plans(work.plans)
+            learns_values = self.how.critic and self.advantages is None
+            replay = self._replay(own, work.out, learns_values, keep=self.how.keep)
+            if (advantages := self.advantages) is not None:
+                replay.add_column("advantage", advantages.make(work.plans, work.out, work.progress)["advantage"])
+            torch.manual_seed(self.seed)
+            options: dict[str, Any] = {"width": recipe.width, "depth": recipe.depth}
+            options |= {"feature_noise": recipe.feature_noise, "distribution": DISTRIBUTIONS[self.how.loss]}
+            actor = make_policy(self.actor, own, **options)
+            loss = _make_loss(self, actor, own)
+            if learns_values:
+                loss.make_value_estimator(gamma=recipe.gamma)
+            options = {"checkpoint": checkpoint, "progress": work.progress, "title": self.label}
+            OfflineTrainer(loss, replay, self._config(recipe.steps), **options).train()
+            return {"actor": actor, "replay": replay}
+
+        return kept_policy(work.out / self.folder / "policy.zip", {"run": self.describe(work.plans)}, train), {}
 
     def evaluate(self, policy: Policy, work: Work) -> tuple[EvaluationResult, dict[str, Any]]:
         return self.rollouts(policy, work, max_steps=self.max_steps), {}
@@ -286,44 +280,35 @@ def _encoder(condition: str, plans: Plans, noise: float = 0.0) -> Encoder:
     return DescriptorEncoder(tuple(plans), feature_noise=noise, **METHODS[condition].options)
 
 
-def _critic(run: OfflineRun, plans: Plans, kind: type[QValue] | type[Value] = QValue) -> QValue | Value:
-    return kind(_encoder(run.critic, plans), width=run.recipe.width, depth=run.recipe.critic_depth)
-
-
-def _advantage(actor: Policy, run: OfflineRun, plans: Plans) -> LossModule:
-    recipe = run.recipe
-    return AdvantageWeightedLoss(actor, beta=recipe.beta, max_weight=recipe.max_weight, loss_function=recipe.distance)
-
-
-def _bc(actor: Policy, run: OfflineRun, plans: Plans) -> LossModule:
-    return bc_loss(actor, run.recipe.distance)
-
-
-def _iql(actor: Policy, run: OfflineRun, plans: Plans) -> LossModule:
-    value = _critic(run, plans, Value)  # drawn before the critic
-    options: dict[str, Any] = {"expectile": run.recipe.expectile, "temperature": run.recipe.temperature}
-    return IQLLoss(actor, _critic(run, plans), value, num_qvalue_nets=2, loss_function="l2", **options)
-
-
-def _td3_bc(actor: Policy, run: OfflineRun, plans: Plans) -> LossModule:
-    options: dict[str, Any] = {"bounds": (-1.0, 1.0), "alpha": run.recipe.alpha, "delay_actor": True}
-    return TD3BCLoss(actor, _critic(run, plans), num_qvalue_nets=2, loss_function="l2", **options)
-
-
-def _cql(actor: Policy, run: OfflineRun, plans: Plans) -> LossModule:
-    # TorchRL makes rows of the actions that it draws: one or ten, each soft maximum is of three actions.
-    options: dict[str, Any] = {"min_q_weight": run.recipe.cql_weight, "num_random": 1}
-    return CQLLoss(actor, _critic(run, plans), loss_function="l2", **options)
-
-
-LOSSES: Mapping[str, tuple[Callable[[Policy, OfflineRun, Plans], LossModule], str | None]] = {
-    "advantage": (_advantage, None),
-    "bc": (_bc, None),
-    "iql": (_iql, "normal"),
-    "td3-bc": (_td3_bc, None),
-    "cql": (_cql, "tanh_normal"),
+DISTRIBUTIONS: Mapping[str, str | None] = {
+    "advantage": None,
+    "bc": None,
+    "iql": "normal",
+    "td3-bc": None,
+    "cql": "tanh_normal",
 }
-"""By name: what makes the loss, and the distribution that its actor needs."""
+"""By name: the distribution that the loss wants of its actor."""
+
+
+def _make_loss(run: OfflineRun, actor: Policy, plans: Plans) -> LossModule:
+    recipe, name = run.recipe, run.how.loss
+    if name == "bc":
+        return bc_loss(actor, recipe.distance)
+    if name == "advantage":
+        options: dict[str, Any] = {"beta": recipe.beta, "max_weight": recipe.max_weight}
+        return AdvantageWeightedLoss(actor, loss_function=recipe.distance, **options)
+    critic: dict[str, Any] = {"width": recipe.width, "depth": recipe.critic_depth}
+    # The order in which networks are made decides their initial weights.
+    value = Value(_encoder(run.critic, plans), **critic) if name == "iql" else None
+    q = QValue(_encoder(run.critic, plans), **critic)
+    if value is not None:
+        options = {"expectile": recipe.expectile, "temperature": recipe.temperature}
+        return IQLLoss(actor, q, value, num_qvalue_nets=2, loss_function="l2", **options)
+    if name == "td3-bc":
+        options = {"bounds": (-1.0, 1.0), "alpha": recipe.alpha, "delay_actor": True}
+        return TD3BCLoss(actor, q, num_qvalue_nets=2, loss_function="l2", **options)
+    # TorchRL makes rows of the actions that it draws: one or ten, each soft maximum is of three actions.
+    return CQLLoss(actor, q, loss_function="l2", min_q_weight=recipe.cql_weight, num_random=1)
 
 
 def offline_runs(

@@ -60,7 +60,7 @@ class OfflineMethod:
 
     Attributes:
         name: in folders and tables.
-        loss: a name of :data:`lw_torchrl.paper.offline.LOSSES`.
+        loss: a name of :data:`lw_torchrl.paper.offline.DISTRIBUTIONS`.
         keep: which episodes it sees; None for all.
         critic: whether it has a critic, which may be conditioned otherwise than the actor.
         version: raised by 1 whenever the method changes, so that earlier results are refused.

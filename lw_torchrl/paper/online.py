@@ -23,7 +23,7 @@ from lw_torchrl.modules.policy import METHODS, Policy, make_policy
 from lw_torchrl.modules.residual_actor import ResidualActor
 from lw_torchrl.paper.imitation import ExpertDataset
 from lw_torchrl.paper.recipes import TARGET
-from lw_torchrl.paper.runs import Run, Work, execute_run, own_tasks, plain
+from lw_torchrl.paper.runs import Run, Work, execute_run, kept_policy, own_tasks, plain
 from lw_torchrl.training import (
     LEARNERS,
     BehavioralCloningConfig,
@@ -31,10 +31,8 @@ from lw_torchrl.training import (
     OnlineConfig,
     OnlineTrainer,
     load_actor,
-    save_actor,
 )
-from lw_torchrl.training.checkpoint import describe_data, read_description
-from lw_torchrl.training.training_state import check_description
+from lw_torchrl.training.checkpoint import read_description
 
 START = "start"
 """The policy that is begun with: a run beside those of :data:`~lw_torchrl.training.LEARNERS`."""
@@ -161,17 +159,15 @@ class OnlineRun(Run):
     def learn(self, work: Work) -> tuple[Policy, dict[str, Any]]:
         if self.method == START:
             return self.load_start(work), {}
-        folder, described = work.out / self.folder, {"run": self.describe(work.plans)}
-        file, checkpoint = folder / "policy.zip", folder / "checkpoint.zip"
-        if not file.is_file():
+        file = work.out / self.folder / "policy.zip"
+
+        def train(checkpoint: Path) -> dict[str, Any]:
             trainer, tuned = self._make_trainer(work, file, checkpoint)
             trainer.train()
-            data = describe_data(trainer.replay)
-            save_actor(trainer.policy, file, data=data, history=trainer.history, **tuned, **described)
-        checkpoint.unlink(missing_ok=True)
-        check_description(file, described)
-        description = read_description(file)
-        return load_actor(file), {name: description[name] for name in ("history", "tuned") if name in description}
+            return {"actor": trainer.policy, "replay": trainer.replay, "history": trainer.history, **tuned}
+
+        policy, description = kept_policy(file, {"run": self.describe(work.plans)}, train), read_description(file)
+        return policy, {name: description[name] for name in ("history", "tuned") if name in description}
 
     def evaluate(self, policy: Policy, work: Work) -> tuple[EvaluationResult, dict[str, Any]]:
         if self.step is None:
@@ -189,21 +185,18 @@ class OnlineRun(Run):
             if self.task not in policy.tasks:
                 raise ValueError(f"start: the policy of {str(self.start)!r} does not know the task {self.task!r}")
             return policy
-        folder, described = work.out / self.begin.folder, {"run": self.begin.describe(work.plans)}
-        file, checkpoint = folder / "policy.zip", folder / "checkpoint.zip"
+
+        def train(checkpoint: Path) -> dict[str, Any]:
+            torch.manual_seed(self.seed)
+            actor = make_policy(self.condition, self.own_plans(work.plans), feature_noise=self.recipe.feature_noise)
+            replay, config = self._replay(work, actor), replace(self.recipe.cloning, seed=self.seed)
+            options: dict[str, Any] = {"checkpoint": checkpoint, "progress": work.progress}
+            BehavioralCloningTrainer(actor, replay, config, **options).train()
+            return {"actor": actor, "replay": replay}
+
+        file = work.out / self.begin.folder / "policy.zip"
         with held(file, "out", wait=True):
-            if not file.is_file():
-                torch.manual_seed(self.seed)
-                plans = self.own_plans(work.plans)
-                actor = make_policy(self.condition, plans, feature_noise=self.recipe.feature_noise)
-                replay = self._replay(work, actor)
-                config = replace(self.recipe.cloning, seed=self.seed)
-                options: dict[str, Any] = {"checkpoint": checkpoint, "progress": work.progress}
-                BehavioralCloningTrainer(actor, replay, config, **options).train()
-                save_actor(actor, file, data=describe_data(replay), **described)
-            checkpoint.unlink(missing_ok=True)
-        check_description(file, described)
-        return load_actor(file)
+            return kept_policy(file, {"run": self.begin.describe(work.plans)}, train)
 
     def _replay(self, work: Work, actor: Policy, **options: Any) -> LanguageWorldExperienceReplay:
         return LanguageWorldExperienceReplay(

@@ -20,6 +20,10 @@ from lw_torchrl.evaluation import EvaluationResult, MethodComparison, evaluate, 
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.tasks import TASKS, resolve_tasks
 from lw_torchrl.language.text import TextEncoder
+from lw_torchrl.modules.policy import Policy
+from lw_torchrl.training import load_actor, save_actor
+from lw_torchrl.training.checkpoint import describe_data
+from lw_torchrl.training.training_state import check_description
 
 EVALUATION_SEED = 10_000
 """Training seeds count from 0; the evaluation of training seed k has seed 10000 + k."""
@@ -28,17 +32,7 @@ RESULTS = "results.json"
 
 @dataclass(frozen=True)
 class Work:
-    """What a run is executed with: none of it but the plans and the text encoder changes the result.
-
-    Attributes:
-        plans: a plan for each task.
-        out: the experiments' folder.
-        tasks: that are evaluated.
-        progress: show progress bars.
-        text_encoder: texts to vectors (n, E) float32; None for the shipped one.
-        device: where networks are trained and evaluated.
-        make_logger: a TorchRL logger for a policy's file.
-    """
+    """With what a run is executed: the arguments of :func:`execute_run`, checked."""
 
     plans: Plans
     out: Path
@@ -230,6 +224,26 @@ def _execute(run: Run, work: Work) -> EvaluationResult:
     return result
 
 
+def kept_policy(file: Path, described: Mapping[str, Any], train: Callable[[Path], Mapping[str, Any]]) -> Policy:
+    """The policy of a file; if there is none, it is trained and saved first.
+
+    Args:
+        file: the policy's.
+        described: what the file must say.
+        train: trains it, with this checkpoint meanwhile; returns arguments of :func:`~lw_torchrl.save_actor`.
+
+    Raises:
+        ValueError: the file says something else.
+    """
+    checkpoint = file.with_name("checkpoint.zip")
+    if not file.is_file():
+        trained = dict(train(checkpoint))
+        save_actor(trained.pop("actor"), file, data=describe_data(trained.pop("replay")), **trained, **described)
+    checkpoint.unlink(missing_ok=True)  # another process may have done so, where files cannot be locked
+    check_description(file, described)
+    return load_actor(file)
+
+
 def joined(results: Sequence[EvaluationResult]) -> EvaluationResult:
     """One result of those of several tasks, evaluated alike."""
     tasks = [task for one in results for task in one.config["tasks"]]
@@ -254,9 +268,9 @@ def compare(
     )
 
 
-def write_summary(path: Path, text: str, told: Mapping[str, Any]) -> None:
+def write_summary(path: Path, text: str, numbers: Mapping[str, Any]) -> None:
     """A table as ``path``.md, its numbers as ``path``.json."""
-    write_json(path.with_name(f"{path.name}.json"), told)
+    write_json(path.with_name(f"{path.name}.json"), numbers)
     write_text(path.with_name(f"{path.name}.md"), text)
 
 

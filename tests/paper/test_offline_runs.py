@@ -13,7 +13,7 @@ import torch
 import lw_torchrl as lw
 from lw_torchrl.data.behaviours import BEHAVIOURS
 from lw_torchrl.data.metadata import read_metadata
-from lw_torchrl.paper.offline import LOSSES, Advantages, BehaviourDataset, OfflineRun, offline_runs, write_table
+from lw_torchrl.paper.offline import DISTRIBUTIONS, Advantages, BehaviourDataset, OfflineRun, offline_runs, write_table
 from lw_torchrl.paper.offline_recipes import (
     MIXTURES,
     NOISE,
@@ -78,7 +78,7 @@ def test_the_tables_compare_the_same_steps_and_the_methods_that_they_name():
             assert len(set(rows)) == len(rows)
             assert ("filtered-bc", "pcbc", "pcbc") in rows
     assert {row[0] for row in OFFLINE_TABLES["methods"].rows["B"]} == set(OFFLINE_METHODS)
-    assert {method.loss for method in OFFLINE_METHODS.values()} == set(LOSSES)
+    assert {method.loss for method in OFFLINE_METHODS.values()} == set(DISTRIBUTIONS)
 
 
 def test_no_two_datasets_begin_alike_and_none_as_an_evaluation(monkeypatch, tmp_path):
@@ -202,7 +202,7 @@ def test_what_a_method_gave_before_it_was_changed_is_refused(out, monkeypatch):
 
 def test_a_run_that_another_process_ends_first_is_the_same(out, monkeypatch):
     run = tiny("bc")
-    kept = "lw_torchrl.paper.offline.save_actor"
+    kept = "lw_torchrl.paper.runs.save_actor"
     monkeypatch.setattr(
         kept, lambda *one, **about: (lw.save_actor(*one, **about), (out / run.folder / "checkpoint.zip").unlink())
     )
