@@ -43,7 +43,14 @@ def check(
     known = read_tasks(task_file)
     output = Output(json)
     if file.suffix == ".toml":
-        kind, number, notes = _check_table(file, known, "" if task_file else "; tasks of yours come by --task-file")
+        try:
+            kind, number, notes = _check_table(file, known, "" if task_file else "; tasks of yours come by --task-file")
+        except ValueError as error:
+            if not json:
+                raise
+            output.show("files", [{"file": file, "steps": 0, "faults": [str(error)], "notes": []}])
+            output.fault = str(error)
+            return output
         lines = [*(f"{file.name}: note: {note}" for note in notes), f"{file.name}: {counted(number, kind)}, valid"]
         row = {"file": file, f"{kind}s": number, "faults": [], "notes": notes}
         output.show("files", [row], "\n".join(lines))

@@ -12,16 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from lw_torchrl._checks import counted
-from lw_torchrl.cli.options import (
-    ACTORS,
-    Json,
-    check_actor,
-    check_dataset,
-    check_folder,
-    one_or_many,
-    simulated,
-    use_one_thread,
-)
+from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Columns, Output, Row
 
 if TYPE_CHECKING:
@@ -55,9 +46,9 @@ def collect(
     policy: str = "expert",
     behaviour: str | None = None,
     num_envs: int | None = None,
-    json: Json = False,
+    json: options.Json = False,
 ) -> Output:
-    """Collect demonstrations of the scripted experts, or of others. Stopped and started again it carries on.
+    """Collect demonstrations of the scripted experts, or of others. If it is stopped, the same command resumes it.
 
     Example: lw-torchrl collect MT10 --out demos/mt10 --noise 0 0.1 0.2 --redraw-failures
 
@@ -66,28 +57,28 @@ def collect(
         out: the dataset's folder.
         episodes: kept for each task.
         seed: evaluate on another one.
-        noise: standard deviations of the execution noise, gone through in turn, one an episode.
-        noise_hold: steps for which each draw of the noise is kept; longer leads further astray.
-        gripper_noise: what the noise on the gripper is multiplied by; noise there makes grasps fail.
+        noise: standard deviations of the execution noise, used in turn, one per episode.
+        noise_hold: steps for which each draw of the noise is kept; a longer one leads further from the path.
+        gripper_noise: factor of the noise on the gripper, which makes grasps fail.
         redraw_failures: keep successful episodes only.
         policy: who acts: expert, Meta-World's scripts; scripted, plans with scripted skills; spoilt-60 or spoilt-30,
             the same in so many of 100 pieces of an episode; wrong, any skill of the plan; random; or a policy's file,
             of `lw-torchrl train`.
-        behaviour: the label of its episodes; by default the name of who acts, of a policy its file's.
+        behaviour: the label of its episodes; by default the name of who acts, or of the policy's file.
         num_envs: environments stepped together; the dataset does not depend on it.
     """
-    check_folder("--out", out)
-    check_actor("policy", policy)
+    options.check_folder("--out", out)
+    options.check_actor("policy", policy)
     from lw_torchrl.language.tasks import TASKS
 
-    chosen = simulated("tasks", one_or_many(tasks), TASKS)
+    chosen = options.simulated("tasks", options.one_or_many(tasks), TASKS)
     from lw_torchrl.data import collect_demonstrations
 
     acts: str | Policy = policy
-    if policy not in ACTORS:
+    if policy not in options.ACTORS:
         from lw_torchrl.training.checkpoint import load_actor
 
-        use_one_thread()
+        options.use_one_thread()
         acts, behaviour = load_actor(policy), behaviour or Path(policy).stem
     made = collect_demonstrations(
         chosen,
@@ -118,7 +109,7 @@ def data(
     folders: Positional[Annotated[tuple[Path, ...], arg(metavar="FOLDERS ...")]],
     /,
     check: bool = False,
-    json: Json = False,
+    json: options.Json = False,
 ) -> Output:
     """Show what datasets hold: who acted, in what, how often it succeeded, what it earned. Several are a mixture.
 
@@ -132,7 +123,7 @@ def data(
     if not folders:
         raise ValueError("folders must name at least one dataset")
     for folder in folders:
-        check_dataset("folders", folder)
+        options.check_dataset("folders", folder)
     from lw_torchrl.data.metadata import read_metadata
     from lw_torchrl.data.replay_checks import check_behaviours
 

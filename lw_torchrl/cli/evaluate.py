@@ -9,25 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from lw_torchrl._checks import counted
-from lw_torchrl.cli.options import (
-    Device,
-    Json,
-    OwnEncoder,
-    PlanSources,
-    SkillFile,
-    TaskFile,
-    check_encoder,
-    check_folder,
-    check_plan_files,
-    check_saved,
-    load_policy,
-    one_or_many,
-    read_plans,
-    read_skills,
-    read_tasks,
-    simulated,
-    use_one_thread,
-)
+from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Output
 from lw_torchrl.cli.train_evaluator import with_evaluator
 
@@ -41,8 +23,8 @@ def evaluate(
     /,
     tasks: tuple[str, ...] = (),
     plans: tuple[str, ...] = (),
-    task_file: TaskFile = None,
-    text_encoder: OwnEncoder = None,
+    task_file: options.TaskFile = None,
+    text_encoder: options.OwnEncoder = None,
     episodes: int = 20,
     seed: int = 1000,
     noise: float = 0.1,
@@ -52,8 +34,8 @@ def evaluate(
     reference: tuple[str, ...] = (),
     evaluator: Path | None = None,
     out: Path | None = None,
-    device: Device = "cpu",
-    json: Json = False,
+    device: options.Device = "cpu",
+    json: options.Json = False,
 ) -> Output:
     """Evaluate a trained policy, or the scripted experts, and write the result, a figure and a recording.
 
@@ -70,39 +52,39 @@ def evaluate(
         noise: standard deviation of the noise on the executed action.
         stop_at_success: end an episode at its first success; any-step success stays the same.
         num_envs: environments stepped together; the result does not depend on it.
-        attribute: say of each failed episode whether a query, the plan or a skill was at fault, or time; they are run
-            again a few times.
-        reference: with --attribute, plans that are trusted, for failed episodes to be run again with: MT10, MT50, .plan
-            or .json files, or folders.
+        attribute: say why each failed episode failed: a query, the plan, a skill or time. They are run again a few
+            times.
+        reference: with --attribute, trusted plans for running failed episodes again: MT10, MT50, .plan or .json files,
+            or folders.
         evaluator: a network that answers the conditions, of `lw-torchrl train-evaluator`.
         out: folder for results.json, success.png and rollout.rrd; with --attribute also failures.png.
     """
     if out is not None:
-        check_folder("--out", out)
+        options.check_folder("--out", out)
     if reference and not attribute:
         raise ValueError("--reference is for --attribute, which runs failed episodes again with these plans")
     if evaluator is not None and str(checkpoint) == "expert":
         raise ValueError("--evaluator is for a policy with plans, the scripted experts ask no conditions")
     if str(checkpoint) != "expert":
-        check_saved("checkpoint", checkpoint)
+        options.check_saved("checkpoint", checkpoint)
     if evaluator is not None:
-        check_saved("evaluator", evaluator, "network", "train-evaluator")
-    check_encoder(text_encoder)
-    known = dict(read_tasks(task_file))
-    chosen = simulated("tasks", one_or_many(tasks), known) if tasks else ()
-    given = read_plans(plans, known) if plans else None
-    check_plan_files("--reference", reference)  # which may speak of a policy's own tasks
+        options.check_saved("evaluator", evaluator, "network", "train-evaluator")
+    options.check_encoder(text_encoder)
+    known = dict(options.read_tasks(task_file))
+    chosen = options.simulated("tasks", options.one_or_many(tasks), known) if tasks else ()
+    given = options.read_plans(plans, known) if plans else None
+    options.check_plan_files("--reference", reference)  # which may speak of a policy's own tasks
     import lw_torchrl as lw
     from lw_torchrl._devices import check_device
     from lw_torchrl._files import held
     from lw_torchrl.evaluation import plot_failures
     from lw_torchrl.record.rollouts import run_recorded, write_recording
 
-    use_one_thread()
+    options.use_one_thread()
     there = check_device("device", device)
     policy = None
     if str(checkpoint) != "expert":
-        policy = load_policy(checkpoint, seed, given, text_encoder)
+        policy = options.load_policy(checkpoint, seed, given, text_encoder)
         if evaluator is not None:
             policy = with_evaluator(policy, evaluator, text_encoder)
         known.update({task: found for task in policy.tasks if (found := policy.definition(task)) is not None})
@@ -122,7 +104,7 @@ def evaluate(
         num_envs=num_envs,
         device=there,
         attribute=attribute,
-        reference=read_plans(reference, known) if reference else None,
+        reference=options.read_plans(reference, known) if reference else None,
     )
     output = Output(json)
     output.result(result)
@@ -149,8 +131,7 @@ def evaluate(
 
 
 def _default_tasks(policy: Policy, checkpoint: Path, *, trained: bool) -> tuple[str, ...]:
-    """The policy's tasks, of these the ones that its file says it was trained on, of these the simulator's; what is
-    left out is printed."""
+    """The tasks that a policy was trained on, as its file says, that the simulator has; what is left out is printed."""
     from lw_torchrl.language.tasks import TASKS
     from lw_torchrl.training.checkpoint import demonstrated_tasks
 
@@ -177,12 +158,12 @@ def scripted(
     seed: int = 1000,
     select: Literal["first", "random", "mix"] = "first",
     noise: float = 0.0,
-    plans: PlanSources = ("MT50",),
-    skill_file: SkillFile = None,
-    task_file: TaskFile = None,
+    plans: options.PlanSources = ("MT50",),
+    skill_file: options.SkillFile = None,
+    task_file: options.TaskFile = None,
     full: bool = False,
     out: Path = Path("runs/scripted"),
-    json: Json = False,
+    json: options.Json = False,
 ) -> Output:
     """Carry out plans with scripted skills, and say how each step fared: no training, no expert.
 
@@ -197,13 +178,13 @@ def scripted(
         full: run all 500 steps, instead of stopping at the first success.
         out: folder for results.json, plan_use.json and success.png.
     """
-    check_folder("--out", out)
-    known = read_tasks(task_file)
-    chosen = simulated("tasks", one_or_many(names), known)
-    loaded = read_plans(plans, known)
+    options.check_folder("--out", out)
+    known = options.read_tasks(task_file)
+    chosen = options.simulated("tasks", options.one_or_many(names), known)
+    loaded = options.read_plans(plans, known)
     loaded.require(chosen)
     loaded = type(loaded)({task: loaded[task] for task in chosen})
-    skills = read_skills(skill_file, known)
+    skills = options.read_skills(skill_file, known)
     import lw_torchrl as lw
     from lw_torchrl._files import held, write_json
     from lw_torchrl.evaluation.plan_use import PlanUse

@@ -8,17 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from lw_torchrl._checks import counted
-from lw_torchrl.cli.options import (
-    Json,
-    PlanSources,
-    SkillFile,
-    TaskFile,
-    one_or_many,
-    read_plans,
-    read_skills,
-    read_tasks,
-    simulated,
-)
+from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Columns, Output, Row
 
 if TYPE_CHECKING:
@@ -28,8 +18,8 @@ if TYPE_CHECKING:
 def tasks(
     names: Positional[Annotated[tuple[str, ...], arg(metavar="[NAMES ...]")]] = (),
     /,
-    task_file: TaskFile = None,
-    json: Json = False,
+    task_file: options.TaskFile = None,
+    json: options.Json = False,
 ) -> Output:
     """List tasks: their descriptions, and the objects that queries can name.
 
@@ -40,7 +30,7 @@ def tasks(
     """
     import lw_torchrl as lw
 
-    known = read_tasks(task_file)
+    known = options.read_tasks(task_file)
     rows = [
         {
             "task": name,
@@ -48,7 +38,7 @@ def tasks(
             "description": known[name].description,
             "objects": [{"name": one.name, "ours": one.ours} for one in known[name].objects[1:]],
         }
-        for name in lw.resolve_tasks(one_or_many(names) or list(known), tasks=known)
+        for name in lw.resolve_tasks(options.one_or_many(names) or list(known), tasks=known)
     ]
 
     def objects(row: Row) -> str:
@@ -69,9 +59,9 @@ def skills(
     task: Positional[Annotated[str | None, arg(metavar="[TASK]")]] = None,
     /,
     nearest: str | None = None,
-    skill_file: SkillFile = None,
-    task_file: TaskFile = None,
-    json: Json = False,
+    skill_file: options.SkillFile = None,
+    task_file: options.TaskFile = None,
+    json: options.Json = False,
 ) -> Output:
     """List the scripted skills, or find the one closest to a text.
 
@@ -85,8 +75,8 @@ def skills(
     from lw_torchrl.language.named_objects import GRIPPER
     from lw_torchrl.language.tasks import check_task
 
-    known = read_tasks(task_file)
-    table = read_skills(skill_file, known)
+    known = options.read_tasks(task_file)
+    table = options.read_skills(skill_file, known)
     definition = None if task is None else known[check_task(task, known)]
     output = Output(json)
     if nearest is not None:
@@ -120,11 +110,11 @@ def _numbers(values: Iterable[float]) -> str:
 def plans(
     names: Positional[Annotated[tuple[str, ...], arg(metavar="[NAMES ...]")]] = (),
     /,
-    plans: PlanSources = ("MT50",),
+    plans: options.PlanSources = ("MT50",),
     skill_set: Literal["own", "MT10"] = "own",
     roles: bool = False,
-    task_file: TaskFile = None,
-    json: Json = False,
+    task_file: options.TaskFile = None,
+    json: options.Json = False,
 ) -> Output:
     """Show plans: the whole text of those named, or a list of all; or which thing each of their steps brings where.
 
@@ -138,9 +128,9 @@ def plans(
     """
     import lw_torchrl as lw
 
-    known = read_tasks(task_file)
-    loaded = read_plans(plans, known, skill_set)
-    chosen = lw.resolve_tasks(one_or_many(names), tasks=known) if names else tuple(loaded)
+    known = options.read_tasks(task_file)
+    loaded = options.read_plans(plans, known, skill_set)
+    chosen = lw.resolve_tasks(options.one_or_many(names), tasks=known) if names else tuple(loaded)
     loaded.require(chosen)
     output = Output(json)
     if roles:
@@ -184,8 +174,8 @@ def queries(
     text: Positional[Annotated[str | None, arg(metavar="[TEXT]")]] = None,
     /,
     by: Literal["edit", "embedding"] = "edit",
-    task_file: TaskFile = None,
-    json: Json = False,
+    task_file: options.TaskFile = None,
+    json: options.Json = False,
 ) -> Output:
     """List a task's base queries, or find the one closest to a text.
 
@@ -199,7 +189,7 @@ def queries(
     import lw_torchrl as lw
     from lw_torchrl.language.tasks import check_task
 
-    known = read_tasks(task_file)
+    known = options.read_tasks(task_file)
     definition = known[check_task(task, known)]
     output = Output(json)
     if text is not None:
@@ -222,8 +212,8 @@ def query(
     step: int = 0,
     seed: int = 0,
     episode: int = 0,
-    task_file: TaskFile = None,
-    json: Json = False,
+    task_file: options.TaskFile = None,
+    json: options.Json = False,
 ) -> Output:
     """Answer a query on a state of a task: the state after so many steps of the scripted expert.
 
@@ -240,8 +230,8 @@ def query(
     from lw_torchrl._checks import check_int
     from lw_torchrl.language.tasks import check_task
 
-    known = read_tasks(task_file)
-    (name,) = simulated("task", [check_task(task, known)], known)
+    known = options.read_tasks(task_file)
+    (name,) = options.simulated("task", [check_task(task, known)], known)
     definition = known[name]
     listed = (
         [lw.parse_query(text, definition)]

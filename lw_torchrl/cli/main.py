@@ -53,7 +53,7 @@ GROUPS: dict[str, dict[str, Any]] = {"plan": cli_plan.COMMANDS}
 """Commands that have commands of their own."""
 ABOUT = """Language-World with TorchRL: policies carried by plans in English. --version tells which.
 
-Exit status: 0, done; 1, a fault of ours, with a traceback; 2, an error that you can mend, in one line on the standard
+Exit status: 0, done; 1, a bug of ours, with a traceback; 2, an error that you can fix, in one line on the standard
 error; 130, stopped by Ctrl-C; 141, nobody reads the output. What prints a table prints JSON with --json."""
 
 _RESUMABLE = {"demo", "collect", "train", "train-evaluator", "reproduce", "offline", "online"}

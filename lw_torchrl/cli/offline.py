@@ -38,8 +38,9 @@ def offline(
     out: Path = Path("runs/offline"),
     json: Json = False,
 ) -> Output:
-    """Learn policies offline, from scripts that were spoilt, and compare the methods. Stopped and started again it
-    carries on.
+    """Learn policies offline, from scripts that were spoilt, and compare the methods.
+
+    If it is stopped, the same command resumes it.
 
     The data are mixtures: B, of each task 20 episodes of plans carried out by scripts that are right in 30 of 100
     pieces, 20 in 60 of 100, 20 in none and 10 of chance; W, B without the second; C, 5 clean demonstrations, 20 in none
@@ -91,7 +92,7 @@ def offline(
         str(dataset.folder): partial(dataset.collect, out, progress=True) for one in runs for dataset in one.datasets
     }
     advantages: dict[str, Job] = {
-        str(one.folder): partial(_learn, one, known, out) for run in runs if (one := run.advantages) is not None
+        str(own.folder): partial(_learn, own, known, out) for one in runs if (own := one.advantages) is not None
     }
     jobs: dict[str, Job] = {str(one.folder): partial(execute_run, one, known, out) for one in runs}
 
@@ -104,7 +105,18 @@ def offline(
             summaries[name] = read_json(out / f"{name}.json", "the summary")
         return summaries
 
-    command = ["offline", table, "--episodes", episodes, "--out", out, "--plans", *plans, "--seeds", *seeds]
+    command: list[object] = [
+        "offline",
+        table,
+        "--episodes",
+        episodes,
+        "--out",
+        out,
+        "--plans",
+        *plans,
+        "--seeds",
+        *seeds,
+    ]
     for option, value in (("--reward", reward), ("--beta", beta), ("--distance", distance), ("--steps", steps)):
         command += [] if value is None else [option, value]
     for option, values in (("--mixtures", mixtures), ("--methods", methods)):

@@ -40,7 +40,7 @@ def online(
     out: Path = Path("runs/online"),
     json: Json = False,
 ) -> Output:
-    """Train policies in their environment, beside demonstrations. Stopped and started again it carries on.
+    """Train policies in their environment, beside demonstrations. If it is stopped, the same command resumes it.
 
     A run is a policy of one task, method and seed with its evaluation; the policy that it begins with is a run too.
     With --run any scheduler can do each by a command of its own; starts first. The summary is written when the command
@@ -102,7 +102,7 @@ def online(
     for one in runs:
         stage = starts if one.method == START else others
         stage[str(one.folder)] = partial(execute_run, one, found, out, make_logger=make)
-    command = ["online", *tasks, "--frames", frames, "--demonstrations", demonstrations, "--out", out]
+    command: list[object] = ["online", *tasks, "--frames", frames, "--demonstrations", demonstrations, "--out", out]
     command += ["--seeds", *seeds, "--methods", *methods, "--plans", *plans]
     command += ["--condition", condition, "--episodes", episodes, "--logger", logger]
     for option, value in (("--start", start), ("--step", step)):
@@ -112,7 +112,7 @@ def online(
         [],
         [starts, others],
         command,
-        lambda: {runs[0].group: _summarize(runs, found, out)},
+        lambda: {str(runs[0].group): _summarize(runs, found, out)},
         lambda result: _told_of_step(result.config),
     )
 
@@ -157,7 +157,8 @@ def _summarize(runs: Sequence[OnlineRun], plans: Plans, out: Path) -> dict[str, 
         found[one] = result
     methods = [method for method in dict.fromkeys(one.method for one in runs) if method != START]
     order = [*methods, START]
-    comparison = compare(sorted(found.items(), key=lambda pair: (order.index(pair[0].method), pair[0].seed)))
+    ordered = sorted(found.items(), key=lambda pair: (order.index(pair[0].method), pair[0].seed))
+    comparison = compare(ordered)
     folder = out / runs[0].group
     curves = {
         task: {

@@ -34,7 +34,7 @@ METHODS = ("pcbc", "dc", "one-hot")
 Json = Annotated[bool, arg(help="print one JSON document instead, see docs/cli.md.")]
 TaskFile = Annotated[Path | None, arg(help="a file of your tasks, which replace ours of the same name or join them.")]
 SkillFile = Annotated[Path | None, arg(help="a file of your skills, which replace ours of the same text or join them.")]
-TextEncoder = Annotated[str | None, arg(help="your function from texts to vectors, as my_texts:encode.")]
+EncoderName = Annotated[str | None, arg(help="your function from texts to vectors, as my_texts:encode.")]
 OwnEncoder = Annotated[
     str | None, arg(help="the function that the policy was trained with, if it was one of yours, as my_texts:encode.")
 ]

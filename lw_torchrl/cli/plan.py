@@ -9,17 +9,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from lw_torchrl.cli.options import (
-    Json,
-    PlanSources,
-    SkillFile,
-    TaskFile,
-    check_folder,
-    read_plans,
-    read_skills,
-    read_tasks,
-    use_one_thread,
-)
+from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Output
 from lw_torchrl.cli.plan_models import generate, repair
 
@@ -29,8 +19,8 @@ def prompt(
     /,
     format: str = "chain_py",
     vocabulary: bool = False,
-    plans: PlanSources = ("MT10",),
-    task_file: TaskFile = None,
+    plans: options.PlanSources = ("MT10",),
+    task_file: options.TaskFile = None,
 ) -> None:
     """Print the text that asks a language model for a plan: plans of three other tasks, then the task.
 
@@ -44,8 +34,8 @@ def prompt(
     """
     from lw_torchrl.planners.prompts import plan_prompt
 
-    known = read_tasks(task_file)
-    found = plan_prompt(task, format, plans=read_plans(plans, known), vocabulary=vocabulary, tasks=known)
+    known = options.read_tasks(task_file)
+    found = plan_prompt(task, format, plans=options.read_plans(plans, known), vocabulary=vocabulary, tasks=known)
     print(found, end="")
 
 
@@ -56,20 +46,20 @@ def check(
     format: str | None = None,
     episodes: int = 5,
     seed: int = 0,
-    skill_file: SkillFile = None,
-    task_file: TaskFile = None,
-    json: Json = False,
+    skill_file: options.SkillFile = None,
+    task_file: options.TaskFile = None,
+    json: options.Json = False,
 ) -> Output:
-    """Say of a plan how it was read, where its conditions hold, and which steps never fire.
+    """Say how a plan was read, where its conditions hold, and which steps never fire.
 
     Example: lw-torchrl plan check runs/plans/llama3.1/chain_py/push-0.py
 
     Args:
         file: an answer FORMAT/TASK-ATTEMPT.EXT, as plan generate writes it, or a .plan file TASK.plan; any text with
             --task and --format.
-        task: the task it is for; as the file's name says if none is given.
-        format: how it is written; as the file's folder says, or of a .plan file basic_py, if none is given.
-        episodes: of the expert, and of the plan by scripted skills, in whose states it is looked where conditions hold.
+        task: the task it is for; by default as the file's name says.
+        format: how it is written; by default as the file's folder says, or basic_py for a .plan file.
+        episodes: of the expert, and of the plan by scripted skills; conditions are answered in their states.
         seed: of these.
     """
     import lw_torchrl as lw
@@ -79,7 +69,7 @@ def check(
 
     if not file.is_file():
         raise FileNotFoundError(f"file: there is no file {str(file)!r}")
-    known = read_tasks(task_file)
+    known = options.read_tasks(task_file)
     if task is None:
         task = re.sub(r"-\d+$", "", file.stem)
         if task not in known:
@@ -90,11 +80,11 @@ def check(
             raise ValueError(f"--format must be given, one of {', '.join(lw.PLAN_FORMATS)}: the file's folder is none")
     check_task(task, known)
     check_choice("format", format, lw.PLAN_FORMATS)
-    skills = read_skills(skill_file, known) if skill_file else None
+    skills = options.read_skills(skill_file, known) if skill_file else None
     text = read_text(file, ValueError)
     from lw_torchrl.planners.checking import check_plan
 
-    use_one_thread()
+    options.use_one_thread()
     found = check_plan(text, task, format, episodes=episodes, seed=seed, skills=skills, tasks=known)
     output = Output(json)
     steps = [step for step in found.decoded.steps if not step.dropped]
@@ -129,14 +119,14 @@ def compare(
     choose: Literal["random", "first"] = "random",
     noise: float = 0.0,
     max_steps: int = 500,
-    task_file: TaskFile = None,
+    task_file: options.TaskFile = None,
     out: Path = Path("runs/compare"),
-    json: Json = False,
+    json: options.Json = False,
 ) -> Output:
-    """Compare models by the plans they wrote: decode every answer, carry all of them out by scripted skills, at once.
+    """Compare models by the plans they wrote: decode every answer, and carry out all plans by scripted skills.
 
     The plan of each task that did best, be it one that never succeeds, is kept in OUT/best/MODEL/FORMAT, for --plans of
-    any other command. Stopped and started again it carries on.
+    any other command. If it is stopped, the same command resumes it.
 
     Example: lw-torchrl plan compare runs/plans --out runs/compare
 
@@ -144,20 +134,20 @@ def compare(
         source: a folder MODEL/FORMAT/TASK-ATTEMPT.EXT, as plan generate writes it, or a .jsonl file of answers.
         episodes: of each plan, the same initial states for all plans of a task.
         seed: fixes initial states, goals and what is chosen.
-        choose: of several true steps a random one, as in the paper, or the first.
+        choose: which of several true steps acts: a random one, as in the paper, or the first.
         noise: standard deviation of the noise on the executed action.
         max_steps: of an episode.
         out: folder for results.json, summary.md, models.png, formats.png and best/.
     """
-    check_folder("--out", out)
+    options.check_folder("--out", out)
     from lw_torchrl.planners.file_planner import ignored_files, recorded_answers
 
-    known = read_tasks(task_file)
+    known = options.read_tasks(task_file)
     recorded_answers(source)
     from lw_torchrl.planners.comparing import compare_plans
     from lw_torchrl.planners.comparison_report import no_plans, write_report
 
-    use_one_thread()
+    options.use_one_thread()
     found = compare_plans(
         source,
         episodes=episodes,
@@ -201,14 +191,14 @@ def serve(
 ) -> None:
     """Serve a language model on this machine, as OpenAI's servers do, until Ctrl-C. It wants the extra [serve].
 
-    The extra brings a small model, so that everything can be tried without a key: held to a schema it writes plans that
-    run, hardly ones that succeed. Larger ones are GGUF files, which https://huggingface.co has by the thousand.
+    The extra brings a small model, so that everything can be tried without a key. Held to a schema, it writes plans
+    that run, but few that succeed. https://huggingface.co has larger models as GGUF files.
 
     Example: lw-torchrl plan serve Llama-3.2-3B-Instruct-Q4_K_M.gguf --port 8001
 
     Args:
         model: a GGUF file; the small model of the extra if none is given.
-        host: the address to listen at; by default this machine alone is heard. There is no key.
+        host: the address to listen at; by default only this machine can ask. There is no key.
         port: where; 0 takes a free one.
         context: tokens of a question and its answer, at most.
         threads: of the processor; half of its cores if none is given.

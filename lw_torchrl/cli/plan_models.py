@@ -5,23 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import OmitArgPrefixes, Positional
 
 from lw_torchrl._checks import check_choice, counted
-from lw_torchrl.cli.options import (
-    Json,
-    SkillFile,
-    TaskFile,
-    TaskNames,
-    check_folder,
-    one_or_many,
-    read_plans,
-    read_skills,
-    read_tasks,
-    use_one_thread,
-)
+from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Columns, Output, Row
 
 if TYPE_CHECKING:
@@ -55,8 +44,8 @@ class Asking:
     """of the folder for its answers; by default the model's, with "-constrained" behind it where it is."""
     plans: tuple[str, ...] = ("MT10",)
     """where the prompts' examples come from: MT10 or MT50, .plan files, .json files or folders."""
-    skill_file: SkillFile = None
-    task_file: TaskFile = None
+    skill_file: options.SkillFile = None
+    task_file: options.TaskFile = None
     concurrency: int = 4
     """questions at once."""
     retries: int = 6
@@ -70,28 +59,28 @@ class Asking:
 
     def begin(self, names: tuple[str, ...]) -> tuple[OpenAIPlanner, dict[str, Task], Mapping[str, Task]]:
         """The model, the tasks that are named, and all tasks."""
-        check_folder("--out", self.out)
-        check_folder("--cache", self.cache)
+        options.check_folder("--out", self.out)
+        options.check_folder("--cache", self.cache)
         import lw_torchrl as lw
         from lw_torchrl.language.tasks import named_tasks
 
-        known = read_tasks(self.task_file)
-        chosen = dict(named_tasks(one_or_many(names), known=known))
-        options = {name: value for name, value in vars(self).items() if name not in _NOT_THE_MODELS}
-        skills = read_skills(self.skill_file, known) if self.skill_file else None
-        return lw.OpenAIPlanner(skills=skills, plans=read_plans(self.plans, known), **options), chosen, known
+        known = options.read_tasks(self.task_file)
+        chosen = dict(named_tasks(options.one_or_many(names), known=known))
+        asked = {name: value for name, value in vars(self).items() if name not in _NOT_THE_MODELS}
+        skills = options.read_skills(self.skill_file, known) if self.skill_file else None
+        return lw.OpenAIPlanner(skills=skills, plans=options.read_plans(self.plans, known), **asked), chosen, known
 
 
 _NOT_THE_MODELS = ("attempts", "out", "plans", "skill_file", "task_file")
 
 
 def generate(
-    tasks: Positional[TaskNames] = ("MT10",),
+    tasks: Positional[options.TaskNames] = ("MT10",),
     /,
     *,
     asking: Annotated[Asking, OmitArgPrefixes],
     format: tuple[str, ...] = ("chain_py",),
-    json: Json = False,
+    json: options.Json = False,
 ) -> Output:
     """Ask a language model for plans, and say what became of them.
 
@@ -145,7 +134,7 @@ def _counts(answers: Sequence[Answer]) -> dict[str, int]:
 
 
 def repair(
-    tasks: Positional[TaskNames],
+    tasks: Positional[options.TaskNames],
     /,
     *,
     asking: Annotated[Asking, OmitArgPrefixes],
@@ -154,14 +143,14 @@ def repair(
     enough: float = 0.8,
     episodes: int = 10,
     episode_seed: int = 0,
-    json: Json = False,
+    json: options.Json = False,
 ) -> Output:
     """Ask a model for plans, carry them out by scripted skills, tell it what became of those that fail, and ask again.
 
     What it is told: the step where the robot got stuck, conditions that never held, how near things came, what could
     not be read. It begins with the answers in OUT/<name>, as plan generate wrote them, and asks only for those that are
     missing; none is replaced. Each round's are kept as those of a model of its own, <name>-round1 and so on, for plan
-    compare. Stopped and started again it carries on.
+    compare. If it is stopped, the same command resumes it.
 
     Example: lw-torchrl plan repair MT10 --model llama3.1 --base-url http://127.0.0.1:11434/v1 --rounds 3
 
@@ -179,10 +168,10 @@ def repair(
     check_choice("format", format, PLAN_FORMATS)
     from lw_torchrl.planners.repairing import repair_plans
 
-    use_one_thread()
+    options.use_one_thread()
     first = planner.plans([*chosen.values()], format=format, attempts=asking.attempts, out=asking.out, recorded=True)
-    options = {"rounds": rounds, "enough": enough, "episodes": episodes, "seed": episode_seed}
-    found = repair_plans(planner, first, tasks=known, out=asking.out, **options)
+    repairing: dict[str, Any] = {"rounds": rounds, "enough": enough, "episodes": episodes, "seed": episode_seed}
+    found = repair_plans(planner, first, tasks=known, out=asking.out, **repairing)
     rows = []
     for one in found:
         row = {"task": one.answers[0].task, "attempt": one.answers[0].attempt}

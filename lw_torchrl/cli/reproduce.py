@@ -10,18 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 
 from tyro.conf import Positional
 
-from lw_torchrl.cli.options import (
-    Device,
-    Json,
-    TaskFile,
-    TextEncoder,
-    check_encoder,
-    check_folder,
-    read_encoder,
-    read_plans,
-    read_tasks,
-    use_one_thread,
-)
+from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Output
 from lw_torchrl.cli.runs import Job, Scheduled
 
@@ -34,20 +23,20 @@ Experiment = Literal["zero-shot", "few-shot", "one-shot", "scripted", "all"]
 Method = Literal["pcbc", "dc", "one-hot", "scripted"]
 
 
-def demo(out: Path | None = None, quick: bool = False, json: Json = False) -> Output:
+def demo(out: Path | None = None, quick: bool = False, json: options.Json = False) -> Output:
     """Train a plan-conditioned policy on MT10 and show it: demonstrations, training, evaluation, a recording.
 
-    Takes some minutes on two cores. Stopped and started again it carries on.
+    Takes some minutes on two cores. If it is stopped, the same command resumes it.
 
     Args:
         out: folder for results.json, success.png, rollout.rrd, checkpoint.zip and config.json; runs/demo, or
             runs/demo-quick with --quick.
         quick: two tasks and little training, in under a minute; not a measure of anything.
     """
-    folder = check_folder("--out", out or Path("runs/demo-quick" if quick else "runs/demo"))
+    folder = options.check_folder("--out", out or Path("runs/demo-quick" if quick else "runs/demo"))
     from lw_torchrl.paper.demo import QUICK, DemoConfig, run_demo
 
-    use_one_thread()
+    options.use_one_thread()
     result = run_demo(folder, QUICK if quick else DemoConfig())
     output = Output(json)
     if json:  # as text it has printed itself
@@ -64,18 +53,20 @@ def reproduce(
     preset: Literal["strong", "paper", "evaluator"] = "strong",
     passes: int | None = None,
     plans: tuple[str, ...] = (),
-    task_file: TaskFile = None,
-    text_encoder: TextEncoder = None,
+    task_file: options.TaskFile = None,
+    text_encoder: options.EncoderName = None,
     episodes: int = 20,
-    device: Device = "cpu",
+    device: options.Device = "cpu",
     out: Path = Path("runs/reproduce"),
-    json: Json = False,
+    json: options.Json = False,
 ) -> Output:
-    """Run the paper's experiments and compare them with the published results. Stopped and started again it carries on.
+    """Run the paper's experiments and compare them with the published results.
+
+    If it is stopped, the same command resumes it, even on another device.
 
     A run is a dataset, or the policy of one method and seed with its evaluation (in one-shot, a policy for each of the
     50 tasks). With --run any scheduler can do each by a command of its own, datasets first. The summary is written when
-    the command is run without it. A run that was begun on one device can be finished on another.
+    the command is run without it.
 
     Example: lw-torchrl reproduce few-shot --seeds 0 1 2 --methods pcbc dc
 
@@ -95,7 +86,7 @@ def reproduce(
         out: where everything goes; on a cluster, a folder that all its machines share.
     """
     schedule.check(out)
-    check_encoder(text_encoder)
+    options.check_encoder(text_encoder)
     if schedule.launcher == "ray" and device != "cpu":
         raise ValueError(f"--device {device} is for the launcher local: the tasks of ray have a CPU core each")
     if passes is not None and preset != "paper":
@@ -130,14 +121,14 @@ def reproduce(
         for method in methods
         for seed in seeds
     ]
-    options: dict[str, Any] = {}
+    where: dict[str, Any] = {}
     if not schedule.list:
-        options = {"device": check_device("device", device), "text_encoder": read_encoder(text_encoder)}
+        where = {"device": check_device("device", device), "text_encoder": options.read_encoder(text_encoder)}
     datasets: dict[str, Job] = {
         str(dataset.folder): partial(dataset.collect, out, progress=True) for one in runs for dataset in one.datasets
     }
-    jobs: dict[str, Job] = {str(one.folder): partial(execute_run, one, load(one), out, **options) for one in runs}
-    command = ["reproduce", experiment, "--preset", preset, "--episodes", episodes, "--out", out]
+    jobs: dict[str, Job] = {str(one.folder): partial(execute_run, one, load(one), out, **where) for one in runs}
+    command: list[object] = ["reproduce", experiment, "--preset", preset, "--episodes", episodes, "--out", out]
     command += ["--seeds", *seeds, "--methods", *methods, "--device", device]
     for option, given in (("--passes", passes), ("--text-encoder", text_encoder), ("--task-file", task_file)):
         command += [] if given is None else [option, given]
@@ -157,7 +148,7 @@ class _Plans:
     """The plans of a run, each set read once; :class:`ValueError` if a task of the 50 has none."""
 
     def __init__(self, sources: Sequence[str], task_file: Path | None) -> None:
-        self.sources, self.tasks = sources, read_tasks(task_file)
+        self.sources, self.tasks = sources, options.read_tasks(task_file)
         self.known: dict[str, Plans] = {}
 
     def __call__(self, run: ImitationRun) -> Plans:
@@ -168,7 +159,7 @@ class _Plans:
         from lw_torchrl.language.tasks import MT50
 
         if skills not in self.known:
-            found = read_plans(self.sources or ["MT50"], self.tasks, skills)
+            found = options.read_plans(self.sources or ["MT50"], self.tasks, skills)
             if missing := [task for task in MT50 if task not in found]:
                 raise ValueError(
                     f"--plans must have a plan for each of the 50 tasks, they lack {len(missing)}: "
@@ -202,7 +193,7 @@ def _summarize(
     told = {}
     for group, chosen in groups.items():
         results = [(one, result) for one in chosen if (result := load_result(one, load(one), out)) is not None]
-        best = {}
+        best: dict[str, dict[str, list[float]]] = {}
         for method in dict.fromkeys(one.method for one in chosen):
             best |= _best(method, {one.seed: result for one, result in results if one.method == method})
         means = {label: {task: sum(of) / len(of) for task, of in rates.items()} for label, rates in best.items()}

@@ -120,11 +120,9 @@ class Run(ABC):
 
     def rollouts(self, policy: Any, work: Work, **options: Any) -> EvaluationResult:
         """Evaluate one policy, as all runs do: fresh seeds, action noise 0.1."""
-        options = {"tasks": work.tasks, "progress": work.progress} | options
-        seed = EVALUATION_SEED + self.seed
-        return evaluate(
-            policy, episodes_per_task=self.episodes, seed=seed, noise_scale=0.1, stop_at_success=True, **options
-        )
+        given: dict[str, Any] = {"tasks": work.tasks, "episodes_per_task": self.episodes, "progress": work.progress}
+        given |= {"seed": EVALUATION_SEED + self.seed, "noise_scale": 0.1, "stop_at_success": True}
+        return evaluate(policy, **given | options)
 
 
 def load_result(run: Run, plans: Plans, out: Path, tasks: Sequence[str] | None = None) -> EvaluationResult | None:
@@ -224,7 +222,7 @@ def _execute(run: Run, work: Work) -> EvaluationResult:
     return result
 
 
-def kept_policy(file: Path, described: Mapping[str, Any], train: Callable[[Path], Mapping[str, Any]]) -> Policy:
+def kept_policy(file: Path, described: dict[str, Any], train: Callable[[Path], Mapping[str, Any]]) -> Policy:
     """The policy of a file; if there is none, it is trained and saved first.
 
     Args:
