@@ -105,18 +105,8 @@ def offline(
             summaries[name] = read_json(out / f"{name}.json", "the summary")
         return summaries
 
-    command: list[object] = [
-        "offline",
-        table,
-        "--episodes",
-        episodes,
-        "--out",
-        out,
-        "--plans",
-        *plans,
-        "--seeds",
-        *seeds,
-    ]
+    command: list[object] = ["offline", table, "--episodes", episodes, "--out", out]
+    command += ["--plans", *plans, "--seeds", *seeds]
     for option, value in (("--reward", reward), ("--beta", beta), ("--distance", distance), ("--steps", steps)):
         command += [] if value is None else [option, value]
     for option, values in (("--mixtures", mixtures), ("--methods", methods)):

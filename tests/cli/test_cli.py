@@ -316,7 +316,8 @@ def test_the_experts_can_be_evaluated(capsys):
     assert printed.splitlines()[1].split()[:3] == ["reach", "1.00", "-"]
 
 
-def test_the_baseline_trains_and_is_evaluated(capsys, demos, tmp_path):
+def test_the_baseline_trains_and_is_evaluated(capsys, demos, tmp_path, monkeypatch):
+    monkeypatch.setattr(lw, "evaluate", partial(lw.evaluate, max_steps=60))
     path = tmp_path / "baseline.zip"
     run(capsys, "train", demos, "--out", path, "--method", "dc", *TINY)
     assert isinstance(lw.load_actor(path), lw.DescriptorConditionedActor)

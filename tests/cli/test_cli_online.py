@@ -80,7 +80,10 @@ def test_runs_and_their_summary(capsys, tmp_path, tiny, monkeypatch):
     assert "is of another configuration, it differs in recipe.demonstrations (1, now 2); choose another" in message
 
 
-@pytest.mark.parametrize("method", ["sac", "residual", "ppo"])
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("sac", "ppo")]
+
+
+@pytest.mark.parametrize("method", ["residual", *SLOW])
 def test_any_method_begins_with_a_policy_of_ones_own(capsys, tmp_path, tiny, method):
     lw.save_actor(lw.DescriptorConditionedActor("MT10", width=16), tmp_path / "mine.zip")
     out, given = tmp_path / "out", ("--start", tmp_path / "mine.zip")
@@ -122,7 +125,7 @@ def test_what_it_refuses(capsys, tmp_path, tiny):
     assert not (tmp_path / "pcbc").exists()
 
 
-@pytest.mark.parametrize("step", ["2", "weakest"])
+@pytest.mark.parametrize("step", [pytest.param("2", marks=pytest.mark.slow), "weakest"])
 def test_one_step_of_a_plan_is_tuned(capsys, tmp_path, tiny, monkeypatch, step):
     given = arguments(tmp_path, "--step", step, methods=["residual"])
     name = "residual-step2" if step == "2" else "residual-weakest"

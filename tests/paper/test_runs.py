@@ -174,12 +174,12 @@ def test_a_run_waits_for_another_process_that_does_it(undisturbed, tmp_path, hol
 @pytest.mark.parametrize(
     ("setting", "preset", "stop"),
     [
-        (TINY, PRESET, 46),
+        pytest.param(TINY, PRESET, 46, marks=pytest.mark.slow),
         (TINY_ONE_SHOT, PRESET, 46),
-        (TINY, ENSEMBLE, 46),
+        pytest.param(TINY, ENSEMBLE, 46, marks=pytest.mark.slow),
         (TINY, ENSEMBLE, 106),
-        (TINY_ONE_SHOT, ENSEMBLE, 46),
-        (TINY_ONE_SHOT, ENSEMBLE, 106),
+        pytest.param(TINY_ONE_SHOT, ENSEMBLE, 46, marks=pytest.mark.slow),
+        pytest.param(TINY_ONE_SHOT, ENSEMBLE, 106, marks=pytest.mark.slow),
     ],
 )
 def test_stopped_in_training_and_resumed_it_ends_the_same(undisturbed, tmp_path, monkeypatch, setting, preset, stop):
