@@ -20,10 +20,10 @@ from lw_torchrl.evaluation.comparison import markdown_table
 from lw_torchrl.language.named_objects import NamedObject
 from lw_torchrl.language.roles import role_object
 from lw_torchrl.language.tasks import Task
-from lw_torchrl.modules.relative_positions import PlanRoles
-from lw_torchrl.paper.execution import execute_run
+from lw_torchrl.modules.plan_roles import PlanRoles
+from lw_torchrl.paper.imitation import ImitationRun
 from lw_torchrl.paper.recipes import CLEAN, NOISY, PRESETS, SETTINGS, Member, Preset
-from lw_torchrl.paper.runs import Run
+from lw_torchrl.paper.runs import execute_run
 
 Setting = Literal["few-shot", "zero-shot"]
 FULL: Mapping[str, Preset] = PRESETS["strong"]
@@ -125,7 +125,7 @@ def main(arguments: Arguments) -> None:
         shorter = replace(preset, training=replace(preset.training, steps=steps))
         if steps != usual:
             shorter = replace(shorter, name=f"{preset.name}-{steps}-steps")
-        runs = [Run(SETTINGS[setting], "pcbc", seed, shorter, arguments.episodes) for seed in arguments.seeds]
+        runs = [ImitationRun(SETTINGS[setting], "pcbc", seed, shorter, arguments.episodes) for seed in arguments.seeds]
         with PATCHES.get(change, nullcontext)():
             results = [execute_run(run, lw.load_plans("MT50", skills=run.skills), arguments.out) for run in runs]
         means = ", ".join(f"{result.mean_success:.3f}" for result in results)

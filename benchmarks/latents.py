@@ -13,9 +13,9 @@ import lw_torchrl as lw
 from lw_torchrl._files import write_text
 from lw_torchrl.evaluation import count_solved
 from lw_torchrl.evaluation.comparison import markdown_table
-from lw_torchrl.paper.execution import execute_run
+from lw_torchrl.paper.imitation import ImitationRun
 from lw_torchrl.paper.recipes import PRESETS, SETTINGS, Preset
-from lw_torchrl.paper.runs import Run
+from lw_torchrl.paper.runs import execute_run
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ def main(arguments: Arguments) -> None:
     lines = []
     for option, weight in asked:
         recipe = preset(arguments.setting, option, weight)
-        runs = [Run(SETTINGS[arguments.setting], "pcbc", seed, recipe) for seed in arguments.seeds]
+        runs = [ImitationRun(SETTINGS[arguments.setting], "pcbc", seed, recipe) for seed in arguments.seeds]
         results = [execute_run(run, lw.load_plans("MT50", skills=run.skills), arguments.out) for run in runs]
         means = ", ".join(f"{result.mean_success:.3f}" for result in results)
         solved = ", ".join(str(count_solved([list(result.success_once.values())])) for result in results)

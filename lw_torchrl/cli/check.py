@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 from tyro.conf import Positional, arg
 
 from lw_torchrl._checks import counted
-from lw_torchrl.cli.sources import read_skills, read_tasks
-from lw_torchrl.cli.tables import Output
+from lw_torchrl.cli.options import Json, SkillFile, TaskFile, read_skills, read_tasks
+from lw_torchrl.cli.output import Output
 
 if TYPE_CHECKING:
     from lw_torchrl.language.skills import ScriptedSkill
@@ -22,9 +22,9 @@ def check(
     file: Positional[Annotated[Path, arg(metavar="FILE")]],
     /,
     task: str | None = None,
-    skill_file: Path | None = None,
-    task_file: Path | None = None,
-    json: bool = False,
+    skill_file: SkillFile = None,
+    task_file: TaskFile = None,
+    json: Json = False,
 ) -> Output:
     """Validate a file of plans, skills or tasks of your own: what is wrong, where, and the nearest allowed text.
 
@@ -33,9 +33,6 @@ def check(
     Args:
         file: a .plan file, a folder of them, or a .toml file of skills or of tasks.
         task: the task that a plan must be for.
-        skill_file: skills of yours that join ours, or replace those of the same text, for the plans.
-        task_file: tasks of yours, instead of ours of the same name or beside ours, for plans and skills.
-        json: print one JSON document instead, see docs/cli.md.
     """
     import lw_torchrl as lw
     from lw_torchrl._files import read_text
@@ -46,7 +43,14 @@ def check(
     known = read_tasks(task_file)
     output = Output(json)
     if file.suffix == ".toml":
-        kind, number, notes = _check_table(file, known, "" if task_file else "; tasks of yours come by --task-file")
+        try:
+            kind, number, notes = _check_table(file, known, "" if task_file else "; tasks of yours come by --task-file")
+        except ValueError as error:
+            if not json:
+                raise
+            output.show("files", [{"file": file, "steps": 0, "faults": [str(error)], "notes": []}])
+            output.fault = str(error)
+            return output
         lines = [*(f"{file.name}: note: {note}" for note in notes), f"{file.name}: {counted(number, kind)}, valid"]
         row = {"file": file, f"{kind}s": number, "faults": [], "notes": notes}
         output.show("files", [row], "\n".join(lines))

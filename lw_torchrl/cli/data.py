@@ -1,4 +1,4 @@
-"""``lw-torchrl data``: what datasets hold, and whether they are as they were written."""
+"""``lw-torchrl collect`` makes datasets; ``lw-torchrl data`` shows what they hold, and whether they are whole."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from lw_torchrl._checks import counted
-from lw_torchrl.cli.sources import check_dataset
-from lw_torchrl.cli.tables import Output, Row
+from lw_torchrl.cli import options
+from lw_torchrl.cli.output import Columns, Output, Row
 
 if TYPE_CHECKING:
     from lw_torchrl.data.behaviours import Behaviour
     from lw_torchrl.data.dataset import Demonstrations, EpisodeInfo
+    from lw_torchrl.modules.policy import Policy
 
 
 @dataclass(frozen=True)
@@ -32,12 +33,83 @@ class _Episode:
 _WIDTH = 120
 
 
+def collect(
+    tasks: Positional[Annotated[tuple[str, ...], arg(metavar="TASKS ...")]],
+    /,
+    out: Path,
+    episodes: int = 10,
+    seed: int = 0,
+    noise: tuple[float, ...] = (0.0,),
+    noise_hold: int = 10,
+    gripper_noise: float = 0.2,
+    redraw_failures: bool = False,
+    policy: str = "expert",
+    behaviour: str | None = None,
+    num_envs: int | None = None,
+    json: options.Json = False,
+) -> Output:
+    """Collect demonstrations of the scripted experts, or of others. If it is stopped, the same command resumes it.
+
+    Example: lw-torchrl collect MT10 --out demos/mt10 --noise 0 0.1 0.2 --redraw-failures
+
+    Args:
+        tasks: MT10, MT50, or names of tasks.
+        out: the dataset's folder.
+        episodes: kept for each task.
+        seed: evaluate on another one.
+        noise: standard deviations of the execution noise, used in turn, one per episode.
+        noise_hold: steps for which each draw of the noise is kept; a longer one leads further from the path.
+        gripper_noise: factor of the noise on the gripper, which makes grasps fail.
+        redraw_failures: keep successful episodes only.
+        policy: who acts: expert, Meta-World's scripts; scripted, plans with scripted skills; spoilt-60 or spoilt-30,
+            the same in so many of 100 pieces of an episode; wrong, any skill of the plan; random; or a policy's file,
+            of `lw-torchrl train`.
+        behaviour: the label of its episodes; by default the name of who acts, or of the policy's file.
+        num_envs: environments stepped together; the dataset does not depend on it.
+    """
+    options.check_folder("--out", out)
+    options.check_actor("policy", policy)
+    from lw_torchrl.language.tasks import TASKS
+
+    chosen = options.simulated("tasks", options.one_or_many(tasks), TASKS)
+    from lw_torchrl.data import collect_demonstrations
+
+    acts: str | Policy = policy
+    if policy not in options.ACTORS:
+        from lw_torchrl.training.checkpoint import load_actor
+
+        options.use_one_thread()
+        acts, behaviour = load_actor(policy), behaviour or Path(policy).stem
+    made = collect_demonstrations(
+        chosen,
+        episodes_per_task=episodes,
+        root=out,
+        seed=seed,
+        noise_scale=noise,
+        noise_hold=noise_hold,
+        gripper_noise_factor=gripper_noise,
+        redraw_failures=redraw_failures,
+        policy=acts,
+        behaviour=behaviour,
+        num_envs=num_envs,
+    )
+    output = Output(json)
+    rows = [
+        {"task": task, "success": rate, "episodes_run": made.attempts[task]} for task, rate in made.success_rate.items()
+    ]
+    columns: Columns = {"task": "task", "success": lambda row: f"{row['success']:.2f}", "episodes run": "episodes_run"}
+    output.table("tasks", rows, columns)
+    output.show("dataset", made.root)
+    output.show("steps", made.num_steps, f"{counted(made.num_steps, 'step')} in {made.root}")
+    return output
+
+
 def data(
     action: Positional[Annotated[Literal["show"], arg(metavar="show")]],
     folders: Positional[Annotated[tuple[Path, ...], arg(metavar="FOLDERS ...")]],
     /,
     check: bool = False,
-    json: bool = False,
+    json: options.Json = False,
 ) -> Output:
     """Show what datasets hold: who acted, in what, how often it succeeded, what it earned. Several are a mixture.
 
@@ -47,12 +119,11 @@ def data(
         action: the word show.
         folders: of `lw-torchrl collect`.
         check: also read them through against their checksums.
-        json: print one JSON document instead, see docs/cli.md.
     """
     if not folders:
         raise ValueError("folders must name at least one dataset")
     for folder in folders:
-        check_dataset("folders", folder)
+        options.check_dataset("folders", folder)
     from lw_torchrl.data.metadata import read_metadata
     from lw_torchrl.data.replay_checks import check_behaviours
 

@@ -1,16 +1,15 @@
-"""The subcommands of ``lw-torchrl`` that list words: tasks, queries, skills and plans."""
+"""Commands about words: tasks, skills, plans and queries are listed, and a query is answered in a state."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
 from lw_torchrl._checks import counted
-from lw_torchrl.cli.sources import one_or_many, read_plans, read_skills, read_tasks
-from lw_torchrl.cli.tables import Columns, Output, Row
+from lw_torchrl.cli import options
+from lw_torchrl.cli.output import Columns, Output, Row
 
 if TYPE_CHECKING:
     from lw_torchrl.language.plans import ConditionalPlan
@@ -19,8 +18,8 @@ if TYPE_CHECKING:
 def tasks(
     names: Positional[Annotated[tuple[str, ...], arg(metavar="[NAMES ...]")]] = (),
     /,
-    task_file: Path | None = None,
-    json: bool = False,
+    task_file: options.TaskFile = None,
+    json: options.Json = False,
 ) -> Output:
     """List tasks: their descriptions, and the objects that queries can name.
 
@@ -28,13 +27,11 @@ def tasks(
 
     Args:
         names: MT10, MT50, or names of tasks; all there are if none is given.
-        task_file: tasks of yours, instead of ours of the same name or beside ours.
-        json: print one JSON document instead, see docs/cli.md.
     """
     import lw_torchrl as lw
     from lw_torchrl.language.tasks import resolve_tasks
 
-    known = read_tasks(task_file)
+    known = options.read_tasks(task_file)
     rows = [
         {
             "task": name,
@@ -42,7 +39,7 @@ def tasks(
             "description": known[name].description,
             "objects": [{"name": one.name, "ours": one.ours} for one in known[name].objects[1:]],
         }
-        for name in resolve_tasks(one_or_many(names) or list(known), tasks=known)
+        for name in lw.resolve_tasks(options.one_or_many(names) or list(known), tasks=known)
     ]
 
     def objects(row: Row) -> str:
@@ -63,9 +60,9 @@ def skills(
     task: Positional[Annotated[str | None, arg(metavar="[TASK]")]] = None,
     /,
     nearest: str | None = None,
-    skill_file: Path | None = None,
-    task_file: Path | None = None,
-    json: bool = False,
+    skill_file: options.SkillFile = None,
+    task_file: options.TaskFile = None,
+    json: options.Json = False,
 ) -> Output:
     """List the scripted skills, or find the one closest to a text.
 
@@ -74,16 +71,13 @@ def skills(
     Args:
         task: only those that this task can use.
         nearest: a text; the closest skill is shown.
-        skill_file: skills of yours that join ours, or replace those of the same text.
-        task_file: tasks of yours, instead of ours of the same name or beside ours.
-        json: print one JSON document instead, see docs/cli.md.
     """
     from lw_torchrl.language.named_objects import GRIPPER
     from lw_torchrl.language.skills import nearest_skill
     from lw_torchrl.language.tasks import check_task
 
-    known = read_tasks(task_file)
-    table = read_skills(skill_file, known)
+    known = options.read_tasks(task_file)
+    table = options.read_skills(skill_file, known)
     definition = None if task is None else known[check_task(task, known)]
     output = Output(json)
     if nearest is not None:
@@ -117,11 +111,11 @@ def _numbers(values: Iterable[float]) -> str:
 def plans(
     names: Positional[Annotated[tuple[str, ...], arg(metavar="[NAMES ...]")]] = (),
     /,
-    plans: tuple[str, ...] = ("MT50",),
+    plans: options.PlanSources = ("MT50",),
     skill_set: Literal["own", "MT10"] = "own",
     roles: bool = False,
-    task_file: Path | None = None,
-    json: bool = False,
+    task_file: options.TaskFile = None,
+    json: options.Json = False,
 ) -> Output:
     """Show plans: the whole text of those named, or a list of all; or which thing each of their steps brings where.
 
@@ -129,19 +123,15 @@ def plans(
 
     Args:
         names: MT10, MT50, or names of tasks.
-        plans: MT10 or MT50 for the shipped plans, .plan files, .json files of pairs, or folders; where several have a
-            plan for a task, the last one's counts.
         skill_set: of the shipped plans, those with scripted skills of their own, or those worded as MT10's are.
         roles: a table of the steps, what each moves and what it goes to, and what told: "skill", the text is a scripted
             skill's; "words", the text's; "condition", the things that it compares; "nothing".
-        task_file: tasks of yours, instead of ours of the same name or beside ours.
-        json: print one JSON document instead, see docs/cli.md.
     """
     from lw_torchrl.language.tasks import resolve_tasks
 
-    known = read_tasks(task_file)
-    loaded = read_plans(plans, known, skill_set)
-    chosen = resolve_tasks(one_or_many(names), tasks=known) if names else tuple(loaded)
+    known = options.read_tasks(task_file)
+    loaded = options.read_plans(plans, known, skill_set)
+    chosen = lw.resolve_tasks(options.one_or_many(names), tasks=known) if names else tuple(loaded)
     loaded.require(chosen)
     output = Output(json)
     if roles:
@@ -185,8 +175,8 @@ def queries(
     text: Positional[Annotated[str | None, arg(metavar="[TEXT]")]] = None,
     /,
     by: Literal["edit", "embedding"] = "edit",
-    task_file: Path | None = None,
-    json: bool = False,
+    task_file: options.TaskFile = None,
+    json: options.Json = False,
 ) -> Output:
     """List a task's base queries, or find the one closest to a text.
 
@@ -196,14 +186,12 @@ def queries(
         task: a task's name.
         text: any words; what the query answering function makes of them is shown.
         by: closest in spelling, or in meaning, which wants the extra [text].
-        task_file: tasks of yours, instead of ours of the same name or beside ours.
-        json: print one JSON document instead, see docs/cli.md.
     """
     import lw_torchrl as lw
     from lw_torchrl.language.query_search import nearest_query
     from lw_torchrl.language.tasks import check_task
 
-    known = read_tasks(task_file)
+    known = options.read_tasks(task_file)
     definition = known[check_task(task, known)]
     output = Output(json)
     if text is not None:
@@ -216,4 +204,60 @@ def queries(
     lines = [f"{one['query']}{'   (ours)' if one['ours'] else ''}" for one in listed]
     ending = f"\n{len(listed)} base queries; each may be negated, and joined to others by 'and'"
     output.show("queries", listed, "\n".join([*lines, ending]))
+    return output
+
+
+def query(
+    task: Positional[Annotated[str, arg(metavar="TASK")]],
+    text: Positional[Annotated[str | None, arg(metavar="[TEXT]")]] = None,
+    /,
+    step: int = 0,
+    seed: int = 0,
+    episode: int = 0,
+    task_file: options.TaskFile = None,
+    json: options.Json = False,
+) -> Output:
+    """Answer a query on a state of a task: the state after so many steps of the scripted expert.
+
+    Example: lw-torchrl query pick-place "Is the gripper open and not above the puck?" --step 40
+
+    Args:
+        task: a task's name.
+        text: the query; without one, all supported queries that hold are listed.
+        step: how many steps the expert does first, 0 to 500.
+        seed: of the episode.
+        episode: its index.
+    """
+    import lw_torchrl as lw
+    from lw_torchrl._checks import check_int
+    from lw_torchrl.language.tasks import check_task
+
+    known = options.read_tasks(task_file)
+    (name,) = options.simulated("task", [check_task(task, known)], known)
+    definition = known[name]
+    listed = (
+        [lw.parse_query(text, definition)]
+        if text is not None
+        else [lw.parse_query(q, definition) for q in lw.supported_queries(definition)]
+    )
+    if check_int("step", step, minimum=0) > 500:
+        raise ValueError(f"step must be at most 500, got {step}")
+    env = lw.LanguageWorldEnv(name, seed=seed)
+    state = env.reset(episode=episode)
+    if step:
+        state = env.rollout(step, lw.ExpertActor(name), auto_reset=False, tensordict=state)[:, -1]["next"]
+    truths = lw.QueryProgram({definition: listed})(state["observation"], state["task_id"])[0].tolist()
+    env.close()
+    output = Output(json)
+    positions = {place: at.tolist() for place, at in definition.positions(state["observation"][0]).items()}
+    lines = [f"the {place:24} at {' '.join(f'{x:7.3f}' for x in at)} m" for place, at in positions.items()]
+    output.show("positions", positions, "\n".join(lines))
+    opening = state["observation"][0, 3].item()
+    output.show("opening", opening, f"the gripper's opening       {opening:7.3f}\n")
+    answers = [{"query": str(found), "holds": truth} for found, truth in zip(listed, truths, strict=True)]
+    if text is not None:
+        said = [f"{'yes' if one['holds'] else 'no'}: {one['query']}" for one in answers]
+    else:
+        said = [one["query"] for one in answers if one["holds"]]
+    output.show("queries", answers, "\n".join(said))
     return output

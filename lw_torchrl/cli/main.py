@@ -1,6 +1,6 @@
 """The command line, ``lw-torchrl``: each command is a function, and its docstring the help text.
 
-A command returns what it found, an :class:`~lw_torchrl.cli.tables.Output`, where it has ``--json``.
+A command returns what it found, an :class:`~lw_torchrl.cli.output.Output`, where it has ``--json``.
 """
 
 from __future__ import annotations
@@ -18,41 +18,34 @@ import tyro
 
 from lw_torchrl import __version__
 from lw_torchrl._checks import nearest, shown
-from lw_torchrl.cli import experiments as cli_experiments
-from lw_torchrl.cli import language as cli_language
+from lw_torchrl.cli import data, evaluate, language, record, reproduce
 from lw_torchrl.cli import plan as cli_plan
-from lw_torchrl.cli import policies, show
 from lw_torchrl.cli.check import check
-from lw_torchrl.cli.data import data
-from lw_torchrl.cli.errors import in_its_words
 from lw_torchrl.cli.offline import offline
 from lw_torchrl.cli.online import online
-from lw_torchrl.cli.parsing import parse, unpadded
-from lw_torchrl.cli.record import record
-from lw_torchrl.cli.scripted import scripted
-from lw_torchrl.cli.streams import check_arguments, complain, nobody_reads, sound_streams
-from lw_torchrl.cli.tables import Output
+from lw_torchrl.cli.output import Output, check_arguments, complain, nobody_reads, sound_streams
+from lw_torchrl.cli.parsing import in_its_words, parse, unpadded
 from lw_torchrl.cli.train import train
 from lw_torchrl.cli.train_evaluator import train_evaluator
 
 COMMANDS: dict[str, Any] = {
-    "demo": show.demo,
-    "collect": policies.collect,
-    "data": data,
+    "demo": reproduce.demo,
+    "collect": data.collect,
+    "data": data.data,
     "train": train,
     "train-evaluator": train_evaluator,
-    "evaluate": policies.evaluate,
-    "record": record,
-    "view": show.view,
-    "query": show.query,
-    "scripted": scripted,
-    "tasks": cli_language.tasks,
-    "queries": cli_language.queries,
-    "skills": cli_language.skills,
-    "plans": cli_language.plans,
+    "evaluate": evaluate.evaluate,
+    "record": record.record,
+    "view": record.view,
+    "query": language.query,
+    "scripted": evaluate.scripted,
+    "tasks": language.tasks,
+    "queries": language.queries,
+    "skills": language.skills,
+    "plans": language.plans,
     "plan": cli_plan.plan,
     "check": check,
-    "reproduce": cli_experiments.reproduce,
+    "reproduce": reproduce.reproduce,
     "offline": offline,
     "online": online,
 }
@@ -60,21 +53,11 @@ GROUPS: dict[str, dict[str, Any]] = {"plan": cli_plan.COMMANDS}
 """Commands that have commands of their own."""
 ABOUT = """Language-World with TorchRL: policies carried by plans in English. --version tells which.
 
-Exit status: 0, done; 1, a fault of ours, with a traceback; 2, an error that you can mend, in one line on the standard
+Exit status: 0, done; 1, a bug of ours, with a traceback; 2, an error that you can fix, in one line on the standard
 error; 130, stopped by Ctrl-C; 141, nobody reads the output. What prints a table prints JSON with --json."""
 
-RESUMABLE = (
-    "demo",
-    "collect",
-    "train",
-    "train-evaluator",
-    "plan generate",
-    "plan compare",
-    "plan repair",
-    "reproduce",
-    "offline",
-    "online",
-)
+_RESUMABLE = {"demo", "collect", "train", "train-evaluator", "reproduce", "offline", "online"}
+_RESUMABLE |= {"plan generate", "plan compare", "plan repair"}
 
 
 def main(args: Sequence[str] | None = None) -> None:
@@ -173,6 +156,6 @@ def _noting(interrupts: list[int]) -> Iterator[None]:
 
 def _stop(given: Sequence[str]) -> NoReturn:
     named = {" ".join(given[:1]), " ".join(given[:2])}
-    resumed = "; the same command carries on from here" if named & {*RESUMABLE} else ""
+    resumed = "; the same command carries on from here" if named & _RESUMABLE else ""
     complain(f"\nlw-torchrl: stopped{resumed}")
     sys.exit(130)

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
-from lw_torchrl.cli.sources import read_plans, read_tasks
-from lw_torchrl.cli.tables import Output
-from lw_torchrl.cli.units import check_asked, elsewhere, report
+from lw_torchrl.cli.options import Json, PlanSources, read_plans, read_tasks
+from lw_torchrl.cli.output import Output
+from lw_torchrl.cli.runs import Job, Scheduled
 
 if TYPE_CHECKING:
-    from lw_torchrl.evaluation import EvaluationResult
     from lw_torchrl.language.plans import Plans
-    from lw_torchrl.paper.offline_runs import OfflineRun
+    from lw_torchrl.paper.offline import Advantages
 
 Table = Literal["methods", "conditioning", "mt10", "quick", "all"]
 Mixture = Literal["B", "W", "C"]
@@ -26,127 +25,94 @@ OfflineMethod = Literal["advantage", "filtered-bc", "best-bc", "bc", "iql", "td3
 def offline(
     table: Positional[Table],
     /,
+    schedule: Scheduled,
     seeds: tuple[int, ...] = (0, 1, 2),
     mixtures: tuple[Mixture, ...] = (),
     methods: tuple[OfflineMethod, ...] = (),
-    plans: tuple[str, ...] = ("MT10",),
+    plans: PlanSources = ("MT10",),
     reward: Literal["sparse", "cost", "dense_cost"] | None = None,
     beta: float | None = None,
     distance: Literal["l1", "l2"] | None = None,
     steps: int | None = None,
     episodes: int = 20,
-    launcher: Literal["local", "ray"] = "local",
-    jobs: int = 1,
-    run: str | None = None,
-    list: bool = False,
     out: Path = Path("runs/offline"),
-    json: bool = False,
+    json: Json = False,
 ) -> Output:
-    """Learn policies offline, from scripts that were spoilt, and compare the methods. Stopped and started again it
-    carries on.
+    """Learn policies offline, from scripts that were spoilt, and compare the methods.
+
+    If it is stopped, the same command resumes it.
 
     The data are mixtures: B, of each task 20 episodes of plans carried out by scripts that are right in 30 of 100
     pieces, 20 in 60 of 100, 20 in none and 10 of chance; W, B without the second; C, 5 clean demonstrations, 20 in none
-    and 10 of chance. A run is a dataset, the advantages of a mixture's rows, or a policy with its evaluation. Each can
-    be run by a command of its own, with --run, by any scheduler; datasets first, then advantages.
+    and 10 of chance. A run is a dataset, the advantages of a mixture's rows, or a policy with its evaluation. With
+    --run any scheduler can do each by a command of its own; datasets first, then advantages.
 
     Example: lw-torchrl offline methods --jobs 2
 
     Args:
         table: methods, seven of them on plans, in five tasks; conditioning, plans, descriptions or numbers of tasks,
-            for the policy and for its critic; mt10, the best method in all of MT10; quick, two tasks, to see it run;
-            or all but the last.
+            for the policy and for its critic; mt10, the best method in all of MT10; quick, two tasks, to try it; or all
+            but the last.
+        schedule: which runs are done, and where.
         seeds: of the data, the initial weights and the minibatches.
         mixtures: only these of the table's, B, W, C.
         methods: only these of the table's: advantage, filtered-bc, best-bc, bc, iql, td3-bc, cql.
-        plans: MT10 or MT50 for ours, .plan files, .json files of pairs, or folders.
         reward: what values are of, instead of the recipe's: sparse, the success; cost, of each step; dense_cost, what
             Meta-World's dense reward lacks.
         beta: how sharply advantages weigh, instead of the recipe's.
         distance: between actions, in the methods that imitate, instead of the recipe's.
         steps: minibatches of each network, instead of the recipe's.
         episodes: evaluated for each task, on seeds that no data has, action noise 0.1.
-        launcher: local, on this machine; ray, on a Ray cluster, or on all cores of this machine.
-        jobs: runs run at a time by the launcher local.
-        run: run this one alone, such as five/B/advantage-plan/seed0.
-        list: print the names of the runs and do nothing.
         out: where everything goes; on a cluster, a folder that all its machines share.
-        json: print one JSON document instead, see docs/cli.md.
     """
-    check_asked(list, run, out, jobs)
+    schedule.check(out)
     known = read_plans(plans, read_tasks(None))
-    from lw_torchrl._checks import check_choice
     from lw_torchrl._files import read_json
-    from lw_torchrl.cli.threads import use_one_thread
-    from lw_torchrl.paper.mixtures import TASK_SETS
-    from lw_torchrl.paper.offline_recipes import OfflineRecipe
-    from lw_torchrl.paper.offline_tables import OFFLINE_TABLES, advantages_of, write_table
-    from lw_torchrl.paper.offline_training import execute_offline, make_advantages
+    from lw_torchrl.paper.offline import OfflineRun, offline_runs, write_table
+    from lw_torchrl.paper.offline_recipes import OFFLINE_TABLES, OfflineRecipe
+    from lw_torchrl.paper.runs import execute_run
 
     changed = {"reward": reward, "beta": beta, "distance": distance, "steps": steps, "value_steps": steps}
     recipe = replace(OfflineRecipe(), **{name: value for name, value in changed.items() if value is not None})  # type: ignore[arg-type]
-    tables = {
-        name: [
-            one
-            for one in OFFLINE_TABLES[name].runs(seeds, recipe, episodes)
-            if (not mixtures or one.mixture in mixtures) and (not methods or one.method in methods)
+    tables: dict[str, list[OfflineRun]] = {}
+    for name in [name for name in OFFLINE_TABLES if name != "quick"] if table == "all" else [table]:
+        every = offline_runs(OFFLINE_TABLES[name], seeds, recipe, episodes)
+        wanted = [
+            one for one in every if (not mixtures or one.mixture in mixtures) and (not methods or one.method in methods)
         ]
-        for name in (OFFLINE_TABLES if table == "all" else [table])
-        if table != "all" or name != "quick"
-    }
-    tables = {name: runs for name, runs in tables.items() if runs}
+        if wanted:
+            tables[name] = wanted
     if not tables:
         raise ValueError(f"--mixtures and --methods leave nothing of {table}")
-    runs = {str(one.folder): one for chosen in tables.values() for one in chosen}
-    datasets = {str(dataset.folder): dataset for one in runs.values() for dataset in one.datasets}
-    advantages = advantages_of(runs.values())
-    output = Output(json)
-    if list:
-        output.show("runs", [*datasets, *advantages, *runs], "\n".join([*datasets, *advantages, *runs]))
-        return output
-    for one in runs.values():
-        known.require(TASK_SETS[one.tasks])
-    use_one_thread()
-    if run is not None:
-        output.show("run", run)
-    if run in datasets:
-        datasets[run].make(out, progress=True)
-    elif run in advantages:
-        make_advantages(advantages[run], known, out, progress=True)
-    elif run is not None:
-        one = runs[check_choice("run", run, [*datasets, *advantages, *runs])]
-        result = execute_offline(one, known, out)
-        print(_said(run, result))
-        if json:
-            output.result(result)
-    else:
-        if launcher == "local" and jobs == 1:
-            report(len(runs), _here(runs, known, out))
-        else:
-            given = ["offline", table, "--episodes", str(episodes), "--out", str(out), "--plans", *plans]
-            given += ["--seeds", *map(str, seeds)]
-            for name, value in (("--reward", reward), ("--beta", beta), ("--distance", distance), ("--steps", steps)):
-                given += [] if value is None else [name, str(value)]
-            for name, values in (("--mixtures", mixtures), ("--methods", methods)):
-                given += [name, *values] if values else []
-            for stage in (datasets, advantages, runs):
-                report(len(stage), elsewhere(stage, given, launcher, jobs))
+    runs = [one for wanted in tables.values() for one in wanted]
+    if not schedule.list:
+        for one in runs:
+            known.require(one.scope)
+    datasets: dict[str, Job] = {
+        str(dataset.folder): partial(dataset.collect, out, progress=True) for one in runs for dataset in one.datasets
+    }
+    advantages: dict[str, Job] = {
+        str(own.folder): partial(_learn, own, known, out) for one in runs if (own := one.advantages) is not None
+    }
+    jobs: dict[str, Job] = {str(one.folder): partial(execute_run, one, known, out) for one in runs}
+
+    def summarize() -> dict[str, Any]:
         summaries = {}
-        for name, chosen in tables.items():
-            results = {one: execute_offline(one, known, out) for one in chosen}
-            print(f"\n{name}\n{write_table(name, chosen, results, out)}")
+        for name, wanted in tables.items():
+            results = {one: execute_run(one, known, out) for one in wanted}
+            print(f"\n{name}\n{write_table(name, wanted, results, out)}")
             print(f"\n{name}.md, {name}.json and {name}.png are in {out}")
             summaries[name] = read_json(out / f"{name}.json", "the summary")
-        output.show("summaries", summaries)
-    return output
+        return summaries
+
+    command: list[object] = ["offline", table, "--episodes", episodes, "--out", out]
+    command += ["--plans", *plans, "--seeds", *seeds]
+    for option, value in (("--reward", reward), ("--beta", beta), ("--distance", distance), ("--steps", steps)):
+        command += [] if value is None else [option, value]
+    for option, values in (("--mixtures", mixtures), ("--methods", methods)):
+        command += [option, *values] if values else []
+    return schedule.execute(Output(json), [datasets, advantages], [jobs], command, summarize)
 
 
-def _said(name: str, result: EvaluationResult) -> str:
-    return f"{name}: mean success {result.mean_success:.3f}, {result.config['seconds']:.0f} s"
-
-
-def _here(runs: dict[str, OfflineRun], plans: Plans, out: Path) -> Iterator[str]:
-    from lw_torchrl.paper.offline_training import execute_offline
-
-    for name, one in runs.items():
-        yield _said(name, execute_offline(one, plans, out))
+def _learn(one: Advantages, plans: Plans, out: Path) -> None:
+    one.make(plans, out, progress=True)

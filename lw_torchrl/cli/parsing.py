@@ -1,4 +1,4 @@
-"""A command's arguments as values: what it does not know, or not allow, is refused with the nearest that it does."""
+"""A command's arguments: read as values, refused with the nearest that is allowed, and named in errors as options."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ import io
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import MISSING, fields, is_dataclass
 from functools import partial, wraps
-from inspect import Parameter, Signature, signature
+from inspect import Parameter, signature
 from itertools import pairwise
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
@@ -40,8 +41,8 @@ def parse(prog: str, function: Callable[..., Any], args: Sequence[str]) -> parti
         Traceback (most recent call last):
         ValueError: there is no option --minute; did you mean --minutes? `kitchen --help` lists them
     """
-    parameters = signature(function)
-    _check_options(prog, parameters, args)
+    known = arguments(function)
+    _check_options(prog, known, args)
 
     @wraps(function)
     def found(*args: Any, **kwargs: Any) -> partial[Any]:
@@ -55,24 +56,53 @@ def parse(prog: str, function: Callable[..., Any], args: Sequence[str]) -> parti
     except SystemExit as ended:
         if not ended.code:
             raise
-        raise ValueError(_refusal(prog, parameters, said.getvalue())) from None
+        raise ValueError(_refusal(prog, known, said.getvalue())) from None
     sys.stderr.write(said.getvalue())
     if beyond:
         raise ValueError(f"there is one argument too many, {shown(beyond[0])}; `{prog} --help` says what there is")
-    given = parameters.bind(*call.args, **call.keywords).arguments
-    for name, kind in get_type_hints(function).items():
+    given = signature(function).bind(*call.args, **call.keywords).arguments
+    for shared in [*given.values()]:
+        if is_dataclass(shared):
+            given |= vars(shared)
+    for name, one in known.items():
         value = given.get(name)
-        for one in value if isinstance(value, tuple) else [value]:
-            _check_value(name, one, _of_one(kind))
-            if name in SCALES and one is not None:
-                check_scale(name, one)
+        for each in value if isinstance(value, tuple) else [value]:
+            _check_value(name, each, _of_one(one.annotation))
+            if name in SCALES and each is not None:
+                check_scale(name, each)
         if name in COUNTS and isinstance(value, int):
             check_int(name, value, minimum=1)
     return call
 
 
+def arguments(function: Callable[..., Any]) -> dict[str, Parameter]:
+    """A command's arguments; options that it shares with other commands are the fields of a dataclass.
+
+    Example:
+        >>> from dataclasses import dataclass
+        >>> @dataclass
+        ... class Stove:
+        ...     heat: float
+        >>> def cook(dish: str, /, stove: Stove, minutes: int = 10): ...
+        >>> [(name, one.annotation.__name__) for name, one in arguments(cook).items()]
+        [('dish', 'str'), ('heat', 'float'), ('minutes', 'int')]
+    """
+    kinds, found = get_type_hints(function), {}
+    for name, one in signature(function).parameters.items():
+        kind = kinds.get(name, Any)
+        if not is_dataclass(kind):
+            found[name] = one.replace(annotation=kind)
+            continue
+        own = get_type_hints(kind)
+        for field in fields(kind):
+            default = Parameter.empty if field.default is MISSING else field.default
+            option = Parameter(field.name, Parameter.KEYWORD_ONLY, default=default, annotation=own[field.name])
+            found[field.name] = option
+    return found
+
+
 def _check_value(name: str, value: Any, kind: Any) -> None:
-    """Refuse a word that is none of those allowed, or no number; the rules of :func:`_registry` let them pass."""
+    """Refuse a word that is not allowed, or no number; the rules of :func:`_registry` let them pass."""
     if get_origin(kind) is Literal and value is not None:
         check_choice(name, value, get_args(kind))
     elif kind in _NUMBERS and isinstance(value, str):
@@ -93,18 +123,13 @@ def unpadded() -> Iterator[None]:
         sys.stdout.write("".join(f"{line.rstrip()}\n" for line in text.getvalue().splitlines()))
 
 
-def _options(parameters: Signature) -> list[str]:
-    found = ["--help"]
-    for name, one in parameters.parameters.items():
+def _check_options(prog: str, known: Mapping[str, Parameter], args: Sequence[str]) -> None:
+    """Refuse the first option that is none of the command's; what follows ``--`` is none."""
+    options = ["--help"]
+    for name, one in known.items():
         if one.kind is not Parameter.POSITIONAL_ONLY:
             option = name.replace("_", "-")
-            found += [f"--{option}", *([f"--no-{option}"] if one.annotation in (bool, "bool") else [])]
-    return found
-
-
-def _check_options(prog: str, parameters: Signature, args: Sequence[str]) -> None:
-    """Refuse the first option that is none of the command's; what follows ``--`` is none."""
-    options = _options(parameters)
+            options += [f"--{option}", *([f"--no-{option}"] if one.annotation is bool else [])]
     for arg in args:
         if arg == "--":
             return
@@ -160,14 +185,14 @@ def _registry() -> ConstructorRegistry:
     return registry
 
 
-def _refusal(prog: str, parameters: Signature, box: str) -> str:
+def _refusal(prog: str, known: Mapping[str, Parameter], box: str) -> str:
     """What tyro says in a box, in a line."""
     lines = [line.strip("│ ") for line in box.splitlines()[1:]]
     rules = [number for number, line in enumerate(lines) if re.match("[─╰-]{3}", line)]
     parts = [lines[first + 1 : last] for first, last in pairwise([-1, *rules, len(lines)])]
     text = " ".join(" ".join(next((part for part in parts if any(part)), ["the arguments cannot be read"])).split())
     if text.startswith("Missing from"):
-        needed = [one for one in parameters.parameters.values() if one.default is Parameter.empty]
+        needed = [one for one in known.values() if one.default is Parameter.empty]
         names = [
             one.name.upper() if one.kind is Parameter.POSITIONAL_ONLY else f"--{one.name.replace('_', '-')}"
             for one in needed
@@ -175,3 +200,54 @@ def _refusal(prog: str, parameters: Signature, box: str) -> str:
         absent = [name for name in names if name in text.split()]
         return f"{' and '.join(absent or names)} must be given; `{prog} --help` says what there is"
     return re.sub(r"^Missing value for argument '(\S+)'.*", r"\1 must be given a value", text)
+
+
+# Names in the library's errors, and the options that they become, of which a command has one.
+_OPTIONS = {
+    "checkpoint": ("out",),
+    "episodes_per_task": ("episodes",),
+    "gripper_noise_factor": ("gripper_noise",),
+    "noise_scale": ("noise",),
+    "path": ("recording",),
+    "policy": ("behaviours",),
+    "resume": ("out",),
+    "root": ("folders", "out"),
+    "skills": ("skill_file",),
+    "source": ("plans",),
+    "task": ("tasks", "names"),
+    "tasks": ("names",),
+}
+_OPTIONS_OF = {"collect": {"checkpoint": "policy"}, "train": {"root": "data"}, "check": {"plans": "file"}}
+"""Where a command differs, or has an option of that name that means something else."""
+
+
+def in_its_words(command: str, function: Callable[..., object], message: str) -> str:
+    """An error's message, with the command's options and arguments for the names of the library.
+
+    At the beginning any name before a colon, "must" or "differ" is replaced; elsewhere only one with an underscore.
+
+    Example:
+        >>> def collect(tasks: str, /, episodes: int, redraw_failures: bool): ...
+        >>> in_its_words("collect", collect, "episodes_per_task must be at least 1, got 0")
+        '--episodes must be at least 1, got 0'
+        >>> in_its_words("collect", collect, "too few; set redraw_failures=False")
+        'too few; set --no-redraw-failures'
+        >>> in_its_words("collect", collect, "tasks must be names; run the same collect_demonstrations again")
+        'TASKS must be names; run the same `lw-torchrl collect` again'
+    """
+    known, own = arguments(function), _OPTIONS_OF.get(command, {})
+
+    def shown(match: re.Match[str]) -> str:
+        given = match[1]
+        if given == "collect_demonstrations":
+            return f"`lw-torchrl {'collect' if command in ('train', 'data') else command}`"
+        name = next((one for one in (own.get(given), given, *_OPTIONS.get(given, ())) if one in known), "")
+        if not name:
+            return match[0]
+        if known[name].kind is Parameter.POSITIONAL_ONLY:
+            return name.upper()  # as the help has it
+        option = name.replace("_", "-")
+        return f"--no-{option}" if match[2] == "=False" else f"--{option}"
+
+    message = re.sub(r"^([a-z_]+)()(?=:| must| differ)", shown, message)
+    return re.sub(r"(?<![\w-])([a-z]+(?:_[a-z]+)+)(=False|=True)?\b", shown, message)

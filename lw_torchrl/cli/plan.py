@@ -2,24 +2,16 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Sequence
+import re
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from lw_torchrl._checks import counted
-from lw_torchrl.cli.outputs import check_folder
-from lw_torchrl.cli.plan_check import check
-from lw_torchrl.cli.plan_compare import compare
-from lw_torchrl.cli.plan_repair import repair
-from lw_torchrl.cli.plan_serve import serve
-from lw_torchrl.cli.sources import one_or_many, read_plans, read_skills, read_tasks
-from lw_torchrl.cli.tables import Output
-
-if TYPE_CHECKING:
-    from lw_torchrl.planners import Answer
+from lw_torchrl.cli import options
+from lw_torchrl.cli.output import Output
+from lw_torchrl.cli.plan_models import generate, repair
 
 
 def prompt(
@@ -27,8 +19,8 @@ def prompt(
     /,
     format: str = "chain_py",
     vocabulary: bool = False,
-    plans: tuple[str, ...] = ("MT10",),
-    task_file: Path | None = None,
+    plans: options.PlanSources = ("MT10",),
+    task_file: options.TaskFile = None,
 ) -> None:
     """Print the text that asks a language model for a plan: plans of three other tasks, then the task.
 
@@ -39,131 +31,191 @@ def prompt(
         format: how plans are written: basic, chain or goal, then _py, _py_md or _md.
         vocabulary: also say which things the task has, and what can be asked of them.
         plans: where the examples come from: MT10 or MT50 for the shipped plans, .plan files, .json files or folders.
-        task_file: tasks of yours, instead of ours of the same name or beside ours.
     """
     from lw_torchrl.planners.prompts import plan_prompt
 
-    known = read_tasks(task_file)
-    found = plan_prompt(task, format, plans=read_plans(plans, known), vocabulary=vocabulary, tasks=known)
+    known = options.read_tasks(task_file)
+    found = plan_prompt(task, format, plans=options.read_plans(plans, known), vocabulary=vocabulary, tasks=known)
     print(found, end="")
 
 
-def generate(
-    tasks: Positional[Annotated[tuple[str, ...], arg(metavar="[TASKS ...]")]] = ("MT10",),
+def check(
+    file: Positional[Annotated[Path, arg(metavar="FILE")]],
     /,
-    *,
-    model: str,
-    base_url: str | None = None,
-    format: tuple[str, ...] = ("chain_py",),
-    attempts: int = 1,
-    constrain: bool = False,
-    free_skills: bool = False,
-    vocabulary: bool = False,
-    temperature: float | None = None,
-    max_tokens: int = 1024,
-    seed: int | None = None,
-    name: str | None = None,
-    plans: tuple[str, ...] = ("MT10",),
-    skill_file: Path | None = None,
-    task_file: Path | None = None,
-    concurrency: int = 4,
-    retries: int = 6,
-    timeout: float = 300.0,
-    cache: Path = Path("runs/answers"),
-    out: Path = Path("runs/plans"),
-    json: bool = False,
+    task: str | None = None,
+    format: str | None = None,
+    episodes: int = 5,
+    seed: int = 0,
+    skill_file: options.SkillFile = None,
+    task_file: options.TaskFile = None,
+    json: options.Json = False,
 ) -> Output:
-    """Ask a language model for plans, and say what became of them.
+    """Say how a plan was read, where its conditions hold, and which steps never fire.
 
-    The model is behind an OpenAI-compatible server: OpenAI's own, vLLM (http://127.0.0.1:8000/v1), Ollama
-    (http://127.0.0.1:11434/v1), llama.cpp's (http://127.0.0.1:8080/v1). A key is taken from the environment variable
-    OPENAI_API_KEY; a server of your own wants none. What is answered is kept: stopped or killed, the same command asks
-    only for what is missing, and the same question costs nothing a second time.
-
-    Example: lw-torchrl plan generate MT10 --model llama3.1 --base-url http://127.0.0.1:11434/v1 --attempts 4
+    Example: lw-torchrl plan check runs/plans/llama3.1/chain_py/push-0.py
 
     Args:
-        tasks: MT10, MT50, or names of tasks.
-        model: the model's name at the server.
-        base_url: the server's address; OpenAI's, or what OPENAI_BASE_URL says, if none is given.
-        format: how plans are written, one or several: basic, chain or goal, then _py, _py_md or _md; "all" for nine.
-        attempts: answers to each question.
-        constrain: hold the model to a schema, so that it can only write plans that run; the server must know schemas.
-        free_skills: with --constrain, skills in any words instead of the scripted ones.
-        vocabulary: prompts also say which things the task has, and what can be asked of them.
-        temperature: the server's own if none is given.
-        max_tokens: of an answer, at most; models that think first want more.
-        seed: attempt k is sent SEED + k; without, none is sent.
-        name: of the folder for its answers; the model's, with "-constrained" behind it where it is, if none is given.
-        plans: where the prompts' examples come from: MT10 or MT50, .plan files, .json files or folders.
-        skill_file: skills of yours that join ours, or replace those of the same text.
-        task_file: tasks of yours, instead of ours of the same name or beside ours.
-        concurrency: questions at once.
-        retries: how often a question is asked again after a rate limit or a fault, with growing waits.
-        timeout: seconds that one try may take as a whole, to the answer's last byte; each retry has as long.
-        cache: folder where answers are kept, each under a key of all that determines it.
-        out: folder for the answers as texts, OUT/<name>/<format>/<task>-<attempt>.py or .md.
-        json: print one JSON document instead, see docs/cli.md.
+        file: an answer FORMAT/TASK-ATTEMPT.EXT, as plan generate writes it, or a .plan file TASK.plan; any text with
+            --task and --format.
+        task: the task it is for; by default as the file's name says.
+        format: how it is written; by default as the file's folder says, or basic_py for a .plan file.
+        episodes: of the expert, and of the plan by scripted skills; conditions are answered in their states.
+        seed: of these.
     """
-    check_folder("--out", out)
-    check_folder("--cache", cache)
     import lw_torchrl as lw
     from lw_torchrl._checks import check_choice
-    from lw_torchrl.language.tasks import named_tasks
+    from lw_torchrl._files import read_text
+    from lw_torchrl.language.tasks import check_task
 
-    known = read_tasks(task_file)
-    chosen = list(named_tasks(one_or_many(tasks), known=known).values())
-    formats = [*lw.PLAN_FORMATS] if format == ("all",) else list(dict.fromkeys(format))
-    for one in formats:
-        if one == "all":
-            raise ValueError(f"--format must be one of 'all', {', '.join(map(repr, lw.PLAN_FORMATS))}, and 'all' alone")
-        check_choice("format", one, ["all", *lw.PLAN_FORMATS])
-    planner = lw.OpenAIPlanner(
-        model,
-        base_url=base_url,
-        constrain=constrain,
-        free_skills=free_skills,
-        skills=read_skills(skill_file, known) if skill_file else None,
-        plans=read_plans(plans, known),
-        vocabulary=vocabulary,
-        temperature=temperature,
-        max_tokens=max_tokens,
-        seed=seed,
-        name=name,
-        cache=cache,
-        concurrency=concurrency,
-        retries=retries,
-        timeout=timeout,
-    )
-    rows, noted, total = [], Counter[str](), 0
-    for one in formats:
-        answers = planner.plans(chosen, format=one, attempts=attempts, out=out)
-        total += answers.tokens.total
-        noted.update(note for answer in answers for note in answer.notes)
-        for task in dict.fromkeys(answer.task for answer in answers):
-            rows.append({"task": task, "format": one, **_counts([answer for answer in answers if answer.task == task])})
+    if not file.is_file():
+        raise FileNotFoundError(f"file: there is no file {str(file)!r}")
+    known = options.read_tasks(task_file)
+    if task is None:
+        task = re.sub(r"-\d+$", "", file.stem)
+        if task not in known:
+            raise ValueError(f"--task must be given, since the file's name, {file.name!r}, names no task")
+    if format is None:
+        format = "basic_py" if file.suffix == ".plan" else file.absolute().parent.name
+        if format not in lw.PLAN_FORMATS:
+            raise ValueError(f"--format must be given, one of {', '.join(lw.PLAN_FORMATS)}: the file's folder is none")
+    check_task(task, known)
+    check_choice("format", format, lw.PLAN_FORMATS)
+    skills = options.read_skills(skill_file, known) if skill_file else None
+    text = read_text(file, ValueError)
+    from lw_torchrl.planners.checking import check_plan
+
+    options.use_one_thread()
+    found = check_plan(text, task, format, episodes=episodes, seed=seed, skills=skills, tasks=known)
     output = Output(json)
-    title = f"{planner.model} at {planner.address}"
-    output.table("answers", rows, {key.replace("_", " "): key for row in rows[:1] for key in row}, title)
-    output.show("notes", [{"note": note, "answers": times} for note, times in noted.most_common()])
-    for note, times in noted.most_common():
-        print(f"{counted(times, 'answer')}: {note}")
-    output.show("tokens", total)
-    output.show("folder", out / planner.name, f"{total} tokens; written to {out / planner.name}")
+    steps = [step for step in found.decoded.steps if not step.dropped]
+    rows = [
+        {
+            "condition": str(step.condition),
+            "skill": step.written_skill,
+            "scripted": step.scripted,
+            "expert": None if found.expert is None else found.expert.true[k],
+            "own": None if found.own is None else found.own.true[k],
+            "chosen": None if found.own is None else found.own.chosen[k],
+            "never": k in found.never,
+        }
+        for k, step in enumerate(steps)
+    ]
+    output.show("task", found.task, str(found))
+    output.show("reason", found.decoded.reason or None)
+    output.show("notes", [*map(str, found.decoded.notes)])
+    output.show("steps", rows)
+    output.show("success", None if found.own is None else found.success)
     return output
 
 
-def _counts(answers: Sequence[Answer]) -> dict[str, int]:
-    """What a row of the table says of the answers to one question."""
-    plans = [answer.decoded for answer in answers if answer.decoded.plan is not None]
-    return {
-        "answers": len(answers),
-        "plans": len(plans),
-        "all_scripted": sum(decoded.all_scripted for decoded in plans),
-        "asked_now": sum(not answer.cached for answer in answers),
-        "tokens_read": sum(answer.tokens.prompt for answer in answers),
-        "tokens_written": sum(answer.tokens.completion for answer in answers),
-    }
+_BEST = ": of each task the plan that did best, be it one that never succeeds"
+
+
+def compare(
+    source: Positional[Annotated[Path, arg(metavar="DIR|FILE")]],
+    /,
+    episodes: int = 20,
+    seed: int = 1000,
+    choose: Literal["random", "first"] = "random",
+    noise: float = 0.0,
+    max_steps: int = 500,
+    task_file: options.TaskFile = None,
+    out: Path = Path("runs/compare"),
+    json: options.Json = False,
+) -> Output:
+    """Compare models by the plans they wrote: decode every answer, and carry out all plans by scripted skills.
+
+    The plan of each task that did best, be it one that never succeeds, is kept in OUT/best/MODEL/FORMAT, for --plans of
+    any other command. If it is stopped, the same command resumes it.
+
+    Example: lw-torchrl plan compare runs/plans --out runs/compare
+
+    Args:
+        source: a folder MODEL/FORMAT/TASK-ATTEMPT.EXT, as plan generate writes it, or a .jsonl file of answers.
+        episodes: of each plan, the same initial states for all plans of a task.
+        seed: fixes initial states, goals and what is chosen.
+        choose: which of several true steps acts: a random one, as in the paper, or the first.
+        noise: standard deviation of the noise on the executed action.
+        max_steps: of an episode.
+        out: folder for results.json, summary.md, models.png, formats.png and best/.
+    """
+    options.check_folder("--out", out)
+    from lw_torchrl.planners.file_planner import ignored_files, recorded_answers
+
+    known = options.read_tasks(task_file)
+    recorded_answers(source)
+    from lw_torchrl.planners.comparing import compare_plans
+    from lw_torchrl.planners.comparison_report import no_plans, write_report
+
+    options.use_one_thread()
+    found = compare_plans(
+        source,
+        episodes=episodes,
+        seed=seed,
+        choose=choose,
+        noise_scale=noise,
+        max_steps=max_steps,
+        tasks=known,
+        resume=out / "fared.json",
+    )
+    output = Output(json)
+    groups = [
+        {"model": model, "format": format, "success": found.mean(model, format)}
+        | {"best_answer": found.best_of(model, format)}
+        for model, format in found.groups
+    ]
+    output.show("models", groups, f"{found.table()}\n\n{found.task_table()}\n")
+    answers = [
+        {"model": one.model, "format": one.format, "task": one.task, "attempt": one.attempt, "steps": one.steps}
+        | {"dropped": one.dropped, "reason": one.reason or None, "success": one.rate}
+        for one in found.answers
+    ]
+    output.show("answers", answers)
+    if lines := no_plans(found):
+        print("\n".join(lines), end="\n\n")
+    if strays := ignored_files(source):
+        names = ", ".join(map(str, strays[:5])) + (", ..." if len(strays) > 5 else "")
+        print(f"not read, since no answer is named so (<task>-<attempt>.<ext>): {names}\n")
+    for file in write_report(found, out):
+        print(f"written to {file}{_BEST if file.name == 'best' else ''}")
+    return output
+
+
+def serve(
+    model: Positional[Annotated[Path | None, arg(metavar="[MODEL.gguf]")]] = None,
+    /,
+    host: str = "127.0.0.1",
+    port: int = 8000,
+    context: int = 8192,
+    threads: int | None = None,
+) -> None:
+    """Serve a language model on this machine, as OpenAI's servers do, until Ctrl-C. It wants the extra [serve].
+
+    The extra brings a small model, so that everything can be tried without a key. Held to a schema, it writes plans
+    that run, but few that succeed. https://huggingface.co has larger models as GGUF files.
+
+    Example: lw-torchrl plan serve Llama-3.2-3B-Instruct-Q4_K_M.gguf --port 8001
+
+    Args:
+        model: a GGUF file; the small model of the extra if none is given.
+        host: the address to listen at; by default only this machine can ask. There is no key.
+        port: where; 0 takes a free one.
+        context: tokens of a question and its answer, at most.
+        threads: of the processor; half of its cores if none is given.
+    """
+    from lw_torchrl.planners.model_server import model_file, serve_model
+
+    file = model_file(model)
+    print(f"loading {file}", flush=True)
+
+    def ready(name: str, address: str) -> None:
+        print(f"{name} is served at {address}; Ctrl-C ends it. In another terminal:")
+        print(
+            f"lw-torchrl plan generate MT10 --model {name} --base-url {address} --constrain --format basic_py",
+            flush=True,
+        )
+
+    serve_model(file, host=host, port=port, context=context, threads=threads, ready=ready)
 
 
 COMMANDS: dict[str, Callable[..., Output | None]] = {

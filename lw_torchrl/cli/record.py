@@ -1,28 +1,18 @@
-"""``lw-torchrl record``: episodes of any policy, to look at in rerun."""
+"""``lw-torchrl record`` and ``view``: episodes of any policy, recorded and looked at in rerun."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from lw_torchrl.cli.outputs import check_file
-from lw_torchrl.cli.sources import (
-    ACTORS,
-    check_actor,
-    check_encoder,
-    check_plan_files,
-    load_policy,
-    one_or_many,
-    read_plans,
-    read_tasks,
-    simulated,
-)
-from lw_torchrl.cli.tables import Output
-from lw_torchrl.cli.threads import use_one_thread
+from lw_torchrl.cli import options
+from lw_torchrl.cli.output import Output
 
 if TYPE_CHECKING:
     from lw_torchrl.envs.episodes import FinishedEpisode
@@ -40,13 +30,13 @@ def record(
     plans: tuple[str, ...] = (),
     attribute: bool = False,
     reference: tuple[str, ...] = (),
-    task_file: Path | None = None,
-    text_encoder: str | None = None,
+    task_file: options.TaskFile = None,
+    text_encoder: options.OwnEncoder = None,
     seed: int = 1000,
     noise: float = 0.1,
     max_steps: int = 500,
     out: Path | None = None,
-    json: bool = False,
+    json: options.Json = False,
 ) -> Output:
     """Record episodes: the robot in 3-D, the plan as it goes, what held when, and how it ended.
 
@@ -60,46 +50,43 @@ def record(
         episodes: their indices, as in an evaluation with this seed.
         plans: whose steps and conditions are shown and, by policies that read plans, carried out: MT10, MT50, .plan or
             .json files, or folders. If none is given, a policy's own, or else the shipped ones.
-        attribute: say of each failed episode whether a query, the plan or a skill was at fault, or time; it is run
-            again a few times. For scripted and for policies with plans.
-        reference: with --attribute, plans that are trusted, for failed episodes to be run again with.
-        task_file: tasks of yours, whose objects and points the plans may name.
-        text_encoder: the function that a policy was trained with, if it was one of yours, as my_texts:encode.
+        attribute: say why each failed episode failed: a query, the plan, a skill or time. It is run again a few times.
+            For scripted and for policies with plans.
+        reference: with --attribute, trusted plans for running failed episodes again.
         seed: fixes initial states, goals and noise.
         noise: standard deviation of the noise on the executed action.
         max_steps: of an episode.
         out: the file; runs/recordings/TASK-POLICY.rrd if none is given. One that is there is replaced.
-        json: print one JSON document instead, see docs/cli.md.
     """
     if reference and not attribute:
         raise ValueError("--reference is for --attribute, which runs failed episodes again with these plans")
     for option, who in (("policy", policy), ("compare", compare or policy)):
-        check_actor(option, who)
-    check_encoder(text_encoder)
-    check_plan_files("--reference", reference)
-    known = dict(read_tasks(task_file))
-    tasks = simulated("names", one_or_many(names), known)
-    given = read_plans(plans, known) if plans else None
+        options.check_actor(option, who)
+    options.check_encoder(text_encoder)
+    options.check_plan_files("--reference", reference)
+    known = dict(options.read_tasks(task_file))
+    tasks = options.simulated("names", options.one_or_many(names), known)
+    given = options.read_plans(plans, known) if plans else None
     label = names[0] if len(names) == 1 else f"{len(names)}-tasks"
     out = out or Path("runs/recordings") / f"{label}-{Path(policy).stem}.rrd"
-    check_file("--out", out, ".rrd")
+    options.check_file("--out", out, ".rrd")
     import lw_torchrl as lw
     from lw_torchrl._files import replacing
     from lw_torchrl.record.rollouts import run_recorded
 
-    use_one_thread()
-    trusted = read_plans(reference, known) if reference else None
-    options: dict[str, Any] = {"seed": seed, "noise_scale": noise, "max_steps": max_steps}
+    options.use_one_thread()
+    trusted = options.read_plans(reference, known) if reference else None
+    episode_options: dict[str, Any] = {"seed": seed, "noise_scale": noise, "max_steps": max_steps}
     # What can be refused is refused before the first episode runs.
     cast = [_cast(who, tasks, given, known, seed, max_steps, text_encoder) for who in filter(None, (policy, compare))]
     output, rows = Output(json), []
     recorded: list[list[str]] = []
     with replacing(out) as file, lw.RerunLogger(file, exp_name=out.stem) as logger:
         for actor, shown, who in cast:
-            found = run_recorded(actor, tasks, plans=shown, episodes=episodes, progress=True, **options)
+            found = run_recorded(actor, tasks, plans=shown, episodes=episodes, progress=True, **episode_options)
             why: Mapping[tuple[str, int], Failure] = {}
             if attribute and shown is not None and hasattr(actor, "with_plans"):
-                failures = lw.attribute_failures(found, shown, actor=actor, reference=trusted, **options)
+                failures = lw.attribute_failures(found, shown, actor=actor, reference=trusted, **episode_options)
                 why = {(one.task, one.episode): one for one in failures}
             pages = []
             for one in found:
@@ -133,14 +120,14 @@ def _cast(
     from lw_torchrl.data.behaviours import behaviour_of
     from lw_torchrl.data.segment_actor import SegmentActor
 
-    if who not in ACTORS:
-        actor = load_policy(Path(who), seed, plans, text_encoder)
+    if who not in options.ACTORS:
+        actor = options.load_policy(Path(who), seed, plans, text_encoder)
         if missing := [task for task in tasks if task not in actor.tasks]:
             raise ValueError(
                 f"the policy of {who!r} does not know {', '.join(missing)}; it knows {', '.join(actor.tasks)}"
             )
         return actor, actor.plans, Path(who).stem
-    shown = read_plans(("MT50",), known) if plans is None else plans
+    shown = options.read_plans(("MT50",), known) if plans is None else plans
     shown.require(tasks)
     shown = lw.Plans({task: shown[task] for task in tasks})
     if who == "expert":
@@ -156,3 +143,56 @@ def _line(episode: FinishedEpisode, who: str, failure: Failure | None) -> str:
     ended = "failed" if first is None else f"success at step {first}"
     why = "" if failure is None else f", {failure.cause}: {failure.why}"
     return f"{episode.task}, episode {episode.episode}, {who}: {ended}{why}"
+
+
+def view(
+    recording: Positional[Annotated[Path, arg(metavar="RUN|FILE")]],
+    /,
+    episode: str | None = None,
+    screenshot: Path | None = None,
+    step: int | None = None,
+    window_size: str = "1400x900",
+    html: Path | None = None,
+    web: bool = False,
+    port: int = 0,
+) -> None:
+    """Open a recording in the rerun viewer; or take a picture of it, write it as one page, or serve it as one.
+
+    Example: lw-torchrl view runs/demo --episode drawer-open --screenshot picture.png --step 80
+
+    Args:
+        recording: an .rrd file, or a folder that holds one.
+        episode: open at this tab, by its title or its episode's name.
+        screenshot: write a .png here and open no window; wants Debian's mesa-vulkan-drivers and libvulkan1.
+        step: the step to open at; by default the most telling one, of a training the last.
+        window_size: of the picture or the window, WIDTHxHEIGHT.
+        html: write one self-contained page here, some 20 MB, that opens from disk in a browser.
+        web: serve a page on this machine and print its address, until Ctrl-C.
+        port: of the page; 0 takes a free one.
+    """
+    given = [f"--{name}" for name, value in (("screenshot", screenshot), ("html", html), ("web", web)) if value]
+    if len(given) > 1:
+        raise ValueError(f"give one of --screenshot, --html and --web, got {' and '.join(given)}")
+    for option, file, ending in (("--screenshot", screenshot, ".png"), ("--html", html, ".html")):
+        if file is not None:
+            options.check_file(option, file, ending)
+    if not re.fullmatch(r"[1-9]\d*x[1-9]\d*", window_size):
+        raise ValueError(f"window_size must be like '1400x900', got {window_size!r}")
+    if not recording.exists():
+        raise FileNotFoundError(f"recording: there is no file or folder {str(recording)!r}")
+    if recording.is_dir() and not any(recording.glob("*.rrd")):
+        raise FileNotFoundError(f"recording: the folder {str(recording)!r} holds no recording (*.rrd)")
+    from lw_torchrl.record import WebPage, open_viewer, write_html
+
+    if web:
+        with WebPage(recording, episode=episode, step=step, port=port) as page:
+            print(f"{page.address}  (Ctrl-C ends it)", flush=True)
+            with suppress(KeyboardInterrupt):
+                page.serve()
+        return
+    if html is not None:
+        write_html(recording, html, episode=episode, step=step)
+    else:
+        open_viewer(recording, screenshot, window_size, step=step, episode=episode)
+    if written := html or screenshot:
+        print(f"written to {written}")

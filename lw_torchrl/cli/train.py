@@ -9,20 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from lw_torchrl._checks import check_choice
-from lw_torchrl.cli.outputs import check_file
-from lw_torchrl.cli.sources import (
-    METHODS,
-    check_dataset,
-    check_encoder,
-    check_saved,
-    make_logger,
-    one_or_many,
-    read_encoder,
-    read_plans,
-    read_tasks,
-)
-from lw_torchrl.cli.tables import Output
-from lw_torchrl.cli.threads import use_one_thread
+from lw_torchrl.cli import options
+from lw_torchrl.cli.output import Output
 
 if TYPE_CHECKING:
     from lw_torchrl.language.plans import Plans
@@ -36,9 +24,9 @@ def train(
     /,
     out: Path,
     tasks: tuple[str, ...] = (),
-    plans: tuple[str, ...] = ("MT10",),
-    task_file: Path | None = None,
-    text_encoder: str | None = None,
+    plans: options.PlanSources = ("MT10",),
+    task_file: options.TaskFile = None,
+    text_encoder: options.EncoderName = None,
     method: str = "pcbc",
     mix: Literal["latents", "actions"] | None = None,
     features: Literal["raw", "differences", "relative", "both"] = "differences",
@@ -55,10 +43,10 @@ def train(
     qaf_anchor: float = 0.0,
     seed: int = 0,
     logger: Literal["csv", "tensorboard", "wandb"] | None = None,
-    device: str = "cpu",
-    json: bool = False,
+    device: options.Device = "cpu",
+    json: options.Json = False,
 ) -> Output:
-    """Train a policy on demonstrations. Stopped and started again it carries on from its checkpoint.
+    """Train a policy on demonstrations. If it is stopped, the same command resumes it.
 
     Example: lw-torchrl train demos/mt10 --out runs/mt10.zip
 
@@ -67,13 +55,9 @@ def train(
     Args:
         data: a dataset's folder, of `lw-torchrl collect`.
         out: the policy, one file.
-        tasks: MT10, or names of tasks: only their demonstrations; all that the dataset has if none is given.
-        plans: MT10 or MT50 for the shipped plans, .plan files, .json files of pairs, or folders; where several have a
-            plan for a task, the last one's counts.
-        task_file: tasks of yours, whose objects and points the plans may name.
-        text_encoder: a function of yours that turns texts into vectors, as my_texts:encode; evaluate wants it again.
+        tasks: MT10, or names of tasks, to train on only their demonstrations; by default all of the dataset.
         method: pcbc, conditioned on the plan; or a baseline: dc, on the task's description, one-hot, on its number.
-        mix: mix the skills' latents, as in the paper and by default, or their actions; of a policy with plans.
+        mix: of a policy with plans, mix the skills' latents, as in the paper and by default, or their actions.
         features: what the policy sees: the raw observation; differences between hand, objects and goal; relative, these
             without the hand's height and the gripper's opening; or both the first and the second.
         width: of the action decoder's hidden layers.
@@ -82,21 +66,17 @@ def train(
         batch_size: rows of a minibatch, equally many of each task.
         learning_rate: at the start; a cosine brings it to 0.
         after_success: leave out steps so long after an episode's first success; None keeps all.
-        latent_consistency: weight of a term that keeps skills near whose texts are near; of a policy with plans.
-        begin: a trained policy, whose weights, plans and options are begun with; its statistics stay.
-        evaluator: a network that answers the conditions inside the policy and is trained with it: of `lw-torchrl
-            train-evaluator`, or the word new. One that reads pictures has them drawn beside DATA.
-        answers: what its answers count in the attention, see docs/evaluators.md; by default tanh, with --begin hard.
-        qaf_anchor: weight of the error of its answers, beside the error of the actions; without, nothing but the
-            demonstrations holds a condition to its words, and a new evaluator needs it.
+        latent_consistency: weight of a term that keeps skills with similar texts similar; of a policy with plans.
+        begin: a trained policy to start from: its weights, plans, options and statistics.
+        evaluator: a network that answers the conditions inside the policy and is trained with it: a file of
+            `lw-torchrl train-evaluator`, or the word new. If it reads pictures, they are drawn beside DATA.
+        answers: how its answers enter the attention, see docs/evaluators.md; by default tanh, with --begin hard.
+        qaf_anchor: weight of the error of its answers, beside the error of the actions. Without it conditions may drift
+            from their words; a new evaluator needs it.
         seed: of the initial weights and the minibatches.
-        logger: also write loss and learning rate there, below logs/ beside the policy.
-        device: where the networks work: cpu; cuda, or cuda:1 for the second of several; mps, a Mac's; or auto, the GPU
-            where there is one. Minibatches are the same everywhere, and the policy can be loaded
-            anywhere.
-        json: print one JSON document instead, see docs/cli.md.
+        logger: also write loss and learning rate, below logs/ beside the policy.
     """
-    check_file("--out", out)
+    options.check_file("--out", out)
     if begin is not None and out.resolve() == begin.resolve():
         raise ValueError("--out must be another file than --begin, which is only read")
     from lw_torchrl.language.tasks import resolve_tasks
@@ -109,18 +89,18 @@ def train(
         raise ValueError(
             "--evaluator new knows nothing: give --qaf-anchor 1 too, by which it learns what conditions mean"
         )
-    check_dataset("data", data)
-    check_choice("method", method, METHODS)
-    check_encoder(text_encoder)
-    known = read_tasks(task_file)
-    chosen = resolve_tasks(one_or_many(tasks), tasks=known) if tasks else ()
+    options.check_dataset("data", data)
+    check_choice("method", method, options.METHODS)
+    options.check_encoder(text_encoder)
+    known = options.read_tasks(task_file)
+    chosen = resolve_tasks(options.one_or_many(tasks), tasks=known) if tasks else ()
     if begin is not None:
-        check_saved("--begin", begin)
+        options.check_saved("--begin", begin)
         given = {"method": method, "mix": mix, "features": features, "width": width, "depth": depth, "plans": plans}
         _refuse_beside_begin(given)
     if evaluator not in (None, "new"):
-        check_saved("evaluator", Path(evaluator), "network", "train-evaluator")
-    loaded = read_plans(plans, known)
+        options.check_saved("evaluator", Path(evaluator), "network", "train-evaluator")
+    loaded = options.read_plans(plans, known)
     import torch
 
     import lw_torchrl as lw
@@ -128,17 +108,17 @@ def train(
     from lw_torchrl._devices import check_device
     from lw_torchrl.modules.policy import make_policy, policy_class
 
-    use_one_thread()
+    options.use_one_thread()
     there = check_device("device", device)
-    encoder = read_encoder(text_encoder)
-    options: dict[str, Any] = {"features": features, "width": width, "depth": depth}
+    encoder = options.read_encoder(text_encoder)
+    actor_options: dict[str, Any] = {"features": features, "width": width, "depth": depth}
     reads_plans = policy_class(modules.METHODS[method].policy).plan_options
     if mix is not None and not reads_plans:
         raise ValueError(f"--mix is for a method that reads plans, --method {method} does not")
     if latent_consistency and not reads_plans:
         raise ValueError(f"--latent-consistency is for a method that reads plans, --method {method} does not")
     if reads_plans:
-        options["mix"] = mix or "latents"
+        actor_options["mix"] = mix or "latents"
     config = lw.BehavioralCloningConfig(
         steps=steps,
         batch_size=batch_size,
@@ -166,8 +146,8 @@ def train(
         if evaluator is not None:
             if not reads_plans:
                 raise ValueError(f"--evaluator is for a method that reads plans, --method {method} does not")
-            options |= {"evaluator": _evaluator(evaluator, loaded, encoder), "answers": answers or "tanh"}
-        actor = make_policy(method, shown, text_encoder=encoder, **options)
+            actor_options |= {"evaluator": _evaluator(evaluator, loaded, encoder), "answers": answers or "tanh"}
+        actor = make_policy(method, shown, text_encoder=encoder, **actor_options)
     loaded.require(replay.tasks)
     inside = getattr(actor, "evaluator", None)
     if isinstance(inside, lw.HeldEvaluator):
@@ -184,7 +164,7 @@ def train(
         replay.add_column("pixels", lw.data.load_pictures(replay, **pictures))
     elif (transform := actor.transform()) is not None:
         replay.append_transform(transform)
-    writes = None if logger is None else make_logger(logger, out)
+    writes = None if logger is None else options.make_logger(logger, out)
     loss = lw.BehavioralCloningTrainer(actor, replay, config, checkpoint=out, logger=writes, device=there).train()
     output = Output(json)
     output.show("policy", out)

@@ -8,10 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 from tyro.conf import Positional, arg
 
 from lw_torchrl._checks import check_choice
-from lw_torchrl.cli.outputs import check_folder
-from lw_torchrl.cli.sources import ACTORS, check_dataset, check_encoder, one_or_many, read_encoder, simulated
-from lw_torchrl.cli.tables import Output
-from lw_torchrl.cli.threads import use_one_thread
+from lw_torchrl.cli import options
+from lw_torchrl.cli.output import Output
 
 if TYPE_CHECKING:
     from lw_torchrl.modules.clause_evaluator import ClauseEvaluator
@@ -46,10 +44,11 @@ def train_evaluator(
     states_per_task: int = 2000,
     seed: int = 0,
     num_envs: int | None = None,
-    json: bool = False,
+    json: options.Json = False,
 ) -> Output:
-    """Train a network to answer conditions, on all base queries of tasks, and say how well it does. Stopped and started
-    again it carries on.
+    """Train a network to answer conditions, on all base queries of tasks, and say how well it does.
+
+    If it is stopped, the same command resumes it.
 
     Example: lw-torchrl train-evaluator MT10 --out runs/evaluator --held-out-tasks push reach
 
@@ -59,48 +58,47 @@ def train_evaluator(
         tasks: MT10, MT50, or names of tasks, the held-out ones among them.
         out: folder for evaluator.zip, report.json, reliability.png, the episodes that were run, and, with --cameras,
             wrong.png.
-        data: datasets of yours, of `lw-torchrl collect`, in the place of running episodes.
+        data: datasets of `lw-torchrl collect` to use instead of running episodes.
         behaviours: who acts in the episodes that are run, as for `lw-torchrl collect`.
         episodes: of each task and behaviour.
         max_steps: steps of an episode.
-        noise: standard deviations of the execution noise of the expert, gone through in turn.
+        noise: standard deviations of the execution noise of the expert, used in turn.
         cameras: answer from these cameras' pictures instead of from the observation: corner, corner2, corner3, corner4,
             topview, behindGripper, gripperPOV.
         picture: with --cameras, pixels of a picture's height and width.
-        every: only each so-many-th state of an episode is asked, and drawn; by default 1, with --cameras 5.
+        every: use every n-th state of an episode; by default 1, with --cameras 5.
         held_out_tasks: names, or a number of tasks to draw: none of their queries is trained.
         held_out_pairs: the share of pairs of objects none of whose queries is trained.
-        held_out_states: the share of episodes whose states are not trained on.
-        structure: read clauses as they parse, and objects' positions where the tasks' table says; else texts alone.
+        held_out_states: the share of episodes that are not trained on.
+        structure: read parsed clauses, and objects' positions where the tasks' table says; else only texts.
         text_encoder: with --no-structure, a function of yours that turns texts into vectors, as my_texts:encode.
         width: of the hidden layers.
         depth: number of them.
         steps: minibatches; by default 6000, with --cameras 4000.
         batch_size: pairs of a state and a clause in a minibatch, by default 1024; with --cameras states, 48.
         learning_rate: at the start; a cosine brings it to 0. By default 0.003, with --cameras 0.002.
-        states_per_task: at most so many of each task are labelled.
+        states_per_task: the most states that are labelled of each task.
         seed: of the episodes, of what is held out, the initial weights and the minibatches.
         num_envs: environments stepped together; the result does not depend on it.
-        json: print one JSON document instead, see docs/cli.md.
     """
-    check_folder("--out", out)
+    options.check_folder("--out", out)
     if text_encoder is not None and structure:
         raise ValueError("--text-encoder is for --no-structure; with structure no text is read")
     from lw_torchrl._rendering import CAMERAS
     from lw_torchrl.language.tasks import TASKS
 
-    names = simulated("tasks", one_or_many(tasks), TASKS)
+    names = options.simulated("tasks", options.one_or_many(tasks), TASKS)
     drawn = len(held_out_tasks) == 1 and held_out_tasks[0].isdigit()
     for argument, given, allowed in (
-        ("behaviours", behaviours, ACTORS),
+        ("behaviours", behaviours, options.ACTORS),
         ("cameras", cameras, CAMERAS),
         ("held_out_tasks", () if drawn else held_out_tasks, names),
     ):
         for one in given:
             check_choice(argument, one, allowed)
     for folder in data:
-        check_dataset("data", folder)
-    check_encoder(text_encoder)
+        options.check_dataset("data", folder)
+    options.check_encoder(text_encoder)
     import torch
 
     import lw_torchrl as lw
@@ -108,7 +106,7 @@ def train_evaluator(
     from lw_torchrl.evaluation.reliability_figure import plot_reliability
     from lw_torchrl.evaluation.wrong_answers import plot_wrong_answers
 
-    use_one_thread()
+    options.use_one_thread()
     defaults = {"steps": 4000, "batch_size": 48, "learning_rate": 2e-3, "every": 5}
     if not cameras:
         defaults = {"steps": 6000, "batch_size": 1024, "learning_rate": 3e-3, "every": 1}
@@ -122,21 +120,19 @@ def train_evaluator(
         seed=seed,
     )
     torch.manual_seed(seed)
-    options: dict[str, Any] = {
+    network: dict[str, Any] = {
         "structure": structure,
         "depth": depth,
-        "text_encoder": read_encoder(text_encoder),
+        "text_encoder": options.read_encoder(text_encoder),
         "hidden" if cameras else "width": width,
     }
     pictures: dict[str, Any] = {"cameras": cameras, "height": picture, "width": picture}
     plans = lw.load_plans("MT50")
     evaluator: ClauseEvaluator
     if cameras:
-        evaluator = lw.modules.ImageQueryEvaluator(
-            lw.Plans({task: plans[task] for task in names}), **options, **pictures
-        )
+        evaluator = lw.ImageQueryEvaluator(lw.Plans({task: plans[task] for task in names}), **network, **pictures)
     else:
-        evaluator = lw.StateQueryEvaluator(plans, **options)
+        evaluator = lw.StateQueryEvaluator(plans, **network)
     run = {"episodes_per_task": episodes, "max_steps": max_steps, "seed": seed, "num_envs": num_envs}
     roots = list(data) or [_collected(out, who, names, noise, run) for who in behaviours]
     replay = lw.LanguageWorldExperienceReplay(roots, label="executed", episodes=_of_tasks(roots, names))
@@ -189,5 +185,5 @@ def with_evaluator(policy: Policy, path: Path, text_encoder: str | None) -> Poli
 
     if policy.plans is None:
         raise ValueError(f"--evaluator is for a policy with plans, {type(policy).__name__} has none")
-    evaluator: QueryEvaluator = load_evaluator(path, policy.plans, text_encoder=read_encoder(text_encoder))
+    evaluator: QueryEvaluator = load_evaluator(path, policy.plans, text_encoder=options.read_encoder(text_encoder))
     return policy.with_evaluator(evaluator)

@@ -24,7 +24,7 @@ RECORDED = ("drawer-open", "window-open")
 
 @dataclass(frozen=True)
 class DemoConfig:
-    """What the demo does; it is written to config.json beside the results."""
+    """What the demo does, kept in config.json beside the results."""
 
     tasks: tuple[str, ...] = MT10
     demonstrations_per_task: int = 10
@@ -43,19 +43,8 @@ class DemoConfig:
 QUICK = DemoConfig(tasks=RECORDED, demonstrations_per_task=4, training_steps=800, batch_size=100, episodes_per_task=5)
 
 
-def _settle(out: Path, config: DemoConfig) -> None:
-    """Write the configuration, or make sure that the folder is of the same one."""
-    path = out / "config.json"
-    stated = json.loads(json.dumps(asdict(config)))
-    if path.is_file():
-        if read_json(path, "out: the configuration") != stated:
-            raise ValueError(f"out: {str(out)!r} holds a demo of another configuration; choose another folder")
-        return
-    write_json(path, stated)
-
-
 def run_demo(out: Path, config: DemoConfig) -> EvaluationResult:
-    """Run the demo, or what is left of it, and print what there is to see.
+    """Run the demo, or what is left of it, and print its results.
 
     Args:
         out: gets config.json, demonstrations/, checkpoint.zip, results.json, success.png and rollout.rrd. What is
@@ -65,8 +54,12 @@ def run_demo(out: Path, config: DemoConfig) -> EvaluationResult:
     Raises:
         ValueError: ``out`` holds a demo of another configuration, or another process is at work there.
     """
+    stated, path = json.loads(json.dumps(asdict(config))), out / "config.json"
     with held(out, "out", folder=True):
-        _settle(out, config)
+        if not path.is_file():
+            write_json(path, stated)
+        elif read_json(path, "out: the configuration") != stated:
+            raise ValueError(f"out: {str(out)!r} holds a demo of another configuration; choose another folder")
         return _run(out, config)
 
 

@@ -1,27 +1,69 @@
-"""How policies are learned offline: the methods, and one recipe for all of them, all mixtures and all tasks."""
+"""Offline experiments: mixtures of behaviours, methods, one recipe for all of them, and the tables of runs."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Literal
+from typing import Any, Literal
 
 from lw_torchrl._checks import check_choice, check_int, check_probability, check_scale
-from lw_torchrl.data.filters import EpisodeFilter
+from lw_torchrl.data import BEHAVIOURS, EpisodeFilter
 from lw_torchrl.data.rewards import REWARDS, RewardName
+from lw_torchrl.language.tasks import MT10
+
+TASK_SETS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        "five": ("door-open", "drawer-open", "peg-insert-side", "pick-place", "push"),
+        "MT10": MT10,
+        "two": ("door-open", "drawer-open"),
+    }
+)
+"""By name: five tasks of MT10, without those that chance solves; MT10; and two, to try an experiment."""
+
+
+@dataclass(frozen=True)
+class Portion:
+    """Episodes of one behaviour.
+
+    Attributes:
+        behaviour: a name of :data:`BEHAVIOURS`.
+        episodes: of each task.
+    """
+
+    behaviour: str
+    episodes: int
+
+
+_WRONG, _RANDOM = Portion("wrong", 20), Portion("random", 10)
+MIXTURES: Mapping[str, tuple[Portion, ...]] = MappingProxyType(
+    {
+        "B": (Portion("spoilt-30", 20), Portion("spoilt-60", 20), _WRONG, _RANDOM),
+        "W": (Portion("spoilt-30", 20), _WRONG, _RANDOM),
+        "C": (Portion("expert", 5), _WRONG, _RANDOM),
+    }
+)
+"""What a policy learns from, by name: B, plans spoilt a little and much, wrong skills, chance, no expert; W, B without
+the plans spoilt a little; C, the hard case: five expert demonstrations among wrong skills and chance."""
+
+_LED_ASTRAY: dict[str, Any] = {"noise_scale": 0.3, "noise_hold": 10, "gripper_noise_factor": 0.5}
+NOISE: Mapping[str, dict[str, Any]] = dict.fromkeys(BEHAVIOURS, _LED_ASTRAY) | {
+    "expert": {"noise_scale": 0.0},
+    "random": {"noise_scale": 0.1, "noise_hold": 10, "gripper_noise_factor": 1.0},
+}
+"""How each behaviour is executed: the expert without noise, chance with a little, scripts with much."""
 
 
 @dataclass(frozen=True)
 class OfflineMethod:
-    """What is made of a mixture.
+    """How a policy is learned from a mixture.
 
     Attributes:
         name: in folders and tables.
-        loss: a name of :data:`lw_torchrl.paper.offline_training.LOSSES`.
+        loss: a name of :data:`lw_torchrl.paper.offline.DISTRIBUTIONS`.
         keep: which episodes it sees; None for all.
-        critic: whether it has a critic, which may see something else than the actor.
-        version: 1 more whenever it is changed, so that what it gave before is refused.
+        critic: whether it has a critic, which may be conditioned otherwise than the actor.
+        version: raised by 1 whenever the method changes, so that earlier results are refused.
     """
 
     name: str
@@ -45,9 +87,9 @@ OFFLINE_METHODS: Mapping[str, OfflineMethod] = MappingProxyType(
         )
     }
 )
-"""By name: imitation weighted by the advantages of a value learned before; behavioral cloning of the successes (of a
-task without any, of what the next one takes), of the fifth of each task's episodes with the highest return, and of all;
-and TorchRL's IQL, TD3+BC and CQL."""
+"""By name: imitation weighted by the advantages of a value that was learned before; behavioral cloning of the successes
+(of a task without any, as the next method), of the fifth of each task's episodes with the highest return, and of all
+episodes; and TorchRL's IQL, TD3+BC and CQL."""
 
 
 @dataclass(frozen=True)
@@ -59,8 +101,8 @@ class OfflineRecipe:
         n_steps, gamma: of their targets.
         expectile: of the value.
         beta, max_weight: of the weights by advantage, as for :class:`AdvantageWeightedLoss`.
-        distance: to the action that is imitated, weighted or not. The median of what was done in a state ("l1") commits
-            itself where their mean would half open the gripper.
+        distance: to the action that is imitated. With "l1" a policy learns the median of the actions in a state; the
+            mean ("l2") of opening and closing would half open the gripper.
         temperature: of IQL's actor.
         alpha: of TD3+BC, the weight of the value beside the imitation.
         cql_weight: of CQL's penalty.
@@ -97,3 +139,35 @@ class OfflineRecipe:
             check_scale(name, getattr(self, name))
         for name in ("n_steps", "steps", "value_steps", "batch_size", "width", "depth", "critic_depth"):
             check_int(name, getattr(self, name), minimum=1)
+
+
+@dataclass(frozen=True)
+class OfflineTable:
+    """Runs that are compared.
+
+    Attributes:
+        tasks: a name of :data:`TASK_SETS`.
+        rows: mixture to its rows, (method, actor, critic) each; the first is compared with each of the others.
+    """
+
+    tasks: str
+    rows: Mapping[str, tuple[tuple[str, str, str], ...]]
+
+
+_PLAN = "pcbc", "pcbc"
+_CONDITIONS = ("pcbc", "dc", "one-hot")
+_METHODS = tuple((name, *_PLAN) for name in OFFLINE_METHODS)
+_SHORT = tuple((name, *_PLAN) for name in ("advantage", "filtered-bc", "best-bc", "bc"))
+_CONDITIONING = (
+    *(("advantage", actor, critic) for actor in _CONDITIONS for critic in _CONDITIONS),
+    *(("filtered-bc", actor, "pcbc") for actor in _CONDITIONS),
+)
+OFFLINE_TABLES: Mapping[str, OfflineTable] = MappingProxyType(
+    {
+        "methods": OfflineTable("five", {"B": _METHODS, "W": _METHODS, "C": _SHORT}),
+        "conditioning": OfflineTable("five", {"B": _CONDITIONING, "W": _CONDITIONING}),
+        "mt10": OfflineTable("MT10", {"B": _SHORT[:2]}),
+        "quick": OfflineTable("two", {"W": _SHORT[:2]}),
+    }
+)
+"""By name: seven methods on plans; what actors and critics are conditioned on; all of MT10; two tasks, to try it."""

@@ -1,9 +1,7 @@
-"""Online experiments as runs of work: weak policies cloned from few demonstrations, and what methods make of them."""
+"""Online runs: weak policies, cloned from few demonstrations, that methods improve, as a whole or in one plan step."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from hashlib import file_digest
@@ -11,46 +9,52 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torchrl.record.loggers import Logger
 
 from lw_torchrl._checks import check_choice, check_int
 from lw_torchrl._files import held
-from lw_torchrl.data.co_learning_sampler import GROWN, CoLearningSampler
-from lw_torchrl.data.replay import LanguageWorldExperienceReplay
+from lw_torchrl.data import CoLearningSampler, LanguageWorldExperienceReplay
+from lw_torchrl.data.co_learning_sampler import GROWN
 from lw_torchrl.data.rewards import RewardName
-from lw_torchrl.evaluation import EvaluationResult, evaluate
+from lw_torchrl.envs.episodes import FinishedEpisode
+from lw_torchrl.evaluation import EvaluationResult, PlanUse, evaluate, stuck_steps, weakest_step
+from lw_torchrl.evaluation.protocol import policy_of
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.modules.policy import METHODS, Policy, make_policy
 from lw_torchrl.modules.residual_actor import ResidualActor
-from lw_torchrl.paper.execution import EVALUATION_SEED, RESULTS, load_result
+from lw_torchrl.paper.imitation import ExpertDataset
 from lw_torchrl.paper.recipes import TARGET
-from lw_torchrl.paper.runs import Dataset, own_tasks, plain
-from lw_torchrl.paper.tuning import WEAKEST, Elsewhere, tune_step
-from lw_torchrl.training.behavioral_cloning import BehavioralCloningTrainer
-from lw_torchrl.training.checkpoint import describe_data, load_actor, read_description, save_actor
-from lw_torchrl.training.config import BehavioralCloningConfig
-from lw_torchrl.training.online import LEARNERS, OnlineTrainer
-from lw_torchrl.training.online_config import OnlineConfig
-from lw_torchrl.training.training_state import check_description
+from lw_torchrl.paper.runs import Run, Work, execute_run, kept_policy, own_tasks, plain
+from lw_torchrl.training import (
+    LEARNERS,
+    BehavioralCloningConfig,
+    BehavioralCloningTrainer,
+    OnlineConfig,
+    OnlineTrainer,
+    load_actor,
+)
+from lw_torchrl.training.checkpoint import read_description
 
 START = "start"
 """The policy that is begun with: a run beside those of :data:`~lw_torchrl.training.LEARNERS`."""
+WEAKEST = "weakest"
+"""The step that failed episodes came to and not beyond."""
 ONLINE_SEED = 20_000
-"""The episodes of training seed k have seed 20000 + k: neither those of its demonstrations nor of its evaluation."""
+"""The training episodes of seed k have seed 20000 + k, which no demonstration and no evaluation has."""
 DIAGNOSIS_SEED = 30_000
 """Those in which a policy's weakest step is looked for."""
+_DIAGNOSED = 20  # episodes
 
 
 @dataclass(frozen=True)
 class OnlineRecipe:
-    """How weak policies are made and trained on, the same for every task.
+    """How weak policies are made and improved, the same for every task.
 
     Attributes:
-        demonstrations: clean ones of the task, which succeed.
+        demonstrations: of the task, without noise, all successful.
         feature_noise: of the policy cloned from them.
-        cloning: how it is cloned; the run's seed takes the place of its own.
+        cloning: how it is cloned; its seed is replaced by the run's.
         reward, n_steps: of the buffer.
-        config: of the training; the run's seed takes the place of its own.
+        config: of the training; its seed is replaced by the run's.
     """
 
     demonstrations: int = 1
@@ -67,8 +71,8 @@ class OnlineRecipe:
 
 
 @dataclass(frozen=True)
-class OnlineRun:
-    """A policy of one task, method and seed, and its evaluation: what a scheduler runs.
+class OnlineRun(Run):
+    """A policy of one task, method and seed, and its evaluation.
 
     Attributes:
         task: its name.
@@ -79,7 +83,7 @@ class OnlineRun:
         start: a policy file to begin with; None to clone one from the demonstrations.
         episodes: evaluated.
         step: of method "residual", the step of the task's plan that alone is corrected, counted from 0, or "weakest",
-            the one that the start's failed episodes came to and not beyond; None for everywhere.
+            the one that the start's failed episodes reached and did not pass; None for all steps.
     """
 
     task: str
@@ -107,16 +111,22 @@ class OnlineRun:
         return Path(self.condition if self.start is None else f"from-{self.start.stem}")
 
     @property
+    def label(self) -> str:
+        return self.method
+
+    @property
+    def scope(self) -> tuple[str, ...]:
+        return (self.task,)
+
+    @property
     def folder(self) -> Path:
-        """Where its files go, below the experiments' folder."""
         step = f"step{self.step + 1}" if isinstance(self.step, int) else self.step
         method = self.method if step is None else f"{self.method}-{step}"
         return self.group / self.task / method / f"seed{self.seed}"
 
     @property
-    def dataset(self) -> Dataset:
-        """Its demonstrations."""
-        return Dataset(self.task, self.recipe.demonstrations, TARGET, self.seed)
+    def datasets(self) -> tuple[ExpertDataset, ...]:
+        return (ExpertDataset(self.task, self.recipe.demonstrations, TARGET, self.seed),)
 
     @property
     def begin(self) -> OnlineRun:
@@ -135,7 +145,6 @@ class OnlineRun:
         return Plans([plans[self.task]])
 
     def describe(self, plans: Plans) -> dict[str, Any]:
-        """Everything that its result hangs on, as JSON."""
         recipe = asdict(self.recipe)
         if self.method == START:
             del recipe["config"], recipe["reward"], recipe["n_steps"]
@@ -147,150 +156,139 @@ class OnlineRun:
         own = self.own_plans(plans)
         return plain(found | {"condition": self.condition, "plans": own.fingerprint} | own_tasks(own))
 
+    def learn(self, work: Work) -> tuple[Policy, dict[str, Any]]:
+        if self.method == START:
+            return self.load_start(work), {}
+        file = work.out / self.folder / "policy.zip"
 
-def _load_start(run: OnlineRun, plans: Plans, out: Path, progress: bool) -> Policy:
-    """The policy that a run begins with: the one given, or the one cloned, which is kept for all methods."""
-    if run.start is not None:
-        policy = load_actor(run.start)
-        if run.task not in policy.tasks:
-            raise ValueError(f"start: the policy of {str(run.start)!r} does not know the task {run.task!r}")
-        return policy
-    folder, described = out / run.begin.folder, {"run": run.begin.describe(plans)}
-    file, checkpoint = folder / "policy.zip", folder / "checkpoint.zip"
-    with held(file, "out", wait=True):
-        if not file.is_file():
-            torch.manual_seed(run.seed)
-            actor = make_policy(run.condition, run.own_plans(plans), feature_noise=run.recipe.feature_noise)
-            replay = LanguageWorldExperienceReplay(
-                out / run.dataset.folder, label="executed", terminate_on_success=True, transform=actor.transform()
-            )
-            config = replace(run.recipe.cloning, seed=run.seed)
-            BehavioralCloningTrainer(actor, replay, config, checkpoint=checkpoint, progress=progress).train()
-            save_actor(actor, file, data=describe_data(replay), **described)
-        checkpoint.unlink(missing_ok=True)
-    check_description(file, described)
-    return load_actor(file)
+        def train(checkpoint: Path) -> dict[str, Any]:
+            trainer, tuned = self._make_trainer(work, file, checkpoint)
+            trainer.train()
+            return {"actor": trainer.policy, "replay": trainer.replay, "history": trainer.history, **tuned}
 
+        policy, description = kept_policy(file, {"run": self.describe(work.plans)}, train), read_description(file)
+        return policy, {name: description[name] for name in ("history", "tuned") if name in description}
 
-def _train(
-    run: OnlineRun, plans: Plans, out: Path, progress: bool, make_logger: Callable[[Path], Logger] | None
-) -> tuple[Policy, dict[str, Any]]:
-    """What a run makes of its start, kept in ``policy.zip``; its "history", what became of each round, and "tuned", the
-    step of a plan if it is of one."""
-    folder, described = out / run.folder, {"run": run.describe(plans)}
-    file, checkpoint = folder / "policy.zip", folder / "checkpoint.zip"
-    if not file.is_file():
-        actor = _load_start(run, plans, out, progress)
-        recipe, config = run.recipe, replace(run.recipe.config, seed=ONLINE_SEED + run.seed)
-        told: dict[str, Any] = {}
-        if run.step is not None:
+    def evaluate(self, policy: Policy, work: Work) -> tuple[EvaluationResult, dict[str, Any]]:
+        if self.step is None:
+            return super().evaluate(policy, work)
+        assert isinstance(policy, ResidualActor)
+        before = execute_run(self.begin, work.plans, work.out, progress=work.progress).mean_success
+        watch = Elsewhere(self.load_start(work), policy)
+        result = self.rollouts(policy, work, also_record=policy.in_keys, on_episode=watch)
+        return result, {"before": before, "elsewhere": watch.to_json()}
+
+    def load_start(self, work: Work) -> Policy:
+        """The policy that it begins with: the one given, or the one cloned, which is kept for all methods."""
+        if self.start is not None:
+            policy = load_actor(self.start)
+            if self.task not in policy.tasks:
+                raise ValueError(f"start: the policy of {str(self.start)!r} does not know the task {self.task!r}")
+            return policy
+
+        def train(checkpoint: Path) -> dict[str, Any]:
+            torch.manual_seed(self.seed)
+            actor = make_policy(self.condition, self.own_plans(work.plans), feature_noise=self.recipe.feature_noise)
+            replay, config = self._replay(work, actor), replace(self.recipe.cloning, seed=self.seed)
+            options: dict[str, Any] = {"checkpoint": checkpoint, "progress": work.progress}
+            BehavioralCloningTrainer(actor, replay, config, **options).train()
+            return {"actor": actor, "replay": replay}
+
+        file = work.out / self.begin.folder / "policy.zip"
+        with held(file, "out", wait=True):
+            return kept_policy(file, {"run": self.begin.describe(work.plans)}, train)
+
+    def _replay(self, work: Work, actor: Policy, **options: Any) -> LanguageWorldExperienceReplay:
+        return LanguageWorldExperienceReplay(
+            work.out / self.datasets[0].folder,
+            label="executed",
+            terminate_on_success=True,
+            transform=actor.transform(),
+            **options,
+        )
+
+    def _make_trainer(self, work: Work, file: Path, checkpoint: Path) -> tuple[OnlineTrainer, dict[str, Any]]:
+        """A trainer of the start, and "tuned", the step of a plan if the run is of one."""
+        actor: Policy = self.load_start(work)
+        config, tuned = replace(self.recipe.config, seed=ONLINE_SEED + self.seed), {}
+        if self.step is not None:
+            options: dict[str, Any] = {"scale": config.residual_scale, "seed": DIAGNOSIS_SEED + self.seed}
             with torch.random.fork_rng(devices=[]):
                 torch.manual_seed(config.seed)
-                actor, told["tuned"] = tune_step(
-                    actor,
-                    run.task,
-                    run.step,
-                    scale=config.residual_scale,
-                    seed=DIAGNOSIS_SEED + run.seed,
-                    progress=progress,
-                )
-        replay = LanguageWorldExperienceReplay(
-            out / run.dataset.folder,
-            label="executed",
-            reward=recipe.reward,
-            terminate_on_success=True,
-            n_steps=recipe.n_steps,
+                actor, told = tune_step(actor, self.task, self.step, progress=work.progress, **options)
+            tuned = {"tuned": told}
+        replay = self._replay(
+            work,
+            actor,
+            reward=self.recipe.reward,
+            n_steps=self.recipe.n_steps,
             gamma=config.gamma,
             grow=config.frames,
             sampler=CoLearningSampler(GROWN),
-            transform=actor.transform(),
         )
-        trainer = OnlineTrainer(
-            actor,
-            replay,
-            config,
-            method=run.method,
-            tasks=run.task,
-            checkpoint=checkpoint,
-            logger=None if make_logger is None else make_logger(file),
-            progress=progress,
-        )
-        trainer.train()
-        save_actor(trainer.policy, file, data=describe_data(replay), history=trainer.history, **told, **described)
-    checkpoint.unlink(missing_ok=True)
-    check_description(file, described)
-    description = read_description(file)
-    return load_actor(file), {name: description[name] for name in ("history", "tuned") if name in description}
+        logger = None if work.make_logger is None else work.make_logger(file)
+        options = {"checkpoint": checkpoint, "logger": logger, "progress": work.progress}
+        return OnlineTrainer(actor, replay, config, method=self.method, tasks=self.task, **options), tuned
 
 
-def execute_online(
-    run: OnlineRun,
-    plans: Plans,
-    out: Path,
-    *,
-    progress: bool = True,
-    make_logger: Callable[[Path], Logger] | None = None,
-) -> EvaluationResult:
-    """Do a run, or what is left of it; its result is written last, to ``out/run.folder/results.json``.
+def tune_step(
+    start: Policy, task: str, step: int | str, *, scale: float, seed: int, progress: bool = True
+) -> tuple[ResidualActor, dict[str, Any]]:
+    """A residual of one step of a task's plan, and what the result says of it, as JSON.
 
     Args:
-        run: what to do.
-        plans: a plan for its task.
-        out: the experiments' folder.
-        progress: show progress bars.
-        make_logger: a TorchRL logger for a policy's file, for the training.
-
-    Returns:
-        The evaluation, action noise 0.1; ``config["run"]`` says what was done, ``config["history"]`` what became of
-        each round, and ``config["seconds"]`` how long this call took. Of a run of one step, ``config["tuned"]`` says
-        which, ``config["before"]`` the start's success in the same episodes, and ``config["elsewhere"]`` in how many
-        "states" of them the step was not in force ("outside"), and in how many of these the action is not the start's.
+        start: the policy, conditioned on plans.
+        task: one of its tasks.
+        step: of its plan, counted from 0; or "weakest", the one that failed episodes reached and did not pass.
+        scale: how far an action can be corrected.
+        seed: of 20 episodes, in which the weakest step is looked for.
+        progress: show a progress bar of them.
 
     Raises:
-        ValueError: ``out`` holds the same run of another configuration; the start does not know the task.
+        ValueError: the plan does not have the step; or, to find the weakest, no episode failed.
+        TypeError: the policy is not conditioned on plans.
     """
-    if (done := load_result(run, plans, out)) is not None:
-        return done
-    with held(out / run.folder, "out", folder=True, wait=True):
-        return load_result(run, plans, out) or _execute(run, plans, out, progress, make_logger)
+    told: dict[str, Any] = {}
+    if isinstance(step, str):
+        check_choice("step", step, (WEAKEST,))
+        if start.plans is None:
+            raise TypeError(f"step: {type(start).__name__} is not conditioned on plans, whose steps can be tuned")
+        use = PlanUse(start.plans)
+        watching: dict[str, Any] = {"also_record": ["qaf", "skill_weights"], "on_episode": use, "progress": progress}
+        evaluate(start, tasks=task, episodes_per_task=_DIAGNOSED, seed=seed, stop_at_success=True, **watching)
+        step = weakest_step(use, task).step
+        told["stuck"] = [asdict(found) for found in stuck_steps(use)]
+    actor = ResidualActor(start, scale=scale, steps={task: [step]})
+    assert actor.plans is not None
+    chosen = actor.plans[task].steps[step]
+    return actor, {"step": step, "condition": str(chosen.condition), "skill": chosen.skill, **told}
 
 
-def _execute(
-    run: OnlineRun, plans: Plans, out: Path, progress: bool, make_logger: Callable[[Path], Logger] | None
-) -> EvaluationResult:
-    started = time.perf_counter()
-    run.dataset.collect(out, progress)
-    more: dict[str, Any] = {"run": run.describe(plans)}
-    watching: dict[str, Any] = {}
-    if run.method == START:
-        policy = _load_start(run, plans, out, progress)
-    else:
-        policy, told = _train(run, plans, out, progress, make_logger)
-        more |= told
-    if run.step is not None:
-        assert isinstance(policy, ResidualActor)
-        more["before"] = execute_online(run.begin, plans, out, progress=progress).mean_success
-        watch = Elsewhere(_load_start(run, plans, out, progress), policy)
-        watching = {"also_record": policy.in_keys, "on_episode": watch}
-    result = evaluate(
-        policy,
-        tasks=run.task,
-        episodes_per_task=run.episodes,
-        seed=EVALUATION_SEED + run.seed,
-        noise_scale=0.1,
-        stop_at_success=True,
-        progress=progress,
-        **watching,
-    )
-    if run.step is not None:
-        more["elsewhere"] = watch.to_json()
-    more["seconds"] = round(time.perf_counter() - started, 1)
-    result = replace(result, config=result.config | more)
-    result.save(out / run.folder / RESULTS)
-    return result
+class Elsewhere:
+    """Compares a residual of some steps with its start in the states of episodes.
 
+    Pass it to ``evaluate`` as ``on_episode``, and the policy's ``in_keys`` as ``also_record``.
 
-def joined(results: Sequence[EvaluationResult]) -> EvaluationResult:
-    """One result of those of several tasks, evaluated alike."""
-    tasks = [task for one in results for task in one.config["tasks"]]
-    return EvaluationResult(results[0].config | {"tasks": tasks}, tuple(e for one in results for e in one.episodes))
+    Attributes:
+        states: number of states.
+        outside: how many of them have none of the steps in force.
+        changed: in how many of these the two actions differ in any bit.
+    """
+
+    def __init__(self, start: Policy, policy: ResidualActor) -> None:
+        self._start, self._policy = policy_of(start.eval()), policy_of(policy.eval())
+        self._action, self._weight = policy.out_keys_source[0], policy.out_keys_source[2]
+        self.states = self.outside = self.changed = 0
+
+    @torch.no_grad()
+    def __call__(self, episode: FinishedEpisode) -> None:
+        seen = episode.steps.exclude("action", "next")
+        was, now = self._start(seen.copy()), self._policy(seen.copy())
+        outside = now.get(self._weight).squeeze(-1) == 0
+        same = (was.get(self._action) == now.get(self._action)).all(-1)
+        self.states += len(outside)
+        self.outside += int(outside.sum())
+        self.changed += int((outside & ~same).sum())
+
+    def to_json(self) -> dict[str, int]:
+        return {"states": self.states, "outside": self.outside, "changed": self.changed}

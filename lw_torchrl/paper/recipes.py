@@ -1,4 +1,4 @@
-"""What data an experiment may see, and how a preset makes and uses it: named, frozen configurations."""
+"""The paper's experiments as frozen configurations: what data each may see, and how presets make and use it."""
 
 from __future__ import annotations
 
@@ -44,14 +44,7 @@ SETTINGS: Mapping[str, DataSetting] = MappingProxyType(
 
 @dataclass(frozen=True)
 class Execution:
-    """How experts are executed for demonstrations: options of :func:`collect_demonstrations`.
-
-    Attributes:
-        name: part of the datasets' names.
-        noise_scale: of the noise on the executed action, gone through in turn, an episode each.
-        noise_hold: steps for which each draw is kept.
-        redraw_failures: keep successful demonstrations only.
-    """
+    """How experts are executed: a name for datasets, and options of :func:`~lw_torchrl.collect_demonstrations`."""
 
     name: str
     noise_scale: tuple[float, ...]
@@ -73,7 +66,7 @@ class Member:
         actor: its options.
         plan_actor: more options, of :class:`PlanConditionedActor` alone.
         yaw: scale of :class:`RandomYaw` on its demonstrations, in radians.
-        any_yaw: with plans, rows whose steps in force say no direction are turned by any angle.
+        any_yaw: with plans, turn rows by any angle if their steps in force say no direction.
     """
 
     actor: Mapping[str, Any] = field(hash=False)
@@ -99,8 +92,8 @@ class Preset:
         passes: train for so many passes over the rows instead of ``training.steps`` minibatches.
         members: the actors of a policy, each trained by itself on the same demonstrations.
         training: of the optimizer.
-        evaluations: the policy is evaluated so many times, the last time when it is trained, and a 25th of the training
-            apart. More than one is for policies of one member.
+        evaluations: how often the policy is evaluated, a 25th of the training apart, the last time at its end. More
+            than one is for policies of one member.
 
     Raises:
         ValueError: more evaluations than one, of more members than one.
@@ -121,7 +114,7 @@ class Preset:
             raise ValueError(f"evaluations must be 1 of {len(self.members)} members, got {self.evaluations}")
 
     def evaluated_before(self, steps: int) -> list[int]:
-        """After how many steps a policy is evaluated that is trained for more."""
+        """The steps after which a policy is evaluated before its training ends."""
         return sorted({steps - k * steps // 25 for k in range(1, self.evaluations)} - {steps})
 
 
@@ -134,7 +127,7 @@ _STRONG = Preset(
     label="expert",
     after_success=20,
     passes=None,
-    # They err in different tasks. Without noise on the features one tells millimetres apart, as peg-insert-side asks.
+    # They fail in different tasks. Without feature noise one tells millimetres apart, as peg-insert-side needs.
     members=(
         Member(_DIFFERENCES),
         Member(_DIFFERENCES, _FOCUS_AND_ROLES),
@@ -145,8 +138,8 @@ _STRONG = Preset(
 )
 _STRONG_ZERO_SHOT = replace(
     _STRONG,
-    # What the words are about, and little else: whatever else tells tasks apart is another thing in tasks that were
-    # never shown. Methods without plans cannot know it, and see all differences.
+    # Features of what the words are about, and little else: whatever else tells tasks apart differs in unseen tasks.
+    # Methods without plans cannot know it, and see all differences.
     members=(
         Member(
             {"features": "relative", "width": 256, "feature_noise": 0.1},
@@ -161,7 +154,7 @@ _STRONG_ZERO_SHOT = replace(
 _STRONG_ONE_SHOT = replace(
     _STRONG,
     target=TARGET,
-    # One sees where everything is, one what the words are about alone, turned: they fail in different tasks.
+    # One sees where everything is, one only what the words are about, turned: they fail in different tasks.
     members=(
         Member({**_DIFFERENCES, "feature_noise": 0.1}, {**_FOCUS_AND_ROLES, "swap_unmentioned": 0.5}),
         Member(
@@ -186,7 +179,7 @@ _PAPER = Preset(
     "paper",
     base=CLEAN,
     target=None,
-    label="unclipped",  # as the authors' code: the scripts ask for up to 25, which is what makes so small a step move
+    label="unclipped",  # as the authors' code: scripts ask for up to 25, without which so small a learning rate is slow
     after_success=None,
     passes=500,
     members=(

@@ -1,156 +1,279 @@
-"""The paper's experiments as runs of work: datasets, and policies trained on them and evaluated."""
+"""Runs: what every run of an experiment is, how it is executed, and how results are compared."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-from lw_torchrl._checks import check_choice
-from lw_torchrl._files import held
-from lw_torchrl.data.collect import collect_demonstrations
+import torch
+from torchrl.record.loggers import Logger
+
+from lw_torchrl._checks import differences
+from lw_torchrl._devices import CPU, check_device
+from lw_torchrl._files import held, write_json, write_text
+from lw_torchrl.data import collect_demonstrations
+from lw_torchrl.evaluation import EvaluationResult, MethodComparison, evaluate, summarize
 from lw_torchrl.language.plans import Plans
-from lw_torchrl.language.tasks import TASKS
-from lw_torchrl.modules.policy import METHODS, policy_class
-from lw_torchrl.paper.recipes import DataSetting, Execution, Member, Preset
+from lw_torchrl.language.tasks import TASKS, resolve_tasks
+from lw_torchrl.language.text import TextEncoder
+from lw_torchrl.modules.policy import Policy
+from lw_torchrl.training import load_actor, save_actor
+from lw_torchrl.training.checkpoint import describe_data
+from lw_torchrl.training.training_state import check_description
 
-SCRIPTED = "scripted"
-"""Plans with scripted skills: a method beside those of :data:`lw_torchrl.modules.policy.METHODS`, without training."""
+EVALUATION_SEED = 10_000
+"""Training seeds count from 0; the evaluation of training seed k has seed 10000 + k."""
+RESULTS = "results.json"
 
 
 @dataclass(frozen=True)
-class Dataset:
-    """Demonstrations that runs share: a run of work itself.
+class Work:
+    """With what a run is executed: the arguments of :func:`execute_run`, checked."""
 
-    Attributes:
-        tasks: "MT10" or another argument of :func:`resolve_tasks`.
-        episodes: demonstrations of each.
-        execution: how the experts are executed.
-        seed: of the initial states and the noise.
-    """
+    plans: Plans
+    out: Path
+    tasks: tuple[str, ...] = ()
+    progress: bool = True
+    text_encoder: TextEncoder | None = None
+    device: torch.device = CPU
+    make_logger: Callable[[Path], Logger] | None = None
 
-    tasks: str
-    episodes: int
-    execution: Execution
-    seed: int
+
+class Dataset(ABC):
+    """Episodes that runs share."""
 
     @property
+    @abstractmethod
     def folder(self) -> Path:
         """Where it goes, below the experiments' folder."""
-        return Path("demonstrations") / f"{self.tasks}x{self.episodes}-{self.execution.name}-seed{self.seed}"
+
+    @property
+    @abstractmethod
+    def options(self) -> dict[str, Any]:
+        """Of :func:`~lw_torchrl.collect_demonstrations`."""
 
     def collect(self, out: Path, progress: bool) -> None:
         """Collect it, or what is left; of several processes one does, and the others wait."""
         root = out / self.folder
         with held(root, "out", wait=True):
-            collect_demonstrations(
-                self.tasks,
-                episodes_per_task=self.episodes,
-                root=root,
-                seed=self.seed,
-                noise_scale=self.execution.noise_scale,
-                noise_hold=self.execution.noise_hold,
-                redraw_failures=self.execution.redraw_failures,
-                progress=progress,
-            )
+            collect_demonstrations(**self.options, root=root, progress=progress)
 
 
-@dataclass(frozen=True)
-class Run:
-    """One policy, or one for each target, or plans with scripts, of one training seed: what a scheduler runs.
+class Run(ABC):
+    """Policies of one training seed, and their evaluation: what a scheduler runs.
 
     Attributes:
-        setting: what data it sees; scripts see none, and are the same in every setting.
-        method: one of :data:`~lw_torchrl.modules.policy.METHODS`, or "scripted".
-        seed: of demonstrations, initial weights and minibatches.
-        preset: how to train.
+        seed: of data, initial weights and minibatches.
         episodes: evaluated for each task.
-        plans_name: part of the folder's name, for other plans than ours.
         encoder_name: that of the text encoder, for another than ours: "my_texts:encode".
+        any_device: whether its networks can be trained and evaluated on a GPU.
     """
 
-    setting: DataSetting
-    method: str
     seed: int
-    preset: Preset
-    episodes: int = 20
-    plans_name: str = ""
+    episodes: int
     encoder_name: str = ""
-
-    def __post_init__(self) -> None:
-        check_choice("method", self.method, (*METHODS, SCRIPTED))
+    any_device = False
 
     @property
-    def group(self) -> Path:
-        """The folder of the setting, the preset, the plans and the texts: what methods are compared in."""
-        own = self.plans_name, self.encoder_name.replace(":", ".")
-        return Path(self.setting.name) / "-".join(filter(None, (self.preset.name, *own)))
-
-    @property
+    @abstractmethod
     def folder(self) -> Path:
         """Where its files go, below the experiments' folder."""
-        if self.method == SCRIPTED:
-            return Path("-".join(filter(None, ("scripted", self.plans_name)))) / f"seed{self.seed}"
-        return self.group / self.method / f"seed{self.seed}"
 
     @property
+    @abstractmethod
+    def label(self) -> str:
+        """Its name in tables."""
+
+    @property
+    @abstractmethod
     def datasets(self) -> tuple[Dataset, ...]:
-        """What it is trained on: the base tasks' demonstrations, and the targets'."""
-        if self.method == SCRIPTED:
-            return ()
-        base = Dataset(self.setting.base, self.setting.episodes, self.preset.base, self.seed)
-        if self.setting.targets is None:
-            return (base,)
-        assert self.preset.target is not None
-        return base, Dataset(self.setting.targets, 1, self.preset.target, self.seed)
-
-    def actor_options(self, member: Member) -> dict[str, Any]:
-        """Of one of its policy's actors."""
-        more = member.plan_actor if policy_class(METHODS[self.method].policy).plan_options else {}
-        return {**member.actor, **more}
-
-    def any_yaw(self, member: Member) -> bool:
-        """Whether it knows by its plans which rows of a member may be turned by any angle."""
-        return member.any_yaw and policy_class(METHODS[self.method].policy).plan_options
-
-    def _describe_member(self, member: Member) -> dict[str, Any]:
-        found = {"actor": self.actor_options(member), "yaw": member.yaw}
-        return found | {"any_yaw": True} if self.any_yaw(member) else found
+        """What it learns from."""
 
     @property
-    def skills(self) -> Literal["own", "MT10"]:
-        """Whose skills its plans speak of, as for :func:`~lw_torchrl.load_plans`: what is trained on MT10 and never saw
-        another task knows those of MT10 alone."""
-        return "MT10" if self.setting.name == "zero-shot" and self.method != SCRIPTED else "own"
+    @abstractmethod
+    def scope(self) -> str | tuple[str, ...]:
+        """The tasks that it can be evaluated in, as for :func:`resolve_tasks`."""
 
+    @abstractmethod
     def describe(self, plans: Plans) -> dict[str, Any]:
-        """Everything that its result hangs on, as JSON."""
-        reads_plans = self.method == SCRIPTED or policy_class(METHODS[self.method].policy).plan_options
-        read = plans.fingerprint if reads_plans else None
-        described: dict[str, Any] = {"method": self.method, "seed": self.seed, "plans": read}
-        if self.method != SCRIPTED:
-            described |= {
-                "setting": self.setting.name,
-                "preset": self.preset.name,
-                "datasets": [asdict(dataset) for dataset in self.datasets],
-                "members": [self._describe_member(one) for one in self.preset.members],
-                "training": self.preset.training.describe(),
-                "label": self.preset.label,
-                "after_success": self.preset.after_success,
-                "passes": self.preset.passes,
-            }
-            if self.preset.evaluations > 1:
-                described["evaluations"] = self.preset.evaluations
-        if read is None:
-            described |= own_tasks(plans)
-        if self.encoder_name and self.method != SCRIPTED:
-            described["text_encoder"] = self.encoder_name
-        return plain(described)
+        """Everything that its result depends on, as JSON."""
+
+    @abstractmethod
+    def learn(self, work: Work) -> tuple[Any, dict[str, Any]]:
+        """The trained policy, or what the files there hold of it, and what the result says of the training."""
+
+    def evaluate(self, policy: Any, work: Work) -> tuple[EvaluationResult, dict[str, Any]]:
+        """The evaluation of what was learned, and what the result says of it."""
+        return self.rollouts(policy, work), {}
+
+    def evaluated(self, tasks: str | Sequence[str] | None) -> tuple[str, ...]:
+        """Those of its tasks that are among the ones named; None for all."""
+        own = resolve_tasks(self.scope)
+        names = own if tasks is None else resolve_tasks(tasks)
+        if not (shown := tuple(name for name in names if name in own)):
+            raise ValueError(f"tasks must name some of the run's, {', '.join(own)}, got {', '.join(names)}")
+        return shown
+
+    def rollouts(self, policy: Any, work: Work, **options: Any) -> EvaluationResult:
+        """Evaluate one policy, as all runs do: fresh seeds, action noise 0.1."""
+        given: dict[str, Any] = {"tasks": work.tasks, "episodes_per_task": self.episodes, "progress": work.progress}
+        given |= {"seed": EVALUATION_SEED + self.seed, "noise_scale": 0.1, "stop_at_success": True}
+        return evaluate(policy, **given | options)
+
+
+def load_result(run: Run, plans: Plans, out: Path, tasks: Sequence[str] | None = None) -> EvaluationResult | None:
+    """The result of a run, if it is there.
+
+    Raises:
+        ValueError: it is of another configuration, or an evaluation of others than ``tasks``, where they are given.
+    """
+    return load_evaluation(out / run.folder / RESULTS, run, plans, tasks)
+
+
+def load_evaluation(path: Path, run: Run, plans: Plans, tasks: Sequence[str] | None) -> EvaluationResult | None:
+    """As :func:`load_result`, of any file."""
+    if not path.is_file():
+        return None
+    result = EvaluationResult.load(path)
+    found = (result.config.get("run") or {}) | {"episodes": result.config["episodes_per_task"]}
+    ours = run.describe(plans) | {"episodes": run.episodes}
+    if tasks is not None:
+        found, ours = found | {"tasks": result.config["tasks"]}, ours | {"tasks": [*tasks]}
+    if different := differences(found, ours):
+        raise ValueError(
+            f"out: {str(path)!r} is of another configuration, it differs in {', '.join(different)}; choose another "
+            f"folder, or delete {run.folder} there to do the run again"
+        )
+    return result
+
+
+def execute_run(
+    run: Run,
+    plans: Plans,
+    out: Path,
+    *,
+    tasks: str | Sequence[str] | None = None,
+    progress: bool = True,
+    text_encoder: TextEncoder | None = None,
+    device: str | torch.device = "cpu",
+    make_logger: Callable[[Path], Logger] | None = None,
+) -> EvaluationResult:
+    """Do a run, or what is left of it; its result is written last, to ``out/run.folder/results.json``.
+
+    Args:
+        run: what to do.
+        plans: a plan for each of its tasks.
+        out: the experiments' folder.
+        tasks: to evaluate, of a run of the paper; of one with a policy for each target, the targets among them. None
+            for all of a run's.
+        progress: show progress bars.
+        text_encoder: of a run of the paper, texts to vectors (n, E) float32, which its ``encoder_name`` names; None for
+            the shipped one.
+        device: of a run of the paper, where networks are trained and evaluated. A run that was begun on one device can
+            be finished on another.
+        make_logger: of an online run, a TorchRL logger for a policy's file, for the training.
+
+    Returns:
+        The evaluation of the last step's policy on seeds that no training used, action noise 0.1. ``config["run"]``
+        says what was done, ``config["seconds"]`` how long this call took. More is said by some runs:
+
+        - of the paper, where the preset has more evaluations than one, ``config["best"]``: ``of`` how many ``rates``
+          has each task's best success rate. The earlier ones are in ``evaluations/<steps>.json``;
+        - online, ``config["history"]``: what became of each round. Of a run of one step, ``config["tuned"]`` says
+          which, ``config["before"]`` the start's success in the same episodes, and ``config["elsewhere"]`` in how many
+          "states" of them the step was not in force ("outside"), and in how many of these the action is not the
+          start's.
+
+    Raises:
+        ValueError: ``out`` holds the same run of another configuration, or evaluated in other tasks; the run has none
+            of the tasks; its text encoder is missing, or one is given that it does not name; its start does not know
+            the task.
+
+    Source: paper section 'Conditional Plan Experiments'.
+    """
+    work = Work(plans, out, run.evaluated(tasks), progress, text_encoder, check_device("device", device), make_logger)
+    if work.device.type != "cpu" and not run.any_device:
+        raise ValueError(f"device must be the CPU for {type(run).__name__}, got {device}")
+    if (text_encoder is None) != (not run.encoder_name):
+        raise ValueError(
+            f"text_encoder must be given where the run has an encoder_name, which tells its folder from others, and "
+            f"only there; it has {run.encoder_name!r}"
+        )
+    if (done := load_result(run, plans, out, work.tasks)) is not None:
+        return done
+    with held(out / run.folder, "out", folder=True, wait=True):
+        return load_result(run, plans, out, work.tasks) or _execute(run, work)
+
+
+def _execute(run: Run, work: Work) -> EvaluationResult:
+    started = time.perf_counter()
+    for dataset in run.datasets:
+        dataset.collect(work.out, work.progress)
+    policy, trained = run.learn(work)
+    result, evaluated = run.evaluate(policy, work)
+    seconds = round(time.perf_counter() - started, 1)
+    described = {"run": run.describe(work.plans), **trained, **evaluated, "seconds": seconds}
+    result = replace(result, config=result.config | described)
+    result.save(work.out / run.folder / RESULTS)
+    return result
+
+
+def kept_policy(file: Path, described: dict[str, Any], train: Callable[[Path], Mapping[str, Any]]) -> Policy:
+    """The policy of a file; if there is none, it is trained and saved first.
+
+    Args:
+        file: the policy's.
+        described: what the file must say.
+        train: trains it, with this checkpoint meanwhile; returns arguments of :func:`~lw_torchrl.save_actor`.
+
+    Raises:
+        ValueError: the file says something else.
+    """
+    checkpoint = file.with_name("checkpoint.zip")
+    if not file.is_file():
+        trained = dict(train(checkpoint))
+        save_actor(trained.pop("actor"), file, data=describe_data(trained.pop("replay")), **trained, **described)
+    checkpoint.unlink(missing_ok=True)  # another process may have done so, where files cannot be locked
+    check_description(file, described)
+    return load_actor(file)
+
+
+def joined(results: Sequence[EvaluationResult]) -> EvaluationResult:
+    """One result of those of several tasks, evaluated alike."""
+    tasks = [task for one in results for task in one.config["tasks"]]
+    return EvaluationResult(results[0].config | {"tasks": tasks}, tuple(e for one in results for e in one.episodes))
+
+
+def compare(
+    results: Iterable[tuple[Run, EvaluationResult]], published: Mapping[str, Mapping[str, float]] | None = None
+) -> MethodComparison:
+    """Runs compared by their labels, over seeds; those of several tasks are taken together.
+
+    Args:
+        results: in the order of the table.
+        published: label to (task to success rate), beside them.
+    """
+    found: dict[str, dict[int, list[EvaluationResult]]] = {}
+    for run, result in results:
+        found.setdefault(run.label, {}).setdefault(run.seed, []).append(result)
+    return MethodComparison(
+        {label: summarize({seed: joined(of) for seed, of in seeds.items()}) for label, seeds in found.items()},
+        published or {},
+    )
+
+
+def write_summary(path: Path, text: str, numbers: Mapping[str, Any]) -> None:
+    """A table as ``path``.md, its numbers as ``path``.json."""
+    write_json(path.with_name(f"{path.name}.json"), numbers)
+    write_text(path.with_name(f"{path.name}.md"), text)
 
 
 def own_tasks(plans: Plans) -> dict[str, Any]:
-    """The tasks of plans that are not ours of that name, by which texts and objects are others: no plan's fingerprint
-    tells what a description says."""
+    """The tasks of plans that are not ours of that name: no plan's fingerprint says what a description says."""
     own = {task: plan.definition.to_json() for task, plan in plans.items() if plan.definition != TASKS.get(task)}
     return {"own_tasks": own} if own else {}
 

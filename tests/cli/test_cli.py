@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 import re
 import signal
@@ -18,7 +17,8 @@ from commands import fails, run
 import lw_torchrl as lw
 import lw_torchrl.cli.main as cli
 from lw_torchrl.cli.main import main
-from lw_torchrl.cli.streams import BROKEN_PIPE
+from lw_torchrl.cli.output import BROKEN_PIPE
+from lw_torchrl.cli.parsing import arguments
 from lw_torchrl.paper.demo import QUICK
 
 COMMANDS = (
@@ -69,8 +69,7 @@ def test_every_command_explains_itself(capsys, command):
     printed = " ".join(re.sub(r"[^ -~]", " ", capsys.readouterr().out).split())
     first = cli.COMMANDS[command].__doc__.strip().splitlines()[0]
     assert " ".join(first.split()[:5]) in printed
-    parameters = inspect.signature(cli.COMMANDS[command]).parameters.values()
-    options = [p.name for p in parameters if p.kind is p.POSITIONAL_OR_KEYWORD]
+    options = [p.name for p in arguments(cli.COMMANDS[command]).values() if p.kind is not p.POSITIONAL_ONLY]
     assert all(f"--{name.replace('_', '-')}" in printed for name in options)
 
 
@@ -317,7 +316,8 @@ def test_the_experts_can_be_evaluated(capsys):
     assert printed.splitlines()[1].split()[:3] == ["reach", "1.00", "-"]
 
 
-def test_the_baseline_trains_and_is_evaluated(capsys, demos, tmp_path):
+def test_the_baseline_trains_and_is_evaluated(capsys, demos, tmp_path, monkeypatch):
+    monkeypatch.setattr(lw, "evaluate", partial(lw.evaluate, max_steps=60))
     path = tmp_path / "baseline.zip"
     run(capsys, "train", demos, "--out", path, "--method", "dc", *TINY)
     assert isinstance(lw.load_actor(path), lw.DescriptorConditionedActor)

@@ -10,14 +10,14 @@ import pytest
 from commands import document, fails, run
 
 import lw_torchrl as lw
-from lw_torchrl.paper import execution, recipes
+from lw_torchrl.paper import recipes, runs
 from lw_torchrl.paper.recipes import PRESETS, DataSetting, Member
 
 TINY = """
 from dataclasses import replace
 from functools import partial
 import lw_torchrl as lw
-from lw_torchrl.paper import execution, recipes, runs
+from lw_torchrl.paper import recipes, runs
 from lw_torchrl.paper.recipes import PRESETS, DataSetting, Execution, Member
 
 training = lw.BehavioralCloningConfig(steps=40, batch_size=180, checkpoint_every=5)
@@ -26,7 +26,7 @@ recipes.SETTINGS = {
     "few-shot": DataSetting("few-shot", "MT10", 2), "one-shot": DataSetting("one-shot", "MT10", 1, targets="MT10")
 }
 recipes.PRESETS = {"strong": {name: replace(PRESETS["strong"][name], **options) for name in recipes.SETTINGS}}
-execution.evaluate = partial(lw.evaluate, max_steps=20)
+runs.evaluate = partial(lw.evaluate, max_steps=20)
 runs.collect_demonstrations = partial(lw.collect_demonstrations, max_steps=100)
 """
 
@@ -42,7 +42,7 @@ def tiny(monkeypatch):
     paper = replace(small, name="paper", passes=500, evaluations=3)
     presets = {"strong": {"few-shot": small}, "paper": {"few-shot": paper}}
     monkeypatch.setattr(recipes, "PRESETS", MappingProxyType(presets))
-    monkeypatch.setattr(execution, "evaluate", partial(lw.evaluate, max_steps=60))
+    monkeypatch.setattr(runs, "evaluate", partial(lw.evaluate, max_steps=60))
     monkeypatch.setattr(recipes, "SETTINGS", MappingProxyType({"few-shot": DataSetting("few-shot", "reach", 1)}))
 
 

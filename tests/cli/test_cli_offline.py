@@ -2,30 +2,44 @@
 
 import json
 import shutil
-from dataclasses import replace
 
 import pytest
 from commands import document, fails, run
 
 import lw_torchrl as lw
-from lw_torchrl.paper.offline_tables import OFFLINE_TABLES, OfflineTable
+from lw_torchrl.paper import offline
+from lw_torchrl.paper.offline_recipes import OFFLINE_TABLES
 
 SMALL = dict(width=16, depth=1, critic_depth=1, batch_size=20)
 TINY = f"""
 from dataclasses import replace
-from lw_torchrl.paper.offline_tables import OfflineTable
-runs = OfflineTable.runs
-OfflineTable.runs = lambda self, seeds, recipe, episodes: runs(self, seeds, replace(recipe, **{SMALL}), episodes, 120)
+from lw_torchrl.paper import offline
+runs = offline.offline_runs
+offline.offline_runs = lambda table, seeds, recipe, n: runs(table, seeds, replace(recipe, **{SMALL}), n, 120)
 """
 
 
 @pytest.fixture
 def tiny(monkeypatch):
     """Episodes of 120 steps and small networks."""
-    runs = OfflineTable.runs
-    monkeypatch.setattr(
-        OfflineTable, "runs", lambda self, seeds, recipe, n: runs(self, seeds, replace(recipe, **SMALL), n, 120)
-    )
+    monkeypatch.setattr(offline, "offline_runs", offline.offline_runs)  # to be put back
+    exec(TINY, {})
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    """The data of seed 0, which runs share."""
+    out = tmp_path_factory.mktemp("offline")
+    for dataset in offline.OfflineRun("two", "W", 0, max_steps=120).datasets:
+        dataset.collect(out, progress=False)
+    return out / "data"
+
+
+@pytest.fixture
+def filled(data, tmp_path):
+    """A folder with these data."""
+    shutil.copytree(data, tmp_path / "data")
+    return tmp_path
 
 
 def arguments(out, *more):
@@ -46,7 +60,8 @@ def results(folder):
     )
 
 
-def test_a_table_is_made_and_shown(capsys, tmp_path, tiny):
+def test_a_table_is_made_and_shown(capsys, filled, tiny):
+    tmp_path = filled
     printed = run(capsys, *arguments(tmp_path))
     assert "[1/2] two/W/advantage-plan/seed0: mean success " in printed
     assert "| method, conditioned on | W " in printed
@@ -58,7 +73,7 @@ def test_a_table_is_made_and_shown(capsys, tmp_path, tiny):
     assert again.split("\nquick\n")[1] == printed.split("\nquick\n")[1]
 
 
-def test_runs_have_names_and_are_done_one_by_one(capsys, tmp_path, tiny):
+def test_runs_have_names_and_are_done_one_by_one(capsys, data, tmp_path, tiny):
     names = run(capsys, *arguments(tmp_path, "--list")).split()
     assert names == [
         "data/two/spoilt-30-x20-seed0",
@@ -69,6 +84,7 @@ def test_runs_have_names_and_are_done_one_by_one(capsys, tmp_path, tiny):
         "two/W/filtered-bc-plan/seed0",
     ]
     assert not list(tmp_path.iterdir())
+    shutil.copytree(data, tmp_path / "data")
     for name in names:
         assert document(capsys, *arguments(tmp_path, "--run", name))["run"] == name
         assert (tmp_path / name).is_dir()
@@ -118,9 +134,11 @@ def test_plans_that_lack_a_task_are_refused_before_any_work(capsys, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_another_recipe_in_the_same_folder_is_refused(capsys, tmp_path, tiny):
-    run(capsys, *arguments(tmp_path))
-    assert "is of another configuration, it differs in recipe.beta" in fails(capsys, *arguments(tmp_path, "--beta", 3))
+def test_another_recipe_in_the_same_folder_is_refused(capsys, filled, tiny):
+    run(capsys, *arguments(filled, "--methods", "filtered-bc"))
+    assert "is of another configuration, it differs in recipe.beta" in fails(
+        capsys, *arguments(filled, "--methods", "filtered-bc", "--beta", 3)
+    )
 
 
 @pytest.mark.slow

@@ -7,17 +7,17 @@ import pytest
 from commands import document, fails, run
 
 import lw_torchrl as lw
-from lw_torchrl.paper import online, runs, tuning
+from lw_torchrl.paper import online, runs
 
 TINY = """
 from functools import partial
 import lw_torchrl as lw
-from lw_torchrl.paper import online, runs, tuning
+from lw_torchrl.paper import online, runs
 
 cloning = lw.BehavioralCloningConfig(steps=30, batch_size=20, checkpoint_every=10)
 config = lw.OnlineConfig(rows=4, round_steps=15, max_steps=12, batch_size=8, first_frames=20, warm_up=3, epochs=2)
 online.OnlineRecipe = partial(online.OnlineRecipe, cloning=cloning, config=config)
-online.evaluate = tuning.evaluate = partial(lw.evaluate, max_steps=20)
+online.evaluate = runs.evaluate = partial(lw.evaluate, max_steps=20)
 runs.collect_demonstrations = partial(lw.collect_demonstrations, max_steps=100)
 """
 
@@ -28,7 +28,7 @@ def tiny(monkeypatch):
     for module, name in (
         (online, "OnlineRecipe"),
         (online, "evaluate"),
-        (tuning, "evaluate"),
+        (runs, "evaluate"),
         (runs, "collect_demonstrations"),
     ):
         monkeypatch.setattr(module, name, getattr(module, name))  # to be put back
@@ -48,7 +48,7 @@ def test_runs_and_their_summary(capsys, tmp_path, tiny, monkeypatch):
     assert not any(tmp_path.iterdir())
 
     out = run(capsys, *arguments(tmp_path, "--run", "pcbc/reach/td3/seed1", "--logger", "csv", seeds=(0, 1)))
-    assert "pcbc/reach/td3/seed1: success 0." in out
+    assert "pcbc/reach/td3/seed1: mean success 0." in out
     folder = tmp_path / "pcbc" / "reach"
     assert (folder / "start" / "seed1" / "policy.zip").is_file()
     assert not (folder / "start" / "seed1" / "results.json").exists(), "the start is evaluated by its own run"
@@ -73,14 +73,17 @@ def test_runs_and_their_summary(capsys, tmp_path, tiny, monkeypatch):
     assert (tmp_path / "pcbc" / "curves.png").read_bytes().startswith(b"\x89PNG")
     assert "| reach | 0." in (tmp_path / "pcbc" / "summary.md").read_text()
 
-    monkeypatch.setattr(online, "evaluate", lambda *_, **__: pytest.fail("done twice"))
+    monkeypatch.setattr(runs, "evaluate", lambda *_, **__: pytest.fail("done twice"))
     found = document(capsys, *arguments(tmp_path, seeds=(0, 1)))
     assert found == {"summaries": {"pcbc": json.loads((tmp_path / "pcbc" / "summary.json").read_text())}}
     message = fails(capsys, *arguments(tmp_path, "--demonstrations", 2))
     assert "is of another configuration, it differs in recipe.demonstrations (1, now 2); choose another" in message
 
 
-@pytest.mark.parametrize("method", ["sac", "residual", "ppo"])
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("sac", "ppo")]
+
+
+@pytest.mark.parametrize("method", ["residual", *SLOW])
 def test_any_method_begins_with_a_policy_of_ones_own(capsys, tmp_path, tiny, method):
     lw.save_actor(lw.DescriptorConditionedActor("MT10", width=16), tmp_path / "mine.zip")
     out, given = tmp_path / "out", ("--start", tmp_path / "mine.zip")
@@ -122,7 +125,7 @@ def test_what_it_refuses(capsys, tmp_path, tiny):
     assert not (tmp_path / "pcbc").exists()
 
 
-@pytest.mark.parametrize("step", ["2", "weakest"])
+@pytest.mark.parametrize("step", [pytest.param("2", marks=pytest.mark.slow), "weakest"])
 def test_one_step_of_a_plan_is_tuned(capsys, tmp_path, tiny, monkeypatch, step):
     given = arguments(tmp_path, "--step", step, methods=["residual"])
     name = "residual-step2" if step == "2" else "residual-weakest"
@@ -195,10 +198,10 @@ def test_a_run_killed_before_its_result_is_not_trained_again(tmp_path, tiny, mon
     recipe = online.OnlineRecipe()
     one = online.OnlineRun("reach", "td3", 0, recipe, episodes=2)
     one = online.replace(one, recipe=online.replace(recipe, config=online.replace(recipe.config, frames=60)))
-    monkeypatch.setattr(online, "evaluate", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
+    monkeypatch.setattr(runs, "evaluate", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
-        online.execute_online(one, plans, tmp_path, progress=False)
-    monkeypatch.setattr(online, "evaluate", partial(lw.evaluate, max_steps=20))
+        runs.execute_run(one, plans, tmp_path, progress=False)
+    monkeypatch.setattr(runs, "evaluate", partial(lw.evaluate, max_steps=20))
     monkeypatch.setattr(online, "OnlineTrainer", lambda *_, **__: pytest.fail("trained again"))
-    found = online.execute_online(one, plans, tmp_path, progress=False)
+    found = runs.execute_run(one, plans, tmp_path, progress=False)
     assert [entry["frames"] for entry in found.config["history"]] == [60]

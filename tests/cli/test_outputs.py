@@ -8,6 +8,7 @@ import pytest
 from commands import fails
 
 from lw_torchrl.cli.main import COMMANDS, GROUPS
+from lw_torchrl.cli.parsing import arguments
 
 FOLDERS = {
     "demo": ["--quick", "--out"],
@@ -45,7 +46,7 @@ def test_these_are_all_commands_that_write():
     writing = {
         name
         for name, function in {**COMMANDS, **inner}.items()
-        if {"out", "screenshot", "html"} & {*function.__annotations__}
+        if {"out", "screenshot", "html"} & {*arguments(function)}
     }
     assert writing == {*FOLDERS, *FILES}
 

@@ -8,7 +8,7 @@ import pytest
 from commands import fails, run
 
 import lw_torchrl as lw
-from lw_torchrl.cli.sources import read_encoder
+from lw_torchrl.cli.options import read_encoder
 
 TASKS = """
 [reach]

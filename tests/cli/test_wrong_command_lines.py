@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from lw_torchrl.cli import offline, online, sources
+from lw_torchrl.cli import offline, online, options
 from lw_torchrl.cli.main import COMMANDS, GROUPS
 
 HEAVY = ("torch", "torchrl", "mujoco", "metaworld", "rerun", "matplotlib")
@@ -235,12 +235,11 @@ def test_the_words_of_the_command_line_are_those_of_the_library():
 
     from lw_torchrl.data import BEHAVIOURS
     from lw_torchrl.modules import METHODS
-    from lw_torchrl.paper.mixtures import MIXTURES
-    from lw_torchrl.paper.offline_recipes import OFFLINE_METHODS
-    from lw_torchrl.paper.tuning import WEAKEST
+    from lw_torchrl.paper.offline_recipes import MIXTURES, OFFLINE_METHODS
+    from lw_torchrl.paper.online import WEAKEST
 
-    assert tuple(BEHAVIOURS) == sources.ACTORS
-    assert tuple(METHODS) == sources.METHODS
+    assert tuple(BEHAVIOURS) == options.ACTORS
+    assert tuple(METHODS) == options.METHODS
     assert get_args(offline.Mixture) == tuple(MIXTURES)
     assert get_args(offline.OfflineMethod) == tuple(OFFLINE_METHODS)
     assert online.WEAKEST == WEAKEST

@@ -18,7 +18,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import Compose
 
 import lw_torchrl as lw
-from lw_torchrl.paper.execution import execute_run, load_result
+from lw_torchrl.paper.runs import execute_run, load_result
 
 ACTORS = {
     "plan": lambda: make_actor(feature_noise=0.0),

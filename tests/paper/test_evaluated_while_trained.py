@@ -51,8 +51,15 @@ def test_what_is_learned_is_the_same(undisturbed, tmp_path, setting):
     assert [result.config for result in found.values()] == [asked] * 3
 
 
-@by_setting
-@pytest.mark.parametrize("stop", [46, 57])
+@pytest.mark.parametrize(
+    ("setting", "stop"),
+    [
+        pytest.param(TINY, 46, marks=pytest.mark.slow),
+        (TINY, 57),
+        pytest.param(TINY_ONE_SHOT, 46, marks=pytest.mark.slow),
+        pytest.param(TINY_ONE_SHOT, 57, marks=pytest.mark.slow),
+    ],
+)
 def test_stopped_and_resumed_it_ends_the_same(undisturbed, tmp_path, monkeypatch, setting, stop):
     one = a_run(setting=setting, preset=WATCHED)
     count = stop_training(monkeypatch, setting, stop)

@@ -13,13 +13,17 @@ import torch
 import lw_torchrl as lw
 from lw_torchrl.data.behaviours import BEHAVIOURS
 from lw_torchrl.data.metadata import read_metadata
-from lw_torchrl.paper import mixtures
-from lw_torchrl.paper.execution import EVALUATION_SEED
-from lw_torchrl.paper.mixtures import MIXTURES, TASK_SETS, BehaviourData, Portion
-from lw_torchrl.paper.offline_recipes import OFFLINE_METHODS, OfflineRecipe
-from lw_torchrl.paper.offline_runs import Advantages, OfflineRun
-from lw_torchrl.paper.offline_tables import OFFLINE_TABLES, advantages_of, write_table
-from lw_torchrl.paper.offline_training import LOSSES, execute_offline, make_advantages, train_offline
+from lw_torchrl.paper.offline import DISTRIBUTIONS, Advantages, BehaviourDataset, OfflineRun, offline_runs, write_table
+from lw_torchrl.paper.offline_recipes import (
+    MIXTURES,
+    NOISE,
+    OFFLINE_METHODS,
+    OFFLINE_TABLES,
+    TASK_SETS,
+    OfflineRecipe,
+    Portion,
+)
+from lw_torchrl.paper.runs import EVALUATION_SEED, Work, execute_run
 
 PLANS = lw.load_plans("MT10")
 TINY = OfflineRecipe(steps=6, value_steps=6, batch_size=10, width=16, depth=1, critic_depth=1)
@@ -35,7 +39,7 @@ def made(tmp_path_factory):
     """A folder with the data of seed 0."""
     out = tmp_path_factory.mktemp("offline")
     for dataset in tiny().datasets:
-        dataset.make(out, progress=False)
+        dataset.collect(out, progress=False)
     return out
 
 
@@ -54,7 +58,7 @@ def all_runs(seeds=(0, 1, 2)):
         run
         for name, table in OFFLINE_TABLES.items()
         if name != "quick"
-        for run in table.runs(seeds, OfflineRecipe(), 20)
+        for run in offline_runs(table, seeds, OfflineRecipe(), 20)
     ]
 
 
@@ -62,8 +66,9 @@ def test_different_runs_have_different_folders_and_descriptions():
     runs = set(all_runs())
     assert len({run.folder for run in runs}) == len(runs)
     assert len({json.dumps(run.describe(PLANS), sort_keys=True) for run in runs}) == len(runs)
-    advantages = advantages_of(runs)
-    assert len({json.dumps(one.describe(PLANS), sort_keys=True) for one in advantages.values()}) == len(advantages)
+    advantages = {run.advantages for run in runs} - {None}
+    assert len({one.folder for one in advantages}) == len(advantages)
+    assert len({json.dumps(one.describe(PLANS), sort_keys=True) for one in advantages}) == len(advantages)
 
 
 def test_the_tables_compare_the_same_steps_and_the_methods_that_they_name():
@@ -73,18 +78,18 @@ def test_the_tables_compare_the_same_steps_and_the_methods_that_they_name():
             assert len(set(rows)) == len(rows)
             assert ("filtered-bc", "pcbc", "pcbc") in rows
     assert {row[0] for row in OFFLINE_TABLES["methods"].rows["B"]} == set(OFFLINE_METHODS)
-    assert {method.loss for method in OFFLINE_METHODS.values()} == set(LOSSES)
+    assert {method.loss for method in OFFLINE_METHODS.values()} == set(DISTRIBUTIONS)
 
 
 def test_no_two_datasets_begin_alike_and_none_as_an_evaluation(monkeypatch, tmp_path):
     seeds = {}
     monkeypatch.setattr(
-        "lw_torchrl.paper.mixtures.collect_demonstrations",
+        "lw_torchrl.paper.runs.collect_demonstrations",
         lambda tasks, *, seed, policy, **_: seeds.setdefault(seed, []).append(policy),
     )
     for seed in (0, 1, 99):
         for behaviour in BEHAVIOURS:
-            BehaviourData("five", Portion(behaviour, 1), seed).make(tmp_path, progress=False)
+            BehaviourDataset("five", Portion(behaviour, 1), seed).collect(tmp_path, progress=False)
     assert len(seeds) == 3 * len(BEHAVIOURS)
     assert max(seeds) < EVALUATION_SEED
 
@@ -126,19 +131,19 @@ def test_data_are_of_the_behaviours_that_mixtures_name(made):
 @pytest.mark.parametrize(("actor", "critic"), [("pcbc", "pcbc"), ("dc", "one-hot")])
 def test_every_method_learns_and_is_evaluated(made, method, actor, critic):
     run = tiny(method, actor, critic)
-    result = execute_offline(run, PLANS, made, progress=False)
+    result = execute_run(run, PLANS, made, progress=False)
     assert set(result.success_once) == set(TASK_SETS["two"])
     assert result.config["seed"] == EVALUATION_SEED
     policy = lw.load_actor(made / run.folder / "policy.zip")
     assert policy.tasks == TASK_SETS["two"]
     assert not (made / run.folder / "checkpoint.zip").exists()
-    again = execute_offline(run, PLANS, made, progress=False)
+    again = execute_run(run, PLANS, made, progress=False)
     assert (again.episodes, again.config["run"]) == (result.episodes, result.config["run"])
 
 
 def test_advantages_are_those_of_the_value_standardised_by_task(out):
     one = tiny().advantages
-    found = make_advantages(one, PLANS, out, progress=False)["advantage"]
+    found = one.make(PLANS, out, progress=False)["advantage"]
     replay = lw.LanguageWorldExperienceReplay(
         [out / d.folder for d in one.datasets], label="executed", terminate_on_success=True
     )
@@ -148,12 +153,12 @@ def test_advantages_are_those_of_the_value_standardised_by_task(out):
         own = found[task == number].double()
         assert abs(own.mean().item()) < 1e-4
         assert abs(own.std(correction=0).item() - 1) < 1e-3
-    assert torch.equal(make_advantages(one, PLANS, out, progress=False)["advantage"], found)
+    assert torch.equal(one.make(PLANS, out, progress=False)["advantage"], found)
 
 
 def test_stopped_anywhere_a_run_ends_with_the_same_policy(made, out, monkeypatch):
     run = tiny()
-    expected = execute_offline(run, PLANS, made, progress=False)
+    expected = execute_run(run, PLANS, made, progress=False)
     trainer = "lw_torchrl.training.offline.OfflineTrainer.step"
     real = lw.OfflineTrainer.step
     for stop in (4, 9):  # in the value's training, and in the policy's
@@ -167,62 +172,62 @@ def test_stopped_anywhere_a_run_ends_with_the_same_policy(made, out, monkeypatch
 
         monkeypatch.setattr(trainer, step)
         with pytest.raises(KeyboardInterrupt):
-            execute_offline(run, PLANS, out, progress=False)
+            execute_run(run, PLANS, out, progress=False)
     monkeypatch.setattr(trainer, real)
-    found = execute_offline(run, PLANS, out, progress=False)
+    found = execute_run(run, PLANS, out, progress=False)
     assert found.success_once == expected.success_once
     ours, theirs = (lw.load_actor(root / run.folder / "policy.zip").state_dict() for root in (out, made))
     assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
 
 
 def test_results_and_advantages_of_another_recipe_are_refused(made):
-    execute_offline(tiny(), PLANS, made, progress=False)
+    execute_run(tiny(), PLANS, made, progress=False)
     other = replace(TINY, beta=1.5)
     with pytest.raises(ValueError, match=r"results.json' is of another configuration, it differs in recipe.beta"):
-        execute_offline(tiny(recipe=other), PLANS, made, progress=False)
+        execute_run(tiny(recipe=other), PLANS, made, progress=False)
     with pytest.raises(ValueError, match=r"its run differs in recipe.beta"):
-        make_advantages(tiny(recipe=other).advantages, PLANS, made, progress=False)
+        tiny(recipe=other).advantages.make(PLANS, made, progress=False)
     with pytest.raises(ValueError, match=r"its run differs in recipe.beta"):
-        train_offline(tiny(recipe=other), PLANS, made, progress=False)
+        tiny(recipe=other).learn(Work(PLANS, made, progress=False))
 
 
 def test_what_a_method_gave_before_it_was_changed_is_refused(out, monkeypatch):
     run = tiny("bc")
-    execute_offline(run, PLANS, out, progress=False)
+    execute_run(run, PLANS, out, progress=False)
     changed = replace(OFFLINE_METHODS["bc"], version=2)
-    monkeypatch.setattr("lw_torchrl.paper.offline_runs.OFFLINE_METHODS", {**OFFLINE_METHODS, "bc": changed})
+    monkeypatch.setattr("lw_torchrl.paper.offline.OFFLINE_METHODS", {**OFFLINE_METHODS, "bc": changed})
     with pytest.raises(ValueError, match=r"it differs in how.version"):
-        execute_offline(run, PLANS, out, progress=False)
+        execute_run(run, PLANS, out, progress=False)
 
 
 def test_a_run_that_another_process_ends_first_is_the_same(out, monkeypatch):
     run = tiny("bc")
-    kept = "lw_torchrl.paper.offline_training.save_actor"
+    kept = "lw_torchrl.paper.runs.save_actor"
     monkeypatch.setattr(
         kept, lambda *one, **about: (lw.save_actor(*one, **about), (out / run.folder / "checkpoint.zip").unlink())
     )
-    assert execute_offline(run, PLANS, out, progress=False).config["run"] == run.describe(PLANS)
+    assert execute_run(run, PLANS, out, progress=False).config["run"] == run.describe(PLANS)
 
 
 def test_damaged_advantages_are_refused(made, out):
     one = tiny().advantages
-    make_advantages(one, PLANS, out, progress=False)
+    one.make(PLANS, out, progress=False)
     file = out / one.folder / "advantages.zip"
     file.write_bytes(file.read_bytes()[:-40])
-    with pytest.raises(ValueError, match=r"advantages.zip. is damaged .*delete it, and they are learned again"):
-        make_advantages(one, PLANS, out, progress=False)
+    with pytest.raises(ValueError, match=r"advantages.zip. is damaged .*delete it to learn them again"):
+        one.make(PLANS, out, progress=False)
 
 
 def test_a_critic_that_does_not_see_the_plan_is_made_of_the_number_alone(made):
     ways = [tiny(critic=critic).advantages for critic in ("pcbc", "dc", "one-hot")]
-    found = [make_advantages(one, PLANS, made, progress=False)["advantage"] for one in ways]
+    found = [one.make(PLANS, made, progress=False)["advantage"] for one in ways]
     for one, two in pairwise(found):
         assert not torch.equal(one, two)
 
 
 def test_the_table_says_means_intervals_and_differences(made):
     runs = [tiny(), tiny("filtered-bc"), tiny("bc", "dc")]
-    results = {run: execute_offline(run, PLANS, made, progress=False) for run in runs}
+    results = {run: execute_run(run, PLANS, made, progress=False) for run in runs}
     head = write_table("quick", runs, results, made)
     for run in runs:
         assert f"{run.label} " in head
@@ -251,9 +256,9 @@ def test_descriptions_tell_what_a_result_hangs_on():
     assert replace(run, episodes=3).describe(PLANS) == run.describe(PLANS)
     cloned = replace(run, method="bc")
     assert replace(cloned, critic="dc").describe(PLANS) == cloned.describe(PLANS)
-    noise = {**mixtures.NOISE, "wrong": {"noise_scale": 0.1}}
+    noise = {**NOISE, "wrong": {"noise_scale": 0.1}}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lw_torchrl.paper.offline_runs.NOISE", noise)
+        patch.setattr("lw_torchrl.paper.offline.NOISE", noise)
         assert run.describe(PLANS) != described
-    assert described["data"][0] == {"behaviour": "spoilt-30", "episodes": 20, **mixtures.NOISE["spoilt-30"]}
+    assert described["data"][0] == {"behaviour": "spoilt-30", "episodes": 20, **NOISE["spoilt-30"]}
     assert isinstance(Advantages("five", "B", 0).describe(PLANS)["recipe"], dict)

@@ -7,14 +7,27 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tiny_runs import ENSEMBLE, PLANS, PRESET, ROLES, TINY, TINY_ONE_SHOT, a_run, execute, rates, stop_training, task_of
+from tiny_runs import (
+    ENSEMBLE,
+    PLANS,
+    PRESET,
+    ROLES,
+    TINY,
+    TINY_ONE_SHOT,
+    a_run,
+    execute,
+    execute_short,
+    rates,
+    stop_training,
+    task_of,
+)
 
 import lw_torchrl as lw
 from lw_torchrl.modules.policy import METHODS
-from lw_torchrl.paper import execution, training
-from lw_torchrl.paper.execution import execute_run, load_result
+from lw_torchrl.paper import imitation, runs
+from lw_torchrl.paper.imitation import SCRIPTED, ImitationRun
 from lw_torchrl.paper.recipes import PRESETS, SETTINGS, Member
-from lw_torchrl.paper.runs import SCRIPTED, Run
+from lw_torchrl.paper.runs import load_result
 from lw_torchrl.training.checkpoint import demonstration_seeds
 
 
@@ -62,7 +75,7 @@ def test_a_unit_leaves_its_result_and_is_not_done_twice(undisturbed, one, monkey
     episodes, config = rates(undisturbed / one.folder)
     assert [episode["task"] for episode in episodes] == [task_of(one)] * 2
     assert (config["seed"], config["noise_scale"], config["tasks"]) == (10_003, 0.1, [task_of(one)])
-    monkeypatch.setattr(execution, "evaluate", lambda *_, **__: pytest.fail("evaluated again"))
+    monkeypatch.setattr(runs, "evaluate", lambda *_, **__: pytest.fail("evaluated again"))
     assert len(execute(one, undisturbed).episodes) == 2
 
 
@@ -115,11 +128,11 @@ def test_a_result_of_other_tasks_is_refused(undisturbed):
         with pytest.raises(
             ValueError, match=r"another configuration, it differs in tasks \(\['reach'\], now \['push'\]\)"
         ):
-            execute_run(one, PLANS, undisturbed, tasks="push", progress=False)
+            execute_short(one, undisturbed, tasks="push")
     one = a_run(setting=TINY_ONE_SHOT)
-    assert execute_run(one, PLANS, undisturbed, tasks=["push", "reach"], progress=False).config["tasks"] == ["push"]
-    with pytest.raises(ValueError, match="tasks must name some of the run's targets, push, got reach"):
-        execute_run(one, PLANS, undisturbed, tasks="reach", progress=False)
+    assert execute_short(one, undisturbed, tasks=["push", "reach"]).config["tasks"] == ["push"]
+    with pytest.raises(ValueError, match="tasks must name some of the run's, push, got reach"):
+        execute_short(one, undisturbed, tasks="reach")
 
 
 def test_a_result_of_another_description_of_a_task_is_refused(undisturbed):
@@ -128,8 +141,8 @@ def test_a_result_of_another_description_of_a_task_is_refused(undisturbed):
     plans = lw.Plans({**PLANS, "reach": lw.ConditionalPlan("reach", PLANS["reach"].steps, reach)})
     assert plans.fingerprint == PLANS.fingerprint
     with pytest.raises(ValueError, match="another configuration, it differs in own_tasks"):
-        execute_run(a_run("dc"), plans, undisturbed, tasks="reach", progress=False)
-    assert execute_run(a_run("pcbc"), plans, undisturbed, tasks="reach", progress=False)
+        execute_short(a_run("dc"), undisturbed, plans, tasks="reach")
+    assert execute_short(a_run("pcbc"), undisturbed, plans, tasks="reach")
 
 
 def test_what_a_result_says_beyond_the_run_counts(undisturbed, tmp_path):
@@ -161,12 +174,12 @@ def test_a_run_waits_for_another_process_that_does_it(undisturbed, tmp_path, hol
 @pytest.mark.parametrize(
     ("setting", "preset", "stop"),
     [
-        (TINY, PRESET, 46),
+        pytest.param(TINY, PRESET, 46, marks=pytest.mark.slow),
         (TINY_ONE_SHOT, PRESET, 46),
-        (TINY, ENSEMBLE, 46),
+        pytest.param(TINY, ENSEMBLE, 46, marks=pytest.mark.slow),
         (TINY, ENSEMBLE, 106),
-        (TINY_ONE_SHOT, ENSEMBLE, 46),
-        (TINY_ONE_SHOT, ENSEMBLE, 106),
+        pytest.param(TINY_ONE_SHOT, ENSEMBLE, 46, marks=pytest.mark.slow),
+        pytest.param(TINY_ONE_SHOT, ENSEMBLE, 106, marks=pytest.mark.slow),
     ],
 )
 def test_stopped_in_training_and_resumed_it_ends_the_same(undisturbed, tmp_path, monkeypatch, setting, preset, stop):
@@ -180,7 +193,7 @@ def test_stopped_in_training_and_resumed_it_ends_the_same(undisturbed, tmp_path,
 
 
 def test_scripts_are_the_same_in_every_setting_and_run_once(undisturbed, monkeypatch):
-    monkeypatch.setattr(execution, "evaluate", lambda *_, **__: pytest.fail("evaluated again"))
+    monkeypatch.setattr(runs, "evaluate", lambda *_, **__: pytest.fail("evaluated again"))
     other = a_run("scripted", setting=TINY_ONE_SHOT)
     assert load_result(other, PLANS, undisturbed) == load_result(a_run("scripted"), PLANS, undisturbed)
 
@@ -189,7 +202,7 @@ def test_the_policies_of_one_shot_are_kept_one_by_one(undisturbed):
     folder = undisturbed / a_run(setting=TINY_ONE_SHOT).folder
     assert sorted(path.name for path in folder.iterdir()) == ["models", "results.json"]
     actor = lw.load_actor(folder / "models" / "push.zip")
-    result = lw.evaluate(actor, tasks="push", episodes_per_task=2, seed=10_003, stop_at_success=True, progress=False)
+    result = lw.evaluate(actor, tasks="push", episodes_per_task=2, seed=10_003, max_steps=40, progress=False)
     assert result.success_once == lw.EvaluationResult.load(folder / "results.json").success_once
 
 
@@ -202,7 +215,7 @@ def test_an_ensemble_has_members_of_its_own_and_is_not_trained_twice(undisturbed
     assert [actor.config["width"] for actor in policy.members] == [32, 16]
     shutil.copytree(undisturbed, tmp_path / "again")
     (tmp_path / "again" / one.folder / "results.json").unlink()
-    result = execute_run(one, PLANS, tmp_path / "again", tasks=task_of(one), progress=False)
+    result = execute_short(one, tmp_path / "again", tasks=task_of(one))
     assert result.success_once == lw.EvaluationResult.load(undisturbed / one.folder / "results.json").success_once
     assert not list((tmp_path / "again" / one.folder).glob("checkpoint*"))
 
@@ -244,7 +257,7 @@ def test_settings_are_the_papers():
         assert preset.keys() == (SETTINGS.keys() if name != "evaluator" else {"few-shot"})
         assert "one-shot" not in preset or preset["one-shot"].training.batch_size % 180 == 0
     with pytest.raises(ValueError, match=r"method must be one of 'pcbc', .*did you mean 'pcbc'"):
-        Run(TINY, "pbc", 0, PRESET)
+        ImitationRun(TINY, "pbc", 0, PRESET)
 
 
 @pytest.mark.parametrize(
@@ -262,7 +275,7 @@ def test_passes_count_rows(undisturbed, tmp_path, monkeypatch, setting, trainer,
         steps.append(arguments[2].steps)
         stop()
 
-    monkeypatch.setattr(training, trainer, see)
+    monkeypatch.setattr(imitation, trainer, see)
     with pytest.raises(KeyboardInterrupt):
         execute(a_run(setting=setting), tmp_path, replace(PRESET, passes=2))
     rows = len(lw.LanguageWorldExperienceReplay(tmp_path / a_run().datasets[0].folder, after_success=20))
@@ -275,17 +288,17 @@ def test_passes_count_rows(undisturbed, tmp_path, monkeypatch, setting, trainer,
 def test_a_text_encoder_of_ones_own(one, tmp_path):
     own = replace(one, encoder_name="my_texts:lengths")
     assert own.folder != one.folder
-    execute_run(own, PLANS, tmp_path, tasks=task_of(own), progress=False, text_encoder=lengths)
+    execute_short(own, tmp_path, tasks=task_of(own), text_encoder=lengths)
     (tmp_path / own.folder / "results.json").unlink()
-    again = execute_run(own, PLANS, tmp_path, tasks=task_of(own), progress=False, text_encoder=lengths)
+    again = execute_short(own, tmp_path, tasks=task_of(own), text_encoder=lengths)
     assert again.config["run"]["text_encoder"] == "my_texts:lengths"
     if one.method != "one-hot":
         (tmp_path / own.folder / "results.json").unlink()
         with pytest.raises(ValueError, match="text"):  # a policy of other texts is no policy of these
-            execute_run(own, PLANS, tmp_path, tasks=task_of(own), progress=False, text_encoder=backwards)
+            execute_short(own, tmp_path, tasks=task_of(own), text_encoder=backwards)
     for named, encoder in ((own, None), (one, lengths)):
         with pytest.raises(ValueError, match="text_encoder must be given where the run has an encoder_name"):
-            execute_run(named, PLANS, tmp_path, tasks=task_of(own), progress=False, text_encoder=encoder)
+            execute_short(named, tmp_path, tasks=task_of(own), text_encoder=encoder)
 
 
 def test_a_preset_may_put_an_evaluator_into_the_policy(tmp_path):

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import pytest
 import torch
 
 import lw_torchrl as lw
 from lw_torchrl.evaluation import PlanUse, weakest_step
-from lw_torchrl.paper.online import OnlineRun
-from lw_torchrl.paper.tuning import Elsewhere, tune_step
+from lw_torchrl.paper import online
+from lw_torchrl.paper.online import Elsewhere, OnlineRun, tune_step
 
 PLANS = lw.load_plans("MT10")
 
@@ -18,7 +20,8 @@ def make_start():
     return lw.PlanConditionedActor(PLANS, width=16, depth=1)
 
 
-def test_the_weakest_step_is_that_of_its_episodes():
+def test_the_weakest_step_is_that_of_its_episodes(monkeypatch):
+    monkeypatch.setattr(online, "evaluate", partial(lw.evaluate, max_steps=60))
     start = make_start()
     actor, told = tune_step(start, "reach", "weakest", scale=0.7, seed=3, progress=False)
     use = PlanUse(PLANS)
@@ -28,6 +31,7 @@ def test_the_weakest_step_is_that_of_its_episodes():
         episodes_per_task=20,
         seed=3,
         stop_at_success=True,
+        max_steps=60,
         progress=False,
         also_record=["qaf", "skill_weights"],
         on_episode=use,

@@ -2,11 +2,13 @@
 
 import json
 from dataclasses import replace
+from functools import partial
+from unittest.mock import patch
 
 import lw_torchrl as lw
-from lw_torchrl.paper.execution import execute_run
+from lw_torchrl.paper import runs
+from lw_torchrl.paper.imitation import ImitationRun
 from lw_torchrl.paper.recipes import PRESETS, DataSetting, Execution, Member
-from lw_torchrl.paper.runs import Run
 
 PLANS = lw.load_plans("MT50")
 TINY = DataSetting("tiny", "reach", 2)
@@ -25,7 +27,7 @@ ENSEMBLE = replace(PRESET, name="ensemble", members=(MEMBER, OTHER))
 
 
 def a_run(method="pcbc", seed=3, setting=TINY, preset=PRESET):
-    return Run(setting, method, seed, preset, episodes=2)
+    return ImitationRun(setting, method, seed, preset, episodes=2)
 
 
 def task_of(one):
@@ -34,7 +36,14 @@ def task_of(one):
 
 def execute(one, out, preset=None):
     one = one if preset is None else replace(one, preset=preset)
-    return execute_run(one, PLANS, out, tasks=task_of(one), progress=False)
+    return execute_short(one, out, tasks=task_of(one))
+
+
+def execute_short(one, out, plans=PLANS, **options):
+    """Do a run with demonstrations of a hundred steps, and episodes of forty."""
+    collect, evaluate = partial(lw.collect_demonstrations, max_steps=100), partial(runs.evaluate, max_steps=40)
+    with patch.multiple(runs, collect_demonstrations=collect, evaluate=evaluate):
+        return runs.execute_run(one, plans, out, progress=False, **options)
 
 
 def rates(path):

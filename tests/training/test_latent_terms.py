@@ -9,8 +9,8 @@ import torch
 from small_training import CONFIG, assert_same, collect_demos, everything, make_actor, make_replay, make_trainer
 
 import lw_torchrl as lw
+from lw_torchrl.paper.imitation import ImitationRun
 from lw_torchrl.paper.recipes import PRESETS, SETTINGS
-from lw_torchrl.paper.runs import Run
 from lw_torchrl.training import BehavioralCloningConfig, BehavioralCloningTrainer, StackedBehavioralCloning
 from lw_torchrl.training.checkpoint import read_description
 
@@ -133,10 +133,10 @@ def test_a_checkpoint_of_another_weight_is_refused(demos, tmp_path):
 
 def test_a_run_says_of_its_training_what_it_said():
     recipe = PRESETS["strong"]["zero-shot"]
-    described = Run(SETTINGS["zero-shot"], "pcbc", 0, recipe).describe(lw.load_plans("MT50"))
+    described = ImitationRun(SETTINGS["zero-shot"], "pcbc", 0, recipe).describe(lw.load_plans("MT50"))
     assert set(described["training"]) == BEFORE
     with_it = replace(recipe, training=replace(recipe.training, latent_contrast=0.1))
-    described = Run(SETTINGS["zero-shot"], "pcbc", 0, with_it).describe(lw.load_plans("MT50"))
+    described = ImitationRun(SETTINGS["zero-shot"], "pcbc", 0, with_it).describe(lw.load_plans("MT50"))
     assert described["training"]["latent_contrast"] == 0.1
     assert "latent_consistency" not in described["training"]
 

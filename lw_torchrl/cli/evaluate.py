@@ -1,29 +1,16 @@
-"""The subcommands of ``lw-torchrl`` that make policies: demonstrations, training, evaluation."""
+"""``lw-torchrl evaluate``, trained policies and experts; ``lw-torchrl scripted``, plans carried out by scripts."""
 
 from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
 from lw_torchrl._checks import counted
-from lw_torchrl.cli.outputs import check_folder
-from lw_torchrl.cli.sources import (
-    ACTORS,
-    check_actor,
-    check_encoder,
-    check_plan_files,
-    check_saved,
-    load_policy,
-    one_or_many,
-    read_plans,
-    read_tasks,
-    simulated,
-)
-from lw_torchrl.cli.tables import Columns, Output
-from lw_torchrl.cli.threads import use_one_thread
+from lw_torchrl.cli import options
+from lw_torchrl.cli.output import Output
 from lw_torchrl.cli.train_evaluator import with_evaluator
 
 if TYPE_CHECKING:
@@ -31,85 +18,13 @@ if TYPE_CHECKING:
     from lw_torchrl.modules.policy import Policy
 
 
-def collect(
-    tasks: Positional[Annotated[tuple[str, ...], arg(metavar="TASKS ...")]],
-    /,
-    out: Path,
-    episodes: int = 10,
-    seed: int = 0,
-    noise: tuple[float, ...] = (0.0,),
-    noise_hold: int = 10,
-    gripper_noise: float = 0.2,
-    redraw_failures: bool = False,
-    policy: str = "expert",
-    behaviour: str | None = None,
-    num_envs: int | None = None,
-    json: bool = False,
-) -> Output:
-    """Collect demonstrations of the scripted experts, or of others. Stopped and started again it carries on.
-
-    Example: lw-torchrl collect MT10 --out demos/mt10 --noise 0 0.1 0.2 --redraw-failures
-
-    Args:
-        tasks: MT10, MT50, or names of tasks.
-        out: the dataset's folder.
-        episodes: kept for each task.
-        seed: evaluate on another one.
-        noise: standard deviations of the execution noise, gone through in turn, one an episode.
-        noise_hold: steps for which each draw of the noise is kept; longer leads further astray.
-        gripper_noise: what the noise on the gripper is multiplied by; noise there makes grasps fail.
-        redraw_failures: keep successful episodes only.
-        policy: who acts: expert, Meta-World's scripts; scripted, plans with scripted skills; spoilt-60 or spoilt-30,
-            the same in so many of 100 pieces of an episode; wrong, any skill of the plan; random; or a policy's file,
-            of `lw-torchrl train`.
-        behaviour: the label of its episodes; by default the name of who acts, of a policy its file's.
-        num_envs: environments stepped together; the dataset does not depend on it.
-        json: print one JSON document instead, see docs/cli.md.
-    """
-    check_folder("--out", out)
-    check_actor("policy", policy)
-    from lw_torchrl.language.tasks import TASKS
-
-    chosen = simulated("tasks", one_or_many(tasks), TASKS)
-    from lw_torchrl.data import collect_demonstrations
-
-    acts: str | Policy = policy
-    if policy not in ACTORS:
-        from lw_torchrl.training.checkpoint import load_actor
-
-        use_one_thread()
-        acts, behaviour = load_actor(policy), behaviour or Path(policy).stem
-    made = collect_demonstrations(
-        chosen,
-        episodes_per_task=episodes,
-        root=out,
-        seed=seed,
-        noise_scale=noise,
-        noise_hold=noise_hold,
-        gripper_noise_factor=gripper_noise,
-        redraw_failures=redraw_failures,
-        policy=acts,
-        behaviour=behaviour,
-        num_envs=num_envs,
-    )
-    output = Output(json)
-    rows = [
-        {"task": task, "success": rate, "episodes_run": made.attempts[task]} for task, rate in made.success_rate.items()
-    ]
-    columns: Columns = {"task": "task", "success": lambda row: f"{row['success']:.2f}", "episodes run": "episodes_run"}
-    output.table("tasks", rows, columns)
-    output.show("dataset", made.root)
-    output.show("steps", made.num_steps, f"{counted(made.num_steps, 'step')} in {made.root}")
-    return output
-
-
 def evaluate(
     checkpoint: Positional[Annotated[Path, arg(metavar="CHECKPOINT")]],
     /,
     tasks: tuple[str, ...] = (),
     plans: tuple[str, ...] = (),
-    task_file: Path | None = None,
-    text_encoder: str | None = None,
+    task_file: options.TaskFile = None,
+    text_encoder: options.OwnEncoder = None,
     episodes: int = 20,
     seed: int = 1000,
     noise: float = 0.1,
@@ -119,8 +34,8 @@ def evaluate(
     reference: tuple[str, ...] = (),
     evaluator: Path | None = None,
     out: Path | None = None,
-    device: str = "cpu",
-    json: bool = False,
+    device: options.Device = "cpu",
+    json: options.Json = False,
 ) -> Output:
     """Evaluate a trained policy, or the scripted experts, and write the result, a figure and a recording.
 
@@ -132,49 +47,44 @@ def evaluate(
             trained on.
         plans: carry out these instead of the policy's own: MT10, MT50, .plan or .json files, or folders; where several
             have a plan for a task, the last one's counts.
-        task_file: tasks of yours, whose objects and points the plans may name.
-        text_encoder: the function that the policy was trained with, if it was one of yours, as my_texts:encode.
         episodes: of each task.
         seed: fixes initial states, goals and noise; not one that the demonstrations used.
         noise: standard deviation of the noise on the executed action.
         stop_at_success: end an episode at its first success; any-step success stays the same.
         num_envs: environments stepped together; the result does not depend on it.
-        attribute: say of each failed episode whether a query, the plan or a skill was at fault, or time; they are run
-            again a few times.
-        reference: with --attribute, plans that are trusted, for failed episodes to be run again with: MT10, MT50, .plan
-            or .json files, or folders.
+        attribute: say why each failed episode failed: a query, the plan, a skill or time. They are run again a few
+            times.
+        reference: with --attribute, trusted plans for running failed episodes again: MT10, MT50, .plan or .json files,
+            or folders.
         evaluator: a network that answers the conditions, of `lw-torchrl train-evaluator`.
         out: folder for results.json, success.png and rollout.rrd; with --attribute also failures.png.
-        device: where the networks work: cpu; cuda, or cuda:1 for the second of several; mps, a Mac's; or auto, the GPU
-            where there is one. The simulation is always on the CPU.
-        json: print one JSON document instead, see docs/cli.md.
     """
     if out is not None:
-        check_folder("--out", out)
+        options.check_folder("--out", out)
     if reference and not attribute:
         raise ValueError("--reference is for --attribute, which runs failed episodes again with these plans")
     if evaluator is not None and str(checkpoint) == "expert":
         raise ValueError("--evaluator is for a policy with plans, the scripted experts ask no conditions")
     if str(checkpoint) != "expert":
-        check_saved("checkpoint", checkpoint)
+        options.check_saved("checkpoint", checkpoint)
     if evaluator is not None:
-        check_saved("evaluator", evaluator, "network", "train-evaluator")
-    check_encoder(text_encoder)
-    known = dict(read_tasks(task_file))
-    chosen = simulated("tasks", one_or_many(tasks), known) if tasks else ()
-    given = read_plans(plans, known) if plans else None
-    check_plan_files("--reference", reference)  # which may speak of a policy's own tasks
+        options.check_saved("evaluator", evaluator, "network", "train-evaluator")
+    options.check_encoder(text_encoder)
+    known = dict(options.read_tasks(task_file))
+    chosen = options.simulated("tasks", options.one_or_many(tasks), known) if tasks else ()
+    given = options.read_plans(plans, known) if plans else None
+    options.check_plan_files("--reference", reference)  # which may speak of a policy's own tasks
     import lw_torchrl as lw
     from lw_torchrl._devices import check_device
     from lw_torchrl._files import held
     from lw_torchrl.evaluation import plot_failures
     from lw_torchrl.record.rollouts import run_recorded, write_recording
 
-    use_one_thread()
+    options.use_one_thread()
     there = check_device("device", device)
     policy = None
     if str(checkpoint) != "expert":
-        policy = load_policy(checkpoint, seed, given, text_encoder)
+        policy = options.load_policy(checkpoint, seed, given, text_encoder)
         if evaluator is not None:
             policy = with_evaluator(policy, evaluator, text_encoder)
         known.update({task: found for task in policy.tasks if (found := policy.definition(task)) is not None})
@@ -194,7 +104,7 @@ def evaluate(
         num_envs=num_envs,
         device=there,
         attribute=attribute,
-        reference=read_plans(reference, known) if reference else None,
+        reference=options.read_plans(reference, known) if reference else None,
     )
     output = Output(json)
     output.result(result)
@@ -221,8 +131,7 @@ def evaluate(
 
 
 def _default_tasks(policy: Policy, checkpoint: Path, *, trained: bool) -> tuple[str, ...]:
-    """The policy's tasks, of these the ones that its file says it was trained on, of these the simulator's; what is
-    left out is printed."""
+    """The tasks that a policy was trained on, as its file says, that the simulator has; what is left out is printed."""
     from lw_torchrl.language.tasks import TASKS
     from lw_torchrl.training.checkpoint import demonstrated_tasks
 
@@ -240,3 +149,77 @@ def _default_tasks(policy: Policy, checkpoint: Path, *, trained: bool) -> tuple[
     if own:
         print(f"without {', '.join(own)}, which the simulator lacks")
     return tuple(task for task in chosen if task in TASKS)
+
+
+def scripted(
+    names: Positional[Annotated[tuple[str, ...], arg(metavar="[NAMES ...]")]] = ("MT10",),
+    /,
+    episodes: int = 50,
+    seed: int = 1000,
+    select: Literal["first", "random", "mix"] = "first",
+    noise: float = 0.0,
+    plans: options.PlanSources = ("MT50",),
+    skill_file: options.SkillFile = None,
+    task_file: options.TaskFile = None,
+    full: bool = False,
+    out: Path = Path("runs/scripted"),
+    json: options.Json = False,
+) -> Output:
+    """Carry out plans with scripted skills, and say how each step fared: no training, no expert.
+
+    Example: lw-torchrl scripted MT50 --episodes 50
+
+    Args:
+        names: MT10, MT50, or names of tasks.
+        episodes: of each task.
+        seed: fixes initial states and goals.
+        select: of several true steps, take the first, a random one, as in the paper, or mix them.
+        noise: standard deviation of the noise on the executed action.
+        full: run all 500 steps, instead of stopping at the first success.
+        out: folder for results.json, plan_use.json and success.png.
+    """
+    options.check_folder("--out", out)
+    known = options.read_tasks(task_file)
+    chosen = options.simulated("tasks", options.one_or_many(names), known)
+    loaded = options.read_plans(plans, known)
+    loaded.require(chosen)
+    loaded = type(loaded)({task: loaded[task] for task in chosen})
+    skills = options.read_skills(skill_file, known)
+    import lw_torchrl as lw
+    from lw_torchrl._files import held, write_json
+    from lw_torchrl.evaluation.plan_use import PlanUse
+
+    use = PlanUse(loaded)
+    result = lw.evaluate(
+        lw.ScriptedSkillActor(loaded, select, skills=skills),
+        tasks=chosen,
+        episodes_per_task=episodes,
+        seed=seed,
+        noise_scale=noise,
+        stop_at_success=not full,
+        also_record=["qaf", "skill_weights"],
+        on_episode=use,
+    )
+    seen = use.tasks()
+    steps = {
+        task: [
+            {"skill": step.skill, "true": true, "chosen": taken, "stuck": stuck}
+            for step, true, taken, stuck in zip(loaded[task].steps, found.true, found.chosen, found.stuck, strict=True)
+        ]
+        for task, found in seen.items()
+    }
+    if not json:
+        for task, found in seen.items():
+            print(f"{task}: success {result.success_once[task]:.2f}")
+            for one in steps[task]:
+                ended = f", stuck here in {one['stuck']} of {found.failed} failed episodes" if one["stuck"] else ""
+                print(f"    true {one['true']:4.0%}  chosen {one['chosen']:4.0%}  {one['skill']}{ended}")
+        print()
+    output = Output(json)
+    output.result(result, steps=steps)
+    with held(out, "out", folder=True, wait=True):
+        result.save(out / "results.json", plans=loaded.fingerprint)
+        write_json(out / "plan_use.json", {task: found.to_json() for task, found in seen.items()})
+        lw.plot_success(result, out / "success.png", title=f"plans and scripted skills, {episodes} episodes a task")
+    print(f"written to {out}")
+    return output

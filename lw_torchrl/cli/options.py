@@ -1,14 +1,20 @@
-"""What a user brings to a command, under the same option everywhere: --task-file, --plans, --skill-file,
---text-encoder, datasets and policies. What names and files alone can tell is checked without torch."""
+"""Options that mean the same in every command: the user's files, plans, policies and encoders; places to write to.
+
+What names and files alone can tell is checked without torch.
+"""
 
 from __future__ import annotations
 
+import os
 import sys
+import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from tyro.conf import arg
 
 from lw_torchrl._checks import unknown_name
 
@@ -25,8 +31,28 @@ ACTORS = ("expert", "scripted", "spoilt-60", "spoilt-30", "wrong", "random")
 METHODS = ("pcbc", "dc", "one-hot")
 """The names of :data:`lw_torchrl.modules.METHODS`."""
 
-
-_OWN_ENGINE = "tasks of your own run in an engine of yours, in Python: docs/training.md"
+Json = Annotated[bool, arg(help="print one JSON document instead, see docs/cli.md.")]
+TaskFile = Annotated[Path | None, arg(help="a file of your tasks, which replace ours of the same name or join them.")]
+SkillFile = Annotated[Path | None, arg(help="a file of your skills, which replace ours of the same text or join them.")]
+EncoderName = Annotated[str | None, arg(help="your function from texts to vectors, as my_texts:encode.")]
+OwnEncoder = Annotated[
+    str | None, arg(help="the function that the policy was trained with, if it was one of yours, as my_texts:encode.")
+]
+Device = Annotated[
+    str,
+    arg(
+        help="where networks work: cpu; cuda, or cuda:1 for the second of several; mps, a Mac's; or auto, the GPU if "
+        "there is one. The simulation is always on the CPU."
+    ),
+]
+PlanSources = Annotated[
+    tuple[str, ...],
+    arg(
+        help="MT10 or MT50 for the shipped plans, .plan files, .json files of pairs, or folders. If several have a "
+        "plan for a task, the last one counts."
+    ),
+]
+TaskNames = Annotated[tuple[str, ...], arg(metavar="TASKS ...", help="MT10, MT50, or names of tasks.")]
 
 
 def one_or_many(names: tuple[str, ...]) -> str | tuple[str, ...]:
@@ -35,7 +61,7 @@ def one_or_many(names: tuple[str, ...]) -> str | tuple[str, ...]:
 
 
 def read_tasks(task_file: Path | None) -> Mapping[str, Task]:
-    """The 50 tasks, with those of --task-file in their place or beside them.
+    """The 50 tasks, with those of --task-file, which replace them or join them.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -50,8 +76,7 @@ def read_tasks(task_file: Path | None) -> Mapping[str, Task]:
 
 
 def read_skills(skill_file: Path | None, tasks: Mapping[str, Task]) -> Mapping[str, ScriptedSkill]:
-    """The scripted skills, with those of --skill-file in their place or beside them; errors as of
-    :func:`read_tasks`."""
+    """The scripted skills, with those of --skill-file; errors as of :func:`read_tasks`."""
     from lw_torchrl.language.skills import load_skills
 
     if skill_file is None:
@@ -81,14 +106,17 @@ def simulated(argument: str, names: str | Sequence[str], known: Mapping[str, Tas
 
     given = [names] if isinstance(names, str) else names
     if own := [name for name in given if name not in (*SETS, *TASKS) and name in known]:
-        raise ValueError(f"{argument}: the simulator has no {', '.join(own)}; {_OWN_ENGINE}")
+        raise ValueError(
+            f"{argument}: the simulator has no {', '.join(own)}; "
+            "tasks of your own run in an engine of yours, in Python: docs/training.md"
+        )
     return resolve_tasks(names, tasks=TASKS)
 
 
 def read_plans(sources: Sequence[str], tasks: Mapping[str, Task], skills: Literal["own", "MT10"] = "own") -> Plans:
-    """The plans of --plans: MT10, MT50, files and folders; where two have a plan for a task, the later one's counts.
+    """The plans of --plans: MT10, MT50, files and folders; where two have a plan for a task, the later one counts.
 
-    A shipped plan that counts is carried over to the task of that name in ``tasks``.
+    A shipped plan is carried over to the task of its name in ``tasks``.
 
     Raises:
         PlanError: (a ValueError) a source holds no valid plans, or a shipped one names what a task of the user's lacks.
@@ -115,6 +143,40 @@ def read_plans(sources: Sequence[str], tasks: Mapping[str, Task], skills: Litera
                     f"fit the {task!r} of --task-file; name a plan of yours for it, last ({error})"
                 ) from error
     return Plans(found)
+
+
+def check_folder(option: str, path: Path) -> Path:
+    """Return ``path`` if it is a folder that can be written to, or one could be made there.
+
+    Raises:
+        ValueError: it is a file, lies below one, or cannot be written to.
+    """
+    here = path
+    while not os.path.lexists(here):
+        here = here.parent
+    if not here.is_dir():
+        where = f"{str(path)!r} is none" if here == path else f"{str(path)!r} lies below the file {str(here)!r}"
+        raise ValueError(f"{option} must be a folder, {where}")
+    try:
+        with tempfile.TemporaryFile(dir=here):
+            pass
+    except OSError as error:
+        raise ValueError(f"{option}: {str(here)!r} cannot be written to ({error.strerror})") from error
+    return path
+
+
+def check_file(option: str, path: Path, ending: str = "") -> Path:
+    """Return ``path`` if it is a file that can be written to, or one could be made there.
+
+    Raises:
+        ValueError: it is a folder, its folder cannot be written to, or its name ends otherwise.
+    """
+    if path.is_dir():
+        raise ValueError(f"{option} must be a file, {str(path)!r} is a folder")
+    check_folder(f"{option}'s folder", path.parent)
+    if not path.name.endswith(ending):
+        raise ValueError(f"{option} must end in {ending!r}, got {str(path)!r}")
+    return path
 
 
 def check_encoder(name: str | None) -> None:
@@ -207,3 +269,12 @@ def load_policy(checkpoint: Path, seed: int, plans: Plans | None, text_encoder: 
         raise ValueError(f"seed must differ from the demonstrations' seed, {seed}; an evaluation wants fresh states")
     policy = lw.load_actor(checkpoint, text_encoder=read_encoder(text_encoder))
     return policy if plans is None else policy.with_plans(plans)
+
+
+def use_one_thread() -> None:
+    """One thread for PyTorch, unless OMP_NUM_THREADS says otherwise: networks this small gain little from a second, and
+    lose much where another process wants the core."""
+    if "OMP_NUM_THREADS" not in os.environ:
+        import torch
+
+        torch.set_num_threads(1)

@@ -4,7 +4,7 @@ import sys
 
 import pytest
 
-from lw_torchrl.paper.launchers import run_command, run_commands
+from lw_torchrl.cli.runs import run_command, run_commands
 
 FAILS = ["plans", "no-such-folder"]
 
@@ -15,7 +15,7 @@ def test_a_command_says_what_it_printed_or_why_it_failed():
         run_command(FAILS)
 
 
-@pytest.mark.parametrize("launcher", ["local", "ray"])
+@pytest.mark.parametrize("launcher", ["local", pytest.param("ray", marks=pytest.mark.slow)])
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::FutureWarning", "ignore::DeprecationWarning")
 def test_every_command_runs_and_an_error_comes_last(launcher):
     if launcher == "ray":

@@ -1,29 +1,36 @@
-"""What a command has found: tables on a terminal, plain columns in a pipe, or one JSON document with ``--json``."""
+"""What a command prints: tables, plain columns in a pipe or one JSON document; and streams that it can print to."""
 
 from __future__ import annotations
 
 import json
 import math
+import os
+import select
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING, Any, TextIO
+
+from lw_torchrl._checks import counted
 
 if TYPE_CHECKING:
     from lw_torchrl.evaluation import EvaluationResult
 
+BROKEN_PIPE = 141  # what a shell reports of a program that a closed pipe ended
 Row = Mapping[str, Any]
 Columns = Mapping[str, str | Callable[[Row], Any]]
 """Heading to the name of what stands in a row, or to a function of the row."""
 
 
 class Output:
-    """Prints what is found as text, at once, or gathers it for a document.
+    """Prints what is found as text, at once, or gathers it for a JSON document.
 
     Args:
         as_json: gather.
 
     Attributes:
-        fault: what the command ends with as an error, once all that it found is printed; "" for none.
+        fault: the error with which the command ends after printing what it found; "" for none.
 
     Example:
         >>> output = Output(as_json=False)
@@ -48,13 +55,7 @@ class Output:
         elif text is not None:
             print(text)
 
-    def table(
-        self,
-        key: str,
-        rows: Sequence[Row],
-        columns: Columns | None = None,
-        title: str = "",
-    ) -> None:
+    def table(self, key: str, rows: Sequence[Row], columns: Columns | None = None, title: str = "") -> None:
         """Print rows as a table, or keep them under the key.
 
         Args:
@@ -82,6 +83,13 @@ class Output:
         self.show("mean_success", found.mean_success)
         self.show("config", found.config)
 
+    def notes(self, found: Iterable[str]) -> None:
+        """Print what is noted of answers, the most frequent first, or keep it under "notes"."""
+        noted = Counter(found).most_common()
+        self.show("notes", [{"note": note, "answers": times} for note, times in noted])
+        for note, times in noted:
+            print(f"{counted(times, 'answer')}: {note}")
+
     def document(self) -> str:
         """All that was kept, as JSON: what is no finite number is null, a path a text."""
         return json.dumps(_plain(self._found), indent=2, allow_nan=False)
@@ -104,7 +112,7 @@ def _cell(value: Any) -> str:
 
 
 def _in_pipe(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Columns as wide as what stands in them, whatever the terminal; nothing behind the last."""
+    """Columns as wide as their cells, whatever the terminal; no padding behind the last."""
     lines = [headings, *rows]
     widths = [max(len(line[column]) for line in lines) for column in range(len(headings))]
     found = [f"{title}\n"] if title else []
@@ -129,3 +137,63 @@ def _on_terminal(title: str, headings: Sequence[str], rows: Sequence[Sequence[st
     for row in rows:
         table.add_row(*row)
     Printer(highlight=False, markup=False).print(table)
+
+
+def check_arguments(args: Sequence[str]) -> None:
+    """Refuse an argument that is no text in the locale's encoding: its name could be written to no file of ours."""
+    for arg in args:
+        if any("\ud800" <= character <= "\udfff" for character in arg):
+            raise ValueError(f"the argument {arg!a} is no text in the encoding {sys.getfilesystemencoding()}")
+
+
+def complain(message: str) -> None:
+    """Print to the standard error, if it can be written to."""
+    with suppress(OSError):
+        print(message, file=sys.stderr, flush=True)
+
+
+def nobody_reads() -> bool:
+    """Whether the standard output or error is a pipe whose other end is closed."""
+    poll = select.poll()
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError):  # under a test's capture they have no number
+            poll.register(stream.fileno(), 0)
+    return any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0))
+
+
+def _replace_absent() -> None:
+    # In this order, since an opened file gets the lowest free number: nothing of ours is opened as 1 or 2.
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))  # noqa: SIM115
+    for stream in (sys.stdout, sys.stderr):
+        if getattr(stream, "errors", None) in ("strict", "surrogateescape"):  # the latter in the C locale
+            stream.reconfigure(errors="replace")  # type: ignore[union-attr]
+
+
+def _let_go(stream: TextIO) -> None:
+    """Drop what cannot be printed, so that the interpreter does not fail at its end."""
+    try:
+        stream.flush()
+    except OSError:
+        with open(os.devnull, "w", encoding="utf-8") as nowhere:
+            os.dup2(nowhere.fileno(), stream.fileno())
+
+
+@contextmanager
+def sound_streams() -> Iterator[None]:
+    """Within the block there are streams to print to; a :class:`BrokenPipeError` of theirs ends the program quietly.
+
+    Raises:
+        SystemExit: 141, since nobody reads.
+    """
+    _replace_absent()
+    try:
+        yield
+    except BrokenPipeError:
+        if not nobody_reads():
+            raise
+        sys.exit(BROKEN_PIPE)
+    finally:
+        for stream in (sys.stdout, sys.stderr):
+            _let_go(stream)

@@ -1,0 +1,193 @@
+"""Experiments from the command line: run by run, here, in several processes or on a Ray cluster, then a summary."""
+
+from __future__ import annotations
+
+import logging
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from tyro.conf import OmitArgPrefixes
+
+from lw_torchrl._checks import check_choice, check_int
+from lw_torchrl.cli.options import check_folder, use_one_thread
+from lw_torchrl.cli.output import Output
+
+if TYPE_CHECKING:
+    from lw_torchrl.evaluation import EvaluationResult
+
+Job = Callable[[], "EvaluationResult | None"]
+"""Does a run, or makes what several runs share, which has no result."""
+Launcher = Literal["local", "ray"]
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Which runs are done, and where."""
+
+    launcher: Launcher = "local"
+    """local, on this machine; ray, on a Ray cluster, or on all cores of this machine."""
+    jobs: int = 1
+    """runs at a time, by the launcher local."""
+    run: str | None = None
+    """do this run alone, of the names that --list prints."""
+    list: bool = False
+    """print the names of the runs and do nothing."""
+
+    def check(self, out: Path) -> None:
+        """Raise :class:`ValueError` for options that exclude each other, or where nothing can be written."""
+        if not self.list:
+            check_folder("--out", out)
+        elif self.run is not None:
+            raise ValueError("--list names the runs and does none, --run does one: give one of them")
+        check_int("jobs", self.jobs, minimum=1)
+
+    def execute(
+        self,
+        output: Output,
+        shared: Sequence[Mapping[str, Job]],
+        runs: Sequence[Mapping[str, Job]],
+        command: Sequence[object],
+        summarize: Callable[[], Mapping[str, Any]],
+        told: Callable[[EvaluationResult], str] = lambda result: "",
+    ) -> Output:
+        """Do what is asked for; the summary is written when all runs are done.
+
+        Args:
+            output: what is found goes there.
+            shared: stages of jobs that runs share, by their names; a run does what it lacks of them itself.
+            runs: stages of runs, by their names.
+            command: arguments of ``lw-torchrl`` that list the same runs in another process.
+            summarize: write the summary; returns what it holds.
+            told: more lines about a run's result.
+        """
+        every = {name: job for stage in (*shared, *runs) for name, job in stage.items()}
+        names = [name for stage in runs for name in stage]
+        if self.list:
+            output.show("runs", [*every], "\n".join(every))
+            return output
+        use_one_thread()
+
+        def line(name: str) -> tuple[EvaluationResult | None, str]:
+            result = every[name]()
+            if result is None:
+                return None, name
+            said = f"{name}: mean success {result.mean_success:.3f}, {result.config['seconds']:.0f} s"
+            return result, "\n".join(filter(None, (said, told(result))))
+
+        if self.run is not None:
+            result, said = line(check_choice("run", self.run, every))
+            output.show("run", self.run)
+            if result is not None:
+                print(said)
+                if output.as_json:
+                    output.result(result)
+            return output
+        if self.launcher == "local" and self.jobs == 1:
+            _report(len(names), (line(name)[1] for name in names))
+        else:
+            given = [str(one) for one in command]
+            for stage in (*shared, *runs):
+                _report(len(stage), self._elsewhere([*stage], given))
+        output.show("summaries", summarize())
+        return output
+
+    def _elsewhere(self, names: Sequence[str], command: Sequence[str]) -> Iterator[str]:
+        """Do runs by ``lw-torchrl COMMAND --run NAME``, several at a time; yields what each printed, as it ends."""
+        for index, printed in run_commands([[*command, "--run", name] for name in names], self.launcher, self.jobs):
+            yield printed.strip() or names[index]
+
+
+Scheduled = Annotated[Schedule, OmitArgPrefixes]
+"""The options of a :class:`Schedule`, of a command."""
+
+
+def _report(total: int, lines: Iterator[str]) -> None:
+    """Print what each run says as it ends, and how long the others will take."""
+    started = time.perf_counter()
+    for number, line in enumerate(lines, 1):
+        left = (time.perf_counter() - started) / number * (total - number)
+        print(f"[{number}/{total}] {line}; about {left / 60:.0f} min left", flush=True)
+
+
+def run_command(arguments: Sequence[str]) -> str:
+    """Run ``lw-torchrl`` with these arguments in a process of its own, on one core; return what it printed.
+
+    Raises:
+        RuntimeError: it failed, with the end of what it said.
+    """
+    done = subprocess.run(
+        [sys.executable, "-m", "lw_torchrl", *arguments],
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if done.returncode:
+        said = "\n".join(done.stderr.splitlines()[-5:])
+        raise RuntimeError(f"lw-torchrl {' '.join(arguments)} failed:\n{said}")
+    return done.stdout
+
+
+def run_commands(commands: Sequence[Sequence[str]], launcher: Launcher, jobs: int) -> Iterator[tuple[int, str]]:
+    """Run commands, several at a time; yield the index and the output of each as it ends.
+
+    A command that fails does not stop the others that run; once they have ended, the first error is raised.
+
+    Args:
+        commands: arguments of ``lw-torchrl`` each.
+        launcher: "local", ``jobs`` processes; "ray", a task of one core each, on the cluster that RAY_ADDRESS names or
+            on this machine. A cluster's machines must see the same files.
+        jobs: of "local".
+
+    Raises:
+        RuntimeError: a command failed.
+        ImportError: "ray" without the extra ``[ray]``.
+    """
+    failed: Exception | None = None
+    for index, outcome in _ray(commands) if launcher == "ray" else _local(commands, jobs):
+        if isinstance(outcome, Exception):
+            failed = failed or outcome
+        else:
+            yield index, outcome
+    if failed is not None:
+        raise RuntimeError(str(failed)) from failed
+
+
+def _local(commands: Sequence[Sequence[str]], jobs: int) -> Iterator[tuple[int, str | Exception]]:
+    with ThreadPoolExecutor(jobs) as pool:
+        futures = {pool.submit(run_command, command): index for index, command in enumerate(commands)}
+        try:
+            for future in as_completed(futures):
+                yield futures[future], future.exception() or future.result()  # type: ignore[misc]
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def _ray(commands: Sequence[Sequence[str]]) -> Iterator[tuple[int, str | Exception]]:
+    try:
+        import ray
+    except ImportError as error:
+        raise ImportError("launcher 'ray' needs the extra [ray]: pip install 'lw_torchrl[ray]'") from error
+    started = not ray.is_initialized()
+    if started:
+        ray.init(log_to_driver=False, include_dashboard=False, logging_level=logging.WARNING)
+    try:
+        task = ray.remote(num_cpus=1, max_retries=3)(run_command)
+        waiting = {task.remote(list(command)): index for index, command in enumerate(commands)}
+        while waiting:
+            (done,), _ = ray.wait(list(waiting), num_returns=1)
+            index = waiting.pop(done)
+            try:
+                yield index, ray.get(done)
+            except ray.exceptions.RayError as error:
+                yield index, getattr(error, "cause", None) or error  # what the task raised, without Ray's traceback
+    finally:
+        if started:
+            ray.shutdown()
