@@ -18,9 +18,8 @@ from torchrl.data.replay_buffers.storages import Storage
 from lw_torchrl._files import reading
 from lw_torchrl._state_tree import join, split
 from lw_torchrl._tensor_archive import TensorArchive, write_archive
-from lw_torchrl.data.checksums import verify
-from lw_torchrl.data.dataset import Demonstrations
-from lw_torchrl.data.metadata import read_metadata
+from lw_torchrl.data.dataset import Demonstrations, read_metadata
+from lw_torchrl.data.memory_map import verify
 from lw_torchrl.data.selection import JoinedDemonstrations
 
 _FILE = "buffer.zip"

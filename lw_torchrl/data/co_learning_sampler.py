@@ -14,10 +14,9 @@ from torchrl.data.replay_buffers.storages import Storage
 
 from lw_torchrl._checks import unknown_name
 from lw_torchrl._keys import check_key
-from lw_torchrl.data.device_storage import beside
-from lw_torchrl.data.group_sampler import GroupSampler, column, nearest_sizes
 from lw_torchrl.data.growing import GrowingStorage
-from lw_torchrl.data.storage import JoinedStorage
+from lw_torchrl.data.samplers import GroupSampler, column, nearest_sizes
+from lw_torchrl.data.storage import JoinedStorage, beside
 from lw_torchrl.language.tasks import MT50, TASKS, task_id
 
 GROWN = "grown"

@@ -18,7 +18,6 @@ from lw_torchrl._checks import checked
 from lw_torchrl._files import flush, held, write_json
 from lw_torchrl._versions import SIMULATORS, package_versions, version_changes
 from lw_torchrl.data.behaviours import Behaviour, behaviour_of
-from lw_torchrl.data.checksums import whole_episodes
 from lw_torchrl.data.dataset import (
     DATA,
     LOCK,
@@ -29,18 +28,21 @@ from lw_torchrl.data.dataset import (
     DatasetError,
     Demonstrations,
     EpisodeInfo,
+    read_config,
+    read_metadata,
+    read_versions,
+    write_metadata,
 )
-from lw_torchrl.data.episode_files import EpisodeFiles, write_failed
-from lw_torchrl.data.metadata import read_config, read_metadata, read_versions, write_metadata
-from lw_torchrl.data.missing_episodes import run_missing_episodes
-from lw_torchrl.data.rows import (
+from lw_torchrl.data.memory_map import (
     ROW_BYTES,
     describe_episode,
     holds_columns,
     load_rows,
     read_rows,
+    whole_episodes,
     write_rows,
 )
+from lw_torchrl.data.missing_episodes import EpisodeFiles, run_missing_episodes, write_failed
 from lw_torchrl.language.tasks import resolve_tasks, task_id
 from lw_torchrl.modules.networks import evaluating
 from lw_torchrl.modules.policy import Policy

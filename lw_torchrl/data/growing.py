@@ -1,4 +1,4 @@
-"""GrowingStorage: demonstrations as they are on disk, and behind them rows that come while learning."""
+"""GrowingStorage: demonstrations on disk, and behind them rows that are written during training."""
 
 from __future__ import annotations
 
@@ -11,14 +11,13 @@ from typing import Any, NoReturn
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
+from torchrl.data.replay_buffers.writers import Writer
 
 from lw_torchrl._checks import check_int
 from lw_torchrl._files import reading
 from lw_torchrl._tensor_archive import TensorArchive, write_archive
-from lw_torchrl.data.collected import collected_rows
-from lw_torchrl.data.grown_state import check_grown
 from lw_torchrl.data.storage import DEMONSTRATION, DONE, REWARD, TRAJECTORY, JoinedStorage, column_name
-from lw_torchrl.data.trajectories import Open, follow, shared_keys
+from lw_torchrl.data.trajectories import Open, check_grown, collected_rows, follow, shared_keys
 
 Columns = Mapping[NestedKey, Tensor]
 
@@ -245,3 +244,40 @@ class GrowingStorage(JoinedStorage):
                 "batches, and extend the buffer with them here"
             )
         return super().__getstate__()
+
+
+class GrowingWriter(Writer):
+    """Writes what a buffer is extended with to its :class:`GrowingStorage`."""
+
+    _storage: GrowingStorage
+
+    @property
+    def _write_count(self) -> int:
+        return self._storage.count
+
+    def extend(self, data: TensorDictBase) -> Tensor:
+        """Write the rows of a batch; their places, int64 of the batch's shape."""
+        index = self._storage.extend(data)
+        for entity in self._storage._attached_entities_iter():
+            entity.mark_update(index.reshape(-1))
+        return index
+
+    def add(self, data: TensorDictBase) -> Tensor:
+        """Write one step, of one row or of (N,) rows; their places, int64 of its shape."""
+        return self.extend(data if data.ndim else data.unsqueeze(0)).view(data.shape)
+
+    def _empty(self, empty_write_count: bool = True) -> None:
+        pass
+
+    def state_dict(self) -> dict[str, Any]:
+        """Nothing; the storage knows how many rows were written."""
+        return {}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Nothing to restore."""
+
+    def dumps(self, path: Any) -> None:
+        """Nothing to write."""
+
+    def loads(self, path: Any) -> None:
+        """Nothing to read."""

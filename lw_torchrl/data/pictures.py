@@ -24,11 +24,9 @@ from lw_torchrl._checks import check_int, checked
 from lw_torchrl._files import replacing
 from lw_torchrl._progress import Progress
 from lw_torchrl._rendering import check_cameras
-from lw_torchrl.data.checksums import verify
-from lw_torchrl.data.dataset import DatasetError, Demonstrations, EpisodeInfo
-from lw_torchrl.data.metadata import read_metadata
+from lw_torchrl.data.dataset import DatasetError, Demonstrations, EpisodeInfo, read_metadata
+from lw_torchrl.data.memory_map import load_rows, verify
 from lw_torchrl.data.replay import LanguageWorldExperienceReplay
-from lw_torchrl.data.rows import load_rows
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.transforms.camera import CameraTransform
 

@@ -21,14 +21,9 @@ from torchrl.envs import Transform
 from lw_torchrl._checks import check_choice, check_int, check_path, checked_but
 from lw_torchrl._devices import CPU, check_device
 from lw_torchrl.data.buffer_state import RestorableReplay, fingerprint
-from lw_torchrl.data.checksums import verify
-from lw_torchrl.data.dataset import DATA, Demonstrations
-from lw_torchrl.data.device_storage import DeviceStorage
-from lw_torchrl.data.filters import EpisodeFilter
-from lw_torchrl.data.growing import GrowingStorage
-from lw_torchrl.data.growing_writer import GrowingWriter
-from lw_torchrl.data.metadata import read_metadata
-from lw_torchrl.data.n_steps import check_n_steps
+from lw_torchrl.data.dataset import DATA, Demonstrations, read_metadata
+from lw_torchrl.data.growing import GrowingStorage, GrowingWriter
+from lw_torchrl.data.memory_map import verify
 from lw_torchrl.data.replay_checks import (
     admit_rows,
     check_apart,
@@ -41,17 +36,18 @@ from lw_torchrl.data.replay_checks import (
     check_transform,
     warn_of_simulators,
 )
-from lw_torchrl.data.rewards import REWARDS, RewardName
+from lw_torchrl.data.rewards import REWARDS, RewardName, check_n_steps
 from lw_torchrl.data.selection import (
     LABELS,
     EpisodeChoice,
+    EpisodeFilter,
     JoinedDemonstrations,
     Label,
     choose_episodes,
     read_part,
     returns_of,
 )
-from lw_torchrl.data.storage import JoinedStorage, WholeStorage
+from lw_torchrl.data.storage import DeviceStorage, JoinedStorage, WholeStorage
 
 
 def _as_it_is(batch: TensorDictBase) -> TensorDictBase:

@@ -1,13 +1,70 @@
-"""Which of a collector's rows follow one another, and numbers for their trajectories that are nobody else's."""
+"""The rows that a growing buffer stores: checked, and linked to trajectories."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
-from tensordict import NestedKey
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
+
+from lw_torchrl.data.rewards import STEPS
+from lw_torchrl.data.storage import TRAJECTORY, column_name
+from lw_torchrl.language.value_checks import finite
+
+EXECUTED = ("next", "executed_action")
+MASK = ("collector", "mask")
+
+
+def collected_rows(batch: TensorDictBase, columns: Mapping[NestedKey, Tensor]) -> dict[NestedKey, Tensor]:
+    """The columns of a batch (n, ...), its dimensions made one.
+
+    ``action`` is what was done, ``("next", "executed_action")``, where the batch has that; a policy's own may lie
+    outside [-1, 1].
+
+    Args:
+        batch: what a collector yields, of one or more dimensions.
+        columns: name to rows of the column that these are to join.
+
+    Raises:
+        ValueError: a column is missing, or of another dtype or shape; a number is NaN or infinite; an action lies
+            outside [-1, 1]; the rows are of n steps already, or no steps, by ``("collector", "mask")``.
+    """
+    names = set(batch.keys(True, True))
+    if STEPS in names:
+        raise ValueError(
+            f"batch holds {STEPS}, so MultiStep or MultiStepTransform was here: leave it out and give the buffer "
+            "n_steps= and gamma=, which makes n steps of the demonstrations and of these rows alike"
+        )
+    if MASK in names and not batch.get(MASK).all():
+        raise ValueError(
+            "batch holds rows that are no steps: split_trajs=True fills trajectories up to one length; leave it out, "
+            "or give batch[batch['collector', 'mask']]"
+        )
+    sources = {key: EXECUTED if key == "action" and EXECUTED in names else key for key in columns}
+    if absent := [column_name(key) for key, source in sources.items() if source not in names]:
+        raise ValueError(f"batch lacks the columns {', '.join(absent)}, which the demonstrations have")
+    found = {}
+    for key, like in columns.items():
+        leaf = batch.get(sources[key])
+        tail = leaf.shape[batch.ndim :]
+        if leaf.dtype != like.dtype or tail != like.shape[1:]:
+            raise ValueError(
+                f"batch: column {column_name(sources[key])} must be {like.dtype} of shape {tuple(like.shape[1:])} a "
+                f"row as in the demonstrations, got {leaf.dtype} of shape {tuple(tail)}"
+            )
+        if leaf.dtype.is_floating_point and not leaf.isfinite().all():
+            raise ValueError(f"batch: column {column_name(sources[key])} holds NaN or an infinite number")
+        found[key] = leaf.detach().reshape(-1, *tail)
+    if sources.get("action") == "action" and (most := float(found["action"].abs().max())) > 1.0:
+        raise ValueError(
+            f"batch: action must be what was done, in [-1, 1], got one of {most:.3g}; LanguageWorldEnv gives it as "
+            "('next', 'executed_action'), which is taken where it is there"
+        )
+    return found
+
 
 Columns = Mapping[NestedKey, Tensor]
 
@@ -104,3 +161,47 @@ def follow(
     kept = (opened.key[stay], opened.number[stay], opened.last[stay])
     added = (key[ends], numbers[ends], serial + ends)
     return previous, numbers, Open(*(torch.cat(pair) for pair in zip(kept, added, strict=True)))
+
+
+def check_grown(
+    state: Mapping[str, Any], grow: int, ring: Mapping[NestedKey, Tensor]
+) -> tuple[int, int, dict[NestedKey, Tensor], Open]:
+    """The parts of a growing storage's state, if they fit one another and the ring."""
+
+    def require(holds: bool, name: str, wanted: str) -> None:
+        if not holds:
+            raise ValueError(f"state_dict: {name} must be {wanted}")
+
+    require(state.get("grow") == grow, "grow", f"{grow}, as this buffer's")
+    count, number = state.get("count"), state.get("number")
+    require(type(count) is int and 0 <= count < 2**62, "count", "a number of rows")
+    require(type(number) is int and 0 <= number < 2**62, "number", "a trajectory's number")
+    assert isinstance(count, int)
+    assert isinstance(number, int)
+    there = min(count, grow)
+    given = state.get("rows")
+    names = {column_name(key): key for key in ring}
+    require(isinstance(given, Mapping) and set(given) == set(names), "rows", f"the columns {', '.join(names)}")
+    rows = {}
+    for name, key in names.items():
+        leaf, like = given[name], ring[key]  # type: ignore[index]
+        fits = isinstance(leaf, Tensor) and leaf.dtype == like.dtype and leaf.shape == (there, *like.shape[1:])
+        require(fits, f"rows[{name!r}]", f"{like.dtype} of shape {(there, *like.shape[1:])}")
+        if leaf.dtype.is_floating_point:
+            require(finite(leaf), f"rows[{name!r}]", "finite numbers")
+        rows[key] = leaf
+    if "action" in rows:
+        require(bool((rows["action"].abs() <= 1).all()), "rows['action']", "in [-1, 1]")
+    require(bool((rows[TRAJECTORY] < number).all()), f"rows[{column_name(TRAJECTORY)!r}]", f"below {number}")
+    given = state.get("open")
+    require(isinstance(given, Mapping) and set(given) == {"key", "number", "last"}, "open", "key, number and last")
+    parts = [given[name] for name in ("key", "number", "last")]  # type: ignore[index]
+    for part in parts:
+        fits = isinstance(part, Tensor) and part.dtype == torch.int64 and part.shape == parts[0].shape[:1]
+        require(fits, "open", "(K,) int64 each")
+    opened = Open(*(part.clone() for part in parts))
+    inside = (opened.last >= count - there) & (opened.last < count)
+    require(bool(inside.all()) and len(opened.last.unique()) == len(opened.last), "open", "of rows that are there")
+    numbers = rows[TRAJECTORY].reshape(-1)[opened.last - (count - there)]
+    require(torch.equal(opened.number, numbers), "open", "of these rows' trajectories")
+    return count, number, rows, opened

@@ -1,16 +1,13 @@
-"""Which of TorchRL's workers an environment is made in: one factory, called in each, must not give the same episodes.
-
-TorchRL tells a factory nothing of its worker. But the factory is called from within TorchRL's own functions, and these
-know: we look for them on the call stack, which needs no state and gives the same in every run.
-"""
+"""Which of TorchRL's workers an environment is made in, and the lock that lets in one thread at a time."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping
+from functools import wraps
 from multiprocessing import current_process, parent_process
 from types import FrameType
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 MANY = 2**16
 """Stands for the number of workers where TorchRL does not tell it: more than there are."""
@@ -79,3 +76,49 @@ def torchrl_worker() -> tuple[int, int]:
         outer, count = _by_process(-2)
         rank, of = rank + outer * of, of * count
     return rank, of
+
+
+Method = TypeVar("Method", bound=Callable[..., Any])
+
+
+class OneThread:
+    """Lets one thread in at a time, that one as often as it wants.
+
+    Args:
+        lock: an RLock. A Lock would stay taken where an interrupt comes between taking it and the block.
+        patience: seconds to wait for another thread.
+
+    Raises:
+        RuntimeError: on entering, another thread is still in.
+
+    Example:
+        >>> import threading
+        >>> with OneThread(threading.RLock()):
+        ...     print("stepping")
+        stepping
+    """
+
+    def __init__(self, lock: Any, patience: float = 0.0) -> None:
+        self._lock, self._patience = lock, patience
+
+    def __enter__(self) -> None:
+        if not self._lock.acquire(timeout=self._patience):
+            raise RuntimeError(
+                "another thread is stepping, resetting or drawing this environment, and a simulation takes one thread "
+                "at a time: make an environment in each thread, or one with num_envs= and step its rows together"
+            )
+
+    def __exit__(self, *error: object) -> None:
+        self._lock.release()
+
+
+def alone(method: Method) -> Method:
+    """A method of an environment that no other thread may be in, and that wants the environment usable."""
+
+    @wraps(method)
+    def run(self: Any, *args: Any, **kwargs: Any) -> Any:
+        with self._one_thread:
+            self._check_usable()
+            return method(self, *args, **kwargs)
+
+    return run  # type: ignore[return-value]

@@ -8,8 +8,8 @@ from types import MappingProxyType
 from typing import Literal
 
 from lw_torchrl._checks import check_choice, check_int, check_probability, check_scale
-from lw_torchrl.data.filters import EpisodeFilter
 from lw_torchrl.data.rewards import REWARDS, RewardName
+from lw_torchrl.data.selection import EpisodeFilter
 
 
 @dataclass(frozen=True)

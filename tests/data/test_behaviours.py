@@ -17,10 +17,9 @@ from tensordict import TensorDict
 import lw_torchrl as lw
 from lw_torchrl._seeding import episode_generator
 from lw_torchrl.data import BEHAVIOURS, Behaviour, CollectConfig, DatasetError, missing_episodes
-from lw_torchrl.data.behaviours import behaviour_of, policy_fingerprint, segment_plans
-from lw_torchrl.data.metadata import parse_config, read_metadata
-from lw_torchrl.data.rows import load_rows
-from lw_torchrl.data.segment_actor import SegmentActor
+from lw_torchrl.data.behaviours import SegmentActor, behaviour_of, policy_fingerprint, segment_plans
+from lw_torchrl.data.dataset import parse_config, read_metadata
+from lw_torchrl.data.memory_map import load_rows
 from lw_torchrl.envs.episodes import run_episodes
 from lw_torchrl.language.tasks import task_id
 from lw_torchrl.training import BehavioralCloningConfig, BehavioralCloningTrainer

@@ -13,7 +13,7 @@ from collecting import collect, tree
 from lw_torchrl._files import held
 from lw_torchrl.data import DatasetError, LanguageWorldExperienceReplay
 from lw_torchrl.data import collect as collect_module
-from lw_torchrl.data.episode_files import EpisodeFiles
+from lw_torchrl.data.missing_episodes import EpisodeFiles
 
 
 @pytest.fixture(scope="module")

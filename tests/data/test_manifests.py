@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from mutations import mutated
 
 from lw_torchrl.data import CollectConfig, DatasetError, collect_demonstrations, missing_episodes
-from lw_torchrl.data.metadata import read_config, read_metadata
-from lw_torchrl.data.rows import load_rows
+from lw_torchrl.data.dataset import read_config, read_metadata
+from lw_torchrl.data.memory_map import load_rows
 
 OPTIONS = dict(episodes_per_task=2, max_steps=4, noise_scale=(0.0, 0.3), progress=False)
 

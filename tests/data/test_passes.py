@@ -10,8 +10,8 @@ from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer, TensorStorage
 
 from lw_torchrl.data import CoLearningSampler, TaskBalancedSampler
-from lw_torchrl.data.group_sampler import GroupSampler
 from lw_torchrl.data.passes import Passes, choose, spans
+from lw_torchrl.data.samplers import GroupSampler
 from lw_torchrl.language.tasks import task_id
 
 TARGET = "coffee-push"

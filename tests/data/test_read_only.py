@@ -14,8 +14,8 @@ from tensordict import MemoryMappedTensor, TensorDict
 from torchrl.data import SliceSampler
 
 from lw_torchrl.data import JoinedStorage, LanguageWorldExperienceReplay, TaskBalancedSampler
-from lw_torchrl.data.metadata import read_metadata
-from lw_torchrl.data.rows import MappedColumn, load_rows, map_rows
+from lw_torchrl.data.dataset import read_metadata
+from lw_torchrl.data.memory_map import MappedColumn, load_rows, map_rows
 
 KINDS = {
     "expert": {},

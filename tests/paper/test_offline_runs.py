@@ -12,7 +12,7 @@ import torch
 
 import lw_torchrl as lw
 from lw_torchrl.data.behaviours import BEHAVIOURS
-from lw_torchrl.data.metadata import read_metadata
+from lw_torchrl.data.dataset import read_metadata
 from lw_torchrl.paper import mixtures
 from lw_torchrl.paper.execution import EVALUATION_SEED
 from lw_torchrl.paper.mixtures import MIXTURES, TASK_SETS, BehaviourData, Portion

@@ -15,11 +15,10 @@ from scipy.spatial.transform import Rotation
 from lw_torchrl.envs.engine import EngineStep
 from lw_torchrl.envs.engines.metaworld import MetaWorldEngine
 from lw_torchrl.envs.engines.vectorized.engine import VectorizedEngine
-from lw_torchrl.envs.engines.vectorized.models import borrow_model, return_models
 from lw_torchrl.envs.engines.vectorized.observation import quaternion_of_matrix, row_norm
-from lw_torchrl.envs.engines.vectorized.simulation_table import parse_simulation_table, simulation_table
-from lw_torchrl.envs.engines.vectorized.task_logic import model_path
-from lw_torchrl.envs.engines.vectorized.worker_pool import RowGroup, WorkerPool, split_into_groups
+from lw_torchrl.envs.engines.vectorized.simulated_rows import RowGroup, WorkerPool, split_into_groups
+from lw_torchrl.envs.engines.vectorized.tables import parse_simulation_table, simulation_table
+from lw_torchrl.envs.engines.vectorized.task_programs import borrow_model, model_path, return_models
 
 TASKS = list(simulation_table())
 

@@ -14,21 +14,31 @@ from numpy.typing import NDArray
 from lw_torchrl._checks import check_choice, check_int
 from lw_torchrl.envs.cameras import Cameras
 from lw_torchrl.envs.engine import ACTION_SIZE, OBSERVATION_SIZE, BodyPoses, EngineStep, RowModel
-from lw_torchrl.envs.engines.vectorized.models import SharedModel, borrow_model, check_versions, return_models
-from lw_torchrl.envs.engines.vectorized.observation import Observer
-from lw_torchrl.envs.engines.vectorized.rewards.dense_reward import DenseReward, EpisodeNotes
-from lw_torchrl.envs.engines.vectorized.rewards.table import reward_table
-from lw_torchrl.envs.engines.vectorized.sensors import CURRENT, REWARD_WIDTH, WIDTH
-from lw_torchrl.envs.engines.vectorized.simulated_row import WARNING_KINDS, SimulatedRow, is_stable
-from lw_torchrl.envs.engines.vectorized.simulation_table import simulation_table
+from lw_torchrl.envs.engines.vectorized.observation import CURRENT, REWARD_WIDTH, WIDTH, Observer
+from lw_torchrl.envs.engines.vectorized.rewards.dense_reward import DenseReward, EpisodeStarts
+from lw_torchrl.envs.engines.vectorized.simulated_rows import (
+    WARNING_KINDS,
+    RowGroup,
+    SimulatedRow,
+    WorkerPool,
+    is_stable,
+    split_into_groups,
+)
 from lw_torchrl.envs.engines.vectorized.success import SuccessFunction
-from lw_torchrl.envs.engines.vectorized.task_logic import make_task_logic, model_path
-from lw_torchrl.envs.engines.vectorized.worker_pool import RowGroup, WorkerPool, split_into_groups
+from lw_torchrl.envs.engines.vectorized.tables import reward_table, simulation_table
+from lw_torchrl.envs.engines.vectorized.task_programs import (
+    SharedModel,
+    borrow_model,
+    check_versions,
+    make_task_logic,
+    model_path,
+    return_models,
+)
 from lw_torchrl.language.tasks import check_task
 
 Rows = NDArray[np.intp]
 Array = NDArray[np.float64]
-Truth = NDArray[np.bool_]
+Mask = NDArray[np.bool_]
 
 FINGERS = np.array([1.0, -1.0])
 """The two fingers are driven against each other by one number of the action."""
@@ -96,7 +106,7 @@ class VectorizedEngine:
                 self._group_of_row[row] = number
                 builders[row] = programs[tasks[row]]
         rewards = [reward_table()[task] if dense else None for task in tasks]
-        self._notes = EpisodeNotes([reward for reward in rewards if reward is not None]) if dense else None
+        self._starts = EpisodeStarts([reward for reward in rewards if reward is not None]) if dense else None
         self._width = REWARD_WIDTH if dense else WIDTH
         self._rows = [
             SimulatedRow(table[task], models[number], builder, task_reward)
@@ -137,8 +147,8 @@ class VectorizedEngine:
             self._observation[row] = self._rows[row].reset(seed_of[row])
             self._mocap[row] = self._rows[row].mocap
             self._goal[row] = self._rows[row].goal
-            if self._notes is not None:
-                self._notes.begin(row, self._rows[row].program)
+            if self._starts is not None:
+                self._starts.begin(row, self._rows[row].program)
 
         self._pool.work(self._by_group(index), reset)
         self._current[index] = self._observation[index, CURRENT]
@@ -146,7 +156,7 @@ class VectorizedEngine:
         self._started[index] = True
         return self._observation[index]
 
-    def step(self, action: NDArray[Any], active: Truth) -> EngineStep:
+    def step(self, action: NDArray[Any], active: Mask) -> EngineStep:
         """Step the rows where ``active`` (N, bool) with ``action`` (N, 4), in the action's own precision."""
         n = len(self._rows)
         action, active = np.asarray(action), np.asarray(active, dtype=bool)
@@ -189,7 +199,7 @@ class VectorizedEngine:
         self._running = None
         self._return_models()
 
-    def _step_running(self, running: _RunningRows, action: NDArray[Any], reward: Array, success: Truth) -> None:
+    def _step_running(self, running: _RunningRows, action: NDArray[Any], reward: Array, success: Mask) -> None:
         rows = running.rows
         action = action[rows]
         shift = np.minimum(np.maximum(action[:, :3], -1), 1) * self._action_scale
@@ -225,7 +235,7 @@ class VectorizedEngine:
         success[rows] = achieved
         reward[rows] = rewards
 
-    def _running_rows(self, running: Truth) -> _RunningRows:
+    def _running_rows(self, running: Mask) -> _RunningRows:
         """What steps exactly these rows; kept for the next step, for the mask seldom changes."""
         key = running.tobytes()
         if self._running is None or self._running.key != key:
@@ -242,14 +252,14 @@ class VectorizedEngine:
 class _RunningRows:
     """Everything about one set of running rows that does not change from step to step."""
 
-    def __init__(self, engine: VectorizedEngine, running: Truth, key: bytes) -> None:
+    def __init__(self, engine: VectorizedEngine, running: Mask, key: bytes) -> None:
         self.key = key
         self.rows = rows = np.flatnonzero(running)
         self.members = members = [engine._rows[row] for row in rows]
         sources = [member.sources for member in members]
         self.observer = Observer(sources)
         self.success = SuccessFunction(sources, lambda k: members[k].program)
-        self.reward = None if engine._notes is None else DenseReward(engine._notes, rows)
+        self.reward = None if engine._starts is None else DenseReward(engine._starts, rows)
         place = {row: k for k, row in enumerate(rows.tolist())}
         self.groups = [(group, [place[row] for row in items]) for group, items in engine._by_group(rows)]
         self.low, self.high = engine._low[rows], engine._high[rows]

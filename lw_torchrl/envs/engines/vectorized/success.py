@@ -12,13 +12,21 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl.envs.engines.vectorized.observation import row_norm
-from lw_torchrl.envs.engines.vectorized.sensors import GRIPPER, JOINT, LEFT_TIP, OBJECT, POINT, RIGHT_TIP, SECOND
-from lw_torchrl.envs.engines.vectorized.simulation_table import TaskSources
+from lw_torchrl.envs.engines.vectorized.observation import (
+    GRIPPER,
+    JOINT,
+    LEFT_TIP,
+    OBJECT,
+    POINT,
+    RIGHT_TIP,
+    SECOND,
+    row_norm,
+)
+from lw_torchrl.envs.engines.vectorized.tables import TaskSources
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
-Truth = NDArray[np.bool_]
+Mask = NDArray[np.bool_]
 
 
 class Scene(NamedTuple):
@@ -32,7 +40,7 @@ class Scene(NamedTuple):
         point: (rows, 3) what is to come close to them.
     """
 
-    near: Truth
+    near: Mask
     sensors: Array
     current: Array
     goal: Array
@@ -49,7 +57,7 @@ class SuccessFunction:
 
     Args:
         sources: each row's task.
-        programs: gives a row's :class:`~lw_torchrl.envs.engines.vectorized.task_logic.TaskLogic` of its present
+        programs: gives a row's :class:`~lw_torchrl.envs.engines.vectorized.task_programs.TaskLogic` of its present
             episode, for the one rule that looks at contacts.
     """
 
@@ -74,7 +82,7 @@ class SuccessFunction:
             for name in sorted({rule for rule in rules if rule is not None})
         ]
 
-    def __call__(self, sensors: Array, current: Array, goal: Array) -> Truth:
+    def __call__(self, sensors: Array, current: Array, goal: Array) -> Mask:
         """(rows,) whether each row stands in success.
 
         Args:
@@ -100,23 +108,23 @@ class SuccessFunction:
             success[rows] = rule(self, rows, scene)
         return success
 
-    def _point_below_goal(self, rows: Index, scene: Scene) -> Truth:
+    def _point_below_goal(self, rows: Index, scene: Scene) -> Mask:
         """The ring is over the peg and has sunk below its top."""
         return scene.near[rows] & (scene.goal[rows, 2] - scene.point[rows, 2] > 0.0)
 
-    def _object_above_goal(self, rows: Index, scene: Scene) -> Truth:
+    def _object_above_goal(self, rows: Index, scene: Scene) -> Mask:
         """The object is higher than the goal, wherever it is."""
         return scene.current[rows, OBJECT.stop - 1] > scene.goal[rows, 2]
 
-    def _joint_above(self, rows: Index, scene: Scene) -> Truth:
+    def _joint_above(self, rows: Index, scene: Scene) -> Mask:
         """The joint has moved further than ``above``."""
         return scene.sensors[rows, JOINT.start] > self._above[rows]
 
-    def _joint_near(self, rows: Index, scene: Scene) -> Truth:
+    def _joint_near(self, rows: Index, scene: Scene) -> Mask:
         """The joint is within ``within`` of ``angle``."""
         return np.abs(scene.sensors[rows, JOINT.start] - self._angle[rows]) <= self._within[rows]
 
-    def _stick_inserted(self, rows: Index, scene: Scene) -> Truth:
+    def _stick_inserted(self, rows: Index, scene: Scene) -> Mask:
         """The container is at the goal, and the stick's end is through its handle."""
         held = scene.near[rows]
         if held.any():
@@ -126,7 +134,7 @@ class SuccessFunction:
             held &= (aside[:, 1] <= STICK_SIDEWAYS) & (aside[:, 2] <= STICK_UPWARD)
         return held
 
-    def _stick_held(self, rows: Index, scene: Scene) -> Truth:
+    def _stick_held(self, rows: Index, scene: Scene) -> Mask:
         """The container is at the goal, and the gripper holds the stick up."""
         held = scene.near[rows]
         for k in np.flatnonzero(held):
@@ -136,7 +144,7 @@ class SuccessFunction:
         return held
 
 
-RULES: dict[str, Callable[[SuccessFunction, Index, Scene], Truth]] = {
+RULES: dict[str, Callable[[SuccessFunction, Index, Scene], Mask]] = {
     "point below goal": SuccessFunction._point_below_goal,
     "object above goal": SuccessFunction._object_above_goal,
     "joint above": SuccessFunction._joint_above,

@@ -1,4 +1,4 @@
-"""GroupSampler: exact numbers from groups of rows, each group gone through in passes of its own."""
+"""GroupSampler and TaskBalancedSampler: exact numbers of rows from each group, each group in passes of its own."""
 
 from __future__ import annotations
 
@@ -16,11 +16,10 @@ from torchrl.data.replay_buffers.storages import Storage
 
 from lw_torchrl._checks import check_int
 from lw_torchrl._files import reading
+from lw_torchrl._keys import check_key
 from lw_torchrl._tensor_archive import TensorArchive, write_archive
-from lw_torchrl.data.device_storage import beside
-from lw_torchrl.data.passes import Passes
-from lw_torchrl.data.sampler_state import check_state
-from lw_torchrl.data.storage import JoinedStorage
+from lw_torchrl.data.passes import Passes, check_state
+from lw_torchrl.data.storage import JoinedStorage, beside
 
 _FILE = "sampler.zip"
 
@@ -262,3 +261,53 @@ class GroupSampler(Sampler):
         """
         with reading(path, "sampler's state"):
             self.load_state_dict(TensorArchive(Path(path) / _FILE).tensors("state"))
+
+
+class TaskBalancedSampler(GroupSampler):
+    """Equal numbers from every task, exactly; within a task every row once before any comes again.
+
+    The buffer may grow: rows that come take random places in the passes under way, and what is overwritten leaves them;
+    a task that comes or goes begins all passes anew. No batch looks at more than the rows that came.
+
+    It draws from the replay buffer's generator, so ``ReplayBuffer(..., generator=...)`` fixes the batches. State is
+    saved and restored with the buffer's. An epoch is a pass over the largest task; each task has passes of its own.
+
+    Args:
+        task_key: the entry of the storage that tells the task.
+
+    Raises:
+        ValueError: at sampling, a batch size that the number of tasks does not divide (with the nearest that it
+            does), or an empty storage.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+        >>> replay = TensorDictReplayBuffer(storage=LazyTensorStorage(10), sampler=TaskBalancedSampler(), batch_size=4)
+        >>> _ = replay.extend(TensorDict({"task_id": torch.tensor([3] * 8 + [7] * 2)}, [10]))
+        >>> replay.sample()["task_id"].bincount(minlength=8).tolist()
+        [0, 0, 0, 2, 0, 0, 0, 2]
+
+    Source: paper section 'Cross-Task Co-Learning via 1:1 Data Mixing', its minibatches of equal numbers.
+    """
+
+    def __init__(self, task_key: NestedKey = "task_id") -> None:
+        check_key("task_key", task_key)
+        self.task_key = task_key
+        super().__init__()
+
+    def _label(self, storage: Storage) -> Tensor:
+        return torch.unique(column(storage, self.task_key).reshape(-1), return_inverse=True)[1]
+
+    def _keys(self, storage: Storage, rows: Tensor) -> Tensor:
+        return column(storage, self.task_key, rows)
+
+    def _shares(self, batch_size: int) -> Tensor:
+        groups = len(self._passes.size)
+        count, rest = divmod(batch_size, groups)
+        if rest or not count:
+            raise ValueError(
+                f"batch_size must be divisible by the number of tasks, {groups}, got {batch_size}; the nearest are "
+                + nearest_sizes(batch_size, groups)
+            )
+        return torch.full((groups,), count)
