@@ -1,15 +1,22 @@
-"""A demonstration dataset's description: how it was made, which episodes it holds, and its metadata.json."""
+"""A demonstration dataset's description: how it was made, which episodes it holds, and its metadata.json.
+
+root/data/            the rows, one a step, in TorchRL's TED layout; see :mod:`.memory_map`
+root/metadata.json    written last: without it the dataset is not finished. Nothing in it is taken on trust
+root/.partial/        while collecting: config.json, versions.json and the episodes; see :mod:`.missing_episodes`
+root/.lock            held while collecting
+"""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from reprlib import repr as short
 from typing import Any
 
-from lw_torchrl._checks import check_int, check_scale
+from lw_torchrl._checks import check_fields, check_int, check_scale
 from lw_torchrl._files import read_json, write_json
 from lw_torchrl.data.behaviours import EXPERT, NOISY, Behaviour, check_own_label
 from lw_torchrl.language.tasks import MT50, resolve_tasks, task_id
@@ -41,14 +48,11 @@ class CollectConfig:
         episodes_per_task: kept episodes of each task.
         seed: with task and episode, fixes the initial state, the goal and the noise.
         noise_scale: standard deviations of the execution noise, one an episode in turn; (0.0,) for none.
-        noise_hold: the steps for which each draw of the noise is kept; the longer, the further it leads astray.
-        gripper_noise_factor: what the gripper's noise is multiplied by; noise there makes grasps fail.
-        redraw_failures: keep successful episodes only, and draw another for each failure.
+        noise_hold: the steps for which each draw of the noise is kept.
+        gripper_noise_factor: multiplies the gripper's noise, which makes grasps fail.
+        redraw_failures: keep only successful episodes, and draw another for each failure.
         max_steps: steps of an episode.
         policy: who acts.
-
-    Raises:
-        ValueError, TypeError: a wrong value, by its name.
     """
 
     tasks: tuple[str, ...]
@@ -65,8 +69,7 @@ class CollectConfig:
         if not isinstance(self.policy, Behaviour):
             raise TypeError(f"policy must be a Behaviour, got {self.policy!r}")
         check_own_label(self.policy)
-        if not isinstance(self.redraw_failures, bool):
-            raise TypeError(f"redraw_failures must be True or False, got {self.redraw_failures!r}")
+        check_fields(self)
         if not self.noise_scale:
             raise ValueError("noise_scale must hold at least one number, got an empty sequence")
         checked = {
@@ -82,7 +85,7 @@ class CollectConfig:
             object.__setattr__(self, name, value)
 
     def to_json(self) -> dict[str, Any]:
-        """As JSON; who acts is left out where it is the expert, as in datasets that know no others."""
+        """As JSON; ``policy`` is left out for the expert, as older datasets do."""
         found = {key: list(v) if isinstance(v, tuple) else v for key, v in asdict(self).items()}
         return {key: v for key, v in found.items() if key != "policy" or self.policy != EXPERT}
 
@@ -123,10 +126,9 @@ class Demonstrations:
         root: its folder.
         config: how it was collected.
         versions: of the packages that it was begun with.
-        task_ids: task name to the number that stands for it in the files; rows are shown with today's
-            :func:`~lw_torchrl.task_id`, whatever it was then.
+        task_ids: task name to its number in the files; rows are shown with the present :func:`~lw_torchrl.task_id`.
         episodes: in the order of the rows.
-        attempts: task name to the episodes run, failures that were redrawn among them.
+        attempts: task name to the number of episodes run, with the failures that were redrawn.
     """
 
     root: Path
@@ -163,20 +165,17 @@ def write_metadata(
     attempts: dict[str, int],
 ) -> None:
     """Write the metadata, which makes the dataset a finished one."""
-    write_json(
-        root / METADATA,
-        {
-            "format": FORMAT,
-            "version": FORMAT_VERSION,
-            "config": config.to_json(),
-            "versions": versions,
-            "task_ids": {task: task_id(task) for task in config.tasks},
-            "attempts": attempts,
-            "episodes": {
-                key: [getattr(episode, key) for episode in episodes] for key in EpisodeInfo.__dataclass_fields__
-            },
-        },
-    )
+    columns = {key: [getattr(episode, key) for episode in episodes] for key in EpisodeInfo.__dataclass_fields__}
+    found = {
+        "format": FORMAT,
+        "version": FORMAT_VERSION,
+        "config": config.to_json(),
+        "versions": versions,
+        "task_ids": {task: task_id(task) for task in config.tasks},
+        "attempts": attempts,
+        "episodes": columns,
+    }
+    write_json(root / METADATA, found)
 
 
 def read_metadata(root: str | os.PathLike[str]) -> Demonstrations:
@@ -223,43 +222,35 @@ def read_metadata(root: str | os.PathLike[str]) -> Demonstrations:
         ) from error
 
 
-def read_config(path: Path) -> CollectConfig:
-    """The configuration of a half-made dataset.
-
-    Raises:
-        DatasetError: (a ValueError) the file is damaged.
-    """
+@contextmanager
+def _half_made(path: Path) -> Iterator[None]:
+    """Name the file of a half-made dataset that cannot be read."""
     try:
-        return parse_config(read_json(path, "root: the configuration"))
+        yield
     except _BAD as error:
         raise DatasetError(
             f"root: {str(path)!r} is damaged ({str(error)[:500]}); delete {str(path.parent.parent)!r} to start again"
         ) from error
+
+
+def read_config(path: Path) -> CollectConfig:
+    """The configuration of a half-made dataset; a damaged file is a :class:`DatasetError`."""
+    with _half_made(path):
+        return parse_config(read_json(path, "root: the configuration"))
 
 
 def read_versions(path: Path) -> dict[str, str]:
-    """The versions of the packages that a half-made dataset was begun with; of one that does not say, none.
-
-    Raises:
-        DatasetError: (a ValueError) the file is damaged.
-    """
-    try:
+    """The package versions that a half-made dataset was begun with, {} if it does not say; a damaged file is a
+    :class:`DatasetError`."""
+    with _half_made(path), suppress(FileNotFoundError):
         return _versions(read_json(path, "root: the versions"))
-    except FileNotFoundError:
-        return {}
-    except _BAD as error:
-        raise DatasetError(
-            f"root: {str(path)!r} is damaged ({str(error)[:500]}); delete {str(path.parent.parent)!r} to start again"
-        ) from error
+    return {}
 
 
 def parse_config(stated: Any) -> CollectConfig:
-    """A configuration from its JSON.
-
-    Raises:
-        ValueError, TypeError, OverflowError: it is none.
-    """
-    names = [name for name in CollectConfig.__dataclass_fields__ if name != "policy" or name in _mapping(stated)]
+    """A configuration from its JSON; ValueError, TypeError or OverflowError if it is none."""
+    there = stated if isinstance(stated, Mapping) else {}
+    names = [name for name in CollectConfig.__dataclass_fields__ if name != "policy" or name in there]
     found = _object("config", stated, names)
     for name, longest in (("tasks", len(MT50)), ("noise_scale", None)):
         if not isinstance(found[name], list) or (longest and len(found[name]) > longest):
@@ -271,10 +262,6 @@ def parse_config(stated: Any) -> CollectConfig:
     if list(config.tasks) != found["tasks"]:
         raise ValueError(f"tasks must be sorted, got {short(found['tasks'])}")
     return config
-
-
-def _mapping(stated: Any) -> Mapping[str, Any]:
-    return stated if isinstance(stated, Mapping) else {}
 
 
 def _object(name: str, stated: Any, keys: Any) -> dict[str, Any]:

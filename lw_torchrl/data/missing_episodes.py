@@ -34,13 +34,8 @@ _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 class EpisodeFiles:
-    """The episodes so far, one file each; a file that says FAILED stands for one that was not kept.
-
-    Args:
-        folder: where they lie.
-        tasks: the tasks' names.
-        max_steps: the most steps that an episode has.
-    """
+    """The episodes so far, one file each, so that a kill costs only those under way; a file that says FAILED stands
+    for an episode that was not kept."""
 
     def __init__(self, folder: Path, tasks: Sequence[str], max_steps: int) -> None:
         self.folder, self.tasks, self.max_steps = folder, tasks, max_steps
@@ -70,11 +65,7 @@ class EpisodeFiles:
         return self._path(task, episode).stat().st_size != len(_FAILED)
 
     def get(self, task: str, episode: int) -> TensorDict:
-        """An episode's rows.
-
-        Raises:
-            Exception: of many kinds, where the file is damaged.
-        """
+        """An episode's rows; any exception where the file is damaged."""
         content = self._content(self._path(task, episode))
         with zipfile.ZipFile(BytesIO(content)) as archive:
             if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):
@@ -100,11 +91,7 @@ class EpisodeFiles:
         return path.read_bytes()
 
     def drop_damaged(self) -> None:
-        """Remove what cannot be read: those episodes are run again.
-
-        Raises:
-            DatasetError: (a ValueError) a folder has the name of an episode's file.
-        """
+        """Remove the files that cannot be read, so that their episodes are run again."""
         for path in self.folder.glob("*.npz"):
             task, _, number = path.stem.rpartition(".")
             if task not in self.tasks or not number.isdecimal():
@@ -128,7 +115,7 @@ def write_failed(folder: Path, size: int, error: OSError) -> OSError:
     )
 
 
-_Acts = Callable[[TensorDictBase], TensorDictBase]
+_Actor = Callable[[TensorDictBase], TensorDictBase]
 
 _RECORDED = [
     "observation",
@@ -142,7 +129,7 @@ _RECORDED = [
 _MAX_ATTEMPTS = 20  # episodes run for each one that is kept, before redrawing gives up
 
 
-def _take_stock(config: CollectConfig, files: EpisodeFiles) -> tuple[dict[str, list[int]], dict[str, list[int]]]:
+def _kept_and_missing(config: CollectConfig, files: EpisodeFiles) -> tuple[dict[str, list[int]], dict[str, list[int]]]:
     """The kept episodes of each task, and those still to run. Candidates are taken in the order of their index, so
     which are kept depends neither on the number of environments nor on interruptions."""
     kept: dict[str, list[int]] = {}
@@ -164,8 +151,8 @@ def _take_stock(config: CollectConfig, files: EpisodeFiles) -> tuple[dict[str, l
     return kept, wanted
 
 
-def _clipped(policy: _Acts) -> _Acts:
-    """``policy`` with what it asked for beside what can be done, as :class:`ExpertActor` gives them."""
+def _clipped(policy: _Actor) -> _Actor:
+    """``policy`` with ``unclipped_action`` beside ``action``, as of :class:`ExpertActor`."""
 
     def run(tensordict: TensorDictBase) -> TensorDictBase:
         tensordict = policy(tensordict)
@@ -175,8 +162,8 @@ def _clipped(policy: _Acts) -> _Acts:
     return run
 
 
-def _cast(config: CollectConfig, policy: Policy | None, env: LanguageWorldEnv) -> tuple[EnvBase, _Acts]:
-    """The environment with what must run before who acts, and who acts."""
+def _env_and_actor(config: CollectConfig, policy: Policy | None, env: LanguageWorldEnv) -> tuple[EnvBase, _Actor]:
+    """The environment with the actor's transforms, and the actor."""
     if config.policy.kind == "expert":
         return env, ExpertActor(config.tasks)
     if policy is None:
@@ -190,27 +177,20 @@ def _cast(config: CollectConfig, policy: Policy | None, env: LanguageWorldEnv) -
 def run_missing_episodes(
     config: CollectConfig, policy: Policy | None, files: EpisodeFiles, num_envs: int | None, progress: bool
 ) -> dict[str, list[int]]:
-    """Run episodes until the files are full; returns the kept ones of each task.
-
-    Args:
-        config: what to collect.
-        policy: who acts, where the configuration says that a trained one does.
-        files: the episodes so far.
-        num_envs: environments stepped together.
-        progress: show a progress bar.
+    """Run episodes until the files hold all; returns the kept ones of each task.
 
     Raises:
         OSError: there is no room.
         RuntimeError: redrawing found too few successes.
     """
-    kept, wanted = _take_stock(config, files)
+    kept, wanted = _kept_and_missing(config, files)
     missing = sum(map(len, wanted.values()))
     if not missing:
         return kept
     rows = max(len(config.tasks), min(50, missing)) if num_envs is None else num_envs
     options = {"num_envs": rows, "seed": config.seed, "max_steps": config.max_steps, "strict": policy is not None}
     base = LanguageWorldEnv(config.tasks, reward="dense", **options)  # type: ignore[arg-type]
-    env, acts = _cast(config, policy, base)
+    env, actor = _env_and_actor(config, policy, base)
     scales = [(s, s, s, s * config.gripper_noise_factor) for s in config.noise_scale]
     total = config.episodes_per_task * len(config.tasks)
     before = (total - missing) * config.max_steps
@@ -221,7 +201,7 @@ def run_missing_episodes(
             bar.set_done((total - missing) * config.max_steps)  # steps back by the failures that are drawn again
             episodes = run_episodes(
                 env,
-                acts,
+                actor,
                 wanted,
                 keys=_RECORDED,
                 noise=(lambda n: scales[n % len(scales)]) if any(config.noise_scale) else None,
@@ -231,13 +211,9 @@ def run_missing_episodes(
             )
             for task, episode, steps in episodes:
                 keep = not config.redraw_failures or bool(steps.get(("next", "success")).any())
-                files.put(task, episode, _as_rows(steps) if keep else None)
-            kept, wanted = _take_stock(config, files)
+                steps.rename_key_(("next", "reward"), ("next", "reward_dense"))
+                steps.set(("next", "reward_sparse"), steps.get(("next", "success")).float())
+                files.put(task, episode, steps if keep else None)
+            kept, wanted = _kept_and_missing(config, files)
             missing = sum(map(len, wanted.values()))
     return kept
-
-
-def _as_rows(steps: TensorDictBase) -> TensorDictBase:
-    """Recorded steps with a dataset's columns, the trajectory's number aside."""
-    steps.rename_key_(("next", "reward"), ("next", "reward_dense"))
-    return steps.set(("next", "reward_sparse"), steps.get(("next", "success")).float())

@@ -72,8 +72,8 @@ def add_pictures(
 ) -> None:
     """Draw the rows of a dataset, as :class:`CameraTransform` would have while it was collected.
 
-    Each episode is run again with its actions; that its observations are the stored ones, bit for bit, is checked. The
-    pictures are kept beside the rows as PNGs, losslessly compressed. Killed and called again it carries on.
+    Each episode is run again with its actions, and must give the stored observations bit for bit. The pictures are
+    saved beside the rows as PNGs. A call that was killed carries on when it is repeated.
 
     Args:
         root: the dataset's folder, of :func:`collect_demonstrations`.
@@ -81,8 +81,8 @@ def add_pictures(
         progress: show a progress bar when it takes longer than a second.
 
     Raises:
-        ValueError: a wrong argument; DatasetError where the folder holds no dataset, or episodes that go otherwise
-            today, by another version of MuJoCo or Meta-World.
+        DatasetError: (a ValueError) the folder holds no dataset, or its episodes go otherwise today, by another version
+            of MuJoCo or Meta-World.
         ImportError: there is no OpenGL; it names what to install.
         OSError: there is no room; nothing is lost.
 
@@ -154,7 +154,7 @@ def _write(path: Path, pictures: Sequence[np.ndarray[Any, Any]]) -> None:
 
 
 def _whole(path: Path, wanted: _Wanted, count: int) -> bool:
-    """Whether a file has all its pictures; one that is damaged is made anew."""
+    """Whether a file has all its pictures; a damaged one is written anew."""
     if not path.is_file():
         return False
     try:
@@ -198,15 +198,15 @@ def load_pictures(
     """The pictures of a buffer's rows, for ``replay.add_column("pixels", ...)``, in memory.
 
     Args:
-        replay: a buffer of datasets that :func:`add_pictures` drew so.
-        cameras, height, width, every: as they were given there.
+        replay: a buffer of datasets that :func:`add_pictures` drew.
+        cameras, height, width, every: as given there.
 
     Returns:
-        (R, height, width·C, 3) uint8, in the order of ``replay[:]``; between two pictures of an episode, the earlier
-        one. They are of ``observation``; ``("next", "observation")`` has none.
+        (R, height, width·C, 3) uint8, of ``observation``, in the order of ``replay[:]``; between two pictures of an
+        episode, the earlier one.
 
     Raises:
-        ValueError: a wrong argument; DatasetError where a dataset has no such pictures, or they are damaged.
+        DatasetError: (a ValueError) a dataset has no such pictures, or they are damaged.
     """
     wanted = _wanted(cameras, height, width, every)
     _, lengths = torch.unique_consecutive(replay.storage.column(("collector", "traj_ids")), return_counts=True)

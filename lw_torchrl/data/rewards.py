@@ -34,7 +34,7 @@ class Reward:
 
     @property
     def is_source(self) -> bool:
-        """Whether it is what the environment gives."""
+        """Whether it is the environment's own reward."""
         return (self.shift, self.scale, self.at_success) == (0.0, 1.0, None)
 
     def of(self, source: Tensor, success: Tensor) -> Tensor:
@@ -54,15 +54,13 @@ REWARDS: Mapping[RewardName, Reward] = MappingProxyType(
     }
 )
 """By name: the success as 0 and 1; Meta-World's own, at most 10; a cost of 0.01 a step, none at success; what the dense
-reward lacks of 10, as a cost of at most about 0.1 a step, none at success. Costs want episodes that end at success
-(``terminate_on_success``): a return of 0 is then the best there is, and "stay short of the goal" earns nothing."""
+reward lacks of 10, as a cost of at most about 0.1 a step, none at success. Costs need episodes that end at success
+(``terminate_on_success``): then the best return is 0, and staying short of the goal earns nothing."""
 
 
 def check_reward(name: RewardName, reward: Tensor, success: Tensor) -> None:
-    """Raise :class:`ValueError` where rows (R, 1) plainly have another reward than the one named.
-
-    A dense reward of several steps, from ``frame_skip``, shows where it is over 10.
-    """
+    """Raise :class:`ValueError` if rows (R, 1) plainly have another reward than the one named; one of several steps,
+    from ``frame_skip``, shows where it is over 10."""
     stated = REWARDS[name]
     sparse = success.to(torch.float32)
     if stated.source == "sparse":
@@ -104,19 +102,15 @@ def check_n_steps(n_steps: Any, gamma: Any) -> tuple[int, float]:
 
 
 def last_rows(end: Tensor, n_steps: int) -> Tensor:
-    """The row in which ``n_steps`` steps from each row end: (R,) int64, at most the end of its trajectory.
-
-    Args:
-        end: whether each row is the last of its trajectory, (R,) bool; rows are in the order of time.
-        n_steps: steps to look ahead.
-    """
+    """The row in which ``n_steps`` steps from each row end: (R,) int64, at most the last of its trajectory, where
+    ``end``, (R,) bool, is true."""
     rows = torch.arange(len(end))
     ends = torch.where(end, rows, max(len(end) - 1, 0))
     return torch.minimum(rows + n_steps - 1, ends.flip(0).cummin(0).values.flip(0))
 
 
 def sum_rewards(reward: Tensor, last: Tensor, gamma: float, n_steps: int) -> Tensor:
-    """The discounted rewards from each row to ``last``: (R, 1), summed in the order of time."""
+    """The discounted reward from each row to ``last``: (R, 1), summed in the order of time."""
     total = reward.clone()
     rows = torch.arange(len(reward))
     for ahead in range(1, n_steps):

@@ -22,21 +22,18 @@ _Listed = tuple[int, int, str, float, int]  # part, number in it, task, return, 
 
 @dataclass(frozen=True)
 class EpisodeFilter:
-    """Episodes to keep; those that every condition given keeps.
+    """Which episodes to keep: those that meet every condition given.
 
-    An episode's return is the sum of ``("next", "reward")``, the one asked for, over the rows that are shown of it.
+    An episode's return is the sum of the requested ``("next", "reward")`` over the rows that are shown of it.
 
     Attributes:
         success: keep those that succeeded at some step, or, if False, those that did not.
-        least_return: keep those whose return is at least so much.
-        best: keep so large a part of each task's episodes, those of the highest return, the shorter where they tie;
-            counted among those that the other conditions keep, and at least one.
+        least_return: keep those with at least this return.
+        best: the fraction of each task's episodes to keep, those of the highest return, the shorter at a tie; of those
+            that meet the other conditions, and at least one.
         behaviours: keep those of these labels, "spoilt-30" say.
-        else_best: of a task of which the conditions leave nothing, keep so large a part of all its episodes, chosen as
-            for ``best``; None, for an error.
-
-    Raises:
-        ValueError, TypeError: a wrong value, by its name.
+        else_best: for a task without an episode that meets the conditions, the fraction of all its episodes to keep,
+            chosen as for ``best``; None for an error.
 
     Example:
         >>> EpisodeFilter(success=True, behaviours=("expert", "noisy")).best is None
@@ -70,9 +67,6 @@ class EpisodeFilter:
         Args:
             parts: the datasets' descriptions.
             returns: of each part, the return and the rows of each episode, (E, 2) float64.
-
-        Raises:
-            ValueError: a label that no part has (with the nearest), or nothing is left of a part's task.
         """
         labels = {part.config.behaviour for part in parts}
         for label in self.behaviours or ():
@@ -108,18 +102,13 @@ class EpisodeFilter:
 
 
 def _best(listed: list[_Listed], part: float) -> list[_Listed]:
-    """So large a part of a task's episodes, the highest returns and then the shortest first; one at least of any."""
+    """This fraction of a task's episodes, by return and then length; at least one."""
     ours = sorted(listed, key=lambda row: (-row[3], row[4], row[0], row[1]))
     return ours[: max(1, round(part * len(ours)))]
 
 
 def episode_returns(reward: Tensor, lengths: Sequence[int]) -> Tensor:
-    """The return and the number of rows of episodes that lie one after another: (E, 2) float64.
-
-    Args:
-        reward: (R, 1) float32.
-        lengths: of each episode.
-    """
+    """The return and the number of rows of consecutive episodes: (E, 2) float64, of rewards (R, 1) float32."""
     rows = torch.tensor(lengths, dtype=torch.int64)
     total = torch.zeros(len(rows), dtype=torch.float64)
     total.index_add_(0, torch.repeat_interleave(rows), reward.reshape(-1).double())
@@ -139,12 +128,7 @@ def _first(argument: str, task: str, there: list[int], number: int) -> list[int]
 
 
 def choose_episodes(found: Demonstrations, chosen: EpisodeChoice, argument: str = "episodes") -> Demonstrations:
-    """A dataset's description with the chosen episodes alone, in the dataset's order.
-
-    Raises:
-        ValueError: a task or an episode that the dataset does not hold, an episode twice, none at all.
-        TypeError: something that chooses no episodes.
-    """
+    """A dataset's description with only the chosen episodes, in the dataset's order."""
     if chosen is None:
         return found
     there: dict[str, list[int]] = {}
@@ -200,8 +184,7 @@ def _kept(episodes: Sequence[EpisodeInfo], after: int | None) -> tuple[Tensor, T
 
 
 def returns_of(whole: Demonstrations, chosen: Demonstrations, reward: RewardName, after: int | None) -> Tensor:
-    """The return and the number of rows of each chosen episode, up to ``after`` steps past its first success: (E, 2)
-    float64."""
+    """The return and the number of rows, (E, 2) float64, of the chosen episodes up to ``after`` steps past success."""
     rows, (kept, _) = load_rows(whole), _kept(chosen.episodes, after)
     made = REWARDS[reward]
     source, success = (rows.get(("next", key))[kept] for key in (f"reward_{made.source}", "success"))
@@ -221,12 +204,9 @@ def read_part(
 ) -> tuple[TensorDictBase, Tensor | None]:
     """All rows of a dataset, memory-mapped, and which of them to show: (n,) int64, None for all.
 
-    What differs from the files is held in memory, one number a row: the ends of episodes that are cut short, which are
-    ``terminated`` where ``terminate_on_success`` asks for it, a reward that is not on disk, ``first_trajectory`` added
-    to the trajectories' ids, and the number ``behaviour``.
-
-    Raises:
-        DatasetError: (a ValueError) as for :func:`load_rows`; or an action is NaN or infinite.
+    Columns that differ from the files are in memory, one number a row: the ends of episodes that are cut short, which
+    are ``terminated`` with ``terminate_on_success``; a reward that is not on disk; the trajectories' ids plus
+    ``first_trajectory``; and the number ``behaviour``.
     """
     rows = load_rows(whole)
     if label == "executed":
@@ -290,7 +270,7 @@ class JoinedDemonstrations:
 
     @property
     def episodes(self) -> tuple[EpisodeInfo, ...]:
-        """The episodes in the order of the rows; ``start`` and ``length`` are those in their own dataset."""
+        """The episodes in the order of the rows; ``start`` and ``length`` are as in their own dataset."""
         return tuple(episode for part in self.parts for episode in part.episodes)
 
     @property

@@ -17,13 +17,8 @@ from lw_torchrl.language.tasks import MT50, task_id
 
 
 class TaskIds(Categorical):
-    """Each row's task: a Categorical whose zero is the row's own id, so that policies can act on an environment's
-    ``fake_tensordict()``, which is of zeros: the id 0 is a task that they may not know.
-
-    Args:
-        n: how many ids there are.
-        ids: (N,) int64, those of the rows.
-    """
+    """Each row's task: a Categorical of n whose zero is the row's own id, (N,) int64, so that policies can act on
+    ``fake_tensordict()``, which is of zeros: they may not know the task of id 0."""
 
     ids: Tensor | None = None
 
@@ -32,7 +27,7 @@ class TaskIds(Categorical):
         self.ids = ids
 
     def zero(self, shape: torch.Size | None = None) -> Tensor:
-        """The rows' ids, in front of them the dimensions of ``shape``."""
+        """The rows' ids, with the dimensions of ``shape`` in front."""
         if self.ids is None:
             return super().zero(shape)
         return self.ids.expand((*(shape or ()), *self.shape)).clone()
@@ -87,11 +82,6 @@ def action_spec(n: int) -> Bounded:
     return Bounded(-1.0, 1.0, (n, ACTION_SIZE))
 
 
-def reward_spec(n: int) -> Unbounded:
-    """The reward of each of n rows."""
-    return Unbounded((n, 1))
-
-
 def done_spec(n: int) -> Composite:
     """How each of n rows may end."""
     return Composite(done=_flag(n), terminated=_flag(n), truncated=_flag(n), shape=(n,))
@@ -102,11 +92,7 @@ def _flag(n: int) -> Categorical:
 
 
 def row_mask(tensordict: TensorDictBase | None, key: str, n: int) -> np.ndarray:
-    """The rows that a mask such as "_reset" names, (n,) bool; all where there is none.
-
-    Raises:
-        ValueError: another number of rows, or dtype.
-    """
+    """The rows of a mask such as "_reset", (n,) bool; all if there is none."""
     mask = None if tensordict is None else tensordict.get(key, None)
     if mask is None:
         return np.ones(n, dtype=bool)
@@ -116,7 +102,7 @@ def row_mask(tensordict: TensorDictBase | None, key: str, n: int) -> np.ndarray:
 
 
 def clipped_action(tensordict: TensorDictBase, batch_size: torch.Size) -> Tensor:
-    """The action as it is executed, (*batch_size, 4) float32 in [-1, 1]; another shape or dtype is a ValueError."""
+    """The action as it is executed, (*batch_size, 4) float32 in [-1, 1]."""
     action = tensordict.get("action", None)
     if action is None or action.shape != (*batch_size, ACTION_SIZE) or action.dtype != torch.float32:
         given = "none" if action is None else f"{action.dtype} of shape {tuple(action.shape)}"
@@ -129,12 +115,10 @@ Mask = NDArray[np.bool_]
 
 
 class RowStates:
-    """The last observation of N rows, the episode and step that each is at, and how it stands.
-
-    Args:
-        tasks: the name of each row's task.
+    """The last observation of N rows, and the episode, step and flags of each.
 
     Attributes:
+        tasks: the name of each row's task.
         task_id: (N,) int64.
         observation: (N, 39) float32.
         episode: (N,) int64; -1 before the first reset.
@@ -154,19 +138,14 @@ class RowStates:
         self.over[:] = True
 
     def begin(self, rows: Rows, episodes: NDArray[np.int64], observation: NDArray[np.float64]) -> None:
-        """Rows stand at the beginning of an episode."""
+        """Put rows at the beginning of an episode."""
         self.observation[rows] = observation
         self.episode[rows] = episodes
         self.steps[rows] = 0
         self._flags[:, rows] = False
 
     def as_tensordict(self, executed_action: NDArray[np.float32] | None = None, **more: Tensor) -> TensorDict:
-        """All of it as fresh tensors, N rows.
-
-        Args:
-            executed_action: (N, 4) float32; None for zeros.
-            more: what else there is to tell, (N, ...).
-        """
+        """All of it as fresh tensors, N rows, with ``executed_action`` (N, 4) float32, zeros for None, and ``more``."""
         n = len(self.tasks)
         over, terminated, fault, success = (torch.from_numpy(flag.copy()).unsqueeze(-1) for flag in self._flags)
         executed = torch.zeros(n, ACTION_SIZE) if executed_action is None else torch.from_numpy(executed_action)
@@ -188,7 +167,7 @@ class RowStates:
         )
 
     def refuse_other_tasks(self, tensordict: TensorDictBase, rows: Rows) -> None:
-        """Raise :class:`ValueError` where a state to go to is of other tasks."""
+        """Raise :class:`ValueError` if a state to go to is of other tasks."""
         given = tensordict.get("task_id", None)
         if given is not None and not torch.equal(given.cpu().reshape(-1)[rows], self.task_id[rows]):
             raise ValueError(
@@ -197,7 +176,7 @@ class RowStates:
             )
 
     def refuse_later_steps(self, tensordict: TensorDictBase, rows: Rows) -> None:
-        """Raise :class:`ValueError`, and want a reset, where a state to go to is not the first of its episode."""
+        """Raise :class:`ValueError`, and require a reset, if a state to go to is not the first of its episode."""
         wanted = tensordict.get("observation", None)
         if wanted is None:
             return

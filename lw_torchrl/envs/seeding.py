@@ -54,7 +54,7 @@ _MOST_RESETS = 2**32  # of a row; with the workers and rows that there can be, i
 
 
 def check_worker(worker: Any) -> tuple[int, int]:
-    """Return ``worker`` as (rank, of) with 0 <= rank < of."""
+    """Return ``worker`` as (rank, of), if 0 <= rank < of."""
     if not isinstance(worker, Sequence) or isinstance(worker, str) or len(worker) != 2:
         raise TypeError(f"worker must be a pair (rank, of), got {worker!r}")
     of = check_int("worker's of", worker[1], minimum=1)
@@ -65,8 +65,7 @@ def check_worker(worker: Any) -> tuple[int, int]:
 
 
 def stated_episode(tensordict: TensorDictBase | None, episode: int | Tensor | None) -> Tensor:
-    """The episode that ``reset(tensordict, set_state=True)`` goes to; without one, or with another beside it, a
-    ValueError."""
+    """The episode that ``reset(tensordict, set_state=True)`` goes to; ValueError without one, or with two."""
     if episode is not None:
         raise ValueError("episode and set_state=True each name an episode: give one of them")
     if tensordict is None or (episode := tensordict.get("episode", None)) is None:
@@ -78,9 +77,8 @@ def stated_episode(tensordict: TensorDictBase | None, episode: int | Tensor | No
 
 
 class EpisodeCounter:
-    """The m-th reset of the r-th of a task's R rows in the w-th of W workers is episode (m·W + w)·R + r.
-
-    So W environments of R rows run what one of W·R rows would.
+    """The m-th reset of the r-th of a task's R rows in the w-th of W workers is episode (m·W + w)·R + r, so that W
+    environments of R rows run the episodes of one with W·R rows.
 
     Args:
         tasks: the task of each row, in turn over the different ones.
@@ -109,7 +107,7 @@ class EpisodeCounter:
         return (self.resets * self._stride + self._first)[rows]
 
     def asked(self, episode: int | Tensor, rows: Rows) -> Episodes:
-        """The episodes asked for in ``rows``: one integer for all, or an int64 tensor (N,) with one for each."""
+        """The requested episodes of ``rows``, from one integer for all, or an int64 tensor (N,) with one for each."""
         n = len(self.names)
         if isinstance(episode, Tensor) and (
             episode.shape not in ((), (n,)) or episode.dtype not in (torch.int64, torch.int32)
@@ -139,7 +137,7 @@ class EpisodeCounter:
         return torch.frombuffer(bytearray(json.dumps(state).encode()), dtype=torch.uint8)
 
     def load(self, dumped: Tensor) -> None:
-        """Take seed and counters from :meth:`dump` of an environment with the same tasks in its rows."""
+        """Take seed and counters of a :meth:`dump` with the same tasks in its rows."""
         try:
             state = parse_json(dumped.cpu().numpy().tobytes())
             names, seed, resets = list(state["tasks"]), check_int("seed", state["seed"]), list(state["resets"])

@@ -120,9 +120,7 @@ def test_an_interrupted_dataset_carries_on_without_doing_episodes_twice(half_mad
     done = []
     put = EpisodeFiles.put
     monkeypatch.setattr(
-        EpisodeFiles,
-        "put",
-        lambda self, task, episode, steps: (done.append(task), put(self, task, episode, steps)),
+        EpisodeFiles, "put", lambda self, task, episode, steps: (done.append(task), put(self, task, episode, steps))
     )
     collect(half_made)
     assert len(done) == 2

@@ -145,8 +145,7 @@ def test_the_state_is_part_of_the_replay_buffers():
 
 
 @pytest.mark.parametrize(
-    ("tasks", "batch_size", "nearest"),
-    [(3, 100, "99 and 102"), (3, 2, "3"), (10, 512, "510 and 520"), (7, 1, "7")],
+    ("tasks", "batch_size", "nearest"), [(3, 100, "99 and 102"), (3, 2, "3"), (10, 512, "510 and 520"), (7, 1, "7")]
 )
 def test_a_batch_that_the_tasks_do_not_divide_is_refused_with_the_nearest(tasks, batch_size, nearest):
     replay = make_replay(make_rows([4] * tasks), batch_size)

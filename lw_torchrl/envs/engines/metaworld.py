@@ -51,11 +51,7 @@ class MetaWorldEngine:
     """
 
     def __init__(
-        self,
-        tasks: Sequence[str],
-        *,
-        reward: Literal["sparse", "dense"] = "sparse",
-        num_threads: int | None = None,
+        self, tasks: Sequence[str], *, reward: Literal["sparse", "dense"] = "sparse", num_threads: int | None = None
     ) -> None:
         self._dense = reward == "dense"
         # The environment above counts the steps; Meta-World's own limit must not come first.

@@ -80,11 +80,7 @@ class VectorizedEngine:
     """
 
     def __init__(
-        self,
-        tasks: Sequence[str],
-        *,
-        reward: Literal["sparse", "dense"] = "sparse",
-        num_threads: int | None = None,
+        self, tasks: Sequence[str], *, reward: Literal["sparse", "dense"] = "sparse", num_threads: int | None = None
     ) -> None:
         check_versions()
         dense = check_choice("reward", reward, ("sparse", "dense")) == "dense"
