@@ -41,15 +41,15 @@ EDGES = [0.005, 0.01, 0.015, 0.02, 0.025, 0.03, 0.035, 0.04, 0.05, 0.06, 0.065, 
 """Distances at which Meta-World's formulas change."""
 
 
-def play_both(tasks: list[str], steps: int, precisions: list[type], seed: int) -> dict[str, float]:
+def play_both(tasks: list[str], steps: int, precisions: list[tuple[type, ...]], seed: int) -> dict[str, float]:
     """The largest difference of each task's rewards over episodes of the experts' actions, with noise and with
-    random ones and random grips among them, one episode for each precision."""
+    random ones and random grips among them; of each episode the precisions of its steps, in turn."""
     n, rng = len(tasks), np.random.default_rng(seed)
     oracle, engine = MetaWorldEngine(tasks, reward="dense"), VectorizedEngine(tasks, reward="dense", num_threads=1)
     policies = [ENV_POLICY_MAP[f"{task}-v3"]() for task in tasks]
     everyone = np.ones(n, bool)
     worst = np.zeros(n)
-    for precision in precisions:
+    for in_turn in precisions:
         seeds = rng.integers(2**31, size=n).tolist()
         seen = oracle.reset(range(n), seeds)
         engine.reset(range(n), seeds)
@@ -61,7 +61,7 @@ def play_both(tasks: list[str], steps: int, precisions: list[type], seed: int) -
             wild, grips = rng.random(n) < 0.15, rng.random(n) < 0.2
             action[wild] = rng.uniform(-1, 1, (wild.sum(), 4))
             action[grips, 3] = rng.uniform(0, 1, grips.sum())
-            action = np.clip(action, -1, 1).astype(precision)
+            action = np.clip(action, -1, 1).astype(in_turn[step % len(in_turn)])
             expected, got = oracle.step(action, everyone), engine.step(action, everyone)
             assert np.array_equal(expected.observation, got.observation)
             worst = np.maximum(worst, np.abs(expected.reward - got.reward))
@@ -72,14 +72,14 @@ def play_both(tasks: list[str], steps: int, precisions: list[type], seed: int) -
 
 
 def test_every_tasks_reward_has_metaworlds_bits():
-    differences = play_both(TASKS, 40, [np.float32, np.float64], seed=0)
+    differences = play_both(TASKS, 30, [(np.float32, np.float64)], seed=0)
     assert set(differences.values()) == {0.0}, differences
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("tasks", [TASKS[k : k + 10] for k in range(0, 50, 10)], ids=lambda tasks: tasks[0])
 def test_whole_episodes_have_metaworlds_bits(tasks):
-    differences = play_both(tasks, 500, [np.float32, np.float64, np.float32], seed=1)
+    differences = play_both(tasks, 500, [(np.float32,), (np.float64,), (np.float32,)], seed=1)
     assert set(differences.values()) == {0.0}, differences
 
 

@@ -30,7 +30,7 @@ from lw_torchrl.envs.engines.vectorized.task_programs import (
     SharedModel,
     borrow_model,
     check_versions,
-    make_task_logic,
+    make_task_program,
     model_path,
     return_models,
 )
@@ -54,11 +54,11 @@ def available_cores() -> int:
 class VectorizedEngine:
     """Simulates all rows together: physics in threads, everything else in NumPy over all rows at once.
 
-    It gives the very numbers of :class:`~lw_torchrl.envs.engines.metaworld.MetaWorldEngine`, whatever the
-    number of threads. The rows of one XML file share a compiled model; each has only a state of its own.
+    Its numbers are those of :class:`~lw_torchrl.envs.engines.metaworld.MetaWorldEngine`, bit for bit, whatever the
+    number of threads. The rows of one XML file share a compiled model; each has a state of its own.
 
-    A row faults when its action is not finite, or when its simulation becomes unstable. It then repeats its
-    last stable observation, is not simulated, and stays faulted until it is reset; other rows notice nothing.
+    A row faults when its action is not finite, or when its simulation becomes unstable. It then repeats its last stable
+    observation and is not simulated until it is reset; other rows are not affected.
 
     Args:
         tasks: the task of each row.
@@ -67,7 +67,6 @@ class VectorizedEngine:
 
     Raises:
         ImportError: another Meta-World or MuJoCo than the one this engine was compared with.
-        ValueError: an unknown task or reward.
 
     Example:
         >>> engine = VectorizedEngine(["reach", "push"], num_threads=1)
@@ -97,7 +96,7 @@ class VectorizedEngine:
         self._return_models = weakref.finalize(self, return_models, models)
         for number, group in enumerate(self._groups):
             models.append(borrow_model(model_path(tasks[group.rows[0]])))
-            programs = {task: make_task_logic(task, models[-1]) for task in {tasks[row] for row in group.rows}}
+            programs = {task: make_task_program(task, models[-1]) for task in {tasks[row] for row in group.rows}}
             for row in group.rows:
                 self._group_of_row[row] = number
                 builders[row] = programs[tasks[row]]
@@ -117,7 +116,10 @@ class VectorizedEngine:
         self._high = np.array([space.high for space in bounds]).reshape(n, OBSERVATION_SIZE)
         self._mocap_low = np.array([builder.mocap_low for builder in builders]).reshape(n, 3)
         self._mocap_high = np.array([builder.mocap_high for builder in builders]).reshape(n, 3)
-        self._action_scale = _single({builder.action_scale for builder in builders}, default=0.01)
+        scales = {builder.action_scale for builder in builders}
+        if len(scales) > 1:
+            raise RuntimeError(f"the tasks were to share one action scale, got {sorted(scales)}")
+        self._action_scale = scales.pop() if scales else 0.01
 
         self._mocap = np.zeros((n, 3))
         self._goal = np.zeros((n, 3))
@@ -128,10 +130,7 @@ class VectorizedEngine:
         self._running: _RunningRows | None = None
 
     def reset(self, rows: Sequence[int], seeds: Sequence[int]) -> Array:
-        """Start an episode in each of ``rows``, as Meta-World's ``env.seed(seed); env.reset()`` does.
-
-        The episode depends on the seed and on the actions alone, not on what the row did before.
-        """
+        """Start an episode in each of ``rows``, as Meta-World's ``env.seed(seed); env.reset()`` does."""
         index = np.asarray(rows, dtype=np.intp).reshape(-1)
         if len(index) != len(seeds):
             raise ValueError(f"seeds must be as many as rows, {len(index)}, got {len(seeds)}")
@@ -164,7 +163,7 @@ class VectorizedEngine:
         if not self._started[active].all():
             row = int(np.flatnonzero(active & ~self._started)[0])
             raise RuntimeError(f"row {row} must be reset before it is stepped")
-        # What is not a number must not reach the physics: MuJoCo would quietly start the row over.
+        # NaN must not reach the physics: MuJoCo would silently restart the row.
         self._faulted |= active & ~np.isfinite(action).all(axis=1)
         reward, success = np.zeros(n), np.zeros(n, dtype=bool)
         running = active & ~self._faulted
@@ -173,7 +172,7 @@ class VectorizedEngine:
         return EngineStep(self._observation.copy(), reward, success, active & self._faulted)
 
     def render(self, rows: Sequence[int], *, camera: str, height: int, width: int) -> NDArray[np.uint8]:
-        """Pictures of rows, (len(rows), height, width, 3) uint8; the simulation goes on as if none had been taken."""
+        """Pictures of rows, (len(rows), height, width, 3) uint8; they change nothing in the simulation."""
         cameras = self._cameras = self._cameras or Cameras()
         pictures = [self._rows[row].picture(cameras, camera=camera, height=height, width=width) for row in rows]
         return np.stack(pictures)
@@ -183,7 +182,7 @@ class VectorizedEngine:
         return self._rows[row].model
 
     def poses(self, row: int) -> BodyPoses:
-        """Where the bodies of a row are now; about 3 µs."""
+        """Where the bodies of a row are now."""
         return self._rows[row].poses()
 
     def close(self) -> None:
@@ -219,20 +218,15 @@ class VectorizedEngine:
         stable = is_stable(observation, warnings)
         if not stable.all():
             self._faulted[rows[~stable]] = True
-            rows, current, observation, achieved, rewards = (
-                rows[stable],
-                current[stable],
-                observation[stable],
-                achieved[stable],
-                rewards[stable],
-            )
+            rows, current, observation = rows[stable], current[stable], observation[stable]
+            achieved, rewards = achieved[stable], rewards[stable]
         self._current[rows] = current
         self._observation[rows] = observation
         success[rows] = achieved
         reward[rows] = rewards
 
     def _running_rows(self, running: Mask) -> _RunningRows:
-        """What steps exactly these rows; kept for the next step, for the mask seldom changes."""
+        """These rows; kept for the next step, since the mask seldom changes."""
         key = running.tobytes()
         if self._running is None or self._running.key != key:
             self._running = _RunningRows(self, running, key)
@@ -246,7 +240,7 @@ class VectorizedEngine:
 
 
 class _RunningRows:
-    """Everything about one set of running rows that does not change from step to step."""
+    """What is constant for one set of running rows."""
 
     def __init__(self, engine: VectorizedEngine, running: Mask, key: bytes) -> None:
         self.key = key
@@ -260,9 +254,3 @@ class _RunningRows:
         self.groups = [(group, [place[row] for row in items]) for group, items in engine._by_group(rows)]
         self.low, self.high = engine._low[rows], engine._high[rows]
         self.mocap_low, self.mocap_high = engine._mocap_low[rows], engine._mocap_high[rows]
-
-
-def _single(values: set[float], *, default: float) -> float:
-    if len(values) > 1:
-        raise RuntimeError(f"the tasks were to share one action scale, got {sorted(values)}")
-    return values.pop() if values else default

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
-from lw_torchrl.envs.engines.vectorized.tables import PLACES, Place, TaskReward, TaskSources
+from lw_torchrl.envs.engines.vectorized.tables import TaskReward, TaskSources, parse_place
 
 Array = NDArray[np.float64]
 
-# One row of sensors. The first 18 numbers are laid out like the observation, whose number 3, the opening of
-# the gripper, is computed. What a task does not have is left to chance.
+# The columns of the sensors. The first 18 are laid out like the observation, whose number 3, the opening of the
+# gripper, is computed. Columns that a task does not have hold arbitrary numbers.
 HAND = slice(0, 3)
 GRIPPER = 3
 OBJECT = slice(4, 7)
@@ -31,7 +31,7 @@ POINT = slice(39, 42)
 JOINT = slice(42, 43)
 WIDTH = 43
 
-# Only the dense reward looks at these.
+# Of the dense reward only.
 LEFT_PAD = slice(43, 46)
 RIGHT_PAD = slice(46, 49)
 PLACE = slice(49, 52)
@@ -42,17 +42,9 @@ MATRIX_OF = "matrix of "
 
 
 class StateView:
-    """The arrays of a MuJoCo state as one, so that a single ``take`` reads from any of them.
-
-    MuJoCo keeps them all in one block of memory. Joining ten small arrays instead costs four times as much,
-    as each is a Python object that has left the processor's cache since the last step.
-
-    Args:
-        model: the compiled model.
-        data: its state, which must live as long as this window.
-
-    Raises:
-        RuntimeError: the arrays do not lie in one block.
+    """The arrays of a MuJoCo state, which are in one block of memory, as one, so that a single ``take`` reads from any
+    of them. Joining ten small arrays costs four times as much: each is a Python object that has left the processor's
+    cache since the last step. The state must live as long as this view.
     """
 
     def __init__(self, model: Any, data: Any) -> None:
@@ -70,18 +62,21 @@ class StateView:
         self.numbers = as_strided(first, shape=(size // first.itemsize,), strides=(first.itemsize,))
 
     def position(self, place: str) -> Array:
-        """Where "body NAME", "geom NAME" or "site NAME" is."""
-        return self._positions[Place.parse(place).kind][self._number(place)]
+        """The position of "body NAME", "geom NAME" or "site NAME"."""
+        kind, number = self._find(place)
+        return self._positions[kind][number]
 
     def matrix(self, place: str) -> Array:
-        """How the place is turned, nine numbers."""
-        return self._matrices[Place.parse(place).kind][self._number(place)]
+        """The rotation matrix of a place, nine numbers."""
+        kind, number = self._find(place)
+        return self._matrices[kind][number]
 
     def quaternion(self, place: str) -> Array:
-        """How a body is turned, four numbers."""
-        if Place.parse(place).kind != "body":
+        """The quaternion of a body."""
+        kind, number = self._find(place)
+        if kind != "body":
             raise ValueError(f"only a body has a quaternion of its own, got {place!r}")
-        return self._quaternions[self._number(place)]
+        return self._quaternions[number]
 
     def joint(self, name: str) -> Array:
         """The coordinate of a joint that has one."""
@@ -92,10 +87,9 @@ class StateView:
         """The index in ``numbers`` of the first number of one of the arrays above."""
         return (_address(array) - self._start) // array.itemsize
 
-    def _number(self, place: str) -> int:
-        at = Place.parse(place)
-        assert at.kind in PLACES
-        return getattr(self._model, at.kind)(at.name).id
+    def _find(self, place: str) -> tuple[str, int]:
+        kind, name = parse_place(place)
+        return kind, getattr(self._model, kind)(name).id
 
 
 def _address(array: Array) -> int:
@@ -147,13 +141,8 @@ DIAL_RADIUS = 0.05  # metres
 
 
 class Observer:
-    """Makes the observations of a fixed set of rows.
-
-    Each operation is Meta-World's, in its order, so that the last bit agrees.
-
-    Args:
-        sources: each row's task.
-    """
+    """Makes the observations of a fixed set of rows, by Meta-World's operations in its order, so that the last bit
+    agrees."""
 
     def __init__(self, sources: Sequence[TaskSources]) -> None:
         self._matrices = np.flatnonzero([row.quaternion.startswith(MATRIX_OF) for row in sources])
@@ -164,7 +153,7 @@ class Observer:
         self._constant, self._is_constant = _constants(sources)
 
     def current(self, sensors: Array) -> Array:
-        """(rows, 18) the part of the observation that describes the present state alone."""
+        """(rows, 18) the part of the observation that describes the present state."""
         current = sensors[:, CURRENT].copy()
         np.copyto(current, self._constant, where=self._is_constant)
         span = row_norm(sensors[:, RIGHT_CLAW] - sensors[:, LEFT_CLAW])
@@ -182,7 +171,7 @@ class Observer:
 
 
 def _constants(sources: Sequence[TaskSources]) -> tuple[Array, NDArray[np.bool_]]:
-    """What part of each row never changes: its value, and where."""
+    """The constant part of each row: its value, and where."""
     value = np.zeros((len(sources), CURRENT.stop))
     fixed = np.zeros(value.shape, dtype=bool)
     for k, row in enumerate(sources):
@@ -194,18 +183,14 @@ def _constants(sources: Sequence[TaskSources]) -> tuple[Array, NDArray[np.bool_]
 
 
 def row_norm(vectors: Array) -> Array:
-    """The length of each row, with the bits of ``np.linalg.norm`` of that row alone.
-
-    That function takes the dot product from BLAS, and so does ``vecdot``; a sum of squares over an axis
-    rounds differently in one case out of nine.
-    """
+    """The length of each row, with the bits of ``np.linalg.norm`` of that row alone, which takes the dot product from
+    BLAS as ``vecdot`` does; a sum of squares over an axis rounds differently in one case out of nine."""
     return np.sqrt(np.vecdot(vectors, vectors))
 
 
 def quaternion_of_matrix(matrix: Array) -> Array:
     """(n, 4) quaternions, x y z w, of (n, 9) rotation matrices, with the bits of SciPy's
-    ``Rotation.from_matrix(...).as_quat()`` at a fraction of its cost.
-    """
+    ``Rotation.from_matrix(...).as_quat()`` at a fraction of its cost."""
     m00, m01, m02, m10, m11, m12, m20, m21, m22 = matrix.T
     trace = m00 + m11 + m22
     quaternion = np.stack((m21 - m12, m02 - m20, m10 - m01, 1.0 + trace))

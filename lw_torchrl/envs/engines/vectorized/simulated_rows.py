@@ -31,13 +31,13 @@ VELOCITIES_DONE = int(mujoco.mjtStage.mjSTAGE_VEL)
 
 
 class SimulatedRow:
-    """A state, the places its last reset gave to bodies and sites, and Meta-World's program for its task.
+    """A state, the positions that its last reset gave to bodies and sites, and Meta-World's program for its task.
 
     Args:
         sources: where the row's task finds its numbers.
         shared: the model, which no other thread may use while this row simulates or resets.
         builder: the task's program on that model, from which each episode takes a copy.
-        reward: the numbers of its dense reward, for what that looks at in the state.
+        reward: its dense reward, for the sensors that it needs.
     """
 
     def __init__(self, sources: TaskSources, shared: SharedModel, builder: Any, reward: TaskReward | None) -> None:
@@ -71,21 +71,18 @@ class SimulatedRow:
 
     @property
     def mocap(self) -> Array:
-        """(3,) the place that the hand is drawn to."""
+        """(3,) the position that the hand is drawn to."""
         return self._mocap
 
     @property
     def goal(self) -> Array:
-        """(3,) where the last reset put the goal."""
-        return self.program.present_goal()
+        """(3,) the goal of the present episode."""
+        return self.program._target_pos
 
     def simulate(self, mocap: Array, control: Array, sensors: Array, warnings: NDArray[np.int32]) -> None:
-        """One step of the environment: five of physics, and one more look without moving.
-
-        That look, ``mj_forward``, also leaves the accelerations from which the next step's solver starts, so
-        without it the numbers would drift apart from Meta-World's. ``sensors`` (as wide as its index) and
-        ``warnings`` (3,) are filled at once, while the state is still in the processor's cache.
-        """
+        """One step of the environment: five of physics, and a look without moving, ``mj_forward``, which also leaves
+        the accelerations from which the next step's solver starts. ``sensors`` (as wide as its index) and ``warnings``
+        (3,) are filled while the state is still in the processor's cache."""
         self._take_model()
         self._mocap[...] = mocap
         self._control[...] = control
@@ -105,7 +102,7 @@ class SimulatedRow:
         return RowModel(self.shared.path, self._model)
 
     def poses(self) -> BodyPoses:
-        """Where the bodies are; the state holds them, whoever has the model."""
+        """Where the bodies are."""
         return BodyPoses(self._data.xpos.copy(), self._data.xquat.copy())
 
     def picture(self, cameras: Cameras, **size: Any) -> NDArray[np.uint8]:
@@ -116,10 +113,9 @@ class SimulatedRow:
     def _substep_after_look(self) -> None:
         """One ``mj_step`` where since the last ``mj_forward`` only the controls and the mocap body have moved.
 
-        That body touches nothing, and nothing hangs on it but the weld to the hand. So contacts, inertia and its
-        factors, velocities and what they cause are still those of the look, which saves a tenth of the step; the bits
-        are the same. Meta-World's solver, Newton's, wants no projection of constraints. Numbers that are not finite or
-        too large are found by the substep after this one.
+        That body touches nothing, and only the weld to the hand depends on it. So contacts, inertia, velocities and
+        what they cause are still those of the look, which saves a tenth of the step with the same bits. Newton's solver
+        needs no projection of constraints. The substep after this one finds numbers that are not finite or too large.
         """
         model, data = self._model, self._data
         mujoco.mj_kinematics(model, data)
@@ -134,17 +130,13 @@ class SimulatedRow:
 
 
 def is_stable(observation: Array, warnings: NDArray[np.int32]) -> NDArray[np.bool_]:
-    """(rows,) whether the numbers are finite and MuJoCo gave none of its three warnings since the reset."""
+    """(rows,) whether the numbers are finite and MuJoCo has given none of its three warnings since the reset."""
     return np.isfinite(observation).all(axis=1) & (warnings == WARNED_ALREADY).all(axis=1)
 
 
 class RowGroup:
-    """Rows that share a model, and so take turns.
-
-    Attributes:
-        rows: their numbers.
-        seconds: how long the last piece of work on them took, each row of it; a guess for the next.
-    """
+    """Rows that share a model, and so take turns; ``seconds`` is the time of each row's last work, an estimate of the
+    next."""
 
     def __init__(self, rows: Sequence[int]) -> None:
         self.rows = tuple(rows)
@@ -152,9 +144,8 @@ class RowGroup:
 
 
 def split_into_groups(keys: Sequence[str], num_threads: int) -> list[RowGroup]:
-    """Put the rows with one key (the model's file) together, in several groups only where one alone would
-    keep a thread busy for more than half of its share.
-    """
+    """Put the rows with one key (the model's file) together, in several groups only if one would keep a thread busy for
+    more than half of its share."""
     by_key: dict[str, list[int]] = defaultdict(list)
     for row, key in enumerate(keys):
         by_key[key].append(row)
@@ -168,10 +159,9 @@ def split_into_groups(keys: Sequence[str], num_threads: int) -> list[RowGroup]:
 
 
 class WorkerPool:
-    """Threads that take one group after another until none is left.
+    """Threads that take one group after another until none is left, those that took long last time first.
 
-    A group is in the hands of one thread at a time, so its rows may share a model; which thread that is
-    changes no result. Groups that took long last time are begun first, which evens out the ends.
+    One thread at a time works on a group, so its rows may share a model; which thread changes no result.
     """
 
     def __init__(self, num_threads: int) -> None:

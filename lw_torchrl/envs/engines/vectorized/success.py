@@ -1,8 +1,4 @@
-"""Meta-World's success of many rows at once.
-
-Nearly every task succeeds when a point comes close to the goal. What the other rules of
-data/simulation.toml mean is written at the method of each.
-"""
+"""Meta-World's success of many rows at once: a point comes close to the goal, or one of the rules below."""
 
 from __future__ import annotations
 
@@ -30,15 +26,8 @@ Mask = NDArray[np.bool_]
 
 
 class Scene(NamedTuple):
-    """What a rule looks at, one entry a row.
-
-    Attributes:
-        near: whether the point is as close to the goal as the table asks.
-        sensors: what was read from the states.
-        current: the first 18 numbers of the observations.
-        goal: (rows, 3) the goals.
-        point: (rows, 3) what is to come close to them.
-    """
+    """The inputs of a rule, one entry a row: whether the point is as close to the goal as the table asks, the sensors,
+    the first 18 numbers of the observations, the goals (rows, 3), and the points (rows, 3) that are to reach them."""
 
     near: Mask
     sensors: Array
@@ -53,23 +42,16 @@ STICK_UPWARD = 0.06
 
 
 class SuccessFunction:
-    """Judges a fixed set of rows.
-
-    Args:
-        sources: each row's task.
-        programs: gives a row's :class:`~lw_torchrl.envs.engines.vectorized.task_programs.TaskLogic` of its present
-            episode, for the one rule that looks at contacts.
-    """
+    """The success of a fixed set of rows; ``programs`` gives a row's present
+    :class:`~lw_torchrl.envs.engines.vectorized.task_programs.TaskProgram`, for the one rule that looks at contacts."""
 
     def __init__(self, sources: Sequence[TaskSources], programs: Callable[[int], Any]) -> None:
         success = [row.success for row in sources]
         self._programs = programs
-        self._offset = np.array([row.offset for row in success])
-        self._axes = np.array([row.axes for row in success])
-        self._within = np.array([row.within for row in success])
-        self._under = np.array([row.under for row in success])
-        self._above = np.array([row.above for row in success])
-        self._angle = np.array([row.angle for row in success])
+        self._offset, self._axes, self._within, self._under, self._above, self._angle = (
+            np.array([getattr(row, name) for row in success])
+            for name in ("offset", "axes", "within", "under", "above", "angle")
+        )
         points = [row.point for row in success]
         self._seconds = np.flatnonzero([point == "second" for point in points])
         self._grippers = np.flatnonzero([point == "gripper" for point in points])
@@ -83,13 +65,7 @@ class SuccessFunction:
         ]
 
     def __call__(self, sensors: Array, current: Array, goal: Array) -> Mask:
-        """(rows,) whether each row stands in success.
-
-        Args:
-            sensors: (rows, WIDTH) what was read from the states.
-            current: (rows, 18) the first numbers of the observations.
-            goal: (rows, 3) the goals.
-        """
+        """(rows,) whether each row succeeds, by sensors (rows, WIDTH), observations (rows, 18) and goals (rows, 3)."""
         point = current[:, OBJECT].copy()
         if self._seconds.size:
             point[self._seconds] = current[self._seconds, SECOND]

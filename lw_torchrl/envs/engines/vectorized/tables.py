@@ -23,25 +23,12 @@ NO_OFFSET: Vector = (-0.0, -0.0, -0.0)
 """Adding -0.0 leaves every number as it is, 0.0 and -0.0 included; adding 0.0 does not."""
 
 
-@dataclass(frozen=True)
-class Place:
-    """A named part of the model.
-
-    Attributes:
-        kind: "body", "geom" or "site".
-        name: its name in the model.
-    """
-
-    kind: str
-    name: str
-
-    @classmethod
-    def parse(cls, text: str) -> Place:
-        """Read "site goal"; :class:`ValueError` for anything else."""
-        kind, _, name = text.partition(" ")
-        if kind not in PLACES or not name:
-            raise ValueError(f"a place is 'body NAME', 'geom NAME' or 'site NAME', got {text!r}")
-        return cls(kind, name)
+def parse_place(text: str) -> tuple[str, str]:
+    """The kind, "body", "geom" or "site", and the name of a part of the model, "site goal" say."""
+    kind, _, name = text.partition(" ")
+    if kind not in PLACES or not name:
+        raise ValueError(f"a place is 'body NAME', 'geom NAME' or 'site NAME', got {text!r}")
+    return kind, name
 
 
 @dataclass(frozen=True)
@@ -64,7 +51,7 @@ class SuccessSources:
         if self.rule is not None and self.rule not in RULES:
             raise ValueError(f"success.rule must be one of {', '.join(RULES)}, got {self.rule!r}")
         if self.point not in ("object", "second", "gripper"):
-            Place.parse(self.point)
+            parse_place(self.point)
 
 
 @dataclass(frozen=True)
@@ -89,9 +76,10 @@ DENSITIES = ("sparse", "high", "medium")
 FIRST_DISTANCE = "first distance"
 
 
-def _check_points(points: tuple[str, ...]) -> None:
-    if len(points) != 2:
-        raise ValueError(f"two points are needed, got {', '.join(points)}")
+def _check_points(points: tuple[str, ...], *numbers: int) -> None:
+    if len(points) not in numbers:
+        wanted = " or ".join(("one", "two")[number - 1] for number in numbers)
+        raise ValueError(f"{wanted} points are needed, got {', '.join(points)}")
     for point in points:
         check_choice("a point", point, POINTS)
 
@@ -110,9 +98,9 @@ class Term:
     curve: str = "long tail"
 
     def __post_init__(self) -> None:
-        _check_points(self.between)
+        _check_points(self.between, 2)
         if isinstance(self.margin, tuple):
-            _check_points(self.margin)
+            _check_points(self.margin, 2)
         check_choice("curve", self.curve, CURVES)
 
 
@@ -149,10 +137,8 @@ class Funnel:
     offset: Vector = NO_OFFSET
 
     def __post_init__(self) -> None:
-        if not 1 <= len(self.about) <= 2:
-            raise ValueError(f"funnel.about must be one or two points, got {', '.join(self.about)}")
-        for point in (self.over, *self.about):
-            check_choice("a point", point, POINTS)
+        _check_points((self.over,), 1)
+        _check_points(self.about, 1, 2)
 
 
 @dataclass(frozen=True)

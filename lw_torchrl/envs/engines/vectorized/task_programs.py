@@ -21,11 +21,7 @@ SUPPORTED_VERSIONS = {"metaworld": "3.1.1", "mujoco": "3.3.0"}
 
 
 def check_versions() -> None:
-    """Refuse a Meta-World or MuJoCo whose numbers have not been compared with this engine's.
-
-    Raises:
-        ImportError: names the installed and the supported version.
-    """
+    """Raise ImportError for a Meta-World or MuJoCo whose numbers have not been compared with this engine's."""
     for package, supported in SUPPORTED_VERSIONS.items():
         try:
             installed = importlib.metadata.version(package)
@@ -40,15 +36,9 @@ def check_versions() -> None:
 
 
 class SharedModel:
-    """A compiled model that many rows use in turn.
-
-    A reset of a Meta-World task moves bodies and sites of the model itself, so each row keeps its own
-    ``body_pos`` and ``site_pos`` and :meth:`load`\\ s them before its physics. The rows of one shared model
-    must therefore never run at the same time.
-
-    Attributes:
-        holder: whose bodies and sites are in the model now; a row that finds itself here need not load.
-    """
+    """A compiled model that many rows use in turn, never at the same time: a reset of a Meta-World task moves bodies
+    and sites of the model itself, so each row keeps its own ``body_pos`` and ``site_pos``, and loads them before its
+    physics unless it is still the ``holder``."""
 
     def __init__(self, path: str, model: Any) -> None:
         self.path = path
@@ -72,21 +62,21 @@ class SharedModel:
     def duplicate(self) -> SharedModel:
         """A second model, for rows that are to run beside this one's; copied, not compiled."""
         twin = SharedModel(self.path, copy.copy(self.model))
-        # Somebody may be using this model just now: take what never changes from it, not its present state.
+        # This model may be in use: take what never changes from it, not its present state.
         twin.compiled_body_pos = self.compiled_body_pos
         twin.compiled_site_pos = self.compiled_site_pos
         twin.restore()
         return twin
 
 
-# An engine that is forgotten gives its models back whenever Python collects it, be it inside borrow_model.
+# reentrant: an engine that Python collects gives its models back, perhaps inside borrow_model
 _lock = threading.RLock()
 _compiled: dict[str, SharedModel] = {}
 _idle: dict[str, SharedModel] = {}
 
 
 def borrow_model(path: str) -> SharedModel:
-    """A model of the XML file that nobody else uses, compiled only if this process never did so before."""
+    """A model of the XML file that nobody else uses, compiled only once in a process."""
     with _lock:
         if (idle := _idle.pop(path, None)) is not None:
             return idle
@@ -109,16 +99,11 @@ WARNED_ALREADY = 1000
 counts here instead: nothing is written, and a count that is another number tells of a warning."""
 
 
-def silence_warnings(data: Any) -> None:
-    """Let MuJoCo count this state's warnings without printing them; a reset of the state undoes it."""
-    data.warning.number[:] = WARNED_ALREADY
+class TaskProgram:
+    """A Meta-World environment without a simulator of its own, mixed into one of Meta-World's classes.
 
-
-class TaskLogic:
-    """A Meta-World environment without a simulator of its own.
-
-    Mixed into one of Meta-World's classes by :func:`make_task_logic`. It is built once for each model;
-    every episode of every row then runs on a light copy (:meth:`on`) that shares everything but the state.
+    It is built once for each model; every episode of every row runs on a light copy (:meth:`on`) that shares everything
+    but the state.
     """
 
     model: Any
@@ -147,12 +132,12 @@ class TaskLogic:
     def _initialize_simulation(self) -> tuple[Any, Any]:
         return self.model, mujoco.MjData(self.model)
 
-    def on(self, data: Any) -> TaskLogic:
+    def on(self, data: Any) -> TaskProgram:
         """A copy of this program, as it was when built, that works on ``data``."""
         program = object.__new__(type(self))
         program.__dict__.update(self.__dict__)
         program.data = data
-        # Two attributes are windows into the state: in Meta-World they follow the fingers of its one state.
+        # Two attributes are views of the state: in Meta-World they follow the fingers.
         program.init_left_pad = program.get_body_com("leftpad")  # type: ignore[attr-defined]
         program.init_right_pad = program.get_body_com("rightpad")  # type: ignore[attr-defined]
         return program
@@ -160,19 +145,19 @@ class TaskLogic:
     def start_episode(self, seed: int) -> NDArray[np.float64]:
         """Reset as Meta-World's ``env.seed(seed); env.reset()`` does; returns the first observation.
 
-        Meta-World places everything twice and simulates the hand's way to its start both times. Of the first
-        round only the random draws and the places it gives to bodies and sites survive, and neither depends
-        on the hand, so here the first round leaves the hand alone.
+        Meta-World places everything twice and simulates the hand's way to its start both times. Of the first round only
+        the random draws and the positions of bodies and sites survive, which do not depend on the hand, so here the
+        first round does not move it.
         """
         self.np_random, _ = seeding.np_random(seed)
         mujoco.mj_resetData(self.model, self.data)
-        silence_warnings(self.data)
+        self.data.warning.number[:] = WARNED_ALREADY
         mujoco.mj_forward(self.model, self.data)
         self._moves_hand = False
         self.reset_model()
 
         mujoco.mj_resetData(self.model, self.data)
-        silence_warnings(self.data)
+        self.data.warning.number[:] = WARNED_ALREADY
         self._moves_hand = True
         observation = self.reset_model()
         observation[18:36] = observation[:18]
@@ -186,10 +171,6 @@ class TaskLogic:
             mujoco.mj_step(self.model, self.data, nstep=steps * self.frame_skip)
         self.init_tcp = self.tcp_center
 
-    def present_goal(self) -> NDArray[np.float64]:
-        """Where the goal is now."""
-        return self._target_pos
-
 
 def _task_class(task: str) -> Any:
     import_metaworld()
@@ -202,15 +183,14 @@ def _task_class(task: str) -> Any:
 @cache
 def _program_class(task: str) -> Any:
     base = _task_class(task)
-    return type(f"{base.__name__}Program", (TaskLogic, base), {})
+    return type(f"{base.__name__}Program", (TaskProgram, base), {})
 
 
 def model_path(task: str) -> str:
     """The XML file of a task; 36 files serve the 50 tasks."""
-    task_class = _task_class(task)
-    return object.__new__(task_class).model_name
+    return object.__new__(_task_class(task)).model_name
 
 
-def make_task_logic(task: str, shared: SharedModel) -> Any:
+def make_task_program(task: str, shared: SharedModel) -> Any:
     """Meta-World's program of ``task`` on a shared model."""
     return _program_class(task)(shared.model)
