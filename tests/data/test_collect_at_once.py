@@ -65,6 +65,7 @@ def test_a_finished_dataset_is_read_by_as_many_as_like(made):
         assert elsewhere(made.root) == made
 
 
+@pytest.mark.slow
 def test_two_processes_leave_a_whole_dataset(made, tmp_path):
     program = f"""
 import sys

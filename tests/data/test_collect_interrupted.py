@@ -91,7 +91,7 @@ KILLER = """
 """
 
 
-@pytest.mark.parametrize("mode", ["replace", "seed 1"])
+@pytest.mark.parametrize("mode", ["replace", pytest.param("seed 1", marks=pytest.mark.slow)])
 def test_killed_again_and_again_it_gives_the_same_dataset(made, tmp_path, mode):
     root = tmp_path / "demos"
     command = [sys.executable, "-W", "ignore", "-c", textwrap.dedent(KILLER), str(root), mode]

@@ -53,7 +53,7 @@ def play_both(tasks: list[str], steps: int, precisions: list[tuple[type, ...]], 
         seeds = rng.integers(2**31, size=n).tolist()
         seen = oracle.reset(range(n), seeds)
         engine.reset(range(n), seeds)
-        for _ in range(steps):
+        for step in range(steps):
             with warnings.catch_warnings():
                 warnings.filterwarnings("ignore", message="Constant.* may be too high")
                 action = np.stack([policy.get_action(row) for policy, row in zip(policies, seen, strict=True)])
