@@ -47,16 +47,6 @@ from lw_torchrl.modules.networks import evaluating
 from lw_torchrl.modules.policy import Policy
 
 
-def _known_to_experts(tasks: str | Iterable[str]) -> tuple[str, ...]:
-    try:
-        return resolve_tasks(tasks)
-    except TypeError as error:
-        raise TypeError(
-            f"{error}. Meta-World's experts demonstrate its own 50 tasks; docs/training.md shows demonstrations by a "
-            "policy of one's own"
-        ) from error
-
-
 def _open_episode_files(
     root: Path, config: CollectConfig, made_with: dict[str, str] | None = None
 ) -> tuple[EpisodeFiles, dict[str, str]]:
@@ -173,7 +163,7 @@ def _assemble(
 def _made(
     root: Path, config: CollectConfig, policy: Policy | None, num_envs: int | None, progress: bool
 ) -> Demonstrations:
-    """The dataset, finished or mended where it is not. The folder must be held: another call may have come first."""
+    """The dataset, finished or repaired if need be; the folder must be held, and another call may have come first."""
     found, damaged = None, None
     if (root / METADATA).is_file():
         found, *damaged = _read_through(root, config, progress)
@@ -265,7 +255,13 @@ def collect_demonstrations(
         >>> demos.num_steps, demos.success_rate
         (80, {'reach': 1.0})
     """
-    names = _known_to_experts(tasks)
+    try:
+        names = resolve_tasks(tasks)
+    except TypeError as error:
+        raise TypeError(
+            f"{error}. Meta-World's experts demonstrate its own 50 tasks; docs/training.md shows demonstrations by a "
+            "policy of one's own"
+        ) from error
     actor = policy if isinstance(policy, Policy) else None
     if actor is not None and (unknown := [task for task in names if task not in actor.tasks]):
         raise ValueError(f"tasks must be among the policy's, it was not made for {', '.join(unknown)}")
@@ -285,12 +281,12 @@ def collect_demonstrations(
         raise ValueError(f"root must be a folder, {str(folder)!r} is a file")
     found = None
     if (folder / METADATA).is_file():
-        with suppress(OSError):  # another call may be mending it
+        with suppress(OSError):  # another call may be repairing it
             found = _read_through(folder, config, progress)[0]
     elif folder.is_dir() and {path.name for path in folder.iterdir()} - {LOCK} and not (folder / PARTIAL).is_dir():
         raise DatasetError(f"root: {str(folder)!r} is not empty and holds no dataset; choose another folder")
     if found is None or (folder / PARTIAL).is_dir():
-        alone = held(folder, "root", "collect_demonstrations", folder=True, error=DatasetError)
-        with alone, nullcontext() if actor is None else evaluating(actor):
+        lock = held(folder, "root", "collect_demonstrations", folder=True, error=DatasetError)
+        with lock, nullcontext() if actor is None else evaluating(actor):
             found = _made(folder, config, actor, num_envs, progress)
     return found

@@ -30,7 +30,7 @@ class DatasetError(ValueError):
 
 
 class DamagedDatasetError(DatasetError):
-    """A dataset whose files are not as they were written; the same :func:`collect_demonstrations` mends it."""
+    """A dataset whose files are not as they were written; the same :func:`collect_demonstrations` repairs it."""
 
 
 def _whole_number(argument: str, given: Any, minimum: int) -> int:

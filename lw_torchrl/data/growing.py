@@ -155,7 +155,7 @@ class GrowingStorage(JoinedStorage):
         return (self.num_joined + serial % self.grow).view(batch.shape)
 
     def _read_only(self) -> NoReturn:
-        raise RuntimeError("rows of a storage that grows are written by a GrowingWriter alone, at the end of its ring")
+        raise RuntimeError("only a GrowingWriter writes rows of a storage that grows, at the end of its ring")
 
     def _write(self, serial: Tensor, found: Columns, previous: Tensor) -> None:
         slot = serial % self.grow

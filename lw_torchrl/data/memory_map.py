@@ -3,7 +3,7 @@
 The files are those of ``TensorDict.memmap``, so ``TensorDict.load_memmap`` reads them too. Here they are mapped as
 :data:`COLUMNS` says, so that nothing in the folder can ask for another shape, class or pickle. The map is
 copy-on-write: what is written to a column changes it for this process, never the file. The files themselves are not
-written through a map, since a full disk under one ends the process without a word.
+written through a map, since a full disk under one ends the process silently.
 """
 
 from __future__ import annotations
@@ -155,11 +155,8 @@ class MappedColumn(Tensor):
 
 
 def map_rows(demonstrations: Demonstrations) -> TensorDict:
-    """The rows of a dataset as they are in the files, memory-mapped.
-
-    Raises:
-        DatasetError: (a ValueError) a column is missing, or not as long as the metadata say; or there are other files.
-    """
+    """The rows of a dataset as they are in the files, memory-mapped; DatasetError if a column is missing, or not as
+    long as the metadata say, or there are other files."""
     folder, number = demonstrations.root / DATA, demonstrations.num_steps
     if odd := _surplus(folder):
         raise DatasetError(
@@ -235,16 +232,8 @@ def _files(root: Path) -> tuple[tuple[int, ...], ...]:
 
 
 def verify(demonstrations: Demonstrations, episodes: Sequence[EpisodeInfo], *, every: bool = True) -> None:
-    """Check episodes against their checksums, unless this process has and the files are as they were then.
-
-    Args:
-        demonstrations: the whole dataset's description.
-        episodes: those to check.
-        every: check all of them; otherwise at most :data:`READ_AT_ONCE` bytes, spread evenly.
-
-    Raises:
-        DatasetError: (a ValueError) rows differ from their checksums, or cannot be read at all.
-    """
+    """Check episodes of a dataset against their checksums, unless this process has and the files are as they were then;
+    DatasetError if they differ. Without ``every``, at most :data:`READ_AT_ONCE` bytes are read, spread evenly."""
     rows, root = map_rows(demonstrations), demonstrations.root.resolve()
     files = _files(root)
     known = _VERIFIED.get(root, _Verified(files, set()))

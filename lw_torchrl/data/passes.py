@@ -42,11 +42,7 @@ class Passes:
     """The rows of each group in the order of its pass: those already drawn, then those left, in random order.
 
     A new row takes a random place among those left, a row that goes leaves no gap; neither looks at the other rows.
-
-    Args:
-        order: rows group after group.
-        size: rows of each group, (G,) int64, at least 1.
-        cursor: rows of each group already drawn in this pass, (G,) int64; none by default.
+    ``order`` holds the rows group after group, ``size`` (G,) their number, and ``cursor`` (G,) the rows already drawn.
     """
 
     def __init__(self, order: Tensor, size: Tensor, cursor: Tensor | None = None) -> None:

@@ -127,9 +127,10 @@ def _taken(
             going = step < lengths
             here = rows[starts + torch.minimum(torch.tensor(step), lengths - 1)]
             if not torch.equal(state.get("observation")[going], here.get("observation")[going]):
+                versions = ", ".join(f"{name} {version}" for name, version in found.versions.items())
                 raise DatasetError(
                     f"root: episodes of {episodes[0].task!r} in {str(found.root)!r} go otherwise when they are run "
-                    f"again, from step {step} on: they were made by {_versions(found)}"
+                    f"again, from step {step} on: they were made by {versions}"
                 )
             if step % wanted.every == 0:
                 for place in going.nonzero().flatten().tolist():
@@ -137,10 +138,6 @@ def _taken(
             state.set("action", here.get("action")).set("_step", going)
             state = step_mdp(env.step(state), exclude_action=True).exclude("_step")
     return taken
-
-
-def _versions(found: Demonstrations) -> str:
-    return ", ".join(f"{name} {version}" for name, version in found.versions.items())
 
 
 def _write(path: Path, pictures: Sequence[np.ndarray[Any, Any]]) -> None:
@@ -181,7 +178,7 @@ def _read(path: Path, wanted: _Wanted, count: int) -> Tensor:
                     if picture.mode != "RGB" or picture.size != (wanted.shape[1], wanted.shape[0]):
                         raise ValueError(f"{name} is {picture.mode} of {picture.size} pixels")
                     pictures[number] = np.asarray(picture)
-    except Exception as error:  # a file from a stranger may be anything
+    except Exception as error:  # a damaged file may raise anything
         raise DatasetError(f"root: {str(path)!r} is damaged ({error}); add_pictures makes it anew") from error
     return torch.from_numpy(pictures)
 

@@ -62,12 +62,7 @@ class EpisodeFilter:
             raise ValueError("keep: behaviours must hold at least one label, got none")
 
     def choose(self, parts: Sequence[Demonstrations], returns: Sequence[Tensor]) -> list[Demonstrations]:
-        """The parts with the episodes that are kept.
-
-        Args:
-            parts: the datasets' descriptions.
-            returns: of each part, the return and the rows of each episode, (E, 2) float64.
-        """
+        """The parts with the episodes that are kept, by the return and the rows of each, (E, 2) float64 a part."""
         labels = {part.config.behaviour for part in parts}
         for label in self.behaviours or ():
             if label not in labels:
@@ -121,12 +116,6 @@ EpisodeChoice = int | Mapping[str, int | Sequence[int]] | None
 """All episodes; the first so many of each task; or, for each task to take, the first so many or these."""
 
 
-def _first(argument: str, task: str, there: list[int], number: int) -> list[int]:
-    if check_int(argument, number, minimum=1) > len(there):
-        raise ValueError(f"{argument}: the dataset has {len(there)} episodes of {task!r}, got {number}")
-    return there[:number]
-
-
 def choose_episodes(found: Demonstrations, chosen: EpisodeChoice, argument: str = "episodes") -> Demonstrations:
     """A dataset's description with only the chosen episodes, in the dataset's order."""
     if chosen is None:
@@ -149,7 +138,9 @@ def choose_episodes(found: Demonstrations, chosen: EpisodeChoice, argument: str 
             raise unknown_name(f"{argument}: task", task, there)
         place = f"{argument}[{task!r}]"
         if hasattr(some, "__index__"):
-            numbers = _first(place, task, there[task], some)  # type: ignore[arg-type]
+            if (number := check_int(place, some, minimum=1)) > len(there[task]):
+                raise ValueError(f"{place}: the dataset has {len(there[task])} episodes of {task!r}, got {number}")
+            numbers = there[task][:number]
         elif isinstance(some, Sequence) and not isinstance(some, str):
             numbers = [check_int(place, number) for number in some]
         else:

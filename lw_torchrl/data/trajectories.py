@@ -121,11 +121,9 @@ def link_rows(
 
     Args:
         key: the collector's ids, (n,) int64; rows of the same key are in the order of time.
-        done: (n,) bool.
-        batch: the columns of the rows.
+        done, batch: the rows, (n,) bool and the columns.
         opened: the trajectories that may continue, whose last rows are in ``ring`` at ``slots``, (K,) int64.
-        serial: the serial number of the first row.
-        number: of the next trajectory.
+        serial, number: of the first row, and of the next trajectory.
 
     Returns:
         The serial number of the row before each, (n,) int64, -1 where a trajectory begins; each trajectory's number,

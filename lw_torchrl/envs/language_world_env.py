@@ -30,7 +30,7 @@ from lw_torchrl.envs.row_states import (
     row_mask,
 )
 from lw_torchrl.envs.seeding import EpisodeCounter, check_worker, stated_episode
-from lw_torchrl.envs.workers import OneThread, alone, torchrl_worker
+from lw_torchrl.envs.workers import OneThread, one_thread_at_a_time, torchrl_worker
 from lw_torchrl.language.tasks import Task, named_tasks
 
 
@@ -222,7 +222,7 @@ class LanguageWorldEnv(EnvBase):
                 "make the environment in this process (give ParallelEnv or a collector a function that makes it)"
             )
 
-    @alone
+    @one_thread_at_a_time
     def _reset(
         self, tensordict: TensorDictBase | None = None, *, episode: int | Tensor | None = None, set_state: bool = False
     ) -> TensorDict:
@@ -240,7 +240,7 @@ class LanguageWorldEnv(EnvBase):
     def _shown(self, rows: TensorDict) -> TensorDict:
         return rows if self.batch_size else rows[0]
 
-    @alone
+    @one_thread_at_a_time
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         action = clipped_action(tensordict, self.batch_size).cpu().numpy().reshape(-1, ACTION_SIZE)
         active = row_mask(tensordict, "_step", len(self.row_tasks))
@@ -293,7 +293,7 @@ class LanguageWorldEnv(EnvBase):
         self._rows.fault |= rows
         warnings.warn(f"{message}; the row is truncated and flagged, the others go on", stacklevel=4)
 
-    @alone
+    @one_thread_at_a_time
     def render(
         self, *, camera: str = "corner2", height: int = 240, width: int = 320, rows: Sequence[int] | None = None
     ) -> Tensor:

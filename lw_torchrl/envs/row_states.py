@@ -115,16 +115,8 @@ Mask = NDArray[np.bool_]
 
 
 class RowStates:
-    """The last observation of N rows, and the episode, step and flags of each.
-
-    Attributes:
-        tasks: the name of each row's task.
-        task_id: (N,) int64.
-        observation: (N, 39) float32.
-        episode: (N,) int64; -1 before the first reset.
-        steps: (N,) int64, of the simulation since the reset.
-        over, terminated, fault, success: (N,) bool; a row that was never reset is over.
-    """
+    """The last observation (N, 39) float32 of N rows; the episode, -1 before the first reset, and the steps since the
+    reset, (N,) int64; and the flags over, terminated, fault and success, (N,) bool. A row never reset is over."""
 
     def __init__(self, tasks: Sequence[str]) -> None:
         self.tasks = tasks

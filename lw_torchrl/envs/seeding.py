@@ -29,9 +29,6 @@ def episode_seed(task: str | Task, seed: int, episode: int) -> int:
     Returns:
         An integer in [0, 2**63), for Meta-World's ``env.seed``.
 
-    Raises:
-        ValueError: the task is unknown or the episode negative.
-
     Example:
         >>> episode_seed("reach", 0, 0) == episode_seed("reach", 0, 0)
         True
@@ -78,13 +75,7 @@ def stated_episode(tensordict: TensorDictBase | None, episode: int | Tensor | No
 
 class EpisodeCounter:
     """The m-th reset of the r-th of a task's R rows in the w-th of W workers is episode (m·W + w)·R + r, so that W
-    environments of R rows run the episodes of one with W·R rows.
-
-    Args:
-        tasks: the task of each row, in turn over the different ones.
-        seed: with task and episode it fixes every reset.
-        worker: (w, W).
-    """
+    environments of R rows run the episodes of one with W·R rows; ``worker`` is (w, W)."""
 
     def __init__(self, tasks: Sequence[Task], seed: int, worker: tuple[int, int]) -> None:
         self.tasks = tuple(tasks)

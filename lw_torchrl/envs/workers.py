@@ -103,7 +103,7 @@ class OneThread:
         self._lock.release()
 
 
-def alone(method: Method) -> Method:
+def one_thread_at_a_time(method: Method) -> Method:
     """A method of a usable environment that one thread may be in at a time."""
 
     @wraps(method)

@@ -194,7 +194,7 @@ def test_mending_can_be_interrupted_anywhere(root, made, monkeypatch, stop):
 def test_a_damaged_dataset_of_another_configuration_is_left_alone(root):
     flip(root / "data/observation.memmap", 0)
     before = tree(root)
-    with pytest.raises(DatasetError, match="seed 3, now 4"):
+    with pytest.raises(DatasetError, match=r"seed \(3, now 4\)"):
         collect(root, seed=4)
     assert tree(root) == before
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from lw_torchrl._checks import check_choice, check_int
 from lw_torchrl.envs.cameras import Cameras
 from lw_torchrl.envs.engine import ACTION_SIZE, OBSERVATION_SIZE, BodyPoses, EngineStep, RowModel
-from lw_torchrl.envs.engines.vectorized.observation import CURRENT, REWARD_WIDTH, WIDTH, Observer
+from lw_torchrl.envs.engines.vectorized.observation import CURRENT, REWARD_WIDTH, WIDTH, Array, Index, Mask, Observer
 from lw_torchrl.envs.engines.vectorized.rewards.dense_reward import DenseReward, EpisodeStarts
 from lw_torchrl.envs.engines.vectorized.simulated_rows import (
     WARNING_KINDS,
@@ -35,10 +35,6 @@ from lw_torchrl.envs.engines.vectorized.task_programs import (
     return_models,
 )
 from lw_torchrl.language.tasks import check_task
-
-Rows = NDArray[np.intp]
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 FINGERS = np.array([1.0, -1.0])
 """The two fingers are driven against each other by one number of the action."""
@@ -141,7 +137,7 @@ class VectorizedEngine:
         def reset(row: int) -> None:
             self._observation[row] = self._rows[row].reset(seed_of[row])
             self._mocap[row] = self._rows[row].mocap
-            self._goal[row] = self._rows[row].goal
+            self._goal[row] = self._rows[row].program._target_pos
             if self._starts is not None:
                 self._starts.begin(row, self._rows[row].program)
 
@@ -232,7 +228,7 @@ class VectorizedEngine:
             self._running = _RunningRows(self, running, key)
         return self._running
 
-    def _by_group(self, rows: Rows) -> list[tuple[RowGroup, list[int]]]:
+    def _by_group(self, rows: Index) -> list[tuple[RowGroup, list[int]]]:
         items: dict[int, list[int]] = defaultdict(list)
         for row, number in zip(rows.tolist(), self._group_of_row[rows].tolist(), strict=True):
             items[number].append(row)

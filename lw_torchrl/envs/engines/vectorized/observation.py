@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from lw_torchrl.envs.engines.vectorized.tables import TaskReward, TaskSources, parse_place
 
 Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+Mask = NDArray[np.bool_]
 
 # The columns of the sensors. The first 18 are laid out like the observation, whose number 3, the opening of the
 # gripper, is computed. Columns that a task does not have hold arbitrary numbers.

@@ -16,11 +16,9 @@ from numpy.typing import NDArray
 
 from lw_torchrl.envs.cameras import Cameras
 from lw_torchrl.envs.engine import BodyPoses, RowModel
-from lw_torchrl.envs.engines.vectorized.observation import StateView, sensor_index
+from lw_torchrl.envs.engines.vectorized.observation import Array, StateView, sensor_index
 from lw_torchrl.envs.engines.vectorized.tables import TaskReward, TaskSources
 from lw_torchrl.envs.engines.vectorized.task_programs import WARNED_ALREADY, SharedModel
-
-Array = NDArray[np.float64]
 
 UNSTABLE = slice(int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADQACC) + 1)
 """MuJoCo's three warnings of an unstable simulation: bad positions, velocities or accelerations."""
@@ -33,11 +31,8 @@ VELOCITIES_DONE = int(mujoco.mjtStage.mjSTAGE_VEL)
 class SimulatedRow:
     """A state, the positions that its last reset gave to bodies and sites, and Meta-World's program for its task.
 
-    Args:
-        sources: where the row's task finds its numbers.
-        shared: the model, which no other thread may use while this row simulates or resets.
-        builder: the task's program on that model, from which each episode takes a copy.
-        reward: its dense reward, for the sensors that it needs.
+    No other thread may use the ``shared`` model while this row simulates or resets. Each episode takes a copy of
+    ``builder``, the task's program on that model. The dense reward says which sensors it needs.
     """
 
     def __init__(self, sources: TaskSources, shared: SharedModel, builder: Any, reward: TaskReward | None) -> None:
@@ -50,7 +45,7 @@ class SimulatedRow:
         self._body_pos = shared.compiled_body_pos.copy()
         self._site_pos = shared.compiled_site_pos.copy()
         self._substeps: int = builder.frame_skip
-        self._mocap: Array = self._data.mocap_pos[0]
+        self.mocap: Array = self._data.mocap_pos[0]  # that the hand is drawn to
         self._control: Array = self._data.ctrl
         window = StateView(self._model, self._data)
         self._numbers = window.numbers
@@ -69,22 +64,12 @@ class SimulatedRow:
         self.shared.holder = self
         return observation
 
-    @property
-    def mocap(self) -> Array:
-        """(3,) the position that the hand is drawn to."""
-        return self._mocap
-
-    @property
-    def goal(self) -> Array:
-        """(3,) the goal of the present episode."""
-        return self.program._target_pos
-
     def simulate(self, mocap: Array, control: Array, sensors: Array, warnings: NDArray[np.int32]) -> None:
         """One step of the environment: five of physics, and a look without moving, ``mj_forward``, which also leaves
         the accelerations from which the next step's solver starts. ``sensors`` (as wide as its index) and ``warnings``
         (3,) are filled while the state is still in the processor's cache."""
         self._take_model()
-        self._mocap[...] = mocap
+        self.mocap[...] = mocap
         self._control[...] = control
         if self._looked:
             self._substep_after_look()
@@ -135,7 +120,7 @@ def is_stable(observation: Array, warnings: NDArray[np.int32]) -> NDArray[np.boo
 
 
 class RowGroup:
-    """Rows that share a model, and so take turns; ``seconds`` is the time of each row's last work, an estimate of the
+    """Index that share a model, and so take turns; ``seconds`` is the time of each row's last work, an estimate of the
     next."""
 
     def __init__(self, rows: Sequence[int]) -> None:

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lw_torchrl.envs.engines.vectorized.observation import (
     GRIPPER,
@@ -16,13 +15,12 @@ from lw_torchrl.envs.engines.vectorized.observation import (
     POINT,
     RIGHT_TIP,
     SECOND,
+    Array,
+    Index,
+    Mask,
     row_norm,
 )
 from lw_torchrl.envs.engines.vectorized.tables import TaskSources
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
-Mask = NDArray[np.bool_]
 
 
 class Scene(NamedTuple):

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lw_torchrl._checks import check_choice
-from lw_torchrl.envs.engines.vectorized.observation import CURRENT, GRIPPER, OBJECT
+from lw_torchrl.envs.engines.vectorized.observation import CURRENT, GRIPPER, OBJECT, Array, Index, Mask
 from lw_torchrl.envs.engines.vectorized.rewards.formulas import FORMULAS, LIFTS, StepState
 from lw_torchrl.envs.engines.vectorized.rewards.parameters import (
     CONSTANT,
@@ -27,22 +27,11 @@ from lw_torchrl.envs.engines.vectorized.rewards.parameters import (
 from lw_torchrl.envs.engines.vectorized.rewards.terms import CagingTerm, FunnelTerm, Proximity, ProximityTerms, limited
 from lw_torchrl.envs.engines.vectorized.tables import FIRST_DISTANCE, TaskReward
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
-Mask = NDArray[np.bool_]
-
 FULL_REWARD = 10.0
 
 
 class EpisodeStarts:
-    """What the rewards of an episode need to know of its beginning, one entry a row.
-
-    Args:
-        rewards: each row's task.
-
-    Raises:
-        ValueError: a formula or a lift that does not exist.
-    """
+    """What rewards need of the beginning of an episode, one entry a row."""
 
     def __init__(self, rewards: Sequence[TaskReward]) -> None:
         for reward in rewards:
@@ -70,12 +59,7 @@ class EpisodeStarts:
 
 
 class DenseReward:
-    """Rewards a fixed set of rows.
-
-    Args:
-        starts: of all rows.
-        rows: the set.
-    """
+    """Rewards a fixed set of rows, of which ``starts`` are those of all rows."""
 
     def __init__(self, starts: EpisodeStarts, rows: Index) -> None:
         self._starts, self._rows = starts, rows
@@ -88,15 +72,9 @@ class DenseReward:
         self._formulas = [(FORMULAS[name], np.flatnonzero(task.formula == name)) for name in np.unique(task.formula)]
 
     def __call__(self, sensors: Array, observation: Array, goal: Array, action: NDArray[Any]) -> Array:
-        """(rows,) the rewards, as Meta-World's ``compute_reward``.
-
-        Args:
-            sensors: (rows, REWARD_WIDTH) what was read from the states.
-            observation: (rows, 39).
-            goal: (rows, 3) the goals.
-            action: (rows, 4) what was done, in the action's own precision.
-        """
-        # Rows whose simulation broke, and branches that are not taken, may hold anything.
+        """(rows,) as Meta-World's ``compute_reward``, of sensors (rows, REWARD_WIDTH), observations (rows, 39), goals
+        (rows, 3) and actions (rows, 4) in their own precision."""
+        # Index whose simulation broke, and branches that are not taken, may hold anything.
         with np.errstate(all="ignore"):
             less = self._starts.less[self._rows]
             points = self._starts.points[self._rows]

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lw_torchrl.envs.engines.vectorized.observation import (
     CORNERS,
@@ -18,6 +17,9 @@ from lw_torchrl.envs.engines.vectorized.observation import (
     PLACE,
     QUATERNION,
     SECOND,
+    Array,
+    Index,
+    Mask,
     row_norm,
 )
 from lw_torchrl.envs.engines.vectorized.rewards.parameters import GOAL, PLACED, START, TCP, VIA, Parameters
@@ -30,16 +32,12 @@ from lw_torchrl.envs.engines.vectorized.rewards.terms import (
     tolerance,
 )
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
-Mask = NDArray[np.bool_]
-
 Cast = Callable[[Any], Any]
 """Brings numbers to the precision that a formula is computed in: single, where a number of a float32 action takes part,
 for NumPy gives way to it where a plain Python number meets it."""
 
 Formula = Callable[["StepState", Index, Cast], Numbers]
-"""(moment, rows, cast) -> (len(rows),) their rewards."""
+"""(state, rows, cast) -> (len(rows),) their rewards."""
 
 
 @dataclass

@@ -9,7 +9,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lw_torchrl.envs.engines.vectorized.observation import (
     CURRENT,
@@ -21,10 +20,9 @@ from lw_torchrl.envs.engines.vectorized.observation import (
     REWARD_WIDTH,
     RIGHT_TIP,
     SECOND,
+    Array,
 )
 from lw_torchrl.envs.engines.vectorized.tables import FIRST_DISTANCE, Cage, Funnel, Held, TaskReward, Term
-
-Array = NDArray[np.float64]
 
 # The columns of the features: first the sensors, then these. The first four are constant within an episode.
 START, TCP_START, MARK, CONSTANT, GOAL, TCP, GRIP = (

@@ -7,11 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl.envs.engines.vectorized.observation import LEFT_PAD, RIGHT_PAD, row_norm
+from lw_torchrl.envs.engines.vectorized.observation import LEFT_PAD, RIGHT_PAD, Array, Mask, row_norm
 from lw_torchrl.envs.engines.vectorized.rewards.parameters import ACROSS, FEATURES, GRIP, VIA, Parameters
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Numbers = NDArray[np.floating]
 """Single or double precision: Meta-World computes with the gripper's action in the action's own."""
 
@@ -82,13 +80,8 @@ class ProximityTerms:
         self._gaussian = np.nonzero(task.gaussian)
 
     def __call__(self, features: Array, less: Array) -> Proximity:
-        """Measure.
-
-        Args:
-            features: (rows, FEATURES).
-            less: (rows, 4) what is taken from the distance between a margin's points. NaN asks for the present
-                distance as the margin, and is replaced by it.
-        """
+        """Measure features (rows, FEATURES). ``less`` (rows, 4) is taken from the distance of a margin's points; NaN is
+        replaced by the present distance, and makes it the margin."""
         numbers = features.reshape(-1)
         difference = numbers.take(self._first)
         difference += self._offset
@@ -130,16 +123,11 @@ class CagingTerm:
         self._pinch = (cage.radius + cage.pinch)[self._pinching][:, None]
 
     def __call__(self, features: Array, near: Proximity, closed: Numbers, narrow: Mask) -> tuple[Array, Mask]:
-        """Measure.
+        """Measure features (rows, FEATURES).
 
-        Args:
-            features: (rows, FEATURES).
-            near: the terms.
-            closed: (rows,) how far the gripper is told to close, in the action's precision.
-            narrow: (rows,) where ``closed`` is a number of the action itself, not a bound of its range.
-
-        Returns:
-            (rows,) from 0 to 1, and where it was computed in the action's precision, because ``closed`` takes part.
+        ``closed`` (rows,) is how far the gripper is told to close, in the action's precision, and ``narrow`` (rows,)
+        where it is a number of the action itself, not a bound of its range. Returns values (rows,) from 0 to 1, and
+        where they were computed in the action's precision, because ``closed`` takes part.
         """
         rows = self._rows
         numbers = features.reshape(-1)
