@@ -166,7 +166,8 @@ def _made(
     """The dataset, finished or repaired if need be; the folder must be held, and another call may have come first."""
     found, damaged = None, None
     if (root / METADATA).is_file():
-        found, *damaged = _read_through(root, config, progress)
+        found, whole, reason = _read_through(root, config, progress)
+        damaged = whole, reason
     if found is None:
         for path in (root / DATA, root / PARTIAL):
             if path.is_symlink() or (path.exists() and not path.is_dir()):

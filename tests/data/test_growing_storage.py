@@ -291,7 +291,7 @@ def test_it_is_of_one_process():
 def test_another_writer_is_refused():
     storage = GrowingStorage([own_rows([3])], grow=5)
     replay = TensorDictReplayBuffer(storage=storage, batch_size=2, collate_fn=lambda batch: batch)
-    with pytest.raises(RuntimeError, match="written by a GrowingWriter alone"):
+    with pytest.raises(RuntimeError, match="only a GrowingWriter writes"):
         replay.extend(own_rows([2]))
 
 

@@ -58,7 +58,7 @@ class SuccessFunction:
         self._goal_height = np.array([row.goal_height for row in success if row.goal_height is not None])
         rules = [row.rule for row in success]
         self._rules = [
-            (RULES[name], np.flatnonzero([rule == name for rule in rules]))
+            (getattr(SuccessFunction, "_" + name.replace(" ", "_")), np.flatnonzero([rule == name for rule in rules]))
             for name in sorted({rule for rule in rules if rule is not None})
         ]
 
@@ -116,16 +116,6 @@ class SuccessFunction:
             lifted = current[OBJECT][2] - STICK_LIFT > program.stick_init_pos[2]
             held[k] = current[GRIPPER] > 0.0 and lifted and both_pads_press(program, "objGeom")
         return held
-
-
-RULES: dict[str, Callable[[SuccessFunction, Index, Scene], Mask]] = {
-    "point below goal": SuccessFunction._point_below_goal,
-    "object above goal": SuccessFunction._object_above_goal,
-    "joint above": SuccessFunction._joint_above,
-    "joint near": SuccessFunction._joint_near,
-    "stick inserted": SuccessFunction._stick_inserted,
-    "stick held": SuccessFunction._stick_held,
-}
 
 
 def both_pads_press(program: Any, geom: str) -> bool:

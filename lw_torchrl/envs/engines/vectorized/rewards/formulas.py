@@ -42,37 +42,27 @@ Formula = Callable[["StepState", Index, Cast], Numbers]
 
 @dataclass
 class StepState:
-    """All rows after one step.
-
-    Attributes:
-        task: the rows' numbers.
-        features: (rows, FEATURES).
-        proximity: how close the pairs of points are.
-        near, placed, via: (rows,) the values of these terms.
-        above: (rows,) whether the hand keeps above the floor.
-        lift: (rows,) how well a held object is on its way to the goal.
-        wide: (rows,) where ``lift`` is a NumPy number, not a Python one, so that single precision gives way to it.
-        grasp: (rows,) how well the object is gripped.
-        narrow: (rows,) where a number of the action takes part, so that the reward has the action's precision.
-        closed: (rows,) how far the gripper is told to close, from 0 to 1.
-        effort: (rows,) the gripper's action on a scale from 0, open, to 1, closed.
-        held: (rows,) whether the object counts as held.
-    """
+    """All rows after one step, one entry a row."""
 
     task: Parameters
-    features: Array
+    features: Array  # (rows, FEATURES)
     proximity: Proximity
-    near: Array
+    near: Array  # the values of these terms
     placed: Array
     via: Array
-    above: Array
-    lift: Array
-    wide: Mask
-    grasp: Array
-    narrow: Mask
-    closed: Numbers
-    effort: Numbers
-    held: Mask
+    above: Array  # how well the hand keeps above the floor of the funnel
+    lift: Array  # how well a held object is on its way to the goal
+    wide: Mask  # where ``lift`` is a NumPy number, not a Python one, so that single precision gives way to it
+    grasp: Array  # how well the object is gripped
+    narrow: Mask  # where a number of the action takes part, so that the reward has the action's precision
+    closed: Numbers  # how far the gripper is told to close, from 0 to 1
+    effort: Numbers  # the gripper's action, from 0, open, to 1, closed
+    held: Mask  # whether the object counts as held
+
+
+def _by_name(*functions: Any) -> dict[str, Any]:
+    """Functions by their names in data/rewards.toml."""
+    return {one.__name__.replace("_", " "): one for one in functions}
 
 
 TO_HANDLE = np.array([-0.05, 0.0, 0.0])
@@ -262,26 +252,11 @@ def stick_pull(s: StepState, rows: Index, cast: Cast) -> Any:
 
 
 FORMULAS: dict[str, Formula] = {
-    "reach": reach,
-    "press": press,
-    "press behind wall": press_behind_wall,
     "sum": weighted_sum,
-    "both": both,
-    "slide": slide,
-    "door": door,
-    "lid": lid,
-    "carry": carry,
-    "carry over wall": carry_over_wall,
-    "push": push,
-    "push round wall": push_round_wall,
-    "unplug": unplug,
-    "sweep": sweep,
-    "soccer": soccer,
-    "peg": peg,
-    "unpeg": unpeg,
-    "hammer": hammer,
-    "stick push": stick_push,
-    "stick pull": stick_pull,
+    **_by_name(
+        *(reach, press, press_behind_wall, both, slide, door, lid, carry, carry_over_wall, push, push_round_wall),
+        *(unplug, sweep, soccer, peg, unpeg, hammer, stick_push, stick_pull),
+    ),
 }
 
 
@@ -321,8 +296,4 @@ def onto_shelf(s: StepState, rows: Index) -> None:
     s.wide[rows] = before
 
 
-LIFTS: dict[str, Callable[[StepState, Index], None]] = {
-    "over funnel": over_funnel,
-    "into box": into_box,
-    "onto shelf": onto_shelf,
-}
+LIFTS: dict[str, Callable[[StepState, Index], None]] = _by_name(over_funnel, into_box, onto_shelf)

@@ -53,17 +53,11 @@ def limited(x: Numbers, low: float, high: float) -> Numbers:
 
 
 class Proximity(NamedTuple):
-    """How close two points are, for every term of every row, each (rows, 4).
-
-    Attributes:
-        distance: of the two points.
-        margin: how much further the value falls to 0.1.
-        value: 1 where they are close, less where they are not.
-    """
+    """How close two points are, for every term of every row, each (rows, 4)."""
 
     distance: Array
-    margin: Array
-    value: Array
+    margin: Array  # how much further the value falls to 0.1
+    value: Array  # 1 where the points are close, less where they are not
 
 
 class ProximityTerms:
