@@ -175,7 +175,7 @@ def _size(part: Demonstrations) -> int:
 
 def _about(part: Demonstrations) -> list[str]:
     """What a dataset's metadata say of it, in lines."""
-    from lw_torchrl.data.metadata import FORMAT_VERSION
+    from lw_torchrl.data.dataset import FORMAT_VERSION
 
     how = part.config
     noise = "none"
@@ -260,7 +260,7 @@ def _row(label: str, episodes: list[_Episode]) -> dict[str, Any]:
 
 
 def _check(output: Output, parts: list[Demonstrations]) -> None:
-    from lw_torchrl.data.checksums import whole_episodes
+    from lw_torchrl.data.memory_map import whole_episodes
 
     damaged = []
     for part in parts:

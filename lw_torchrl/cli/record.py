@@ -117,8 +117,7 @@ def _cast(
 ) -> tuple[Any, Plans | None, str]:
     """Who acts, the plans whose conditions are answered, and what the policy is called."""
     import lw_torchrl as lw
-    from lw_torchrl.data.behaviours import behaviour_of
-    from lw_torchrl.data.segment_actor import SegmentActor
+    from lw_torchrl.data.behaviours import SegmentActor, behaviour_of
 
     if who not in options.ACTORS:
         actor = options.load_policy(Path(who), seed, plans, text_encoder)

@@ -181,7 +181,7 @@ def train(
 
 def _all_of(data: Path, tasks: tuple[str, ...]) -> dict[str, list[int]]:
     """Every episode of these tasks in a dataset."""
-    from lw_torchrl.data.metadata import read_metadata
+    from lw_torchrl.data.dataset import read_metadata
 
     found = read_metadata(data)
     for task in tasks:

@@ -167,7 +167,7 @@ def _collected(out: Path, who: str, tasks: tuple[str, ...], noise: tuple[float, 
 
 def _of_tasks(roots: list[Path], tasks: tuple[str, ...]) -> list[dict[str, list[int]]]:
     """For each dataset every episode of these tasks."""
-    from lw_torchrl.data.metadata import read_metadata
+    from lw_torchrl.data.dataset import read_metadata
 
     chosen = []
     for root in roots:

@@ -5,14 +5,12 @@ from lw_torchrl.data.behaviours import BEHAVIOURS, Behaviour
 from lw_torchrl.data.co_learning_sampler import CoLearningSampler
 from lw_torchrl.data.collect import collect_demonstrations
 from lw_torchrl.data.dataset import CollectConfig, DatasetError, Demonstrations
-from lw_torchrl.data.filters import EpisodeFilter
-from lw_torchrl.data.growing import GrowingStorage
-from lw_torchrl.data.growing_writer import GrowingWriter
+from lw_torchrl.data.growing import GrowingStorage, GrowingWriter
 from lw_torchrl.data.pictures import add_pictures, load_pictures
 from lw_torchrl.data.replay import LanguageWorldExperienceReplay
-from lw_torchrl.data.selection import JoinedDemonstrations
+from lw_torchrl.data.samplers import TaskBalancedSampler
+from lw_torchrl.data.selection import EpisodeFilter, JoinedDemonstrations
 from lw_torchrl.data.storage import JoinedStorage
-from lw_torchrl.data.task_balanced_sampler import TaskBalancedSampler
 
 __all__ = [
     "BEHAVIOURS",

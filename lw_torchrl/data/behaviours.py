@@ -9,12 +9,19 @@ from hashlib import sha256
 from types import MappingProxyType
 from typing import Any, Literal
 
+import numpy as np
 import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 
-from lw_torchrl._checks import check_choice, check_fields, check_int, check_probability, shown, unknown_name
+from lw_torchrl._checks import check_fields, check_int, check_probability, shown, unknown_name
+from lw_torchrl._seeding import episode_generator
 from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.plans import Plans
+from lw_torchrl.language.tasks import task_id
 from lw_torchrl.modules.policy import Policy
+from lw_torchrl.modules.scripted_skill_actor import ScriptedSkillActor
 
 _MOST_STEPS = 100_000
 _OF_SEGMENTS = ("right", "otherwise", "shortest", "longest")
@@ -24,8 +31,8 @@ _OF_SEGMENTS = ("right", "otherwise", "shortest", "longest")
 class Behaviour:
     """Who acts in an episode, as a dataset's metadata say it; equal ones act alike.
 
-    "segments" is an actor by pieces of an episode: in each, with the probability ``right``, it carries out the plan by
-    scripted skills, and otherwise does something else throughout. All it draws hangs on (task, seed, episode).
+    A behaviour of kind "segments" acts in pieces of an episode. In each it follows the plan by scripted skills with
+    probability ``right``, and does something else otherwise. What it draws depends only on (task, seed, episode).
 
     Attributes:
         name: the label of its episodes.
@@ -34,9 +41,6 @@ class Behaviour:
         otherwise: of "segments", what it does elsewhere: "skill", any one of the plan's, or "action", one in [-1, 1].
         shortest, longest: of "segments", steps of a piece.
         fingerprint: of the plans of "segments"; of the description and weights of "policy"; None until it is known.
-
-    Raises:
-        ValueError, TypeError: a wrong value, by its name.
 
     Example:
         >>> Behaviour("half-right", right=0.5).otherwise
@@ -53,11 +57,8 @@ class Behaviour:
 
     def __post_init__(self) -> None:
         check_fields(self, "behaviour: ")
-        label = self.name if isinstance(self.name, str) else ""
-        if not 0 < len(label) <= 100 or not label.isprintable() or label != label.strip():
+        if not 0 < len(self.name) <= 100 or not self.name.isprintable() or self.name != self.name.strip():
             raise ValueError(f"behaviour: name must be a label of 1 to 100 characters, got {shown(self.name)}")
-        check_choice("behaviour: kind", self.kind, ("expert", "segments", "policy"))
-        check_choice("behaviour: otherwise", self.otherwise, ("skill", "action"))
         object.__setattr__(self, "right", check_probability("behaviour: right", self.right))
         for field in ("shortest", "longest"):
             object.__setattr__(self, field, check_int(f"behaviour: {field}", getattr(self, field), minimum=1))
@@ -66,14 +67,14 @@ class Behaviour:
                 f"behaviour: longest must be from shortest, {shown(self.shortest)}, to {_MOST_STEPS}, got "
                 f"{shown(self.longest)}"
             )
-        if self.fingerprint is not None and not isinstance(self.fingerprint, str):
-            raise TypeError(f"behaviour: fingerprint must be a text or None, got {shown(self.fingerprint)}")
-        if self.kind != "segments" and (odd := [name for name in _OF_SEGMENTS if getattr(self, name) != _usual(name)]):
+        default = {field.name: field.default for field in fields(self)}
+        odd = [name for name in _OF_SEGMENTS if getattr(self, name) != default[name]]
+        if self.kind != "segments" and odd:
             raise ValueError(f"behaviour: {', '.join(odd)} is of kind 'segments', got kind {self.kind!r}")
 
     @property
     def acts(self) -> Behaviour:
-        """Of two that have the same one, neither does what the other would not, given the same plans."""
+        """What it does given the same plans: two behaviours act alike if these are equal."""
         return replace(self, fingerprint=None) if self.kind == "segments" else self
 
     def to_json(self) -> dict[str, Any]:
@@ -88,26 +89,17 @@ class Behaviour:
         return cls(**stated)
 
 
-def _usual(name: str) -> Any:
-    return Behaviour.__dataclass_fields__[name].default
-
-
 EXPERT = Behaviour("expert", "expert")
 NOISY = "noisy"
 """The label of the expert's episodes where they are executed with noise."""
-BEHAVIOURS: Mapping[str, Behaviour] = MappingProxyType(
-    {
-        behaviour.name: behaviour
-        for behaviour in (
-            EXPERT,
-            Behaviour("scripted"),
-            Behaviour("spoilt-60", right=0.6),
-            Behaviour("spoilt-30", right=0.3),
-            Behaviour("wrong", right=0.0),
-            Behaviour("random", right=0.0, otherwise="action"),
-        )
-    }
+_SEGMENTS = (
+    Behaviour("scripted"),
+    Behaviour("spoilt-60", right=0.6),
+    Behaviour("spoilt-30", right=0.3),
+    Behaviour("wrong", right=0.0),
+    Behaviour("random", right=0.0, otherwise="action"),
 )
+BEHAVIOURS: Mapping[str, Behaviour] = MappingProxyType({one.name: one for one in (EXPERT, *_SEGMENTS)})
 """By name: Meta-World's expert; plans with scripted skills; the same in 60 or 30 of 100 pieces, and any skill of the
 plan in the others; any skill of the plan throughout; one action in [-1, 1] after another."""
 
@@ -127,19 +119,14 @@ def segment_plans(tasks: Iterable[str]) -> Plans:
 
 
 def behaviour_of(policy: Any, tasks: Iterable[str], name: str | None = None) -> Behaviour:
-    """The behaviour in these tasks that an argument ``policy`` stands for, under another name if one is given.
-
-    Raises:
-        ValueError: an unknown name (with the nearest); a trained policy without a name.
-        TypeError: it is none.
-    """
+    """The behaviour in these tasks that an argument ``policy`` stands for, under another name if one is given."""
     if isinstance(policy, Policy):
         if name is None:
             raise ValueError("behaviour must name the policy in the dataset, behaviour='my-policy' say, got None")
         if policy.draws:
             raise ValueError(
-                f"policy: this {type(policy).__name__} draws in the order in which it is called, so that its episodes "
-                "would hang on num_envs and on interruptions"
+                f"policy: this {type(policy).__name__} draws in the order in which it is called, so its episodes would "
+                "depend on num_envs and on interruptions"
             )
         return Behaviour(name, "policy", fingerprint=policy_fingerprint(policy))
     if isinstance(policy, str):
@@ -158,7 +145,7 @@ def behaviour_of(policy: Any, tasks: Iterable[str], name: str | None = None) -> 
 
 
 def policy_fingerprint(policy: Policy) -> str:
-    """A digest of a policy's description, weights and, by which another text encoder is known, its texts' vectors."""
+    """A digest of a policy's description, weights and text vectors, which show another text encoder."""
     digest = sha256(json.dumps(policy.describe(), sort_keys=True).encode())
     # Their signs, since the scale that they are brought to may round otherwise elsewhere.
     named = policy.named_buffers(remove_duplicate=False)
@@ -167,3 +154,68 @@ def policy_fingerprint(policy: Policy) -> str:
         digest.update(f"{key} {value.dtype} {tuple(value.shape)}".encode())
         digest.update(value.detach().cpu().reshape(-1).view(torch.uint8).numpy().tobytes())
     return digest.hexdigest()[:16]
+
+
+class SegmentActor(TensorDictModuleBase):
+    """Acts as a :class:`Behaviour` of kind "segments", in episodes that are run from their beginning.
+
+    Reads ``observation`` (N, 39) float32, ``task_id`` and ``episode`` (N,) int64, ``qaf`` (N, S) bool and ``_step``
+    (N,) bool, the rows that count; writes ``action`` (N, 4) float32 in [-1, 1]. An episode begins in a row whose task
+    or episode differs from the last call's.
+
+    Args:
+        behaviour: how it acts.
+        plans: a plan for each task, all of scripted skills.
+        seed: of the episodes.
+        max_steps: of an episode.
+    """
+
+    row_by_row = True  # no network: its rows need no blocks of one size
+
+    def __init__(self, behaviour: Behaviour, plans: Plans, seed: int, max_steps: int) -> None:
+        super().__init__()
+        self.behaviour, self.seed, self.max_steps = behaviour, seed, max_steps
+        self.script = ScriptedSkillActor(plans)
+        self.in_keys = [*self.script.in_keys, "episode", "_step"]
+        self.out_keys = ["action"]
+        self._task = {task_id(task): plan.definition for task, plan in plans.items()}
+        self._begun = torch.empty(0, 2, dtype=torch.int64)
+
+    def _begin(self, rows: int) -> None:
+        steps = rows, self.max_steps
+        self._begun, self._done = torch.full((rows, 2), -1), torch.zeros(rows, dtype=torch.int64)
+        self._right, self._skill = torch.zeros(steps, dtype=torch.bool), torch.zeros(steps, dtype=torch.int64)
+        self._held = torch.zeros(*steps, 4)
+
+    def _draw(self, row: int, task: int, episode: int) -> None:
+        """Draw the pieces of the row's new episode."""
+        how, definition = self.behaviour, self._task[task]
+        draws = episode_generator("segments", definition, self.seed, episode)
+        length = draws.integers(how.shortest, how.longest + 1, -(-self.max_steps // how.shortest))
+        pieces = np.repeat(np.arange(len(length)), length)[: self.max_steps]
+        right = draws.random(len(length)) < how.right
+        skill = draws.integers(len(self.script.plans[definition.name].steps), size=len(length))
+        held = draws.uniform(-1.0, 1.0, (len(length), 4)).astype(np.float32)
+        self._right[row] = torch.from_numpy(right[pieces])
+        self._skill[row] = torch.from_numpy(skill[pieces])
+        self._held[row] = torch.from_numpy(held[pieces])
+        self._done[row] = 0
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``action``."""
+        weights, actions = self.script.prepare(tensordict)
+        rows = torch.arange(len(weights))
+        if len(self._begun) != len(rows):
+            self._begin(len(rows))
+        now = torch.stack((tensordict.get("task_id"), tensordict.get("episode")), -1)
+        active: Tensor = tensordict.get("_step")
+        for row in (active & (now != self._begun).any(-1)).nonzero().flatten().tolist():
+            self._draw(row, *now[row].tolist())
+        self._begun = torch.where(active.unsqueeze(-1), now, self._begun)
+        step = self._done.clamp(max=self.max_steps - 1)
+        other = self._held[rows, step]
+        if self.behaviour.otherwise == "skill":
+            other = actions[rows, self._skill[rows, step]]
+        follows = self._right[rows, step].unsqueeze(-1)
+        self._done += active
+        return tensordict.set("action", torch.where(follows, (weights.unsqueeze(-1) * actions).sum(-2), other))

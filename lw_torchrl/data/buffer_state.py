@@ -18,9 +18,8 @@ from torchrl.data.replay_buffers.storages import Storage
 from lw_torchrl._files import reading
 from lw_torchrl._state_tree import join, split
 from lw_torchrl._tensor_archive import TensorArchive, write_archive
-from lw_torchrl.data.checksums import verify
-from lw_torchrl.data.dataset import Demonstrations
-from lw_torchrl.data.metadata import read_metadata
+from lw_torchrl.data.dataset import Demonstrations, read_metadata
+from lw_torchrl.data.memory_map import verify
 from lw_torchrl.data.selection import JoinedDemonstrations
 
 _FILE = "buffer.zip"
@@ -28,7 +27,7 @@ _VERSION = 2
 
 
 def fingerprint(parts: Sequence[Demonstrations], *cuts: Any) -> str:
-    """What tells the rows of these episodes, cut short as ``cuts`` say, from any others."""
+    """A digest of the rows of these episodes, cut short as ``cuts`` say."""
     listed = [[[e.task, e.episode, e.start, e.length, e.checksum] for e in part.episodes] for part in parts]
     return sha256(json.dumps([listed, *cuts]).encode()).hexdigest()
 
@@ -50,8 +49,7 @@ class RestorableReplay(BaseDatasetExperienceReplay):
         return (shown,) if isinstance(shown, Demonstrations) else shown.parts
 
     def verify(self) -> None:
-        """Read the episodes that are shown through against their checksums, unless this process has, since the files
-        were last changed.
+        """Check the episodes that are shown against their checksums, unless this process has since the files changed.
 
         Raises:
             DatasetError: (a ValueError) they are not as they were written.
@@ -67,7 +65,7 @@ class RestorableReplay(BaseDatasetExperienceReplay):
         )
 
     def preprocess(self, *args: Any, **kwargs: Any) -> TensorStorage:
-        """As TorchRL's, which wants the rows in one tensordict."""
+        """As TorchRL's, which needs the rows in one tensordict."""
         shown = self.storage
         self._storage: Storage = TensorStorage(shown[:])
         try:
@@ -76,15 +74,14 @@ class RestorableReplay(BaseDatasetExperienceReplay):
             self._storage = shown
 
     def state_dict(self) -> dict[str, Any]:
-        """The state of sampler, generator and transforms, the rows that came, and which rows of datasets are shown."""
+        """The state of sampler, generator and transforms, the rows written, and which rows of datasets are shown."""
         return super().state_dict() | {"rows": self._fingerprint}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` gave, once the rows that are shown are verified.
+        """Restore a state, after :meth:`verify`.
 
         Raises:
-            ValueError: it is the state of a buffer that shows other rows, or none; nothing has changed then.
-                DatasetError as from :meth:`verify`.
+            ValueError: it is no state, or of a buffer that shows other rows; then nothing has changed.
         """
         self.verify()
         self._restore(state_dict)
@@ -107,18 +104,17 @@ class RestorableReplay(BaseDatasetExperienceReplay):
             raise ValueError(f"state_dict does not fit this buffer ({type(error).__name__}: {error})") from error
 
     def dumps(self, path: str | os.PathLike[str]) -> None:
-        """Save the state to a folder, as one file, which is there whole or not at all."""
+        """Save the state to a folder, as one file that is there whole or not at all."""
         tensors: dict[str, Tensor] = {}
         tree = split(self.state_dict(), tensors)
         write_archive(Path(path) / _FILE, {"format_version": _VERSION, "state": tree}, {"tensors": tensors})
 
     def loads(self, path: str | os.PathLike[str]) -> None:
-        """Restore what :meth:`dumps` saved, once the rows that are shown are verified.
+        """Restore what :meth:`dumps` saved, after :meth:`verify`.
 
         Raises:
             FileNotFoundError: there is no such file.
-            ValueError: it is damaged, or the state of a buffer that shows other rows; nothing has changed then.
-                DatasetError as from :meth:`verify`.
+            ValueError: it is damaged, or of a buffer that shows other rows; then nothing has changed.
         """
         self.verify()
         with reading(path, "buffer's state"):

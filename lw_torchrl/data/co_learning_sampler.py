@@ -1,4 +1,4 @@
-"""CoLearningSampler: one target task's demonstration beside the base tasks, in an exact ratio."""
+"""CoLearningSampler: a target task's rows and those of the base tasks in an exact ratio."""
 
 from __future__ import annotations
 
@@ -14,10 +14,9 @@ from torchrl.data.replay_buffers.storages import Storage
 
 from lw_torchrl._checks import unknown_name
 from lw_torchrl._keys import check_key
-from lw_torchrl.data.device_storage import beside
-from lw_torchrl.data.group_sampler import GroupSampler, column, nearest_sizes
 from lw_torchrl.data.growing import GrowingStorage
-from lw_torchrl.data.storage import JoinedStorage
+from lw_torchrl.data.samplers import GroupSampler, column, nearest_sizes
+from lw_torchrl.data.storage import JoinedStorage, to_device_of
 from lw_torchrl.language.tasks import MT50, TASKS, task_id
 
 GROWN = "grown"
@@ -55,35 +54,32 @@ def _check_fraction(fraction: Any) -> Fraction:
 
 
 class CoLearningSampler(GroupSampler):
-    """Half of every minibatch from the target's demonstration, half in equal numbers from the base tasks; exactly.
+    """Half of every minibatch from the target's demonstrations, half in equal numbers from the base tasks; exactly.
 
-    Target and base tasks are gone through without replacement, each in passes of its own: every row of the target
-    comes once before any comes again, and so does every row of each base task. An epoch, at whose end ``ran_out`` is
-    true, is the pass that takes the most batches: of the largest base task, as a rule. It draws from the replay
-    buffer's generator; its state, restored in the middle of an epoch, goes on with the same batches.
+    Target and base tasks are drawn without replacement, each in passes of its own: every row of a group comes once
+    before any comes again. An epoch, at whose end ``ran_out`` is true, is the pass that takes the most batches, as a
+    rule that of the largest base task. It draws from the replay buffer's generator; its state, restored in the middle
+    of an epoch, continues with the same batches.
 
-    With the target "grown" it is what the buffer was extended with, a collector's rows, say, that is mixed with
-    demonstrations: these as above, of all tasks; of the rows that are there now each is as likely, and independent of
-    the others, so that one may come twice.
+    The target "grown" stands for the rows that the buffer was extended with, a collector's, say: each is drawn with the
+    same probability, with replacement. The demonstrations of all tasks are the base, as above.
 
     Where a target by name is itself a base task, its base demonstrations are left out. A batch holds the target's rows,
     then those of the base tasks in the order of their ids; each row has, beside the storage's own columns:
-        is_target: (B,) bool, whether it is the target's; which rows are a dataset's, the storage says.
+        is_target: (B,) bool, whether it is the target's.
 
     Args:
-        target: "grown"; a task's name; or the episodes that are the target's: one bool for each episode, in the order
-            of ``replay.demonstrations.episodes``. A name stands for all demonstrations of the task; in a storage
-            that joins datasets, for those of the last dataset that has any.
+        target: "grown"; a task's name; or one bool for each episode, in the order of
+            ``replay.demonstrations.episodes``. A name stands for all demonstrations of the task; in a storage that
+            joins datasets, for those of the last dataset that has any.
         target_fraction: the target's share of a minibatch, between 0 and 1, such as 0.5, 1/3 or Fraction(2, 7).
-        task_key: the entry of the storage that tells the task.
-        episode_key: the entry of the storage that tells the episode, for a mask; episodes are numbered in its order.
+        task_key: the entry of the storage that holds the task.
+        episode_key: the entry that holds the episode, for a mask; episodes are numbered in its order.
 
     Raises:
-        ValueError: an unknown task, with the nearest; a fraction that is none; a mask without an episode, or without
-            any other. At sampling: a batch size that cannot be exact, with the nearest that can; no row of the target
-            or of a base task; a mask of another number of episodes; a target other than "grown" where the storage
-            grows, or "grown" where it does not.
-        TypeError: a target that is neither name nor mask.
+        ValueError: an unknown task, with the nearest; a mask that is all true or all false. At sampling: a batch size
+            that cannot be exact, with the nearest that can; no row of the target or of a base task; a mask of another
+            number of episodes; "grown" without a storage that grows, or another target with one.
 
     Example:
         >>> import torch
@@ -165,7 +161,7 @@ class CoLearningSampler(GroupSampler):
         return column(storage, self.task_key, rows) if by_task else None
 
     def row_weights(self, storage: Storage) -> Tensor:
-        """How often each row comes in a minibatch, as a share of all: (R,) float32, 0 for a row that is left out."""
+        """Each row's mean share of a minibatch: (R,) float32, 0 for a row that is left out."""
         label = self._label(storage)
         mine = float(self.target_fraction)
         if isinstance(storage, GrowingStorage):
@@ -191,18 +187,18 @@ class CoLearningSampler(GroupSampler):
         return torch.tensor([mine] * (not self._grown) + [(batch_size - mine) // base] * base)
 
     def add(self, index: Any) -> None:
-        """Note that rows were written, over old ones perhaps; those of a growing buffer are in no group."""
+        """Note that rows were written or overwritten; those of a growing buffer are in no group."""
         if not self._grown:
             super().add(index)
 
     extend = add
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor | tuple[Tensor, ...], dict[str, Any]]:
-        """Draw ``batch_size`` indices, the target's first, and tell which are the target's."""
+        """Draw ``batch_size`` indices, the target's first, and ``is_target``."""
         self._check_storage(storage)
         if not isinstance(storage, GrowingStorage):
             index, info = super().sample(storage, batch_size)
-            info["is_target"] = beside(storage, self._layout(batch_size)[1] == 0)
+            info["is_target"] = to_device_of(storage, self._layout(batch_size)[1] == 0)
             return index, info
         if not storage.num_grown:
             raise ValueError("target 'grown': nothing has come yet; extend the buffer before the first sample")
@@ -222,15 +218,11 @@ class CoLearningSampler(GroupSampler):
         return {"target": target, "target_fraction": fraction}
 
     def state_dict(self) -> dict[str, Any]:
-        """The shuffled order, how far each pass has come, and of which target and ratio that is."""
+        """The shuffled order, how far each pass has come, the target and the ratio."""
         return super().state_dict() | self._identity()
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` gave.
-
-        Raises:
-            ValueError: it is no such state, or that of another target or ratio.
-        """
+        """Restore a state; :class:`ValueError` if it is none, or of another target or ratio."""
         for name, ours in self._identity().items():
             given = state_dict.get(name)
             if not isinstance(given, Tensor) or given.dtype != ours.dtype or not torch.equal(given.cpu(), ours.cpu()):

@@ -9,16 +9,14 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import nullcontext, suppress
 from numbers import Real
 from pathlib import Path
-from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 
-from lw_torchrl._checks import checked
+from lw_torchrl._checks import checked, differences
 from lw_torchrl._files import flush, held, write_json
 from lw_torchrl._versions import SIMULATORS, package_versions, version_changes
 from lw_torchrl.data.behaviours import Behaviour, behaviour_of
-from lw_torchrl.data.checksums import whole_episodes
 from lw_torchrl.data.dataset import (
     DATA,
     LOCK,
@@ -29,38 +27,31 @@ from lw_torchrl.data.dataset import (
     DatasetError,
     Demonstrations,
     EpisodeInfo,
+    read_config,
+    read_metadata,
+    read_versions,
+    write_metadata,
 )
-from lw_torchrl.data.episode_files import EpisodeFiles, write_failed
-from lw_torchrl.data.metadata import read_config, read_metadata, read_versions, write_metadata
-from lw_torchrl.data.missing_episodes import run_missing_episodes
-from lw_torchrl.data.rows import (
+from lw_torchrl.data.memory_map import (
     ROW_BYTES,
     describe_episode,
     holds_columns,
     load_rows,
     read_rows,
+    whole_episodes,
     write_rows,
 )
+from lw_torchrl.data.missing_episodes import EpisodeFiles, run_missing_episodes, write_failed
 from lw_torchrl.language.tasks import resolve_tasks, task_id
 from lw_torchrl.modules.networks import evaluating
 from lw_torchrl.modules.policy import Policy
 
 
-def _known_to_experts(tasks: str | Iterable[str]) -> tuple[str, ...]:
-    try:
-        return resolve_tasks(tasks)
-    except TypeError as error:
-        raise TypeError(
-            f"{error}. Meta-World's experts demonstrate its own 50 tasks; docs/training.md shows demonstrations by a "
-            "policy of one's own"
-        ) from error
-
-
 def _open_episode_files(
     root: Path, config: CollectConfig, made_with: dict[str, str] | None = None
 ) -> tuple[EpisodeFiles, dict[str, str]]:
-    """The episodes so far, and the versions of the packages that the dataset is begun with; of a damaged one, which is
-    taken apart, they are ``made_with``."""
+    """The episodes so far, and the versions of the packages that the dataset was begun with; a damaged dataset that is
+    taken apart gives its own, ``made_with``."""
     folder = root / PARTIAL
     stated, of_packages = folder / "config.json", folder / "versions.json"
     begun = stated.is_file()
@@ -71,7 +62,7 @@ def _open_episode_files(
     if recorded and (made_with or any(folder.glob("*.npz"))):
         _check_versions(root, recorded)
         versions = recorded
-    if recorded or not begun:  # what an older one was begun with, nobody knows
+    if recorded or not begun:  # an older one does not say what it was begun with
         write_json(of_packages, versions)
     if not begun:
         write_json(stated, config.to_json())
@@ -81,7 +72,7 @@ def _open_episode_files(
 
 
 def _check_versions(root: Path, recorded: dict[str, str]) -> None:
-    """Refuse to mix the episodes of two simulators, and warn where others may differ in their last bits."""
+    """Refuse to mix two simulators' episodes; warn where other packages may change the last bits."""
     if changes := version_changes(recorded, SIMULATORS):
         wanted = " ".join(f"{name}=={recorded[name]}" for name in SIMULATORS if name in recorded)
         raise DatasetError(
@@ -90,21 +81,16 @@ def _check_versions(root: Path, recorded: dict[str, str]) -> None:
         )
     if changes := version_changes(recorded, ("lw_torchrl", "numpy", "torch")):
         warnings.warn(
-            f"root: the dataset in {str(root)!r} was begun under other versions ({'; '.join(changes)}): it is gone on "
-            "with, but the episodes to come may differ in their last bits from those that these would have given",
+            f"root: the dataset in {str(root)!r} was begun under other versions ({'; '.join(changes)}): it is "
+            "continued, but new episodes may differ in their last bits from those that these would have given",
             stacklevel=5,
         )
 
 
-def _flat(config: CollectConfig) -> dict[str, Any]:
-    policy = {f"policy.{key}": value for key, value in config.policy.to_json().items()}
-    return {key: value for key, value in config.to_json().items() if key != "policy"} | policy
-
-
 def _check_same(before: CollectConfig, config: CollectConfig, what: str) -> None:
     if before != config:
-        was, now = _flat(before), _flat(config)
-        differ = ", ".join(f"{key} {was[key]!r}, now {now[key]!r}" for key in now if was[key] != now[key])
+        was, now = (one.to_json() | {"policy": one.policy.to_json()} for one in (before, config))
+        differ = ", ".join(differences(was, now))
         raise DatasetError(
             f"{what} of another configuration ({differ}); choose another folder, or delete it to start again"
         )
@@ -113,7 +99,7 @@ def _check_same(before: CollectConfig, config: CollectConfig, what: str) -> None
 def _read_through(
     root: Path, config: CollectConfig, progress: bool
 ) -> tuple[Demonstrations | None, list[EpisodeInfo], str]:
-    """The dataset in a folder if all of it is as it was written; else its whole episodes, and what is the matter."""
+    """The dataset in a folder if all of it is as it was written; else its whole episodes, and what is wrong."""
     try:
         found = read_metadata(root)
     except DamagedDatasetError as error:
@@ -132,23 +118,10 @@ def _read_through(
     return found if len(whole) == len(found.episodes) else None, whole, "rows differ from their checksums"
 
 
-def _check_folders(root: Path) -> None:
-    """Raise unless the folders that are written anew are folders of their own, or not there."""
-    for path in (root / DATA, root / PARTIAL):
-        if path.is_symlink() or (path.exists() and not path.is_dir()):
-            raise DatasetError(
-                f"root: {str(path)!r} must be a folder for the dataset to be collected or mended, it is a "
-                f"{'link' if path.is_symlink() else 'file'}; put the folder itself there, or choose another root"
-            )
-
-
 def _take_apart(root: Path, config: CollectConfig, whole: list[EpisodeInfo], reason: str) -> None:
     """Make a damaged dataset a half-made one: what is whole goes back among the episode files."""
     kept = f"{len(whole)} of {config.episodes_per_task * len(config.tasks)} episodes"
-    warnings.warn(
-        f"root: {str(root)!r} is damaged; {kept} are kept, the others are run again ({reason})",
-        stacklevel=4,
-    )
+    warnings.warn(f"root: {str(root)!r} is damaged; {kept} are kept, the others are run again ({reason})", stacklevel=4)
     files, _ = _open_episode_files(root, config, read_metadata(root).versions if whole else None)
     for info in whole:
         if not files.has(info.task, info.episode):
@@ -190,15 +163,20 @@ def _assemble(
 def _made(
     root: Path, config: CollectConfig, policy: Policy | None, num_envs: int | None, progress: bool
 ) -> Demonstrations:
-    """The dataset, finished or mended where it is not. The folder must be held: another call may have come first."""
-    found = None
+    """The dataset, finished or repaired if need be; the folder must be held, and another call may have come first."""
+    found, damaged = None, None
     if (root / METADATA).is_file():
         found, whole, reason = _read_through(root, config, progress)
-        if found is None:
-            _check_folders(root)
-            _take_apart(root, config, whole, reason)
+        damaged = whole, reason
     if found is None:
-        _check_folders(root)
+        for path in (root / DATA, root / PARTIAL):
+            if path.is_symlink() or (path.exists() and not path.is_dir()):
+                raise DatasetError(
+                    f"root: {str(path)!r} must be a folder for the dataset to be collected or mended, it is a "
+                    f"{'link' if path.is_symlink() else 'file'}; put the folder itself there, or choose another root"
+                )
+        if damaged is not None:
+            _take_apart(root, config, *damaged)
         files, versions = _open_episode_files(root, config)
         _assemble(root, config, versions, files, run_missing_episodes(config, policy, files, num_envs, progress))
         found = read_metadata(root)
@@ -225,35 +203,32 @@ def collect_demonstrations(
 ) -> Demonstrations:
     """Run Meta-World's scripted experts, or others, and write their episodes to a dataset.
 
-    Killed, or out of disk, and called again it carries on. Called on a finished dataset of the same configuration it
-    reads that through: if all is as it was written it returns, else it keeps the whole episodes and runs the others
-    again. The dataset depends on neither ``num_envs`` nor interruptions nor damage.
+    A call that was killed, or ran out of disk, carries on when it is repeated. On a finished dataset of the same
+    configuration it checks all rows, and runs damaged episodes again. The dataset depends neither on ``num_envs`` nor
+    on interruptions or damage.
 
     Each row is a step, in TorchRL's TED layout (R rows):
         observation: (R, 39) float32, metres; next/observation likewise.
         task_id, episode: (R,) int64; next/task_id likewise. collector/traj_ids: (R,) int64, unique per episode.
         action: (R, 4) float32 in [-1, 1], as executed, noise included.
-        expert_action: (R, 4) float32 in [-1, 1], what the expert, or who acted, wanted in the same state;
+        expert_action: (R, 4) float32 in [-1, 1], what the expert, or whoever acted, wanted in the same state;
             unclipped_action: (R, 4) float32, what its script asked for.
         next/reward_sparse, next/reward_dense: (R, 1) float32, the success as 0 and 1, and Meta-World's reward.
         next/success, next/done, next/terminated, next/truncated: (R, 1) bool.
 
     Args:
-        tasks: of the 50, as for :func:`resolve_tasks`. Meta-World's experts know no others: docs/training.md shows
-            demonstrations by a policy of one's own, in a task or an engine of one's own.
+        tasks: of the 50, as for :func:`resolve_tasks`; docs/training.md shows demonstrations in tasks of your own.
         episodes_per_task: how many episodes of each task to keep.
         root: the dataset's folder, new or left by an earlier call.
-        policy: who acts: "expert", Meta-World's script; "scripted", the shipped plans with scripted skills; "spoilt-60"
-            or "spoilt-30", the same in so many of 100 pieces of 8 to 24 steps, and any skill of the plan in the others;
-            "wrong", any skill of the plan throughout; "random", one action after another; a :class:`Behaviour` of
-            yours; or a trained :class:`Policy`, in eval mode and without exploration, as :func:`evaluate` runs it.
-            One acts in all of a dataset; mixtures are lists of datasets.
-        behaviour: the label of its episodes, for :class:`EpisodeFilter`; None for its name. A Policy wants one.
+        policy: who acts in the whole dataset; mixtures are lists of datasets. "expert", Meta-World's script;
+            "scripted", the shipped plans with scripted skills; "spoilt-60" or "spoilt-30", the same in so many of 100
+            pieces of 8 to 24 steps, and any skill of the plan in the others; "wrong", any skill of the plan; "random",
+            random actions; a :class:`Behaviour`; or a trained :class:`Policy`, run as :func:`evaluate` runs it.
+        behaviour: the label of its episodes, for :class:`EpisodeFilter`; None for its name. A Policy needs one.
         seed: evaluate on another one.
-        noise_scale: standard deviation of the noise on the executed action; a sequence is gone through in turn, one
-            an episode.
-        noise_hold: the steps for which each draw of the noise is kept; the longer, the further it leads the expert
-            astray, and the more a policy learns of the way back.
+        noise_scale: standard deviation of the noise on the executed action; a sequence gives one to each episode, in
+            turn.
+        noise_hold: steps for which each draw of the noise is kept; the longer, the further it leads the expert astray.
         gripper_noise_factor: multiplies the noise on the gripper.
         redraw_failures: keep only successful episodes.
         max_steps: steps of an episode.
@@ -264,14 +239,14 @@ def collect_demonstrations(
         The finished dataset's description.
 
     Warns:
-        UserWarning: a finished dataset was damaged; or one that is gone on with was begun under another version of
-            numpy, torch or this package.
+        UserWarning: a finished dataset was damaged; or one that is continued was begun under another version of numpy,
+            torch or this package.
 
     Raises:
-        ValueError: a wrong argument; DatasetError where ``root`` holds something else, or episodes of another version
-            of MuJoCo or Meta-World to go on with, or another call is at work in it.
+        DatasetError: (a ValueError) ``root`` holds something else, or episodes of another version of MuJoCo or
+            Meta-World, or another call is at work in it.
         TypeError: ``tasks`` holds a :class:`~lw_torchrl.Task`.
-        OSError: it cannot be written, since there is no room, say; nothing is lost.
+        OSError: it cannot be written, for lack of room, say; nothing is lost.
         RuntimeError: redrawing found too few successes.
 
     Example:
@@ -281,7 +256,13 @@ def collect_demonstrations(
         >>> demos.num_steps, demos.success_rate
         (80, {'reach': 1.0})
     """
-    names = _known_to_experts(tasks)
+    try:
+        names = resolve_tasks(tasks)
+    except TypeError as error:
+        raise TypeError(
+            f"{error}. Meta-World's experts demonstrate its own 50 tasks; docs/training.md shows demonstrations by a "
+            "policy of one's own"
+        ) from error
     actor = policy if isinstance(policy, Policy) else None
     if actor is not None and (unknown := [task for task in names if task not in actor.tasks]):
         raise ValueError(f"tasks must be among the policy's, it was not made for {', '.join(unknown)}")
@@ -301,12 +282,12 @@ def collect_demonstrations(
         raise ValueError(f"root must be a folder, {str(folder)!r} is a file")
     found = None
     if (folder / METADATA).is_file():
-        with suppress(OSError):  # another call may be mending it
+        with suppress(OSError):  # another call may be repairing it
             found = _read_through(folder, config, progress)[0]
     elif folder.is_dir() and {path.name for path in folder.iterdir()} - {LOCK} and not (folder / PARTIAL).is_dir():
         raise DatasetError(f"root: {str(folder)!r} is not empty and holds no dataset; choose another folder")
     if found is None or (folder / PARTIAL).is_dir():
-        alone = held(folder, "root", "collect_demonstrations", folder=True, error=DatasetError)
-        with alone, nullcontext() if actor is None else evaluating(actor):
+        lock = held(folder, "root", "collect_demonstrations", folder=True, error=DatasetError)
+        with lock, nullcontext() if actor is None else evaluating(actor):
             found = _made(folder, config, actor, num_envs, progress)
     return found

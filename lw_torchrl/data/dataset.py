@@ -1,21 +1,25 @@
-"""A demonstration dataset, described: how it was made, and the episodes that it holds.
+"""A demonstration dataset's description: how it was made, which episodes it holds, and its metadata.json.
 
-root/data/            TorchRL's TED layout as a memory-mapped TensorDict, one row a step; see :mod:`.rows`
-root/metadata.json    written last: without it the dataset is not finished; see :mod:`.metadata`
-root/.partial/        the episodes so far, while collecting; see :mod:`.episode_files`. Beside them config.json and
-                      versions.json say how they are made, from the start
+root/data/            the rows, one a step, in TorchRL's TED layout; see :mod:`.memory_map`
+root/metadata.json    written last: without it the dataset is not finished. Nothing in it is taken on trust
+root/.partial/        while collecting: config.json, versions.json and the episodes; see :mod:`.missing_episodes`
 root/.lock            held while collecting
 """
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from reprlib import repr as short
 from typing import Any
 
-from lw_torchrl._checks import check_int, check_scale
+from lw_torchrl._checks import check_fields, check_int, check_scale
+from lw_torchrl._files import read_json, write_json
 from lw_torchrl.data.behaviours import EXPERT, NOISY, Behaviour, check_own_label
-from lw_torchrl.language.tasks import resolve_tasks
+from lw_torchrl.language.tasks import MT50, resolve_tasks, task_id
 
 DATA, METADATA, PARTIAL, LOCK = "data", "metadata.json", ".partial", ".lock"
 _MOST = 2**63 - 1
@@ -26,7 +30,7 @@ class DatasetError(ValueError):
 
 
 class DamagedDatasetError(DatasetError):
-    """A dataset whose files are not as they were written; the same :func:`collect_demonstrations` mends it."""
+    """A dataset whose files are not as they were written; the same :func:`collect_demonstrations` repairs it."""
 
 
 def _whole_number(argument: str, given: Any, minimum: int) -> int:
@@ -44,14 +48,11 @@ class CollectConfig:
         episodes_per_task: kept episodes of each task.
         seed: with task and episode, fixes the initial state, the goal and the noise.
         noise_scale: standard deviations of the execution noise, one an episode in turn; (0.0,) for none.
-        noise_hold: the steps for which each draw of the noise is kept; the longer, the further it leads astray.
-        gripper_noise_factor: what the gripper's noise is multiplied by; noise there makes grasps fail.
-        redraw_failures: keep successful episodes only, and draw another for each failure.
+        noise_hold: the steps for which each draw of the noise is kept.
+        gripper_noise_factor: multiplies the gripper's noise, which makes grasps fail.
+        redraw_failures: keep only successful episodes, and draw another for each failure.
         max_steps: steps of an episode.
         policy: who acts.
-
-    Raises:
-        ValueError, TypeError: a wrong value, by its name.
     """
 
     tasks: tuple[str, ...]
@@ -68,8 +69,7 @@ class CollectConfig:
         if not isinstance(self.policy, Behaviour):
             raise TypeError(f"policy must be a Behaviour, got {self.policy!r}")
         check_own_label(self.policy)
-        if not isinstance(self.redraw_failures, bool):
-            raise TypeError(f"redraw_failures must be True or False, got {self.redraw_failures!r}")
+        check_fields(self)
         if not self.noise_scale:
             raise ValueError("noise_scale must hold at least one number, got an empty sequence")
         checked = {
@@ -85,7 +85,7 @@ class CollectConfig:
             object.__setattr__(self, name, value)
 
     def to_json(self) -> dict[str, Any]:
-        """As JSON; who acts is left out where it is the expert, as in datasets that know no others."""
+        """As JSON; ``policy`` is left out for the expert, as older datasets do."""
         found = {key: list(v) if isinstance(v, tuple) else v for key, v in asdict(self).items()}
         return {key: v for key, v in found.items() if key != "policy" or self.policy != EXPERT}
 
@@ -126,10 +126,9 @@ class Demonstrations:
         root: its folder.
         config: how it was collected.
         versions: of the packages that it was begun with.
-        task_ids: task name to the number that stands for it in the files; rows are shown with today's
-            :func:`~lw_torchrl.task_id`, whatever it was then.
+        task_ids: task name to its number in the files; rows are shown with the present :func:`~lw_torchrl.task_id`.
         episodes: in the order of the rows.
-        attempts: task name to the episodes run, failures that were redrawn among them.
+        attempts: task name to the number of episodes run, with the failures that were redrawn.
     """
 
     root: Path
@@ -151,3 +150,167 @@ class Demonstrations:
         for episode in self.episodes:
             found.setdefault(episode.task, []).append(episode.success)
         return {task: sum(found[task]) / len(found[task]) for task in self.config.tasks if task in found}
+
+
+FORMAT = "lw_torchrl.demonstrations"
+FORMAT_VERSION = 2
+_BAD = (ValueError, TypeError, KeyError, OverflowError, RecursionError)
+
+
+def write_metadata(
+    root: Path,
+    config: CollectConfig,
+    versions: dict[str, str],
+    episodes: Sequence[EpisodeInfo],
+    attempts: dict[str, int],
+) -> None:
+    """Write the metadata, which makes the dataset a finished one."""
+    columns = {key: [getattr(episode, key) for episode in episodes] for key in EpisodeInfo.__dataclass_fields__}
+    found = {
+        "format": FORMAT,
+        "version": FORMAT_VERSION,
+        "config": config.to_json(),
+        "versions": versions,
+        "task_ids": {task: task_id(task) for task in config.tasks},
+        "attempts": attempts,
+        "episodes": columns,
+    }
+    write_json(root / METADATA, found)
+
+
+def read_metadata(root: str | os.PathLike[str]) -> Demonstrations:
+    """Describe the dataset in a folder.
+
+    Raises:
+        FileNotFoundError: there is no such folder.
+        DatasetError: (a ValueError) the dataset is half-written, damaged, or of another format or version.
+    """
+    folder = Path(root)
+    path = folder / METADATA
+    if not folder.is_dir():
+        raise FileNotFoundError(f"root: no dataset folder {str(folder)!r}; make one with collect_demonstrations")
+    if not path.is_file():
+        if (folder / PARTIAL).is_dir():
+            raise DatasetError(
+                f"root: the dataset in {str(folder)!r} is half-written; run the same collect_demonstrations again, "
+                "and it carries on"
+            )
+        raise DatasetError(f"root: {str(folder)!r} holds no {METADATA}, so it is no dataset of {FORMAT}")
+    try:
+        found = read_json(path, "root: the metadata")
+        stated = found["format"], found["version"]
+        if stated != (FORMAT, FORMAT_VERSION) or isinstance(stated[1], float):
+            raise DatasetError(
+                f"root: {str(path)!r} is of format {short(stated[0])} version {short(stated[1])}; this package reads "
+                f"{FORMAT!r} version {FORMAT_VERSION}. Collect it again with the same collect_demonstrations, into "
+                "another folder or after deleting this one"
+            )
+        config = parse_config(found["config"])
+        episodes = _episodes(_object("episodes", found["episodes"], EpisodeInfo.__dataclass_fields__), config)
+        last = {episode.task: episode.episode for episode in episodes}
+        attempts = _object("attempts", found["attempts"], config.tasks)
+        if any(_integer(f"attempts of {task}", attempts[task]) != last[task] + 1 for task in config.tasks):
+            raise ValueError("the attempts are not those of the episodes")
+        versions, task_ids = _versions(found["versions"]), _task_ids(found["task_ids"], config)
+        return Demonstrations(folder, config, versions, task_ids, episodes, attempts)
+    except DatasetError:
+        raise
+    except _BAD as error:
+        raise DamagedDatasetError(
+            f"root: {str(path)!r} is damaged ({type(error).__name__}: {str(error)[:500]}); the same "
+            "collect_demonstrations makes the dataset again"
+        ) from error
+
+
+@contextmanager
+def _half_made(path: Path) -> Iterator[None]:
+    """Name the file of a half-made dataset that cannot be read."""
+    try:
+        yield
+    except _BAD as error:
+        raise DatasetError(
+            f"root: {str(path)!r} is damaged ({str(error)[:500]}); delete {str(path.parent.parent)!r} to start again"
+        ) from error
+
+
+def read_config(path: Path) -> CollectConfig:
+    """The configuration of a half-made dataset; a damaged file is a :class:`DatasetError`."""
+    with _half_made(path):
+        return parse_config(read_json(path, "root: the configuration"))
+
+
+def read_versions(path: Path) -> dict[str, str]:
+    """The package versions that a half-made dataset was begun with, {} if it does not say; a damaged file is a
+    :class:`DatasetError`."""
+    with _half_made(path), suppress(FileNotFoundError):
+        return _versions(read_json(path, "root: the versions"))
+    return {}
+
+
+def parse_config(stated: Any) -> CollectConfig:
+    """A configuration from its JSON; ValueError, TypeError or OverflowError if it is none."""
+    there = stated if isinstance(stated, Mapping) else {}
+    names = [name for name in CollectConfig.__dataclass_fields__ if name != "policy" or name in there]
+    found = _object("config", stated, names)
+    for name, longest in (("tasks", len(MT50)), ("noise_scale", None)):
+        if not isinstance(found[name], list) or (longest and len(found[name]) > longest):
+            raise ValueError(f"{name} must be a list, of at most {longest or 'any'} entries, got {short(found[name])}")
+    options: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in found.items()}
+    if "policy" in options:
+        options["policy"] = Behaviour.from_json(options["policy"])
+    config = CollectConfig(**options)
+    if list(config.tasks) != found["tasks"]:
+        raise ValueError(f"tasks must be sorted, got {short(found['tasks'])}")
+    return config
+
+
+def _object(name: str, stated: Any, keys: Any) -> dict[str, Any]:
+    if not isinstance(stated, Mapping) or set(stated) != set(keys):
+        raise ValueError(f"{name} must be an object of {', '.join(keys)}, got {short(stated)}")
+    return dict(stated)
+
+
+def _integer(name: str, stated: Any, minimum: int = 0, maximum: int = 2**63 - 1) -> int:
+    if type(stated) is not int or not minimum <= stated <= maximum:
+        raise ValueError(f"{name} must be an integer in [{minimum}, {maximum}], got {short(stated)}")
+    return stated
+
+
+def _versions(stated: Any) -> dict[str, str]:
+    if not isinstance(stated, dict) or not all(isinstance(v, str) and len(v) <= 100 for v in stated.values()):
+        raise ValueError(f"versions must be names and short texts, got {short(stated)}")
+    return stated
+
+
+def _task_ids(stated: Any, config: CollectConfig) -> dict[str, int]:
+    found = _object("task_ids", stated, config.tasks)
+    numbers = {task: _integer(f"task_ids of {task}", found[task]) for task in config.tasks}
+    if len({*numbers.values()}) != len(numbers):
+        raise ValueError(f"task_ids must differ, got {short(stated)}")
+    return numbers
+
+
+def _episodes(columns: dict[str, Any], config: CollectConfig) -> tuple[EpisodeInfo, ...]:
+    """The episodes from their columns: sorted, as many of each task as configured, row after row."""
+    number = len(config.tasks) * config.episodes_per_task
+    for name, column in columns.items():
+        if not isinstance(column, list) or len(column) != number:
+            raise ValueError(f"episodes: {name} must be a list of {number}, got {short(column)}")
+    expected = [task for task in config.tasks for _ in range(config.episodes_per_task)]
+    if columns["task"] != expected:
+        raise ValueError(f"episodes: task must be {short(expected)}, got {short(columns['task'])}")
+    found: list[EpisodeInfo] = []
+    start = 0
+    for row in zip(*(columns[key] for key in EpisodeInfo.__dataclass_fields__), strict=True):
+        info = EpisodeInfo(*row)
+        follows = found and found[-1].task == info.task
+        _integer("episodes: episode", info.episode, found[-1].episode + 1 if follows else 0)
+        _integer("episodes: start", info.start, start, start)
+        start += _integer("episodes: length", info.length, 1, config.max_steps)
+        if info.first_success is not None:
+            _integer("episodes: first_success", info.first_success, 1, info.length)
+        if info.success is not (info.first_success is not None):
+            raise ValueError(f"episodes: success must be {info.first_success is not None}, got {short(info.success)}")
+        _integer("episodes: checksum", info.checksum, 0, 2**32 - 1)
+        found.append(info)
+    return tuple(found)

@@ -1,4 +1,4 @@
-"""GrowingStorage: demonstrations as they are on disk, and behind them rows that come while learning."""
+"""GrowingStorage: demonstrations on disk, and behind them rows that are written during training."""
 
 from __future__ import annotations
 
@@ -11,39 +11,37 @@ from typing import Any, NoReturn
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
+from torchrl.data.replay_buffers.writers import Writer
 
 from lw_torchrl._checks import check_int
 from lw_torchrl._files import reading
 from lw_torchrl._tensor_archive import TensorArchive, write_archive
-from lw_torchrl.data.collected import collected_rows
-from lw_torchrl.data.grown_state import check_grown
 from lw_torchrl.data.storage import DEMONSTRATION, DONE, REWARD, TRAJECTORY, JoinedStorage, column_name
-from lw_torchrl.data.trajectories import Open, follow, shared_keys
+from lw_torchrl.data.trajectories import OpenTrajectories, check_grown_state, collected_rows, link_rows, shared_keys
 
 Columns = Mapping[NestedKey, Tensor]
 
 
 class GrowingStorage(JoinedStorage):
-    """A :class:`JoinedStorage` with a part that grows: a ring of rows, allocated once, whose oldest are overwritten.
+    """A :class:`JoinedStorage` with a ring of rows behind it, allocated once, whose oldest are overwritten.
 
-    The rows of the parts come first and stay; row i that was ever written is at ``num_joined + i % grow``. A replay
-    buffer over it wants a :class:`GrowingWriter` and ``collate_fn=lambda batch: batch``;
-    ``LanguageWorldExperienceReplay(..., grow=)`` sees to both.
+    The rows of the parts come first and stay; the i-th row ever written is at ``num_joined + i % grow``. A replay
+    buffer over it needs a :class:`GrowingWriter` and ``collate_fn=lambda batch: batch``;
+    ``LanguageWorldExperienceReplay(..., grow=)`` sets both.
 
-    Of a batch of any dimensions, the last of which is time, the columns of the parts are stored; see
-    :func:`collected_rows`. ``("collector", "traj_ids")`` is numbered anew, from one above the largest of the parts: a
-    trajectory keeps its number from batch to batch for as long as its newest row is here, and no other, of this
-    collector, another one or one after a restart, ever gets it. A row follows another if both have the collector's id,
-    the other is not done, and it is bit for bit what the other became.
+    Batches may have any dimensions, the last of which is time; the columns of the parts are stored, see
+    :func:`collected_rows`. ``("collector", "traj_ids")`` gets new numbers, above those of the parts: a trajectory keeps
+    its number from batch to batch as long as its newest row is in the ring, and no other trajectory ever gets it. A
+    row follows another if both have the collector's id, the other is not done, and its "next" is bit for bit this row.
 
-    Samples have one column more, ``is_demonstration`` (B,) bool: true of the parts' rows, false of those that came.
+    Samples have one column more, ``is_demonstration`` (B,) bool: true of the parts' rows, false of those written.
 
     Args:
         parts, rows, n_steps, gamma: as for :class:`JoinedStorage`; ("collector", "traj_ids") and ("next", "done") are
-            needed. Rows get their n steps as those that follow them come; until then they look less far ahead.
+            needed. A row looks fewer than n steps ahead until the rows that follow it are written.
         grow: rows of the ring.
-        admit: from the columns of each batch to those that are stored; it raises what is wrong.
-        check: called with the columns of a state, as they were stored; it raises what is wrong.
+        admit: called with the columns of each batch, returns those to store, or raises.
+        check: called with the columns of a restored state; it raises if they are wrong.
 
     Attributes:
         num_joined: rows of the parts.
@@ -51,8 +49,8 @@ class GrowingStorage(JoinedStorage):
         count: rows ever written.
 
     Raises:
-        ValueError, IndexError, TypeError: as for :class:`JoinedStorage`. At writing: a batch of more rows than the
-            ring has, or what :func:`collected_rows` refuses.
+        ValueError: as for :class:`JoinedStorage`; at writing, a batch of more rows than the ring has, or what
+            :func:`collected_rows` refuses.
 
     Example:
         >>> from tensordict import TensorDict
@@ -96,7 +94,7 @@ class GrowingStorage(JoinedStorage):
         if not shared_keys(self._columns):
             raise ValueError("parts must have a column and its ('next', ...), by which it shows what follows what")
         known = [int(leaf.max()) for leaf in self._columns[TRAJECTORY] if len(leaf)]
-        self._number, self._open = max(known, default=-1) + 1, Open.none()
+        self._number, self._open = max(known, default=-1) + 1, OpenTrajectories.none()
         joined = int(self._ends[-1])
         self._ring = {
             key: torch.empty((self.grow, *leaves[0].shape[1:]), dtype=leaves[0].dtype)
@@ -140,24 +138,24 @@ class GrowingStorage(JoinedStorage):
         if self._admit is not None:
             found = self._admit(found)
         key, done = found[TRAJECTORY].reshape(-1), found[DONE].reshape(-1)
-        ring = self._ring, self._open.last % self.grow
-        previous, numbers, opened = follow(key, done, found, self._open, *ring, serial=self.count, number=self._number)
+        slots, begin = self._open.last % self.grow, {"serial": self.count, "number": self._number}
+        previous, numbers, opened = link_rows(key, done, found, self._open, self._ring, slots, **begin)
         if (cut := len(numbers.unique()) - len(key.unique())) > number // 2:
             warnings.warn(
-                f"batch: {cut} of {number} rows are not what the rows before them became, ('next', ...), though of the "
-                "same trajectory, which had not ended; each begins a trajectory. Are rows or steps left out?",
+                f"batch: {cut} of {number} rows are not the ('next', ...) of the rows before them, though of the same "
+                "trajectory, which had not ended; each begins a trajectory. Are rows or steps left out?",
                 stacklevel=2,
             )
         found = {**found, TRAJECTORY: numbers.view(found[TRAJECTORY].shape)}
         serial = torch.arange(self.count, self.count + number)
         self._write(serial, found, previous)
         here = opened.last >= self.count - self.grow
-        self._open = Open(opened.key[here], opened.number[here], opened.last[here])
+        self._open = OpenTrajectories(opened.key[here], opened.number[here], opened.last[here])
         self._number = max(self._number, int(numbers.max()) + 1)
         return (self.num_joined + serial % self.grow).view(batch.shape)
 
     def _read_only(self) -> NoReturn:
-        raise RuntimeError("rows of a storage that grows are written by a GrowingWriter alone, at the end of its ring")
+        raise RuntimeError("only a GrowingWriter writes rows of a storage that grows, at the end of its ring")
 
     def _write(self, serial: Tensor, found: Columns, previous: Tensor) -> None:
         slot = serial % self.grow
@@ -170,7 +168,7 @@ class GrowingStorage(JoinedStorage):
         self._bump_mutation_revision()
 
     def _look_back(self, serial: Tensor, reward: Tensor, previous: Tensor) -> None:
-        """Let the rows before new ones look ahead to them."""
+        """Extend the n steps of earlier rows to new ones."""
         slot = serial % self.grow
         place = self.num_joined + slot
         self._previous[slot] = previous
@@ -185,13 +183,13 @@ class GrowingStorage(JoinedStorage):
             behind = self._previous[behind % self.grow]
 
     def _empty(self) -> None:  # type: ignore[override]
-        """Forget the rows of the ring; numbers of trajectories go on."""
-        self.count, self._open = 0, Open.none()
+        """Forget the rows of the ring; numbers of trajectories are not reused."""
+        self.count, self._open = 0, OpenTrajectories.none()
         self._set_last_cursor(None)
         self._bump_mutation_revision()
 
     def state_dict(self) -> dict[str, Any]:
-        """The rows of the ring, the oldest first, and which of their trajectories may go on."""
+        """The rows of the ring, the oldest first, and which of their trajectories may continue."""
         slot = torch.arange(self.count - self.num_grown, self.count) % self.grow
         return {
             **super().state_dict(),
@@ -203,13 +201,9 @@ class GrowingStorage(JoinedStorage):
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` gave.
-
-        Raises:
-            ValueError: it is none, or that of other columns, of another ``grow``, or of other demonstrations.
-        """
+        """Restore a state; :class:`ValueError` if it is of other columns, another ``grow``, or other demonstrations."""
         super().load_state_dict(state_dict)
-        count, number, rows, opened = check_grown(state_dict, self.grow, self._ring)
+        count, number, rows, opened = check_grown_state(state_dict, self.grow, self._ring)
         if self._check is not None and count:
             self._check(rows)
         self._empty()
@@ -245,3 +239,40 @@ class GrowingStorage(JoinedStorage):
                 "batches, and extend the buffer with them here"
             )
         return super().__getstate__()
+
+
+class GrowingWriter(Writer):
+    """Writes what a buffer is extended with to its :class:`GrowingStorage`."""
+
+    _storage: GrowingStorage
+
+    @property
+    def _write_count(self) -> int:
+        return self._storage.count
+
+    def extend(self, data: TensorDictBase) -> Tensor:
+        """Write the rows of a batch; their places, int64 of the batch's shape."""
+        index = self._storage.extend(data)
+        for entity in self._storage._attached_entities_iter():
+            entity.mark_update(index.reshape(-1))
+        return index
+
+    def add(self, data: TensorDictBase) -> Tensor:
+        """Write one step, of one row or of (N,) rows; their places, int64 of its shape."""
+        return self.extend(data if data.ndim else data.unsqueeze(0)).view(data.shape)
+
+    def _empty(self, empty_write_count: bool = True) -> None:
+        pass
+
+    def state_dict(self) -> dict[str, Any]:
+        """Nothing; the storage knows how many rows were written."""
+        return {}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Nothing to restore."""
+
+    def dumps(self, path: Any) -> None:
+        """Nothing to write."""
+
+    def loads(self, path: Any) -> None:
+        """Nothing to read."""

@@ -1,27 +1,121 @@
-"""Running the episodes that a dataset still lacks, by whoever acts in it."""
+"""The episodes of an unfinished dataset: a file for each one that was run, and running the missing ones."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import errno
+import stat
+import zipfile
+from collections.abc import Callable, Sequence
 from contextlib import closing
+from io import BytesIO
+from pathlib import Path
 
+import numpy as np
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from lw_torchrl._files import replacing
 from lw_torchrl._progress import Progress
-from lw_torchrl.data.behaviours import segment_plans
-from lw_torchrl.data.dataset import CollectConfig
-from lw_torchrl.data.episode_files import EpisodeFiles
-from lw_torchrl.data.segment_actor import SegmentActor
+from lw_torchrl.data.behaviours import SegmentActor, segment_plans
+from lw_torchrl.data.dataset import CollectConfig, DatasetError
+from lw_torchrl.data.memory_map import COLUMNS, ROW_BYTES
 from lw_torchrl.envs.episodes import policy_of, read_action, run_episodes
 from lw_torchrl.envs.experts import ExpertActor
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.modules.policy import Policy
 from lw_torchrl.transforms.qaf import QAFTransform
 
-_Acts = Callable[[TensorDictBase], TensorDictBase]
+_STORED = [key for key in COLUMNS if key != ("collector", "traj_ids")]
+_FAILED = b"FAILED"
+_HEADERS = 2**16  # bytes of a file beside its rows, at the most
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+class EpisodeFiles:
+    """The episodes so far, one file each, so that a kill costs only those under way; a file that says FAILED stands
+    for an episode that was not kept."""
+
+    def __init__(self, folder: Path, tasks: Sequence[str], max_steps: int) -> None:
+        self.folder, self.tasks, self.max_steps = folder, tasks, max_steps
+
+    def _path(self, task: str, episode: int) -> Path:
+        return self.folder / f"{task}.{episode}.npz"
+
+    def put(self, task: str, episode: int, steps: TensorDictBase | None) -> None:
+        """Write an episode's rows, or that it was not kept."""
+        content = _FAILED
+        if steps is not None:
+            stream = BytesIO()
+            np.savez(stream, **{"/".join(key): steps.get(key).numpy() for key in _STORED})
+            content = stream.getvalue()
+        try:
+            with replacing(self._path(task, episode), sync=False) as path:  # a damaged one is run again
+                path.write_bytes(content)
+        except OSError as error:
+            raise write_failed(self.folder, len(content), error) from error
+
+    def has(self, task: str, episode: int) -> bool:
+        """Whether the episode was run."""
+        return self._path(task, episode).is_file()
+
+    def kept(self, task: str, episode: int) -> bool:
+        """Whether an episode that was run was kept."""
+        return self._path(task, episode).stat().st_size != len(_FAILED)
+
+    def get(self, task: str, episode: int) -> TensorDict:
+        """An episode's rows; any exception where the file is damaged."""
+        content = self._content(self._path(task, episode))
+        with zipfile.ZipFile(BytesIO(content)) as archive:
+            if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):
+                raise ValueError("it is compressed")
+        with np.load(BytesIO(content), allow_pickle=False) as found:
+            columns = {key: torch.from_numpy(found["/".join(key)]) for key in _STORED}
+        length = len(columns["episode",])
+        for key, column in columns.items():
+            tail, dtype = COLUMNS[key]
+            if column.shape != (length, *tail) or column.dtype != dtype:
+                raise ValueError(f"{'/'.join(key)} must be {dtype} of shape {(length, *tail)}")
+        if not 0 < length <= self.max_steps or (columns["episode",] != episode).any():
+            raise ValueError("it is another episode")
+        steps = TensorDict({}, [length])
+        for key, column in columns.items():
+            steps.set(key, column)
+        return steps
+
+    def _content(self, path: Path) -> bytes:
+        found = path.lstat()
+        if not stat.S_ISREG(found.st_mode) or found.st_size > self.max_steps * ROW_BYTES + _HEADERS:
+            raise ValueError("it is no file, or larger than an episode can be")
+        return path.read_bytes()
+
+    def drop_damaged(self) -> None:
+        """Remove the files that cannot be read, so that their episodes are run again."""
+        for path in self.folder.glob("*.npz"):
+            task, _, number = path.stem.rpartition(".")
+            if task not in self.tasks or not number.isdecimal():
+                continue
+            if path.is_dir() and not path.is_symlink():
+                raise DatasetError(f"root: {str(path)!r} is a folder, and no episode's file; move it elsewhere")
+            try:
+                if self._content(path) != _FAILED:
+                    self.get(task, int(number))
+            except Exception:  # whatever is wrong with it, the episode can be run again
+                path.unlink()
+
+
+def write_failed(folder: Path, size: int, error: OSError) -> OSError:
+    """The error for something that could not be written while collecting; the caller raises it."""
+    until = "there is room" if error.errno in _NO_ROOM else "that is mended"
+    return OSError(
+        error.errno,
+        f"root: writing {size} bytes to {str(folder)!r} failed: {error.strerror or error}. Nothing is lost: once "
+        f"{until}, the same collect_demonstrations carries on",
+    )
+
+
+_Actor = Callable[[TensorDictBase], TensorDictBase]
 
 _RECORDED = [
     "observation",
@@ -35,7 +129,7 @@ _RECORDED = [
 _MAX_ATTEMPTS = 20  # episodes run for each one that is kept, before redrawing gives up
 
 
-def _take_stock(config: CollectConfig, files: EpisodeFiles) -> tuple[dict[str, list[int]], dict[str, list[int]]]:
+def _kept_and_missing(config: CollectConfig, files: EpisodeFiles) -> tuple[dict[str, list[int]], dict[str, list[int]]]:
     """The kept episodes of each task, and those still to run. Candidates are taken in the order of their index, so
     which are kept depends neither on the number of environments nor on interruptions."""
     kept: dict[str, list[int]] = {}
@@ -57,8 +151,8 @@ def _take_stock(config: CollectConfig, files: EpisodeFiles) -> tuple[dict[str, l
     return kept, wanted
 
 
-def _clipped(policy: _Acts) -> _Acts:
-    """``policy`` with what it asked for beside what can be done, as :class:`ExpertActor` gives them."""
+def _clipped(policy: _Actor) -> _Actor:
+    """``policy`` with ``unclipped_action`` beside ``action``, as of :class:`ExpertActor`."""
 
     def run(tensordict: TensorDictBase) -> TensorDictBase:
         tensordict = policy(tensordict)
@@ -68,8 +162,8 @@ def _clipped(policy: _Acts) -> _Acts:
     return run
 
 
-def _cast(config: CollectConfig, policy: Policy | None, env: LanguageWorldEnv) -> tuple[EnvBase, _Acts]:
-    """The environment with what must run before who acts, and who acts."""
+def _env_and_actor(config: CollectConfig, policy: Policy | None, env: LanguageWorldEnv) -> tuple[EnvBase, _Actor]:
+    """The environment with the actor's transforms, and the actor."""
     if config.policy.kind == "expert":
         return env, ExpertActor(config.tasks)
     if policy is None:
@@ -83,27 +177,20 @@ def _cast(config: CollectConfig, policy: Policy | None, env: LanguageWorldEnv) -
 def run_missing_episodes(
     config: CollectConfig, policy: Policy | None, files: EpisodeFiles, num_envs: int | None, progress: bool
 ) -> dict[str, list[int]]:
-    """Run episodes until the files are full; returns the kept ones of each task.
-
-    Args:
-        config: what to collect.
-        policy: who acts, where the configuration says that a trained one does.
-        files: the episodes so far.
-        num_envs: environments stepped together.
-        progress: show a progress bar.
+    """Run episodes until the files hold all; returns the kept ones of each task.
 
     Raises:
         OSError: there is no room.
         RuntimeError: redrawing found too few successes.
     """
-    kept, wanted = _take_stock(config, files)
+    kept, wanted = _kept_and_missing(config, files)
     missing = sum(map(len, wanted.values()))
     if not missing:
         return kept
     rows = max(len(config.tasks), min(50, missing)) if num_envs is None else num_envs
     options = {"num_envs": rows, "seed": config.seed, "max_steps": config.max_steps, "strict": policy is not None}
     base = LanguageWorldEnv(config.tasks, reward="dense", **options)  # type: ignore[arg-type]
-    env, acts = _cast(config, policy, base)
+    env, actor = _env_and_actor(config, policy, base)
     scales = [(s, s, s, s * config.gripper_noise_factor) for s in config.noise_scale]
     total = config.episodes_per_task * len(config.tasks)
     before = (total - missing) * config.max_steps
@@ -114,7 +201,7 @@ def run_missing_episodes(
             bar.set_done((total - missing) * config.max_steps)  # steps back by the failures that are drawn again
             episodes = run_episodes(
                 env,
-                acts,
+                actor,
                 wanted,
                 keys=_RECORDED,
                 noise=(lambda n: scales[n % len(scales)]) if any(config.noise_scale) else None,
@@ -124,13 +211,9 @@ def run_missing_episodes(
             )
             for task, episode, steps in episodes:
                 keep = not config.redraw_failures or bool(steps.get(("next", "success")).any())
-                files.put(task, episode, _as_rows(steps) if keep else None)
-            kept, wanted = _take_stock(config, files)
+                steps.rename_key_(("next", "reward"), ("next", "reward_dense"))
+                steps.set(("next", "reward_sparse"), steps.get(("next", "success")).float())
+                files.put(task, episode, steps if keep else None)
+            kept, wanted = _kept_and_missing(config, files)
             missing = sum(map(len, wanted.values()))
     return kept
-
-
-def _as_rows(steps: TensorDictBase) -> TensorDictBase:
-    """Recorded steps with a dataset's columns, the trajectory's number aside."""
-    steps.rename_key_(("next", "reward"), ("next", "reward_dense"))
-    return steps.set(("next", "reward_sparse"), steps.get(("next", "success")).float())

@@ -1,6 +1,9 @@
-"""Passes over groups of rows, kept up as rows come and go."""
+"""Passes over groups of rows, updated as rows come and go; their state, checked."""
 
 from __future__ import annotations
+
+from reprlib import repr as short
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,12 +20,10 @@ def _without(some: Tensor, others: Tensor) -> Tensor:
 
 
 def choose(first: Tensor, size: Tensor, count: Tensor, generator: torch.Generator | None) -> Tensor:
-    """``count[g]`` different places of the ``size[g]`` from ``first[g]`` on, each choice as likely, sorted.
-
-    The work is of the order of ``count``, however large ``size`` is.
-    """
+    """``count[g]`` different places of the ``size[g]`` from ``first[g]`` on, uniformly, sorted; the work is of
+    the order of ``count``, however large ``size`` is."""
     few = 2 * count <= size
-    wanted = torch.where(few, count, size - count)  # of the others, those that are not chosen are fewer
+    wanted = torch.where(few, count, size - count)  # where those that are not chosen are fewer, draw these
     found, missing = wanted.new_empty(0), wanted
     while missing.any():
         group = torch.repeat_interleave(missing)
@@ -38,15 +39,10 @@ def choose(first: Tensor, size: Tensor, count: Tensor, generator: torch.Generato
 
 
 class Passes:
-    """The rows of each group in the order of its pass: those that were drawn, then those that are to come.
+    """The rows of each group in the order of its pass: those already drawn, then those left, in random order.
 
-    The rows to come are in random order. A row that comes takes a random place among those to come, a row that goes
-    leaves no gap; neither looks at the other rows.
-
-    Args:
-        order: rows group after group.
-        size: rows of each group, (G,) int64, at least 1.
-        cursor: rows of each group that were drawn in this pass, (G,) int64; none by default.
+    A new row takes a random place among those left, a row that goes leaves no gap; neither looks at the other rows.
+    ``order`` holds the rows group after group, ``size`` (G,) their number, and ``cursor`` (G,) the rows already drawn.
     """
 
     def __init__(self, order: Tensor, size: Tensor, cursor: Tensor | None = None) -> None:
@@ -54,7 +50,7 @@ class Passes:
         self.start = size.cumsum(0) - size
         self.cursor = torch.zeros_like(size) if cursor is None else cursor
         self._room = size
-        self._place: Tensor | None = None  # of each row in the order, -1 for none; made when rows come or go
+        self._place: Tensor | None = None  # of each row in the order, -1 for none; made when rows change
 
     def shuffle(self, group: int, generator: torch.Generator | None) -> None:
         """Begin a pass of a group."""
@@ -66,7 +62,7 @@ class Passes:
             self._place[self.order[start : start + size]] = torch.arange(start, start + size)
 
     def take(self, group: int, count: int, generator: torch.Generator | None) -> tuple[Tensor, bool]:
-        """``count`` rows of a group, over the end of its pass, and whether a pass ended."""
+        """``count`` rows of a group, across the end of its pass, and whether a pass ended."""
         taken, ended = [], False
         start, size = int(self.start[group]), int(self.size[group])
         while count:
@@ -81,17 +77,11 @@ class Passes:
         return torch.cat(taken), ended
 
     def compact(self) -> Tensor:
-        """The rows group after group, without what is kept free between them."""
+        """The rows group after group, without the free places between them."""
         return self.order[spans(self.start, self.size)]
 
     def exchange(self, rows: Tensor, label: Tensor, generator: torch.Generator | None) -> None:
-        """Let rows go, where they are, and come into their groups.
-
-        Args:
-            rows: (n,) int64, each once.
-            label: the group of each, (n,) int64.
-            generator: what the places are drawn from.
-        """
+        """Move rows (n,) int64, each once, from where they are, if anywhere, to their groups (n,) int64."""
         place = self._places(int(rows.max()) + 1)
         at = place[rows]
         place[rows] = -1
@@ -113,7 +103,7 @@ class Passes:
         self._place[rows] = places
 
     def _close(self, holes: Tensor) -> None:
-        """Fill gaps among the rows that were drawn with others of these, then the rest with rows to come."""
+        """Fill gaps among the rows already drawn with others of these, then the rest with rows left."""
         group = torch.searchsorted(self.start, holes, right=True) - 1
         drawn = holes < (self.start + self.cursor)[group]
         gone = group[drawn].bincount(minlength=len(self.size))
@@ -146,3 +136,38 @@ class Passes:
         self._room, self.start = room, room.cumsum(0) - room
         self.order = torch.zeros(int(room.sum()), dtype=torch.int64)
         self._put(spans(self.start, self.size), rows)
+
+
+def check_state(state: Any) -> dict[str, Any]:
+    """A sampler's state, if its parts fit one another: the groups' rows one after another, each row once."""
+
+    def require(holds: bool, name: str, wanted: str) -> None:
+        if not holds:
+            raise ValueError(f"state_dict: {name} must be {wanted}, got {short(state.get(name))}")
+
+    found: dict[str, Any] = {}
+    for name, dtype in (("length", torch.int64), ("ran_out", torch.bool)):
+        given = state.get(name)
+        require(isinstance(given, Tensor) and given.dtype == dtype and given.numel() == 1, name, f"one {dtype}")
+        found[name] = given.item()
+    require(found["length"] >= 0, "length", "at least 0")
+    for name in ("order", "start", "size", "cursor"):
+        given = state.get(name)
+        require(isinstance(given, Tensor) and given.dtype == torch.int64 and given.dim() == 1, name, "(n,) int64")
+        found[name] = given.cpu()
+    order, start, size, cursor = (found[name] for name in ("order", "start", "size", "cursor"))
+    rows = len(order)
+    require(
+        bool(((size > 0) & (size <= rows)).all()) and int(size.sum()) == rows, "size", f"of {rows} rows, none empty"
+    )
+    require(torch.equal(start, size.cumsum(0) - size), "start", "where the groups begin")
+    fits = cursor.shape == size.shape and bool(((cursor >= 0) & (cursor < size)).all())
+    require(fits, "cursor", "a place within each group")
+    inside = rows <= found["length"] and bool(((order >= 0) & (order < found["length"])).all())
+    require(inside and len(order.unique()) == rows, "order", f"rows below {found['length']}, each once")
+    for name, lengths in (("known", {0, len(size)}), ("written", None)):
+        given = state.get(name)
+        fits = isinstance(given, Tensor) and given.dtype == torch.int64 and given.dim() == 1
+        require(fits and (lengths is None or len(given) in lengths), name, "(n,) int64, one a group or none")
+        found[name] = given.cpu()
+    return found

@@ -24,11 +24,9 @@ from lw_torchrl._checks import check_int, checked
 from lw_torchrl._files import replacing
 from lw_torchrl._progress import Progress
 from lw_torchrl._rendering import check_cameras
-from lw_torchrl.data.checksums import verify
-from lw_torchrl.data.dataset import DatasetError, Demonstrations, EpisodeInfo
-from lw_torchrl.data.metadata import read_metadata
+from lw_torchrl.data.dataset import DatasetError, Demonstrations, EpisodeInfo, read_metadata
+from lw_torchrl.data.memory_map import load_rows, verify
 from lw_torchrl.data.replay import LanguageWorldExperienceReplay
-from lw_torchrl.data.rows import load_rows
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.transforms.camera import CameraTransform
 
@@ -74,8 +72,8 @@ def add_pictures(
 ) -> None:
     """Draw the rows of a dataset, as :class:`CameraTransform` would have while it was collected.
 
-    Each episode is run again with its actions; that its observations are the stored ones, bit for bit, is checked. The
-    pictures are kept beside the rows as PNGs, losslessly compressed. Killed and called again it carries on.
+    Each episode is run again with its actions, and must give the stored observations bit for bit. The pictures are
+    saved beside the rows as PNGs. A call that was killed carries on when it is repeated.
 
     Args:
         root: the dataset's folder, of :func:`collect_demonstrations`.
@@ -83,8 +81,8 @@ def add_pictures(
         progress: show a progress bar when it takes longer than a second.
 
     Raises:
-        ValueError: a wrong argument; DatasetError where the folder holds no dataset, or episodes that go otherwise
-            today, by another version of MuJoCo or Meta-World.
+        DatasetError: (a ValueError) the folder holds no dataset, or its episodes go otherwise today, by another version
+            of MuJoCo or Meta-World.
         ImportError: there is no OpenGL; it names what to install.
         OSError: there is no room; nothing is lost.
 
@@ -129,9 +127,10 @@ def _taken(
             going = step < lengths
             here = rows[starts + torch.minimum(torch.tensor(step), lengths - 1)]
             if not torch.equal(state.get("observation")[going], here.get("observation")[going]):
+                versions = ", ".join(f"{name} {version}" for name, version in found.versions.items())
                 raise DatasetError(
                     f"root: episodes of {episodes[0].task!r} in {str(found.root)!r} go otherwise when they are run "
-                    f"again, from step {step} on: they were made by {_versions(found)}"
+                    f"again, from step {step} on: they were made by {versions}"
                 )
             if step % wanted.every == 0:
                 for place in going.nonzero().flatten().tolist():
@@ -139,10 +138,6 @@ def _taken(
             state.set("action", here.get("action")).set("_step", going)
             state = step_mdp(env.step(state), exclude_action=True).exclude("_step")
     return taken
-
-
-def _versions(found: Demonstrations) -> str:
-    return ", ".join(f"{name} {version}" for name, version in found.versions.items())
 
 
 def _write(path: Path, pictures: Sequence[np.ndarray[Any, Any]]) -> None:
@@ -156,7 +151,7 @@ def _write(path: Path, pictures: Sequence[np.ndarray[Any, Any]]) -> None:
 
 
 def _whole(path: Path, wanted: _Wanted, count: int) -> bool:
-    """Whether a file has all its pictures; one that is damaged is made anew."""
+    """Whether a file has all its pictures; a damaged one is written anew."""
     if not path.is_file():
         return False
     try:
@@ -183,7 +178,7 @@ def _read(path: Path, wanted: _Wanted, count: int) -> Tensor:
                     if picture.mode != "RGB" or picture.size != (wanted.shape[1], wanted.shape[0]):
                         raise ValueError(f"{name} is {picture.mode} of {picture.size} pixels")
                     pictures[number] = np.asarray(picture)
-    except Exception as error:  # a file from a stranger may be anything
+    except Exception as error:  # a damaged file may raise anything
         raise DatasetError(f"root: {str(path)!r} is damaged ({error}); add_pictures makes it anew") from error
     return torch.from_numpy(pictures)
 
@@ -200,15 +195,15 @@ def load_pictures(
     """The pictures of a buffer's rows, for ``replay.add_column("pixels", ...)``, in memory.
 
     Args:
-        replay: a buffer of datasets that :func:`add_pictures` drew so.
-        cameras, height, width, every: as they were given there.
+        replay: a buffer of datasets that :func:`add_pictures` drew.
+        cameras, height, width, every: as given there.
 
     Returns:
-        (R, height, width·C, 3) uint8, in the order of ``replay[:]``; between two pictures of an episode, the earlier
-        one. They are of ``observation``; ``("next", "observation")`` has none.
+        (R, height, width·C, 3) uint8, of ``observation``, in the order of ``replay[:]``; between two pictures of an
+        episode, the earlier one.
 
     Raises:
-        ValueError: a wrong argument; DatasetError where a dataset has no such pictures, or they are damaged.
+        DatasetError: (a ValueError) a dataset has no such pictures, or they are damaged.
     """
     wanted = _wanted(cameras, height, width, every)
     _, lengths = torch.unique_consecutive(replay.storage.column(("collector", "traj_ids")), return_counts=True)

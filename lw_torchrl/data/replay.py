@@ -18,17 +18,12 @@ from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.writers import Writer
 from torchrl.envs import Transform
 
-from lw_torchrl._checks import check_choice, check_int, check_path, checked_but
+from lw_torchrl._checks import check_int, check_path, checked_but
 from lw_torchrl._devices import CPU, check_device
 from lw_torchrl.data.buffer_state import RestorableReplay, fingerprint
-from lw_torchrl.data.checksums import verify
-from lw_torchrl.data.dataset import DATA, Demonstrations
-from lw_torchrl.data.device_storage import DeviceStorage
-from lw_torchrl.data.filters import EpisodeFilter
-from lw_torchrl.data.growing import GrowingStorage
-from lw_torchrl.data.growing_writer import GrowingWriter
-from lw_torchrl.data.metadata import read_metadata
-from lw_torchrl.data.n_steps import check_n_steps
+from lw_torchrl.data.dataset import DATA, Demonstrations, read_metadata
+from lw_torchrl.data.growing import GrowingStorage, GrowingWriter
+from lw_torchrl.data.memory_map import verify
 from lw_torchrl.data.replay_checks import (
     admit_rows,
     check_apart,
@@ -36,25 +31,24 @@ from lw_torchrl.data.replay_checks import (
     check_column,
     check_growing,
     check_label,
-    check_prefetch,
     check_rows,
     check_transform,
     warn_of_simulators,
 )
-from lw_torchrl.data.rewards import REWARDS, RewardName
+from lw_torchrl.data.rewards import RewardName, check_n_steps
 from lw_torchrl.data.selection import (
-    LABELS,
     EpisodeChoice,
+    EpisodeFilter,
     JoinedDemonstrations,
     Label,
     choose_episodes,
     read_part,
     returns_of,
 )
-from lw_torchrl.data.storage import JoinedStorage, WholeStorage
+from lw_torchrl.data.storage import DeviceStorage, JoinedStorage, WholeStorage
 
 
-def _as_it_is(batch: TensorDictBase) -> TensorDictBase:
+def _identity(batch: TensorDictBase) -> TensorDictBase:
     return batch
 
 
@@ -78,40 +72,38 @@ class LanguageWorldExperienceReplay(RestorableReplay):
     """The rows of datasets that :func:`collect_demonstrations` made; several are joined, and none is copied.
 
     Samples hold observation (B, 39) float32, action (B, 4) float32, task_id and episode (B,) int64, and what
-    ``label`` leaves; a :class:`QAFTransform` adds ``qaf`` and ``qaf_plan``. collector/traj_ids (B,) int64 tells
-    episodes apart, those of different datasets too; behaviour (B,) int64 says who acted, an index of ``behaviours``.
-    is_demonstration (B,) bool is true of rows of datasets, and false of those that :meth:`extend` wrote.
+    ``label`` leaves; a :class:`QAFTransform` adds ``qaf`` and ``qaf_plan``. collector/traj_ids (B,) int64 is unique for
+    each episode of all datasets; behaviour (B,) int64 says who acted, an index of ``behaviours``. is_demonstration
+    (B,) bool is true of a dataset's rows, and false of those that :meth:`extend` wrote.
 
     Args:
-        root: the dataset's folder, or a list of folders: the rows of the first come first. None may come twice, unless
-            ``episodes`` says which to show of each.
+        root: the dataset's folder, or a list of folders, in the order of the rows. A folder may come twice only if
+            ``episodes`` says what to show of each.
         episodes: which episodes to show. None: all; a number: the first so many of each task; a mapping: for each task
-            to show, the first so many, or a list of indices of episodes. Of a list of folders, a list of such choices.
-        keep: of these, the ones that went so: the successes, the best tenth, those of one behaviour; see
-            :class:`EpisodeFilter`.
+            to show, the first so many, or a list of indices of episodes. For a list of folders, a list of such choices.
+        keep: of these, the successes, the best tenth, those of one behaviour, ...; see :class:`EpisodeFilter`.
         batch_size: rows of a sample.
         sampler: a TorchRL sampler, :class:`TaskBalancedSampler` say; None for uniform.
         transform: applied to each sample.
-        label: what ``action`` holds. "expert": what the expert wanted, in [-1, 1]; "unclipped": what its script asked
-            for, up to 25; of both, reward and next are left out, since they belong to the executed action. "executed":
-            what was executed, with reward and next. Datasets that others than the expert acted in have that alone.
+        label: what ``action`` holds. "executed": what was executed, with reward and next; the only one for datasets in
+            which others than the expert acted. "expert": what the expert wanted, in [-1, 1]; "unclipped": what its
+            script asked for, up to 25; both without reward and next, which belong to the executed action.
         reward: what ``("next", "reward")`` holds with label="executed": "sparse", the success as 0 and 1; "dense",
             Meta-World's own, at most 10; "cost", -0.01 a step and 0 at success; or "dense_cost", what the dense reward
-            lacks of 10, through -100, and 0 at success. Rows that come later are given the same reward as they come.
+            lacks of 10, divided by -100, and 0 at success. :meth:`extend` gives its rows the same reward.
         after_success: drop the steps that come more than so many after the first success; None keeps all.
         terminate_on_success: end each episode at its first success, with ``("next", "terminated")``, as
             ``LanguageWorldEnv(terminate_on_success=True)`` does; with label="executed".
-        n_steps: how many steps ``("next", ...)`` lies ahead; see :class:`JoinedStorage`. It never crosses the end of
-            an episode, that of ``after_success`` included.
-        gamma: the discount of the rewards on the way, for ``n_steps`` of 2 or more; the loss must have the same.
-        grow: rows of a part that :meth:`extend` writes to, beside the demonstrations; see :class:`GrowingStorage`. The
-            oldest are overwritten. Samples then hold the columns that a collector gives too: the expert's actions, and
-            the other reward, are left out.
-        device: where the rows are kept and transforms work: None or "cpu" for the files, memory-mapped; or "cuda",
-            "cuda:1", "mps" or "auto", into whose memory all rows are copied once. Minibatches are the same everywhere.
-        check: whether to read the episodes that are shown through against their checksums, once in a process as long as
-            the files stay as they are; of more than 2 GiB so much, spread evenly. It takes one to three seconds a
-            gigabyte. :meth:`verify` reads all, and so does a trainer that goes on from a checkpoint.
+        n_steps: how many steps ``("next", ...)`` is ahead, within the episode that is shown; see
+            :class:`JoinedStorage`.
+        gamma: the discount of the rewards on the way, for ``n_steps`` of 2 or more; the loss must use the same.
+        grow: rows of a ring that :meth:`extend` writes to, whose oldest are overwritten; see :class:`GrowingStorage`.
+            Samples then leave out the expert's actions and the other reward, which a collector does not give.
+        device: where the rows are kept and transforms work: None or "cpu" for the files, memory-mapped; "cuda",
+            "cuda:1", "mps" or "auto" for a copy in its memory. Minibatches are the same everywhere.
+        check: whether to check the episodes that are shown against their checksums, once in a process while the files
+            stay the same; at most 2 GiB of them, spread evenly. It takes one to three seconds a gigabyte.
+            :meth:`verify` checks all, and so does a trainer that resumes from a checkpoint.
         **kwargs: for :class:`torchrl.data.TensorDictReplayBuffer`: generator, pin_memory, ...; prefetch, at most 1:
             several threads would draw in an order that differs from run to run.
 
@@ -127,11 +119,10 @@ class LanguageWorldExperienceReplay(RestorableReplay):
             others than the installed ones.
 
     Raises:
-        ValueError: a wrong argument; a task or an episode that the dataset does not hold; ``n_steps`` or ``grow``
-            without label="executed"; a transform that does nothing to samples, such as ``MultiStepTransform``, in place
-            of which there is ``n_steps``. From :meth:`extend`, with ``grow``: rows that do not fit the demonstrations,
-            or have another reward.
-        RuntimeError: :meth:`extend` without ``grow``; rows that are assigned to.
+        ValueError: a task or an episode that the dataset does not hold; ``n_steps`` or ``grow`` without
+            label="executed"; a transform that does nothing to samples, such as ``MultiStepTransform``, which
+            ``n_steps`` replaces. From :meth:`extend`: rows that do not fit the demonstrations, or have another reward.
+        RuntimeError: :meth:`extend` without ``grow``; an assignment to rows.
         FileNotFoundError: there is no such folder.
         DatasetError: (a ValueError) the dataset is half-written, damaged, or of another format or version.
 
@@ -169,15 +160,15 @@ class LanguageWorldExperienceReplay(RestorableReplay):
     ) -> None:
         check_n_steps(n_steps, gamma)
         check_transform(transform)
-        check_prefetch(kwargs.get("prefetch"))
+        if (prefetch := kwargs.get("prefetch") or 0) > 1:
+            raise ValueError(
+                f"prefetch must be None, 0 or 1, got {prefetch}: several threads draw the batches in an order that "
+                "differs from run to run"
+            )
         if (n_steps > 1 or grow is not None) and label != "executed":
             raise ValueError(f"n_steps and grow need label='executed', whose actions the rewards are of, got {label!r}")
         if grow is not None:
             check_growing(sampler, kwargs)
-        check_choice("label", label, LABELS)
-        check_choice("reward", reward, REWARDS)
-        if keep is not None and not isinstance(keep, EpisodeFilter):
-            raise TypeError(f"keep must be an EpisodeFilter, got {keep!r}")
         if batch_size is not None:
             check_int("batch_size", batch_size, minimum=1)
         if after_success is not None:
@@ -249,7 +240,7 @@ class LanguageWorldExperienceReplay(RestorableReplay):
             storage = storage if where == CPU else DeviceStorage(storage, where)
         else:
             storage = WholeStorage(parts[0] if kept[0] is None else parts[0][kept[0]])  # the second is in memory
-        kwargs.setdefault("collate_fn", _as_it_is)
+        kwargs.setdefault("collate_fn", _identity)
         writer: Writer = ImmutableDatasetWriter() if grow is None else GrowingWriter()
         self.root = self.roots[0]
         self._fingerprint = fingerprint(shown, after_success, terminate_on_success)
@@ -257,18 +248,13 @@ class LanguageWorldExperienceReplay(RestorableReplay):
         self.label, self.reward, self.terminate_on_success = label, reward, terminate_on_success
         self._grows = grow is not None
         super().__init__(
-            storage=storage,
-            sampler=sampler,
-            writer=writer,
-            batch_size=batch_size,
-            transform=transform,
-            **kwargs,
+            storage=storage, sampler=sampler, writer=writer, batch_size=batch_size, transform=transform, **kwargs
         )
 
     def set_sampler(self, sampler: Sampler) -> Sampler:
         """Take another sampler, which draws from the buffer's generator; returns the one before.
 
-        In one of several workers of a DataLoader, where all have copies of the generator, it waits for ``set_rng``.
+        In a worker of a DataLoader it gets no generator until ``set_rng``, since all workers have copies of one.
         """
         if self._grows:
             check_growing(sampler, {})
@@ -292,7 +278,7 @@ class LanguageWorldExperienceReplay(RestorableReplay):
         return super().insert_transform(index, transform, invert=invert)
 
     def share(self, shared: bool = True) -> LanguageWorldExperienceReplay:
-        """Let other processes read it; a buffer that grows refuses."""
+        """Let other processes read it; with ``grow``, a RuntimeError."""
         if shared and self._grows:
             raise RuntimeError(
                 "a buffer that grows is of one process: let the collector yield its batches, and extend the buffer "
@@ -301,18 +287,17 @@ class LanguageWorldExperienceReplay(RestorableReplay):
         return super().share(shared)
 
     def add_column(self, name: str, values: Tensor, *, of: LanguageWorldExperienceReplay | None = None) -> None:
-        """Give each row a number of its own, held in memory, that samples then have: its advantage, say.
+        """Give samples a new column, held in memory: each row's advantage, say.
 
         Args:
             name: of the column, a new one.
-            values: (R, ...), for each row in the order of ``replay[:]``; a copy is kept where the rows are.
-            of: the buffer that they were made of, where that is another one, looking n steps ahead say: it must show
-                the same rows in the same order. A filter by return shows other episodes by another reward.
+            values: (R, ...), for each row in the order of ``replay[:]``; a copy is kept on the device of the rows.
+            of: the buffer that the values were computed from, if it is another one, with n steps say. It must show the
+                same rows in the same order, and so the same episodes where a filter keeps some by their return.
 
         Raises:
-            ValueError: another number of rows, a name that samples have, or a buffer that grows, whose later rows would
-                have none; or ``of`` shows other rows.
-            TypeError: ``name`` is no text, or ``values`` is no tensor.
+            ValueError: another number of rows, a name that samples have, or ``of`` shows other rows; or, with ``grow``,
+                since later rows would have no value.
         """
         if self._grows:
             raise ValueError(f"add_column: {name!r} would be of no row that comes later, and this buffer grows")
@@ -332,11 +317,7 @@ class LanguageWorldExperienceReplay(RestorableReplay):
 
     @property
     def data_path_root(self) -> Path:
-        """The dataset's folder.
-
-        Raises:
-            ValueError: there are several; see ``roots``.
-        """
+        """The dataset's folder; ValueError if there are several, see ``roots``."""
         if len(self.roots) > 1:
             raise ValueError(f"this buffer joins {len(self.roots)} datasets, so it has no one folder; see its roots")
         return self.roots[0]

@@ -1,4 +1,4 @@
-"""What a replay buffer of demonstrations refuses, since it would go wrong without a word."""
+"""What a replay buffer of demonstrations refuses, since it would go wrong silently."""
 
 from __future__ import annotations
 
@@ -19,35 +19,30 @@ from lw_torchrl.data.dataset import Demonstrations
 from lw_torchrl.data.rewards import REWARDS, RewardName, check_reward
 from lw_torchrl.language.value_checks import finite
 
-_OF_SAMPLERS = ("index", "is_target")  # what samples have beside rows
-
-
+_OF_SAMPLERS = ("index", "is_target")  # keys of samples that are no columns
 _ELSEWHERE = ("inv", "_inv_call", "_inv_apply_transform", "_call", "_step", "_reset")
 """What a transform overrides that acts on rows as they are written, or in an environment."""
 
 
-class _Looked(Exception):
+class _Accessed(Exception):
     pass
 
 
 def _refusal(transform: Transform) -> str | None:
-    """Why a transform is of no use to samples; None for one whose forward looks at them.
-
-    Its forward is given what is no sample, but notes that somebody looks at it.
-    """
+    """Why a transform is of no use to samples; None for one whose forward accesses a stand-in for a sample."""
     if all(getattr(type(transform), name) is getattr(Transform, name) for name in _ELSEWHERE):
-        return None  # a forward of its own alone, which may count samples, say: it is not called for a trial
-    looked: list[str] = []
+        return None  # it has only a forward, which may count samples, say: it is not called for a trial
+    accessed: list[str] = []
 
     class Sample:
         def __getattribute__(self, name: str) -> Any:
-            looked.append(name)
-            raise _Looked
+            accessed.append(name)
+            raise _Accessed
 
     try:
         inspect.unwrap(type(transform).forward)(transform, Sample())
-    except (RuntimeError, ValueError) as error:  # of those that work in an environment alone
-        return None if looked else f"refuses samples ({str(error) or 'it works in an environment alone'})"
+    except (RuntimeError, ValueError) as error:  # of those that only work in an environment
+        return None if accessed else f"refuses samples ({str(error) or 'it only works in an environment'})"
     except Exception:  # it is no sample
         return None
     return (
@@ -71,17 +66,8 @@ def check_transform(transform: Any) -> None:
         raise ValueError(f"transform: {type(transform).__name__} {why}; {instead}")
 
 
-def check_prefetch(batches: int | None) -> None:
-    """Raise where several threads would draw batches in an order that differs from run to run."""
-    if (batches or 0) > 1:
-        raise ValueError(
-            f"prefetch must be None, 0 or 1, got {batches}: several threads draw the batches in an order that differs "
-            "from run to run"
-        )
-
-
 def check_label(label: str, parts: Sequence[Demonstrations]) -> None:
-    """Raise :class:`ValueError` where an expert's actions are asked for, and another one acted."""
+    """Raise :class:`ValueError` if an expert's actions are asked for, and another one acted."""
     others = sorted({part.config.behaviour for part in parts if part.config.policy.kind != "expert"})
     if others and label != "executed":
         raise ValueError(
@@ -90,7 +76,7 @@ def check_label(label: str, parts: Sequence[Demonstrations]) -> None:
 
 
 def check_apart(roots: Sequence[Path]) -> None:
-    """Raise :class:`ValueError` where two of the folders are one, whose rows would come twice."""
+    """Raise :class:`ValueError` if two of the folders are one, whose rows would come twice."""
     first: dict[Path, Path] = {}
     for root in roots:
         if (before := first.setdefault(root.resolve(), root)) is not root:
@@ -101,7 +87,7 @@ def check_apart(roots: Sequence[Path]) -> None:
 
 
 def check_behaviours(parts: Sequence[Demonstrations]) -> None:
-    """Raise :class:`ValueError` where one label stands for two behaviours."""
+    """Raise :class:`ValueError` if one label stands for two behaviours."""
     first: dict[str, Demonstrations] = {}
     for part in parts:
         label, policy = part.config.behaviour, part.config.policy
@@ -114,7 +100,7 @@ def check_behaviours(parts: Sequence[Demonstrations]) -> None:
 
 
 def warn_of_simulators(parts: Sequence[Demonstrations], grows: bool) -> None:
-    """Warn where episodes of different simulators come together, those to come among them where the buffer grows."""
+    """Warn if episodes of different simulators come together; with ``grows``, the installed one among them."""
     made = [(repr(str(part.root)), part.versions) for part in parts]
     made += [("the rows to come", package_versions())] if grows else []
     for name in SIMULATORS:
@@ -132,7 +118,7 @@ def warn_of_simulators(parts: Sequence[Demonstrations], grows: bool) -> None:
 
 
 def check_growing(sampler: Any, options: Mapping[str, Any]) -> None:
-    """Raise for what a buffer that grows cannot do, or would do wrong without a word."""
+    """Raise for what a buffer that grows cannot do, or would do wrong silently."""
     if options.get("prefetch"):
         raise ValueError(f"prefetch={options['prefetch']} draws batches before the newest rows come: leave it out")
     if options.get("shared"):
@@ -145,7 +131,7 @@ def check_growing(sampler: Any, options: Mapping[str, Any]) -> None:
 
 
 def check_rows(reward: RewardName, terminate_on_success: bool, rows: Mapping[NestedKey, Tensor]) -> None:
-    """Raise where rows have another reward, or other ends, than the demonstrations that they are to stand beside."""
+    """Raise if rows have another reward, or other ends, than the demonstrations."""
     success = rows["next", "success"]
     check_reward(reward, rows["next", "reward"], success)
     if not torch.equal(rows["next", "terminated"], success & terminate_on_success):
@@ -166,7 +152,7 @@ def admit_rows(
 
 
 def check_column(name: Any, values: Any, rows: int, there: Iterable[str], transform: Transform) -> None:
-    """Raise unless ``values`` can be a new column of so many rows, beside those that are there or come to samples."""
+    """Raise unless ``values`` can be a new column of so many rows, beside those that are ``there``."""
     if not isinstance(name, str) or not isinstance(values, Tensor):
         raise TypeError(f"add_column takes a name and a tensor, got {type(name).__name__} and {type(values).__name__}")
     written = {key for part in transform.modules() if isinstance(part, Transform) for key in part.out_keys or ()}

@@ -1,14 +1,16 @@
-"""The rewards that stored and collected rows are shown with: made of the simulator's, before n steps are summed."""
+"""The rewards that rows are shown with, and their discounted sums over n steps."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
+
+from lw_torchrl._checks import check_int, check_probability
 
 RewardName = Literal["sparse", "dense", "cost", "dense_cost"]
 
@@ -32,7 +34,7 @@ class Reward:
 
     @property
     def is_source(self) -> bool:
-        """Whether it is what the environment gives."""
+        """Whether it is the environment's own reward."""
         return (self.shift, self.scale, self.at_success) == (0.0, 1.0, None)
 
     def of(self, source: Tensor, success: Tensor) -> Tensor:
@@ -52,15 +54,13 @@ REWARDS: Mapping[RewardName, Reward] = MappingProxyType(
     }
 )
 """By name: the success as 0 and 1; Meta-World's own, at most 10; a cost of 0.01 a step, none at success; what the dense
-reward lacks of 10, as a cost of at most about 0.1 a step, none at success. Costs want episodes that end at success
-(``terminate_on_success``): a return of 0 is then the best there is, and "stay short of the goal" earns nothing."""
+reward lacks of 10, as a cost of at most about 0.1 a step, none at success. Costs need episodes that end at success
+(``terminate_on_success``): then the best return is 0, and staying short of the goal earns nothing."""
 
 
 def check_reward(name: RewardName, reward: Tensor, success: Tensor) -> None:
-    """Raise :class:`ValueError` where rows (R, 1) plainly have another reward than the one named.
-
-    A dense reward of several steps, from ``frame_skip``, shows where it is over 10.
-    """
+    """Raise :class:`ValueError` if rows (R, 1) plainly have another reward than the one named; one of several steps,
+    from ``frame_skip``, shows where it is over 10."""
     stated = REWARDS[name]
     sparse = success.to(torch.float32)
     if stated.source == "sparse":
@@ -81,3 +81,39 @@ def check_reward(name: RewardName, reward: Tensor, success: Tensor) -> None:
         )
     if stated.at_success is not None and (reward[success] != stated.at_success).any():
         raise ValueError(f"batch: the reward of a success must be {stated.at_success} for {name!r}")
+
+
+STEPS = "steps_to_next_obs"
+"""The column that says how many steps lie between ``observation`` and ``("next", "observation")``; TorchRL's name."""
+
+
+def check_n_steps(n_steps: Any, gamma: Any) -> tuple[int, float]:
+    """Both, if they go together: more than one step needs the discount."""
+    number = check_int("n_steps", n_steps, minimum=1)
+    if number == 1:
+        if gamma is not None:
+            raise ValueError(f"gamma belongs to n_steps of 2 or more, got gamma={gamma!r} with n_steps=1")
+        return 1, 1.0
+    if gamma is None:
+        raise ValueError(f"n_steps={number} needs gamma, the discount that the loss has too")
+    if not (discount := check_probability("gamma", gamma)):
+        raise ValueError("gamma must be above 0, got 0")
+    return number, discount
+
+
+def last_rows(end: Tensor, n_steps: int) -> Tensor:
+    """The row in which ``n_steps`` steps from each row end: (R,) int64, at most the last of its trajectory, where
+    ``end``, (R,) bool, is true."""
+    rows = torch.arange(len(end))
+    ends = torch.where(end, rows, max(len(end) - 1, 0))
+    return torch.minimum(rows + n_steps - 1, ends.flip(0).cummin(0).values.flip(0))
+
+
+def sum_rewards(reward: Tensor, last: Tensor, gamma: float, n_steps: int) -> Tensor:
+    """The discounted reward from each row to ``last``: (R, 1), summed in the order of time."""
+    total = reward.clone()
+    rows = torch.arange(len(reward))
+    for ahead in range(1, n_steps):
+        inside = (rows + ahead <= last).nonzero().flatten()
+        total[inside] += gamma**ahead * reward[inside + ahead]
+    return total

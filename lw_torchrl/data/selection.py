@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
@@ -10,13 +10,105 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from lw_torchrl._checks import check_int, unknown_name
+from lw_torchrl._checks import check_fields, check_int, check_probability, check_text, unknown_name
 from lw_torchrl.data.dataset import CollectConfig, DamagedDatasetError, Demonstrations, EpisodeInfo
-from lw_torchrl.data.filters import episode_returns
+from lw_torchrl.data.memory_map import load_rows
 from lw_torchrl.data.rewards import REWARDS, RewardName
-from lw_torchrl.data.rows import load_rows
 from lw_torchrl.data.storage import DEMONSTRATION, TRAJECTORY
 from lw_torchrl.language.value_checks import finite
+
+_Listed = tuple[int, int, str, float, int]  # part, number in it, task, return, rows
+
+
+@dataclass(frozen=True)
+class EpisodeFilter:
+    """Which episodes to keep: those that meet every condition given.
+
+    An episode's return is the sum of the requested ``("next", "reward")`` over the rows that are shown of it.
+
+    Attributes:
+        success: keep those that succeeded at some step, or, if False, those that did not.
+        least_return: keep those with at least this return.
+        best: the fraction of each task's episodes to keep, those of the highest return, the shorter at a tie; of those
+            that meet the other conditions, and at least one.
+        behaviours: keep those of these labels, "spoilt-30" say.
+        else_best: for a task without an episode that meets the conditions, the fraction of all its episodes to keep,
+            chosen as for ``best``; None for an error.
+
+    Example:
+        >>> EpisodeFilter(success=True, behaviours=("expert", "noisy")).best is None
+        True
+    """
+
+    success: bool | None = None
+    least_return: float | None = None
+    best: float | None = None
+    behaviours: tuple[str, ...] | None = None
+    else_best: float | None = None
+
+    def __post_init__(self) -> None:
+        check_fields(self, "keep: ")
+        for name in ("best", "else_best"):
+            if (part := getattr(self, name)) is not None and not check_probability(f"keep: {name}", part):
+                raise ValueError(f"keep: {name} must be above 0, got 0")
+        if self.behaviours is None:
+            return
+        if isinstance(self.behaviours, str) or not isinstance(self.behaviours, Iterable):
+            raise TypeError(f"keep: behaviours must be a tuple of labels, got {self.behaviours!r}")
+        object.__setattr__(self, "behaviours", tuple(self.behaviours))
+        for label in self.behaviours:
+            check_text("keep: behaviours", label)
+        if not self.behaviours:
+            raise ValueError("keep: behaviours must hold at least one label, got none")
+
+    def choose(self, parts: Sequence[Demonstrations], returns: Sequence[Tensor]) -> list[Demonstrations]:
+        """The parts with the episodes that are kept, by the return and the rows of each, (E, 2) float64 a part."""
+        labels = {part.config.behaviour for part in parts}
+        for label in self.behaviours or ():
+            if label not in labels:
+                raise unknown_name("keep: behaviours", label, sorted(labels))
+        listed = [
+            (part, number, episode.task, float(earned), int(rows))
+            for part, (described, found) in enumerate(zip(parts, returns, strict=True))
+            for number, (episode, (earned, rows)) in enumerate(zip(described.episodes, found.tolist(), strict=True))
+        ]
+        chosen = []
+        for task in sorted({row[2] for row in listed}):
+            ours = [row for row in listed if row[2] == task]
+            left = [row for row in ours if self._keeps(parts[row[0]], row[1], row[3])]
+            if not left and self.else_best is not None:
+                chosen += _best(ours, self.else_best)
+            else:
+                chosen += left if self.best is None else _best(left, self.best)
+        kept = {(part, number) for part, number, *_ in chosen}
+        if lost := sorted({row[2] for row in listed} - {row[2] for row in chosen}):
+            raise ValueError(f"keep: {self} leaves no episode of {', '.join(lost)}")
+        return [
+            replace(part, episodes=tuple(e for number, e in enumerate(part.episodes) if (place, number) in kept))
+            for place, part in enumerate(parts)
+        ]
+
+    def _keeps(self, part: Demonstrations, number: int, earned: float) -> bool:
+        return (
+            (self.success is None or part.episodes[number].success == self.success)
+            and (self.least_return is None or earned >= self.least_return)
+            and (self.behaviours is None or part.config.behaviour in self.behaviours)
+        )
+
+
+def _best(listed: list[_Listed], part: float) -> list[_Listed]:
+    """This fraction of a task's episodes, by return and then length; at least one."""
+    ours = sorted(listed, key=lambda row: (-row[3], row[4], row[0], row[1]))
+    return ours[: max(1, round(part * len(ours)))]
+
+
+def episode_returns(reward: Tensor, lengths: Sequence[int]) -> Tensor:
+    """The return and the number of rows of consecutive episodes: (E, 2) float64, of rewards (R, 1) float32."""
+    rows = torch.tensor(lengths, dtype=torch.int64)
+    total = torch.zeros(len(rows), dtype=torch.float64)
+    total.index_add_(0, torch.repeat_interleave(rows), reward.reshape(-1).double())
+    return torch.stack((total, rows.double()), -1)
+
 
 Label = Literal["expert", "unclipped", "executed"]
 LABELS = get_args(Label)
@@ -24,19 +116,8 @@ EpisodeChoice = int | Mapping[str, int | Sequence[int]] | None
 """All episodes; the first so many of each task; or, for each task to take, the first so many or these."""
 
 
-def _first(argument: str, task: str, there: list[int], number: int) -> list[int]:
-    if check_int(argument, number, minimum=1) > len(there):
-        raise ValueError(f"{argument}: the dataset has {len(there)} episodes of {task!r}, got {number}")
-    return there[:number]
-
-
 def choose_episodes(found: Demonstrations, chosen: EpisodeChoice, argument: str = "episodes") -> Demonstrations:
-    """A dataset's description with the chosen episodes alone, in the dataset's order.
-
-    Raises:
-        ValueError: a task or an episode that the dataset does not hold, an episode twice, none at all.
-        TypeError: something that chooses no episodes.
-    """
+    """A dataset's description with only the chosen episodes, in the dataset's order."""
     if chosen is None:
         return found
     there: dict[str, list[int]] = {}
@@ -57,7 +138,9 @@ def choose_episodes(found: Demonstrations, chosen: EpisodeChoice, argument: str 
             raise unknown_name(f"{argument}: task", task, there)
         place = f"{argument}[{task!r}]"
         if hasattr(some, "__index__"):
-            numbers = _first(place, task, there[task], some)  # type: ignore[arg-type]
+            if (number := check_int(place, some, minimum=1)) > len(there[task]):
+                raise ValueError(f"{place}: the dataset has {len(there[task])} episodes of {task!r}, got {number}")
+            numbers = there[task][:number]
         elif isinstance(some, Sequence) and not isinstance(some, str):
             numbers = [check_int(place, number) for number in some]
         else:
@@ -92,8 +175,7 @@ def _kept(episodes: Sequence[EpisodeInfo], after: int | None) -> tuple[Tensor, T
 
 
 def returns_of(whole: Demonstrations, chosen: Demonstrations, reward: RewardName, after: int | None) -> Tensor:
-    """The return and the number of rows of each chosen episode, up to ``after`` steps past its first success: (E, 2)
-    float64."""
+    """The return and the number of rows, (E, 2) float64, of the chosen episodes up to ``after`` steps past success."""
     rows, (kept, _) = load_rows(whole), _kept(chosen.episodes, after)
     made = REWARDS[reward]
     source, success = (rows.get(("next", key))[kept] for key in (f"reward_{made.source}", "success"))
@@ -113,12 +195,9 @@ def read_part(
 ) -> tuple[TensorDictBase, Tensor | None]:
     """All rows of a dataset, memory-mapped, and which of them to show: (n,) int64, None for all.
 
-    What differs from the files is held in memory, one number a row: the ends of episodes that are cut short, which are
-    ``terminated`` where ``terminate_on_success`` asks for it, a reward that is not on disk, ``first_trajectory`` added
-    to the trajectories' ids, and the number ``behaviour``.
-
-    Raises:
-        DatasetError: (a ValueError) as for :func:`load_rows`; or an action is NaN or infinite.
+    Columns that differ from the files are in memory, one number a row: the ends of episodes that are cut short, which
+    are ``terminated`` with ``terminate_on_success``; a reward that is not on disk; the trajectories' ids plus
+    ``first_trajectory``; and the number ``behaviour``.
     """
     rows = load_rows(whole)
     if label == "executed":
@@ -182,7 +261,7 @@ class JoinedDemonstrations:
 
     @property
     def episodes(self) -> tuple[EpisodeInfo, ...]:
-        """The episodes in the order of the rows; ``start`` and ``length`` are those in their own dataset."""
+        """The episodes in the order of the rows; ``start`` and ``length`` are as in their own dataset."""
         return tuple(episode for part in self.parts for episode in part.episodes)
 
     @property

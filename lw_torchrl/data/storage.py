@@ -13,12 +13,13 @@ from tensordict import NestedKey, TensorDict, TensorDictBase, is_leaf_nontensor
 from torch import Tensor
 from torchrl.data.replay_buffers.storages import Storage
 
+from lw_torchrl._devices import CPU
 from lw_torchrl._files import read_json, reading, write_json
-from lw_torchrl.data.n_steps import STEPS, check_n_steps, last_rows, sum_rewards
+from lw_torchrl.data.rewards import STEPS, check_n_steps, last_rows, sum_rewards
 
 TRAJECTORY, REWARD, DONE = ("collector", "traj_ids"), ("next", "reward"), ("next", "done")
 DEMONSTRATION = "is_demonstration"
-"""The column that says which rows are a dataset's, and which ones a buffer was extended with."""
+"""The column that is true of a dataset's rows, and false of those that a buffer was extended with."""
 _MAX_RUNS = 4  # runs of one part in a batch, for each part, up to which they are read one after another
 
 
@@ -28,7 +29,7 @@ def column_name(key: NestedKey) -> str:
 
 
 def _columns(parts: Sequence[TensorDictBase]) -> dict[NestedKey, list[Tensor]]:
-    """The leaves of each column; all parts must have the same ones."""
+    """The leaves of each column, which must agree in all parts."""
     columns: dict[NestedKey, list[Tensor]] = {}
     for number, part in enumerate(parts):
         if part.batch_dims != 1:
@@ -64,29 +65,26 @@ def _nested(columns: Mapping[NestedKey, Tensor], shape: Sequence[int], device: t
 
 
 class JoinedStorage(Storage):
-    """Rows of several tensordicts, memory-mapped ones say, behind one index; reading a batch copies that batch alone.
+    """Rows of several tensordicts, memory-mapped ones say, behind one index; only the batch that is read is copied.
 
-    The rows come in the order of the parts, and within a part in the order of ``rows``. Nothing can be written, and
-    its state is its length: whoever restores a buffer opens the same data again. A replay buffer over it wants
-    ``collate_fn=lambda batch: batch``; :class:`LanguageWorldExperienceReplay` sees to that.
+    The rows come in the order of the parts, and within a part in the order of ``rows``. The storage is read-only, and
+    its state is its length. A replay buffer over it needs ``collate_fn=lambda batch: batch``;
+    :class:`LanguageWorldExperienceReplay` sets that.
 
-    With ``n_steps``, what is under ``"next"`` is that of the row so many steps ahead, or of the trajectory's last where
-    that comes before: observation, done, terminated and truncated belong together. ``("next", "reward")`` is the
-    discounted sum on the way, and ``steps_to_next_obs``, (B,) int64, the number of steps, which TorchRL's value
-    estimators read. In memory that takes three numbers a row.
+    With ``n_steps``, the entries under ``"next"`` are those of the row so many steps ahead, or of the trajectory's last
+    row if that comes before. ``("next", "reward")`` is the discounted sum on the way, and ``steps_to_next_obs``, (B,)
+    int64, the number of steps, which TorchRL's value estimators read. This takes three numbers a row in memory.
 
     Args:
         parts: P tensordicts of one batch dimension and the same columns (names, dtypes, shapes of a row).
-        rows: for each part the rows to take, (n,) int64, or None for all; None for all of all.
+        rows: for each part the rows to take, (n,) int64, or None for all; None for all of all parts.
         n_steps: steps to ``("next", ...)``; 2 or more need the columns ("next", "reward"), (n, 1), ("next", "done") and
             ("collector", "traj_ids").
-        gamma: the discount of the rewards on the way, in (0, 1]; the loss must have the same.
+        gamma: the discount of the rewards on the way, in (0, 1]; the loss must use the same.
 
     Raises:
-        ValueError: no parts, columns that differ, not as many ``rows`` as parts, ``n_steps`` without ``gamma`` or
-            without a column that it needs.
+        ValueError: the parts' columns differ, or a column that ``n_steps`` needs is missing.
         IndexError: a row outside its part.
-        TypeError: a column is no tensor.
         RuntimeError: at an attempt to write.
 
     Example:
@@ -97,7 +95,7 @@ class JoinedStorage(Storage):
         >>> storage[:]["x"].tolist(), storage[[5, 0]]["x"].tolist()
         ([0, 1, 2, 3, 70, 71], [71, 0])
 
-    Source: ``torchrl.data.StorageEnsemble``, which joins storages for samplers that name the storage with each index.
+    Source: ``torchrl.data.StorageEnsemble``, whose samplers name a storage with each index.
     """
 
     def __init__(
@@ -131,13 +129,13 @@ class JoinedStorage(Storage):
         self._rows = torch.cat(taken)
         self.num_joined, self.num_parts = len(self._rows), len(parts)
         self._batch_device = parts[0].device
-        self._places: Tensor | None = None  # of all rows, where a row says more than its part's columns
+        self._places: Tensor | None = None  # of all rows, where rows have more columns than the parts
         super().__init__(max_size=len(self._rows))
         if self.n_steps > 1:
             self._look_ahead()
 
     def _look_ahead(self) -> None:
-        """Note where each row's steps end, and what they earn."""
+        """Note where each row's n steps end, and their discounted reward."""
         if absent := [column_name(key) for key in (REWARD, DONE, TRAJECTORY) if key not in self._columns]:
             raise ValueError(f"n_steps={self.n_steps} needs the columns {', '.join(absent)}, which parts do not have")
         found = self._gather(self._rows, [REWARD, DONE, TRAJECTORY])
@@ -154,15 +152,11 @@ class JoinedStorage(Storage):
         return self.num_joined
 
     def part(self) -> Tensor:
-        """The number of the part that each row is from: (R,) int64, from 0."""
+        """The index of each row's part: (R,) int64."""
         return torch.bucketize(self._rows[: len(self)], self._ends, right=True)
 
     def column(self, key: NestedKey, index: Tensor | None = None) -> Tensor:
-        """One column of all rows, (R, ...), or of those at ``index``, (n,) int64.
-
-        Raises:
-            KeyError: there is no such column.
-        """
+        """One column of all rows, (R, ...), or of those at ``index``, (n,) int64."""
         if key not in self.keys():
             raise KeyError(f"no column {column_name(key)}; there are {', '.join(map(column_name, self.keys()))}")
         return self._read(torch.arange(len(self)) if index is None else index, [key])[key]
@@ -229,7 +223,7 @@ class JoinedStorage(Storage):
         return _nested(found, rows.shape, self._batch_device)
 
     def contains(self, item: Any) -> Any:
-        """Whether an index, or each of a tensor of indices, names a row."""
+        """Whether an index, or each of a tensor of indices, is one of a row."""
         if isinstance(item, Tensor):
             return (item >= -len(self)) & (item < len(self))
         return -len(self) <= item < len(self)
@@ -268,17 +262,54 @@ class JoinedStorage(Storage):
 
 
 class WholeStorage(JoinedStorage):
-    """A :class:`JoinedStorage` of all rows of one tensordict, of which a slice is not copied.
-
-    Whoever writes to a slice changes what later batches hold.
-    """
+    """A :class:`JoinedStorage` of all rows of one tensordict, whose slices are views: a write to one changes later
+    batches."""
 
     def __init__(self, rows: TensorDictBase) -> None:
         super().__init__([rows])
 
     def get(self, index: Any) -> TensorDict:
-        """The rows at an index, as for :class:`JoinedStorage`; of a slice, where they lie."""
+        """The rows at an index, as for :class:`JoinedStorage`; of a slice, views."""
         if not isinstance(index, slice):
             return super().get(index)
         found = {key: leaf[index] for key, (leaf,) in self._columns.items()}
         return _nested(found, self._rows[index].shape, self._batch_device)
+
+
+def device_of_rows(storage: Storage) -> torch.device:
+    """The device of a storage's rows; the CPU for a storage that does not say."""
+    said = getattr(storage, "device", None)
+    return CPU if said in (None, "auto") else torch.device(said)
+
+
+def to_device_of(storage: Storage, index: Tensor) -> Tensor:
+    """``index``, drawn on the CPU, on the device of the rows, in a copy that does not block."""
+    device = device_of_rows(storage)
+    return index if device.type == "cpu" else index.to(device, non_blocking=True)
+
+
+class DeviceStorage(JoinedStorage):
+    """The rows of a :class:`JoinedStorage`, copied once to a device's memory.
+
+    Samplers draw on the CPU, with the buffer's generator, so minibatches are the same on every device.
+
+    Attributes:
+        device: of the rows.
+
+    Source: ``torchrl.data.LazyTensorStorage(device=...)``, whose samplers need a generator of the device.
+    """
+
+    def __init__(self, storage: JoinedStorage, device: torch.device) -> None:
+        rows: TensorDictBase = storage.get(slice(None))
+        super().__init__([rows.to(device)])
+        self._part = storage.part()
+        self._rows = self._rows.to(device)
+        self.device = device
+
+    def part(self) -> Tensor:
+        """The index of each row's part: (R,) int64, on the CPU."""
+        return self._part
+
+    def _rand_given_ndim(self, batch_size: int) -> Tensor:
+        """Uniform rows, (B,) int64: the ones that are drawn on the CPU."""
+        return to_device_of(self, torch.randint(0, len(self), (batch_size,), generator=self._rng))

@@ -1,45 +1,92 @@
-"""Which of a collector's rows follow one another, and numbers for their trajectories that are nobody else's."""
+"""The rows that a growing buffer stores: checked, and linked to trajectories."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
-from tensordict import NestedKey
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
+
+from lw_torchrl.data.rewards import STEPS
+from lw_torchrl.data.storage import TRAJECTORY, column_name
+from lw_torchrl.language.value_checks import finite
+
+EXECUTED = ("next", "executed_action")
+MASK = ("collector", "mask")
+
+
+def collected_rows(batch: TensorDictBase, columns: Mapping[NestedKey, Tensor]) -> dict[NestedKey, Tensor]:
+    """The ``columns`` of a collector's batch (n, ...), flattened to one dimension.
+
+    ``action`` is ``("next", "executed_action")`` where the batch has that; a policy's own may be outside [-1, 1].
+
+    Raises:
+        ValueError: a column is missing, or of another dtype or shape; a number is NaN or infinite; an action is outside
+            [-1, 1]; rows are of n steps already, or padding, by ``("collector", "mask")``.
+    """
+    names = set(batch.keys(True, True))
+    if STEPS in names:
+        raise ValueError(
+            f"batch holds {STEPS}, so MultiStep or MultiStepTransform was here: leave it out and give the buffer "
+            "n_steps= and gamma=, which makes n steps of the demonstrations and of these rows alike"
+        )
+    if MASK in names and not batch.get(MASK).all():
+        raise ValueError(
+            "batch holds rows that are no steps: split_trajs=True fills trajectories up to one length; leave it out, "
+            "or give batch[batch['collector', 'mask']]"
+        )
+    sources = {key: EXECUTED if key == "action" and EXECUTED in names else key for key in columns}
+    if absent := [column_name(key) for key, source in sources.items() if source not in names]:
+        raise ValueError(f"batch lacks the columns {', '.join(absent)}, which the demonstrations have")
+    found = {}
+    for key, like in columns.items():
+        leaf = batch.get(sources[key])
+        tail = leaf.shape[batch.ndim :]
+        if leaf.dtype != like.dtype or tail != like.shape[1:]:
+            raise ValueError(
+                f"batch: column {column_name(sources[key])} must be {like.dtype} of shape {tuple(like.shape[1:])} a "
+                f"row as in the demonstrations, got {leaf.dtype} of shape {tuple(tail)}"
+            )
+        if leaf.dtype.is_floating_point and not leaf.isfinite().all():
+            raise ValueError(f"batch: column {column_name(sources[key])} holds NaN or an infinite number")
+        found[key] = leaf.detach().reshape(-1, *tail)
+    if sources.get("action") == "action" and (most := float(found["action"].abs().max())) > 1.0:
+        raise ValueError(
+            f"batch: action must be what was done, in [-1, 1], got one of {most:.3g}; LanguageWorldEnv gives it as "
+            "('next', 'executed_action'), which is taken where it is there"
+        )
+    return found
+
 
 Columns = Mapping[NestedKey, Tensor]
 
 
 @dataclass(frozen=True)
-class Open:
-    """Trajectories whose last row so far was not their end, one entry each, in the order of those rows.
-
-    Attributes:
-        key: the collector's id, (K,) int64.
-        number: ours.
-        last: the serial number of the last row.
-    """
+class OpenTrajectories:
+    """Trajectories that have not ended, in the order of their last rows: the collector's id of each, ours, and the
+    serial number of the last row, (K,) int64 each."""
 
     key: Tensor
     number: Tensor
     last: Tensor
 
     @classmethod
-    def none(cls) -> Open:
+    def none(cls) -> OpenTrajectories:
         return cls(*(torch.empty(0, dtype=torch.int64) for _ in range(3)))
 
 
 def shared_keys(columns: Iterable[NestedKey]) -> dict[NestedKey, NestedKey]:
-    """The columns that a row has twice: as it was, and under "next" as it became."""
+    """The columns that a row has twice: for the step, and under "next" for the one after."""
     names = list(columns)
     pairs = {key: ("next", key) if isinstance(key, str) else ("next", *key) for key in names}
     return {key: later for key, later in pairs.items() if later in names}
 
 
-def _goes_on(was: Columns, before: Tensor, now: Columns, after: Tensor) -> Tensor:
-    """Whether what the rows ``before`` of ``was`` became is what the rows ``after`` of ``now`` are."""
+def _continues(was: Columns, before: Tensor, now: Columns, after: Tensor) -> Tensor:
+    """Whether the "next" of the rows ``before`` of ``was`` equals the rows ``after`` of ``now``."""
     equal = [
         (was[later][before] == now[key][after]).unsqueeze(-1).flatten(1).all(1)
         for key, later in shared_keys(now).items()
@@ -48,7 +95,7 @@ def _goes_on(was: Columns, before: Tensor, now: Columns, after: Tensor) -> Tenso
 
 
 def _match(start: Tensor, candidate: Tensor, starts: int, candidates: int) -> Tensor:
-    """The candidate of each start, -1 for none: the newest, and each once."""
+    """The candidate of each start, -1 for none: the newest, each used once."""
     found = torch.full((starts,), -1).scatter_reduce_(0, start, candidate, "amax")
     mine = (found >= 0).nonzero().flatten()
     owner = torch.full((candidates,), starts).scatter_reduce_(0, found[mine], mine, "amin")
@@ -56,36 +103,39 @@ def _match(start: Tensor, candidate: Tensor, starts: int, candidates: int) -> Te
     return found
 
 
-def follow(
-    key: Tensor, done: Tensor, batch: Columns, opened: Open, ring: Columns, slots: Tensor, *, serial: int, number: int
-) -> tuple[Tensor, Tensor, Open]:
+def link_rows(
+    key: Tensor,
+    done: Tensor,
+    batch: Columns,
+    opened: OpenTrajectories,
+    ring: Columns,
+    slots: Tensor,
+    *,
+    serial: int,
+    number: int,
+) -> tuple[Tensor, Tensor, OpenTrajectories]:
     """The row before each, and the number of its trajectory.
 
-    A row follows another if both have the same ``key``, the other is not ``done``, and what it became is bit for bit
-    what this one was. Otherwise a trajectory begins: a collector was reset, or another one counts from 0 as well.
+    A row follows another if both have the same ``key``, the other is not ``done``, and its "next" is bit for bit this
+    row. Otherwise a trajectory begins: a collector was reset, or another one counts from 0 as well.
 
     Args:
         key: the collector's ids, (n,) int64; rows of the same key are in the order of time.
-        done: (n,) bool.
-        batch: the columns of the rows.
-        opened: the trajectories that may go on.
-        ring: columns in which their last rows are.
-        slots: where, (K,) int64.
-        serial: the serial number of the first row.
-        number: of the next trajectory.
+        done, batch: the rows, (n,) bool and the columns.
+        opened: the trajectories that may continue, whose last rows are in ``ring`` at ``slots``, (K,) int64.
+        serial, number: of the first row, and of the next trajectory.
 
     Returns:
-        previous: the serial number of the row before, (n,) int64, -1 where a trajectory begins.
-        numbers: (n,) int64.
-        opened: the trajectories that may go on from here.
+        The serial number of the row before each, (n,) int64, -1 where a trajectory begins; each trajectory's number,
+        (n,) int64; and the trajectories that may continue.
     """
     order = key.argsort(stable=True)
     one, next_one = order[:-1], order[1:]
     first = torch.ones(len(key), dtype=torch.bool)
-    first[1:] = (key[one] != key[next_one]) | done[one] | ~_goes_on(batch, one, batch, next_one)
+    first[1:] = (key[one] != key[next_one]) | done[one] | ~_continues(batch, one, batch, next_one)
     starts = order[first]
     start, candidate = (key[starts][:, None] == opened.key).nonzero(as_tuple=True)
-    going = _goes_on(ring, slots[candidate], batch, starts[start])
+    going = _continues(ring, slots[candidate], batch, starts[start])
     match = _match(start[going], candidate[going], len(starts), len(opened.key))
 
     new = match < 0
@@ -103,4 +153,48 @@ def follow(
     stay[match[~new]] = False
     kept = (opened.key[stay], opened.number[stay], opened.last[stay])
     added = (key[ends], numbers[ends], serial + ends)
-    return previous, numbers, Open(*(torch.cat(pair) for pair in zip(kept, added, strict=True)))
+    return previous, numbers, OpenTrajectories(*(torch.cat(pair) for pair in zip(kept, added, strict=True)))
+
+
+def check_grown_state(
+    state: Mapping[str, Any], grow: int, ring: Mapping[NestedKey, Tensor]
+) -> tuple[int, int, dict[NestedKey, Tensor], OpenTrajectories]:
+    """Count, next number, rows and open trajectories of a growing storage's state, if they fit the ring."""
+
+    def require(holds: bool, name: str, wanted: str) -> None:
+        if not holds:
+            raise ValueError(f"state_dict: {name} must be {wanted}")
+
+    require(state.get("grow") == grow, "grow", f"{grow}, as this buffer's")
+    count, number = state.get("count"), state.get("number")
+    require(type(count) is int and 0 <= count < 2**62, "count", "a number of rows")
+    require(type(number) is int and 0 <= number < 2**62, "number", "a trajectory's number")
+    assert isinstance(count, int)
+    assert isinstance(number, int)
+    there = min(count, grow)
+    given = state.get("rows")
+    names = {column_name(key): key for key in ring}
+    require(isinstance(given, Mapping) and set(given) == set(names), "rows", f"the columns {', '.join(names)}")
+    rows = {}
+    for name, key in names.items():
+        leaf, like = given[name], ring[key]  # type: ignore[index]
+        fits = isinstance(leaf, Tensor) and leaf.dtype == like.dtype and leaf.shape == (there, *like.shape[1:])
+        require(fits, f"rows[{name!r}]", f"{like.dtype} of shape {(there, *like.shape[1:])}")
+        if leaf.dtype.is_floating_point:
+            require(finite(leaf), f"rows[{name!r}]", "finite numbers")
+        rows[key] = leaf
+    if "action" in rows:
+        require(bool((rows["action"].abs() <= 1).all()), "rows['action']", "in [-1, 1]")
+    require(bool((rows[TRAJECTORY] < number).all()), f"rows[{column_name(TRAJECTORY)!r}]", f"below {number}")
+    given = state.get("open")
+    require(isinstance(given, Mapping) and set(given) == {"key", "number", "last"}, "open", "key, number and last")
+    parts = [given[name] for name in ("key", "number", "last")]  # type: ignore[index]
+    for part in parts:
+        fits = isinstance(part, Tensor) and part.dtype == torch.int64 and part.shape == parts[0].shape[:1]
+        require(fits, "open", "(K,) int64 each")
+    opened = OpenTrajectories(*(part.clone() for part in parts))
+    inside = (opened.last >= count - there) & (opened.last < count)
+    require(bool(inside.all()) and len(opened.last.unique()) == len(opened.last), "open", "of rows that are there")
+    numbers = rows[TRAJECTORY].reshape(-1)[opened.last - (count - there)]
+    require(torch.equal(opened.number, numbers), "open", "of these rows' trajectories")
+    return count, number, rows, opened

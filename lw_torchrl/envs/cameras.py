@@ -20,7 +20,7 @@ _LOOKS = (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION)  #
 
 
 def _open_gl() -> Any:
-    """A context of OpenGL without a window; without a display and MUJOCO_GL, of EGL."""
+    """A context of OpenGL without a window; of EGL without a display and MUJOCO_GL."""
     headless = sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
     if headless and not os.environ.get("MUJOCO_GL"):
         before = os.environ.get("PYOPENGL_PLATFORM")
@@ -42,26 +42,17 @@ def _no_open_gl(error: Exception) -> ImportError:
     )
 
 
-def _let_go(context: Any) -> None:
-    """Let another thread take the context, where EGL draws."""
-    if type(context).__module__ == "mujoco.egl":
-        from OpenGL import EGL  # type: ignore[import-untyped]
-
-        EGL.eglReleaseThread()
-
-
 _open: WeakSet[Cameras] = WeakSet()
-_processes: set[int] = set()  # that opened OpenGL, this one and those it was forked from
+_processes: set[int] = set()  # that opened OpenGL: this one and those it was forked from
 
 
 def _close_all() -> None:
-    """Before the platform's own end, after which freeing a context is an error."""
     for cameras in list(_open):
         cameras.close()
 
 
 class Cameras:
-    """Takes pictures; a model's meshes and textures are loaded at its first. One thread at a time, which may be any.
+    """Takes pictures, in any thread but one at a time; a model's meshes and textures are loaded at its first picture.
 
     Raises:
         ImportError: there is no OpenGL, at once or with the first picture.
@@ -80,25 +71,22 @@ class Cameras:
             raise _no_open_gl(error) from error
         if not _open:
             atexit.unregister(_close_all)
-            atexit.register(_close_all)  # after the platform's, so that it runs first
+            atexit.register(_close_all)  # before the platform ends, after which freeing a context is an error
         _open.add(self)
         _processes.add(os.getpid())
         self._loaded: dict[str, tuple[Any, Any]] = {}
 
     def picture(self, scene: str, model: Any, data: Any, *, camera: str, height: int, width: int) -> NDArray[np.uint8]:
-        """One picture, (height, width, 3) uint8, the first line on top.
-
-        Args:
-            scene: a name that models of the same meshes and textures share.
-            model, data: the state, which stays as it is.
-            camera: one of ``_rendering.CAMERAS``.
-            height, width: pixels.
-        """
+        """One picture of a state, (height, width, 3) uint8, the first line on top; models with the same meshes share
+        the name of a ``scene``."""
         self._gl.make_current()
         try:
             return self._picture(scene, model, data, camera, height, width)
         finally:
-            _let_go(self._gl)
+            if type(self._gl).__module__ == "mujoco.egl":  # another thread may take the context
+                from OpenGL import EGL  # type: ignore[import-untyped]
+
+                EGL.eglReleaseThread()
 
     def _picture(self, scene: str, model: Any, data: Any, camera: str, height: int, width: int) -> NDArray[np.uint8]:
         if scene not in self._loaded:

@@ -1,7 +1,7 @@
 """The engine interface: what :class:`~lw_torchrl.envs.LanguageWorldEnv` asks of a simulator.
 
-An engine holds N rows, each of one task for life, and knows nothing of TorchRL. It works in Meta-World's own
-numbers (float64 observations); the environment above converts, counts steps and truncates.
+An engine holds N rows, each of a fixed task, and does not use TorchRL. Its numbers are Meta-World's own (float64
+observations); the environment converts them, counts steps and truncates.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ __all__ = ["ACTION_SIZE", "OBSERVATION_SIZE", "BodyPoses", "Engine", "EngineStep
 
 
 class EngineStep(NamedTuple):
-    """What one step of all rows gave. Every array is the caller's to keep: an engine returns fresh ones.
+    """The result of one step of all rows, in fresh arrays.
 
     Attributes:
         observation: (N, 39) float64, Meta-World's vector (metres; gripper opening in [0, 1]; quaternions).
         reward: (N,) float64; Meta-World's dense reward, or the success as 0 and 1.
         success: (N,) bool, Meta-World's success at this step.
-        fault: (N,) bool, true where the simulation became unstable; such a row repeats its last stable
-            observation and wants a reset.
+        fault: (N,) bool, true where the simulation became unstable; such a row repeats its last stable observation
+            until it is reset.
 
     Rows that were not active repeat their last observation, with reward 0, success False and fault False.
     """
@@ -40,19 +40,12 @@ class Engine(Protocol):
     """Simulates N rows of Meta-World tasks."""
 
     def reset(self, rows: Sequence[int], seeds: Sequence[int]) -> NDArray[np.float64]:
-        """Start an episode in each of ``rows``, as ``env.seed(seed); env.reset()`` of Meta-World's own
-        environment does, whatever the row did before.
-
-        Returns:
-            (len(rows), 39) float64, the first observations.
-        """
+        """Start an episode in each of ``rows``, as Meta-World's own ``env.seed(seed); env.reset()`` does, whatever the
+        row did before; returns the first observations, (len(rows), 39) float64."""
         ...
 
     def step(self, action: NDArray[np.float32], active: NDArray[np.bool_]) -> EngineStep:
-        """Step the rows where ``active`` (N, bool) with ``action`` (N, 4), each number in [-1, 1].
-
-        The arithmetic is done in the action's own precision, as Meta-World's is.
-        """
+        """Step the rows where ``active`` (N, bool) with ``action`` (N, 4) in [-1, 1], in the action's own precision."""
         ...
 
     def close(self) -> None:
@@ -61,7 +54,7 @@ class Engine(Protocol):
 
 
 class Pictured(Engine, Protocol):
-    """An engine that can also be looked at, as ``LanguageWorldEnv.render`` wants it."""
+    """An engine that also takes pictures, for ``LanguageWorldEnv.render``."""
 
     def render(self, rows: Sequence[int], *, camera: str, height: int, width: int) -> NDArray[np.uint8]:
         """Pictures of the rows as they are now: (len(rows), height, width, 3) uint8, the first line on top."""
@@ -69,7 +62,7 @@ class Pictured(Engine, Protocol):
 
 
 class RowModel(NamedTuple):
-    """The compiled MuJoCo model of a row, to be looked at.
+    """The compiled MuJoCo model of a row, to read.
 
     Attributes:
         path: its XML file; models of one file have the same geoms and meshes.
@@ -81,10 +74,10 @@ class RowModel(NamedTuple):
 
 
 class BodyPoses(NamedTuple):
-    """Where the bodies of a row are; the arrays are the caller's to keep.
+    """Where the bodies of a row are, in fresh arrays.
 
     Attributes:
-        position: (bodies, 3) float64, metres, of the world.
+        position: (bodies, 3) float64, metres, in the world's frame.
         quaternion: (bodies, 4) float64, w first.
     """
 
@@ -93,12 +86,12 @@ class BodyPoses(NamedTuple):
 
 
 class Posed(Engine, Protocol):
-    """An engine whose bodies can be read, as recordings of the scene want it."""
+    """An engine whose bodies can be read, for recordings of the scene."""
 
     def model(self, row: int) -> RowModel:
         """The model of a row."""
         ...
 
     def poses(self, row: int) -> BodyPoses:
-        """Where the bodies of a row are now, those that stand still too."""
+        """Where all bodies of a row are now."""
         ...

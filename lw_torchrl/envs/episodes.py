@@ -1,4 +1,4 @@
-"""Running exactly the episodes one asks for, on however many rows there are: what collecting and evaluating share."""
+"""Running exactly the requested episodes, on any number of rows: what collecting and evaluating share."""
 
 from __future__ import annotations
 
@@ -20,13 +20,7 @@ from lw_torchrl.envs.seeding import action_noise
 
 
 class FinishedEpisode(NamedTuple):
-    """One finished episode.
-
-    Attributes:
-        task: the task's name.
-        episode: its index.
-        steps: TensorDict of batch (T,) with the recorded keys.
-    """
+    """One finished episode: the task's name, the episode's index, and the recorded keys of its steps, batch (T,)."""
 
     task: str
     episode: int
@@ -34,16 +28,14 @@ class FinishedEpisode(NamedTuple):
 
     @property
     def first_success(self) -> int | None:
-        """The first successful step, counted from 1; None without success. It wants ("next", "success") recorded."""
+        """The first successful step, from 1; None without success. It needs ("next", "success") recorded."""
         hits = self.steps.get(("next", "success")).flatten().nonzero().flatten()
         return int(hits[0]) + 1 if len(hits) else None
 
 
 def policy_of(actor: Any, device: str | torch.device | None = None) -> Callable[[TensorDictBase], TensorDictBase]:
-    """The actor as episodes are run with it, on a device, or where it is; what it reads goes there and comes back.
-
-    Networks are run on blocks of rows, so that rows do not feel one another.
-    """
+    """The actor as episodes are run with it, on a device, or where it is. Networks run on blocks of rows of one size,
+    so that no row depends on the others."""
     there = place(actor, device)
     policy = actor if getattr(actor, "row_by_row", False) else in_blocks(actor)
     if there == CPU:
@@ -61,13 +53,6 @@ def read_action(tensordict: TensorDictBase) -> Tensor:
             f"the actor's action must be float32 of shape {shape}, got {action.dtype} of shape {tuple(action.shape)}"
         )
     return action
-
-
-def _base(env: EnvBase) -> LanguageWorldEnv:
-    base = env.base_env if isinstance(env, TransformedEnv) else env
-    if not isinstance(base, LanguageWorldEnv):
-        raise TypeError(f"env must be a LanguageWorldEnv or a TransformedEnv of one, got {type(base).__name__}")
-    return base
 
 
 def run_episodes(
@@ -92,19 +77,17 @@ def run_episodes(
         policy: called on all N rows, with a ``_step`` mask of those that count.
         episodes: task name to episode indices; one that is listed several times is run as often.
         keys: what to record of each step, ``("next", "success")`` say; ``action`` is the executed one.
-        noise: episode index to the four standard deviations of the noise added to the action, from the same
-            (task, seed, episode) as the episode itself; None for none.
-        noise_hold: the steps for which each draw of the noise is kept.
+        noise: episode index to the four standard deviations of the noise added to the action, drawn from the
+            episode's (task, seed, episode); None for none.
+        noise_hold: steps for which each draw of the noise is kept.
         after_success: end an episode so many steps after its first successful one; None for never.
-        clean_action: where to write the action before the noise.
-        place: where to write, for the policy, which in its task's list the episode of each row is, (N,) int64.
-        on_progress: told after each step how many more of all the steps are done with; what an early stop saves
-            counts as done.
-
-    Yields:
-        Every episode, in the order in which they finish.
+        clean_action: the key for the action before the noise.
+        place: the key for the place of each row's episode in its task's list, (N,) int64, for the policy to read.
+        on_progress: called after each step with the number of steps done, with those that an early end saves.
     """
-    base = _base(env)
+    base = env.base_env if isinstance(env, TransformedEnv) else env
+    if not isinstance(base, LanguageWorldEnv):
+        raise TypeError(f"env must be a LanguageWorldEnv or a TransformedEnv of one, got {type(base).__name__}")
     rows = len(base.row_tasks)
     waiting = {task: deque(enumerate(listed)) for task, listed in episodes.items()}
     if unknown := set(waiting) - set(base.tasks):
@@ -118,7 +101,7 @@ def run_episodes(
     buffers: TensorDictBase | None = None
     state: TensorDictBase = env.full_done_spec.zero()
     idle = torch.ones(rows, dtype=torch.bool)
-    fresh = True  # no row was reset yet; policies look at the task of a row without work too
+    fresh = True  # no row was reset yet; policies read the task of idle rows too
     while True:
         starting = torch.zeros(rows, dtype=torch.bool)
         for row in torch.nonzero(idle).flatten().tolist():
@@ -145,7 +128,7 @@ def run_episodes(
         if noise is not None:
             now = noises[np.arange(rows), np.minimum(steps, base.max_steps - 1)]
             action = (action + torch.from_numpy(now)).clamp(-1.0, 1.0)
-        # Rows at rest keep a harmless action: theirs is computed from a state that may be stale.
+        # Idle rows get a harmless action: theirs is computed from a state that may be stale.
         state.set("action", torch.where(active.unsqueeze(-1), action, 0.0))
         state.set("_step", active)
         state = env.step(state)

@@ -25,12 +25,12 @@ class ExpertActor(TensorDictModuleBase):
     """Meta-World's scripted policy of each row's task.
 
     Reads ``observation`` (B, 39) float32 and ``task_id`` (B,) int64; writes ``action`` (B, 4) float32, clipped to
-    [-1, 1], and ``unclipped_action`` (B, 4) float32, what the script asked for, far more as a rule. Rows that a
+    [-1, 1], and ``unclipped_action`` (B, 4) float32, what the script asked for, usually far more. Rows that a
     ``_step`` mask (B,) leaves out get zeros.
 
     Args:
         tasks: the tasks it must know, as for :func:`resolve_tasks`.
-        in_keys, out_keys: other names for what it reads and writes, in the order above; nested ones too.
+        in_keys, out_keys: other names for these keys, in the order above; nested ones too.
 
     Raises:
         ValueError: an unknown task, or at call time a task_id outside ``tasks``.

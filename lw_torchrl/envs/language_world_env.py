@@ -14,41 +14,47 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl._utils import seed_generator
+from torchrl.data import Unbounded
 from torchrl.envs import EnvBase
 
-from lw_torchrl._checks import check_choice, check_int, checked
+from lw_torchrl._checks import check_int, checked
 from lw_torchrl._rendering import check_picture
 from lw_torchrl.envs.engine import ACTION_SIZE, Engine
 from lw_torchrl.envs.engines import make_engine
-from lw_torchrl.envs.episode_counter import EpisodeCounter, check_worker, stated_episode
-from lw_torchrl.envs.one_thread import OneThread, alone
-from lw_torchrl.envs.row_states import RowStates
-from lw_torchrl.envs.specs import action_spec, clipped_action, done_spec, observation_spec, reward_spec, row_mask
-from lw_torchrl.envs.workers import torchrl_worker
+from lw_torchrl.envs.row_states import (
+    RowStates,
+    action_spec,
+    clipped_action,
+    done_spec,
+    observation_spec,
+    row_mask,
+)
+from lw_torchrl.envs.seeding import EpisodeCounter, check_worker, stated_episode
+from lw_torchrl.envs.workers import OneThread, one_thread_at_a_time, torchrl_worker
 from lw_torchrl.language.tasks import Task, named_tasks
 
 
 class LanguageWorldEnv(EnvBase):
     """N environments over any mixture of the 50 tasks, stepped together, by the MT50-rand protocol: a random
-    initial state and goal at every reset, the goal observed, 500 steps, ended by truncation alone.
+    initial state and goal at every reset, the goal observed, 500 steps, ended only by truncation.
 
-    Row i keeps the task ``tasks[i % n]`` for life. The m-th reset of the r-th of a task's R rows is that task's
-    episode m·R + r. An episode starts as Meta-World's own environment does after
-    ``env.seed(episode_seed(task, seed, episode)); env.reset()``, whatever ran before or beside it.
+    Row i has the task ``tasks[i % n]``. The m-th reset of the r-th of a task's R rows is that task's episode m·R + r.
+    An episode starts as Meta-World's own environment does after ``env.seed(episode_seed(task, seed, episode));
+    env.reset()``, whatever ran before or beside it.
 
-    ``env.reset(episode=7)`` or ``env.reset(episode=tensor)``, int64 (N,), asks for episodes; that counts as a reset
-    too. A SerialEnv or ParallelEnv takes ``reset(list_of_kwargs=[{"episode": ...}, ...])``. The ``episode`` in a
-    tensordict is an output, which a reset ignores. ``reset(tensordict, set_state=True)`` goes to the beginning of the
-    tensordict's ``episode``; it refuses an ``observation`` that is not the first, since physics in the middle of an
-    episode cannot be restored, and it does not reach through a TransformedEnv, which hands down no outputs.
+    ``env.reset(episode=7)`` or ``env.reset(episode=tensor)``, int64 (N,), starts these episodes and counts as a reset.
+    A SerialEnv or ParallelEnv takes ``reset(list_of_kwargs=[{"episode": ...}, ...])``. A reset ignores the ``episode``
+    in a tensordict, unless ``reset(tensordict, set_state=True)`` asks for its beginning; an ``observation`` that is not
+    the episode's first is refused, since the middle of an episode cannot be restored. ``set_state`` does not reach
+    through a TransformedEnv, which hands down no outputs.
 
-    In the w-th of W workers the m-th reset is episode (m·W + w)·R + r: W workers run what one environment of W·R rows
-    would. TorchRL's SerialEnv, ParallelEnv, AsyncEnvPool and multi-process collectors are recognised where they call
-    the function that makes the environment; for anything else (Ray, RPC, processes of your own) say ``worker=(w, W)``,
-    or give each another seed.
+    In the w-th of W workers the m-th reset is episode (m·W + w)·R + r: W workers run the episodes of one environment
+    with W·R rows. TorchRL's SerialEnv, ParallelEnv, AsyncEnvPool and multi-process collectors are recognised when they
+    call the function that makes the environment; elsewhere (Ray, RPC, your own processes) give ``worker=(w, W)``, or
+    another seed to each.
 
-    ``state_dict`` holds the seed and the counters, so that one which loads it goes on with the next episodes; it must
-    be reset first. A TransformedEnv, and a Collector with it, saves it by its
+    ``state_dict`` holds the seed and the counters; an environment that loads it must be reset, and continues with the
+    next episodes. A TransformedEnv, and a Collector with it, saves it by its
     :class:`~lw_torchrl.transforms.QAFTransform` or :class:`~lw_torchrl.transforms.EnvState`; call
     ``collector.reset()`` after ``collector.load_state_dict``.
 
@@ -59,9 +65,9 @@ class LanguageWorldEnv(EnvBase):
         success: (N, 1) bool, Meta-World's success at this step.
         fault: (N, 1) bool, the row was truncated because its action was NaN or its simulation became unstable.
         action: (N, 4) float32, end-effector displacement xyz and gripper effort, each in [-1, 1]. The environment never
-            writes it: a policy's numbers out of range stay as they were sampled, so that their likelihood stays true.
-        executed_action: (N, 4) float32 in [-1, 1], what was done in the step that led here: the action, clipped as
-            Meta-World does. Zeros after a reset, and for a row that was not stepped.
+            writes it: a policy's numbers out of range keep their likelihood.
+        executed_action: (N, 4) float32 in [-1, 1], the action of the step that led here, clipped as Meta-World does.
+            Zeros after a reset, and for a row that was not stepped.
         reward: (N, 1) float32; done, terminated, truncated: (N, 1) bool; terminated stays false unless
             ``terminate_on_success``.
 
@@ -77,19 +83,18 @@ class LanguageWorldEnv(EnvBase):
         num_threads: of the simulation, by default the cores this process may use; never changes a result.
         reward: "sparse", the success as 0 and 1, or "dense", Meta-World's own.
         max_steps: steps of the simulation until truncation.
-        frame_skip: how many steps of the simulation an action lasts; their rewards are added up, and success is that of
-            any of them.
+        frame_skip: steps of the simulation for each action; their rewards are added, and any may succeed.
         terminate_on_success: end an episode at its first success, with ``terminated``.
         strict: raise on a NaN action, instead of truncating the row with a warning as for an unstable simulation.
-        worker: (w, W), which of how many environments like this one it is; None asks TorchRL.
-        batch_size: () for a single environment without the dimension of rows, as AsyncEnvPool wants it.
+        worker: (w, W), the index of this one of W environments; None asks TorchRL.
+        batch_size: () for a single environment without the dimension of rows, for AsyncEnvPool.
 
     Raises:
         ValueError: an unknown task or engine, ``num_envs`` under the number of tasks, or a wrong ``episode``.
         RuntimeError: a step of a row that has ended; a reset or step in a forked process that did not make it, or while
             another thread is in one, or draws.
         TypeError: it is pickled or copied; pass the function that makes it.
-        ImportError: a rendering library named by MUJOCO_GL is absent, or the vectorized engine does not know the
+        ImportError: a rendering library named by MUJOCO_GL is missing, or the vectorized engine does not know the
             installed version of Meta-World or MuJoCo.
 
     Example:
@@ -128,7 +133,6 @@ class LanguageWorldEnv(EnvBase):
         num_envs = n if num_envs is None else check_int("num_envs", num_envs, minimum=1)
         if num_envs < n:
             raise ValueError(f"num_envs must be at least the number of tasks, {n}, got {num_envs}")
-        check_choice("reward", reward, ("sparse", "dense"))
         if num_threads is not None:
             check_int("num_threads", num_threads, minimum=1)
         self.max_steps = check_int("max_steps", max_steps, minimum=1)
@@ -151,13 +155,13 @@ class LanguageWorldEnv(EnvBase):
         which = ... if batch_size is None else 0
         self.observation_spec = observation_spec(self._rows.task_id)[which]
         self.action_spec = action_spec(num_envs)[which]
-        self.reward_spec = reward_spec(num_envs)[which]
+        self.reward_spec = Unbounded((num_envs, 1))[which]
         self.done_spec = done_spec(num_envs)[which]
         self._engine = make_engine(engine, self.row_tasks, reward=reward, num_threads=num_threads)
         self.is_closed = False  # EnvBase starts with True
 
     def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
-        """Begin at episode 0, of another seed if one is given, any integer; returns the seed for a next environment."""
+        """Begin at episode 0, with another seed if one is given; returns the seed for the next environment."""
         self._set_seed(seed)
         return seed if seed is None or static_seed else seed_generator(abs(seed))
 
@@ -172,7 +176,7 @@ class LanguageWorldEnv(EnvBase):
 
     @property
     def engine(self) -> Engine:
-        """The simulator of the rows, to look at: what steps or resets it behind the environment's back breaks both."""
+        """The simulator of the rows, to read only: do not step or reset it."""
         return self._engine
 
     @property
@@ -191,7 +195,7 @@ class LanguageWorldEnv(EnvBase):
             self._rows.over[:] = True
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
-        """Take seed and episode counters from another's ``state_dict()``, and want a reset.
+        """Take seed and episode counters from another's ``state_dict()``, and require a reset.
 
         Raises:
             ValueError: the state is of other tasks or rows; with ``strict``, there is none.
@@ -218,7 +222,7 @@ class LanguageWorldEnv(EnvBase):
                 "make the environment in this process (give ParallelEnv or a collector a function that makes it)"
             )
 
-    @alone
+    @one_thread_at_a_time
     def _reset(
         self, tensordict: TensorDictBase | None = None, *, episode: int | Tensor | None = None, set_state: bool = False
     ) -> TensorDict:
@@ -236,7 +240,7 @@ class LanguageWorldEnv(EnvBase):
     def _shown(self, rows: TensorDict) -> TensorDict:
         return rows if self.batch_size else rows[0]
 
-    @alone
+    @one_thread_at_a_time
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         action = clipped_action(tensordict, self.batch_size).cpu().numpy().reshape(-1, ACTION_SIZE)
         active = row_mask(tensordict, "_step", len(self.row_tasks))
@@ -289,16 +293,16 @@ class LanguageWorldEnv(EnvBase):
         self._rows.fault |= rows
         warnings.warn(f"{message}; the row is truncated and flagged, the others go on", stacklevel=4)
 
-    @alone
+    @one_thread_at_a_time
     def render(
         self, *, camera: str = "corner2", height: int = 240, width: int = 320, rows: Sequence[int] | None = None
     ) -> Tensor:
         """Pictures of rows as they are now, for TorchRL's PixelRenderTransform and VideoRecorder, and
         :class:`CameraTransform`.
 
-        They are drawn by OpenGL, without shadows; on Linux without a display and MUJOCO_GL it is EGL. A picture changes
-        nothing in the simulation. A PixelRenderTransform does: ask for its environment's ``observation_spec`` before
-        the first reset, or the first step resets it.
+        OpenGL draws them, without shadows; on Linux without a display and MUJOCO_GL it is EGL. A picture changes
+        nothing in the simulation. With a PixelRenderTransform, read the environment's ``observation_spec`` before the
+        first reset; otherwise the first step resets it.
 
         Args:
             camera: "corner2", "corner", "corner3", "corner4", "topview", "behindGripper" or "gripperPOV".
@@ -312,7 +316,7 @@ class LanguageWorldEnv(EnvBase):
             ValueError: an unknown camera or size, or no such row.
             RuntimeError: a row that was never reset; or the process was forked from one that took pictures.
             ImportError: there is no OpenGL; it names what to install.
-            NotImplementedError: the engine is one of your own and has no ``render``.
+            NotImplementedError: your own engine has no ``render``.
 
         Example:
             >>> env = LanguageWorldEnv("reach")
@@ -335,11 +339,7 @@ class LanguageWorldEnv(EnvBase):
         return pictures if self.batch_size else pictures[0]
 
     def close(self, *, raise_if_closed: bool = True) -> None:
-        """Free the simulators, behind the last step of another thread.
-
-        Raises:
-            RuntimeError: another thread was still in the simulation after ten seconds.
-        """
+        """Free the simulators; RuntimeError if another thread is still in one after ten seconds."""
         with self._last_one:
             if not self.is_closed:
                 self._engine.close()

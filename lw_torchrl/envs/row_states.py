@@ -1,35 +1,122 @@
-"""What an environment knows of each of its rows."""
+"""The specs of LanguageWorldEnv, and the state of each of its rows."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.data import Bounded, Categorical, Composite, Unbounded
 
 from lw_torchrl.envs.engine import ACTION_SIZE, OBSERVATION_SIZE
-from lw_torchrl.language.tasks import task_id
+from lw_torchrl.language.tasks import MT50, task_id
+
+
+class TaskIds(Categorical):
+    """Each row's task: a Categorical of n whose zero is the row's own id, (N,) int64, so that policies can act on
+    ``fake_tensordict()``, which is of zeros: they may not know the task of id 0."""
+
+    ids: Tensor | None = None
+
+    def __init__(self, n: int, ids: Tensor | None = None, **options: Any) -> None:
+        super().__init__(n, **({} if ids is None else {"shape": ids.shape, "dtype": ids.dtype}), **options)
+        self.ids = ids
+
+    def zero(self, shape: torch.Size | None = None) -> Tensor:
+        """The rows' ids, with the dimensions of ``shape`` in front."""
+        if self.ids is None:
+            return super().zero(shape)
+        return self.ids.expand((*(shape or ()), *self.shape)).clone()
+
+    def _with(self, made: TaskIds, ids: Callable[[Tensor], Tensor]) -> TaskIds:
+        made.ids = None if self.ids is None else ids(self.ids)
+        return made
+
+    def expand(self, *shape: Any) -> TaskIds:
+        made = super().expand(*shape)
+        return self._with(made, lambda ids: ids.expand(made.shape))
+
+    def _reshape(self, shape: Any) -> TaskIds:
+        return self._with(super()._reshape(shape), lambda ids: ids.reshape(shape))
+
+    def _unflatten(self, dim: int, sizes: Any) -> TaskIds:
+        return self._with(super()._unflatten(dim, sizes), lambda ids: ids.unflatten(dim, sizes))
+
+    def squeeze(self, dim: int | None = None) -> TaskIds:
+        return self._with(super().squeeze(dim), lambda ids: ids.squeeze() if dim is None else ids.squeeze(dim))
+
+    def unsqueeze(self, dim: int) -> TaskIds:
+        return self._with(super().unsqueeze(dim), lambda ids: ids.unsqueeze(dim))
+
+    def to(self, dest: Any) -> TaskIds:
+        return self._with(super().to(dest), lambda ids: ids if isinstance(dest, torch.dtype) else ids.to(dest))
+
+    def clone(self) -> TaskIds:
+        return self._with(super().clone(), Tensor.clone)
+
+    def __getitem__(self, index: Any) -> TaskIds:
+        return self._with(super().__getitem__(index), lambda ids: ids[index])
+
+
+def observation_spec(task_id: Tensor) -> Composite:
+    """The outputs beside reward and done, of rows with these tasks, (N,) int64."""
+    n = len(task_id)
+    ids = len(MT50) if int(task_id.max()) < len(MT50) else 2**32  # a task of one's own has a hash
+    return Composite(
+        observation=Unbounded((n, OBSERVATION_SIZE)),
+        task_id=TaskIds(ids, task_id),
+        episode=Unbounded((n,), dtype=torch.int64),
+        success=_flag(n),
+        fault=_flag(n),
+        executed_action=action_spec(n),
+        shape=(n,),
+    )
+
+
+def action_spec(n: int) -> Bounded:
+    """The action of each of n rows."""
+    return Bounded(-1.0, 1.0, (n, ACTION_SIZE))
+
+
+def done_spec(n: int) -> Composite:
+    """How each of n rows may end."""
+    return Composite(done=_flag(n), terminated=_flag(n), truncated=_flag(n), shape=(n,))
+
+
+def _flag(n: int) -> Categorical:
+    return Categorical(2, shape=(n, 1), dtype=torch.bool)
+
+
+def row_mask(tensordict: TensorDictBase | None, key: str, n: int) -> np.ndarray:
+    """The rows of a mask such as "_reset", (n,) bool; all if there is none."""
+    mask = None if tensordict is None else tensordict.get(key, None)
+    if mask is None:
+        return np.ones(n, dtype=bool)
+    if mask.dtype != torch.bool or mask.numel() != n:
+        raise ValueError(f"{key} must be bool of shape ({n},) or ({n}, 1), got {mask.dtype} of {tuple(mask.shape)}")
+    return mask.reshape(n).cpu().numpy()
+
+
+def clipped_action(tensordict: TensorDictBase, batch_size: torch.Size) -> Tensor:
+    """The action as it is executed, (*batch_size, 4) float32 in [-1, 1]."""
+    action = tensordict.get("action", None)
+    if action is None or action.shape != (*batch_size, ACTION_SIZE) or action.dtype != torch.float32:
+        given = "none" if action is None else f"{action.dtype} of shape {tuple(action.shape)}"
+        raise ValueError(f"action must be float32 of shape {(*batch_size, ACTION_SIZE)}, got {given}")
+    return action.detach().clamp(-1.0, 1.0)
+
 
 Rows = NDArray[np.intp]
-Truth = NDArray[np.bool_]
+Mask = NDArray[np.bool_]
 
 
 class RowStates:
-    """The last observation of N rows, the episode and step that each is at, and how it stands.
-
-    Args:
-        tasks: the name of each row's task.
-
-    Attributes:
-        task_id: (N,) int64.
-        observation: (N, 39) float32.
-        episode: (N,) int64; -1 before the first reset.
-        steps: (N,) int64, of the simulation since the reset.
-        over, terminated, fault, success: (N,) bool; a row that was never reset is over.
-    """
+    """The last observation (N, 39) float32 of N rows; the episode, -1 before the first reset, and the steps since the
+    reset, (N,) int64; and the flags over, terminated, fault and success, (N,) bool. A row never reset is over."""
 
     def __init__(self, tasks: Sequence[str]) -> None:
         self.tasks = tasks
@@ -43,19 +130,14 @@ class RowStates:
         self.over[:] = True
 
     def begin(self, rows: Rows, episodes: NDArray[np.int64], observation: NDArray[np.float64]) -> None:
-        """Rows stand at the beginning of an episode."""
+        """Put rows at the beginning of an episode."""
         self.observation[rows] = observation
         self.episode[rows] = episodes
         self.steps[rows] = 0
         self._flags[:, rows] = False
 
     def as_tensordict(self, executed_action: NDArray[np.float32] | None = None, **more: Tensor) -> TensorDict:
-        """All of it as fresh tensors, N rows.
-
-        Args:
-            executed_action: (N, 4) float32; None for zeros.
-            more: what else there is to tell, (N, ...).
-        """
+        """All of it as fresh tensors, N rows, with ``executed_action`` (N, 4) float32, zeros for None, and ``more``."""
         n = len(self.tasks)
         over, terminated, fault, success = (torch.from_numpy(flag.copy()).unsqueeze(-1) for flag in self._flags)
         executed = torch.zeros(n, ACTION_SIZE) if executed_action is None else torch.from_numpy(executed_action)
@@ -77,7 +159,7 @@ class RowStates:
         )
 
     def refuse_other_tasks(self, tensordict: TensorDictBase, rows: Rows) -> None:
-        """Raise :class:`ValueError` where a state to go to is of other tasks."""
+        """Raise :class:`ValueError` if a state to go to is of other tasks."""
         given = tensordict.get("task_id", None)
         if given is not None and not torch.equal(given.cpu().reshape(-1)[rows], self.task_id[rows]):
             raise ValueError(
@@ -86,7 +168,7 @@ class RowStates:
             )
 
     def refuse_later_steps(self, tensordict: TensorDictBase, rows: Rows) -> None:
-        """Raise :class:`ValueError`, and want a reset, where a state to go to is not the first of its episode."""
+        """Raise :class:`ValueError`, and require a reset, if a state to go to is not the first of its episode."""
         wanted = tensordict.get("observation", None)
         if wanted is None:
             return

@@ -1,10 +1,19 @@
-"""Randomness that hangs on what it is for: (task, seed, episode), never on where or when it runs."""
+"""Which episode each row runs next, and the randomness of an episode, which depends only on (task, seed, episode)."""
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
+import json
+from collections.abc import Sequence
+from typing import Any
 
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from lw_torchrl._checks import check_int, shown
+from lw_torchrl._files import parse_json
 from lw_torchrl._seeding import episode_generator, episode_hash
 from lw_torchrl.language.tasks import Task
 
@@ -20,9 +29,6 @@ def episode_seed(task: str | Task, seed: int, episode: int) -> int:
     Returns:
         An integer in [0, 2**63), for Meta-World's ``env.seed``.
 
-    Raises:
-        ValueError: the task is unknown or the episode negative.
-
     Example:
         >>> episode_seed("reach", 0, 0) == episode_seed("reach", 0, 0)
         True
@@ -37,3 +43,108 @@ def action_noise(task: str | Task, seed: int, episode: int, steps: int, hold: in
     draw is kept for ``hold`` steps."""
     draws = episode_generator("noise", task, seed, episode).standard_normal((-(-steps // hold), 4), dtype=np.float32)
     return draws.repeat(hold, axis=0)[:steps]
+
+
+Rows = NDArray[np.intp]
+Episodes = NDArray[np.int64]
+_MOST_RESETS = 2**32  # of a row; with the workers and rows that there can be, its episodes fit into int64
+
+
+def check_worker(worker: Any) -> tuple[int, int]:
+    """Return ``worker`` as (rank, of), if 0 <= rank < of."""
+    if not isinstance(worker, Sequence) or isinstance(worker, str) or len(worker) != 2:
+        raise TypeError(f"worker must be a pair (rank, of), got {worker!r}")
+    of = check_int("worker's of", worker[1], minimum=1)
+    rank = check_int("worker's rank", worker[0], minimum=0)
+    if rank >= of:
+        raise ValueError(f"worker's rank must be under the number of workers, {of}, got {rank}")
+    return rank, of
+
+
+def stated_episode(tensordict: TensorDictBase | None, episode: int | Tensor | None) -> Tensor:
+    """The episode that ``reset(tensordict, set_state=True)`` goes to; ValueError without one, or with two."""
+    if episode is not None:
+        raise ValueError("episode and set_state=True each name an episode: give one of them")
+    if tensordict is None or (episode := tensordict.get("episode", None)) is None:
+        raise ValueError(
+            "set_state=True needs episode in the tensordict; a TransformedEnv does not hand it down: "
+            "reset(episode=tensordict['episode'])"
+        )
+    return episode
+
+
+class EpisodeCounter:
+    """The m-th reset of the r-th of a task's R rows in the w-th of W workers is episode (m·W + w)·R + r, so that W
+    environments of R rows run the episodes of one with W·R rows; ``worker`` is (w, W)."""
+
+    def __init__(self, tasks: Sequence[Task], seed: int, worker: tuple[int, int]) -> None:
+        self.tasks = tuple(tasks)
+        self.names = [task.name for task in tasks]
+        n = len(set(self.names))
+        self.seed = seed
+        self.resets = np.zeros(len(tasks), dtype=np.int64)
+        rows = np.arange(len(tasks))
+        self._rank, copies = rows // n, np.bincount(rows % n)[rows % n]
+        self._first, self._stride = worker[0] * copies + self._rank, worker[1] * copies
+
+    def start_again(self, seed: int | None) -> None:
+        """Begin at the first episode, of another seed if one is given."""
+        if seed is not None:
+            self.seed = check_int("seed", seed)
+        self.resets[:] = 0
+
+    def next(self, rows: Rows) -> Episodes:
+        """The episodes that come next in ``rows``."""
+        return (self.resets * self._stride + self._first)[rows]
+
+    def asked(self, episode: int | Tensor, rows: Rows) -> Episodes:
+        """The requested episodes of ``rows``, from one integer for all, or an int64 tensor (N,) with one for each."""
+        n = len(self.names)
+        if isinstance(episode, Tensor) and (
+            episode.shape not in ((), (n,)) or episode.dtype not in (torch.int64, torch.int32)
+        ):
+            raise ValueError(
+                f"episode must be an integer, or int64 of shape ({n},), one for each row, got {episode.dtype} of "
+                f"shape {tuple(episode.shape)}"
+            )
+        if not isinstance(episode, Tensor):
+            if check_int("episode", episode, minimum=0) >= 2**63:
+                raise ValueError(f"episode must be below 2**63, got {shown(episode)}")
+            episode = torch.tensor(episode)
+        found = episode.expand(n).cpu().numpy().astype(np.int64)[rows]
+        if (found < 0).any():
+            raise ValueError(f"episode must be at least 0, got {found.min()}")
+        return found
+
+    def seeds(self, rows: Rows, episodes: Episodes) -> list[int]:
+        """The simulator's seed of each row's episode."""
+        return [
+            episode_seed(self.tasks[row], self.seed, int(episode)) for row, episode in zip(rows, episodes, strict=True)
+        ]
+
+    def dump(self) -> Tensor:
+        """Tasks, seed and counters as JSON in a tensor (bytes,) uint8."""
+        state = {"tasks": self.names, "seed": self.seed, "resets": self.resets.tolist()}
+        return torch.frombuffer(bytearray(json.dumps(state).encode()), dtype=torch.uint8)
+
+    def load(self, dumped: Tensor) -> None:
+        """Take seed and counters of a :meth:`dump` with the same tasks in its rows."""
+        try:
+            state = parse_json(dumped.cpu().numpy().tobytes())
+            names, seed, resets = list(state["tasks"]), check_int("seed", state["seed"]), list(state["resets"])
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"state_dict is none of a LanguageWorldEnv: {error!r:.200}") from error
+        if names != self.names:
+            raise ValueError(
+                f"state_dict is of an environment with other rows, {len(names)}: {_few(names)}; this one has "
+                f"{len(self.names)}: {_few(self.names)}"
+            )
+        if len(resets) != len(names) or any(type(one) is not int or not 0 <= one < _MOST_RESETS for one in resets):
+            raise ValueError(
+                f"state_dict must count the resets of {len(names)} rows, below {_MOST_RESETS}, got {shown(resets)}"
+            )
+        self.seed, self.resets = seed, np.array(resets, dtype=np.int64)
+
+
+def _few(names: Sequence[str]) -> str:
+    return ", ".join(map(str, names[:6])) + (", ..." if len(names) > 6 else "")

@@ -1,19 +1,20 @@
-"""Which of TorchRL's workers an environment is made in: one factory, called in each, must not give the same episodes.
+"""Which of TorchRL's workers an environment is made in, and the lock that lets in one thread at a time.
 
-TorchRL tells a factory nothing of its worker. But the factory is called from within TorchRL's own functions, and these
-know: we look for them on the call stack, which needs no state and gives the same in every run.
+One factory, called in each worker, must not give the same episodes, but TorchRL tells it nothing of its worker. The
+TorchRL functions that call it know: they are found on the call stack, which needs no state.
 """
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping
+from functools import wraps
 from multiprocessing import current_process, parent_process
 from types import FrameType
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 MANY = 2**16
-"""Stands for the number of workers where TorchRL does not tell it: more than there are."""
+"""Stands for a number of workers that TorchRL does not tell: more than there are."""
 
 Locals = Mapping[str, Any]
 
@@ -30,7 +31,7 @@ def _threads(found: Locals) -> NoReturn:
 
 
 def _remote(found: Locals) -> tuple[int, int]:
-    """A RayCollector tells its collectors who they are; those of other collectors are counted by their process."""
+    """A RayCollector tells its collectors their index; those of other collectors are counted by their process."""
     index = found.get("worker_idx")
     return (0, 1) if index is None or parent_process() is not None else (index, MANY)
 
@@ -55,14 +56,11 @@ _WORKER_PROCESSES: dict[tuple[str, str], Callable[[Locals], tuple[int, int]]] = 
 
 
 def torchrl_worker() -> tuple[int, int]:
-    """(rank, of) of the worker that this is called in, (0, 1) where there is none.
+    """(rank, of) of the worker that this is called in, (0, 1) outside; a RuntimeError in a ThreadingAsyncEnvPool.
 
     Workers within workers are counted through. SerialEnv and ParallelEnv say how many there are; for collectors and
-    AsyncEnvPool ``of`` is :data:`MANY`. A ParallelEnv without shared buffers says nothing: its workers are told apart
-    by the order in which the parent started them.
-
-    Raises:
-        RuntimeError: in a ThreadingAsyncEnvPool.
+    AsyncEnvPool ``of`` is :data:`MANY`. Workers of a ParallelEnv without shared buffers are known by the order in which
+    they were started.
     """
     rank, of, processes = 0, 1, 0
     frame: FrameType | None = sys._getframe(1)
@@ -79,3 +77,39 @@ def torchrl_worker() -> tuple[int, int]:
         outer, count = _by_process(-2)
         rank, of = rank + outer * of, of * count
     return rank, of
+
+
+Method = TypeVar("Method", bound=Callable[..., Any])
+
+
+class OneThread:
+    """Lets one thread in at a time, which may enter again; two would break MuJoCo's memory or, silently, its numbers.
+    Entering raises a RuntimeError if another thread is in for longer than ``patience`` seconds.
+
+    The lock is an RLock: a Lock would stay taken if an interrupt came between taking it and the block.
+    """
+
+    def __init__(self, lock: Any, patience: float = 0.0) -> None:
+        self._lock, self._patience = lock, patience
+
+    def __enter__(self) -> None:
+        if not self._lock.acquire(timeout=self._patience):
+            raise RuntimeError(
+                "another thread is stepping, resetting or drawing this environment, and a simulation takes one thread "
+                "at a time: make an environment in each thread, or one with num_envs= and step its rows together"
+            )
+
+    def __exit__(self, *error: object) -> None:
+        self._lock.release()
+
+
+def one_thread_at_a_time(method: Method) -> Method:
+    """A method of a usable environment that one thread may be in at a time."""
+
+    @wraps(method)
+    def run(self: Any, *args: Any, **kwargs: Any) -> Any:
+        with self._one_thread:
+            self._check_usable()
+            return method(self, *args, **kwargs)
+
+    return run  # type: ignore[return-value]

@@ -11,9 +11,9 @@ from torchrl.data import TensorDictReplayBuffer
 from torchrl.data.replay_buffers.samplers import PrioritizedSampler, RandomSampler
 
 from lw_torchrl._devices import CPU
-from lw_torchrl.data.device_storage import DeviceStorage, device_of_rows
-from lw_torchrl.data.group_sampler import GroupSampler
 from lw_torchrl.data.replay import LanguageWorldExperienceReplay
+from lw_torchrl.data.samplers import GroupSampler
+from lw_torchrl.data.storage import DeviceStorage, device_of_rows
 from lw_torchrl.modules.critics import Value
 from lw_torchrl.modules.policy import plans_of
 

@@ -14,11 +14,11 @@ from commands import fails, run
 
 import lw_torchrl as lw
 import lw_torchrl.data as data_room
-import lw_torchrl.data.checksums as checksums
+import lw_torchrl.data.memory_map as memory_map
 from lw_torchrl import _progress
 from lw_torchrl.cli.main import main
 from lw_torchrl.data import collect_demonstrations
-from lw_torchrl.data.rows import load_rows
+from lw_torchrl.data.memory_map import load_rows
 
 
 def collect(root, **options):
@@ -135,8 +135,8 @@ def test_check_reads_every_row(capsys, made, tmp_path):
 
 
 def test_a_long_check_writes_lines_into_a_pipe(capsys, made, monkeypatch):
-    describe = checksums.describe_episode
-    monkeypatch.setattr(checksums, "describe_episode", lambda *given: time.sleep(0.4) or describe(*given))
+    describe = memory_map.describe_episode
+    monkeypatch.setattr(memory_map, "describe_episode", lambda *given: time.sleep(0.4) or describe(*given))
     monkeypatch.setattr(_progress, "EVERY", 0.5)
     main(["data", "show", str(made[0].root), "--check"])
     error = capsys.readouterr().err

@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 
 from lw_torchrl.data import collect_demonstrations
-from lw_torchrl.data.episode_files import EpisodeFiles
-from lw_torchrl.data.metadata import read_metadata
-from lw_torchrl.data.rows import describe_episode, map_rows
+from lw_torchrl.data.dataset import read_metadata
+from lw_torchrl.data.memory_map import describe_episode, map_rows
+from lw_torchrl.data.missing_episodes import EpisodeFiles
 
 TASKS = ("push", "reach")
 NOISE = (0.0, 0.3)

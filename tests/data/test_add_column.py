@@ -65,11 +65,7 @@ def test_a_copy_is_kept_without_its_graph(roots, variant):
 def test_what_is_drawn_and_the_samplers_state_stay_as_they_were(roots, variant, tmp_path):
     def make():
         return opened(
-            roots,
-            variant,
-            batch_size=8,
-            sampler=TaskBalancedSampler(),
-            generator=torch.Generator().manual_seed(3),
+            roots, variant, batch_size=8, sampler=TaskBalancedSampler(), generator=torch.Generator().manual_seed(3)
         )
 
     plain, columned = make(), make()

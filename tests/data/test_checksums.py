@@ -12,10 +12,10 @@ import pytest
 from collecting import EPISODES, STEPS, collect, tree
 
 import lw_torchrl as lw
-from lw_torchrl.data import DatasetError, LanguageWorldExperienceReplay, checksums
-from lw_torchrl.data.episode_files import EpisodeFiles
-from lw_torchrl.data.metadata import read_metadata
-from lw_torchrl.data.rows import COLUMNS, ROW_BYTES, load_rows
+from lw_torchrl.data import DatasetError, LanguageWorldExperienceReplay, memory_map
+from lw_torchrl.data.dataset import read_metadata
+from lw_torchrl.data.memory_map import COLUMNS, ROW_BYTES, load_rows
+from lw_torchrl.data.missing_episodes import EpisodeFiles
 from lw_torchrl.training.loss_state import bc_loss
 
 TASKS = ("push", "reach")
@@ -36,19 +36,19 @@ def root(made, tmp_path):
 @pytest.fixture
 def settled(monkeypatch):
     """Files that were written just now count as written long ago."""
-    monkeypatch.setattr(checksums, "_SETTLED", 0)
+    monkeypatch.setattr(memory_map, "_SETTLED", 0)
 
 
 @pytest.fixture
 def read(monkeypatch):
     """The episodes that are read through."""
-    found, real = [], checksums._as_written
+    found, real = [], memory_map._as_written
 
     def reading(demonstrations, info, rows):
         found.append((info.task, info.episode))
         return real(demonstrations, info, rows)
 
-    monkeypatch.setattr(checksums, "_as_written", reading)
+    monkeypatch.setattr(memory_map, "_as_written", reading)
     return found
 
 
@@ -144,14 +144,14 @@ def test_a_change_that_keeps_size_and_time_is_noticed(root, settled, name):
 
 def test_what_was_written_a_moment_ago_is_not_remembered(root, read, monkeypatch):
     """It may be written again, under the same time."""
-    monkeypatch.setattr(checksums, "_SETTLED", 10**12)
+    monkeypatch.setattr(memory_map, "_SETTLED", 10**12)
     for _ in range(2):
         LanguageWorldExperienceReplay(root)
     assert read == [*ALL, *ALL]
 
 
 def test_a_large_dataset_is_read_in_part_and_wholly_when_asked(root, read, settled, monkeypatch):
-    monkeypatch.setattr(checksums, "READ_AT_ONCE", 2 * STEPS * ROW_BYTES)
+    monkeypatch.setattr(memory_map, "READ_AT_ONCE", 2 * STEPS * ROW_BYTES)
     replay = LanguageWorldExperienceReplay(root)
     assert read == [ALL[0], ALL[3]]
     replay.verify()

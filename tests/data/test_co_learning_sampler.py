@@ -62,7 +62,7 @@ def drawn(replay, number):
     return [replay.sample()["row"].tolist() for _ in range(number)]
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(base_sizes, target_size, fractions, multiples, seeds)
 def test_every_batch_has_exactly_the_fraction_of_the_target_and_equal_numbers_of_the_rest(
     base, target, fraction, multiple, seed
@@ -81,7 +81,7 @@ def test_every_batch_has_exactly_the_fraction_of_the_target_and_equal_numbers_of
         assert found.tolist() == [size * (1 - fraction) / len(base)] * len(base)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(base_sizes, target_size, fractions, seeds)
 def test_target_and_each_base_task_come_once_before_any_row_comes_again(base, target, fraction, seed):
     rows = make_rows(base, target)
@@ -97,7 +97,7 @@ def test_target_and_each_base_task_come_once_before_any_row_comes_again(base, ta
             assert sorted(piece) == everything or start + len(everything) > len(mine)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(base_sizes, target_size, fractions, st.integers(1, 300))
 def test_a_batch_that_cannot_be_exact_is_refused_with_the_nearest_that_can(base, target, fraction, size):
     unit = smallest(len(base), fraction)
@@ -120,7 +120,7 @@ def test_the_papers_batch_with_ten_base_tasks_and_with_nine():
         replay.sample()
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(base_sizes, target_size, seeds, st.integers(0, 6))
 def test_a_state_saved_anywhere_in_an_epoch_gives_the_same_batches_again(base, target, seed, before):
     rows, size = make_rows(base, target), lcm(2, 2 * len(base))
@@ -173,7 +173,7 @@ def test_the_buffers_generator_alone_fixes_the_batches():
     assert drawn(make_replay(rows, 20, seed=6), 5) != first
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(base_sizes, target_size, fractions, seeds)
 def test_it_ran_out_whenever_the_pass_that_takes_most_batches_ends(base, target, fraction, seed):
     size = smallest(len(base), fraction)
@@ -319,7 +319,7 @@ def test_torchrls_ensemble_cannot_keep_the_ratio():
     assert found != {20}
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(base_sizes, target_size, fractions, seeds)
 def test_row_weights_are_how_often_rows_come(base, target, fraction, seed):
     rows = make_rows(base, target, shuffled=seed)

@@ -13,8 +13,8 @@ from collecting import EPISODES, NOISE, SEED, STEPS, TASKS, collect, tree
 
 import lw_torchrl as lw
 from lw_torchrl.data import CollectConfig
-from lw_torchrl.data.metadata import read_metadata
-from lw_torchrl.data.rows import load_rows
+from lw_torchrl.data.dataset import read_metadata
+from lw_torchrl.data.memory_map import load_rows
 from lw_torchrl.envs.engines.metaworld import make_metaworld_env
 from lw_torchrl.envs.experts import ExpertActor
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv

@@ -13,7 +13,7 @@ from collecting import collect, tree
 from lw_torchrl._files import held
 from lw_torchrl.data import DatasetError, LanguageWorldExperienceReplay
 from lw_torchrl.data import collect as collect_module
-from lw_torchrl.data.episode_files import EpisodeFiles
+from lw_torchrl.data.missing_episodes import EpisodeFiles
 
 
 @pytest.fixture(scope="module")
@@ -65,6 +65,7 @@ def test_a_finished_dataset_is_read_by_as_many_as_like(made):
         assert elsewhere(made.root) == made
 
 
+@pytest.mark.slow
 def test_two_processes_leave_a_whole_dataset(made, tmp_path):
     program = f"""
 import sys

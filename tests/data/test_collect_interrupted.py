@@ -13,8 +13,8 @@ import pytest
 from collecting import STEPS, collect, interrupt_after, tree
 
 from lw_torchrl.data import DatasetError
-from lw_torchrl.data.episode_files import EpisodeFiles
-from lw_torchrl.data.metadata import read_metadata
+from lw_torchrl.data.dataset import read_metadata
+from lw_torchrl.data.missing_episodes import EpisodeFiles
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +91,7 @@ KILLER = """
 """
 
 
-@pytest.mark.parametrize("mode", ["replace", "seed 1"])
+@pytest.mark.parametrize("mode", ["replace", pytest.param("seed 1", marks=pytest.mark.slow)])
 def test_killed_again_and_again_it_gives_the_same_dataset(made, tmp_path, mode):
     root = tmp_path / "demos"
     command = [sys.executable, "-W", "ignore", "-c", textwrap.dedent(KILLER), str(root), mode]
@@ -120,9 +120,7 @@ def test_an_interrupted_dataset_carries_on_without_doing_episodes_twice(half_mad
     done = []
     put = EpisodeFiles.put
     monkeypatch.setattr(
-        EpisodeFiles,
-        "put",
-        lambda self, task, episode, steps: (done.append(task), put(self, task, episode, steps)),
+        EpisodeFiles, "put", lambda self, task, episode, steps: (done.append(task), put(self, task, episode, steps))
     )
     collect(half_made)
     assert len(done) == 2

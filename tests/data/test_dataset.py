@@ -13,8 +13,8 @@ from collecting import restate_checksums
 from tensordict import NonTensorData, TensorDict
 
 from lw_torchrl.data import DatasetError, LanguageWorldExperienceReplay, TaskBalancedSampler, collect_demonstrations
-from lw_torchrl.data.metadata import FORMAT, FORMAT_VERSION, read_metadata
-from lw_torchrl.data.rows import load_rows
+from lw_torchrl.data.dataset import FORMAT, FORMAT_VERSION, read_metadata
+from lw_torchrl.data.memory_map import load_rows
 from lw_torchrl.language.tasks import task_id
 
 

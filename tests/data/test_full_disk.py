@@ -9,12 +9,12 @@ import sys
 
 import pytest
 
-from lw_torchrl.data.episode_files import write_failed
+from lw_torchrl.data.missing_episodes import write_failed
 
 COLLECT = """
 import os, sys
 from lw_torchrl.data import collect_demonstrations
-from lw_torchrl.data.rows import ROW_BYTES
+from lw_torchrl.data.memory_map import ROW_BYTES
 
 folder, plain = sys.argv[1:]
 options = dict(episodes_per_task=4, max_steps=120, noise_scale=(0.0, 0.3), num_envs=1, progress=False)

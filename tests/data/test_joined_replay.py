@@ -16,7 +16,7 @@ from lw_torchrl.data import (
     collect_demonstrations,
     selection,
 )
-from lw_torchrl.data.rows import load_rows
+from lw_torchrl.data.memory_map import load_rows
 from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.tasks import task_id
 from lw_torchrl.modules import PlanConditionedActor

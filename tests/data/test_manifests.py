@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from mutations import mutated
 
 from lw_torchrl.data import CollectConfig, DatasetError, collect_demonstrations, missing_episodes
-from lw_torchrl.data.metadata import read_config, read_metadata
-from lw_torchrl.data.rows import load_rows
+from lw_torchrl.data.dataset import read_config, read_metadata
+from lw_torchrl.data.memory_map import load_rows
 
 OPTIONS = dict(episodes_per_task=2, max_steps=4, noise_scale=(0.0, 0.3), progress=False)
 
@@ -60,7 +60,7 @@ def check_description(found):
     json.dumps(found.config.to_json())
 
 
-@settings(max_examples=400, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_metadata_of_other_shapes_are_refused_or_hold_together(root, made, stated, data):
     changed = data.draw(mutated(stated))
@@ -74,7 +74,7 @@ def test_metadata_of_other_shapes_are_refused_or_hold_together(root, made, state
     assert len(rows) == found.num_steps == made.num_steps
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=75, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_a_configuration_of_another_shape_is_refused_or_holds_together(tmp_path, made, data):
     path = tmp_path / "config.json"

@@ -6,7 +6,7 @@ import pytest
 import torch
 from collecting import SEED, STEPS, collect, interrupt_after, tree
 
-from lw_torchrl.data.rows import load_rows
+from lw_torchrl.data.memory_map import load_rows
 from lw_torchrl.language.tasks import MT50
 
 

@@ -38,12 +38,12 @@ def trajectories(rows):
 def check(found, expected):
     for key in (*(("next", key) for key in ("observation", "done", "terminated", "truncated")), "steps_to_next_obs"):
         assert torch.equal(found[key], expected[key]), key
-    torch.testing.assert_close(found["next", "reward"], expected["next", "reward"], rtol=0, atol=1e-6)
+    torch.testing.assert_close(found["next", "reward"], expected["next", "reward"], rtol=5e-7, atol=1e-6)
     for key in ("observation", "action"):
         assert torch.equal(found[key], expected[key])
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(st.lists(st.integers(1, 9), min_size=1, max_size=5), steps, gammas, st.booleans())
 def test_they_are_torchrls(lengths, n_steps, gamma, two_parts):
     rows = own_rows(lengths)
@@ -64,7 +64,7 @@ def test_rows_that_are_chosen_do_not_look_over_those_that_are_not():
     assert torch.equal(found["next", "observation"], rows["next", "observation"][[1, 1, 4, 4]])
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(st.lists(st.integers(1, 6), min_size=1, max_size=6), st.integers(1, 3), steps, st.integers(0, 99))
 def test_rows_that_come_look_as_far_as_torchrls_transform_once_the_others_are_there(sizes, envs, n_steps, seed):
     stream, storage = Stream(0, envs, seed), GrowingStorage([own_rows([3])], grow=200, n_steps=n_steps, gamma=0.9)

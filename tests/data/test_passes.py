@@ -10,8 +10,8 @@ from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer, TensorStorage
 
 from lw_torchrl.data import CoLearningSampler, TaskBalancedSampler
-from lw_torchrl.data.group_sampler import GroupSampler
 from lw_torchrl.data.passes import Passes, choose, spans
+from lw_torchrl.data.samplers import GroupSampler
 from lw_torchrl.language.tasks import task_id
 
 TARGET = "coffee-push"
@@ -19,7 +19,7 @@ TASKS = torch.tensor([task_id(TARGET), 0, 1, 2])
 writes = st.lists(st.tuples(st.integers(1, 12), st.integers(0, 3)), min_size=1, max_size=12)  # rows, batches after
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 9), st.integers(0, 9)), min_size=1, max_size=4), st.integers(0, 999))
 def test_places_are_chosen_each_once(groups, seed):
     size, count = (torch.tensor(column) for column in zip(*((max(pair), min(pair)) for pair in groups), strict=True))
@@ -53,7 +53,7 @@ def test_a_row_that_comes_may_be_next_or_last():
     assert ((counts - 100.0).abs() < 50).all()
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=75, deadline=None)
 @given(st.data(), st.lists(st.integers(1, 8), min_size=1, max_size=4), st.integers(0, 999))
 def test_rows_go_and_come(data, sizes, seed):
     size = torch.tensor(sizes)
@@ -92,7 +92,7 @@ def written(number, start, seed):
     return TensorDict({"task_id": tasks, "row": torch.arange(start, start + number)}, [number])
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(writes, st.booleans(), st.integers(16, 40), st.integers(0, 99), st.integers(0, 11))
 def test_groups_are_those_of_a_fresh_look_and_a_restored_buffer_goes_on(events, balanced, ring, seed, saved):
     kind = "balanced" if balanced else "co-learning"

@@ -8,7 +8,7 @@ from tensordict import TensorDict
 from torchrl.data import SliceSampler
 
 from lw_torchrl.data import LanguageWorldExperienceReplay, TaskBalancedSampler, collect_demonstrations
-from lw_torchrl.data.rows import load_rows
+from lw_torchrl.data.memory_map import load_rows
 from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.query_program import QueryProgram
 from lw_torchrl.transforms import QAFTransform

@@ -7,8 +7,8 @@ import torch
 from collecting import collect
 
 import lw_torchrl as lw
+from lw_torchrl.data.memory_map import load_rows
 from lw_torchrl.data.rewards import REWARDS, check_reward
-from lw_torchrl.data.rows import load_rows
 
 
 def by_hand(name, dense, success):

@@ -66,7 +66,7 @@ def test_a_state_that_is_none_is_refused_and_nothing_changes(name, bad):
 numbers = st.lists(st.integers(-2, 9) | st.integers(-(2**63), 2**63 - 1), max_size=9)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=150, deadline=None)
 @given(st.dictionaries(st.sampled_from(["order", "start", "size", "cursor"]), numbers), st.integers(-1, 10))
 def test_whatever_the_numbers_a_state_is_refused_or_gives_rows_of_its_tasks(changed, length):
     replay = make()

@@ -33,7 +33,7 @@ def parts(lengths):
     return [part(length, 100 * number) for number, length in enumerate(lengths)]
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=75, deadline=None)
 @given(st.data(), lengths, st.booleans())
 def test_it_is_the_concatenation_of_the_chosen_rows(data, lengths, choose):
     joined = parts(lengths)

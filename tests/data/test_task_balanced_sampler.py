@@ -47,7 +47,7 @@ def drawn(replay, number):
     return [replay.sample()["row"].tolist() for _ in range(number)]
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(sizes, counts, seeds)
 def test_every_batch_holds_equal_numbers_of_every_task(sizes, count, seed):
     replay = make_replay(make_rows(sizes), count * len(sizes), seed)
@@ -57,7 +57,7 @@ def test_every_batch_holds_equal_numbers_of_every_task(sizes, count, seed):
         assert found.tolist() == [count] * len(sizes)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(sizes, counts, seeds)
 def test_within_a_task_every_row_comes_once_before_any_comes_again(sizes, count, seed):
     rows = make_rows(sizes)
@@ -72,7 +72,7 @@ def test_within_a_task_every_row_comes_once_before_any_comes_again(sizes, count,
         assert len(set(rest)) == len(rest)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(sizes, counts, seeds)
 def test_the_generator_fixes_the_batches(sizes, count, seed):
     one, two = (make_replay(make_rows(sizes), count * len(sizes), seed) for _ in range(2))
@@ -88,7 +88,7 @@ def test_another_seed_gives_other_batches_and_a_pass_another_order():
     assert sorted(passes[0]) == sorted(passes[1])
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(sizes, counts, seeds, st.integers(0, 5))
 def test_a_state_saved_anywhere_gives_the_same_batches_again(sizes, count, seed, before):
     rows = make_rows(sizes)
@@ -145,8 +145,7 @@ def test_the_state_is_part_of_the_replay_buffers():
 
 
 @pytest.mark.parametrize(
-    ("tasks", "batch_size", "nearest"),
-    [(3, 100, "99 and 102"), (3, 2, "3"), (10, 512, "510 and 520"), (7, 1, "7")],
+    ("tasks", "batch_size", "nearest"), [(3, 100, "99 and 102"), (3, 2, "3"), (10, 512, "510 and 520"), (7, 1, "7")]
 )
 def test_a_batch_that_the_tasks_do_not_divide_is_refused_with_the_nearest(tasks, batch_size, nearest):
     replay = make_replay(make_rows([4] * tasks), batch_size)
@@ -171,7 +170,7 @@ def test_an_empty_storage_is_refused():
         TaskBalancedSampler().sample(LazyTensorStorage(10), 4)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(sizes, counts, seeds)
 def test_it_ran_out_whenever_a_batch_ends_a_pass_over_the_largest_task(sizes, count, seed):
     replay = make_replay(make_rows(sizes), count * len(sizes), seed)

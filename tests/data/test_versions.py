@@ -14,7 +14,7 @@ from collecting import collect, interrupt_after
 import lw_torchrl as lw
 from lw_torchrl._versions import SIMULATORS, package_versions, version_changes
 from lw_torchrl.data import DatasetError, LanguageWorldExperienceReplay
-from lw_torchrl.data.metadata import read_metadata
+from lw_torchrl.data.dataset import read_metadata
 
 
 @pytest.fixture

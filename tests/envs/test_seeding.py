@@ -52,14 +52,14 @@ def test_no_two_episodes_share_a_seed():
 
 
 @given(TRIPLES, TRIPLES)
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 def test_different_triples_have_different_randomness(left, right):
     assert (episode_seed(*left) == episode_seed(*right)) == (left == right)
     assert np.array_equal(action_noise(*left, 2), action_noise(*right, 2)) == (left == right)
 
 
 @given(TRIPLES, st.integers(1, 60), st.integers(1, 60), st.integers(1, 9))
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50, deadline=None)
 def test_noise_does_not_hang_on_how_much_is_drawn(triple, steps, more, hold):
     noise = action_noise(*triple, steps, hold)
     assert noise.shape == (steps, 4)

@@ -162,10 +162,7 @@ def test_an_env_creator_changes_nothing():
 @pytest.mark.parametrize(
     ("other", "message"),
     [
-        (
-            lambda: lw.LanguageWorldEnv(TASKS, num_envs=4, num_threads=1),
-            "other rows, 4: push, reach, push, reach",
-        ),
+        (lambda: lw.LanguageWorldEnv(TASKS, num_envs=4, num_threads=1), "other rows, 4: push, reach, push, reach"),
         (lambda: lw.LanguageWorldEnv(["push", "sweep"], num_envs=3, num_threads=1), "other rows, 3: push, sweep, push"),
     ],
     ids=["rows", "tasks"],

@@ -15,7 +15,7 @@ from lw_torchrl.language.tasks import check_task
 
 
 def import_metaworld() -> Any:
-    """Import Meta-World; an absent rendering library is named."""
+    """Import Meta-World; the error names a missing rendering library."""
     with naming_absent_renderer():
         import metaworld
         import metaworld.policies
@@ -44,18 +44,11 @@ class MetaWorldEngine:
     Args:
         tasks: the task of each row.
         reward: "sparse" for the success as 0 and 1, "dense" for Meta-World's own reward.
-        num_threads: accepted for the interface; Meta-World's Python holds one thread.
-
-    Raises:
-        ValueError: a task that Meta-World does not have.
+        num_threads: ignored; Meta-World runs in one thread.
     """
 
     def __init__(
-        self,
-        tasks: Sequence[str],
-        *,
-        reward: Literal["sparse", "dense"] = "sparse",
-        num_threads: int | None = None,
+        self, tasks: Sequence[str], *, reward: Literal["sparse", "dense"] = "sparse", num_threads: int | None = None
     ) -> None:
         self._dense = reward == "dense"
         # The environment above counts the steps; Meta-World's own limit must not come first.
@@ -81,7 +74,7 @@ class MetaWorldEngine:
         for row in np.flatnonzero(active):
             env = self._envs[row]
             observation, dense, _, _, info = env.step(action[row])
-            # MuJoCo quietly starts an unstable simulation over, and only counts a warning; a reset clears it.
+            # MuJoCo silently restarts an unstable simulation, and only counts a warning; a reset clears it.
             warned = env.data.warning.number[self._unstable].any()
             if warned or env._did_see_sim_exception or not np.isfinite(observation).all():
                 fault[row] = True

@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 
 from lw_torchrl.envs.engines.vectorized.engine import VectorizedEngine
-from lw_torchrl.envs.engines.vectorized.simulated_row import SimulatedRow
-from lw_torchrl.envs.engines.vectorized.simulation_table import simulation_table
+from lw_torchrl.envs.engines.vectorized.simulated_rows import SimulatedRow
+from lw_torchrl.envs.engines.vectorized.tables import simulation_table
 
 TASKS = list(simulation_table())
 STATE = ("qpos", "qvel", "qacc", "qacc_warmstart", "xpos", "xquat", "site_xpos", "efc_force", "time")
@@ -23,8 +23,8 @@ def test_a_substep_after_a_look_has_the_bits_of_a_whole_one(monkeypatch):
     engine, plain = (VectorizedEngine(TASKS, num_threads=1) for _ in range(2))
     for row in plain._rows:
         monkeypatch.setattr(row, "_substep_after_look", lambda row=row: whole_substep(row))
-    for step in range(30):
-        if step % 15 == 0:
+    for step in range(20):
+        if step % 10 == 0:
             for k in (engine, plain):
                 k.reset(range(n), range(step, step + n))
         action = rng.uniform(-1, 1, (n, 4)).astype(np.float32)

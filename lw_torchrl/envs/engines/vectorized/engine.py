@@ -14,21 +14,27 @@ from numpy.typing import NDArray
 from lw_torchrl._checks import check_choice, check_int
 from lw_torchrl.envs.cameras import Cameras
 from lw_torchrl.envs.engine import ACTION_SIZE, OBSERVATION_SIZE, BodyPoses, EngineStep, RowModel
-from lw_torchrl.envs.engines.vectorized.models import SharedModel, borrow_model, check_versions, return_models
-from lw_torchrl.envs.engines.vectorized.observation import Observer
-from lw_torchrl.envs.engines.vectorized.rewards.dense_reward import DenseReward, EpisodeNotes
-from lw_torchrl.envs.engines.vectorized.rewards.table import reward_table
-from lw_torchrl.envs.engines.vectorized.sensors import CURRENT, REWARD_WIDTH, WIDTH
-from lw_torchrl.envs.engines.vectorized.simulated_row import WARNING_KINDS, SimulatedRow, is_stable
-from lw_torchrl.envs.engines.vectorized.simulation_table import simulation_table
+from lw_torchrl.envs.engines.vectorized.observation import CURRENT, REWARD_WIDTH, WIDTH, Array, Index, Mask, Observer
+from lw_torchrl.envs.engines.vectorized.rewards.dense_reward import DenseReward, EpisodeStarts
+from lw_torchrl.envs.engines.vectorized.simulated_rows import (
+    WARNING_KINDS,
+    RowGroup,
+    SimulatedRow,
+    WorkerPool,
+    is_stable,
+    split_into_groups,
+)
 from lw_torchrl.envs.engines.vectorized.success import SuccessFunction
-from lw_torchrl.envs.engines.vectorized.task_logic import make_task_logic, model_path
-from lw_torchrl.envs.engines.vectorized.worker_pool import RowGroup, WorkerPool, split_into_groups
+from lw_torchrl.envs.engines.vectorized.tables import reward_table, simulation_table
+from lw_torchrl.envs.engines.vectorized.task_programs import (
+    SharedModel,
+    borrow_model,
+    check_versions,
+    make_task_program,
+    model_path,
+    return_models,
+)
 from lw_torchrl.language.tasks import check_task
-
-Rows = NDArray[np.intp]
-Array = NDArray[np.float64]
-Truth = NDArray[np.bool_]
 
 FINGERS = np.array([1.0, -1.0])
 """The two fingers are driven against each other by one number of the action."""
@@ -44,11 +50,11 @@ def available_cores() -> int:
 class VectorizedEngine:
     """Simulates all rows together: physics in threads, everything else in NumPy over all rows at once.
 
-    It gives the very numbers of :class:`~lw_torchrl.envs.engines.metaworld.MetaWorldEngine`, whatever the
-    number of threads. The rows of one XML file share a compiled model; each has only a state of its own.
+    Its numbers are those of :class:`~lw_torchrl.envs.engines.metaworld.MetaWorldEngine`, bit for bit, whatever the
+    number of threads. The rows of one XML file share a compiled model; each has a state of its own.
 
-    A row faults when its action is not finite, or when its simulation becomes unstable. It then repeats its
-    last stable observation, is not simulated, and stays faulted until it is reset; other rows notice nothing.
+    A row faults when its action is not finite, or when its simulation becomes unstable. It then repeats its last stable
+    observation and is not simulated until it is reset; other rows are not affected.
 
     Args:
         tasks: the task of each row.
@@ -57,7 +63,6 @@ class VectorizedEngine:
 
     Raises:
         ImportError: another Meta-World or MuJoCo than the one this engine was compared with.
-        ValueError: an unknown task or reward.
 
     Example:
         >>> engine = VectorizedEngine(["reach", "push"], num_threads=1)
@@ -70,11 +75,7 @@ class VectorizedEngine:
     """
 
     def __init__(
-        self,
-        tasks: Sequence[str],
-        *,
-        reward: Literal["sparse", "dense"] = "sparse",
-        num_threads: int | None = None,
+        self, tasks: Sequence[str], *, reward: Literal["sparse", "dense"] = "sparse", num_threads: int | None = None
     ) -> None:
         check_versions()
         dense = check_choice("reward", reward, ("sparse", "dense")) == "dense"
@@ -91,12 +92,12 @@ class VectorizedEngine:
         self._return_models = weakref.finalize(self, return_models, models)
         for number, group in enumerate(self._groups):
             models.append(borrow_model(model_path(tasks[group.rows[0]])))
-            programs = {task: make_task_logic(task, models[-1]) for task in {tasks[row] for row in group.rows}}
+            programs = {task: make_task_program(task, models[-1]) for task in {tasks[row] for row in group.rows}}
             for row in group.rows:
                 self._group_of_row[row] = number
                 builders[row] = programs[tasks[row]]
         rewards = [reward_table()[task] if dense else None for task in tasks]
-        self._notes = EpisodeNotes([reward for reward in rewards if reward is not None]) if dense else None
+        self._starts = EpisodeStarts([reward for reward in rewards if reward is not None]) if dense else None
         self._width = REWARD_WIDTH if dense else WIDTH
         self._rows = [
             SimulatedRow(table[task], models[number], builder, task_reward)
@@ -111,7 +112,10 @@ class VectorizedEngine:
         self._high = np.array([space.high for space in bounds]).reshape(n, OBSERVATION_SIZE)
         self._mocap_low = np.array([builder.mocap_low for builder in builders]).reshape(n, 3)
         self._mocap_high = np.array([builder.mocap_high for builder in builders]).reshape(n, 3)
-        self._action_scale = _single({builder.action_scale for builder in builders}, default=0.01)
+        scales = {builder.action_scale for builder in builders}
+        if len(scales) > 1:
+            raise RuntimeError(f"the tasks were to share one action scale, got {sorted(scales)}")
+        self._action_scale = scales.pop() if scales else 0.01
 
         self._mocap = np.zeros((n, 3))
         self._goal = np.zeros((n, 3))
@@ -122,10 +126,7 @@ class VectorizedEngine:
         self._running: _RunningRows | None = None
 
     def reset(self, rows: Sequence[int], seeds: Sequence[int]) -> Array:
-        """Start an episode in each of ``rows``, as Meta-World's ``env.seed(seed); env.reset()`` does.
-
-        The episode depends on the seed and on the actions alone, not on what the row did before.
-        """
+        """Start an episode in each of ``rows``, as Meta-World's ``env.seed(seed); env.reset()`` does."""
         index = np.asarray(rows, dtype=np.intp).reshape(-1)
         if len(index) != len(seeds):
             raise ValueError(f"seeds must be as many as rows, {len(index)}, got {len(seeds)}")
@@ -136,9 +137,9 @@ class VectorizedEngine:
         def reset(row: int) -> None:
             self._observation[row] = self._rows[row].reset(seed_of[row])
             self._mocap[row] = self._rows[row].mocap
-            self._goal[row] = self._rows[row].goal
-            if self._notes is not None:
-                self._notes.begin(row, self._rows[row].program)
+            self._goal[row] = self._rows[row].program._target_pos
+            if self._starts is not None:
+                self._starts.begin(row, self._rows[row].program)
 
         self._pool.work(self._by_group(index), reset)
         self._current[index] = self._observation[index, CURRENT]
@@ -146,7 +147,7 @@ class VectorizedEngine:
         self._started[index] = True
         return self._observation[index]
 
-    def step(self, action: NDArray[Any], active: Truth) -> EngineStep:
+    def step(self, action: NDArray[Any], active: Mask) -> EngineStep:
         """Step the rows where ``active`` (N, bool) with ``action`` (N, 4), in the action's own precision."""
         n = len(self._rows)
         action, active = np.asarray(action), np.asarray(active, dtype=bool)
@@ -158,7 +159,7 @@ class VectorizedEngine:
         if not self._started[active].all():
             row = int(np.flatnonzero(active & ~self._started)[0])
             raise RuntimeError(f"row {row} must be reset before it is stepped")
-        # What is not a number must not reach the physics: MuJoCo would quietly start the row over.
+        # NaN must not reach the physics: MuJoCo would silently restart the row.
         self._faulted |= active & ~np.isfinite(action).all(axis=1)
         reward, success = np.zeros(n), np.zeros(n, dtype=bool)
         running = active & ~self._faulted
@@ -167,7 +168,7 @@ class VectorizedEngine:
         return EngineStep(self._observation.copy(), reward, success, active & self._faulted)
 
     def render(self, rows: Sequence[int], *, camera: str, height: int, width: int) -> NDArray[np.uint8]:
-        """Pictures of rows, (len(rows), height, width, 3) uint8; the simulation goes on as if none had been taken."""
+        """Pictures of rows, (len(rows), height, width, 3) uint8; they change nothing in the simulation."""
         cameras = self._cameras = self._cameras or Cameras()
         pictures = [self._rows[row].picture(cameras, camera=camera, height=height, width=width) for row in rows]
         return np.stack(pictures)
@@ -177,7 +178,7 @@ class VectorizedEngine:
         return self._rows[row].model
 
     def poses(self, row: int) -> BodyPoses:
-        """Where the bodies of a row are now; about 3 µs."""
+        """Where the bodies of a row are now."""
         return self._rows[row].poses()
 
     def close(self) -> None:
@@ -189,7 +190,7 @@ class VectorizedEngine:
         self._running = None
         self._return_models()
 
-    def _step_running(self, running: _RunningRows, action: NDArray[Any], reward: Array, success: Truth) -> None:
+    def _step_running(self, running: _RunningRows, action: NDArray[Any], reward: Array, success: Mask) -> None:
         rows = running.rows
         action = action[rows]
         shift = np.minimum(np.maximum(action[:, :3], -1), 1) * self._action_scale
@@ -213,26 +214,21 @@ class VectorizedEngine:
         stable = is_stable(observation, warnings)
         if not stable.all():
             self._faulted[rows[~stable]] = True
-            rows, current, observation, achieved, rewards = (
-                rows[stable],
-                current[stable],
-                observation[stable],
-                achieved[stable],
-                rewards[stable],
-            )
+            rows, current, observation = rows[stable], current[stable], observation[stable]
+            achieved, rewards = achieved[stable], rewards[stable]
         self._current[rows] = current
         self._observation[rows] = observation
         success[rows] = achieved
         reward[rows] = rewards
 
-    def _running_rows(self, running: Truth) -> _RunningRows:
-        """What steps exactly these rows; kept for the next step, for the mask seldom changes."""
+    def _running_rows(self, running: Mask) -> _RunningRows:
+        """These rows; kept for the next step, since the mask seldom changes."""
         key = running.tobytes()
         if self._running is None or self._running.key != key:
             self._running = _RunningRows(self, running, key)
         return self._running
 
-    def _by_group(self, rows: Rows) -> list[tuple[RowGroup, list[int]]]:
+    def _by_group(self, rows: Index) -> list[tuple[RowGroup, list[int]]]:
         items: dict[int, list[int]] = defaultdict(list)
         for row, number in zip(rows.tolist(), self._group_of_row[rows].tolist(), strict=True):
             items[number].append(row)
@@ -240,23 +236,17 @@ class VectorizedEngine:
 
 
 class _RunningRows:
-    """Everything about one set of running rows that does not change from step to step."""
+    """What is constant for one set of running rows."""
 
-    def __init__(self, engine: VectorizedEngine, running: Truth, key: bytes) -> None:
+    def __init__(self, engine: VectorizedEngine, running: Mask, key: bytes) -> None:
         self.key = key
         self.rows = rows = np.flatnonzero(running)
         self.members = members = [engine._rows[row] for row in rows]
         sources = [member.sources for member in members]
         self.observer = Observer(sources)
         self.success = SuccessFunction(sources, lambda k: members[k].program)
-        self.reward = None if engine._notes is None else DenseReward(engine._notes, rows)
+        self.reward = None if engine._starts is None else DenseReward(engine._starts, rows)
         place = {row: k for k, row in enumerate(rows.tolist())}
         self.groups = [(group, [place[row] for row in items]) for group, items in engine._by_group(rows)]
         self.low, self.high = engine._low[rows], engine._high[rows]
         self.mocap_low, self.mocap_high = engine._mocap_low[rows], engine._mocap_high[rows]
-
-
-def _single(values: set[float], *, default: float) -> float:
-    if len(values) > 1:
-        raise RuntimeError(f"the tasks were to share one action scale, got {sorted(values)}")
-    return values.pop() if values else default

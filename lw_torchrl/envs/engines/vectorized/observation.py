@@ -1,41 +1,150 @@
-"""Observations of many rows at once, from their sensors."""
+"""What is read from the states after each step, and the observations made of it."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
-from lw_torchrl.envs.engines.vectorized.sensors import (
-    CURRENT,
-    GRIPPER,
-    JOINT,
-    LEFT_CLAW,
-    MATRIX,
-    MATRIX_OF,
-    OBJECT,
-    QUATERNION,
-    RIGHT_CLAW,
-    SECOND,
-    SECOND_QUATERNION,
-)
-from lw_torchrl.envs.engines.vectorized.simulation_table import TaskSources
+from lw_torchrl.envs.engines.vectorized.tables import TaskReward, TaskSources, parse_place
 
 Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+
+# The columns of the sensors. The first 18 are laid out like the observation, whose number 3, the opening of the
+# gripper, is computed. Columns that a task does not have hold arbitrary numbers.
+HAND = slice(0, 3)
+GRIPPER = 3
+OBJECT = slice(4, 7)
+QUATERNION = slice(7, 11)
+SECOND = slice(11, 14)
+SECOND_QUATERNION = slice(14, 18)
+CURRENT = slice(0, 18)
+RIGHT_CLAW = slice(18, 21)
+LEFT_CLAW = slice(21, 24)
+MATRIX = slice(24, 33)
+RIGHT_TIP = slice(33, 36)
+LEFT_TIP = slice(36, 39)
+POINT = slice(39, 42)
+JOINT = slice(42, 43)
+WIDTH = 43
+
+# Of the dense reward only.
+LEFT_PAD = slice(43, 46)
+RIGHT_PAD = slice(46, 49)
+PLACE = slice(49, 52)
+CORNERS = slice(52, 64)
+REWARD_WIDTH = 64
+
+MATRIX_OF = "matrix of "
+
+
+class StateView:
+    """The arrays of a MuJoCo state, which are in one block of memory, as one, so that a single ``take`` reads from any
+    of them. Joining ten small arrays costs four times as much: each is a Python object that has left the processor's
+    cache since the last step. The state must live as long as this view.
+    """
+
+    def __init__(self, model: Any, data: Any) -> None:
+        self._model = model
+        self._positions = {"body": data.xpos, "geom": data.geom_xpos, "site": data.site_xpos}
+        self._matrices = {"body": data.xmat, "geom": data.geom_xmat, "site": data.site_xmat}
+        self._quaternions: Array = data.xquat
+        self._joints: Array = data.qpos
+        arrays = [*self._positions.values(), *self._matrices.values(), self._quaternions, self._joints]
+        first = min(arrays, key=_address)
+        self._start = _address(first)
+        size = max(_address(array) + array.nbytes for array in arrays) - self._start
+        if size > data.nbuffer:
+            raise RuntimeError("MuJoCo keeps this state in more than one block of memory")
+        self.numbers = as_strided(first, shape=(size // first.itemsize,), strides=(first.itemsize,))
+
+    def position(self, place: str) -> Array:
+        """The position of "body NAME", "geom NAME" or "site NAME"."""
+        kind, number = self._find(place)
+        return self._positions[kind][number]
+
+    def matrix(self, place: str) -> Array:
+        """The rotation matrix of a place, nine numbers."""
+        kind, number = self._find(place)
+        return self._matrices[kind][number]
+
+    def quaternion(self, place: str) -> Array:
+        """The quaternion of a body."""
+        kind, number = self._find(place)
+        if kind != "body":
+            raise ValueError(f"only a body has a quaternion of its own, got {place!r}")
+        return self._quaternions[number]
+
+    def joint(self, name: str) -> Array:
+        """The coordinate of a joint that has one."""
+        address = self._model.joint(name).qposadr[0]
+        return self._joints[address : address + 1]
+
+    def where(self, array: Array) -> int:
+        """The index in ``numbers`` of the first number of one of the arrays above."""
+        return (_address(array) - self._start) // array.itemsize
+
+    def _find(self, place: str) -> tuple[str, int]:
+        kind, name = parse_place(place)
+        return kind, getattr(self._model, kind)(name).id
+
+
+def _address(array: Array) -> int:
+    return array.__array_interface__["data"][0]
+
+
+def sensor_index(window: StateView, sources: TaskSources, reward: TaskReward | None) -> NDArray[np.intp]:
+    """(WIDTH,) which numbers of the window make a task's row of sensors; (REWARD_WIDTH,) with a dense reward."""
+    success = sources.success
+    parts = [
+        (HAND, window.position("body hand")),
+        (OBJECT, window.position(sources.object)),
+        (RIGHT_CLAW, window.position("body rightclaw")),
+        (LEFT_CLAW, window.position("body leftclaw")),
+    ]
+    if sources.quaternion.startswith(MATRIX_OF):
+        parts.append((MATRIX, window.matrix(sources.quaternion.removeprefix(MATRIX_OF))))
+    elif sources.quaternion not in ("zeros", "identity"):
+        parts.append((QUATERNION, window.quaternion(sources.quaternion)))
+    if sources.second is not None:
+        parts.append((SECOND, window.position(sources.second)))
+        if sources.second_quaternion != "zeros":
+            parts.append((SECOND_QUATERNION, window.quaternion(sources.second_quaternion)))
+    if success.point == "gripper" or reward is not None:
+        parts.append((RIGHT_TIP, window.position("site rightEndEffector")))
+        parts.append((LEFT_TIP, window.position("site leftEndEffector")))
+    if (point := success.stick_end or success.point) not in ("object", "second", "gripper"):
+        parts.append((POINT, window.position(point)))
+    joint = sources.dial or success.joint
+    if reward is not None:
+        joint = joint or reward.joint
+        parts.append((LEFT_PAD, window.position("body leftpad")))
+        parts.append((RIGHT_PAD, window.position("body rightpad")))
+        if reward.place is not None:
+            parts.append((PLACE, window.position(reward.place)))
+        for number, corner in enumerate(reward.corners):
+            start = CORNERS.start + 3 * number
+            parts.append((slice(start, start + 3), window.position(corner)))
+    if joint is not None:
+        parts.append((JOINT, window.joint(joint)))
+    index = np.zeros(WIDTH if reward is None else REWARD_WIDTH, dtype=np.intp)
+    for columns, array in parts:
+        index[columns] = window.where(array) + np.arange(array.size)
+    return index
+
 
 WIDEST_GRIP = 0.1  # metres
 DIAL_RADIUS = 0.05  # metres
 
 
 class Observer:
-    """Makes the observations of a fixed set of rows.
-
-    Each operation is Meta-World's, in its order, so that the last bit agrees.
-
-    Args:
-        sources: each row's task.
-    """
+    """Makes the observations of a fixed set of rows, by Meta-World's operations in its order, so that the last bit
+    agrees."""
 
     def __init__(self, sources: Sequence[TaskSources]) -> None:
         self._matrices = np.flatnonzero([row.quaternion.startswith(MATRIX_OF) for row in sources])
@@ -46,7 +155,7 @@ class Observer:
         self._constant, self._is_constant = _constants(sources)
 
     def current(self, sensors: Array) -> Array:
-        """(rows, 18) the part of the observation that describes the present state alone."""
+        """(rows, 18) the part of the observation that describes the present state."""
         current = sensors[:, CURRENT].copy()
         np.copyto(current, self._constant, where=self._is_constant)
         span = row_norm(sensors[:, RIGHT_CLAW] - sensors[:, LEFT_CLAW])
@@ -64,7 +173,7 @@ class Observer:
 
 
 def _constants(sources: Sequence[TaskSources]) -> tuple[Array, NDArray[np.bool_]]:
-    """What part of each row never changes: its value, and where."""
+    """The constant part of each row: its value, and where."""
     value = np.zeros((len(sources), CURRENT.stop))
     fixed = np.zeros(value.shape, dtype=bool)
     for k, row in enumerate(sources):
@@ -76,18 +185,14 @@ def _constants(sources: Sequence[TaskSources]) -> tuple[Array, NDArray[np.bool_]
 
 
 def row_norm(vectors: Array) -> Array:
-    """The length of each row, with the bits of ``np.linalg.norm`` of that row alone.
-
-    That function takes the dot product from BLAS, and so does ``vecdot``; a sum of squares over an axis
-    rounds differently in one case out of nine.
-    """
+    """The length of each row, with the bits of ``np.linalg.norm`` of that row alone, which takes the dot product from
+    BLAS as ``vecdot`` does; a sum of squares over an axis rounds differently in one case out of nine."""
     return np.sqrt(np.vecdot(vectors, vectors))
 
 
 def quaternion_of_matrix(matrix: Array) -> Array:
     """(n, 4) quaternions, x y z w, of (n, 9) rotation matrices, with the bits of SciPy's
-    ``Rotation.from_matrix(...).as_quat()`` at a fraction of its cost.
-    """
+    ``Rotation.from_matrix(...).as_quat()`` at a fraction of its cost."""
     m00, m01, m02, m10, m11, m12, m20, m21, m22 = matrix.T
     trace = m00 + m11 + m22
     quaternion = np.stack((m21 - m12, m02 - m20, m10 - m01, 1.0 + trace))

@@ -1,8 +1,4 @@
-"""Meta-World's success of many rows at once.
-
-Nearly every task succeeds when a point comes close to the goal. What the other rules of
-data/simulation.toml mean is written at the method of each.
-"""
+"""Meta-World's success of many rows at once: a point comes close to the goal, or one of the rules below."""
 
 from __future__ import annotations
 
@@ -10,29 +6,28 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lw_torchrl.envs.engines.vectorized.observation import row_norm
-from lw_torchrl.envs.engines.vectorized.sensors import GRIPPER, JOINT, LEFT_TIP, OBJECT, POINT, RIGHT_TIP, SECOND
-from lw_torchrl.envs.engines.vectorized.simulation_table import TaskSources
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
-Truth = NDArray[np.bool_]
+from lw_torchrl.envs.engines.vectorized.observation import (
+    GRIPPER,
+    JOINT,
+    LEFT_TIP,
+    OBJECT,
+    POINT,
+    RIGHT_TIP,
+    SECOND,
+    Array,
+    Index,
+    Mask,
+    row_norm,
+)
+from lw_torchrl.envs.engines.vectorized.tables import TaskSources
 
 
 class Scene(NamedTuple):
-    """What a rule looks at, one entry a row.
+    """The inputs of a rule, one entry a row: whether the point is as close to the goal as the table asks, the sensors,
+    the first 18 numbers of the observations, the goals (rows, 3), and the points (rows, 3) that are to reach them."""
 
-    Attributes:
-        near: whether the point is as close to the goal as the table asks.
-        sensors: what was read from the states.
-        current: the first 18 numbers of the observations.
-        goal: (rows, 3) the goals.
-        point: (rows, 3) what is to come close to them.
-    """
-
-    near: Truth
+    near: Mask
     sensors: Array
     current: Array
     goal: Array
@@ -45,23 +40,16 @@ STICK_UPWARD = 0.06
 
 
 class SuccessFunction:
-    """Judges a fixed set of rows.
-
-    Args:
-        sources: each row's task.
-        programs: gives a row's :class:`~lw_torchrl.envs.engines.vectorized.task_logic.TaskLogic` of its present
-            episode, for the one rule that looks at contacts.
-    """
+    """The success of a fixed set of rows; ``programs`` gives a row's present
+    :class:`~lw_torchrl.envs.engines.vectorized.task_programs.TaskProgram`, for the one rule that looks at contacts."""
 
     def __init__(self, sources: Sequence[TaskSources], programs: Callable[[int], Any]) -> None:
         success = [row.success for row in sources]
         self._programs = programs
-        self._offset = np.array([row.offset for row in success])
-        self._axes = np.array([row.axes for row in success])
-        self._within = np.array([row.within for row in success])
-        self._under = np.array([row.under for row in success])
-        self._above = np.array([row.above for row in success])
-        self._angle = np.array([row.angle for row in success])
+        self._offset, self._axes, self._within, self._under, self._above, self._angle = (
+            np.array([getattr(row, name) for row in success])
+            for name in ("offset", "axes", "within", "under", "above", "angle")
+        )
         points = [row.point for row in success]
         self._seconds = np.flatnonzero([point == "second" for point in points])
         self._grippers = np.flatnonzero([point == "gripper" for point in points])
@@ -70,18 +58,12 @@ class SuccessFunction:
         self._goal_height = np.array([row.goal_height for row in success if row.goal_height is not None])
         rules = [row.rule for row in success]
         self._rules = [
-            (RULES[name], np.flatnonzero([rule == name for rule in rules]))
+            (getattr(SuccessFunction, "_" + name.replace(" ", "_")), np.flatnonzero([rule == name for rule in rules]))
             for name in sorted({rule for rule in rules if rule is not None})
         ]
 
-    def __call__(self, sensors: Array, current: Array, goal: Array) -> Truth:
-        """(rows,) whether each row stands in success.
-
-        Args:
-            sensors: (rows, WIDTH) what was read from the states.
-            current: (rows, 18) the first numbers of the observations.
-            goal: (rows, 3) the goals.
-        """
+    def __call__(self, sensors: Array, current: Array, goal: Array) -> Mask:
+        """(rows,) whether each row succeeds, by sensors (rows, WIDTH), observations (rows, 18) and goals (rows, 3)."""
         point = current[:, OBJECT].copy()
         if self._seconds.size:
             point[self._seconds] = current[self._seconds, SECOND]
@@ -100,23 +82,23 @@ class SuccessFunction:
             success[rows] = rule(self, rows, scene)
         return success
 
-    def _point_below_goal(self, rows: Index, scene: Scene) -> Truth:
+    def _point_below_goal(self, rows: Index, scene: Scene) -> Mask:
         """The ring is over the peg and has sunk below its top."""
         return scene.near[rows] & (scene.goal[rows, 2] - scene.point[rows, 2] > 0.0)
 
-    def _object_above_goal(self, rows: Index, scene: Scene) -> Truth:
+    def _object_above_goal(self, rows: Index, scene: Scene) -> Mask:
         """The object is higher than the goal, wherever it is."""
         return scene.current[rows, OBJECT.stop - 1] > scene.goal[rows, 2]
 
-    def _joint_above(self, rows: Index, scene: Scene) -> Truth:
+    def _joint_above(self, rows: Index, scene: Scene) -> Mask:
         """The joint has moved further than ``above``."""
         return scene.sensors[rows, JOINT.start] > self._above[rows]
 
-    def _joint_near(self, rows: Index, scene: Scene) -> Truth:
+    def _joint_near(self, rows: Index, scene: Scene) -> Mask:
         """The joint is within ``within`` of ``angle``."""
         return np.abs(scene.sensors[rows, JOINT.start] - self._angle[rows]) <= self._within[rows]
 
-    def _stick_inserted(self, rows: Index, scene: Scene) -> Truth:
+    def _stick_inserted(self, rows: Index, scene: Scene) -> Mask:
         """The container is at the goal, and the stick's end is through its handle."""
         held = scene.near[rows]
         if held.any():
@@ -126,7 +108,7 @@ class SuccessFunction:
             held &= (aside[:, 1] <= STICK_SIDEWAYS) & (aside[:, 2] <= STICK_UPWARD)
         return held
 
-    def _stick_held(self, rows: Index, scene: Scene) -> Truth:
+    def _stick_held(self, rows: Index, scene: Scene) -> Mask:
         """The container is at the goal, and the gripper holds the stick up."""
         held = scene.near[rows]
         for k in np.flatnonzero(held):
@@ -134,16 +116,6 @@ class SuccessFunction:
             lifted = current[OBJECT][2] - STICK_LIFT > program.stick_init_pos[2]
             held[k] = current[GRIPPER] > 0.0 and lifted and both_pads_press(program, "objGeom")
         return held
-
-
-RULES: dict[str, Callable[[SuccessFunction, Index, Scene], Truth]] = {
-    "point below goal": SuccessFunction._point_below_goal,
-    "object above goal": SuccessFunction._object_above_goal,
-    "joint above": SuccessFunction._joint_above,
-    "joint near": SuccessFunction._joint_near,
-    "stick inserted": SuccessFunction._stick_inserted,
-    "stick held": SuccessFunction._stick_held,
-}
 
 
 def both_pads_press(program: Any, geom: str) -> bool:

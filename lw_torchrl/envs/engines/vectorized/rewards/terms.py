@@ -1,15 +1,19 @@
-"""What Meta-World's rewards are made of, over arrays, with the bits of its own scalars."""
+"""What rewards are made of: Meta-World's scalar functions over arrays, and the terms of all rows at once."""
 
 from __future__ import annotations
+
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from lw_torchrl.envs.engines.vectorized.observation import LEFT_PAD, RIGHT_PAD, Array, Mask, row_norm
+from lw_torchrl.envs.engines.vectorized.rewards.parameters import ACROSS, FEATURES, GRIP, VIA, Parameters
+
 Numbers = NDArray[np.floating]
 """Single or double precision: Meta-World computes with the gripper's action in the action's own."""
 
-AT_MARGIN = 0.1  # what a margin away from the bounds gives
+AT_MARGIN = 0.1  # the value at a distance of one margin
 LONG_TAIL = np.sqrt(1 / AT_MARGIN - 1)
 GAUSSIAN = np.sqrt(-2 * np.log(AT_MARGIN))
 
@@ -21,12 +25,12 @@ def square(x: Array) -> Array:
 
 
 def long_tail(margins: Array) -> Array:
-    """From 1 at 0 to 0.1 at 1; beyond, slowly on."""
+    """From 1 at 0 to 0.1 at 1; beyond, it falls slowly."""
     return 1 / (square(margins * LONG_TAIL) + 1)
 
 
 def gaussian(margins: Array) -> Array:
-    """From 1 at 0 to 0.1 at 1; beyond, fast to 0."""
+    """From 1 at 0 to 0.1 at 1; beyond, it falls fast to 0."""
     return np.exp(-0.5 * square(margins * GAUSSIAN))
 
 
@@ -46,3 +50,138 @@ def hamacher_product(a: Numbers, b: Numbers) -> Numbers:
 def limited(x: Numbers, low: float, high: float) -> Numbers:
     """``np.clip`` at a third of its cost for few numbers."""
     return np.minimum(np.maximum(x, low), high)
+
+
+class Proximity(NamedTuple):
+    """How close two points are, for every term of every row, each (rows, 4)."""
+
+    distance: Array
+    margin: Array  # how much further the value falls to 0.1
+    value: Array  # 1 where the points are close, less where they are not
+
+
+class ProximityTerms:
+    """How close pairs of points are, for a fixed set of rows."""
+
+    def __init__(self, task: Parameters) -> None:
+        row = np.arange(len(task.within)).reshape(-1, 1, 1, 1, 1) * FEATURES
+        points = task.points + row
+        self._first = np.ascontiguousarray(points[:, :, 0])
+        self._second = np.ascontiguousarray(points[:, :, 1])
+        self._offset = task.offset
+        self._axes = task.axes[:, None]
+        self._within = task.within
+        self._gaussian = np.nonzero(task.gaussian)
+
+    def __call__(self, features: Array, less: Array) -> Proximity:
+        """Measure features (rows, FEATURES). ``less`` (rows, 4) is taken from the distance of a margin's points; NaN is
+        replaced by the present distance, and makes it the margin."""
+        numbers = features.reshape(-1)
+        difference = numbers.take(self._first)
+        difference += self._offset
+        difference -= numbers.take(self._second)
+        difference *= self._axes
+        length = row_norm(difference)
+        distance = np.ascontiguousarray(length[:, 0])
+        np.copyto(less, distance, where=np.isnan(less))
+        margin = np.abs(length[:, 1] - less)
+        beyond = (distance - self._within) / margin
+        value = long_tail(beyond)
+        if self._gaussian[0].size:
+            value[self._gaussian] = gaussian(beyond[self._gaussian])
+        value[distance <= self._within] = 1.0
+        return Proximity(distance, margin, value)
+
+
+CAGED = 0.97  # from here on it counts that the gripper closes
+CAGED_FOR_PINCH = 0.95
+PADS = np.array([LEFT_PAD.start + 1, RIGHT_PAD.start + 1])
+SIDES = np.array([1.0, -1.0])
+
+
+class CagingTerm:
+    """How well the gripper encloses and grips the object, for a fixed set of rows."""
+
+    def __init__(self, task: Parameters) -> None:
+        self._rows = np.flatnonzero(task.cage.used)
+        cage = task.cage.of(self._rows)
+        row = self._rows * FEATURES
+        self._pads = row[:, None] + PADS
+        self._object = (row + GRIP.start + 1)[:, None]
+        self._start = (row + cage.start)[:, None]
+        self._radius, self._pad, self._signed = cage.radius[:, None], cage.pad[:, None], cage.signed[:, None]
+        self._high, self._medium = cage.high, cage.medium
+        pinching = np.isfinite(cage.pinch)
+        self._gripping = ~pinching
+        self._pinching = np.flatnonzero(pinching)
+        self._pinch = (cage.radius + cage.pinch)[self._pinching][:, None]
+
+    def __call__(self, features: Array, near: Proximity, closed: Numbers, narrow: Mask) -> tuple[Array, Mask]:
+        """Measure features (rows, FEATURES).
+
+        ``closed`` (rows,) is how far the gripper is told to close, in the action's precision, and ``narrow`` (rows,)
+        where it is a number of the action itself, not a bound of its range. Returns values (rows,) from 0 to 1, and
+        where they were computed in the action's precision, because ``closed`` takes part.
+        """
+        rows = self._rows
+        numbers = features.reshape(-1)
+        pads, where = numbers.take(self._pads), numbers.take(self._object)
+        sideways = pads - where
+        sideways = np.where(self._signed, sideways * SIDES, np.abs(sideways))
+        margin = np.abs(np.abs(pads - numbers.take(self._start)) - self._pad)
+        left, right = tolerance(sideways, self._radius, self._pad, margin).T
+        cage = hamacher_product(hamacher_product(left, right), near.value[rows, ACROSS])
+        via = near.value[rows, VIA]
+
+        caged = cage > CAGED
+        gripped = np.where(caged & self._gripping, closed[rows], 0.0)
+        grasp = self._blend(cage, gripped, via, self._high, self._medium)
+        narrow = narrow[rows] & caged & self._gripping
+        if narrow.any():
+            some, dtype = np.flatnonzero(narrow), closed.dtype
+            kinds = self._high[some], self._medium[some]
+            grasp[some] = self._blend(cage[some].astype(dtype), closed[rows[some]], via[some].astype(dtype), *kinds)
+        if (some := self._pinching).size:
+            left, right = tolerance(sideways[some], self._radius[some], self._pinch, margin[some]).T
+            pinched = np.where(cage[some] > CAGED_FOR_PINCH, hamacher_product(left, right), 0.0)
+            grasp[some] = (cage[some] + pinched) / 2
+
+        all_grasps, all_narrow = np.zeros(len(features)), np.zeros(len(features), dtype=bool)
+        all_grasps[rows], all_narrow[rows] = grasp, narrow
+        return all_grasps, all_narrow
+
+    @staticmethod
+    def _blend(cage: Any, gripped: Any, via: Any, high: Mask, medium: Mask) -> Any:
+        both = hamacher_product(cage, gripped)
+        other = np.where(high, cage, via)
+        return np.where(high | medium, (both + other) / 2, both)
+
+
+FUNNEL_DEPTH = 0.01  # metres below the floor that still count as above
+
+
+class FunnelTerm:
+    """Whether the hand keeps above a funnel's floor on its way, for a fixed set of rows."""
+
+    def __init__(self, task: Parameters) -> None:
+        self._rows = np.flatnonzero(task.funnel.used)
+        funnel = task.funnel.of(self._rows)
+        row = self._rows * FEATURES
+        self._height_of = row + funnel.over
+        self._from = (row + funnel.over)[:, None, None] + (-2, -1)
+        self._about = row[:, None, None] + funnel.about
+        self._offset = funnel.offset[:, None, :2]
+        self._rim, self._slope, self._height = (one[:, None] for one in (funnel.rim, funnel.slope, funnel.height))
+        self._margin = funnel.margin
+
+    def __call__(self, features: Array) -> Array:
+        """(rows,) 1 above the floor, less below it."""
+        above = np.ones(len(features))
+        if self._rows.size:
+            numbers = features.reshape(-1)
+            radius = row_norm(numbers.take(self._from) - (numbers.take(self._about) + self._offset)) - self._rim
+            floor = np.where(radius > 0.0, self._slope * np.log(radius) + self._height, 0.0).min(axis=1)
+            margin = np.where(np.isnan(self._margin), floor / 2.0, self._margin)
+            z = numbers.take(self._height_of)
+            above[self._rows] = np.where(z >= floor, 1.0, tolerance(floor - z, 0.0, FUNNEL_DEPTH, margin))
+        return above

@@ -1,4 +1,4 @@
-"""GroupSampler: exact numbers from groups of rows, each group gone through in passes of its own."""
+"""GroupSampler and TaskBalancedSampler: exact numbers of rows from each group, each group in passes of its own."""
 
 from __future__ import annotations
 
@@ -16,21 +16,17 @@ from torchrl.data.replay_buffers.storages import Storage
 
 from lw_torchrl._checks import check_int
 from lw_torchrl._files import reading
+from lw_torchrl._keys import check_key
 from lw_torchrl._tensor_archive import TensorArchive, write_archive
-from lw_torchrl.data.device_storage import beside
-from lw_torchrl.data.passes import Passes
-from lw_torchrl.data.sampler_state import check_state
-from lw_torchrl.data.storage import JoinedStorage
+from lw_torchrl.data.passes import Passes, check_state
+from lw_torchrl.data.storage import JoinedStorage, to_device_of
 
 _FILE = "sampler.zip"
 
 
 def column(storage: Storage, key: NestedKey, index: Tensor | None = None) -> Tensor:
-    """One column of all rows of a storage, or of those at an index, on the CPU; a joined one would otherwise copy all
-    columns.
-
-    Rows of a storage of several dimensions are numbered in row-major order.
-    """
+    """One column of all rows of a storage, or of those at an index, on the CPU; rows of a storage of several dimensions
+    are numbered in row-major order."""
     if isinstance(storage, JoinedStorage):
         return storage.column(key, index).cpu()
     rows = storage.get(slice(0, len(storage)))
@@ -43,7 +39,7 @@ def column(storage: Storage, key: NestedKey, index: Tensor | None = None) -> Ten
 
 
 def nearest_sizes(batch_size: int, unit: int) -> str:
-    """The multiples of ``unit`` around a batch size that is none, in words."""
+    """The multiples of ``unit`` next to a batch size, in words."""
     below = batch_size // unit * unit
     return " and ".join(str(size) for size in (below, below + unit) if size)
 
@@ -51,16 +47,16 @@ def nearest_sizes(batch_size: int, unit: int) -> str:
 class GroupSampler(Sampler):
     """Exact numbers from groups of rows; within a group every row comes once before any comes again.
 
-    A subclass says which group each row is in (:meth:`_label`) and how many a batch has of each (:meth:`_shares`).
-    A batch holds the groups one after another. A group's pass goes on over the end of a batch and, where a batch asks
-    for more than is left, over the end of the pass: the rest comes from the next pass, in a new order.
+    A subclass gives the group of each row (:meth:`_label`) and the rows of each group in a batch (:meth:`_shares`). A
+    batch holds the groups one after another. A group's pass continues in the next batch; where a pass ends within a
+    batch, the rest comes from the next pass, in a new order.
 
-    Rows may come and be overwritten. If the subclass says by what a row's group is known (:meth:`_keys`), the groups
-    and passes are kept up: a row that comes takes a random place in what is left of its group's pass, so that it comes
-    once before any comes again, and the work is that of the rows that came. All rows are grouped again, and all passes
-    begin, where a group comes or goes, where the subclass does not say, and in a storage of several dimensions.
+    Rows may be written and overwritten. If the subclass tells a row's group by a column (:meth:`_keys`), groups and
+    passes are updated: a new row takes a random place in what is left of its group's pass, and the work is that of the
+    new rows. Otherwise, and when a group comes or goes or the storage has several dimensions, all rows are grouped
+    again and all passes begin.
 
-    Of a storage of several dimensions (``ndim=2``) an index is a tuple of as many tensors, as TorchRL's samplers give.
+    For a storage of several dimensions (``ndim=2``) an index is a tuple of as many tensors, as TorchRL's samplers give.
     """
 
     def __init__(self) -> None:
@@ -71,8 +67,8 @@ class GroupSampler(Sampler):
         self._length = 0
         none = torch.empty(0, dtype=torch.int64)
         self._passes = Passes(none, none)
-        self._known: Tensor | None = None  # what each group's rows are known by
-        self._written: list[Tensor] = []  # rows that were written since the last batch
+        self._known: Tensor | None = None  # the key of each group's rows
+        self._written: list[Tensor] = []  # rows written since the last batch
         self._ran_out = False
         self._restored = False
         self._laid_out: tuple[int, Tensor, Tensor, Tensor] | None = None  # see _layout
@@ -86,11 +82,11 @@ class GroupSampler(Sampler):
         """The rows of each group in a batch: (G,) int64, at least 1; a size that cannot be exact raises ValueError."""
 
     def _keys(self, storage: Storage, rows: Tensor) -> Tensor | None:
-        """What tells the groups of rows apart, (n,) int64; None where that takes a look at all rows."""
+        """The key of each row's group, (n,) int64; None where that takes a look at all rows."""
         return None
 
     def _covered(self, storage: Storage) -> int:
-        """The number of rows that are grouped: the first so many."""
+        """How many of the first rows are grouped."""
         return len(storage) if storage.ndim == 1 else storage.shape.numel()
 
     @property
@@ -114,12 +110,12 @@ class GroupSampler(Sampler):
             self._passes.shuffle(group, self._rng)
 
     def _know(self, storage: Storage) -> None:
-        """Note what each group is known by."""
+        """Note the key of each group."""
         found = self._keys(storage, self._passes.order[self._passes.start]) if storage.ndim == 1 else None
         self._known = None if found is None else found.reshape(-1).cpu()
 
     def _take_in(self, storage: Storage) -> bool:
-        """Move the rows that were written to their groups; whether that is all there was to do."""
+        """Move the rows that were written to their groups; False if all rows must be grouped again."""
         if self._known is None or not self._written:
             return False
         rows = torch.cat(self._written).unique()
@@ -145,8 +141,9 @@ class GroupSampler(Sampler):
             self._laid_out = (batch_size, shares, group, place)
         return self._laid_out[1:]
 
-    def _check_worker(self) -> None:
-        """Raise where each worker of a DataLoader has a copy of this sampler, all of which would draw the same rows."""
+    def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor | tuple[Tensor, ...], dict[str, Any]]:
+        """Draw ``batch_size`` indices, group after group."""
+        batch_size = check_int("batch_size", batch_size, minimum=1)
         worker = get_worker_info()
         if worker is not None and worker.num_workers > 1 and self._process != os.getpid():
             raise RuntimeError(
@@ -154,11 +151,6 @@ class GroupSampler(Sampler):
                 "buffer anew with a generator of its own, or replay.set_sampler(...) and replay.set_rng(...); see "
                 "docs/sampling.md"
             )
-
-    def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor | tuple[Tensor, ...], dict[str, Any]]:
-        """Draw ``batch_size`` indices, group after group."""
-        batch_size = check_int("batch_size", batch_size, minimum=1)
-        self._check_worker()
         if not len(storage):
             raise ValueError("storage must hold at least one row, got an empty one")
         if self._restored and self._length:
@@ -180,26 +172,26 @@ class GroupSampler(Sampler):
                 rows, ended = passes.take(number, int(shares[number]), self._rng)
                 index[first[number] : first[number] + len(rows)] = rows
                 self._ran_out |= ended and bool(longest[number])
-        index = beside(storage, index)
+        index = to_device_of(storage, index)
         return (index if storage.ndim == 1 else torch.unravel_index(index, storage.shape)), {}
 
     def add(self, index: Any) -> None:
-        """Note that rows were written, over old ones perhaps."""
+        """Note that rows were written or overwritten."""
         rows = torch.as_tensor(index, device="cpu").reshape(-1)
         self._written.append(rows)
         if sum(map(len, self._written)) > 2 * self._length:
-            self._length, self._written = 0, []  # as much work as to group all rows again
+            self._length, self._written = 0, []  # it is as much work to group all rows again
 
     extend = add
 
     def mark_update(self, index: Any, *, storage: Storage | None = None) -> None:
-        """Note that rows were written, by another buffer of the same storage perhaps."""
+        """Note that rows were written, perhaps by another buffer of the same storage."""
         self.add(index)
 
     def state_dict(self) -> dict[str, Any]:
         """The shuffled order, how far each group's pass has come, and the rows written since the last batch."""
         none = torch.empty(0, dtype=torch.int64)
-        begun = self._length > 0 and not (self._written and self._known is None)  # or else all is grouped again
+        begun = self._length > 0 and not (self._written and self._known is None)  # otherwise all is grouped again
         size = self._passes.size if begun else none
         return {
             "length": torch.tensor(self._length if begun else 0),
@@ -213,12 +205,7 @@ class GroupSampler(Sampler):
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` gave.
-
-        Raises:
-            ValueError: it is no such state. Whether it is one of the storage's rows shows at the next sample, which
-                raises it then.
-        """
+        """Restore a state; :class:`ValueError` if it is none, or at the next sample if it is of other rows."""
         state = check_state(state_dict)
         self._length, self._ran_out = state["length"], state["ran_out"]
         self._passes = Passes(state["order"].clone(), state["size"].clone(), state["cursor"].clone())
@@ -228,10 +215,8 @@ class GroupSampler(Sampler):
         self._restored = True
 
     def _check_restored(self, storage: Storage) -> None:
-        """Raise unless a restored state is of the storage's rows, in their groups.
-
-        Where rows were written since, all are grouped again if the others are not in the groups that the state says.
-        """
+        """Raise unless a restored state is of the storage's rows, in their groups; if rows were written since and the
+        others are in other groups, all are grouped again."""
         rows, groups = self._passes.order, torch.repeat_interleave(self._passes.size)
         length = self._covered(storage)
         if self._written:
@@ -254,11 +239,56 @@ class GroupSampler(Sampler):
         write_archive(Path(path) / _FILE, {}, {"state": self.state_dict()})
 
     def loads(self, path: Any) -> None:
-        """Read the state that :meth:`dumps` wrote, without unpickling.
-
-        Raises:
-            FileNotFoundError: there is no such file.
-            ValueError: it is damaged, or of something else.
-        """
+        """Read the state that :meth:`dumps` wrote; a ValueError if it is damaged, or of something else."""
         with reading(path, "sampler's state"):
             self.load_state_dict(TensorArchive(Path(path) / _FILE).tensors("state"))
+
+
+class TaskBalancedSampler(GroupSampler):
+    """Equal numbers from every task, exactly; within a task every row comes once before any comes again.
+
+    The buffer may grow: new rows take random places in the present passes, and overwritten ones leave them; when a task
+    comes or goes, all passes begin anew. A batch costs no more than the rows written since the last one.
+
+    It draws from the replay buffer's generator, so ``ReplayBuffer(..., generator=...)`` fixes the batches. Its state is
+    saved with the buffer's. Each task has passes of its own; an epoch is a pass over the largest task.
+
+    Args:
+        task_key: the entry of the storage that holds the task.
+
+    Raises:
+        ValueError: at sampling, a batch size that the number of tasks does not divide (with the nearest that it
+            does), or an empty storage.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+        >>> replay = TensorDictReplayBuffer(storage=LazyTensorStorage(10), sampler=TaskBalancedSampler(), batch_size=4)
+        >>> _ = replay.extend(TensorDict({"task_id": torch.tensor([3] * 8 + [7] * 2)}, [10]))
+        >>> replay.sample()["task_id"].bincount(minlength=8).tolist()
+        [0, 0, 0, 2, 0, 0, 0, 2]
+
+    Source: paper section 'Cross-Task Co-Learning via 1:1 Data Mixing', its minibatches of equal numbers.
+    """
+
+    def __init__(self, task_key: NestedKey = "task_id") -> None:
+        check_key("task_key", task_key)
+        self.task_key = task_key
+        super().__init__()
+
+    def _label(self, storage: Storage) -> Tensor:
+        return torch.unique(column(storage, self.task_key).reshape(-1), return_inverse=True)[1]
+
+    def _keys(self, storage: Storage, rows: Tensor) -> Tensor:
+        return column(storage, self.task_key, rows)
+
+    def _shares(self, batch_size: int) -> Tensor:
+        groups = len(self._passes.size)
+        count, rest = divmod(batch_size, groups)
+        if rest or not count:
+            raise ValueError(
+                f"batch_size must be divisible by the number of tasks, {groups}, got {batch_size}; the nearest are "
+                + nearest_sizes(batch_size, groups)
+            )
+        return torch.full((groups,), count)

@@ -1,19 +1,20 @@
-"""The rows of a dataset: a file for each column, written through files and read through a memory map.
+"""The rows of a dataset: a file for each column, memory-mapped, and the checksums of its episodes.
 
-They are what ``TensorDict.memmap`` writes, so ``TensorDict.load_memmap`` reads them too. Here they are mapped column by
-column, as :data:`COLUMNS` says: nothing that lies in the folder can ask for another shape, class or pickle. The map is
-copy-on-write: whoever writes to a column changes it for this process alone, never the file. Writing goes through files,
-since a full disk under a memory map ends the process without a word.
+The files are those of ``TensorDict.memmap``, so ``TensorDict.load_memmap`` reads them too. Here they are mapped as
+:data:`COLUMNS` says, so that nothing in the folder can ask for another shape, class or pickle. The map is
+copy-on-write: what is written to a column changes it for this process, never the file. The files themselves are not
+written through a map, since a full disk under one ends the process silently.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+import time
+from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from math import prod
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from zlib import crc32
 
 import numpy as np
@@ -21,8 +22,10 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from lw_torchrl._checks import counted
 from lw_torchrl._files import flush, read_json
-from lw_torchrl.data.dataset import DATA, DamagedDatasetError, DatasetError, Demonstrations, EpisodeInfo
+from lw_torchrl._progress import Progress
+from lw_torchrl.data.dataset import DATA, METADATA, DamagedDatasetError, DatasetError, Demonstrations, EpisodeInfo
 from lw_torchrl.language.tasks import task_id
 
 Column = tuple[str, ...]
@@ -49,13 +52,8 @@ def _path(folder: Path, key: Column) -> Path:
     return folder.joinpath(*key[:-1], f"{key[-1]}.memmap")
 
 
-def column_files(folder: Path) -> list[Path]:
-    """The files of the columns."""
-    return [_path(folder, key) for key in COLUMNS]
-
-
 def _meta(rows: int) -> dict[str, dict[str, Any]]:
-    """What the description in each folder says, as TensorDict writes it; the folder of the rows is ""."""
+    """The description in each folder, as TensorDict writes it; "" is the folder of the rows."""
     found: dict[str, dict[str, Any]] = {"": {}}
     for (*parents, name), (tail, dtype) in COLUMNS.items():
         for parent in parents:
@@ -67,11 +65,8 @@ def _meta(rows: int) -> dict[str, dict[str, Any]]:
 
 
 def write_rows(folder: Path, episodes: Iterable[TensorDictBase]) -> None:
-    """Write episodes, each of the columns of :data:`COLUMNS`, one after another, and see them onto the disk.
-
-    Raises:
-        OSError: there is no room for them; the folder holds a part of them then.
-    """
+    """Write episodes of :data:`COLUMNS`, one after another, and flush them to the disk; after an :class:`OSError` the
+    folder holds a part of them."""
     rows = 0
     for name in _meta(0):
         (folder / name).mkdir(parents=True, exist_ok=True)
@@ -89,7 +84,7 @@ def write_rows(folder: Path, episodes: Iterable[TensorDictBase]) -> None:
 
 
 def read_rows(folder: Path, start: int, length: int) -> TensorDict | None:
-    """Some rows as they lie in the files, in memory; None where a column is missing or too short."""
+    """Some rows of the files, in memory; None where a column is missing or too short."""
     found = TensorDict({}, [length])
     for key, (tail, dtype) in COLUMNS.items():
         path, width = _path(folder, key), _WIDTH[key]
@@ -103,7 +98,7 @@ def read_rows(folder: Path, start: int, length: int) -> TensorDict | None:
 
 
 def describe_episode(task: str, episode: int, start: int, rows: TensorDictBase) -> EpisodeInfo:
-    """What the metadata say of an episode of these rows."""
+    """The metadata of an episode of these rows."""
     checksum = 0
     for key in COLUMNS:
         checksum = crc32(rows.get(key).contiguous().numpy().data, checksum)
@@ -112,8 +107,8 @@ def describe_episode(task: str, episode: int, start: int, rows: TensorDictBase) 
     return EpisodeInfo(task, episode, start, len(rows), first is not None, first, checksum)
 
 
-def surplus(folder: Path) -> list[str]:
-    """What lies among the rows and is no part of them; hidden files do not count."""
+def _surplus(folder: Path) -> list[str]:
+    """Files among the rows that are no part of them; hidden files do not count."""
     ours = {_path(folder, key) for key in COLUMNS} | {folder / name / _META for name in _meta(0)}
     folders = {folder / name for name in _meta(0)}
     there = [path for one in folders if one.is_dir() for path in one.iterdir() if not path.name.startswith(".")]
@@ -122,11 +117,11 @@ def surplus(folder: Path) -> list[str]:
 
 def holds_columns(folder: Path) -> bool:
     """Whether a folder holds columns of a dataset, and nothing else."""
-    return any(_path(folder, key).is_file() for key in COLUMNS) and not surplus(folder)
+    return any(_path(folder, key).is_file() for key in COLUMNS) and not _surplus(folder)
 
 
 def _check_files(folder: Path, rows: int) -> None:
-    """Raise if the files are not what they should be. Mapping a file that is too short would lengthen it."""
+    """Raise unless the files are as they were written; mapping one that is too short would lengthen it."""
     for name, expected in _meta(rows).items():
         found = read_json(folder / name / _META, "the description", limit=2**20)
         if not name and found.get("shape") != [rows]:
@@ -138,26 +133,15 @@ def _check_files(folder: Path, rows: int) -> None:
             raise ValueError(f"{'/'.join(key)}.memmap has {size} bytes, not {rows * width}")
 
 
-def _renumbered(demonstrations: Demonstrations) -> Tensor:
-    """Today's task_id of each row: (R,) int64."""
-    episodes = demonstrations.episodes
-    numbers = torch.tensor([task_id(episode.task) for episode in episodes])
-    return numbers.repeat_interleave(torch.tensor([episode.length for episode in episodes]))
-
-
 class MappedColumn(Tensor):
-    """A column in its file. A process that is spawned maps the file again; what is computed of it is a plain tensor."""
+    """A column in its file. A spawned process maps the file again; what is computed from it is a plain tensor."""
 
     __torch_function__ = torch._C._disabled_torch_function_impl  # type: ignore[assignment]
     _source: tuple[Path, tuple[int, ...], torch.dtype]
 
     @staticmethod
     def of(path: Path, shape: tuple[int, ...], dtype: torch.dtype) -> MappedColumn:
-        """Map a file that holds exactly such a column.
-
-        Raises:
-            OSError, ValueError, RuntimeError: it cannot be read, or is of another size.
-        """
+        """Map a file that holds exactly such a column; OSError, ValueError or RuntimeError for another."""
         content = torch.from_numpy(np.memmap(path, np.uint8, "c"))
         column = content.view(dtype).view(shape).as_subclass(MappedColumn)
         column._source = (path.absolute(), shape, dtype)
@@ -171,14 +155,10 @@ class MappedColumn(Tensor):
 
 
 def map_rows(demonstrations: Demonstrations) -> TensorDict:
-    """The rows of a dataset as they lie in the files, memory-mapped.
-
-    Raises:
-        DatasetError: (a ValueError) a column is missing, or not as long as the metadata say; or something else lies
-            among them.
-    """
+    """The rows of a dataset as they are in the files, memory-mapped; DatasetError if a column is missing, or not as
+    long as the metadata say, or there are other files."""
     folder, number = demonstrations.root / DATA, demonstrations.num_steps
-    if odd := surplus(folder):
+    if odd := _surplus(folder):
         raise DatasetError(
             f"root: {', '.join(map(repr, odd[:5]))} in {str(folder)!r} is no part of a dataset; move it elsewhere"
         )
@@ -196,16 +176,82 @@ def map_rows(demonstrations: Demonstrations) -> TensorDict:
 
 
 def load_rows(demonstrations: Demonstrations) -> TensorDict:
-    """The rows of a dataset, memory-mapped.
-
-    Where tasks were numbered otherwise when the dataset was made, ``task_id`` and ``("next", "task_id")`` are today's
-    numbers, in memory.
-
-    Raises:
-        DatasetError: (a ValueError) as for :func:`map_rows`.
-    """
+    """:func:`map_rows`; if tasks had other numbers when the dataset was made, ``task_id`` and ``("next", "task_id")``
+    are the present ones, in memory."""
     rows = map_rows(demonstrations)
     if any(task_id(task) != stored for task, stored in demonstrations.task_ids.items()):
-        rows.set("task_id", now := _renumbered(demonstrations))
+        episodes = demonstrations.episodes
+        lengths = torch.tensor([episode.length for episode in episodes])
+        now = torch.tensor([task_id(episode.task) for episode in episodes]).repeat_interleave(lengths)
+        rows.set("task_id", now)
         rows.set(("next", "task_id"), now.clone())
     return rows
+
+
+READ_AT_ONCE = 2 * 2**30
+"""Bytes of rows that are verified when a dataset is opened; of a larger one, so many, spread evenly."""
+
+_SETTLED = 3 * 10**9  # ns; a younger file may be written again with the same time
+
+
+class _Verified(NamedTuple):
+    """The episodes of a dataset that this process has verified, and the state of its files then."""
+
+    files: tuple[tuple[int, ...], ...]
+    episodes: set[EpisodeInfo]
+
+
+_VERIFIED: dict[Path, _Verified] = {}
+
+
+def _as_written(demonstrations: Demonstrations, info: EpisodeInfo, rows: TensorDictBase) -> bool:
+    return (
+        describe_episode(info.task, info.episode, info.start, rows) == info
+        and bool((rows.get("task_id") == demonstrations.task_ids[info.task]).all())
+        and bool((rows.get("episode") == info.episode).all())
+    )
+
+
+def whole_episodes(demonstrations: Demonstrations, *, progress: bool) -> list[EpisodeInfo]:
+    """The episodes whose rows are as they were written, by their checksums and the other metadata; a column that is too
+    short does not matter for the episodes that it holds."""
+    whole = []
+    with Progress("checking", len(demonstrations.episodes), "episode", show=progress) as bar:
+        for info in demonstrations.episodes:
+            rows = read_rows(demonstrations.root / DATA, info.start, info.length)
+            bar.update()
+            if rows is not None and _as_written(demonstrations, info, rows):
+                whole.append(info)
+    return whole
+
+
+def _files(root: Path) -> tuple[tuple[int, ...], ...]:
+    """What changes when a dataset's files do."""
+    found = [path.stat() for path in (root / METADATA, *(_path(root / DATA, key) for key in COLUMNS))]
+    return tuple((one.st_dev, one.st_ino, one.st_size, one.st_mtime_ns, one.st_ctime_ns) for one in found)
+
+
+def verify(demonstrations: Demonstrations, episodes: Sequence[EpisodeInfo], *, every: bool = True) -> None:
+    """Check episodes of a dataset against their checksums, unless this process has and the files are as they were then;
+    DatasetError if they differ. Without ``every``, at most :data:`READ_AT_ONCE` bytes are read, spread evenly."""
+    rows, root = map_rows(demonstrations), demonstrations.root.resolve()
+    files = _files(root)
+    known = _VERIFIED.get(root, _Verified(files, set()))
+    known = known if known.files == files else _Verified(files, set())
+    size = sum(info.length for info in episodes) * ROW_BYTES
+    asked = episodes if every else episodes[:: -(-size // READ_AT_ONCE)]
+    broken = [
+        info
+        for info in asked
+        if info not in known.episodes
+        and not _as_written(demonstrations, info, rows[info.start : info.start + info.length])
+    ]
+    if broken:
+        listed = ", ".join(f"{info.episode} of {info.task!r}" for info in broken[:5]) + ", ..." * (len(broken) > 5)
+        raise DamagedDatasetError(
+            f"root: the rows in {str(demonstrations.root)!r} are not as they were written: "
+            f"{counted(len(broken), 'episode')} of {len(asked)} differ from their checksums, {listed}; the same "
+            "collect_demonstrations keeps the others and runs these again"
+        )
+    if max(max(one[3:]) for one in files) < time.time_ns() - _SETTLED:
+        _VERIFIED[root] = _Verified(files, known.episodes | set(asked))

@@ -1,4 +1,4 @@
-"""The numbers of each task's dense reward: data/rewards.toml, read and checked."""
+"""The tables of all tasks: data/simulation.toml (observation, success) and data/rewards.toml, read and checked."""
 
 from __future__ import annotations
 
@@ -7,12 +7,66 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.resources import files
-from math import inf
+from math import inf, nan
 from types import MappingProxyType
 from typing import Any
 
 from lw_torchrl._checks import check_choice
-from lw_torchrl.envs.engines.vectorized.simulation_table import NO_OFFSET, Vector
+
+Vector = tuple[float, float, float]
+Pair = tuple[float, float]
+
+PLACES = ("body", "geom", "site")
+RULES = ("point below goal", "object above goal", "joint above", "joint near", "stick inserted", "stick held")
+
+NO_OFFSET: Vector = (-0.0, -0.0, -0.0)
+"""Adding -0.0 leaves every number as it is, 0.0 and -0.0 included; adding 0.0 does not."""
+
+
+def parse_place(text: str) -> tuple[str, str]:
+    """The kind, "body", "geom" or "site", and the name of a part of the model, "site goal" say."""
+    kind, _, name = text.partition(" ")
+    if kind not in PLACES or not name:
+        raise ValueError(f"a place is 'body NAME', 'geom NAME' or 'site NAME', got {text!r}")
+    return kind, name
+
+
+@dataclass(frozen=True)
+class SuccessSources:
+    """What makes a task a success; see the head of data/simulation.toml for each field."""
+
+    within: float = inf
+    under: float = inf
+    point: str = "object"
+    offset: Vector = NO_OFFSET
+    axes: Vector = (1.0, 1.0, 1.0)
+    goal_height: float | None = None
+    rule: str | None = None
+    joint: str | None = None
+    angle: float = 0.0
+    above: float = 0.0
+    stick_end: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.rule is not None and self.rule not in RULES:
+            raise ValueError(f"success.rule must be one of {', '.join(RULES)}, got {self.rule!r}")
+        if self.point not in ("object", "second", "gripper"):
+            parse_place(self.point)
+
+
+@dataclass(frozen=True)
+class TaskSources:
+    """Where one task's observation comes from; see the head of data/simulation.toml for each field."""
+
+    object: str
+    quaternion: str
+    success: SuccessSources
+    offset: Vector = NO_OFFSET
+    dial: str | None = None
+    second: str | None = None
+    second_offset: Vector = NO_OFFSET
+    second_quaternion: str = "zeros"
+
 
 POINTS = (
     "hand", "object", "second", "goal", "tcp", "left pad", "grip", "place", "start", "tcp at start", "mark", "waypoint",
@@ -22,9 +76,10 @@ DENSITIES = ("sparse", "high", "medium")
 FIRST_DISTANCE = "first distance"
 
 
-def _check_points(points: tuple[str, ...]) -> None:
-    if len(points) != 2:
-        raise ValueError(f"two points are needed, got {', '.join(points)}")
+def _check_points(points: tuple[str, ...], *numbers: int) -> None:
+    if len(points) not in numbers:
+        wanted = " or ".join(("one", "two")[number - 1] for number in numbers)
+        raise ValueError(f"{wanted} points are needed, got {', '.join(points)}")
     for point in points:
         check_choice("a point", point, POINTS)
 
@@ -43,9 +98,9 @@ class Term:
     curve: str = "long tail"
 
     def __post_init__(self) -> None:
-        _check_points(self.between)
+        _check_points(self.between, 2)
         if isinstance(self.margin, tuple):
-            _check_points(self.margin)
+            _check_points(self.margin, 2)
         check_choice("curve", self.curve, CURVES)
 
 
@@ -62,7 +117,7 @@ class Cage:
     slide: float = 0.0
     offset: Vector = NO_OFFSET
     signed: bool = False
-    pinch: float | None = None
+    pinch: float = inf
 
     def __post_init__(self) -> None:
         check_choice("cage.density", self.density, DENSITIES)
@@ -78,14 +133,12 @@ class Funnel:
     rim: float
     slope: float
     height: float
-    margin: float | None = None
+    margin: float = nan
     offset: Vector = NO_OFFSET
 
     def __post_init__(self) -> None:
-        if not 1 <= len(self.about) <= 2:
-            raise ValueError(f"funnel.about must be one or two points, got {', '.join(self.about)}")
-        for point in (self.over, *self.about):
-            check_choice("a point", point, POINTS)
+        _check_points((self.over,), 1)
+        _check_points(self.about, 1, 2)
 
 
 @dataclass(frozen=True)
@@ -122,7 +175,7 @@ class TaskReward:
     waypoint: tuple[float | str, float | str, float | str] = (0.0, 0.0, 0.0)
     corners: tuple[str, ...] = ()
     joint: str | None = None
-    weights: tuple[float, float] = (1.0, 1.0)
+    weights: Pair = (1.0, 1.0)
     factor: float = 1.0
     bonus: float = 5.0
     shut: bool = False
@@ -156,25 +209,39 @@ def _plain(table: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def parse_reward_table(text: str) -> dict[str, TaskReward]:
-    """Read the table from TOML.
-
-    Raises:
-        ValueError: an entry that is not understood; the message names the task.
-    """
-    kinds: dict[str, Any] = {"near": Term, "placed": Term, "via": Term, "cage": Cage, "funnel": Funnel, "held": Held}
-    rewards = {}
+def _parse(text: str, kind: str, task: Any, parts: Mapping[str, Any]) -> dict[str, Any]:
+    tasks = {}
     for name, entry in tomllib.loads(text).items():
         try:
-            parts = {key: kinds[key](**_plain(entry.pop(key))) for key in kinds.keys() & entry.keys()}
-            rewards[name] = TaskReward(**_plain(entry), **parts)
+            made = {key: parts[key](**_plain(entry.pop(key))) for key in parts.keys() & entry.keys()}
+            tasks[name] = task(**_plain(entry), **made)
         except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"reward table, task {name!r}: {error}") from error
-    return rewards
+            raise ValueError(f"{kind} table, task {name!r}: {error}") from error
+    return tasks
+
+
+def parse_simulation_table(text: str) -> dict[str, TaskSources]:
+    """Read TOML; :class:`ValueError` names the task of an entry that is not understood."""
+    return _parse(text, "simulation", TaskSources, {"success": SuccessSources})
+
+
+def parse_reward_table(text: str) -> dict[str, TaskReward]:
+    """Read TOML; :class:`ValueError` names the task of an entry that is not understood."""
+    parts = {"near": Term, "placed": Term, "via": Term, "cage": Cage, "funnel": Funnel, "held": Held}
+    return _parse(text, "reward", TaskReward, parts)
+
+
+def _shipped(name: str) -> str:
+    return (files("lw_torchrl.envs.engines.vectorized") / "data" / name).read_text(encoding="utf-8")
+
+
+@cache
+def simulation_table() -> Mapping[str, TaskSources]:
+    """The sources of all 50 tasks, by task name."""
+    return MappingProxyType(parse_simulation_table(_shipped("simulation.toml")))
 
 
 @cache
 def reward_table() -> Mapping[str, TaskReward]:
     """The rewards of all 50 tasks, by task name."""
-    text = (files("lw_torchrl.envs.engines.vectorized") / "data/rewards.toml").read_text(encoding="utf-8")
-    return MappingProxyType(parse_reward_table(text))
+    return MappingProxyType(parse_reward_table(_shipped("rewards.toml")))
