@@ -75,7 +75,7 @@ def collect(
 
     acts: str | Policy = policy
     if policy not in ACTORS:
-        from lw_torchrl.training.checkpoint import load_actor
+        from lw_torchrl.training.files import load_actor
 
         use_one_thread()
         acts, behaviour = load_actor(policy), behaviour or Path(policy).stem
@@ -224,7 +224,7 @@ def _default_tasks(policy: Policy, checkpoint: Path, *, trained: bool) -> tuple[
     """The policy's tasks, of these the ones that its file says it was trained on, of these the simulator's; what is
     left out is printed."""
     from lw_torchrl.language.tasks import TASKS
-    from lw_torchrl.training.checkpoint import demonstrated_tasks
+    from lw_torchrl.training.files import demonstrated_tasks
 
     shown = demonstrated_tasks(checkpoint) if trained else set()
     chosen = [task for task in policy.tasks if task in shown] or list(policy.tasks)

@@ -25,10 +25,10 @@ from lw_torchrl.paper.execution import EVALUATION_SEED, RESULTS, load_result
 from lw_torchrl.paper.mixtures import TASK_SETS
 from lw_torchrl.paper.offline_recipes import OfflineRecipe
 from lw_torchrl.paper.offline_runs import SEEN_BY, Advantages, Learned, OfflineRun
-from lw_torchrl.training.checkpoint import describe_data, load_actor, save_actor
-from lw_torchrl.training.loss_state import bc_loss
+from lw_torchrl.training.behavioral_cloning import bc_loss
+from lw_torchrl.training.envelope import check_description, check_same_description
+from lw_torchrl.training.files import describe_data, load_actor, save_actor
 from lw_torchrl.training.offline import OfflineConfig, OfflineTrainer
-from lw_torchrl.training.training_state import check_description, check_same_description
 from lw_torchrl.transforms import QAFTransform
 
 _CHUNK = 20_000  # rows whose advantages are taken at once

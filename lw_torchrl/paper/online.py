@@ -26,12 +26,11 @@ from lw_torchrl.paper.execution import EVALUATION_SEED, RESULTS, load_result
 from lw_torchrl.paper.recipes import TARGET
 from lw_torchrl.paper.runs import Dataset, own_tasks, plain
 from lw_torchrl.paper.tuning import WEAKEST, Elsewhere, tune_step
-from lw_torchrl.training.behavioral_cloning import BehavioralCloningTrainer
-from lw_torchrl.training.checkpoint import describe_data, load_actor, read_description, save_actor
-from lw_torchrl.training.config import BehavioralCloningConfig
-from lw_torchrl.training.online import LEARNERS, OnlineTrainer
-from lw_torchrl.training.online_config import OnlineConfig
-from lw_torchrl.training.training_state import check_description
+from lw_torchrl.training.algorithms import LEARNERS, OnlineConfig
+from lw_torchrl.training.behavioral_cloning import BehavioralCloningConfig, BehavioralCloningTrainer
+from lw_torchrl.training.envelope import check_description
+from lw_torchrl.training.files import describe_data, load_actor, read_description, save_actor
+from lw_torchrl.training.online import OnlineTrainer
 
 START = "start"
 """The policy that is begun with: a run beside those of :data:`~lw_torchrl.training.LEARNERS`."""

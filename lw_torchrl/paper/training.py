@@ -19,11 +19,10 @@ from lw_torchrl.modules import ActorEnsemble
 from lw_torchrl.modules.policy import Policy, make_policy
 from lw_torchrl.paper.recipes import Member
 from lw_torchrl.paper.runs import Run
-from lw_torchrl.training.behavioral_cloning import BehavioralCloningTrainer
-from lw_torchrl.training.checkpoint import describe_data, load_actor, save_actor
-from lw_torchrl.training.config import BehavioralCloningConfig
+from lw_torchrl.training.behavioral_cloning import BehavioralCloningConfig, BehavioralCloningTrainer
+from lw_torchrl.training.envelope import check_description
+from lw_torchrl.training.files import describe_data, load_actor, save_actor
 from lw_torchrl.training.stacked import StackedBehavioralCloning
-from lw_torchrl.training.training_state import check_description
 from lw_torchrl.transforms import RandomYaw
 
 

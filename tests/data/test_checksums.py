@@ -16,7 +16,7 @@ from lw_torchrl.data import DatasetError, LanguageWorldExperienceReplay, checksu
 from lw_torchrl.data.episode_files import EpisodeFiles
 from lw_torchrl.data.metadata import read_metadata
 from lw_torchrl.data.rows import COLUMNS, ROW_BYTES, load_rows
-from lw_torchrl.training.loss_state import bc_loss
+from lw_torchrl.training.behavioral_cloning import bc_loss
 
 TASKS = ("push", "reach")
 ALL = [(task, episode) for task in TASKS for episode in range(EPISODES)]

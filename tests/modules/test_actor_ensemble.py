@@ -6,7 +6,7 @@ from tensordict import TensorDict
 from torchrl.envs import TransformedEnv
 
 import lw_torchrl as lw
-from lw_torchrl.training.checkpoint import save_actor
+from lw_torchrl.training.files import save_actor
 
 PLANS = lw.load_plans("MT10")
 

@@ -15,7 +15,7 @@ from lw_torchrl.paper import execution, training
 from lw_torchrl.paper.execution import execute_run, load_result
 from lw_torchrl.paper.recipes import PRESETS, SETTINGS, Member
 from lw_torchrl.paper.runs import SCRIPTED, Run
-from lw_torchrl.training.checkpoint import demonstration_seeds
+from lw_torchrl.training.files import demonstration_seeds
 
 
 def backwards(texts):

@@ -20,7 +20,7 @@ from torchrl.checkpoint import Checkpoint
 
 import lw_torchrl as lw
 from lw_torchrl import _tensor_archive
-from lw_torchrl.training.checkpoint import FORMAT_VERSION
+from lw_torchrl.training.files import FORMAT_VERSION
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import lw_torchrl as lw
-from lw_torchrl.training.checkpoint import read_description
+from lw_torchrl.training.files import read_description
 
 MOST_MEMORY = 2 * 2**30
 

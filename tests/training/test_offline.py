@@ -16,8 +16,8 @@ from torchrl.record.loggers import Logger
 
 import lw_torchrl as lw
 from lw_torchrl.training import OfflineConfig, OfflineTrainer, fit_normalization
-from lw_torchrl.training.loss_state import sum_of_losses, tensors_of
-from lw_torchrl.training.minibatches import check_minibatches
+from lw_torchrl.training.behavioral_cloning import sum_of_losses, tensors_of
+from lw_torchrl.training.buffers import check_minibatches
 
 CONFIG = OfflineConfig(steps=12, batch_size=8, checkpoint_every=5)
 CRITIC = dict(width=16, depth=1)

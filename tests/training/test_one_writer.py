@@ -14,7 +14,7 @@ from small_training import CONFIG, PLANS, SMALL, collect_demos, make_actor, make
 import lw_torchrl as lw
 from lw_torchrl._tensor_archive import TensorArchive
 from lw_torchrl._versions import package_versions
-from lw_torchrl.training.loss_state import bc_loss
+from lw_torchrl.training.behavioral_cloning import bc_loss
 
 OFFLINE = lw.OfflineConfig(steps=12, batch_size=8, checkpoint_every=5)
 EVALUATOR = lw.QueryEvaluatorConfig(steps=12, batch_size=8, held_out_pairs=0.0)

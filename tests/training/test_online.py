@@ -20,8 +20,8 @@ from torchrl.record.loggers import CSVLogger
 import lw_torchrl as lw
 from lw_torchrl.modules import DescriptorEncoder, QValue
 from lw_torchrl.training import LEARNERS, expert_iteration
-from lw_torchrl.training.checkpoint import write
-from lw_torchrl.training.expert_iteration import successful
+from lw_torchrl.training.algorithms.expert_iteration import successful
+from lw_torchrl.training.files import write
 
 
 @pytest.fixture(scope="module")

@@ -11,8 +11,7 @@ from lw_torchrl.modules.critics import QValue, Value
 from lw_torchrl.modules.policy import Policy
 from lw_torchrl.objectives.advantage_weighted import AdvantageWeightedLoss, standardize_by_task
 from lw_torchrl.objectives.expectile_value import ExpectileValueLoss
-from lw_torchrl.training.learner import Learner, encoder_like, make_optimizer
-from lw_torchrl.training.online_config import OnlineConfig
+from lw_torchrl.training.algorithms.learner import Learner, OnlineConfig, adamw, encoder_like
 
 
 class AdvantageLearner(Learner):
@@ -31,8 +30,8 @@ class AdvantageLearner(Learner):
         self.targets = SoftUpdate(self.value, eps=config.target_eps)
         self.actor = AdvantageWeightedLoss(start, beta=config.beta, loss_function=config.distance)
         self.loss = nn.ModuleDict({"value": self.value, "actor": self.actor})
-        self.optimizers["critic"] = make_optimizer(self.value.parameters(), config.critic_learning_rate)
-        self.optimizers["actor"] = make_optimizer(self.actor.parameters(), config.cloning_learning_rate)
+        self.optimizers["critic"] = adamw(self.value.parameters(), config.critic_learning_rate)
+        self.optimizers["actor"] = adamw(self.actor.parameters(), config.cloning_learning_rate)
 
     def observe(self, rows: TensorDictBase) -> None:
         self.replay.extend(rows)

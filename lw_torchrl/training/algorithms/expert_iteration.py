@@ -8,9 +8,8 @@ from torchrl.data import TensorDictReplayBuffer
 
 from lw_torchrl.modules.critics import QValue
 from lw_torchrl.modules.policy import Policy
-from lw_torchrl.training.learner import Learner, make_optimizer
-from lw_torchrl.training.loss_state import bc_loss
-from lw_torchrl.training.online_config import OnlineConfig
+from lw_torchrl.training.algorithms.learner import Learner, OnlineConfig, adamw
+from lw_torchrl.training.behavioral_cloning import bc_loss
 
 
 class ExpertIterationLearner(Learner):
@@ -27,7 +26,7 @@ class ExpertIterationLearner(Learner):
         super().__init__(start, replay, config)
         self.loss = bc_loss(self.policy.train(), config.distance)  # its copy has the start's noise on features
         self.policy.eval()
-        self.optimizers["actor"] = make_optimizer(self.loss.parameters(), config.cloning_learning_rate)
+        self.optimizers["actor"] = adamw(self.loss.parameters(), config.cloning_learning_rate)
 
     def end_round(self, rows: TensorDictBase | None, steps: int) -> None:
         assert rows is not None

@@ -13,8 +13,7 @@ from torchrl.objectives.value import GAE
 from lw_torchrl.data.rewards import REWARDS
 from lw_torchrl.modules.critics import QValue, Value
 from lw_torchrl.modules.policy import Policy
-from lw_torchrl.training.learner import Learner, make_optimizer, stochastic
-from lw_torchrl.training.online_config import OnlineConfig
+from lw_torchrl.training.algorithms.learner import Learner, OnlineConfig, adamw, stochastic
 
 
 class PPOLearner(Learner):
@@ -35,7 +34,7 @@ class PPOLearner(Learner):
         self.advantage = GAE(
             gamma=config.gamma, lmbda=config.gae_lambda, value_network=value, average_gae=True, deactivate_vmap=True
         )
-        self.optimizers["all"] = make_optimizer(self.loss.parameters(), config.actor_learning_rate)
+        self.optimizers["all"] = adamw(self.loss.parameters(), config.actor_learning_rate)
 
     def act(self, state: TensorDictBase) -> TensorDictBase:
         with set_exploration_type(ExplorationType.RANDOM):
