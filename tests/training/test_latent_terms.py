@@ -69,7 +69,7 @@ def test_stopped_and_started_again_it_ends_with_the_same_bits(demos, tmp_path, s
     with pytest.raises(KeyboardInterrupt):
         make_trainer(demos, path, config=ON, stop_at=stop).train()
     resumed = make_trainer(demos, path, config=ON, actor=make_actor(99))
-    assert resumed.state.step == 5
+    assert resumed.steps == 5
     resumed.train()
     assert_same(everything(resumed), everything(whole))
 
