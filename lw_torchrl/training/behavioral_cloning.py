@@ -110,14 +110,8 @@ def bc_loss(actor: nn.Module, distance: str) -> BCLoss:
 
 
 class LatentTerms(nn.Module):
-    """The weighted sum of a configuration's terms, of an actor; a module, for ``functional_call``.
-
-    Attributes:
-        weights: of each kind that is asked for; empty for none, and then it is not to be called.
-
-    Raises:
-        ValueError: a term is asked for of an actor without plans.
-    """
+    """The weighted sum of a configuration's terms on the latents of an actor's skills; a module, for
+    ``functional_call``. With no ``weights`` it must not be called; an actor without plans has no terms."""
 
     def __init__(self, actor: Any, config: BehavioralCloningConfig) -> None:
         super().__init__()
@@ -136,15 +130,8 @@ class LatentTerms(nn.Module):
 
 
 class EvaluatorAnchor:
-    """The cross entropy of an evaluator's answers to its plans' conditions with the query answering function's, the
-    mean over the steps that there are.
-
-    Args:
-        actor: whose evaluator it is.
-
-    Raises:
-        ValueError: the actor has none.
-    """
+    """The mean cross entropy of the answers of an actor's evaluator to its plans' conditions with the query answering
+    function's. It holds the evaluator to the words while the loss of imitation trains it."""
 
     def __init__(self, actor: Any) -> None:
         evaluator = getattr(actor, "evaluator", None)
@@ -154,8 +141,8 @@ class EvaluatorAnchor:
         self.program, self.tables = plan_program(evaluator.plans), PlanTables(evaluator.plans)
 
     def __call__(self, batch: TensorDictBase) -> Tensor:
-        """Of a minibatch with ``observation`` (B, 39) float32, ``task_id`` (B,) int64 and what the evaluator reads: ()
-        float32."""
+        """() float32, of a minibatch with ``observation`` (B, 39) float32, ``task_id`` (B,) int64 and what the
+        evaluator reads."""
         task = batch.get("task_id")
         logits = self.evaluator.answers(*(batch.get(key) for key in self.evaluator.in_keys))
         truth = self.program(batch.get("observation"), task).to(logits.dtype)
@@ -182,14 +169,13 @@ class BehavioralCloningTrainer(Training):
             steps. Make the buffer with the same ``device``, or each minibatch has to go over.
 
     Warns:
-        UserWarning: the checkpoint is of training on another kind of device: it goes on with the same minibatches, but
-            not bit for bit. Or it was written under another version of torch or another package that bits hang on.
+        UserWarning: the checkpoint was written on another kind of device, or under other versions of torch, say:
+            training goes on with the same minibatches, but not bit for bit.
 
     Raises:
         ValueError: the checkpoint is damaged, of another architecture, configuration or data; the actor writes no
-            ``action``, or has no plans and the configuration has a term on skills' latents, or no evaluator and
-            it has an anchor; or, in :meth:`train`, the
-            loss or the weights are no numbers.
+            ``action``, has no plans for the configuration's terms on skills' latents, or no evaluator for its anchor;
+            or, in :meth:`train`, the loss or the weights are no numbers.
         TypeError: a checkpoint for an actor that is no :class:`Policy`.
         OSError: the checkpoint cannot be written; the earlier one stays.
 

@@ -21,22 +21,11 @@ def _check_plans(network: Any, replay: TensorDictReplayBuffer) -> None:
     for transform in replay.transform:
         answered = plans_of(transform)
         if answered is not None and (different := answered.differences(own)):
+            name = "critic" if isinstance(network, Value) else "actor"
             raise ValueError(
-                f"replay's QAFTransform must have the {_called(network)}'s plans, they differ for "
-                f"{', '.join(different)}; use {_called(network)}.transform()"
+                f"replay's QAFTransform must have the {name}'s plans, they differ for {', '.join(different)}; use "
+                f"{name}.transform()"
             )
-
-
-def _called(network: Any) -> str:
-    return "critic" if isinstance(network, Value) else "actor"
-
-
-def _check_batch_size(replay: TensorDictReplayBuffer, size: int) -> None:
-    """Raise :class:`ValueError` if the buffer was made for minibatches of another size."""
-    if replay.batch_size not in (None, size):
-        raise ValueError(
-            f"batch_size of the replay buffer must be None or the configuration's, {size}, got {replay.batch_size}"
-        )
 
 
 def _check_draws(replay: TensorDictReplayBuffer) -> None:
@@ -59,7 +48,10 @@ def check_minibatches(networks: Iterable[Any], replay: TensorDictReplayBuffer, s
         _check_plans(network, replay)
     if replay._prefetch:
         raise ValueError("replay must not prefetch: batches drawn ahead would be lost when training is resumed")
-    _check_batch_size(replay, size)
+    if replay.batch_size not in (None, size):
+        raise ValueError(
+            f"batch_size of the replay buffer must be None or the configuration's, {size}, got {replay.batch_size}"
+        )
     _check_draws(replay)
 
 

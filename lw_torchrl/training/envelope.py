@@ -49,11 +49,9 @@ class Envelope:
     """How files of a kind are written and read.
 
     Attributes:
-        format: the name that a file gives its format.
-        version: of the format.
-        part: what the file describes: "actor", "evaluator" or "loss".
-        argument: how errors begin.
-        called: the file in errors.
+        format, version: what a file says that it is.
+        part: what it describes: "actor", "evaluator" or "loss".
+        argument, called: how errors begin, and call what is in the file.
         command: that writes one.
         group: of the weights.
     """
@@ -80,16 +78,13 @@ class Envelope:
         groups: Mapping[str, Mapping[str, Tensor]],
         training: Mapping[str, Any] | None = None,
     ) -> None:
-        """Write a file whole or not at all.
+        """Write a file whole, or leave the earlier one and raise :class:`OSError`.
 
         Args:
             path: the file.
             described: what it says, as JSON, the part among it.
             groups: the weights, of one module or of many stacked, and its texts' vectors.
             training: all that training resumes from, the weights aside, if it is trained.
-
-        Raises:
-            OSError: it cannot be written; an earlier file stays.
         """
         described = {"format": self.format, "version": self.version, **described}
         if training is not None:
@@ -126,7 +121,7 @@ class Envelope:
                     f"{begin} is of version 1, whose files can run code when they are read; this package reads version "
                     f"{self.version}. Train it again"
                 ) from error
-            raise ValueError(f"{begin} is damaged or no file of {self.called} ({error})") from error
+            raise ValueError(f"{begin} is damaged or none of ours ({error})") from error
         name, version = found.description.get("format"), found.description.get("version")
         if (name, version) != (self.format, self.version):
             other = [kind for kind in (POLICY, EVALUATOR, TRAINING) if kind.format == name != self.format]
@@ -136,7 +131,7 @@ class Envelope:
                 f"version {self.version}. {hint}"
             )
         if not isinstance(found.description.get(self.part), dict):
-            raise ValueError(f"{begin} is damaged or no file of {self.called} (it describes no {self.part})")
+            raise ValueError(f"{begin} is damaged or none of ours (it describes no {self.part})")
         return found
 
     def check_can_be_saved(self, module: Any, make: Callable[[Any], nn.Module]) -> None:
@@ -159,18 +154,8 @@ class Envelope:
         encoder: TextEncoder | None,
         texts_of: Callable[[Module], dict[str, Tensor]],
     ) -> Module:
-        """Make the module of a file, in eval mode.
-
-        Args:
-            path: the file.
-            make: from its description and a text encoder to the module.
-            encoder: the text encoder; None for the shipped one.
-            texts_of: the vectors of a module's texts.
-
-        Raises:
-            FileNotFoundError: there is no such file.
-            ValueError: it is damaged, or its weights, sizes or texts are not those that it says.
-        """
+        """The module of a file, in eval mode; ``make`` makes it of its description and a text encoder, and ``texts_of``
+        gives the vectors of its texts. :class:`ValueError` if its weights, sizes or texts are not those it says."""
         archive = self.open(path)
         described = archive.description[self.part]
         try:

@@ -7,7 +7,7 @@ import signal
 import threading
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from types import FrameType
 from typing import Any, ClassVar
@@ -77,15 +77,7 @@ class ReplayState:
 
 class Training:
     """What all trainers share. A subclass makes ``optimizer``, and fills in :meth:`step`, :meth:`parameters` and
-    :meth:`contents`.
-
-    Args:
-        config: for :meth:`run` with ``steps``, ``checkpoint_every`` and ``learning_rate``.
-        replays: the buffers that are trained on.
-        checkpoint: the file, or None. What killed trainings left beside it is removed.
-        logger: for what :meth:`means` gives.
-        progress: show a progress bar.
-        title: of the progress bar.
+    :meth:`contents`. Its ``config`` has ``steps``, ``checkpoint_every`` and ``learning_rate``.
 
     Attributes:
         steps: the minibatches done.
@@ -93,7 +85,8 @@ class Training:
         networks: those that are in train mode while :meth:`run` lasts.
         device: where the networks are.
         described: what a checkpoint says, as JSON: training resumes only from one that says the same.
-        envelope: of the checkpoint; ``says_device``: whether it says on which kind of device it was trained.
+        envelope: of the checkpoint.
+        says_device: whether a checkpoint says on which kind of device it was trained.
     """
 
     envelope: ClassVar[Envelope]
@@ -122,7 +115,7 @@ class Training:
         self._losses: deque[Tensor] = deque(maxlen=READ_EVERY)
         if self.checkpoint is not None:
             sweep(self.checkpoint)
-        self._know_checkpoint()
+        self._file_known = self._file_now()  # it was read or written by this training
 
     def step(self) -> Any:
         """Train on one minibatch: find its loss and give it to :meth:`descend`."""
@@ -140,21 +133,15 @@ class Training:
         """Change the gradients before the optimizer's step."""
 
     def means(self, losses: Tensor) -> dict[str, float]:
-        """What is logged every 100 steps and at the end, by name; what has "loss" in its name is shown.
-
-        Args:
-            losses: of the last 100 steps, (n,) or (n, M) float32 on the CPU.
-        """
+        """What is logged every 100 steps and at the end, by name, of the losses of the last 100 steps, (n,) or (n, M)
+        float32 on the CPU; what has "loss" in its name is shown."""
         return {"loss": losses.mean().item()}
 
     def descend(self, losses: Tensor) -> Tensor:
-        """Take an optimizer's step on the loss, () float32, or on those of M models, (M,) float32.
+        """Take an optimizer's step on the loss, () float32, or on those of M models, (M,) float32; return it, detached.
 
-        Returns:
-            The loss, detached, on its device: nobody has waited for it.
-
-        Raises:
-            ValueError: a loss is no finite number; of other devices than the CPU, :meth:`run` says so later.
+        A loss that is no finite number is a :class:`ValueError`, at once on the CPU. Another device is not waited for:
+        there :meth:`run` says so later.
         """
         if self.device == CPU:
             self._check_loss(losses, self.steps)
@@ -169,13 +156,8 @@ class Training:
         return losses.detach()
 
     def run(self, until: int | None = None) -> Tensor:
-        """Train to the last step, or until so many in all, from wherever training stands.
-
-        Ctrl-C ends it between two steps, with a checkpoint; a second Ctrl-C at once.
-
-        Returns:
-            The losses of the last 100 steps made, (n,) or (n, M) float32 on the CPU.
-        """
+        """Train to the last step, or until so many in all, from wherever training stands; return the losses of the last
+        100 steps made, (n,) or (n, M) float32 on the CPU. Ctrl-C ends it between two steps, with a checkpoint."""
         every, total = self.config.checkpoint_every, self.config.steps
         if until is not None and check_int("until", until, minimum=1) > total:
             raise ValueError(f"until must be at most the configuration's steps, {total}, got {until}")
@@ -230,33 +212,21 @@ class Training:
 
     @contextmanager
     def at_work(self, total: int, done: int) -> Iterator[tuple[Progress, Interrupt]]:
-        """Keep other trainings from the checkpoint, show progress and take Ctrl-C between steps while the block lasts.
-
-        Raises:
-            ValueError: another training is at work, or has written the checkpoint meanwhile.
-        """
+        """Keep other trainings from the checkpoint, show progress and take Ctrl-C between steps while the block lasts;
+        :class:`ValueError` if another training is at work, or has written the checkpoint meanwhile."""
         bar = Progress(self.title, total, "step", initial=done, show=self.progress)
-        with self._checkpoint_held(), bar, interrupts_between_steps() as interrupt:
-            yield bar, interrupt
-
-    @contextmanager
-    def _checkpoint_held(self) -> Iterator[None]:
-        if self.checkpoint is None:
-            yield
-            return
-        with held(self.checkpoint, "checkpoint", "training"):
-            if self._found_checkpoint() not in (None, self._known_checkpoint):
+        alone = nullcontext() if self.checkpoint is None else held(self.checkpoint, "checkpoint", "training")
+        with alone:
+            if self._file_now() not in (None, self._file_known):
                 raise ValueError(
                     f"checkpoint: {str(self.checkpoint)!r} was written by another training after this one had begun; "
                     "begin anew to go on from it, or choose another file"
                 )
-            yield
+            with bar, interrupts_between_steps() as interrupt:
+                yield bar, interrupt
 
-    def _know_checkpoint(self) -> None:
-        """The file as it is now is this training's own: it was read or written by it."""
-        self._known_checkpoint = self._found_checkpoint()
-
-    def _found_checkpoint(self) -> tuple[int, ...] | None:
+    def _file_now(self) -> tuple[int, ...] | None:
+        """What tells the checkpoint's file from a later one; None for no file."""
         if self.checkpoint is None or not self.checkpoint.exists():
             return None
         stat = self.checkpoint.stat()
@@ -274,14 +244,10 @@ class Training:
             kind = self.device.type
             said = {"device": kind} if self.says_device and kind != "cpu" else {}
             self.envelope.write(self.checkpoint, self.described | said, self.contents(), self.state_dict())
-            self._know_checkpoint()
+            self._file_known = self._file_now()  # it was read or written by this training
 
     def resume(self, packages: Sequence[str] = LIBRARIES) -> bool:
-        """Go on from the checkpoint, and say whether it is there; warnings and errors of :meth:`Envelope.resume`.
-
-        Args:
-            packages: on whose versions the bits of the training depend.
-        """
+        """Go on from the checkpoint, and say whether it is there; errors and arguments of :meth:`Envelope.resume`."""
         if self.checkpoint is None or not self.checkpoint.exists():
             return False
         for replay in self.replays:
@@ -340,11 +306,9 @@ class Interrupt:
 
 @contextmanager
 def interrupts_between_steps() -> Iterator[Interrupt]:
-    """Within the block the first Ctrl-C only sets ``asked``; the loop looks at it, and ends the block when it can.
-
-    The end of the block then raises :class:`KeyboardInterrupt`; a second Ctrl-C does so at once. In another thread than
-    the main one, and where SIGINT is ignored, nothing is changed.
-    """
+    """Within the block the first Ctrl-C only sets ``asked``, and the end of the block raises
+    :class:`KeyboardInterrupt`; a second Ctrl-C does so at once. Outside of the main thread, and where SIGINT is
+    ignored, nothing is changed."""
     interrupt = Interrupt()
     before = signal.getsignal(signal.SIGINT) if threading.current_thread() is threading.main_thread() else None
     if not callable(before):

@@ -35,8 +35,7 @@ from lw_torchrl.training.files import describe_data, describe_learning
 from lw_torchrl.training.loop import READ_EVERY, ReplayState, Training, make_schedule
 from lw_torchrl.training.normalization import fit_untrained
 
-_INSTEAD = {"loss_actor_bc"}
-"""What is to be minimised instead of another entry, for a while: CQL's first steps of the actor."""
+_INSTEAD = {"loss_actor_bc"}  # minimised in place of another entry: in CQL's first steps of the actor
 
 
 @dataclass(frozen=True)
@@ -101,15 +100,13 @@ class OfflineTrainer(Training):
         last: the means over the last 100 steps of what the loss gives, by name.
 
     Warns:
-        UserWarning: the checkpoint was written under another version of torch or another package that bits hang on: it
-            goes on, but not bit for bit.
+        UserWarning: the checkpoint was written under other versions of torch, say: training does not go on bit for bit.
 
     Raises:
         ValueError: the checkpoint is damaged, or of another loss, configuration or data; a buffer that answers the
             queries of other plans, or draws by priorities; a loss whose value estimator has another gamma than the
-            buffer's n steps, that gives no mean, or CQL's with a Lagrange multiplier; networks that were
-            trained with other statistics, where ``normalize``; or, in :meth:`train`, the loss or
-            the weights are no numbers.
+            buffer's n steps, that gives no mean, or CQL's with a Lagrange multiplier; networks that were trained with
+            other statistics, where ``normalize``; or, in :meth:`train`, the loss or the weights are no numbers.
         TypeError: the loss is none of TorchRL's kind.
         OSError: the checkpoint cannot be written; the earlier one stays.
 
@@ -154,7 +151,9 @@ class OfflineTrainer(Training):
         self.states = [ReplayState(replay, config.seed)]
         delayed = any(name.startswith("target_") and name.endswith("_params") for name, _ in loss.named_children())
         self.targets = SoftUpdate(loss, eps=config.target_eps) if delayed else None
-        actor, others = trained_parameters(loss)
+        trained = [(name, parameter) for name, parameter in loss.named_parameters() if parameter.requires_grad]
+        actor = [parameter for name, parameter in trained if name.startswith("actor_network_params")]
+        others = [parameter for name, parameter in trained if not name.startswith("actor_network_params")]
         rates = (actor, config.learning_rate), (others, config.critic_learning_rate)
         self.groups = [group for group, _ in rates if group]
         options = [{"params": group, "lr": float(rate)} for group, rate in rates if group]
@@ -209,16 +208,6 @@ def networks_of(loss: LossModule) -> list[nn.Module]:
     """The networks that a loss holds, without their parameters."""
     found = (getattr(loss, name.removesuffix("_params"), None) for name, _ in loss.named_children())
     return [network for network in found if isinstance(network, nn.Module)]
-
-
-def trained_parameters(loss: LossModule) -> tuple[list[Tensor], list[Tensor]]:
-    """The parameters of a loss's actor, and the others."""
-    actor: list[Tensor] = []
-    others: list[Tensor] = []
-    for name, parameter in loss.named_parameters():
-        if parameter.requires_grad:
-            (actor if name.startswith("actor_network_params") else others).append(parameter)
-    return actor, others
 
 
 def check_loss(loss: LossModule, replay: TensorDictReplayBuffer) -> None:

@@ -41,10 +41,10 @@ _MOST_EPISODES = 1_000_000
 class OnlineTrainer(Training):
     """Trains a policy in its environment, beside demonstrations.
 
-    It goes on in rounds. In one each row of the environment runs episodes, which end at their first success or after
-    ``max_steps``; what comes goes into the buffer, and the learner makes its gradient steps. At its end all rows are
-    reset, since an episode's physics cannot be restored, and a checkpoint is written: training that is stopped, in
-    whatever way, goes on from the last round's end with the same bits.
+    In a round, each row of the environment runs episodes, which end at their first success or after ``max_steps``;
+    their steps go into the buffer, and the learner makes its gradient steps. At its end all rows are reset, since an
+    episode's physics cannot be restored, and a checkpoint is written: training that was stopped goes on from the last
+    round's end with the same bits.
 
     Args:
         actor: the policy to begin with, one that was cloned, say. Methods "td3" and "expert-iteration" train it in
@@ -72,8 +72,7 @@ class OnlineTrainer(Training):
             that of the first episode of each row, which has the time to end; not of a round shorter than an episode.
 
     Warns:
-        UserWarning: the checkpoint was written under another version of torch or another package that bits hang on: it
-            goes on, but not bit for bit.
+        UserWarning: the checkpoint was written under other versions of mujoco, say: it does not go on bit for bit.
 
     Raises:
         ValueError: a wrong method; a buffer that does not grow, or is not of these plans; the checkpoint is damaged, or
@@ -192,9 +191,6 @@ class OnlineTrainer(Training):
         """Train to the last step of the environment, from the last round's end.
 
         Ctrl-C ends it between two steps, and what came since the last round's end is lost; a second Ctrl-C at once.
-
-        Raises:
-            ValueError: a loss, or a weight, is no number.
         """
         base = LanguageWorldEnv(
             self.tasks,
@@ -288,7 +284,7 @@ def _fingerprint(module: torch.nn.Module) -> str:
 
 
 def check_growing_replay(actor: Policy, replay: Any, config: OnlineConfig) -> None:
-    """Raise :class:`ValueError` unless a buffer grows, and is what rows of the environment can stand beside."""
+    """Raise :class:`ValueError` unless a buffer grows, and rows of the environment fit in it."""
     if not isinstance(replay, LanguageWorldExperienceReplay) or not isinstance(replay.storage, GrowingStorage):
         raise ValueError("replay must be a LanguageWorldExperienceReplay that grows: give it grow=, a number of rows")
     sampler = replay.sampler
@@ -324,15 +320,11 @@ def longest_standstill(rows: TensorDictBase) -> int:
 
 
 class Exploration:
-    """The noise of a round, from its first states on.
+    """The noise of a round.
 
-    A row is stuck where the truth of no condition has changed for longer than it ever took in the demonstrations.
-    There the policy repeats what leads nowhere, so the noise on the hand grows, until half as long again, from
-    ``exploration`` to ``stuck_exploration``; that on the gripper does not, since it opens grasps.
-
-    Args:
-        config: of the training.
-        patience: states without a change after which a row is stuck; 0 for never.
+    A row is stuck if no condition's truth has changed for more states than ``patience``, the longest time in the
+    demonstrations; 0 for never. There the noise on the hand grows, until half as long again, from ``exploration`` to
+    ``stuck_exploration``; that on the gripper does not, since it opens grasps.
     """
 
     def __init__(self, config: OnlineConfig, patience: int) -> None:
@@ -348,12 +340,8 @@ class Exploration:
         self._drawn = torch.randn_like(self._drawn)
 
     def noise(self, state: TensorDictBase) -> Tensor:
-        """(N, 4) float32, what is to be added to the actions in these states.
-
-        Args:
-            state: N rows, one step after those of the last call or, where an episode ended, the first of the next;
-                ``qaf`` (N, S) bool, if it is there.
-        """
+        """(N, 4) float32, to be added to the actions in these states, each one step after those of the last call or
+        the first of a new episode; ``qaf`` (N, S) bool, if it is there."""
         truth = state.get("qaf", None)
         if not self.patience or truth is None:
             return self._drawn * self._scale

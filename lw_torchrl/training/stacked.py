@@ -38,18 +38,14 @@ class _Act(nn.Module):
 
 
 def _fingerprint(actor: Policy) -> str:
-    """16 signs that differ for actors of other descriptions: plans, tasks, options."""
+    """16 characters that differ for actors of other plans, tasks or options."""
     return sha256(json.dumps(actor.describe(), sort_keys=True).encode()).hexdigest()[:16]
-
-
-def _architecture(actor: Policy) -> dict[str, Any]:
-    found = actor.describe()
-    return {"kind": found["kind"], "evaluator": found.get("evaluator"), **found["options"]}
 
 
 def _check_actors(actors: Sequence[Policy]) -> None:
     """Raise :class:`ValueError` unless the actors differ in their weights, plans and tasks alone."""
-    first, *others = map(_architecture, actors)
+    described = [actor.describe() for actor in actors]
+    first, *others = ({"kind": one["kind"], "evaluator": one.get("evaluator"), **one["options"]} for one in described)
     for number, other in enumerate(others, 1):
         if names := [name for name in {**first, **other} if first.get(name) != other.get(name)]:
             raise ValueError(f"actors must be of one architecture, 0 and {number} differ in {', '.join(names)}")
@@ -74,8 +70,8 @@ class StackedBehavioralCloning(Training):
         device: where to train, as for :class:`BehavioralCloningTrainer`; None for where the first actor is.
 
     Warns:
-        UserWarning: the checkpoint was written under another version of torch or another package that bits hang on: it
-            goes on, but not bit for bit.
+        UserWarning: the checkpoint was written on another kind of device, or under other versions of torch, say:
+            training does not go on bit for bit.
 
     Raises:
         ValueError: not as many buffers as actors, one twice, or actors of different options; a checkpoint that is
@@ -126,8 +122,13 @@ class StackedBehavioralCloning(Training):
             raise ValueError("qaf_anchor is for BehavioralCloningTrainer, which trains one policy at a time")
         self.device = place(actors[0], device)
         if self.checkpoint is not None:
-            check_can_be_saved(actors[0])
-            self.described = self._describe()
+            self.described = {
+                "actor": check_can_be_saved(actors[0]).describe() | {"number": len(actors)},
+                "actors": {str(number): _fingerprint(actor) for number, actor in enumerate(actors)},
+                "training": config.describe(),
+                "data": {str(number): describe_data(replay) for number, replay in enumerate(replays)},
+                "replay": {str(number): describe_replay(replay) for number, replay in enumerate(replays)},
+            }
         for number, (actor, replay) in enumerate(zip(actors, replays, strict=True)):
             actor.to(self.device)
             check_replay(actor, replay, config.batch_size)
@@ -150,20 +151,11 @@ class StackedBehavioralCloning(Training):
         self.schedule = make_schedule(config.schedule, self.optimizer, config.steps)
         self.resume()
 
-    def _describe(self) -> dict[str, Any]:
-        return {
-            "actor": self.actors[0].describe() | {"number": len(self.actors)},
-            "actors": {str(number): _fingerprint(actor) for number, actor in enumerate(self.actors)},
-            "training": self.config.describe(),
-            "data": {str(number): describe_data(replay) for number, replay in enumerate(self.replays)},
-            "replay": {str(number): describe_replay(replay) for number, replay in enumerate(self.replays)},
-        }
-
     def parameters(self) -> dict[str, Tensor]:
         return {**self._parameters}
 
     def contents(self) -> dict[str, dict[str, Tensor]]:
-        return {"weights": {**self._parameters}, "texts": text_vectors(self.actors[0])}
+        return {"weights": self.parameters(), "texts": text_vectors(self.actors[0])}
 
     def step(self) -> Tensor:
         """Train every actor on one minibatch and return their losses, (M,) float32, on the device."""

@@ -208,7 +208,7 @@ def test_what_is_no_evaluators_file_is_refused(tmp_path):
     with pytest.raises(ValueError, match="It is a policy's, give an evaluator's"):
         lw.load_evaluator(path, PLANS)
     path.write_bytes(b"PK")
-    with pytest.raises(ValueError, match="is damaged or no file of an evaluator"):
+    with pytest.raises(ValueError, match="is damaged or none of ours"):
         lw.load_evaluator(path, PLANS)
 
     class Mine(lw.QueryEvaluator):

@@ -320,7 +320,7 @@ def test_a_checkpoint_of_other_plans_is_refused(demos, checkpoint):
 @pytest.mark.parametrize("content", [b"", b"no archive", None])
 def test_a_file_that_is_no_checkpoint_is_refused(demos, checkpoint, tmp_path, content):
     path = tmp_path / "checkpoint.zip"
-    said = "is damaged or no file of a loss's training"
+    said = "is damaged or none of ours"
     if content is None:
         lw.save_actor(Networks(0.0, "cpu").actor(), path)
     else:

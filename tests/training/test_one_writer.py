@@ -89,7 +89,7 @@ def test_a_training_goes_on_under_another_torch_with_a_warning(demos, tmp_path, 
     with pytest.warns(UserWarning, match=message) as told:
         make(demos, path)
     assert len(told) == 1
-    assert told[0].filename != lw.training.training_state.__file__
+    assert told[0].filename != lw.training.envelope.__file__
 
 
 def test_the_simulator_counts_in_the_environment_alone(demos, tmp_path, monkeypatch):

@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from tensordict import TensorDictBase
 from torch import nn
-from torchrl.data import TensorDictReplayBuffer
 from torchrl.objectives import SoftUpdate
 
 from lw_torchrl.modules.critics import QValue, Value
-from lw_torchrl.modules.policy import Policy
 from lw_torchrl.objectives.advantage_weighted import AdvantageWeightedLoss, standardize_by_task
 from lw_torchrl.objectives.expectile_value import ExpectileValueLoss
-from lw_torchrl.training.algorithms.learner import Learner, OnlineConfig, adamw, encoder_like
+from lw_torchrl.training.algorithms.learner import Learner, adamw, encoder_like
 
 
 class AdvantageLearner(Learner):
     """A value by expectile regression, and imitation of demonstrations and of the policy's own steps, as much as each
     one's advantage says: nothing is done that was not tried, so a value that errs about the untried harms nothing."""
 
-    def __init__(
-        self, start: Policy, replay: TensorDictReplayBuffer, config: OnlineConfig, critic: Value | None = None
-    ) -> None:
-        super().__init__(start, replay, config)
+    def make(self, critic: Any) -> None:
+        start, config = self.policy, self.config
         if isinstance(critic, QValue):
             raise TypeError("critic must be a Value, of states alone, for the method 'advantage'; got a QValue")
         value = Value(encoder_like(start), ensemble=2) if critic is None else critic

@@ -10,6 +10,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.data import TensorDictReplayBuffer
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import LossModule, SoftUpdate
 
 from lw_torchrl._checks import check_choice, check_fields, check_int, check_probability, check_scale
@@ -125,7 +126,7 @@ class OnlineConfig:
 
 
 class Learner:
-    """How a policy learns; a subclass says what it does with rows as they come, and at the end of a round.
+    """How a policy learns: a subclass makes what it trains, and says what it does with rows and at a round's end.
 
     Args:
         start: the policy to begin with.
@@ -137,10 +138,9 @@ class Learner:
         policy: what acts, and is kept: the start itself, or another made of it.
         loss: holds all that is trained.
         optimizers: by what they train.
-        noisy: whether noise is added to its actions.
+        noisy: whether noise is added to its actions; if not, they are drawn from its distribution.
         wants_round: whether :meth:`end_round` reads the round's rows.
         made: gradient steps.
-        mean: of what was told since the last round, by name.
     """
 
     loss: nn.Module
@@ -154,17 +154,20 @@ class Learner:
         self.optimizers: dict[str, torch.optim.Optimizer] = {}
         self.made = 0
         self._told: dict[str, list[Tensor]] = {}
+        self.make(critic)
+
+    def make(self, critic: Any) -> None:
+        """Make ``loss`` and ``optimizers`` of ``policy`` and a critic that was given, or None."""
 
     def act(self, state: TensorDictBase) -> TensorDictBase:
         """Write ``action`` (N, 4) float32, without the noise."""
-        return self.policy(state)
+        if self.noisy:
+            return self.policy(state)
+        with set_exploration_type(ExplorationType.RANDOM):
+            return self.policy(state)
 
     def noise_weight(self, state: TensorDictBase) -> Tensor | float:
-        """What the noise on the actions of :meth:`act` is multiplied by, (N, 1) float32 or one number for all.
-
-        A residual of some steps has noise in these alone: elsewhere it would teach nothing, and lead astray what is to
-        stay as it is.
-        """
+        """What the noise is multiplied by, (N, 1) float32 or 1.0: a residual of some steps has noise in these alone."""
         policy = self.policy
         of_steps = isinstance(policy, ResidualActor) and policy.steps is not None
         return state.get(policy.out_keys_source[2]) if of_steps else 1.0
@@ -203,13 +206,8 @@ class Learner:
             "optimizers": {name: one.state_dict() for name, one in self.optimizers.items()},
         }
 
-    @torch.no_grad()
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from what :meth:`state_dict` gave.
-
-        Raises:
-            ValueError: it is that of another learner, or holds NaN.
-        """
+        """Go on from what :meth:`state_dict` gave; :class:`ValueError` if it is another learner's, or holds NaN."""
         ours = self.state_dict()
         check_like({**state, "optimizers": None}, {**ours, "optimizers": None}, "learner")
         if not isinstance(state["optimizers"], Mapping) or set(state["optimizers"]) != set(self.optimizers):
@@ -237,7 +235,7 @@ class OffPolicyLearner(Learner):
         self.optimizers["actor"] = adamw(actor.values(True, True), self.config.actor_learning_rate)
         self.optimizers["critic"] = adamw(critics.values(True, True), self.config.critic_learning_rate)
 
-    def critic(self, given: QValue | None) -> QValue:
+    def q_value(self, given: Any) -> QValue:
         """The critic that is given, or one that sees what the policy sees, in eval mode."""
         if given is None:
             return QValue(encoder_like(self.policy)).eval()
@@ -257,11 +255,7 @@ def adamw(parameters: Iterable[Tensor], learning_rate: float) -> torch.optim.Opt
 
 
 def encoder_like(policy: Policy) -> Encoder:
-    """A fresh encoder, without noise, that sees what a policy's sees, with its statistics.
-
-    Raises:
-        TypeError: the policy has none; a critic must then be given.
-    """
+    """A fresh encoder, without noise, that sees what a policy's sees, with its statistics."""
     actor = policy.base if isinstance(policy, ResidualActor) else policy
     if not isinstance(actor, ConditionedActor):
         raise TypeError(f"critic must be given for a {type(policy).__name__}, which has no encoder to make one like")
@@ -278,11 +272,7 @@ def encoder_like(policy: Policy) -> Encoder:
 
 
 def stochastic(policy: Policy, distribution: DistributionName, init_std: float) -> ConditionedActor:
-    """An actor with a distribution, in eval mode: the policy itself if it has one.
-
-    Raises:
-        TypeError: the policy can have none.
-    """
+    """An actor with a distribution, in eval mode: the policy itself if it has one."""
     if not isinstance(policy, ConditionedActor):
         raise TypeError(f"actor must be one that can have a distribution, got {type(policy).__name__}")
     return (policy.stochastic(distribution, init_std) if policy.head.distribution is None else policy).eval()

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from tensordict import TensorDictBase
-from torchrl.data import TensorDictReplayBuffer
-from torchrl.envs.utils import ExplorationType, set_exploration_type
+from typing import Any
 
-from lw_torchrl.modules.critics import QValue
-from lw_torchrl.modules.policy import Policy
 from lw_torchrl.objectives.demonstrated import DemonstratedSACLoss
-from lw_torchrl.training.algorithms.learner import OffPolicyLearner, OnlineConfig, adamw, stochastic
+from lw_torchrl.training.algorithms.learner import OffPolicyLearner, adamw, stochastic
 
 
 class SACLearner(OffPolicyLearner):
@@ -17,14 +13,12 @@ class SACLearner(OffPolicyLearner):
 
     noisy = False
 
-    def __init__(
-        self, start: Policy, replay: TensorDictReplayBuffer, config: OnlineConfig, critic: QValue | None = None
-    ) -> None:
-        super().__init__(start, replay, config)
-        self.policy = stochastic(start, "tanh_normal", config.init_std)
+    def make(self, critic: Any) -> None:
+        config = self.config
+        self.policy = stochastic(self.policy, "tanh_normal", config.init_std)
         loss = DemonstratedSACLoss(
             self.policy,
-            self.critic(critic),
+            self.q_value(critic),
             bc_weight=config.bc_weight,
             loss_function=config.distance,
             alpha_init=config.entropy,
@@ -32,10 +26,6 @@ class SACLearner(OffPolicyLearner):
         self.target_entropy = loss.target_entropy  # which makes a buffer of the loss
         self.set_loss(loss)
         self.optimizers["alpha"] = adamw([loss.log_alpha], config.actor_learning_rate)
-
-    def act(self, state: TensorDictBase) -> TensorDictBase:
-        with set_exploration_type(ExplorationType.RANDOM):
-            return self.policy(state)
 
     def learn(self, steps: int) -> None:
         for _ in range(steps):

@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-from torchrl.data import TensorDictReplayBuffer
+from typing import Any
 
-from lw_torchrl.modules.critics import QValue
 from lw_torchrl.modules.policy import Policy
 from lw_torchrl.modules.residual_actor import ResidualActor
 from lw_torchrl.objectives.demonstrated import DemonstratedTD3Loss
-from lw_torchrl.training.algorithms.learner import OffPolicyLearner, OnlineConfig
+from lw_torchrl.training.algorithms.learner import OffPolicyLearner
 
 
 class TD3Learner(OffPolicyLearner):
     """TD3 with as many demonstrations as rows that came, and imitation of the former."""
 
-    def __init__(
-        self, start: Policy, replay: TensorDictReplayBuffer, config: OnlineConfig, critic: QValue | None = None
-    ) -> None:
-        super().__init__(start, replay, config)
-        self.policy = self.make_policy(start)
+    def make(self, critic: Any) -> None:
+        config = self.config
+        self.policy = self.make_policy(self.policy)
         loss = DemonstratedTD3Loss(
             self.policy,
-            self.critic(critic),
+            self.q_value(critic),
             bounds=(-1.0, 1.0),
             bc_weight=config.bc_weight,
             policy_noise=config.policy_noise,
