@@ -25,7 +25,6 @@ from lw_torchrl.modules.query_evaluator import QueryEvaluator
 from lw_torchrl.objectives.skill_latents import Kind, latent_term, skill_encoder
 from lw_torchrl.training.buffers import check_replay
 from lw_torchrl.training.envelope import POLICY
-from lw_torchrl.training.file_checks import text_vectors
 from lw_torchrl.training.files import check_can_be_saved, describe_data, describe_replay
 from lw_torchrl.training.loop import ReplayState, Training, make_schedule
 from lw_torchrl.training.normalization import check_contacts, fit_normalization
@@ -210,7 +209,7 @@ class BehavioralCloningTrainer(Training):
     ) -> None:
         config = config or BehavioralCloningConfig()
         super().__init__(config, [replay], checkpoint, logger=logger, progress=progress)
-        self.actor, self.replay, self.networks = actor, replay, [actor]
+        self.actor, self.module, self.replay, self.networks = actor, actor, replay, [actor]
         self.device = place(actor, device)
         check_replay(actor, replay, config.batch_size)
         self._latent_terms = LatentTerms(actor, config)
@@ -228,12 +227,6 @@ class BehavioralCloningTrainer(Training):
             fit_normalization(actor, replay)
         else:
             check_contacts(actor)
-
-    def parameters(self) -> dict[str, Tensor]:
-        return dict(self.actor.named_parameters())
-
-    def contents(self) -> dict[str, dict[str, Tensor]]:
-        return {"weights": self.actor.state_dict(keep_vars=True), "texts": text_vectors(self.actor)}
 
     def step(self) -> Tensor:
         """Train on one minibatch and return its loss, () float32, on the device: nobody has waited for it."""

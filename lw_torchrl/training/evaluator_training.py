@@ -221,7 +221,7 @@ class QueryEvaluatorTrainer(Training):
             raise TypeError(f"evaluator must be of class {self.trains.__name__}, got {type(evaluator).__name__}")
         config = config or QueryEvaluatorConfig()
         super().__init__(config, [], checkpoint, progress=progress, title="training the evaluator")
-        self.evaluator, self.networks = evaluator, [evaluator]
+        self.evaluator, self.module, self.networks = evaluator, evaluator, [evaluator]
         if not data.parts["training"]:
             raise ValueError("data must have states and queries to train on, all are held out")
         self._minibatches = type(self).minibatches(evaluator, data.parts["training"], config)
@@ -234,9 +234,6 @@ class QueryEvaluatorTrainer(Training):
             described = data.describe() | {"labels": self._minibatches.labels}
             self.described = {"evaluator": evaluator.describe(), "training": asdict(config), "data": described}
         self.resume()
-
-    def parameters(self) -> dict[str, Tensor]:
-        return dict(self.evaluator.named_parameters())
 
     def contents(self) -> dict[str, dict[str, Tensor]]:
         return {"weights": self.evaluator.state_dict(keep_vars=True), "texts": evaluator_texts(self.evaluator)}

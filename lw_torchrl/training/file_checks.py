@@ -99,13 +99,8 @@ class _Budget(TorchFunctionMode):
 def check_size(
     make: Callable[[TextEncoder], nn.Module], weights: Mapping[str, Tensor], texts: Mapping[str, Tensor]
 ) -> None:
-    """Make a module for a trial, and raise :class:`ValueError` as soon as it has more weights than are stored.
-
-    Args:
-        make: from a text encoder to the module.
-        weights: the stored ones.
-        texts: the stored vectors of its texts; the trial gets others of their width, so that no text model is loaded.
-    """
+    """Make a module for a trial, and raise :class:`ValueError` as soon as it has more weights than are stored. ``make``
+    gets a text encoder that gives vectors as wide as the stored ``texts``, so that no text model is loaded."""
     with torch.random.fork_rng(devices=[]), _Budget(weights):
         make(stand_in(texts))
 

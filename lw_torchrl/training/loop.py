@@ -26,7 +26,7 @@ from lw_torchrl._state_tree import check_like, check_optimizer_state, check_same
 from lw_torchrl._versions import LIBRARIES
 from lw_torchrl.data.replay import LanguageWorldExperienceReplay
 from lw_torchrl.training.envelope import Envelope
-from lw_torchrl.training.file_checks import check_trained
+from lw_torchrl.training.file_checks import check_trained, text_vectors
 
 READ_EVERY = 100
 """Steps between readings of the losses: to read one is to wait for its device."""
@@ -76,10 +76,11 @@ class ReplayState:
 
 
 class Training:
-    """What all trainers share. A subclass makes ``optimizer``, and fills in :meth:`step`, :meth:`parameters` and
-    :meth:`contents`. Its ``config`` has ``steps``, ``checkpoint_every`` and ``learning_rate``.
+    """What all trainers share. A subclass makes ``optimizer`` and ``module``, and fills in :meth:`step`. Its ``config``
+    has ``steps``, ``checkpoint_every`` and ``learning_rate``.
 
     Attributes:
+        module: holds all that is trained.
         steps: the minibatches done.
         states: of the buffers, one each.
         networks: those that are in train mode while :meth:`run` lasts.
@@ -91,6 +92,7 @@ class Training:
 
     envelope: ClassVar[Envelope]
     says_device: ClassVar[bool] = False
+    module: nn.Module
     optimizer: torch.optim.Optimizer
     schedule: Schedule | None = None
     device = CPU
@@ -123,11 +125,11 @@ class Training:
 
     def parameters(self) -> dict[str, Tensor]:
         """What is trained, by name."""
-        raise NotImplementedError
+        return dict(self.module.named_parameters())
 
     def contents(self) -> dict[str, dict[str, Tensor]]:
         """The live tensors that a checkpoint holds, by group and name."""
-        raise NotImplementedError
+        return {"weights": self.module.state_dict(keep_vars=True), "texts": text_vectors(self.module)}
 
     def clip_gradients(self) -> None:
         """Change the gradients before the optimizer's step."""

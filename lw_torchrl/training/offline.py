@@ -144,7 +144,7 @@ class OfflineTrainer(Training):
         check_loss(loss, replay)
         config = config or OfflineConfig()
         super().__init__(config, [replay], checkpoint, logger=logger, progress=progress, title=title)
-        self.loss, self.replay, self.networks = loss, replay, networks_of(loss)
+        self.loss, self.module, self.replay, self.networks = loss, loss, replay, networks_of(loss)
         self.device = next(loss.parameters()).device
         check_minibatches(self.networks, replay, config.batch_size)
         getattr(loss, "target_entropy", None)  # SAC's is a buffer from the first time on that it is asked for
@@ -167,9 +167,6 @@ class OfflineTrainer(Training):
         if config.normalize:
             fit_untrained(loss, replay)
         self.resume()
-
-    def parameters(self) -> dict[str, Tensor]:
-        return dict(self.loss.named_parameters())
 
     def contents(self) -> dict[str, dict[str, Tensor]]:
         return {"loss": tensors_of(self.loss)}

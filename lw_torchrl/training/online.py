@@ -31,7 +31,6 @@ from lw_torchrl.modules.policy import Policy
 from lw_torchrl.training.algorithms import LEARNERS, OnlineConfig
 from lw_torchrl.training.buffers import check_minibatches, check_replay
 from lw_torchrl.training.envelope import POLICY
-from lw_torchrl.training.file_checks import text_vectors
 from lw_torchrl.training.files import check_can_be_saved, describe_data, describe_learning
 from lw_torchrl.training.loop import Interrupt, Training
 
@@ -139,7 +138,7 @@ class OnlineTrainer(Training):
         with drawn_on(CPU, self._drawn):
             self.learner = LEARNERS[method](actor, replay, config, critic)
             self._drawn = torch.get_rng_state()
-        self.policy = self.learner.policy
+        self.policy = self.module = self.learner.policy
         self._patience = longest_standstill(replay[: len(replay) - replay.storage.num_grown])
         self.history: list[dict[str, float]] = []
         self.round = 0
@@ -158,12 +157,6 @@ class OnlineTrainer(Training):
     @property
     def frames(self) -> int:
         return min(self.round * self.config.round_steps * self.config.rows, self.config.frames)
-
-    def parameters(self) -> dict[str, Tensor]:
-        return dict(self.policy.named_parameters())
-
-    def contents(self) -> dict[str, dict[str, Tensor]]:
-        return {"weights": self.policy.state_dict(keep_vars=True), "texts": text_vectors(self.policy)}
 
     def state_dict(self) -> dict[str, Any]:
         return {
