@@ -18,6 +18,81 @@ if TYPE_CHECKING:
     from lw_torchrl.modules.policy import Policy
 
 
+<<<<<<< HEAD:lw_torchrl/cli/evaluate.py
+=======
+def collect(
+    tasks: Positional[Annotated[tuple[str, ...], arg(metavar="TASKS ...")]],
+    /,
+    out: Path,
+    episodes: int = 10,
+    seed: int = 0,
+    noise: tuple[float, ...] = (0.0,),
+    noise_hold: int = 10,
+    gripper_noise: float = 0.2,
+    redraw_failures: bool = False,
+    policy: str = "expert",
+    behaviour: str | None = None,
+    num_envs: int | None = None,
+    json: bool = False,
+) -> Output:
+    """Collect demonstrations of the scripted experts, or of others. Stopped and started again it carries on.
+
+    Example: lw-torchrl collect MT10 --out demos/mt10 --noise 0 0.1 0.2 --redraw-failures
+
+    Args:
+        tasks: MT10, MT50, or names of tasks.
+        out: the dataset's folder.
+        episodes: kept for each task.
+        seed: evaluate on another one.
+        noise: standard deviations of the execution noise, gone through in turn, one an episode.
+        noise_hold: steps for which each draw of the noise is kept; longer leads further astray.
+        gripper_noise: what the noise on the gripper is multiplied by; noise there makes grasps fail.
+        redraw_failures: keep successful episodes only.
+        policy: who acts: expert, Meta-World's scripts; scripted, plans with scripted skills; spoilt-60 or spoilt-30,
+            the same in so many of 100 pieces of an episode; wrong, any skill of the plan; random; or a policy's file,
+            of `lw-torchrl train`.
+        behaviour: the label of its episodes; by default the name of who acts, of a policy its file's.
+        num_envs: environments stepped together; the dataset does not depend on it.
+        json: print one JSON document instead, see docs/cli.md.
+    """
+    check_folder("--out", out)
+    check_actor("policy", policy)
+    from lw_torchrl.language.tasks import TASKS
+
+    chosen = simulated("tasks", one_or_many(tasks), TASKS)
+    from lw_torchrl.data import collect_demonstrations
+
+    acts: str | Policy = policy
+    if policy not in ACTORS:
+        from lw_torchrl.training.files import load_actor
+
+        use_one_thread()
+        acts, behaviour = load_actor(policy), behaviour or Path(policy).stem
+    made = collect_demonstrations(
+        chosen,
+        episodes_per_task=episodes,
+        root=out,
+        seed=seed,
+        noise_scale=noise,
+        noise_hold=noise_hold,
+        gripper_noise_factor=gripper_noise,
+        redraw_failures=redraw_failures,
+        policy=acts,
+        behaviour=behaviour,
+        num_envs=num_envs,
+    )
+    output = Output(json)
+    rows = [
+        {"task": task, "success": rate, "episodes_run": made.attempts[task]} for task, rate in made.success_rate.items()
+    ]
+    columns: Columns = {"task": "task", "success": lambda row: f"{row['success']:.2f}", "episodes run": "episodes_run"}
+    output.table("tasks", rows, columns)
+    output.show("dataset", made.root)
+    output.show("steps", made.num_steps, f"{counted(made.num_steps, 'step')} in {made.root}")
+    return output
+
+
+>>>>>>> small-1-training:lw_torchrl/cli/policies.py
 def evaluate(
     checkpoint: Positional[Annotated[Path, arg(metavar="CHECKPOINT")]],
     /,
@@ -133,7 +208,7 @@ def evaluate(
 def _default_tasks(policy: Policy, checkpoint: Path, *, trained: bool) -> tuple[str, ...]:
     """The tasks that a policy was trained on, as its file says, that the simulator has; what is left out is printed."""
     from lw_torchrl.language.tasks import TASKS
-    from lw_torchrl.training.checkpoint import demonstrated_tasks
+    from lw_torchrl.training.files import demonstrated_tasks
 
     shown = demonstrated_tasks(checkpoint) if trained else set()
     chosen = [task for task in policy.tasks if task in shown] or list(policy.tasks)

@@ -29,7 +29,6 @@ def tasks(
         names: MT10, MT50, or names of tasks; all there are if none is given.
     """
     import lw_torchrl as lw
-    from lw_torchrl.language.tasks import resolve_tasks
 
     known = options.read_tasks(task_file)
     rows = [
@@ -127,7 +126,6 @@ def plans(
         roles: a table of the steps, what each moves and what it goes to, and what told: "skill", the text is a scripted
             skill's; "words", the text's; "condition", the things that it compares; "nothing".
     """
-    from lw_torchrl.language.tasks import resolve_tasks
 
     known = options.read_tasks(task_file)
     loaded = options.read_plans(plans, known, skill_set)

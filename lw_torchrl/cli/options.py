@@ -263,7 +263,7 @@ def make_logger(kind: Literal["csv", "tensorboard", "wandb"], out: Path) -> Any:
 def load_policy(checkpoint: Path, seed: int, plans: Plans | None, text_encoder: str | None) -> Policy:
     """The policy of a file, with the plans that are given; none that has seen the seed's states."""
     import lw_torchrl as lw
-    from lw_torchrl.training.checkpoint import demonstration_seeds
+    from lw_torchrl.training.files import demonstration_seeds
 
     if seed in demonstration_seeds(checkpoint):
         raise ValueError(f"seed must differ from the demonstrations' seed, {seed}; an evaluation wants fresh states")

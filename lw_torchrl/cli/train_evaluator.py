@@ -181,7 +181,7 @@ def _of_tasks(roots: list[Path], tasks: tuple[str, ...]) -> list[dict[str, list[
 
 def with_evaluator(policy: Policy, path: Path, text_encoder: str | None) -> Policy:
     """A policy whose conditions the evaluator of a file answers."""
-    from lw_torchrl.training.evaluator_files import load_evaluator
+    from lw_torchrl.training.files import load_evaluator
 
     if policy.plans is None:
         raise ValueError(f"--evaluator is for a policy with plans, {type(policy).__name__} has none")

@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import Any
 
 from lw_torchrl.data.selection import Label
-from lw_torchrl.training.config import BehavioralCloningConfig
+from lw_torchrl.training.behavioral_cloning import BehavioralCloningConfig
 
 
 @dataclass(frozen=True)

@@ -3,43 +3,153 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
+import warnings
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.utils import clip_grad_norm_
 from torchrl.data import TensorDictReplayBuffer
+from torchrl.objectives import BCLoss
 from torchrl.record.loggers import Logger
 
-from lw_torchrl._checks import checked
-from lw_torchrl._devices import CPU, drawn_on, place
-from lw_torchrl._progress import Progress
+from lw_torchrl._checks import check_choice, check_fields, check_int, check_positive, check_scale, checked
+from lw_torchrl._devices import place
+from lw_torchrl.language.plan_tables import PlanTables
 from lw_torchrl.modules.policy import Policy
-from lw_torchrl.training.checkpoint import describe_data, describe_replay, write
-from lw_torchrl.training.config import BehavioralCloningConfig, last_step, make_optimizer
-from lw_torchrl.training.evaluator_anchor import EvaluatorAnchor
-from lw_torchrl.training.interrupts import interrupts_between_steps
-from lw_torchrl.training.latent_terms import LatentTerms
-from lw_torchrl.training.loss_state import bc_loss
-from lw_torchrl.training.minibatches import check_replay, draw_batch, verify_rows
+from lw_torchrl.modules.query_evaluator import QueryEvaluator
+from lw_torchrl.objectives.skill_latents import Kind, latent_term, skill_encoder
+from lw_torchrl.training.buffers import check_replay
+from lw_torchrl.training.envelope import POLICY
+from lw_torchrl.training.files import check_can_be_saved, describe_data, describe_replay
+from lw_torchrl.training.loop import ReplayState, Training, make_schedule
 from lw_torchrl.training.normalization import check_contacts, fit_normalization
-from lw_torchrl.training.policy_checks import check_can_be_saved, check_trained
-from lw_torchrl.training.recent_losses import READ_EVERY, RecentLosses
-from lw_torchrl.training.training_state import (
-    OneWriter,
-    TrainingState,
-    check_description,
-    load_state,
-    load_training,
-    state_of,
-    warn_of_another_device,
-    where,
-)
+from lw_torchrl.transforms.qaf import plan_program
+
+LOSSES = ("l1", "l2", "smooth_l1")
+_LATER = {"latent_consistency", "latent_contrast", "qaf_anchor"}
+"""Options that files did not say at first: at 0, training is what it was before them."""
 
 
-class BehavioralCloningTrainer:
+@dataclass(frozen=True)
+class BehavioralCloningConfig:
+    """How an actor is trained.
+
+    Attributes:
+        steps: minibatches.
+        batch_size: rows of a minibatch; the number of tasks must divide it.
+        learning_rate: at the start.
+        optimizer: "adamw" or "sgd".
+        weight_decay: the optimizer's.
+        momentum: of "sgd".
+        schedule: of the learning rate, "cosine" to 0 or "constant".
+        normalize: first take the statistics of the observation's features from the demonstrations.
+        loss_function: between the actor's and the demonstrated action: "l1", "l2" or "smooth_l1".
+        max_grad_norm: gradients are clipped to it.
+        seed: of the minibatches, and of what the buffer's transforms and the actor draw while training.
+        checkpoint_every: steps between checkpoints; the last step always makes one.
+        latent_consistency: weight of :class:`SkillLatentLoss` "consistency" in the loss, of a policy with plans: skills
+            whose texts are near stay near.
+        latent_contrast: weight of the "contrastive" one: different skills keep apart.
+        qaf_anchor: weight of the cross entropy of an evaluator's answers with the query answering function's, of a
+            policy with an evaluator: its conditions keep to their words.
+    """
+
+    steps: int = 8000
+    batch_size: int = 500
+    learning_rate: float = 1e-3
+    optimizer: str = "adamw"
+    weight_decay: float = 1e-4
+    momentum: float = 0.9
+    schedule: str = "cosine"
+    normalize: bool = True
+    loss_function: str = "l2"
+    max_grad_norm: float = 1.0
+    seed: int = 0
+    checkpoint_every: int = 500
+    latent_consistency: float = 0.0
+    latent_contrast: float = 0.0
+    qaf_anchor: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        for name in ("steps", "batch_size", "checkpoint_every"):
+            check_int(name, getattr(self, name), minimum=1)
+        for name in ("learning_rate", "weight_decay", "momentum", *sorted(_LATER)):
+            check_scale(name, getattr(self, name))
+        check_positive("max_grad_norm", self.max_grad_norm)
+        check_int("seed", self.seed)
+        check_choice("loss_function", self.loss_function, LOSSES)
+        check_choice("optimizer", self.optimizer, ("adamw", "sgd"))
+        check_choice("schedule", self.schedule, ("cosine", "constant"))
+
+    def describe(self) -> dict[str, Any]:
+        """What files say of it, as JSON: files from before an option hold what those with its default hold."""
+        return {name: value for name, value in asdict(self).items() if value or name not in _LATER}
+
+
+def make_optimizer(parameters: Iterable[Tensor], config: BehavioralCloningConfig) -> torch.optim.Optimizer:
+    """The optimizer of a configuration."""
+    rate = float(config.learning_rate)  # as it is in a checkpoint
+    decay, momentum = config.weight_decay, config.momentum
+    if config.optimizer == "adamw":
+        return torch.optim.AdamW(parameters, lr=rate, weight_decay=decay, fused=True)
+    return torch.optim.SGD(parameters, lr=rate, momentum=momentum, weight_decay=decay, fused=True)
+
+
+def bc_loss(actor: nn.Module, distance: str) -> BCLoss:
+    """TorchRL's BCLoss, without its warning about itself."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*target_actor_network_params.*")
+        return BCLoss(actor, loss_function=distance)
+
+
+class LatentTerms(nn.Module):
+    """The weighted sum of a configuration's terms on the latents of an actor's skills; a module, for
+    ``functional_call``. With no ``weights`` it must not be called; an actor without plans has no terms."""
+
+    def __init__(self, actor: Any, config: BehavioralCloningConfig) -> None:
+        super().__init__()
+        asked: list[tuple[str, Kind]] = [("latent_consistency", "consistency"), ("latent_contrast", "contrastive")]
+        self.weights: dict[Kind, float] = {}
+        for name, kind in asked:
+            if weight := getattr(config, name):
+                skill_encoder(name, actor)
+                self.weights[kind] = weight
+        self.actor = actor
+
+    def forward(self) -> Tensor:
+        encoder = skill_encoder("actor", self.actor)
+        terms = [weight * latent_term(encoder, kind) for kind, weight in self.weights.items()]
+        return sum(terms[1:], terms[0])
+
+
+class EvaluatorAnchor:
+    """The mean cross entropy of the answers of an actor's evaluator to its plans' conditions with the query answering
+    function's. It holds the evaluator to the words while the loss of imitation trains it."""
+
+    def __init__(self, actor: Any) -> None:
+        evaluator = getattr(actor, "evaluator", None)
+        if not isinstance(evaluator, QueryEvaluator):
+            raise ValueError(f"qaf_anchor is for a policy with an evaluator, this {type(actor).__name__} has none")
+        self.evaluator = evaluator
+        self.program, self.tables = plan_program(evaluator.plans), PlanTables(evaluator.plans)
+
+    def __call__(self, batch: TensorDictBase) -> Tensor:
+        """() float32, of a minibatch with ``observation`` (B, 39) float32, ``task_id`` (B,) int64 and what the
+        evaluator reads."""
+        task = batch.get("task_id")
+        logits = self.evaluator.answers(*(batch.get(key) for key in self.evaluator.in_keys))
+        truth = self.program(batch.get("observation"), task).to(logits.dtype)
+        steps = self.tables.mask.to(task.device)[self.tables.rows(task)]
+        return nn.functional.binary_cross_entropy_with_logits(logits[steps], truth[steps])
+
+
+class BehavioralCloningTrainer(Training):
     """Trains an actor to give the demonstrated actions.
 
     Any TensorDictModule that writes ``action`` can be trained; a :class:`Policy` first takes its statistics from the
@@ -58,14 +168,13 @@ class BehavioralCloningTrainer:
             steps. Make the buffer with the same ``device``, or each minibatch has to go over.
 
     Warns:
-        UserWarning: the checkpoint is of training on another kind of device: it goes on with the same minibatches, but
-            not bit for bit. Or it was written under another version of torch or another package that bits hang on.
+        UserWarning: the checkpoint was written on another kind of device, or under other versions of torch, say:
+            training goes on with the same minibatches, but not bit for bit.
 
     Raises:
         ValueError: the checkpoint is damaged, of another architecture, configuration or data; the actor writes no
-            ``action``, or has no plans and the configuration has a term on skills' latents, or no evaluator and
-            it has an anchor; or, in :meth:`train`, the
-            loss or the weights are no numbers.
+            ``action``, has no plans for the configuration's terms on skills' latents, or no evaluator for its anchor;
+            or, in :meth:`train`, the loss or the weights are no numbers.
         TypeError: a checkpoint for an actor that is no :class:`Policy`.
         OSError: the checkpoint cannot be written; the earlier one stays.
 
@@ -84,6 +193,8 @@ class BehavioralCloningTrainer:
     Source: paper section 'Conditional Plan Experiments'; ``torchrl.objectives.BCLoss``.
     """
 
+    envelope, says_device = POLICY, True
+
     @checked
     def __init__(
         self,
@@ -96,72 +207,45 @@ class BehavioralCloningTrainer:
         progress: bool = True,
         device: str | torch.device | None = None,
     ) -> None:
-        self.actor, self.replay, self.logger, self.progress = actor, replay, logger, progress
+        config = config or BehavioralCloningConfig()
+        super().__init__(config, [replay], checkpoint, logger=logger, progress=progress)
+        self.actor, self.module, self.replay, self.networks = actor, actor, replay, [actor]
         self.device = place(actor, device)
-        self.config = config = config or BehavioralCloningConfig()
-        self.checkpoint = None if checkpoint is None else Path(checkpoint)
-        self._writer = OneWriter(self.checkpoint)
         check_replay(actor, replay, config.batch_size)
         self._latent_terms = LatentTerms(actor, config)
         self._anchor = EvaluatorAnchor(actor) if config.qaf_anchor else None
-        self._policy = None if self.checkpoint is None else check_can_be_saved(actor)
-        self._described: dict[str, Any] = {}
-        if self.checkpoint is not None and self._policy is not None:
-            self._described = {"actor": self._policy.describe(), "training": config.describe()}
-            self._described |= {"data": describe_data(replay), "replay": describe_replay(replay)}
+        if self.checkpoint is not None:
+            self.described = {"actor": check_can_be_saved(actor).describe(), "training": config.describe()}
+            self.described |= {"data": describe_data(replay), "replay": describe_replay(replay)}
         self.loss = bc_loss(actor, config.loss_function)
-        self.optimizer, self.schedule = make_optimizer(self.loss.parameters(), config)
-        self._losses = RecentLosses(("the loss",), config.learning_rate)
-        self.state = TrainingState(replay, config.seed)
-        if self.checkpoint is not None and self._policy is not None and self.checkpoint.exists():
-            verify_rows(replay)
-            check_description(self.checkpoint, self._described)
-            warn_of_another_device(self.checkpoint, self.device)
-            found = load_training(self.checkpoint, self._policy, self._policy.state_dict(keep_vars=True))
-            load_state(self.checkpoint, found, self.optimizer, self.schedule, [self.state], config.steps)
-        elif config.normalize and isinstance(actor, Policy):
+        self.optimizer = make_optimizer(self.loss.parameters(), config)
+        self.schedule = make_schedule(config.schedule, self.optimizer, config.steps)
+        self.states = [ReplayState(replay, config.seed)]
+        if self.resume():
+            return
+        if config.normalize and isinstance(actor, Policy):
             fit_normalization(actor, replay)
         else:
             check_contacts(actor)
 
-    def save(self) -> None:
-        """Write the checkpoint, if there is to be one; an earlier one is replaced whole.
-
-        Raises:
-            ValueError: the weights are no finite numbers.
-        """
-        check_trained(dict(self.actor.named_parameters()), self.state.step)
-        if self.checkpoint is not None and self._policy is not None:
-            state = state_of(self.optimizer, self.schedule, [self.state])
-            described = self._described | where(self.device)
-            write(self.checkpoint, described, self._policy, self._policy.state_dict(), state)
-            self._writer.know()
-
     def step(self) -> Tensor:
         """Train on one minibatch and return its loss, () float32, on the device: nobody has waited for it."""
-        # What transforms and the actor draw hangs on the configuration's seed.
-        with drawn_on(self.device, self.state.torch_generator):
-            batch = draw_batch(self.replay, self.config.batch_size, self.device)
+        (state,) = self.states
+        with state.drawing(self.device):
+            batch = state.minibatch(self.config.batch_size, self.device)
             loss = self.loss(batch)["loss_bc"]
-            self.state.torch_generator = torch.get_rng_state()
         if self._latent_terms.weights:
             loss = loss + self._latent_terms()
         if self._anchor is not None:
             loss = loss + self.config.qaf_anchor * self._anchor(batch)
-        if self.device == CPU:
-            self._losses.check(loss, self.state.step)
-        self.optimizer.zero_grad()
-        loss.backward()
-        clip_grad_norm_(self.loss.parameters(), self.config.max_grad_norm)
-        self.optimizer.step()
-        self.schedule.step()
-        self.state.step += 1
-        return loss.detach()
+        return self.descend(loss)
 
-    @property
-    def steps(self) -> int:
-        """How many minibatches the actor has been trained on."""
-        return self.state.step
+    def clip_gradients(self) -> None:
+        clip_grad_norm_(self.loss.parameters(), self.config.max_grad_norm)
+
+    def means(self, losses: Tensor) -> dict[str, float]:
+        assert self.schedule is not None
+        return {"loss": _mean(losses), "learning_rate": self.schedule.get_last_lr()[0]}
 
     def train(self, until: int | None = None) -> float:
         """Train to the last step, from wherever training stands.
@@ -175,31 +259,7 @@ class BehavioralCloningTrainer:
         Returns:
             The mean loss over the last 100 steps made; NaN if there were none left to make.
         """
-        losses = self._losses
-        losses.clear()
-        self.actor.train()
-        every, total = self.config.checkpoint_every, last_step(self.config, until)
-        bar = Progress("training", self.config.steps, "step", initial=self.state.step, show=self.progress)
-        with self._writer.alone(), bar, interrupts_between_steps() as interrupt:
-            while self.state.step < total and not interrupt.asked:
-                losses.add(self.step())
-                step = self.state.step
-                bar.update()
-                saves = step % every == 0 or step == total
-                if saves or step % READ_EVERY == 0:
-                    mean = _mean(losses.read(step))
-                if step % READ_EVERY == 0 or step == total:
-                    bar.note(loss=f"{mean:.4f}")
-                    if self.logger is not None:
-                        self.logger.log_scalar("train/loss", mean, step=step)
-                        self.logger.log_scalar("train/learning_rate", self.schedule.get_last_lr()[0], step=step)
-                if saves:
-                    self.save()
-            if interrupt.asked:
-                losses.read(self.state.step)
-                self.save()
-        self.actor.eval()
-        return _mean(losses.read(self.state.step))
+        return _mean(self.run(until))
 
 
 def _mean(losses: Tensor) -> float:

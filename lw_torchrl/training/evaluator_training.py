@@ -1,33 +1,173 @@
-"""QueryEvaluatorTrainer: a StateQueryEvaluator learns what the query answering function answers."""
+"""QueryEvaluatorTrainer and ImageQueryEvaluatorTrainer: evaluators learn what the query answering function answers."""
 
 from __future__ import annotations
 
-import json
 import math
 import os
-from dataclasses import asdict
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
 from hashlib import blake2b
-from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
-from lw_torchrl._checks import checked_but, differences
-from lw_torchrl._progress import Progress
-from lw_torchrl._state_tree import check_optimizer_state, join
-from lw_torchrl._versions import warn_of_other_versions
-from lw_torchrl.modules.clause_evaluator import ClauseEvaluator, Clauses
+from lw_torchrl._checks import check_scale, checked_but
+from lw_torchrl._state_tree import check_optimizer_state
+from lw_torchrl.language.named_objects import GRIPPER
+from lw_torchrl.language.observation import OPENING
+from lw_torchrl.modules.clause_evaluator import ClauseEvaluator
+from lw_torchrl.modules.image_query_evaluator import ImageQueryEvaluator
 from lw_torchrl.modules.state_query_evaluator import StateQueryEvaluator
-from lw_torchrl.training.evaluator_files import check_evaluator_can_be_saved, open_evaluator, write_evaluator
-from lw_torchrl.training.interrupts import interrupts_between_steps
-from lw_torchrl.training.labelled_queries import LabelledQueries, QueryEvaluatorConfig
-from lw_torchrl.training.policy_checks import copy_weights, first_line
-from lw_torchrl.training.recent_losses import READ_EVERY, RecentLosses
-from lw_torchrl.training.training_state import OneWriter
+from lw_torchrl.training.envelope import EVALUATOR
+from lw_torchrl.training.files import check_evaluator_can_be_saved, evaluator_texts
+from lw_torchrl.training.labelled_queries import Asked, LabelledQueries, QueryEvaluatorConfig
+from lw_torchrl.training.loop import Training
+
+_MOST_WEIGHT = 20.0  # of a rare truth, by the median
 
 
-class QueryEvaluatorTrainer:
+@dataclass(frozen=True)
+class ImageQueryEvaluatorConfig(QueryEvaluatorConfig):
+    """How an evaluator of pictures is trained, as :class:`QueryEvaluatorConfig`, but that a minibatch is of states.
+
+    Attributes:
+        batch_size: states in a minibatch, each asked all clauses of its task.
+        position_weight: of the error in the things' positions, in units of 5 cm, and in how far the gripper is open, in
+            the loss, of an evaluator with ``structure``: the simulator knows them. 0 to learn from answers alone.
+    """
+
+    steps: int = 4000
+    batch_size: int = 48
+    learning_rate: float = 1e-3
+    every: int = 5
+    position_weight: float = 1.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_scale("position_weight", self.position_weight)
+
+
+class _StateMinibatches:
+    """Pairs of a state and a clause, equally many of each predicate and truth."""
+
+    def __init__(self, evaluator: Any, asked: list[Asked], config: QueryEvaluatorConfig) -> None:
+        self.evaluator, self.size = evaluator, config.batch_size
+        self.observation = torch.cat([one.observation for one in asked])
+        self.clauses, self.vectors = evaluator.code([(one.task, clause) for one in asked for clause in one.clauses])
+        self.negatable = len(self.clauses.predicate) // 2 if self.vectors is not None else 0
+        names = [clause.predicate for one in asked for clause in one.clauses]
+        number = {name: place for place, name in enumerate(sorted({*names}))}
+        kind = torch.tensor([number[name] for name in names])
+        groups: list[list[Tensor]] = [[] for _ in range(2 * len(number))]
+        row = first = 0
+        for one in asked:
+            of = kind[first : first + len(one.clauses)]
+            for place in of.unique().tolist():
+                columns = (of == place).nonzero()[:, 0]
+                for truth in (0, 1):
+                    at = (one.truth[:, columns] == bool(truth)).nonzero()
+                    pairs = torch.stack((at[:, 0] + row, columns[at[:, 1]] + first), -1)
+                    groups[2 * place + truth].append(pairs.int())
+            row, first = row + len(one.observation), first + len(one.clauses)
+        parts = [(torch.cat(found), place % 2) for place, found in enumerate(groups) if found]
+        parts = [(found, truth) for found, truth in parts if len(found)]
+        self.pairs = torch.cat([found for found, _ in parts])
+        self.sizes = torch.tensor([len(found) for found, _ in parts])
+        self.starts = self.sizes.cumsum(0) - self.sizes
+        self.truths = torch.tensor([bool(truth) for _, truth in parts])
+        self.labels = _digest((self.observation, self.pairs, self.sizes))
+
+    def draw(self, step: int, generator: torch.Generator) -> tuple[Tensor, Any, Tensor]:
+        """Observation (B, 39) float32, clauses (B, 1) and their truth (B, 1) float32."""
+        group = (torch.arange(self.size) + step * self.size) % len(self.sizes)
+        place = (torch.rand(self.size, generator=generator, dtype=torch.float64) * self.sizes[group]).long()
+        row, clause = self.pairs[self.starts[group] + place].long().unbind(-1)
+        truth = self.truths[group]
+        if self.negatable:
+            negated = torch.rand(self.size, generator=generator) < 0.5
+            clause, truth = clause + negated * self.negatable, truth ^ negated
+        return self.observation[row], self.clauses.pick(clause[:, None]), truth[:, None].float()
+
+    def loss(self, step: int, generator: torch.Generator) -> Tensor:
+        observation, clauses, truth = self.draw(step, generator)
+        logits = self.evaluator.network(observation, clauses, self.vectors)
+        return nn.functional.binary_cross_entropy_with_logits(logits, truth)
+
+
+class _PictureMinibatches:
+    """States, equally many of each task; of each all clauses are asked, and where its things are."""
+
+    def __init__(self, evaluator: Any, asked: list[Asked], config: QueryEvaluatorConfig) -> None:
+        if not isinstance(config, ImageQueryEvaluatorConfig):
+            raise TypeError(f"config must be an ImageQueryEvaluatorConfig, got {type(config).__name__}")
+        self.evaluator, self.asked, self.config = evaluator, asked, config
+        for one in asked:
+            evaluator.check_seen(one.seen("pixels"))
+        self.coded = [evaluator.code([(one.task, clause) for clause in one.clauses]) for one in asked]
+        self.weights = [_answer_weights(one) for one in asked]
+        self.positions = [self._known_positions(one) for one in asked]
+        self.labels = _digest(tensor for one in asked for tensor in (one.observation, one.truth, one.seen("pixels")))
+
+    def _known_positions(self, asked: Asked) -> tuple[Tensor, Tensor, Tensor]:
+        """The things of a task, (n,) int64; where they are, (R, n, 4) float32; and what of that counts, (n, 4)."""
+        names = [name for name in asked.task.object_names if name in self.evaluator.names]
+        positions, number = asked.task.positions(asked.observation), self.evaluator.names.index
+        known = torch.zeros(len(asked.observation), len(names), 4)
+        counts = torch.ones(len(names), 4)
+        for place, name in enumerate(names):
+            known[:, place, :3] = positions[name]
+            known[:, place, 3] = asked.observation[:, OPENING]
+            counts[place, 3] = name == GRIPPER
+        return torch.tensor([number(name) for name in names], dtype=torch.int64), known, counts
+
+    def loss(self, step: int, generator: torch.Generator) -> Tensor:
+        each = max(1, self.config.batch_size // len(self.asked))
+        return torch.stack([self._task_loss(task, each, generator) for task in range(len(self.asked))]).mean()
+
+    def _task_loss(self, task: int, size: int, generator: torch.Generator) -> Tensor:
+        """Of so many states of a task."""
+        asked, network = self.asked[task], self.evaluator.network
+        coded, vectors = self.coded[task]
+        rows = torch.randint(len(asked.observation), (size,), generator=generator)
+        pixels, truth = asked.seen("pixels")[rows], asked.truth[rows]
+        weights = self.weights[task].gather(0, truth.long())
+        clauses = coded.pick(torch.arange(len(coded.predicate)).expand(size, -1))
+        placed = torch.zeros(())
+        if self.evaluator.names:
+            places, _ = network.places(pixels, network.names.weight)
+            logits = network.tell(places, clauses)
+            which, known, counts = self.positions[task]
+            error = nn.functional.smooth_l1_loss(places[:, which] / 0.05, known[rows] / 0.05, reduction="none")
+            placed = (error * counts).sum() / (counts.sum() * size)
+        else:
+            logits = network(pixels, clauses, vectors)
+            truth, weights = torch.cat((truth, ~truth), -1), torch.cat((weights, weights), -1)
+        errors = nn.functional.binary_cross_entropy_with_logits(logits, truth.float(), reduction="none")
+        return (errors * weights).sum() / weights.sum() + self.config.position_weight * placed
+
+
+def _answer_weights(asked: Asked) -> Tensor:
+    """(2, Q) float32, the weight of a clause's false and true answers, by which each predicate and truth weighs
+    alike."""
+    true = asked.truth.double().mean(0)
+    names = [clause.predicate for clause in asked.clauses]
+    weights = torch.zeros(2, len(names))
+    for name in {*names}:
+        own = torch.tensor([other == name for other in names])
+        for value, share in ((0, (1 - true)[own].sum()), (1, true[own].sum())):
+            weights[value, own] = float(1.0 / share) if share > 0 else 0.0
+    return weights.clamp(max=_MOST_WEIGHT * weights.median().item())
+
+
+def _digest(tensors: Iterable[Tensor]) -> str:
+    digest = blake2b(digest_size=8)
+    for tensor in tensors:
+        digest.update(tensor.contiguous().numpy().tobytes())
+    return digest.hexdigest()
+
+
+class QueryEvaluatorTrainer(Training):
     """Trains an evaluator on the answers of the query answering function to all base queries of tasks.
 
     A minibatch has equally many of each predicate and truth, as far as there are any; within these, pairs of a state
@@ -63,7 +203,9 @@ class QueryEvaluatorTrainer:
         True
     """
 
+    envelope = EVALUATOR
     trains: ClassVar[type[ClauseEvaluator]] = StateQueryEvaluator
+    minibatches: ClassVar[Callable[..., _StateMinibatches | _PictureMinibatches]] = _StateMinibatches
 
     @checked_but("evaluator")
     def __init__(
@@ -77,122 +219,44 @@ class QueryEvaluatorTrainer:
     ) -> None:
         if not isinstance(evaluator, self.trains):
             raise TypeError(f"evaluator must be of class {self.trains.__name__}, got {type(evaluator).__name__}")
-        self.evaluator, self.config, self.progress = evaluator, config or QueryEvaluatorConfig(), progress
-        self.checkpoint = None if checkpoint is None else Path(checkpoint)
-        self._writer = OneWriter(self.checkpoint)
-        self._gather(data)
+        config = config or QueryEvaluatorConfig()
+        super().__init__(config, [], checkpoint, progress=progress, title="training the evaluator")
+        self.evaluator, self.module, self.networks = evaluator, evaluator, [evaluator]
+        if not data.parts["training"]:
+            raise ValueError("data must have states and queries to train on, all are held out")
+        self._minibatches = type(self).minibatches(evaluator, data.parts["training"], config)
         trained = (weight for weight in evaluator.parameters() if weight.requires_grad)
-        self.optimizer = torch.optim.AdamW(
-            trained, lr=float(self.config.learning_rate), weight_decay=self.config.weight_decay
-        )
+        self.optimizer = torch.optim.AdamW(trained, lr=float(config.learning_rate), weight_decay=config.weight_decay)
         for group in self.optimizer.param_groups:
             group["initial_lr"] = group["lr"]
-        self.done = 0
-        self._losses = RecentLosses(("the loss",), self.config.learning_rate)
-        self._described = json.loads(json.dumps({"training": asdict(self.config), "data": data.describe()}))
-        self._described["data"]["labels"] = self._digest
         if self.checkpoint is not None:
             check_evaluator_can_be_saved(evaluator)
-            if self.checkpoint.exists():
-                self._load(self.checkpoint)
+            described = data.describe() | {"labels": self._minibatches.labels}
+            self.described = {"evaluator": evaluator.describe(), "training": asdict(config), "data": described}
+        self.resume()
 
-    def _gather(self, data: LabelledQueries) -> None:
-        """Rows and clauses of all tasks in one list each, and the pairs of both by predicate and truth."""
-        asked = data.parts["training"]
-        if not asked:
-            raise ValueError("data must have states and queries to train on, all are held out")
-        self._observation = torch.cat([one.observation for one in asked])
-        self._clauses, self._vectors = self.evaluator.code(
-            [(one.task, clause) for one in asked for clause in one.clauses]
-        )
-        self._negatable = len(self._clauses.predicate) // 2 if self._vectors is not None else 0
-        names = [clause.predicate for one in asked for clause in one.clauses]
-        number = {name: place for place, name in enumerate(sorted({*names}))}
-        kind = torch.tensor([number[name] for name in names])
-        groups: list[list[Tensor]] = [[] for _ in range(2 * len(number))]
-        row = first = 0
-        for one in asked:
-            of = kind[first : first + len(one.clauses)]
-            for place in of.unique().tolist():
-                columns = (of == place).nonzero()[:, 0]
-                for truth in (0, 1):
-                    at = (one.truth[:, columns] == bool(truth)).nonzero()
-                    pairs = torch.stack((at[:, 0] + row, columns[at[:, 1]] + first), -1)
-                    groups[2 * place + truth].append(pairs.int())
-            row, first = row + len(one.observation), first + len(one.clauses)
-        parts = [(torch.cat(found), place % 2) for place, found in enumerate(groups) if found]
-        parts = [(found, truth) for found, truth in parts if len(found)]
-        self._pairs = torch.cat([found for found, _ in parts])
-        self._sizes = torch.tensor([len(found) for found, _ in parts])
-        self._starts = self._sizes.cumsum(0) - self._sizes
-        self._truths = torch.tensor([bool(truth) for _, truth in parts])
-        digest = blake2b(digest_size=8)
-        for tensor in (self._observation, self._pairs, self._sizes):
-            digest.update(tensor.contiguous().numpy().tobytes())
-        self._digest = digest.hexdigest()
+    def contents(self) -> dict[str, dict[str, Tensor]]:
+        return {"weights": self.evaluator.state_dict(keep_vars=True), "texts": evaluator_texts(self.evaluator)}
 
-    def _load(self, path: Path) -> None:
-        archive = open_evaluator(path)
-        ours = {"evaluator": json.loads(json.dumps(self.evaluator.describe())), **self._described}
-        for part, wanted in ours.items():
-            if (found := archive.description.get(part)) != wanted:
-                differ = differences(found if isinstance(found, dict) else {}, wanted)
-                raise ValueError(
-                    f"checkpoint: {str(path)!r} is of another {part}, which differs in {', '.join(differ[:8])}; choose "
-                    "another file, or delete it to start again"
-                )
-        warn_of_other_versions(path, archive.description.get("versions"))
-        try:
-            state = join(archive.description.get("state"), archive.tensors("training"))
-            if not isinstance(state, dict) or set(state) != {"step", "optimizer"}:
-                raise ValueError("a training state has step and optimizer")
-            if type(state["step"]) is not int or not 0 <= state["step"] <= self.config.steps:
-                raise ValueError(f"step must be from 0 to {self.config.steps}")
-            check_optimizer_state(state["optimizer"], self.optimizer, state["step"])
-            copy_weights(archive.tensors("weights"), self.evaluator.state_dict(keep_vars=True))
-            self.optimizer.load_state_dict(state["optimizer"])
-        except (ValueError, KeyError, TypeError, RecursionError) as error:
-            raise ValueError(f"checkpoint: {str(path)!r} does not fit, it is damaged ({first_line(error)})") from error
-        self.done = state["step"]
+    def state_dict(self) -> dict[str, Any]:
+        return {"step": self.steps, "optimizer": self.optimizer.state_dict()}
 
-    def save(self) -> None:
-        """Write the checkpoint, if there is to be one."""
-        if self.checkpoint is not None:
-            state = {"step": self.done, "optimizer": self.optimizer.state_dict()}
-            write_evaluator(self.evaluator, self.checkpoint, self._described, state)
-            self._writer.know()
-
-    def _draw(self) -> tuple[Tensor, Clauses, Tensor]:
-        """Observation (B, 39) float32, clauses (B, 1) and their truth (B, 1) float32."""
-        size = self.config.batch_size
-        generator = torch.Generator().manual_seed((self.config.seed * 1_000_003 + self.done) % 2**63)
-        group = (torch.arange(size) + self.done * size) % len(self._sizes)
-        place = (torch.rand(size, generator=generator, dtype=torch.float64) * self._sizes[group]).long()
-        row, clause = self._pairs[self._starts[group] + place].long().unbind(-1)
-        truth = self._truths[group]
-        if self._negatable:
-            negated = torch.rand(size, generator=generator) < 0.5
-            clause, truth = clause + negated * self._negatable, truth ^ negated
-        return self._observation[row], self._clauses.pick(clause[:, None]), truth[:, None].float()
-
-    def _loss(self) -> Tensor:
-        """Of the step's minibatch, () float32."""
-        observation, clauses, truth = self._draw()
-        logits = self.evaluator.network(observation, clauses, self._vectors)
-        return nn.functional.binary_cross_entropy_with_logits(logits, truth)
+    def load_state_dict(self, found: dict[str, Any]) -> None:
+        if set(found) != {"step", "optimizer"}:
+            raise ValueError("a training state has step and optimizer")
+        if type(found["step"]) is not int or not 0 <= found["step"] <= self.config.steps:
+            raise ValueError(f"step must be from 0 to {self.config.steps}")
+        check_optimizer_state(found["optimizer"], self.optimizer, found["step"])
+        self.optimizer.load_state_dict(found["optimizer"])
+        self.steps = found["step"]
 
     def step(self) -> Tensor:
         """Train on one minibatch and return its loss, () float32."""
-        rate = 0.5 * self.config.learning_rate * (1.0 + math.cos(math.pi * self.done / self.config.steps))
+        rate = 0.5 * self.config.learning_rate * (1.0 + math.cos(math.pi * self.steps / self.config.steps))
         for group in self.optimizer.param_groups:
             group["lr"] = rate
-        loss = self._loss()
-        self._losses.check(loss.detach(), self.done)
-        self.optimizer.zero_grad()
-        loss.backward()
-        self.optimizer.step()
-        self.done += 1
-        return loss.detach()
+        generator = torch.Generator().manual_seed((self.config.seed * 1_000_003 + self.steps) % 2**63)
+        return self.descend(self._minibatches.loss(self.steps, generator))
 
     def train(self) -> float:
         """Train to the last step, from wherever training stands; Ctrl-C ends it between two steps, with a checkpoint.
@@ -200,19 +264,32 @@ class QueryEvaluatorTrainer:
         Returns:
             The mean loss over the last 100 steps made; NaN if there were none left to make.
         """
-        self._losses.clear()
-        self.evaluator.train()
-        total = self.config.steps
-        bar = Progress("training the evaluator", total, "step", initial=self.done, show=self.progress)
-        with self._writer.alone(), bar, interrupts_between_steps() as interrupt:
-            while self.done < total and not interrupt.asked:
-                self._losses.add(self.step())
-                bar.update()
-                if self.done % READ_EVERY == 0:
-                    bar.note(loss=f"{self._losses.read(self.done).mean():.4f}")
-                if self.done % self.config.checkpoint_every == 0 or self.done == total:
-                    self.save()
-            if interrupt.asked:
-                self.save()
-        self.evaluator.eval()
-        return self._losses.read(self.done).mean().item()
+        return self.run().mean().item()
+
+
+class ImageQueryEvaluatorTrainer(QueryEvaluatorTrainer):
+    """Trains an evaluator of pictures on the answers of the query answering function to all base queries of tasks.
+
+    A minibatch has equally many states of each task; of each state all clauses are asked, and each predicate and truth
+    weighs alike. Arguments, errors and files are as for :class:`QueryEvaluatorTrainer`.
+
+    Raises:
+        TypeError: the evaluator is no :class:`ImageQueryEvaluator`, or the configuration is of another class.
+        ValueError: the rows have no pictures.
+
+    Example:
+        >>> import lw_torchrl as lw, tempfile
+        >>> with tempfile.TemporaryDirectory() as root:
+        ...     _ = lw.collect_demonstrations("reach", episodes_per_task=2, root=root, max_steps=40, progress=False)
+        ...     lw.add_pictures(root, "corner", every=5)
+        ...     replay = lw.LanguageWorldExperienceReplay(root, label="executed")
+        ...     replay.add_column("pixels", lw.load_pictures(replay, "corner", every=5))
+        ...     config = ImageQueryEvaluatorConfig(steps=2, batch_size=4, held_out_pairs=0.0)
+        ...     data = lw.LabelledQueries(replay, config)
+        ...     evaluator = lw.ImageQueryEvaluator(lw.load_plans("MT10"), cameras="corner")
+        ...     ImageQueryEvaluatorTrainer(evaluator, data, config).train() < 100.0
+        True
+    """
+
+    trains = ImageQueryEvaluator
+    minibatches = _PictureMinibatches

@@ -82,15 +82,8 @@ class QueryEvaluatorConfig:
 
 @dataclass(frozen=True)
 class Asked:
-    """Clauses that are asked of the states of a task.
-
-    Attributes:
-        task: whose objects they name.
-        clauses: Q of them, none negated.
-        observation: (R, 39) float32.
-        truth: (R, Q) bool, the query answering function's.
-        pixels: (R, H, W, 3) uint8, pictures of the states, where the rows have them.
-    """
+    """Q clauses, none negated, that are asked of R states of a task: ``observation`` (R, 39) float32, ``truth`` (R, Q)
+    bool, and ``pixels`` (R, H, W, 3) uint8 where the rows have pictures."""
 
     task: Task
     clauses: tuple[Clause, ...]
@@ -99,7 +92,7 @@ class Asked:
     pixels: Tensor | None = None
 
     def seen(self, key: str) -> Tensor:
-        """What an evaluator sees of the states, by what it reads; :class:`ValueError` without pictures."""
+        """What an evaluator sees of the states, by the key that it reads."""
         if key == "observation":
             return self.observation
         if key != "pixels" or self.pixels is None:
@@ -138,9 +131,10 @@ class LabelledQueries:
         known = {task_id(task.name): task for task in (TASKS.values() if tasks is None else tasks)}
         rows = replay[:]
         if config.every > 1:
-            rows = rows[_places(rows.get(("collector", "traj_ids"))) % config.every == 0]
+            _, lengths = torch.unique_consecutive(rows.get(("collector", "traj_ids")), return_counts=True)
+            first = (lengths.cumsum(0) - lengths).repeat_interleave(lengths)
+            rows = rows[(torch.arange(len(rows)) - first) % config.every == 0]
         _check_pictures(rows)
-        self._rows = rows
         ids = rows.get("task_id")
         if other := sorted({*ids.unique().tolist()} - {*known}):
             raise ValueError(f"tasks must have all tasks of the rows, they lack those of the ids {shown(other)}")
@@ -158,24 +152,20 @@ class LabelledQueries:
             train = _some((own & ~kept).nonzero().flatten(), config.states_per_task, generator)
             test = _some((own & kept).nonzero().flatten(), config.states_per_task, generator)
             if task.name in self.held_out_tasks:
-                self._ask("tasks", task, clauses, torch.cat((train, test)))
+                self._ask("tasks", task, clauses, rows[torch.cat((train, test))])
                 continue
             new = [clause for clause in clauses if _pair(clause) in self.held_out_pairs]
             old = [clause for clause in clauses if _pair(clause) not in self.held_out_pairs]
-            self._ask("training", task, old, train)
-            self._ask("states", task, old, test)
-            self._ask("queries", task, new, test)
+            self._ask("training", task, old, rows[train])
+            self._ask("states", task, old, rows[test])
+            self._ask("queries", task, new, rows[test])
 
-        del self._rows
-
-    def _ask(self, part: str, task: Task, clauses: Sequence[Clause], which: Tensor) -> None:
-        if not clauses or not len(which):
-            return
-        observation, pixels = self._rows.get("observation")[which].float(), self._rows.get("pixels", None)
-        program = QueryProgram({task: [Query((clause,)) for clause in clauses]})
-        truth = program(observation, torch.full((len(observation),), task_id(task.name)))
-        seen = None if pixels is None else pixels[which]
-        self.parts[part].append(Asked(task, tuple(clauses), observation, truth, seen))
+    def _ask(self, part: str, task: Task, clauses: Sequence[Clause], rows: TensorDictBase) -> None:
+        if clauses and len(rows):
+            observation = rows.get("observation").float()
+            program = QueryProgram({task: [Query((clause,)) for clause in clauses]})
+            truth = program(observation, torch.full((len(rows),), task_id(task.name)))
+            self.parts[part].append(Asked(task, tuple(clauses), observation, truth, rows.get("pixels", None)))
 
     def describe(self) -> dict[str, Any]:
         """What is trained and what is held out, as JSON."""
@@ -197,13 +187,6 @@ def _some(rows: Tensor, most: int, generator: torch.Generator) -> Tensor:
     if len(rows) <= most:
         return rows
     return rows[torch.randperm(len(rows), generator=generator)[:most].sort().values]
-
-
-def _places(trajectory: Tensor) -> Tensor:
-    """(R,) int64, of each row its step in its trajectory, whose rows follow one another."""
-    _, lengths = torch.unique_consecutive(trajectory, return_counts=True)
-    first = (lengths.cumsum(0) - lengths).repeat_interleave(lengths)
-    return torch.arange(len(trajectory)) - first
 
 
 def _check_pictures(rows: TensorDictBase) -> None:
@@ -239,8 +222,8 @@ def _drawn_pairs(share: float, tasks: Sequence[Task], generator: torch.Generator
 
 
 def _held_out_rows(episode: Tensor, ids: Tensor, share: float) -> Tensor:
-    """(R,) bool, the rows of some episodes of each task, spread over all of them: so large a share, at least one if any
-    are asked for and another is left. Episodes of one number begin alike, whoever acts: they go together."""
+    """(R,) bool, the rows of a share of each task's episodes, spread over all of them: at least one, unless ``share``
+    is 0 or no other is left. Episodes of one number begin alike, whoever acts: they go together."""
     held = torch.zeros_like(ids, dtype=torch.bool)
     for number in ids.unique().tolist():
         own = episode[ids == number].unique()

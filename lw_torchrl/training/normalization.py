@@ -23,10 +23,9 @@ from lw_torchrl.modules.relative_positions import PlanRoles
 def fit_normalization(target: nn.Module, replay: TensorDictReplayBuffer) -> None:
     """Give a policy, a critic, or all that a loss holds, the statistics of a buffer's rows.
 
-    A TorchRL loss copies the networks it is given, buffers included: statistics that the networks get later never
-    reach its critics' copies, nor its targets. Here they get them, all the same. Each row counts as often as
-    :class:`CoLearningSampler` draws it: without weights a target's few rows would not count, and its features lie far
-    outside the base tasks' range.
+    A TorchRL loss copies the networks it is given, buffers included. Its copies and targets get the statistics too.
+    Each row counts as often as :class:`CoLearningSampler` draws it: a target's few rows would not count otherwise, and
+    its features lie far outside the base tasks' range.
 
     Args:
         target: a :class:`Policy`, a critic, a module with :class:`ObservationFeatures` in it, or a loss of such.
@@ -91,11 +90,7 @@ def check_contacts(actor: nn.Module) -> None:
 
 
 def fit_untrained(loss: LossModule, replay: TensorDictReplayBuffer) -> None:
-    """As :func:`fit_normalization`, of networks that have no statistics yet, or these.
-
-    Raises:
-        ValueError: one was trained with others: it would see, and do, something else than before.
-    """
+    """As :func:`fit_normalization`; :class:`ValueError` if a network was trained with other statistics."""
     before = [(mean, mean.clone(), std, std.clone()) for _, mean, std in _statistics(loss)]
     fit_normalization(loss, replay)
     for mean, old_mean, std, old_std in before:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import os
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from pathlib import Path
+from hashlib import sha256
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.utils import clip_grad_norm_
 from torchrl.data import TensorDictReplayBuffer
-from torchrl.objectives import LossModule
+from torchrl.envs import MultiStepTransform
+from torchrl.objectives import LossModule, SoftUpdate
 from torchrl.record.loggers import Logger
 
 from lw_torchrl._checks import (
@@ -24,28 +27,15 @@ from lw_torchrl._checks import (
     check_scale,
     checked_but,
 )
-from lw_torchrl._devices import CPU, drawn_on
-from lw_torchrl._progress import Progress
 from lw_torchrl.objectives.n_steps import with_n_steps
-from lw_torchrl.training.checkpoint import describe_data, describe_learning
-from lw_torchrl.training.interrupts import interrupts_between_steps
-from lw_torchrl.training.loss_state import (
-    check_loss,
-    describe_loss,
-    load_tensors,
-    networks_of,
-    open_training,
-    sum_of_losses,
-    targets_of,
-    tensors_of,
-    trained_parameters,
-    write_training,
-)
-from lw_torchrl.training.minibatches import check_minibatches, draw_batch, verify_rows
+from lw_torchrl.training.buffers import check_minibatches
+from lw_torchrl.training.envelope import TRAINING
+from lw_torchrl.training.file_checks import tensors_of
+from lw_torchrl.training.files import describe_data, describe_learning
+from lw_torchrl.training.loop import READ_EVERY, ReplayState, Training, make_schedule
 from lw_torchrl.training.normalization import fit_untrained
-from lw_torchrl.training.policy_checks import check_trained
-from lw_torchrl.training.recent_losses import READ_EVERY, RecentLosses
-from lw_torchrl.training.training_state import OneWriter, TrainingState, load_state, state_of
+
+_INSTEAD = {"loss_actor_bc"}  # minimised in place of another entry: in CQL's first steps of the actor
 
 
 @dataclass(frozen=True)
@@ -65,9 +55,6 @@ class OfflineConfig:
         max_grad_norm: the actor's gradients, and those of all else, are clipped to it.
         seed: of the minibatches, and of what networks and transforms draw while training.
         checkpoint_every: steps between checkpoints.
-
-    Raises:
-        ValueError, TypeError: a wrong value, by its name.
     """
 
     steps: int = 5000
@@ -94,7 +81,7 @@ class OfflineConfig:
         check_int("seed", self.seed)
 
 
-class OfflineTrainer:
+class OfflineTrainer(Training):
     """Trains what a loss holds on a buffer's minibatches: a step minimises the sum of the loss's ``loss_`` entries,
     each of which reaches its own network alone, and moves its targets. CQL's ``loss_actor_bc``, which is for its first
     steps instead of ``loss_actor``, is left out.
@@ -113,15 +100,13 @@ class OfflineTrainer:
         last: the means over the last 100 steps of what the loss gives, by name.
 
     Warns:
-        UserWarning: the checkpoint was written under another version of torch or another package that bits hang on: it
-            goes on, but not bit for bit.
+        UserWarning: the checkpoint was written under other versions of torch, say: training does not go on bit for bit.
 
     Raises:
         ValueError: the checkpoint is damaged, or of another loss, configuration or data; a buffer that answers the
             queries of other plans, or draws by priorities; a loss whose value estimator has another gamma than the
-            buffer's n steps, that gives no mean, or CQL's with a Lagrange multiplier; networks that were
-            trained with other statistics, where ``normalize``; or, in :meth:`train`, the loss or
-            the weights are no numbers.
+            buffer's n steps, that gives no mean, or CQL's with a Lagrange multiplier; networks that were trained with
+            other statistics, where ``normalize``; or, in :meth:`train`, the loss or the weights are no numbers.
         TypeError: the loss is none of TorchRL's kind.
         OSError: the checkpoint cannot be written; the earlier one stays.
 
@@ -142,6 +127,8 @@ class OfflineTrainer:
     Source: ``torchrl.trainers.Trainer``, without an environment.
     """
 
+    envelope = TRAINING
+
     @checked_but("loss")
     def __init__(
         self,
@@ -155,102 +142,132 @@ class OfflineTrainer:
         title: str = "training",
     ) -> None:
         check_loss(loss, replay)
-        self.loss, self.replay, self.logger, self.progress, self.title = loss, replay, logger, progress, title
-        self.config = config = config or OfflineConfig()
-        self.checkpoint = None if checkpoint is None else Path(checkpoint)
-        self._writer = OneWriter(self.checkpoint)
-        self.networks = networks_of(loss)
+        config = config or OfflineConfig()
+        super().__init__(config, [replay], checkpoint, logger=logger, progress=progress, title=title)
+        self.loss, self.module, self.replay, self.networks = loss, loss, replay, networks_of(loss)
         self.device = next(loss.parameters()).device
         check_minibatches(self.networks, replay, config.batch_size)
         getattr(loss, "target_entropy", None)  # SAC's is a buffer from the first time on that it is asked for
-        self.state = TrainingState(replay, config.seed)
-        self.targets = targets_of(loss, config.target_eps)
-        actor, others = trained_parameters(loss)
+        self.states = [ReplayState(replay, config.seed)]
+        delayed = any(name.startswith("target_") and name.endswith("_params") for name, _ in loss.named_children())
+        self.targets = SoftUpdate(loss, eps=config.target_eps) if delayed else None
+        trained = [(name, parameter) for name, parameter in loss.named_parameters() if parameter.requires_grad]
+        actor = [parameter for name, parameter in trained if name.startswith("actor_network_params")]
+        others = [parameter for name, parameter in trained if not name.startswith("actor_network_params")]
         rates = (actor, config.learning_rate), (others, config.critic_learning_rate)
         self.groups = [group for group, _ in rates if group]
         options = [{"params": group, "lr": float(rate)} for group, rate in rates if group]
         self.optimizer = torch.optim.AdamW(options, weight_decay=config.weight_decay, fused=True)
-        self.schedule: torch.optim.lr_scheduler.LRScheduler = (
-            torch.optim.lr_scheduler.CosineAnnealingLR(self.optimizer, config.steps)
-            if config.schedule == "cosine"
-            else torch.optim.lr_scheduler.LambdaLR(self.optimizer, lambda _: 1.0)
-        )
+        self.schedule = make_schedule(config.schedule, self.optimizer, config.steps)
         self.last: dict[str, float] = {}
-        self._recent = RecentLosses(("the loss",), config.learning_rate)
+        self._given: deque[Mapping[str, Tensor]] = deque(maxlen=READ_EVERY)
         if self.checkpoint is not None:
-            self._described = {
-                "loss": describe_loss(loss),
-                "training": asdict(config),
-                "data": describe_data(replay),
-                "replay": describe_learning(replay),
-            }
+            self.described = {"loss": describe_loss(loss), "training": asdict(config)}
+            self.described |= {"data": describe_data(replay), "replay": describe_learning(replay)}
         if config.normalize:
             fit_untrained(loss, replay)
-        if self.checkpoint is not None and self.checkpoint.exists():
-            verify_rows(replay)
-            found, tensors = open_training(self.checkpoint, self._described)
-            load_state(self.checkpoint, found, self.optimizer, self.schedule, [self.state], config.steps)
-            load_tensors(loss, tensors)
+        self.resume()
 
-    def save(self) -> None:
-        """Write the checkpoint, if there is to be one; an earlier one is replaced whole.
-
-        Raises:
-            ValueError: the weights are no finite numbers.
-        """
-        check_trained(dict(self.loss.named_parameters()), self.state.step)
-        if self.checkpoint is not None:
-            state = state_of(self.optimizer, self.schedule, [self.state])
-            write_training(self.checkpoint, self._described, state, tensors_of(self.loss))
-            self._writer.know()
+    def contents(self) -> dict[str, dict[str, Tensor]]:
+        return {"loss": tensors_of(self.loss)}
 
     def step(self) -> TensorDictBase:
         """Train on one minibatch and return what the loss gives, detached."""
-        with drawn_on(self.device, self.state.torch_generator):
-            batch = draw_batch(self.replay, self.config.batch_size, self.device)
+        (state,) = self.states
+        with state.drawing(self.device):
+            batch = state.minibatch(self.config.batch_size, self.device)
             found = self.loss(with_n_steps(self.loss, batch))
-            self.state.torch_generator = torch.get_rng_state()
-        total = sum_of_losses(found)
-        if self.device == CPU:
-            self._recent.check(total, self.state.step)
-        self._recent.add(total.detach())
-        self.optimizer.zero_grad()
-        total.backward()
-        for group in self.groups:
-            clip_grad_norm_(group, self.config.max_grad_norm)
-        self.optimizer.step()
-        self.schedule.step()
+        self.descend(sum_of_losses(found))
         if self.targets is not None:
             self.targets.step()
-        self.state.step += 1
+        self._given.append(found.detach())
         return found.detach()
+
+    def clip_gradients(self) -> None:
+        for group in self.groups:
+            clip_grad_norm_(group, self.config.max_grad_norm)
+
+    def means(self, losses: Tensor) -> dict[str, float]:
+        """Of what the loss gave since they were last asked for."""
+        given = list(self._given)
+        self._given.clear()
+        names = [name for name, value in given[0].items() if value.numel() == 1]
+        self.last = {name: float(torch.stack([one[name].reshape(()) for one in given]).mean()) for name in names}
+        return self.last
 
     def train(self) -> None:
         """Train to the last step, from wherever training stands; Ctrl-C as in :class:`BehavioralCloningTrainer`."""
-        for network in self.networks:
-            network.train()
-        config, state = self.config, self.state
-        given: list[Mapping[str, Tensor]] = []
-        bar = Progress(self.title, config.steps, "step", initial=state.step, show=self.progress)
-        with self._writer.alone(), bar, interrupts_between_steps() as interrupt:
-            while state.step < config.steps and not interrupt.asked:
-                given.append(self.step())
-                bar.update()
-                if state.step % READ_EVERY == 0 or state.step == config.steps:
-                    self._tell(given)
-                    given = []
-                    bar.note(**{name: f"{value:.4f}" for name, value in self.last.items() if "loss" in name})
-                if state.step % config.checkpoint_every == 0 or state.step == config.steps:
-                    self.save()
-            if interrupt.asked:
-                self.save()
-        for network in self.networks:
-            network.eval()
+        self._given.clear()
+        self.run()
 
-    def _tell(self, given: list[Mapping[str, Tensor]]) -> None:
-        self._recent.read(self.state.step)
-        names = [name for name, value in given[0].items() if value.numel() == 1]
-        self.last = {name: float(torch.stack([one[name].reshape(()) for one in given]).mean()) for name in names}
-        if self.logger is not None:
-            for name, value in self.last.items():
-                self.logger.log_scalar(f"train/{name}", value, step=self.state.step)
+
+def networks_of(loss: LossModule) -> list[nn.Module]:
+    """The networks that a loss holds, without their parameters."""
+    found = (getattr(loss, name.removesuffix("_params"), None) for name, _ in loss.named_children())
+    return [network for network in found if isinstance(network, nn.Module)]
+
+
+def check_loss(loss: LossModule, replay: TensorDictReplayBuffer) -> None:
+    """Raise unless a loss can be trained on a buffer; a value estimator that TorchRL would make later is made.
+
+    Raises:
+        TypeError: it is no :class:`LossModule`, but what ``torch.compile`` made of one.
+        ValueError: its sum must not be minimised, or its discount is not that of the buffer's n steps.
+    """
+    if not isinstance(loss, LossModule):
+        raise TypeError(
+            f"loss must be a LossModule, got {type(loss).__name__}, whose targets and actor cannot be found; compile a "
+            "loss in place, by loss.compile()"
+        )
+    if getattr(loss, "reduction", "mean") == "none":
+        raise ValueError("loss must give the mean of its rows, got reduction='none'")
+    if getattr(loss, "with_lagrange", False):
+        raise ValueError(
+            "loss: with_lagrange=True gives a loss_alpha_prime that reaches the critics, and takes from them what "
+            "loss_cql adds; give with_lagrange=False"
+        )
+    if (shown := _gamma_of(replay)) is None or loss.default_value_estimator is None:
+        return
+    own = getattr(loss.value_estimator, "gamma", None)
+    if own is not None and abs(float(own) - shown) > 1e-6:
+        raise ValueError(
+            f"loss: its value estimator's gamma must be that of the replay buffer's n steps, {shown}, got "
+            f"{float(own):.6g}; call loss.make_value_estimator(gamma={shown})"
+        )
+
+
+def _gamma_of(replay: TensorDictReplayBuffer) -> float | None:
+    """The discount of the rewards that a buffer sums; None where ``next`` is one step ahead."""
+    summed = [part.gamma for part in replay.transform if isinstance(part, MultiStepTransform)]
+    return next(iter(summed), getattr(replay, "gamma", None))
+
+
+def sum_of_losses(found: Mapping[str, Any]) -> Tensor:
+    """What is minimised of what a loss gives: the sum of its ``loss_`` entries, without those that stand for another.
+
+    Raises:
+        ValueError: there is none.
+    """
+    terms = [value for name, value in found.items() if name.startswith("loss_") and name not in _INSTEAD]
+    if not terms:
+        raise ValueError(f"loss must give entries that begin with 'loss_', it gives {', '.join(found.keys())}")
+    return torch.stack(terms).sum()
+
+
+def describe_loss(loss: LossModule) -> dict[str, Any]:
+    """What tells a loss from another, its trained weights aside: its class and options, the kinds of its networks, and
+    a digest of what no training changes, plans and texts among it."""
+    digest = sha256()
+    for name, tensor in sorted(loss.named_buffers()):
+        fixed = not name.startswith("target_") and not name.endswith(("features.mean", "features.std"))
+        digest.update(f"{name} {tuple(tensor.shape)}".encode())
+        if fixed:
+            digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+    options = {name: value for name, value in vars(loss).items() if name[0] != "_" and name != "training"}
+    return {
+        "class": type(loss).__name__,
+        "options": {name: v for name, v in options.items() if isinstance(v, (bool, int, float, str))},
+        "networks": [type(network).__name__ for network in networks_of(loss)],
+        "shapes": {name: list(parameter.shape) for name, parameter in loss.named_parameters()},
+        "fixed": digest.hexdigest(),
+    }

@@ -6,10 +6,10 @@ import os
 from collections.abc import Iterable
 from dataclasses import asdict
 from hashlib import sha256
-from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.record.loggers import Logger
@@ -19,45 +19,31 @@ from lw_torchrl._devices import CPU, drawn_on
 from lw_torchrl._progress import Progress
 from lw_torchrl._state_tree import check_like
 from lw_torchrl._versions import LIBRARIES, SIMULATORS
+from lw_torchrl.data.co_learning_sampler import GROWN, CoLearningSampler
+from lw_torchrl.data.growing import GrowingStorage
 from lw_torchrl.data.replay import LanguageWorldExperienceReplay
 from lw_torchrl.data.rewards import REWARDS
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.language.tasks import Task, named_tasks
 from lw_torchrl.modules.critics import QValue
+from lw_torchrl.modules.networks import ACTION_SIZE
 from lw_torchrl.modules.policy import Policy
-from lw_torchrl.training.advantage_learner import AdvantageLearner
-from lw_torchrl.training.checkpoint import describe_data, describe_learning, write
-from lw_torchrl.training.expert_iteration import ExpertIterationLearner
-from lw_torchrl.training.exploration import Exploration, longest_standstill
-from lw_torchrl.training.first_episodes import FirstEpisodes
-from lw_torchrl.training.growing_replay import check_growing_replay
-from lw_torchrl.training.interrupts import Interrupt, interrupts_between_steps
-from lw_torchrl.training.learner import Learner
-from lw_torchrl.training.minibatches import check_minibatches, verify_rows
-from lw_torchrl.training.off_policy import ResidualLearner, SACLearner, TD3Learner
-from lw_torchrl.training.on_policy import PPOLearner
-from lw_torchrl.training.online_config import OnlineConfig
-from lw_torchrl.training.policy_checks import check_can_be_saved, check_trained
-from lw_torchrl.training.training_state import OneWriter, check_description, load_training, misfit
+from lw_torchrl.training.algorithms import LEARNERS, OnlineConfig
+from lw_torchrl.training.buffers import check_minibatches, check_replay
+from lw_torchrl.training.envelope import POLICY
+from lw_torchrl.training.files import check_can_be_saved, describe_data, describe_learning
+from lw_torchrl.training.loop import Interrupt, Training
 
-LEARNERS: dict[str, type[Learner]] = {
-    "advantage": AdvantageLearner,
-    "td3": TD3Learner,
-    "sac": SACLearner,
-    "residual": ResidualLearner,
-    "ppo": PPOLearner,
-    "expert-iteration": ExpertIterationLearner,
-}
-"""The methods of ``lw-torchrl online``, by name."""
+_MOST_EPISODES = 1_000_000
 
 
-class OnlineTrainer:
+class OnlineTrainer(Training):
     """Trains a policy in its environment, beside demonstrations.
 
-    It goes on in rounds. In one each row of the environment runs episodes, which end at their first success or after
-    ``max_steps``; what comes goes into the buffer, and the learner makes its gradient steps. At its end all rows are
-    reset, since an episode's physics cannot be restored, and a checkpoint is written: training that is stopped, in
-    whatever way, goes on from the last round's end with the same bits.
+    In a round, each row of the environment runs episodes, which end at their first success or after ``max_steps``;
+    their steps go into the buffer, and the learner makes its gradient steps. At its end all rows are reset, since an
+    episode's physics cannot be restored, and a checkpoint is written: training that was stopped goes on from the last
+    round's end with the same bits.
 
     Args:
         actor: the policy to begin with, one that was cloned, say. Methods "td3" and "expert-iteration" train it in
@@ -85,8 +71,7 @@ class OnlineTrainer:
             that of the first episode of each row, which has the time to end; not of a round shorter than an episode.
 
     Warns:
-        UserWarning: the checkpoint was written under another version of torch or another package that bits hang on: it
-            goes on, but not bit for bit.
+        UserWarning: the checkpoint was written under other versions of mujoco, say: it does not go on bit for bit.
 
     Raises:
         ValueError: a wrong method; a buffer that does not grow, or is not of these plans; the checkpoint is damaged, or
@@ -120,6 +105,8 @@ class OnlineTrainer:
     Slow with Deep Learning and Tree Search', for expert iteration.
     """
 
+    envelope = POLICY
+
     @checked_but("critic")
     def __init__(
         self,
@@ -135,17 +122,15 @@ class OnlineTrainer:
         progress: bool = True,
         num_threads: int | None = None,
     ) -> None:
-        self.config = config = config or OnlineConfig()
-        self.method = check_choice("method", method, LEARNERS)
+        config = config or OnlineConfig()
+        title = f"training {check_choice('method', method, LEARNERS)}"
+        super().__init__(config, [replay], checkpoint, logger=logger, progress=progress, title=title)
         check_can_be_saved(actor)
         check_growing_replay(actor, replay, config)
         if critic is not None:
             check_minibatches([critic], replay, config.batch_size)
-        self.replay, self.logger, self.progress = replay, logger, progress
+        self.method, self.replay, self.num_threads = method, replay, num_threads
         self.tasks = replay.tasks if tasks is None else list(named_tasks(tasks).values())
-        self.num_threads = num_threads
-        self.checkpoint = None if checkpoint is None else Path(checkpoint)
-        self._writer = OneWriter(self.checkpoint)
         generator = torch.Generator().manual_seed(config.seed)
         replay.set_rng(generator)
         self._drawn = generator.get_state()
@@ -153,13 +138,13 @@ class OnlineTrainer:
         with drawn_on(CPU, self._drawn):
             self.learner = LEARNERS[method](actor, replay, config, critic)
             self._drawn = torch.get_rng_state()
-        self.policy = self.learner.policy
+        self.policy = self.module = self.learner.policy
         self._patience = longest_standstill(replay[: len(replay) - replay.storage.num_grown])
         self.history: list[dict[str, float]] = []
         self.round = 0
         self._episodes: Tensor | None = None
         if self.checkpoint is not None:
-            self._described = {
+            self.described = {
                 "actor": self.policy.describe(),
                 "start": {"weights": start},
                 "critic": {} if critic is None else {"weights": _fingerprint(critic)},
@@ -167,29 +152,13 @@ class OnlineTrainer:
                 "data": describe_data(replay),
                 "replay": describe_learning(replay),
             }
-            if self.checkpoint.exists():
-                verify_rows(replay)
-                check_description(self.checkpoint, self._described)
-                weights = self.policy.state_dict(keep_vars=True)
-                packages = (*SIMULATORS, *LIBRARIES)
-                self._load(load_training(self.checkpoint, self.policy, weights, packages))
+        self.resume((*SIMULATORS, *LIBRARIES))
 
     @property
     def frames(self) -> int:
         return min(self.round * self.config.round_steps * self.config.rows, self.config.frames)
 
-    def save(self) -> None:
-        """Write the checkpoint, if there is to be one; an earlier one is replaced whole.
-
-        Raises:
-            ValueError: the weights are no finite numbers.
-        """
-        check_trained(dict(self.policy.named_parameters()), self.learner.made)
-        if self.checkpoint is not None:
-            write(self.checkpoint, self._described, self.policy, self.policy.state_dict(), self._state())
-            self._writer.know()
-
-    def _state(self) -> dict[str, Any]:
+    def state_dict(self) -> dict[str, Any]:
         return {
             "round": self.round,
             "drawn": self._drawn.clone(),
@@ -199,30 +168,23 @@ class OnlineTrainer:
             "replay": self.replay.state_dict(),
         }
 
-    def _load(self, found: dict[str, Any]) -> None:
-        assert self.checkpoint is not None
-        try:
-            check_like({**found, **_UNLIKE}, {**self._state(), **_UNLIKE}, "state")
-            if not 0 < found["round"] <= self.config.rounds:
-                raise ValueError(f"round must be from 1 to {self.config.rounds}, got {found['round']}")
-            torch.Generator().set_state(found["drawn"].clone())
-            self.learner.load_state_dict(found["learner"])
-            self.replay.load_state_dict(found["replay"])
-            self._episodes, self._drawn = found["episodes"].clone(), found["drawn"].clone()
-            self.history = [{str(name): _number(value) for name, value in one.items()} for one in found["history"]]
-            self.round = found["round"]
-        except (ValueError, KeyError, TypeError, RuntimeError, AttributeError) as error:
-            raise misfit(self.checkpoint, error) from error
+    def load_state_dict(self, found: dict[str, Any]) -> None:
+        apart = {"replay": None, "history": None, "learner": None, "episodes": None}
+        check_like({**found, **apart}, {**self.state_dict(), **apart}, "state")
+        if not 0 < found["round"] <= self.config.rounds:
+            raise ValueError(f"round must be from 1 to {self.config.rounds}, got {found['round']}")
+        torch.Generator().set_state(found["drawn"].clone())
+        self.learner.load_state_dict(found["learner"])
+        self.replay.load_state_dict(found["replay"])
+        self._episodes, self._drawn = found["episodes"].clone(), found["drawn"].clone()
+        self.history = [{str(name): _number(value) for name, value in one.items()} for one in found["history"]]
+        self.round, self.steps = found["round"], self.learner.made
 
     def train(self) -> None:
         """Train to the last step of the environment, from the last round's end.
 
         Ctrl-C ends it between two steps, and what came since the last round's end is lost; a second Ctrl-C at once.
-
-        Raises:
-            ValueError: a loss, or a weight, is no number.
         """
-        bar = Progress(f"training {self.method}", self.config.frames, "step", initial=self.frames, show=self.progress)
         base = LanguageWorldEnv(
             self.tasks,
             num_envs=self.config.rows,
@@ -235,7 +197,7 @@ class OnlineTrainer:
         transform = self.policy.transform()
         env = base if transform is None else TransformedEnv(base, transform)
         try:
-            with self._writer.alone(), bar, interrupts_between_steps() as interrupt:
+            with self.at_work(self.config.frames, self.frames) as (bar, interrupt):
                 if self._episodes is not None:
                     base.set_extra_state(self._episodes)
                 while self.round < self.config.rounds and not interrupt.asked:
@@ -245,8 +207,14 @@ class OnlineTrainer:
                     if done is None:
                         break
                     self._drawn, self._episodes = drawn, base.get_extra_state()
-                    self.round += 1
-                    self._log(done)
+                    self.round, self.steps = self.round + 1, self.learner.made
+                    for name, value in done.items():
+                        if name.startswith("loss") and value != value:
+                            raise ValueError(
+                                f"{name} is no number in round {self.round}: the learning rate is too high"
+                            )
+                    self.history.append(done)
+                    self.log({name: value for name, value in done.items() if name != "frames"}, int(done["frames"]))
                     self.save()
         finally:
             env.close()
@@ -294,19 +262,6 @@ class OnlineTrainer:
         """The gradient steps that are to be made in the first so many steps of the environment."""
         return int(max(0, frames - self.config.first_frames) * self.config.utd)
 
-    def _log(self, found: dict[str, float]) -> None:
-        for name, value in found.items():
-            if name.startswith("loss") and value != value:
-                raise ValueError(f"{name} is no number in round {self.round}: the learning rate is too high")
-        self.history.append(found)
-        if self.logger is not None:
-            for name, value in found.items():
-                if name != "frames":
-                    self.logger.log_scalar(f"train/{name}", value, step=int(found["frames"]))
-
-
-_UNLIKE = {"replay": None, "history": None, "learner": None, "episodes": None}
-
 
 def _number(value: Any) -> int | float:
     """A number as it was written: an integer stays one."""
@@ -319,3 +274,103 @@ def _fingerprint(module: torch.nn.Module) -> str:
     for name, tensor in sorted(module.state_dict().items()):
         found.update(name.encode() + tensor.cpu().contiguous().numpy().tobytes())
     return found.hexdigest()
+
+
+def check_growing_replay(actor: Policy, replay: Any, config: OnlineConfig) -> None:
+    """Raise :class:`ValueError` unless a buffer grows, and rows of the environment fit in it."""
+    if not isinstance(replay, LanguageWorldExperienceReplay) or not isinstance(replay.storage, GrowingStorage):
+        raise ValueError("replay must be a LanguageWorldExperienceReplay that grows: give it grow=, a number of rows")
+    sampler = replay.sampler
+    if not isinstance(sampler, CoLearningSampler) or sampler.target != GROWN:
+        raise ValueError(
+            "replay's sampler must be CoLearningSampler('grown'), which draws demonstrations and rows that came 1:1"
+        )
+    if not replay.terminate_on_success:
+        raise ValueError("replay must end at success, as the environment does: give it terminate_on_success=True")
+    if replay.storage.n_steps > 1 and replay.storage.gamma != config.gamma:
+        raise ValueError(f"gamma must be the replay buffer's, {replay.storage.gamma}, got {config.gamma}")
+    check_replay(actor, replay, config.batch_size)
+
+
+def longest_standstill(rows: TensorDictBase) -> int:
+    """The most rows of an episode, one after the other, with the same truth of all conditions; 0 without ``qaf``.
+
+    Args:
+        rows: (R,) in the order of time, with ``("collector", "traj_ids")`` (R,) int64 and ``qaf`` (R, S) bool.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> ids, truth = torch.tensor([0, 0, 0, 1, 1]), torch.tensor([[1], [0], [0], [0], [1]]).bool()
+        >>> longest_standstill(TensorDict({"collector": {"traj_ids": ids}, "qaf": truth}, [5]))
+        2
+    """
+    if (truth := rows.get("qaf", None)) is None:
+        return 0
+    ids = rows["collector", "traj_ids"]
+    changes = (truth[1:] != truth[:-1]).any(-1) | (ids[1:] != ids[:-1])
+    edges = torch.cat([torch.tensor([0]), changes.nonzero().flatten() + 1, torch.tensor([len(ids)])])
+    return int(edges.diff().max())
+
+
+class Exploration:
+    """The noise of a round.
+
+    A row is stuck if no condition's truth has changed for more states than ``patience``, the longest time in the
+    demonstrations; 0 for never. There the noise on the hand grows, until half as long again, from ``exploration`` to
+    ``stuck_exploration``; that on the gripper does not, since it opens grasps.
+    """
+
+    def __init__(self, config: OnlineConfig, patience: int) -> None:
+        self.patience = patience
+        self._scale = torch.tensor([1.0, 1.0, 1.0, config.gripper_exploration]) * config.exploration
+        self._stuck_scale = torch.tensor([*[config.stuck_exploration] * 3, float(self._scale[3])])
+        self._drawn = torch.zeros(config.rows, ACTION_SIZE)
+        self._since = torch.zeros(config.rows)
+        self._truth: Tensor | None = None
+
+    def draw(self) -> None:
+        """Draw what is kept until the next call."""
+        self._drawn = torch.randn_like(self._drawn)
+
+    def noise(self, state: TensorDictBase) -> Tensor:
+        """(N, 4) float32, to be added to the actions in these states, each one step after those of the last call or
+        the first of a new episode; ``qaf`` (N, S) bool, if it is there."""
+        truth = state.get("qaf", None)
+        if not self.patience or truth is None:
+            return self._drawn * self._scale
+        if self._truth is not None:
+            same = (truth == self._truth).all(-1)
+            self._since = torch.where(same, self._since + 1, 0.0)
+        self._truth = truth.clone()
+        stuck = (2 * (self._since - self.patience) / self.patience).clamp(0.0, 1.0).unsqueeze(-1)
+        return self._drawn * (self._scale + stuck * (self._stuck_scale - self._scale))
+
+    def note(self, ended: Tensor) -> None:
+        """Rows whose episodes ended, (N,) bool, begin anew."""
+        self._since = torch.where(ended, -1.0, self._since)
+
+
+class FirstEpisodes:
+    """Which trajectory each row of a round is in, and how the first episode of each went."""
+
+    def __init__(self, rows: int) -> None:
+        self._episode = torch.zeros(rows, dtype=torch.int64)
+        self._ended = 0
+        self._success = torch.full((rows,), torch.nan)
+
+    def ids(self, round_number: int) -> Tensor:
+        """(N,) int64, of each row's trajectory: no two in a training are the same."""
+        rows = len(self._episode)
+        return (round_number * _MOST_EPISODES + self._episode) * rows + torch.arange(rows)
+
+    def note(self, step: TensorDictBase) -> None:
+        """Look at a step of all rows."""
+        done, success = (step.get(("next", name)).squeeze(-1) for name in ("done", "success"))
+        first = done & (self._episode == 0)
+        self._success = torch.where(first, success.to(torch.float32), self._success)
+        self._episode = self._episode + done
+        self._ended += int(done.sum())
+
+    def result(self) -> dict[str, float]:
+        ended = {"episodes": float(self._ended)}
+        return ended if self._success.isnan().any() else {"success": float(self._success.double().mean()), **ended}

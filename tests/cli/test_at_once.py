@@ -9,7 +9,7 @@ import sys
 import pytest
 
 import lw_torchrl as lw
-from lw_torchrl.training.checkpoint import read_description
+from lw_torchrl.training.files import read_description
 
 
 @pytest.mark.slow

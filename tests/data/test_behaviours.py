@@ -23,7 +23,7 @@ from lw_torchrl.data.memory_map import load_rows
 from lw_torchrl.envs.episodes import run_episodes
 from lw_torchrl.language.tasks import task_id
 from lw_torchrl.training import BehavioralCloningConfig, BehavioralCloningTrainer
-from lw_torchrl.training.checkpoint import demonstrated_tasks, demonstration_seeds
+from lw_torchrl.training.files import demonstrated_tasks, demonstration_seeds
 
 PLANS = lw.load_plans("MT10")
 OTHERS = [name for name in BEHAVIOURS if name != "expert"]

@@ -174,9 +174,9 @@ def test_losses_are_read_every_100_steps(demos, tmp_path):
     trainer.step()
     WAITS.clear()
     mean = trainer.train()
-    assert len([wait for wait in WAITS if "recent_losses" in wait]) == 3  # at 100, at 120, and at the end
-    WAITS[:] = [wait for wait in WAITS if "recent_losses" not in wait]
-    assert all("policy_checks" in wait for wait in WAITS), WAITS  # of the weights, at the end
+    assert len([wait for wait in WAITS if "loop" in wait]) == 3  # at 100, at 120, and at the end
+    WAITS[:] = [wait for wait in WAITS if "loop" not in wait]
+    assert all("file_checks" in wait for wait in WAITS), WAITS  # of the weights, at the end
     cpu = make_trainer(demos, "cpu", steps=120, checkpoint_every=10_000)
     cpu.step()
     assert cpu.train() == mean
@@ -204,7 +204,7 @@ def test_nan_is_found_with_its_step_and_not_written(demos, tmp_path, many):
         trainer.train()
     assert count[0] == 20
     kept = make(demos, "pretend", checkpoint=path, steps=30, checkpoint_every=10)
-    assert (kept.steps if many else kept.state.step) == 10
+    assert kept.steps == 10
 
 
 @pytest.mark.parametrize("many", [False, True])
@@ -213,9 +213,8 @@ def test_it_carries_on_bit_for_bit_where_it_was_begun(demos, tmp_path, many):
     options = {"actor": "noisy plan", "steps": 12, "checkpoint_every": 5}
 
     def everything(trainer):
-        states = trainer.states if many else [trainer.state]
         own = trainer._parameters if many else weights(trainer)
-        found = flat({"weights": own, "states": [s.state_dict() for s in states]})
+        found = flat({"weights": own, "states": [state.state_dict(trainer.steps) for state in trainer.states]})
         found |= flat({"optimizer": trainer.optimizer.state_dict()})
         return {key: value.cpu() if isinstance(value, torch.Tensor) else value for key, value in found.items()}
 
@@ -244,7 +243,7 @@ def test_elsewhere_it_carries_on_and_says_so(demos, tmp_path, begun, ended):
     first.save()
     with pytest.warns(UserWarning, match=f"was trained on '{begun}' and goes on on '{ended}': with the same"):
         second = make_trainer(demos, ended, checkpoint=path)
-    assert second.state.step == 7
+    assert second.steps == 7
     assert_same(weights(second), weights(first))
     assert [second.step().item() for _ in range(3)] == [first.step().item() for _ in range(3)]
 
@@ -389,7 +388,7 @@ def test_a_run_is_the_same_wherever_it_is_done(tmp_path, setting):
     one = a_run("dc", setting=setting, preset=replace(PRESET, training=replace(PRESET.training, steps=5)))
     WAITS.clear()
     found = execute_run(one, RUN_PLANS, tmp_path, tasks=task_of(one), progress=False, device="pretend")
-    assert [wait for wait in WAITS if "recent_losses" in wait], "trained there"
+    assert [wait for wait in WAITS if "loop" in wait], "trained there"
     assert [wait for wait in WAITS if "episodes" in wait], "evaluated there"
     there = {path.relative_to(tmp_path) for path in tmp_path.rglob("*") if path.is_file()}
     assert load_result(one, RUN_PLANS, tmp_path) == found

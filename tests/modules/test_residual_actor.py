@@ -9,7 +9,7 @@ import torch
 
 import lw_torchrl as lw
 from lw_torchrl.modules import make_policy
-from lw_torchrl.training.policy_checks import check_can_be_saved
+from lw_torchrl.training.files import check_can_be_saved
 
 PLANS = lw.load_plans("MT10")
 SMALL = {"width": 16, "depth": 1}

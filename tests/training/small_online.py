@@ -59,7 +59,7 @@ def make_online(root, method="td3", checkpoint=None, *, actor=None, config=CONFI
 
 def everything(trainer):
     """Tensors and numbers of a training, by name."""
-    state = trainer._state()
+    state = trainer.state_dict()
     found = {name: state[name] for name in ("round", "drawn", "episodes", "learner", "history")}
     more = {"policy": trainer.policy.state_dict(), "rows": trainer.replay[:]["observation"]}
     if trainer.replay.storage.num_grown:

@@ -37,7 +37,7 @@ class Stopping(BehavioralCloningTrainer):
     stop_at: int | None = None
 
     def step(self):
-        if self.state.step == self.stop_at:
+        if self.steps == self.stop_at:
             raise KeyboardInterrupt
         return super().step()
 
@@ -64,7 +64,7 @@ def everything(trainer):
             "actor": dict(trainer.actor.state_dict()),
             "optimizer": trainer.optimizer.state_dict(),
             "schedule": trainer.schedule.state_dict(),
-            "state": trainer.state.state_dict(),
+            "state": trainer.states[0].state_dict(trainer.steps),
         }
     )
     return found | {("next batch",): trainer.replay.sample(8)["observation"]}

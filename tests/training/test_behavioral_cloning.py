@@ -36,7 +36,7 @@ def test_the_loss_falls(demos):
     before = [trainer.step() for _ in range(5)]
     after = trainer.train()
     assert after < 0.5 * sum(before) / 5
-    assert trainer.state.step == 300
+    assert trainer.steps == 300
     data = make_replay(demos)[:]
     error = (trainer.actor(data.exclude("action"))["action"] - data["action"]).square().mean().item()
     assert error < 0.5 * sum(before) / 5, "the actor itself has learned"

@@ -37,7 +37,7 @@ from lw_torchrl.training import (
     save_actor,
     save_evaluator,
 )
-from lw_torchrl.training.checkpoint import read_description
+from lw_torchrl.training.files import read_description
 
 SMALL = dict(latent_size=4, width=16, depth=1, encoder_width=8)
 PLANS = load_plans("MT10")

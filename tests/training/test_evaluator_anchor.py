@@ -50,7 +50,7 @@ def test_training_moves_the_evaluator_and_goes_on_to_the_bit(root, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         tuned(root, 0.5, path=tmp_path / "p.zip", stop_at=7).train()
     again = tuned(root, 0.5, path=tmp_path / "p.zip")
-    assert again.state.step == 5
+    assert again.steps == 5
     again.train()
     assert_same(everything(again), everything(whole))
     loaded = lw.load_actor(tmp_path / "p.zip")

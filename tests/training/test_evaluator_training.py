@@ -108,9 +108,10 @@ def test_the_seed_says_what_is_held_out(replay):
 
 def test_a_minibatch_has_equally_many_of_each_predicate_and_truth(replay):
     trainer = make_trainer(replay)
-    groups = len(trainer._sizes)
-    trainer.config = lw.training.QueryEvaluatorConfig(batch_size=groups * 7)
-    _, clauses, truth = trainer._draw()
+    minibatches = trainer._minibatches
+    groups = len(minibatches.sizes)
+    minibatches.size = groups * 7
+    _, clauses, truth = minibatches.draw(0, torch.Generator())
     kinds = torch.stack((clauses.predicate[:, 0], truth[:, 0].long()), -1)
     _, counts = kinds.unique(dim=0, return_counts=True)
     assert len(counts) == groups >= 24
@@ -172,21 +173,21 @@ def test_training_that_was_stopped_goes_on_to_the_bit(replay, tmp_path, kind):
         first.step()
     first.save()
     second = make_trainer(replay, tmp_path / "e.zip", seed=1, **options)
-    assert second.done == 7
+    assert second.steps == 7
     assert second.train() == pytest.approx(loss, abs=1.0)
     assert_same(everything(second), everything(whole))
     again = make_trainer(replay, tmp_path / "e.zip", **options)
-    assert again.done == SMALL.steps
-    loaded = lw.training.load_evaluator(tmp_path / "e.zip", PLANS, **({"text_encoder": words} if options else {}))
+    assert again.steps == SMALL.steps
+    loaded = lw.load_evaluator(tmp_path / "e.zip", PLANS, **({"text_encoder": words} if options else {}))
     assert not loaded.training
     assert_same(flat(dict(loaded.state_dict())), flat(dict(whole.evaluator.state_dict())))
 
 
 def test_another_training_does_not_go_on(replay, tmp_path):
     make_trainer(replay, tmp_path / "e.zip").train()
-    with pytest.raises(ValueError, match=r"of another training, which differs in .*batch_size"):
-        make_trainer(replay, tmp_path / "e.zip", config=lw.training.QueryEvaluatorConfig(steps=12, batch_size=32))
-    with pytest.raises(ValueError, match=r"of another evaluator, which differs in .*width"):
+    with pytest.raises(ValueError, match=r"its training differs in .*batch_size"):
+        make_trainer(replay, tmp_path / "e.zip", config=lw.QueryEvaluatorConfig(steps=12, batch_size=32))
+    with pytest.raises(ValueError, match=r"its evaluator differs in .*width"):
         make_trainer(replay, tmp_path / "e.zip", width=17)
 
 
@@ -206,11 +207,11 @@ def test_what_is_no_evaluators_file_is_refused(tmp_path):
     with pytest.raises(FileNotFoundError, match="train-evaluator` writes one"):
         lw.training.load_evaluator(path, PLANS)
     lw.save_actor(lw.PlanConditionedActor(PLANS, width=8), path)
-    with pytest.raises(ValueError, match="it is a policy's, give the evaluator's"):
-        lw.training.load_evaluator(path, PLANS)
+    with pytest.raises(ValueError, match="It is a policy's, give an evaluator's"):
+        lw.load_evaluator(path, PLANS)
     path.write_bytes(b"PK")
-    with pytest.raises(ValueError, match="is damaged or no evaluator's file"):
-        lw.training.load_evaluator(path, PLANS)
+    with pytest.raises(ValueError, match="is damaged or none of ours"):
+        lw.load_evaluator(path, PLANS)
 
     class Mine(lw.QueryEvaluator):
         pass
@@ -232,8 +233,8 @@ def test_options_that_the_weights_do_not_have_are_refused(tmp_path, part, value)
     found.description["evaluator"]["options"][part] = value
     groups = {name: found.tensors(name) for name in found.groups}
     write_archive(path, {k: v for k, v in found.description.items() if k != "sha256"}, groups)
-    with pytest.raises(ValueError, match=r"evaluator: that of .* cannot be made"):
-        lw.training.load_evaluator(path, PLANS)
+    with pytest.raises(ValueError, match=r"evaluator: the evaluator of .* cannot be made"):
+        lw.load_evaluator(path, PLANS)
 
 
 def test_another_text_encoder_is_found_out(tmp_path):

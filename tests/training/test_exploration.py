@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
-from lw_torchrl.training.exploration import Exploration, longest_standstill
-from lw_torchrl.training.online_config import OnlineConfig
+from lw_torchrl.training.algorithms import OnlineConfig
+from lw_torchrl.training.online import Exploration, longest_standstill
 
 ROWS, PATIENCE = 3, 4
 CONFIG = OnlineConfig(frames=60, rows=ROWS, exploration=0.1, stuck_exploration=0.5, gripper_exploration=0.5)

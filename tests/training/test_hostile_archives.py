@@ -20,7 +20,7 @@ from torchrl.checkpoint import Checkpoint
 
 import lw_torchrl as lw
 from lw_torchrl import _tensor_archive
-from lw_torchrl.training.checkpoint import FORMAT_VERSION
+from lw_torchrl.training.envelope import POLICY
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +99,7 @@ def overlapping(groups, size):
         content = local(name, content) + content
     signed = {name.decode(): sha256(end).hexdigest() for name, end in ends.items()}
     text = json.dumps(
-        {"format": "lw_torchrl.policy", "version": FORMAT_VERSION, "actor": {}, "sha256": signed}
+        {"format": "lw_torchrl.policy", "version": POLICY.version, "actor": {}, "sha256": signed}
     ).encode()
     first = local(b"description.json", text) + text
     directory, offset = b"", 0

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import lw_torchrl as lw
-from lw_torchrl.training.checkpoint import read_description
+from lw_torchrl.training.files import read_description
 
 MOST_MEMORY = 2 * 2**30
 
@@ -126,4 +126,4 @@ def test_sizes_are_checked_before_anything_is_built(good, tmp_path, name, value)
 def test_a_good_file_says_what_it_is(good):
     found = read_description(good)
     assert (found["format"], found["version"]) == ("lw_torchrl.policy", 3)
-    assert make_trainer(good).state.step == CONFIG.steps
+    assert make_trainer(good).steps == CONFIG.steps

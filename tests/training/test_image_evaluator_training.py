@@ -59,7 +59,7 @@ def test_training_that_was_stopped_goes_on_bit_for_bit(replay, tmp_path):
         begun.step()
     begun.save()
     resumed = make_trainer(replay, tmp_path / "begun.zip", seed=5)
-    assert resumed.done == 4
+    assert resumed.steps == 4
     resumed.train()
     found, expected = everything(resumed), everything(whole)
     assert found.keys() == expected.keys()

@@ -66,7 +66,7 @@ def test_it_ends_after_the_step_and_carries_on(demos, tmp_path, stacked):
         make(demos, tmp_path / "c.zip", stacked, times=1).train()
     assert signal.getsignal(signal.SIGINT) is handler
     resumed = make(demos, tmp_path / "c.zip", stacked)
-    assert (resumed.steps if stacked else resumed.state.step) == 6
+    assert resumed.steps == 6
     resumed.train()
     whole = make(demos, None, stacked)
     whole.train()
@@ -80,7 +80,7 @@ def test_the_second_time_it_ends_at_once(demos, tmp_path, stacked):
     with pytest.raises(KeyboardInterrupt):
         trainer.train()
     assert signal.getsignal(signal.SIGINT) is handler
-    assert (trainer.steps if stacked else trainer.state.step) == 5
+    assert trainer.steps == 5
     assert not (tmp_path / "c.zip").exists()
 
 
@@ -92,7 +92,7 @@ def test_where_it_is_ignored_it_is_ignored(demos, tmp_path):
         assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
     finally:
         signal.signal(signal.SIGINT, before)
-    assert trainer.state.step == CONFIG.steps
+    assert trainer.steps == CONFIG.steps
 
 
 def test_in_another_thread_nothing_is_changed(demos):
@@ -100,7 +100,7 @@ def test_in_another_thread_nothing_is_changed(demos):
     thread = threading.Thread(target=trainer.train)
     thread.start()
     thread.join()
-    assert trainer.state.step == CONFIG.steps
+    assert trainer.steps == CONFIG.steps
 
 
 # What a command does before it works: note in a file when the work begins, and at which step.
@@ -112,9 +112,8 @@ original = getattr(place, method)
 
 def noted(self, *args):
     setattr(place, method, original)
-    state = getattr(self, "state", None)
     with open(begun, "w") as file:
-        file.write(f"{{state.step if state else 0}}\\n")
+        file.write(f"{{getattr(self, "steps", 0)}}\\n")
     return original(self, *args)
 
 setattr(place, method, noted)

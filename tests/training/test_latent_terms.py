@@ -12,7 +12,7 @@ import lw_torchrl as lw
 from lw_torchrl.paper.imitation import ImitationRun
 from lw_torchrl.paper.recipes import PRESETS, SETTINGS
 from lw_torchrl.training import BehavioralCloningConfig, BehavioralCloningTrainer, StackedBehavioralCloning
-from lw_torchrl.training.checkpoint import read_description
+from lw_torchrl.training.files import read_description
 
 BEFORE = {
     *("steps", "batch_size", "learning_rate", "optimizer", "weight_decay", "momentum", "schedule", "normalize"),
@@ -71,7 +71,7 @@ def test_stopped_and_started_again_it_ends_with_the_same_bits(demos, tmp_path, s
     with pytest.raises(KeyboardInterrupt):
         make_trainer(demos, path, config=ON, stop_at=stop).train()
     resumed = make_trainer(demos, path, config=ON, actor=make_actor(99))
-    assert resumed.state.step == 5
+    assert resumed.steps == 5
     resumed.train()
     assert_same(everything(resumed), everything(whole))
 
@@ -115,7 +115,7 @@ def test_without_it_files_say_what_they_said_and_no_term_is_taken(demos, tmp_pat
         make_trainer(demos, path, stop_at=7).train()
     assert set(read_description(path)["training"]) == BEFORE
     assert set(asdict(CONFIG)) == {*BEFORE, "latent_consistency", "latent_contrast", "qaf_anchor"}
-    monkeypatch.setattr("lw_torchrl.training.latent_terms.latent_term", None)  # it is never asked
+    monkeypatch.setattr("lw_torchrl.training.behavioral_cloning.latent_term", None)  # it is never asked
     never = make_trainer(demos)
     never.train()
     resumed = make_trainer(demos, path)

@@ -16,8 +16,9 @@ from torchrl.record.loggers import Logger
 
 import lw_torchrl as lw
 from lw_torchrl.training import OfflineConfig, OfflineTrainer, fit_normalization
-from lw_torchrl.training.loss_state import sum_of_losses, tensors_of
-from lw_torchrl.training.minibatches import check_minibatches
+from lw_torchrl.training.buffers import check_minibatches
+from lw_torchrl.training.file_checks import tensors_of
+from lw_torchrl.training.offline import sum_of_losses
 
 CONFIG = OfflineConfig(steps=12, batch_size=8, checkpoint_every=5)
 CRITIC = dict(width=16, depth=1)
@@ -91,7 +92,7 @@ class Stopping(OfflineTrainer):
     stop_at = None
 
     def step(self):
-        if self.state.step == self.stop_at:
+        if self.steps == self.stop_at:
             raise KeyboardInterrupt
         return super().step()
 
@@ -110,7 +111,7 @@ def everything(trainer):
             "loss": tensors_of(trainer.loss),
             "optimizer": trainer.optimizer.state_dict(),
             "schedule": trainer.schedule.state_dict(),
-            "state": trainer.state.state_dict(),
+            "state": trainer.states[0].state_dict(trainer.steps),
         }
     )
 
@@ -124,7 +125,7 @@ def test_stopped_and_started_again_it_ends_with_the_same_bits(demos, tmp_path, n
         with pytest.raises(KeyboardInterrupt):
             make_trainer(demos, name, path, stop_at=stop).train()
     resumed = make_trainer(demos, name, path, seed=99)
-    assert resumed.state.step == 10
+    assert resumed.steps == 10
     resumed.train()
     assert_same(everything(resumed), everything(undisturbed))
     again = make_trainer(demos, name, path, seed=99)
@@ -321,15 +322,16 @@ def test_a_checkpoint_of_other_plans_is_refused(demos, checkpoint):
 @pytest.mark.parametrize("content", [b"", b"no archive", None])
 def test_a_file_that_is_no_checkpoint_is_refused(demos, checkpoint, tmp_path, content):
     path = tmp_path / "checkpoint.zip"
+    said = "is damaged or none of ours"
     if content is None:
         lw.save_actor(Networks(0.0, "cpu").actor(), path)
     else:
         path.write_bytes(content)
-    with pytest.raises(ValueError, match="is damaged or none of a loss's training"):
+    with pytest.raises(ValueError, match="It is a policy's, give a loss's training's" if content is None else said):
         make_trainer(demos, "value", path)
     whole = checkpoint.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(ValueError, match="is damaged or none of a loss's training"):
+    with pytest.raises(ValueError, match=said):
         make_trainer(demos, "value", path)
 
 

@@ -14,7 +14,7 @@ from small_training import CONFIG, PLANS, SMALL, collect_demos, make_actor, make
 import lw_torchrl as lw
 from lw_torchrl._tensor_archive import TensorArchive
 from lw_torchrl._versions import package_versions
-from lw_torchrl.training.loss_state import bc_loss
+from lw_torchrl.training.behavioral_cloning import bc_loss
 
 OFFLINE = lw.OfflineConfig(steps=12, batch_size=8, checkpoint_every=5)
 EVALUATOR = lw.training.QueryEvaluatorConfig(steps=12, batch_size=8, held_out_pairs=0.0)
@@ -89,7 +89,7 @@ def test_a_training_goes_on_under_another_torch_with_a_warning(demos, tmp_path, 
     with pytest.warns(UserWarning, match=message) as told:
         make(demos, path)
     assert len(told) == 1
-    assert told[0].filename != lw.training.training_state.__file__
+    assert told[0].filename != lw.training.envelope.__file__
 
 
 def test_the_simulator_counts_in_the_environment_alone(demos, tmp_path, monkeypatch):

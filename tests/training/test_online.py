@@ -19,9 +19,10 @@ from torchrl.record.loggers import CSVLogger
 
 import lw_torchrl as lw
 from lw_torchrl.modules import DescriptorEncoder, QValue
-from lw_torchrl.training import LEARNERS, expert_iteration
-from lw_torchrl.training.checkpoint import write
-from lw_torchrl.training.expert_iteration import successful
+from lw_torchrl.training import LEARNERS
+from lw_torchrl.training.algorithms import expert_iteration
+from lw_torchrl.training.algorithms.expert_iteration import successful
+from lw_torchrl.training.envelope import POLICY
 
 
 @pytest.fixture(scope="module")
@@ -354,7 +355,7 @@ def test_a_damaged_state_is_refused(demos, tmp_path, damage):
     path, config = tmp_path / "checkpoint.zip", replace(CONFIG, frames=60)
     trainer = make_online(demos, checkpoint=path, config=config)
     trainer.train()
-    state = trainer._state()
+    state = trainer.state_dict()
     if damage == "round":
         state["round"] = 9
     elif damage == "learner":
@@ -368,6 +369,6 @@ def test_a_damaged_state_is_refused(demos, tmp_path, damage):
     else:
         name = next(name for name in state["learner"]["tensors"] if name.startswith("qvalue_network_params"))
         state["learner"]["tensors"][name] = state["learner"]["tensors"][name] * math.nan
-    write(path, trainer._described, trainer.policy, trainer.policy.state_dict(), state)
+    POLICY.write(path, trainer.described, trainer.contents(), state)
     with pytest.raises(ValueError, match="does not fit, it is of another architecture or damaged"):
         make_online(demos, checkpoint=path, config=config)

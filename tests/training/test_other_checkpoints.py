@@ -143,7 +143,7 @@ def test_a_checkpoint_from_before_that_was_said_goes_on(demos, tmp_path):
     description, groups = parts(path)
     del description["replay"]
     rebuild(path, description, groups)
-    assert make_trainer(demos, path).state.step == CONFIG.steps
+    assert make_trainer(demos, path).steps == CONFIG.steps
     with pytest.raises(ValueError, match=r"does not fit.* a sampler's state, one of a RandomSampler"):
         make_trainer(demos, path, sampler=RandomSampler())
 

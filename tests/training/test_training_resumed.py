@@ -35,7 +35,7 @@ def test_stopped_anywhere_and_started_again_it_ends_with_the_same_bits(demos, un
         with pytest.raises(KeyboardInterrupt):
             make_trainer(demos, path, stop_at=stop).train()
     resumed = make_trainer(demos, path, actor=make_actor(99))
-    assert resumed.state.step == max(stops) // 5 * 5
+    assert resumed.steps == max(stops) // 5 * 5
     resumed.train()
     assert_same(everything(resumed), undisturbed)
 
@@ -67,7 +67,7 @@ def test_torchrls_samplers_resume_too(demos, tmp_path, sampler):
     with pytest.raises(KeyboardInterrupt):
         make_trainer(demos, path, sampler=sampler(), stop_at=8).train()
     resumed = make_trainer(demos, path, actor=make_actor(99), sampler=sampler())
-    assert resumed.state.step == 5
+    assert resumed.steps == 5
     resumed.train()
     assert_same(everything(resumed), everything(whole))
 
@@ -77,7 +77,7 @@ def test_a_learning_rate_that_is_an_integer_resumes_too(demos, tmp_path):
     path = tmp_path / "checkpoint.zip"
     with pytest.raises(KeyboardInterrupt):
         make_trainer(demos, path, config=config, stop_at=7).train()
-    assert make_trainer(demos, path, config=config).state.step == 5
+    assert make_trainer(demos, path, config=config).steps == 5
 
 
 def test_a_finished_training_does_nothing_twice(demos, undisturbed, tmp_path):
@@ -93,7 +93,7 @@ def test_a_finished_training_does_nothing_twice(demos, undisturbed, tmp_path):
 def test_checkpoints_come_in_their_time_and_leave_one_file(demos, tmp_path, monkeypatch):
     saved = []
     save = BehavioralCloningTrainer.save
-    monkeypatch.setattr(BehavioralCloningTrainer, "save", lambda self: (saved.append(self.state.step), save(self)))
+    monkeypatch.setattr(BehavioralCloningTrainer, "save", lambda self: (saved.append(self.steps), save(self)))
     make_trainer(demos, tmp_path / "checkpoint.zip").train()
     assert saved == [5, 10, 12]
     assert [path.name for path in tmp_path.iterdir()] == ["checkpoint.zip"]
@@ -207,4 +207,4 @@ def test_a_disk_that_fills_while_saving_leaves_the_old_checkpoint(demos, tmp_pat
     monkeypatch.undo()
     assert path.read_bytes() == content
     assert [found.name for found in tmp_path.iterdir()] == ["checkpoint.zip"]
-    assert make_trainer(demos, path).state.step == 5
+    assert make_trainer(demos, path).steps == 5

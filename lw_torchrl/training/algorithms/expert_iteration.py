@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from tensordict import TensorDictBase
-from torchrl.data import TensorDictReplayBuffer
 
-from lw_torchrl.modules.critics import QValue
-from lw_torchrl.modules.policy import Policy
-from lw_torchrl.training.learner import Learner, make_optimizer
-from lw_torchrl.training.loss_state import bc_loss
-from lw_torchrl.training.online_config import OnlineConfig
+from lw_torchrl.training.algorithms.learner import Learner, adamw
+from lw_torchrl.training.behavioral_cloning import bc_loss
 
 
 class ExpertIterationLearner(Learner):
@@ -19,15 +17,12 @@ class ExpertIterationLearner(Learner):
 
     wants_round = True
 
-    def __init__(
-        self, start: Policy, replay: TensorDictReplayBuffer, config: OnlineConfig, critic: QValue | None = None
-    ) -> None:
+    def make(self, critic: Any) -> None:
         if critic is not None:
             raise ValueError("critic: expert iteration has none; leave it out")
-        super().__init__(start, replay, config)
-        self.loss = bc_loss(self.policy.train(), config.distance)  # its copy has the start's noise on features
+        self.loss = bc_loss(self.policy.train(), self.config.distance)  # its copy has the start's noise on features
         self.policy.eval()
-        self.optimizers["actor"] = make_optimizer(self.loss.parameters(), config.cloning_learning_rate)
+        self.optimizers["actor"] = adamw(self.loss.parameters(), self.config.cloning_learning_rate)
 
     def end_round(self, rows: TensorDictBase | None, steps: int) -> None:
         assert rows is not None

@@ -1,8 +1,7 @@
-"""What a policy must be to be kept in a file, and what a file's must be to be made again."""
+"""What weights, texts and sizes a module and its file must have, so that one can be made of the other."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -12,35 +11,8 @@ from torch.overrides import TorchFunctionMode
 
 from lw_torchrl._state_tree import check_like
 from lw_torchrl.language.text import TEXT_DIMENSION, TextEncoder
-from lw_torchrl.modules.policy import Policy, from_description
 
 _TEXT_TOLERANCE = 0.01  # of numbers of size 1: more than machines differ, far less than encoders do
-
-
-def check_can_be_saved(actor: Any) -> Policy:
-    """Return the actor if a policy file can hold it: what cannot be loaded again is refused before any training.
-
-    Raises:
-        TypeError: it is no :class:`Policy`.
-        ValueError: it is one that its own description does not make again, or its weights are no finite numbers.
-    """
-    if not isinstance(actor, Policy):
-        raise TypeError(
-            f"actor must be a Policy to be kept in a file, got {type(actor).__name__}: save the policy inside of it, "
-            "derive your class from lw_torchrl.Policy, or train without a checkpoint"
-        )
-    described = actor.describe()
-    try:
-        with torch.random.fork_rng(devices=[]):
-            again = from_description(json.loads(json.dumps(described)), _stand_in(text_vectors(actor)))
-        check_remade(actor, again)
-        if (again.in_keys, again.out_keys_source) != (actor.in_keys, actor.out_keys_source):
-            raise ValueError("its in_keys or out_keys were changed later: give them where it is made")
-    except Exception as error:
-        raise ValueError(
-            f"actor cannot be kept in a file, which would not make it again from its description ({first_line(error)})"
-        ) from error
-    return actor
 
 
 def check_remade(module: nn.Module, again: nn.Module) -> None:
@@ -73,6 +45,11 @@ def text_vectors(actor: nn.Module) -> dict[str, Tensor]:
     """The vectors of an actor's texts, by the name of the buffer that holds them."""
     named = actor.named_buffers(remove_duplicate=False)  # an ensemble may have one member twice
     return {name: buffer for name, buffer in named if name.rpartition(".")[2] == "text_vectors"}
+
+
+def tensors_of(module: nn.Module) -> dict[str, Tensor]:
+    """All parameters and buffers of a module by name; a loss's targets and statistics among them."""
+    return {**dict(module.named_parameters()), **dict(module.named_buffers())}
 
 
 def check_options(found: Any, weights: Mapping[str, Tensor]) -> None:
@@ -122,19 +99,14 @@ class _Budget(TorchFunctionMode):
 def check_size(
     make: Callable[[TextEncoder], nn.Module], weights: Mapping[str, Tensor], texts: Mapping[str, Tensor]
 ) -> None:
-    """Make a module for a trial, and raise :class:`ValueError` as soon as it has more weights than are stored.
-
-    Args:
-        make: from a text encoder to the module.
-        weights: the stored ones.
-        texts: the stored vectors of its texts; the trial gets others of their width, so that no text model is loaded.
-    """
+    """Make a module for a trial, and raise :class:`ValueError` as soon as it has more weights than are stored. ``make``
+    gets a text encoder that gives vectors as wide as the stored ``texts``, so that no text model is loaded."""
     with torch.random.fork_rng(devices=[]), _Budget(weights):
-        make(_stand_in(texts))
+        make(stand_in(texts))
 
 
-def _stand_in(found: Mapping[str, Tensor]) -> TextEncoder:
-    """An encoder that gives ones, as many as the vectors of a file's texts have, and not many more in all."""
+def stand_in(found: Mapping[str, Tensor]) -> TextEncoder:
+    """An encoder that gives ones: vectors as wide as those of a file's texts, and not many more numbers in all."""
     width = next((vectors.shape[-1] for vectors in found.values() if vectors.ndim == 2), TEXT_DIMENSION)
     stored = sum(vectors.numel() for vectors in found.values())
     left = stored + _MORE_OF_TEXTS

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from tensordict import TensorDictBase
 from torch.nn.utils import clip_grad_norm_
-from torchrl.data import TensorDictReplayBuffer
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from lw_torchrl.data.rewards import REWARDS
-from lw_torchrl.modules.critics import QValue, Value
-from lw_torchrl.modules.policy import Policy
-from lw_torchrl.training.learner import Learner, make_optimizer, stochastic
-from lw_torchrl.training.online_config import OnlineConfig
+from lw_torchrl.modules.critics import Value
+from lw_torchrl.training.algorithms.learner import Learner, adamw, stochastic
 
 
 class PPOLearner(Learner):
@@ -23,23 +21,17 @@ class PPOLearner(Learner):
     noisy = False
     wants_round = True
 
-    def __init__(
-        self, start: Policy, replay: TensorDictReplayBuffer, config: OnlineConfig, critic: QValue | None = None
-    ) -> None:
+    def make(self, critic: Any) -> None:
         if critic is not None:
             raise ValueError("critic: PPO's is the value of a state on the actor's own encoder; leave it out")
-        super().__init__(start, replay, config)
-        self.policy = actor = stochastic(start, "normal", config.init_std)
+        config = self.config
+        self.policy = actor = stochastic(self.policy, "normal", config.init_std)
         value = Value(actor.encoder)
         self.loss = ClipPPOLoss(actor, value, clip_epsilon=config.clip, entropy_coeff=config.entropy)
         self.advantage = GAE(
             gamma=config.gamma, lmbda=config.gae_lambda, value_network=value, average_gae=True, deactivate_vmap=True
         )
-        self.optimizers["all"] = make_optimizer(self.loss.parameters(), config.actor_learning_rate)
-
-    def act(self, state: TensorDictBase) -> TensorDictBase:
-        with set_exploration_type(ExplorationType.RANDOM):
-            return self.policy(state)
+        self.optimizers["all"] = adamw(self.loss.parameters(), config.actor_learning_rate)
 
     def end_round(self, rows: TensorDictBase | None, steps: int) -> None:
         assert rows is not None

@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from tensordict import TensorDictBase
 from torch import nn
-from torchrl.data import TensorDictReplayBuffer
 from torchrl.objectives import SoftUpdate
 
 from lw_torchrl.modules.critics import QValue, Value
-from lw_torchrl.modules.policy import Policy
 from lw_torchrl.objectives.advantage_weighted import AdvantageWeightedLoss, standardize_by_task
 from lw_torchrl.objectives.expectile_value import ExpectileValueLoss
-from lw_torchrl.training.learner import Learner, encoder_like, make_optimizer
-from lw_torchrl.training.online_config import OnlineConfig
+from lw_torchrl.training.algorithms.learner import Learner, adamw, encoder_like
 
 
 class AdvantageLearner(Learner):
     """A value by expectile regression, and imitation of demonstrations and of the policy's own steps, as much as each
     one's advantage says: nothing is done that was not tried, so a value that errs about the untried harms nothing."""
 
-    def __init__(
-        self, start: Policy, replay: TensorDictReplayBuffer, config: OnlineConfig, critic: Value | None = None
-    ) -> None:
-        super().__init__(start, replay, config)
+    def make(self, critic: Any) -> None:
+        start, config = self.policy, self.config
         if isinstance(critic, QValue):
             raise TypeError("critic must be a Value, of states alone, for the method 'advantage'; got a QValue")
         value = Value(encoder_like(start), ensemble=2) if critic is None else critic
@@ -31,8 +28,8 @@ class AdvantageLearner(Learner):
         self.targets = SoftUpdate(self.value, eps=config.target_eps)
         self.actor = AdvantageWeightedLoss(start, beta=config.beta, loss_function=config.distance)
         self.loss = nn.ModuleDict({"value": self.value, "actor": self.actor})
-        self.optimizers["critic"] = make_optimizer(self.value.parameters(), config.critic_learning_rate)
-        self.optimizers["actor"] = make_optimizer(self.actor.parameters(), config.cloning_learning_rate)
+        self.optimizers["critic"] = adamw(self.value.parameters(), config.critic_learning_rate)
+        self.optimizers["actor"] = adamw(self.actor.parameters(), config.cloning_learning_rate)
 
     def observe(self, rows: TensorDictBase) -> None:
         self.replay.extend(rows)

@@ -1,19 +1,22 @@
-"""The minibatches of a training: what their buffer must be, and how one is drawn."""
+"""What a buffer must be, so that a network can be trained on it and training be resumed."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from typing import Any
 
-import torch
-from tensordict import TensorDictBase
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.data.replay_buffers.samplers import PrioritizedSampler, RandomSampler
 
+<<<<<<< HEAD:lw_torchrl/training/minibatches.py
 from lw_torchrl._devices import CPU
 from lw_torchrl.data.replay import LanguageWorldExperienceReplay
 from lw_torchrl.data.samplers import GroupSampler
 from lw_torchrl.data.storage import DeviceStorage, device_of_rows
+=======
+from lw_torchrl.data.device_storage import DeviceStorage, device_of_rows
+from lw_torchrl.data.group_sampler import GroupSampler
+>>>>>>> small-1-training:lw_torchrl/training/buffers.py
 from lw_torchrl.modules.critics import Value
 from lw_torchrl.modules.policy import plans_of
 
@@ -25,22 +28,11 @@ def _check_plans(network: Any, replay: TensorDictReplayBuffer) -> None:
     for transform in replay.transform:
         answered = plans_of(transform)
         if answered is not None and (different := answered.differences(own)):
+            name = "critic" if isinstance(network, Value) else "actor"
             raise ValueError(
-                f"replay's QAFTransform must have the {_called(network)}'s plans, they differ for "
-                f"{', '.join(different)}; use {_called(network)}.transform()"
+                f"replay's QAFTransform must have the {name}'s plans, they differ for {', '.join(different)}; use "
+                f"{name}.transform()"
             )
-
-
-def _called(network: Any) -> str:
-    return "critic" if isinstance(network, Value) else "actor"
-
-
-def _check_batch_size(replay: TensorDictReplayBuffer, size: int) -> None:
-    """Raise :class:`ValueError` if the buffer was made for minibatches of another size."""
-    if replay.batch_size not in (None, size):
-        raise ValueError(
-            f"batch_size of the replay buffer must be None or the configuration's, {size}, got {replay.batch_size}"
-        )
 
 
 def _check_draws(replay: TensorDictReplayBuffer) -> None:
@@ -57,19 +49,16 @@ def _check_draws(replay: TensorDictReplayBuffer) -> None:
         )
 
 
-def draw_batch(replay: TensorDictReplayBuffer, size: int, device: torch.device) -> TensorDictBase:
-    """A minibatch on the device; of a buffer whose rows are elsewhere, it goes over."""
-    batch = replay.sample(size)
-    return batch if device == CPU else batch.to(device, non_blocking=True)
-
-
 def check_minibatches(networks: Iterable[Any], replay: TensorDictReplayBuffer, size: int) -> None:
     """Raise :class:`ValueError` unless networks can be trained on a buffer's minibatches, and training be resumed."""
     for network in networks:
         _check_plans(network, replay)
     if replay._prefetch:
         raise ValueError("replay must not prefetch: batches drawn ahead would be lost when training is resumed")
-    _check_batch_size(replay, size)
+    if replay.batch_size not in (None, size):
+        raise ValueError(
+            f"batch_size of the replay buffer must be None or the configuration's, {size}, got {replay.batch_size}"
+        )
     _check_draws(replay)
 
 
@@ -78,14 +67,3 @@ def check_replay(actor: Any, replay: TensorDictReplayBuffer, size: int) -> None:
     if "action" not in actor.out_keys:
         raise ValueError(f"actor must write 'action', it writes {', '.join(map(str, actor.out_keys))}")
     check_minibatches([actor], replay, size)
-
-
-def verify_rows(*replays: TensorDictReplayBuffer) -> None:
-    """Read the demonstrations through that a training is to go on with; of a buffer that is none of ours, nothing.
-
-    Raises:
-        DatasetError: (a ValueError) they are not as they were written.
-    """
-    for replay in replays:
-        if isinstance(replay, LanguageWorldExperienceReplay):
-            replay.verify()

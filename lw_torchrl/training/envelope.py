@@ -1,0 +1,249 @@
+"""The one envelope of the files of policies, query evaluators and training: an archive that says what it is.
+
+    description.json       format and version, the module's description, and what training added to it
+    weights.safetensors    the module's state; ``loss.safetensors`` of a loss, targets and statistics among it
+    texts.safetensors      the vectors that its texts had: another text encoder is found out
+    training.safetensors   optimizer, schedule, sampler and generators, while it is trained
+
+Nothing is unpickled, and what the file says of sizes is held against what it holds before anything is made.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import warnings
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor, nn
+
+from lw_torchrl._checks import differences, shown
+from lw_torchrl._state_tree import join, split
+from lw_torchrl._tensor_archive import ArchiveError, TensorArchive, write_archive
+from lw_torchrl._versions import LIBRARIES, warn_of_other_versions
+from lw_torchrl.language.text import TextEncoder
+from lw_torchrl.training.file_checks import (
+    check_options,
+    check_remade,
+    check_size,
+    check_texts,
+    copy_weights,
+    first_line,
+)
+
+_ADDED = {"actors", "replay"}
+"""What older descriptions do not say: a training that was begun without it goes on."""
+
+MISFITS = (ValueError, KeyError, TypeError, RuntimeError, AttributeError)
+"""What a training state of another structure raises where it is loaded."""
+
+Module = TypeVar("Module", bound=nn.Module)
+
+
+@dataclass(frozen=True)
+class Envelope:
+    """How files of a kind are written and read.
+
+    Attributes:
+        format, version: what a file says that it is.
+        part: what it describes: "actor", "evaluator" or "loss".
+        argument, called: how errors begin, and call what is in the file.
+        command: that writes one.
+        group: of the weights.
+    """
+
+    format: str
+    version: int
+    part: str
+    argument: str
+    called: str
+    command: str
+    group: str = "weights"
+
+    def check_about(self, about: Collection[str]) -> None:
+        """Raise :class:`ValueError` for a name that a file gives itself."""
+        if reserved := {"format", "version", "versions", self.part, "state", "sha256"} & set(about):
+            raise ValueError(
+                f"about must not be named {', '.join(sorted(reserved))}, which {self.called} file says itself"
+            )
+
+    def write(
+        self,
+        path: str | os.PathLike[str],
+        described: Mapping[str, Any],
+        groups: Mapping[str, Mapping[str, Tensor]],
+        training: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Write a file whole, or leave the earlier one and raise :class:`OSError`.
+
+        Args:
+            path: the file.
+            described: what it says, as JSON, the part among it.
+            groups: the weights, of one module or of many stacked, and its texts' vectors.
+            training: all that training resumes from, the weights aside, if it is trained.
+        """
+        described = {"format": self.format, "version": self.version, **described}
+        if training is not None:
+            tensors: dict[str, Tensor] = {}
+            described["state"] = split(training, tensors)
+            groups = {**groups, "training": tensors}
+        try:
+            write_archive(path, described, groups)
+        except OSError as error:
+            raise OSError(
+                error.errno,
+                f"{self.argument}: {str(path)!r} cannot be written ({error.strerror}); what stood there before is as "
+                "it was",
+            ) from error
+
+    def open(self, path: str | os.PathLike[str]) -> TensorArchive:
+        """The archive of a file whose format, version and part have been checked.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            ValueError: it is of another kind, or damaged.
+        """
+        begin = f"{self.argument}: {str(path)!r}"
+        if not Path(path).exists():
+            raise FileNotFoundError(f"{self.argument}: no file {str(path)!r}; `{self.command}` writes one")
+        if Path(path).is_dir():
+            raise ValueError(f"{begin} is a folder; {self.called} is one file")
+        try:
+            found = TensorArchive(path)
+        except (ArchiveError, OSError) as error:
+            names = error.names if isinstance(error, ArchiveError) else []
+            if any(name.startswith(("components/", "manifest", "description/")) for name in names):
+                raise ValueError(
+                    f"{begin} is of version 1, whose files can run code when they are read; this package reads version "
+                    f"{self.version}. Train it again"
+                ) from error
+            raise ValueError(f"{begin} is damaged or none of ours ({error})") from error
+        name, version = found.description.get("format"), found.description.get("version")
+        if (name, version) != (self.format, self.version):
+            other = [kind for kind in (POLICY, EVALUATOR, TRAINING) if kind.format == name != self.format]
+            hint = f"It is {other[0].called}'s, give {self.called}'s" if other else "Train it again"
+            raise ValueError(
+                f"{begin} is of format {name!r:.60} version {version!r:.60}; this package reads {self.format!r} "
+                f"version {self.version}. {hint}"
+            )
+        if not isinstance(found.description.get(self.part), dict):
+            raise ValueError(f"{begin} is damaged or none of ours (it describes no {self.part})")
+        return found
+
+    def check_can_be_saved(self, module: Any, make: Callable[[Any], nn.Module]) -> None:
+        """Raise :class:`ValueError` if a file could not hold a module: ``make`` of its description gives another, or
+        its weights are no finite numbers."""
+        described = module.describe()
+        try:
+            with torch.random.fork_rng(devices=[]):
+                check_remade(module, make(json.loads(json.dumps(described))))
+        except Exception as error:
+            raise ValueError(
+                f"{self.part} cannot be kept in a file, which would not make it again from its description "
+                f"({first_line(error)})"
+            ) from error
+
+    def load(
+        self,
+        path: str | os.PathLike[str],
+        make: Callable[[Any, TextEncoder | None], Module],
+        encoder: TextEncoder | None,
+        texts_of: Callable[[Module], dict[str, Tensor]],
+    ) -> Module:
+        """The module of a file, in eval mode; ``make`` makes it of its description and a text encoder, and ``texts_of``
+        gives the vectors of its texts. :class:`ValueError` if its weights, sizes or texts are not those it says."""
+        archive = self.open(path)
+        described = archive.description[self.part]
+        try:
+            weights, texts = archive.tensors(self.group), archive.tensors("texts")
+            check_options(described, weights)
+            check_size(lambda stand_in: make(described, stand_in), weights, texts)
+            module = make(described, encoder)
+            check_texts(texts, texts_of(module))
+            copy_weights(weights, module.state_dict(keep_vars=True))
+        except ImportError:
+            raise
+        except Exception as error:  # a file from a stranger may say anything
+            raise ValueError(
+                f"{self.argument}: the {self.part} of {str(path)!r} cannot be made ({first_line(error)})"
+            ) from error
+        return module.eval()
+
+    def resume(
+        self,
+        path: Path,
+        described: Mapping[str, Any],
+        live: Mapping[str, Tensor],
+        load: Callable[[dict[str, Any]], None],
+        *,
+        texts: Mapping[str, Tensor] | None = None,
+        device: torch.device | None = None,
+        packages: Sequence[str] = LIBRARIES,
+    ) -> None:
+        """Go on with the training of a file.
+
+        Args:
+            path: the file.
+            described: what it must say.
+            live: the weights, which are replaced in place.
+            load: takes the state that :meth:`write` was given.
+            texts: the vectors that it must hold; None for those of a loss, whose description has their digest.
+            device: where training goes on, if files say where they were trained.
+            packages: on whose versions the bits of the training depend.
+
+        Warns:
+            UserWarning: the file was written on another kind of device, or under other versions of packages.
+
+        Raises:
+            ValueError: the file is damaged, of another description, or does not fit.
+        """
+        archive = self.open(path)
+        check_same_description(path, archive.description, described)
+        if device is not None and (before := archive.description.get("device", "cpu")) != device.type:
+            warnings.warn(
+                f"checkpoint: {str(path)!r} was trained on {shown(before)} and goes on on {device.type!r}: with the "
+                "same minibatches, but sums are rounded, and noise is drawn, in another way",
+                stacklevel=3,
+            )
+        warn_of_other_versions(path, archive.description.get("versions"), packages)
+        try:
+            state = join(archive.description.get("state"), archive.tensors("training"))
+            if not isinstance(state, dict):
+                raise ValueError("it has no training state")
+            if texts is not None:
+                check_texts(archive.tensors("texts"), texts)
+            copy_weights(archive.tensors(self.group), live)
+            load(state)
+        except (*MISFITS, RecursionError) as error:
+            raise ValueError(
+                f"checkpoint: {str(path)!r} does not fit, it is of another architecture or damaged "
+                f"({first_line(error)})"
+            ) from error
+
+
+POLICY = Envelope("lw_torchrl.policy", 3, "actor", "checkpoint", "a policy", "lw-torchrl train")
+EVALUATOR = Envelope("lw_torchrl.evaluator", 1, "evaluator", "evaluator", "an evaluator", "lw-torchrl train-evaluator")
+TRAINING = Envelope("lw_torchrl.training", 1, "loss", "checkpoint", "a loss's training", "lw-torchrl offline", "loss")
+
+
+def check_description(path: Path, ours: Mapping[str, Any]) -> None:
+    """Raise :class:`ValueError` unless the policy file was saved with the description ``ours``."""
+    check_same_description(path, POLICY.open(path).description, ours)
+
+
+def check_same_description(path: Path, found: Mapping[str, Any], ours: Mapping[str, Any]) -> None:
+    """Raise :class:`ValueError` unless a file's description ``found`` is ``ours``."""
+    for part, wanted in json.loads(json.dumps(ours)).items():  # JSON has lists, but no tuples
+        if found.get(part) == wanted or (part in _ADDED and part not in found):
+            continue
+        before = found.get(part)
+        different = differences(before if isinstance(before, dict) else {}, wanted or {})
+        kind = "architecture" if part in ("actor", "actors", "evaluator", "loss") else "configuration"
+        raise ValueError(
+            f"checkpoint: {str(path)!r} is of another {kind}, its {part} differs in {', '.join(different[:8])}"
+            f"{', ...' * (len(different) > 8)}; choose another file, or delete it to start again"
+        )

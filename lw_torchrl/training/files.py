@@ -1,0 +1,216 @@
+"""Files of policies and of query evaluators, and what they say of the data that was trained on."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from typing import Any
+
+from torch import Tensor
+from torchrl.envs import Compose, Transform
+
+from lw_torchrl._checks import checked, checked_but
+from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
+from lw_torchrl.language.text import TextEncoder, encoded
+from lw_torchrl.modules.policy import Policy, from_description
+from lw_torchrl.modules.query_evaluator import QueryEvaluator, evaluator_from_description
+from lw_torchrl.training.envelope import EVALUATOR, POLICY
+from lw_torchrl.training.file_checks import stand_in, text_vectors
+
+_PROBE = "the robot's gripper is open"
+
+
+@checked
+def save_actor(actor: Policy, path: str | os.PathLike[str], **about: Any) -> None:
+    """Write a policy, for :func:`load_actor`; an earlier file is replaced whole.
+
+    Args:
+        actor: what to write.
+        path: the file.
+        **about: what else the file is to say, as JSON.
+
+    Raises:
+        TypeError: the actor is no :class:`Policy`.
+        ValueError: :func:`load_actor` would not make it again: its weights are of other names, shapes or dtypes than
+            its description's, or are no finite numbers; or ``about`` names what a file says itself.
+        OSError: it cannot be written; an earlier file stays.
+
+    Example:
+        >>> import lw_torchrl as lw, os, tempfile
+        >>> path = os.path.join(tempfile.mkdtemp(), "policy.zip")
+        >>> lw.save_actor(lw.PlanConditionedActor(lw.load_plans("MT10"), width=8), path)
+        >>> lw.load_actor(path).config["width"]
+        8
+    """
+    POLICY.check_about(about)
+    policy = check_can_be_saved(actor)
+    groups = {"weights": policy.state_dict(), "texts": text_vectors(policy)}
+    POLICY.write(path, {"actor": policy.describe(), **about}, groups)
+
+
+def check_can_be_saved(actor: Any) -> Policy:
+    """Return the actor if a policy file can hold it: what cannot be loaded again is refused before any training.
+
+    Raises:
+        TypeError: it is no :class:`Policy`.
+        ValueError: its own description does not make it again, or its weights are no finite numbers.
+    """
+    if not isinstance(actor, Policy):
+        raise TypeError(
+            f"actor must be a Policy to be kept in a file, got {type(actor).__name__}: save the policy inside of it, "
+            "derive your class from lw_torchrl.Policy, or train without a checkpoint"
+        )
+
+    def make(described: Any) -> Policy:
+        again = from_description(described, stand_in(text_vectors(actor)))
+        if (again.in_keys, again.out_keys_source) != (actor.in_keys, actor.out_keys_source):
+            raise ValueError("its in_keys or out_keys were changed later: give them where it is made")
+        return again
+
+    POLICY.check_can_be_saved(actor, make)
+    return actor
+
+
+@checked
+def load_actor(path: str | os.PathLike[str], *, text_encoder: TextEncoder | None = None) -> Policy:
+    """Make the policy of a file, with its plans and weights, in eval mode.
+
+    Args:
+        path: the file.
+        text_encoder: the one that the policy was made with, if it was not the shipped one.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is damaged, or its weights, sizes or texts are not those that it says, or are no finite numbers;
+            or the text encoder is another than the policy was trained with.
+        ImportError: its texts are not shipped, and the extra ``[text]`` is not installed.
+    """
+    return POLICY.load(path, from_description, text_encoder, text_vectors)
+
+
+@checked_but("evaluator")
+def save_evaluator(evaluator: QueryEvaluator, path: str | os.PathLike[str], **about: Any) -> None:
+    """Write an evaluator, for :func:`load_evaluator`; an earlier file is replaced whole. It holds the network alone,
+    whatever the plans whose conditions it answers.
+
+    Args:
+        evaluator: what to write, of a class in :data:`~lw_torchrl.modules.EVALUATORS`.
+        path: the file.
+        **about: what else the file is to say, as JSON.
+
+    Raises:
+        TypeError: it is no :class:`QueryEvaluator`.
+        ValueError: its own description does not make it again, or its weights are no finite numbers; or ``about`` names
+            what a file says itself.
+        OSError: it cannot be written; an earlier file stays.
+
+    Example:
+        >>> import lw_torchrl as lw, os, tempfile
+        >>> path = os.path.join(tempfile.mkdtemp(), "evaluator.zip")
+        >>> lw.save_evaluator(lw.StateQueryEvaluator(lw.load_plans("MT10"), width=8), path)
+        >>> lw.load_evaluator(path, lw.load_plans("MT50")).config["width"]
+        8
+    """
+    EVALUATOR.check_about(about)
+    check_evaluator_can_be_saved(evaluator)
+    groups = {"weights": evaluator.state_dict(), "texts": evaluator_texts(evaluator)}
+    EVALUATOR.write(path, {"evaluator": evaluator.describe(), **about}, groups)
+
+
+def check_evaluator_can_be_saved(evaluator: Any) -> None:
+    """Raise unless a file can hold the evaluator, as :func:`save_evaluator` does."""
+    if not isinstance(evaluator, QueryEvaluator):
+        raise TypeError(f"evaluator must be a QueryEvaluator to be kept in a file, got {type(evaluator).__name__}")
+    encoder = getattr(evaluator, "text_encoder", None)
+    EVALUATOR.check_can_be_saved(evaluator, lambda found: evaluator_from_description(found, evaluator.plans, encoder))
+
+
+def evaluator_texts(evaluator: QueryEvaluator) -> dict[str, Tensor]:
+    """The vector of one text, of an evaluator that reads texts: a file's texts."""
+    if getattr(evaluator, "text_vectors", None) is None:
+        return {}
+    return {"probe": encoded([_PROBE], getattr(evaluator, "text_encoder", None))}
+
+
+@checked
+def load_evaluator(
+    path: str | os.PathLike[str],
+    plans: Plans | Mapping[str, ConditionalPlan],
+    *,
+    text_encoder: TextEncoder | None = None,
+) -> QueryEvaluator:
+    """Make the evaluator of a file, for the conditions of some plans, in eval mode.
+
+    Args:
+        path: the file.
+        plans: whose conditions it is to answer; they need not be those that it was trained beside.
+        text_encoder: the one that it was made with, if it reads texts and it was not the shipped one.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is damaged or no evaluator's, or its weights, sizes or texts are not those that it says; the
+            plans ask for what it cannot answer; or the text encoder is another than it was trained with.
+        ImportError: it reads texts, and the extra ``[text]`` is not installed.
+    """
+
+    def make(described: Any, encoder: TextEncoder | None) -> QueryEvaluator:
+        return evaluator_from_description(described, as_plans(plans), encoder)
+
+    return EVALUATOR.load(path, make, text_encoder, evaluator_texts)
+
+
+def read_description(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """The description that a policy file was saved with.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is no policy file, or damaged.
+    """
+    return POLICY.open(path).description
+
+
+def demonstration_seeds(path: str | os.PathLike[str]) -> set[int]:
+    """The seeds of the demonstrations that a file's policy was trained on, as far as the file says."""
+    data = read_description(path).get("data")
+    parts = data.get("parts", [data]) if isinstance(data, dict) else []
+    return {part["seed"] for part in parts if isinstance(part, dict) and isinstance(part.get("seed"), int)}
+
+
+def demonstrated_tasks(path: str | os.PathLike[str]) -> set[str]:
+    """The tasks of the demonstrations that a file's policy was trained on, as far as the file says."""
+    data = read_description(path).get("data")
+    found = data if isinstance(data, dict) else {}
+    parts = found.get("episodes", [found.get("tasks")])  # of joined datasets, task name to episodes each
+    named = [part for part in parts if isinstance(part, (dict, list))] if isinstance(parts, list) else []
+    return {task for part in named for task in part if isinstance(task, str)}
+
+
+def describe_data(replay: Any) -> dict[str, Any] | None:
+    """What demonstrations a replay buffer shows, as JSON; None for a buffer that is none of ours."""
+    demonstrations = getattr(replay, "demonstrations", None)
+    return None if demonstrations is None else demonstrations.config.to_json()
+
+
+def describe_replay(replay: Any) -> dict[str, Any]:
+    """How a replay buffer shows its rows, as JSON: what else than :func:`describe_data` its batches hang on."""
+    parts = [part for part in replay.transform.modules() if isinstance(part, Transform)]
+    return {
+        "label": getattr(replay, "label", None),
+        "rows": None if describe_data(replay) is None else len(replay),  # after_success leaves so many
+        "sampler": type(replay.sampler).__name__,
+        "transforms": [_describe_transform(part) for part in parts if not isinstance(part, Compose)],
+    }
+
+
+def describe_learning(replay: Any) -> dict[str, Any]:
+    """As :func:`describe_replay`, for what learns from rewards too; of a buffer that is none of ours, no more."""
+    names = ("reward", "terminate_on_success", "n_steps", "gamma", "columns")
+    told = {name: getattr(replay, name) for name in names if hasattr(replay, name)}
+    grow = getattr(replay.storage, "grow", None)
+    return describe_replay(replay) | told | ({} if grow is None else {"grow": grow})
+
+
+def _describe_transform(transform: Transform) -> dict[str, str]:
+    options = {name: value for name, value in vars(transform).items() if name[0] != "_" and name != "training"}
+    simple = {name: repr(value) for name, value in options.items() if isinstance(value, (bool, int, float, str))}
+    return {"class": type(transform).__name__, **simple}
