@@ -12,7 +12,6 @@ from unittest.mock import patch
 
 import torch
 import tyro
-from lw_torchrl.modules.plan_roles import PlanRoles
 
 import lw_torchrl as lw
 from lw_torchrl._files import write_text
@@ -21,6 +20,7 @@ from lw_torchrl.evaluation.comparison import markdown_table
 from lw_torchrl.language.named_objects import NamedObject
 from lw_torchrl.language.roles import role_object
 from lw_torchrl.language.tasks import Task
+from lw_torchrl.modules.relative_positions import PlanRoles
 from lw_torchrl.paper.imitation import ImitationRun
 from lw_torchrl.paper.recipes import CLEAN, NOISY, PRESETS, SETTINGS, Member, Preset
 from lw_torchrl.paper.runs import execute_run

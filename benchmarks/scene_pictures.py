@@ -26,7 +26,7 @@ import tyro
 from rerun.experimental import ViewerClient
 
 import lw_torchrl as lw
-from lw_torchrl.envs.engines import VectorizedEngine
+from lw_torchrl.envs.engines.vectorized.engine import VectorizedEngine
 from lw_torchrl.envs.seeding import episode_seed
 from lw_torchrl.record.mujoco_scene import Motion, log_model, log_motion, model_geometry
 

@@ -76,7 +76,7 @@ def collect(
 
     acts: str | Policy = policy
     if policy not in options.ACTORS:
-        from lw_torchrl.training.checkpoint import load_actor
+        from lw_torchrl.training.files import load_actor
 
         options.use_one_thread()
         acts, behaviour = load_actor(policy), behaviour or Path(policy).stem
@@ -124,7 +124,7 @@ def data(
         raise ValueError("folders must name at least one dataset")
     for folder in folders:
         options.check_dataset("folders", folder)
-    from lw_torchrl.data.metadata import read_metadata
+    from lw_torchrl.data.dataset import read_metadata
     from lw_torchrl.data.replay_checks import check_behaviours
 
     output = Output(json)

@@ -38,7 +38,7 @@ def tasks(
             "description": known[name].description,
             "objects": [{"name": one.name, "ours": one.ours} for one in known[name].objects[1:]],
         }
-        for name in lw.resolve_tasks(options.one_or_many(names) or list(known), tasks=known)
+        for name in lw.language.tasks.resolve_tasks(options.one_or_many(names) or list(known), tasks=known)
     ]
 
     def objects(row: Row) -> str:
@@ -72,7 +72,7 @@ def skills(
         nearest: a text; the closest skill is shown.
     """
     from lw_torchrl.language.named_objects import GRIPPER
-    from lw_torchrl.language.skills import nearest_skill
+    from lw_torchrl.language.nearest import nearest_skill
     from lw_torchrl.language.tasks import check_task
 
     known = options.read_tasks(task_file)
@@ -126,10 +126,11 @@ def plans(
         roles: a table of the steps, what each moves and what it goes to, and what told: "skill", the text is a scripted
             skill's; "words", the text's; "condition", the things that it compares; "nothing".
     """
+    from lw_torchrl.language.tasks import resolve_tasks
 
     known = options.read_tasks(task_file)
     loaded = options.read_plans(plans, known, skill_set)
-    chosen = lw.resolve_tasks(options.one_or_many(names), tasks=known) if names else tuple(loaded)
+    chosen = resolve_tasks(options.one_or_many(names), tasks=known) if names else tuple(loaded)
     loaded.require(chosen)
     output = Output(json)
     if roles:
@@ -186,7 +187,7 @@ def queries(
         by: closest in spelling, or in meaning, which wants the extra [text].
     """
     import lw_torchrl as lw
-    from lw_torchrl.language.query_search import nearest_query
+    from lw_torchrl.language.nearest import nearest_query
     from lw_torchrl.language.tasks import check_task
 
     known = options.read_tasks(task_file)

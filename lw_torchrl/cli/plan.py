@@ -140,7 +140,7 @@ def compare(
         out: folder for results.json, summary.md, models.png, formats.png and best/.
     """
     options.check_folder("--out", out)
-    from lw_torchrl.planners.file_planner import ignored_files, recorded_answers
+    from lw_torchrl.planners.answer_files import ignored_files, recorded_answers
 
     known = options.read_tasks(task_file)
     recorded_answers(source)

@@ -130,7 +130,9 @@ def train_evaluator(
     plans = lw.load_plans("MT50")
     evaluator: ClauseEvaluator
     if cameras:
-        evaluator = lw.ImageQueryEvaluator(lw.Plans({task: plans[task] for task in names}), **network, **pictures)
+        evaluator = lw.modules.ImageQueryEvaluator(
+            lw.Plans({task: plans[task] for task in names}), **network, **pictures
+        )
     else:
         evaluator = lw.StateQueryEvaluator(plans, **network)
     run = {"episodes_per_task": episodes, "max_steps": max_steps, "seed": seed, "num_envs": num_envs}

@@ -27,8 +27,8 @@ from lw_torchrl.training import (
     load_actor,
     save_actor,
 )
-from lw_torchrl.training.checkpoint import describe_data
-from lw_torchrl.training.training_state import check_description
+from lw_torchrl.training.envelope import check_description
+from lw_torchrl.training.files import describe_data
 from lw_torchrl.transforms import RandomYaw
 
 SCRIPTED = "scripted"

@@ -34,8 +34,8 @@ from lw_torchrl.paper.offline_recipes import (
 )
 from lw_torchrl.paper.runs import Dataset, Run, Work, compare, kept_policy, own_tasks, plain, write_summary
 from lw_torchrl.training import OfflineConfig, OfflineTrainer
-from lw_torchrl.training.loss_state import bc_loss
-from lw_torchrl.training.training_state import check_same_description
+from lw_torchrl.training.behavioral_cloning import bc_loss
+from lw_torchrl.training.envelope import check_same_description
 from lw_torchrl.transforms import QAFTransform
 
 CONDITIONS: Mapping[str, str] = {"pcbc": "plan", "dc": "description", "one-hot": "one-hot"}

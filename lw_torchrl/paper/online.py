@@ -32,7 +32,7 @@ from lw_torchrl.training import (
     OnlineTrainer,
     load_actor,
 )
-from lw_torchrl.training.checkpoint import read_description
+from lw_torchrl.training.files import read_description
 
 START = "start"
 """The policy that is begun with: a run beside those of :data:`~lw_torchrl.training.LEARNERS`."""

@@ -22,8 +22,8 @@ from lw_torchrl.language.tasks import TASKS, resolve_tasks
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.policy import Policy
 from lw_torchrl.training import load_actor, save_actor
-from lw_torchrl.training.checkpoint import describe_data
-from lw_torchrl.training.training_state import check_description
+from lw_torchrl.training.envelope import check_description
+from lw_torchrl.training.files import describe_data
 
 EVALUATION_SEED = 10_000
 """Training seeds count from 0; the evaluation of training seed k has seed 10000 + k."""

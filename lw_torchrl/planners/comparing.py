@@ -151,7 +151,7 @@ def compare_plans(
         source: a folder ``<model>/<format>/<task>-<attempt>.<ext>``, as planners write it, or a .jsonl file as for
             :class:`~lw_torchrl.FilePlanner`.
         episodes, seed, choose, noise_scale, max_steps, num_envs, num_threads: as for
-            :func:`~lw_torchrl.evaluate_plans`.
+            :func:`~lw_torchrl.evaluation.evaluate_plans`.
         tasks: where tasks' names are looked up, as from :func:`~lw_torchrl.load_tasks`.
         resume: a file that keeps how plans fared, every few seconds; what it has is not run again.
         progress: show progress bars.

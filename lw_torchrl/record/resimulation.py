@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl.envs.engines import VectorizedEngine
+from lw_torchrl.envs.engines.vectorized.engine import VectorizedEngine
 from lw_torchrl.envs.seeding import episode_seed
 from lw_torchrl.record.mujoco_scene import Motion
 

@@ -8,15 +8,8 @@ from typing import Any
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.data.replay_buffers.samplers import PrioritizedSampler, RandomSampler
 
-<<<<<<< HEAD:lw_torchrl/training/minibatches.py
-from lw_torchrl._devices import CPU
-from lw_torchrl.data.replay import LanguageWorldExperienceReplay
 from lw_torchrl.data.samplers import GroupSampler
 from lw_torchrl.data.storage import DeviceStorage, device_of_rows
-=======
-from lw_torchrl.data.device_storage import DeviceStorage, device_of_rows
-from lw_torchrl.data.group_sampler import GroupSampler
->>>>>>> small-1-training:lw_torchrl/training/buffers.py
 from lw_torchrl.modules.critics import Value
 from lw_torchrl.modules.policy import plans_of
 

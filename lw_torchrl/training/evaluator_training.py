@@ -281,12 +281,12 @@ class ImageQueryEvaluatorTrainer(QueryEvaluatorTrainer):
         >>> import lw_torchrl as lw, tempfile
         >>> with tempfile.TemporaryDirectory() as root:
         ...     _ = lw.collect_demonstrations("reach", episodes_per_task=2, root=root, max_steps=40, progress=False)
-        ...     lw.add_pictures(root, "corner", every=5)
+        ...     lw.data.add_pictures(root, "corner", every=5)
         ...     replay = lw.LanguageWorldExperienceReplay(root, label="executed")
-        ...     replay.add_column("pixels", lw.load_pictures(replay, "corner", every=5))
+        ...     replay.add_column("pixels", lw.data.load_pictures(replay, "corner", every=5))
         ...     config = ImageQueryEvaluatorConfig(steps=2, batch_size=4, held_out_pairs=0.0)
-        ...     data = lw.LabelledQueries(replay, config)
-        ...     evaluator = lw.ImageQueryEvaluator(lw.load_plans("MT10"), cameras="corner")
+        ...     data = lw.training.LabelledQueries(replay, config)
+        ...     evaluator = lw.modules.ImageQueryEvaluator(lw.load_plans("MT10"), cameras="corner")
         ...     ImageQueryEvaluatorTrainer(evaluator, data, config).train() < 100.0
         True
     """

@@ -107,8 +107,8 @@ def save_evaluator(evaluator: QueryEvaluator, path: str | os.PathLike[str], **ab
     Example:
         >>> import lw_torchrl as lw, os, tempfile
         >>> path = os.path.join(tempfile.mkdtemp(), "evaluator.zip")
-        >>> lw.save_evaluator(lw.StateQueryEvaluator(lw.load_plans("MT10"), width=8), path)
-        >>> lw.load_evaluator(path, lw.load_plans("MT50")).config["width"]
+        >>> lw.training.save_evaluator(lw.StateQueryEvaluator(lw.load_plans("MT10"), width=8), path)
+        >>> lw.training.load_evaluator(path, lw.load_plans("MT50")).config["width"]
         8
     """
     EVALUATOR.check_about(about)

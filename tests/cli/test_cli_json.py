@@ -16,6 +16,7 @@ from commands import check_documented, document, documented, run
 import lw_torchrl as lw
 from lw_torchrl.cli.main import COMMANDS, GROUPS, main
 from lw_torchrl.cli.output import Output
+from lw_torchrl.language.nearest import nearest_query
 
 PLAN = """def push(robot):
     if check("the gripper is near the puck"):

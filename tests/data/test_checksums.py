@@ -10,13 +10,13 @@ from itertools import count
 import numpy as np
 import pytest
 from collecting import EPISODES, STEPS, collect, tree
-from lw_torchrl.training.loss_state import bc_loss
 
 import lw_torchrl as lw
 from lw_torchrl.data import DatasetError, LanguageWorldExperienceReplay, memory_map
 from lw_torchrl.data.dataset import read_metadata
 from lw_torchrl.data.memory_map import COLUMNS, ROW_BYTES, load_rows
 from lw_torchrl.data.missing_episodes import EpisodeFiles
+from lw_torchrl.training.behavioral_cloning import bc_loss
 
 TASKS = ("push", "reach")
 ALL = [(task, episode) for task in TASKS for episode in range(EPISODES)]

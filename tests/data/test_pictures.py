@@ -114,7 +114,7 @@ def test_a_killed_call_leaves_whole_files(root, monkeypatch):
     with pytest.raises(ValueError, match=r"has no pictures of .*lw\.add_pictures"):
         load(lw.LanguageWorldExperienceReplay(root))
     monkeypatch.setattr(pictures, "_write", kept)
-    lw.add_pictures(root, ("corner", "topview"), progress=False, **SIZE)
+    lw.data.add_pictures(root, ("corner", "topview"), progress=False, **SIZE)
     assert len(load(lw.LanguageWorldExperienceReplay(root))) == 48
 
 
@@ -165,5 +165,5 @@ def test_episodes_that_go_otherwise_are_refused(root):
         lw.data.add_pictures(root, "corner", progress=False, **SIZE)
     restate_checksums(root)
     with pytest.raises(ValueError, match=r"go otherwise when they are run again, from step 5 on"):
-        lw.add_pictures(root, "corner", progress=False, **SIZE)
+        lw.data.add_pictures(root, "corner", progress=False, **SIZE)
     assert not files(root)

@@ -2,12 +2,12 @@
 
 import pytest
 import torch
-from lw_torchrl.training.checkpoint import save_actor
 from tensordict import TensorDict
 from torchrl.envs import TransformedEnv
 
 import lw_torchrl as lw
 from lw_torchrl.language.plans import PlanStep
+from lw_torchrl.training.files import save_actor
 
 PLANS = lw.load_plans("MT10")
 

@@ -8,12 +8,12 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from lw_torchrl.training.policy_checks import check_can_be_saved
 from tensordict import TensorDict
 
 import lw_torchrl as lw
 from lw_torchrl.modules import make_policy
 from lw_torchrl.modules.residual_actor import weight_in_force
+from lw_torchrl.training.files import check_can_be_saved
 
 PLANS = lw.load_plans("MT10")
 SMALL = {"width": 16, "depth": 1}

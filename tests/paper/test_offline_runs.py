@@ -9,10 +9,10 @@ from itertools import pairwise
 
 import pytest
 import torch
-from lw_torchrl.data.metadata import read_metadata
 
 import lw_torchrl as lw
 from lw_torchrl.data.behaviours import BEHAVIOURS
+from lw_torchrl.data.dataset import read_metadata
 from lw_torchrl.paper.offline import DISTRIBUTIONS, Advantages, BehaviourDataset, OfflineRun, offline_runs, write_table
 from lw_torchrl.paper.offline_recipes import (
     MIXTURES,

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from lw_torchrl.training.checkpoint import demonstration_seeds
 from tiny_runs import (
     ENSEMBLE,
     PLANS,
@@ -29,6 +28,7 @@ from lw_torchrl.paper import imitation, runs
 from lw_torchrl.paper.imitation import SCRIPTED, ImitationRun
 from lw_torchrl.paper.recipes import PRESETS, SETTINGS, Member
 from lw_torchrl.paper.runs import load_result
+from lw_torchrl.training.files import demonstration_seeds
 
 
 def backwards(texts):

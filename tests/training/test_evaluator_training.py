@@ -178,7 +178,7 @@ def test_training_that_was_stopped_goes_on_to_the_bit(replay, tmp_path, kind):
     assert_same(everything(second), everything(whole))
     again = make_trainer(replay, tmp_path / "e.zip", **options)
     assert again.steps == SMALL.steps
-    loaded = lw.load_evaluator(tmp_path / "e.zip", PLANS, **({"text_encoder": words} if options else {}))
+    loaded = lw.training.load_evaluator(tmp_path / "e.zip", PLANS, **({"text_encoder": words} if options else {}))
     assert not loaded.training
     assert_same(flat(dict(loaded.state_dict())), flat(dict(whole.evaluator.state_dict())))
 
@@ -186,7 +186,7 @@ def test_training_that_was_stopped_goes_on_to_the_bit(replay, tmp_path, kind):
 def test_another_training_does_not_go_on(replay, tmp_path):
     make_trainer(replay, tmp_path / "e.zip").train()
     with pytest.raises(ValueError, match=r"its training differs in .*batch_size"):
-        make_trainer(replay, tmp_path / "e.zip", config=lw.QueryEvaluatorConfig(steps=12, batch_size=32))
+        make_trainer(replay, tmp_path / "e.zip", config=lw.training.QueryEvaluatorConfig(steps=12, batch_size=32))
     with pytest.raises(ValueError, match=r"its evaluator differs in .*width"):
         make_trainer(replay, tmp_path / "e.zip", width=17)
 
@@ -208,10 +208,10 @@ def test_what_is_no_evaluators_file_is_refused(tmp_path):
         lw.training.load_evaluator(path, PLANS)
     lw.save_actor(lw.PlanConditionedActor(PLANS, width=8), path)
     with pytest.raises(ValueError, match="It is a policy's, give an evaluator's"):
-        lw.load_evaluator(path, PLANS)
+        lw.training.load_evaluator(path, PLANS)
     path.write_bytes(b"PK")
     with pytest.raises(ValueError, match="is damaged or none of ours"):
-        lw.load_evaluator(path, PLANS)
+        lw.training.load_evaluator(path, PLANS)
 
     class Mine(lw.QueryEvaluator):
         pass
@@ -234,7 +234,7 @@ def test_options_that_the_weights_do_not_have_are_refused(tmp_path, part, value)
     groups = {name: found.tensors(name) for name in found.groups}
     write_archive(path, {k: v for k, v in found.description.items() if k != "sha256"}, groups)
     with pytest.raises(ValueError, match=r"evaluator: the evaluator of .* cannot be made"):
-        lw.load_evaluator(path, PLANS)
+        lw.training.load_evaluator(path, PLANS)
 
 
 def test_another_text_encoder_is_found_out(tmp_path):

@@ -15,11 +15,11 @@ from torchrl.objectives import LossModule, SoftUpdate
 
 from lw_torchrl._checks import check_choice, check_fields, check_int, check_probability, check_scale
 from lw_torchrl._state_tree import check_like, check_optimizer_state
-from lw_torchrl.modules.action_head import DistributionName
 from lw_torchrl.modules.conditioned_actor import ConditionedActor
 from lw_torchrl.modules.critics import QValue
-from lw_torchrl.modules.descriptor_encoder import DescriptorEncoder
+from lw_torchrl.modules.descriptor_conditioned_actor import DescriptorEncoder
 from lw_torchrl.modules.encoder import Encoder
+from lw_torchrl.modules.networks import DistributionName
 from lw_torchrl.modules.plan_encoder import PlanEncoder
 from lw_torchrl.modules.policy import Policy
 from lw_torchrl.modules.residual_actor import ResidualActor
