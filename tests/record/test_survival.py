@@ -15,12 +15,10 @@ import pytest
 import torch
 from logging_processes import LoggingProcesses
 from recordings import Recording, make_rollout
-from rerun.chunk import RrdReader
 
 from lw_torchrl.record import RerunLogger
 from lw_torchrl.record.opening import opened
 from lw_torchrl.record.rerun_binary import LOCAL, binary, free_port
-from lw_torchrl.record.tabs import Tabs
 
 MOMENTS = [random.Random(seed).uniform(1.2, 3.5) for seed in range(5)]
 
@@ -41,8 +39,8 @@ def copy_of(path):
             command = [binary(), "rrd", "verify", str(copy)]
             done = subprocess.run(command, capture_output=True, text=True, check=False)
             assert done.returncode == 0, done.stdout + done.stderr
-            reader = RrdReader(copy)
-            return Recording(copy), Tabs(reader.stream(store=reader.blueprints()[-1]).to_chunks()).names()
+            recording = Recording(copy)
+            return recording, recording.tabs()
 
 
 KILLED = """
