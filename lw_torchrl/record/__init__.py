@@ -4,11 +4,10 @@ Importing this package loads no rerun; constructing a :class:`RerunLogger` does.
 """
 
 import lw_torchrl._torchrl  # noqa: F401
-from lw_torchrl.record.html import write_html
 from lw_torchrl.record.rerun_logger import RerunLogger
 from lw_torchrl.record.rollout_pages import log_rollout
 from lw_torchrl.record.rollout_recorder import RolloutRecorder
 from lw_torchrl.record.viewer import open_viewer
-from lw_torchrl.record.web import WebPage
+from lw_torchrl.record.web_page import WebPage, write_html
 
 __all__ = ["RerunLogger", "RolloutRecorder", "WebPage", "log_rollout", "open_viewer", "write_html"]

@@ -1,88 +1,20 @@
-"""What the viewer opens with: the tabs of metrics, and the layout, of which only what is new is sent again."""
+"""The layout of a recording: its tabs, of episodes and of what training logs, and which of them a viewer opens."""
 
 from __future__ import annotations
 
-import uuid
-from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from lw_torchrl.record.timelines import entity_path
+from lw_torchrl._checks import unknown_name
+from lw_torchrl.record.conventions import EPISODE_TIMELINE, METRIC_TIMELINE, entity_path
+from lw_torchrl.record.page import Page, side_by_side
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
     from rerun import RecordingStream
-
-
-class Layout:
-    """The layout of one recording, which grows: sending it again costs the views that came, not all of them.
-
-    Rerun keeps a layout as a recording of its own. This one stays the same, its later rows replace or join the former.
-    """
-
-    def __init__(self, application_id: str) -> None:
-        import rerun_bindings
-        from rerun import RecordingStream
-
-        native = rerun_bindings.new_blueprint(application_id, make_default=False, make_thread_default=False)
-        self._stream = RecordingStream._from_native(native)
-        self._rows = self._stream.memory_recording()
-        self._root = uuid.uuid4()
-        self._sent: dict[str, Any] = {}
-
-    def send(self, stream: RecordingStream, blueprint: rrb.Blueprint) -> None:
-        """Make ``blueprint`` the layout of the recording that ``stream`` writes; its views are known by their ids."""
-        import rerun_bindings
-
-        self._stream.set_time("blueprint", sequence=0)  # a stream's time is another one in each thread
-        blueprint.root_container.id = self._root
-        blueprint._log_to_stream(self)
-        rerun_bindings.send_blueprint(self._rows.storage, True, True, recording=stream.to_native())
-
-    def log(self, path: str, *values: Any, **options: Any) -> None:
-        """What a blueprint calls for each of its parts; those that were sent are left out."""
-        if path in self._sent and path.startswith("view/"):
-            return
-        content = [batch.as_arrow_array() for value in values for batch in _batches(value)]
-        if path not in self._sent or self._sent[path] != content:
-            self._sent[path] = content
-            self._stream.log(path, *values, **options)
-
-
-def _batches(value: Any) -> Iterable[Any]:
-    return value.as_component_batches() if hasattr(value, "as_component_batches") else value
-
-
-class MetricTabs:
-    """The tabs of what is no episode: a view for each group of metrics, each histogram, image and video."""
-
-    def __init__(self) -> None:
-        self.kinds: dict[str, dict[tuple[str, ...], Any]] = {kind: {} for kind in TABS}
-        self._ids = {kind: uuid.uuid4() for kind in TABS}
-
-    def add(self, kind: str, *names: str) -> None:
-        """Have a view of what is logged under ``kind``/``names``, if there is none yet."""
-        if names not in self.kinds[kind]:
-            self.kinds[kind][names] = _view(kind, names)
-
-    def count(self) -> int:
-        """How many views there are."""
-        return sum(map(len, self.kinds.values()))
-
-    def tabs(self) -> list[Any]:
-        """A tab for each kind that has a view."""
-        import rerun.blueprint as rrb
-
-        tabs: list[Any] = []
-        for kind, views in self.kinds.items():
-            if not views:
-                continue
-            shown = list(views.values())
-            tab = shown[0] if kind == "hparams" else rrb.Grid(*shown, name=TABS[kind])
-            if kind != "hparams":
-                tab.id = self._ids[kind]
-            tabs.append(tab)
-        return tabs
-
+    from rerun.chunk import RrdReader
 
 TABS = {
     "metrics": "Metrics",
@@ -91,6 +23,148 @@ TABS = {
     "videos": "Videos",
     "hparams": "Hyperparameters",
 }
+"""The titles of the tabs of what is no episode. Their keys begin entity paths, so no episode has such a name."""
+OF_TRAINING = {"metrics", "histograms", "images"}
+"""What lies on the timeline of training, not of episodes."""
+_PROPERTY = "layout"
+
+
+class Tab(NamedTuple):
+    """A tab: what it is asked for by (the episode's name, or the title), its title, and the episodes that it shows."""
+
+    name: str
+    title: str
+    episodes: list[str]
+
+
+class Layout:
+    """The tabs of a recording. Rerun's blueprint is made from them whenever they are sent, with any tab in front.
+
+    A recording holds its tabs as properties too, so that whoever opens it can choose one, and so that a recording whose
+    writer was killed has all of them.
+    """
+
+    def __init__(self) -> None:
+        self.pages: dict[str, Page] = {}
+        self._compared: list[tuple[str, list[str]]] = []
+        self._views: dict[str, list[list[str]]] = {kind: [] for kind in TABS}
+        self._entries: list[str] = []
+        self._saved = self._shown = 0
+
+    def add_page(self, name: str, page: Page) -> None:
+        """Give an episode a tab."""
+        self.pages[name] = page
+        self._entries.append(json.dumps(["page", name, asdict(page)]))
+
+    def compare(self, title: str, names: Sequence[str]) -> None:
+        """Show episodes beside one another in a tab."""
+        self._compared.append((title, list(names)))
+        self._entries.append(json.dumps(["compare", title, list(names)]))
+
+    def add_view(self, kind: str, *names: str) -> None:
+        """Show what is logged under ``kind``/``names``, if it is not shown yet."""
+        if list(names) not in self._views[kind]:
+            self._views[kind].append(list(names))
+            self._entries.append(json.dumps(["view", kind, names]))
+
+    @classmethod
+    def read(cls, reader: RrdReader) -> Layout | None:
+        """The layout of a recording; None if this library did not write it, or an earlier version did."""
+        found = {}
+        for chunk in reader.stream().filter(content=f"/__properties/{_PROPERTY}/**"):
+            number = int(str(chunk.entity_path).rpartition("/")[2])
+            found[number] = json.loads(chunk.to_record_batch().column("entry")[-1].as_py()[0])
+        layout = cls()
+        for _, (kind, name, content) in sorted(found.items()):
+            if kind == "page":
+                layout.add_page(name, Page(**content))
+            elif kind == "compare":
+                layout.compare(name, content)
+            else:
+                layout.add_view(name, *content)
+        return layout if found else None
+
+    def save(self, stream: RecordingStream) -> None:
+        """Write the new tabs as properties of a recording."""
+        import rerun as rr
+
+        for number in range(self._saved, len(self._entries)):
+            values = rr.AnyValues(entry=self._entries[number])
+            stream.log(f"__properties/{_PROPERTY}/{number}", values, static=True)
+        self._saved = len(self._entries)
+
+    def is_due(self, seconds: float) -> bool:
+        """Whether to send the layout again, ``seconds`` after it was sent. Rerun takes it only whole, 0.1 MB a page, so
+        that many pages are sent only when a quarter more came, or after 5 seconds a page."""
+        new = len(self._entries) - self._shown
+        return bool(new) and (4 * new >= self._shown or seconds >= 5 * self._shown)
+
+    def send(self, stream: RecordingStream, tab: str | None = None) -> None:
+        """Have the viewer show the tabs, ``tab`` in front.
+
+        Raises:
+            ValueError: there is no such tab.
+        """
+        self._shown = len(self._entries)
+        stream.send_blueprint(self.blueprint(tab))
+
+    def blueprint(self, tab: str | None = None) -> rrb.Blueprint:
+        """The layout as rerun's; its time panel plays episodes at Meta-World's 80 steps a second."""
+        import rerun.blueprint as rrb
+
+        tabs: list[Any] = [side_by_side([self.pages[name] for name in names], title) for title, names in self._compared]
+        tabs += [page.tab() for page in self.pages.values()]
+        for kind, views in self._views.items():
+            if views:
+                shown = [_view(kind, names) for names in views]
+                tabs.append(shown[0] if kind == "hparams" else rrb.Grid(*shown, name=TABS[kind]))
+        front = None if tab is None else self._find(tab)
+        panel = rrb.TimePanel(
+            state="collapsed", timeline=self.timeline(tab), fps=80.0, play_state="paused", loop_mode="all"
+        )
+        return rrb.Blueprint(
+            rrb.Tabs(*tabs, active_tab=front),
+            rrb.BlueprintPanel(state="collapsed"),
+            rrb.SelectionPanel(state="collapsed"),
+            panel,
+            auto_views=False,
+        )
+
+    def tabs(self) -> list[Tab]:
+        """The tabs from left to right."""
+        return [
+            *(Tab(title, title, names) for title, names in self._compared),
+            *(Tab(name, page.title, [name]) for name, page in self.pages.items()),
+            *(Tab(TABS[kind], TABS[kind], []) for kind, views in self._views.items() if views),
+        ]
+
+    def _find(self, name: str | None) -> int:
+        """The place of the tab of that name or title, or of the only one whose title holds it; without one the first.
+
+        Raises:
+            ValueError: there is no such tab.
+        """
+        tabs = self.tabs()
+        exact = [i for i, tab in enumerate(tabs) if name in (tab.name, tab.title, None)]
+        holding = [i for i, tab in enumerate(tabs) if str(name).lower() in tab.title.lower()]
+        if exact or len(holding) == 1:
+            return (exact or holding)[0]
+        raise unknown_name("episode", str(name), [tab.name for tab in tabs])
+
+    def episodes(self, tab: str | None = None) -> list[str]:
+        """The episodes that a tab shows; without a name the first tab."""
+        return self.tabs()[self._find(tab)].episodes if tab is not None or self.tabs() else []
+
+    def timeline(self, tab: str | None = None) -> str:
+        """The timeline of what a tab shows; without a name of the first tab."""
+        if tab is None and not self.tabs():
+            return METRIC_TIMELINE
+        title = self.tabs()[self._find(tab)].title
+        return METRIC_TIMELINE if title in (TABS[kind] for kind in OF_TRAINING) else EPISODE_TIMELINE
+
+    def opening_step(self, tab: str | None = None) -> int | None:
+        """The step to open a tab at, the earliest decisive one of its episodes; None for a tab of no episode."""
+        return min((self.pages[name].decisive for name in self.episodes(tab)), default=None)
 
 
 def _view(kind: str, names: Sequence[str]) -> Any:

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lw_torchrl.record.timelines import METRIC_TIMELINE, time_columns
+from lw_torchrl.record.conventions import METRIC_TIMELINE, time_columns
 
 if TYPE_CHECKING:
     from rerun import RecordingStream

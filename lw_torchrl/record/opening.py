@@ -1,4 +1,4 @@
-"""Which recording is meant, and what of it a viewer opens: a file that ends where it should, at the tab asked for."""
+"""Which recording is meant, and what of it a viewer opens: a whole file, at the tab and the step asked for."""
 
 from __future__ import annotations
 
@@ -10,9 +10,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from lw_torchrl.record.copying import copy_recording
+from lw_torchrl._checks import check_int
+from lw_torchrl.record.layout import Layout
 from lw_torchrl.record.rerun_binary import binary, plain
-from lw_torchrl.record.rrd_stream import MAGIC, is_whole, mend
+
+FLUSH_SECONDS = 60.0
 
 
 def find_recording(path: str | os.PathLike[str]) -> Path:
@@ -29,7 +31,7 @@ def find_recording(path: str | os.PathLike[str]) -> Path:
         raise FileNotFoundError(f"recording {str(recording)!r} does not exist; expected a file that RerunLogger wrote")
     with recording.open("rb") as file:
         head = file.read(4)
-    if head[:3] != MAGIC:
+    if head[:3] != b"RRF":
         raise ValueError(f"{str(recording)!r} is no rerun recording: it begins with {head!r}")
     return recording
 
@@ -43,34 +45,114 @@ def opened(recording: Path, tab: str | None = None) -> Iterator[Path]:
     Raises:
         ValueError: nothing in it can be read, or it has no such tab.
     """
-    whole = is_whole(recording)
-    if whole:
-        _verify(recording)
+    from rerun.chunk import RrdReader
+
+    if is_whole(recording):
+        _run_rerun(recording, "verify", recording)
         if tab is None:
             yield recording
             return
-    else:
-        warnings.warn(
-            f"recording {str(recording)!r} was not closed: its writer still writes, or was stopped; "
-            "what is in it so far is shown",
-            stacklevel=4,
-        )
+        with tempfile.TemporaryDirectory() as folder:
+            copy = Path(folder) / recording.name
+            copy_recording(recording, copy, tab)
+            yield copy
+        return
+    warnings.warn(
+        f"recording {str(recording)!r} was not closed: its writer still writes, or was stopped; "
+        "what is in it so far is shown",
+        stacklevel=4,
+    )
     with tempfile.TemporaryDirectory() as folder:
-        copy, source = Path(folder) / recording.name, recording
-        if not whole:
-            source = Path(folder) / "mended.rrd"
-            mend(recording, source)
-        try:
-            copy_recording(source, copy, tab)
-        except ValueError as error:
-            if whole:
-                raise
-            raise _damaged(recording, error) from error
+        mended, copy = Path(folder) / "mended.rrd", Path(folder) / recording.name
+        _run_rerun(recording, "merge", recording, "-o", mended)
+        reader = RrdReader(mended)
+        if not reader.recordings():
+            raise _damaged(recording, "it holds nothing yet")
+        if Layout.read(reader) is None and tab is None:  # it has a layout of another's
+            yield mended
+            return
+        copy_recording(mended, copy, tab)
         yield copy
 
 
-def _verify(recording: Path) -> None:
-    done = subprocess.run([binary(), "rrd", "verify", str(recording)], capture_output=True, text=True, check=False)
+def is_whole(path: Path) -> bool:
+    """Whether the recording was closed by its writer, and so ends with an index."""
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - 32))
+        return b"RRF2FOOT" in file.read()
+
+
+def copy_recording(source: Path, target: Path, tab: str | None = None) -> None:
+    """Write a recording again: compact, with an index, and with ``tab`` in front.
+
+    Raises:
+        ValueError: it cannot be read, or there is no such tab.
+        OSError: the copy could not be written whole.
+    """
+    import rerun as rr
+    from rerun.chunk import OptimizationProfile, RrdReader
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that there is no index, which is why it is copied
+            reader = RrdReader(source)
+        known, layout = reader.recordings()[0], Layout.read(reader)
+        # What came in many small pieces becomes a few: a training's curves take a twentieth.
+        data = reader.stream(store=known).collect(optimize=OptimizationProfile.LIVE)
+    except RuntimeError as error:
+        raise ValueError(str(error)) from error
+    if layout is None and tab is not None:
+        raise ValueError(f"episode {tab!r} was given, but the recording, of an earlier version, does not say its tabs")
+    stream = rr.RecordingStream(known.application_id, recording_id=known.recording_id, send_properties=False)
+    try:
+        stream.save(target)
+        # The layout comes first, else a slow browser shows views of its own choice meanwhile.
+        (layout or Layout()).send(stream, tab)
+        stream.send_chunks(data)
+        stream.flush(timeout_sec=FLUSH_SECONDS)
+    except RuntimeError as error:
+        raise OSError(f"{str(target)!r} could not be written: {error}") from error
+    finally:
+        stream.disconnect()
+    if not is_whole(target):  # rerun does not say so
+        raise OSError(f"{str(target)!r} could not be written to its end")
+
+
+def opening_step(path: str | os.PathLike[str], tab: str | None = None, step: int | None = None) -> int | None:
+    """The step that a viewer's cursor is to stand at in a tab, the first tab if none is named.
+
+    Args:
+        path: the recording.
+        tab: the tab's title, or its episode's name.
+        step: the step that was asked for; None takes an episode's decisive one (where its failure is seen, its first
+            success, or its end; of episodes side by side the earliest).
+
+    Returns:
+        The step; None for a tab of no episode, or a recording without steps.
+
+    Raises:
+        TypeError, ValueError: ``step`` is no whole number, or the recording does not go so far.
+    """
+    from rerun.chunk import RrdReader
+
+    reader = RrdReader(os.fspath(path))
+    layout = Layout.read(reader) or Layout()
+    if step is None:
+        return layout.opening_step(tab)
+    timeline, end = layout.timeline(tab), -1
+    for chunk in reader.stream().filter(has_timeline=timeline):
+        times = chunk.to_record_batch().column(timeline)
+        end = max(end, times[-1].cast("int64").as_py()) if len(times) else end
+    if end < 0:
+        raise ValueError(f"step {step} was given, but the recording holds no steps")
+    if check_int("step", step, minimum=0) > end:
+        raise ValueError(f"step must be at most {end}, the recording's last, got {step}")
+    return step
+
+
+def _run_rerun(recording: Path, *arguments: str | Path) -> None:
+    """Run ``rerun rrd``; a ValueError says what is wrong with the recording."""
+    done = subprocess.run([binary(), "rrd", *map(str, arguments)], capture_output=True, text=True, check=False)
     if done.returncode:
         said = [line for line in plain(done.stdout + done.stderr).splitlines() if str(recording) in line]
         raise _damaged(recording, said[0].rpartition(": ")[2] if said else "rerun cannot read it")

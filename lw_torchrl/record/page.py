@@ -1,4 +1,4 @@
-"""The page of an episode: all that is logged of it, and how its views are laid out."""
+"""The page of an episode: all that is logged of it, and how its views lie."""
 
 from __future__ import annotations
 
@@ -6,17 +6,12 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from lw_torchrl.record.colors import BACKGROUND
-from lw_torchrl.record.curves import log_curves
-from lw_torchrl.record.heading import Heading, decisive_step, telling_steps
-from lw_torchrl.record.lanes import log_lanes
+from lw_torchrl.record.conventions import BACKGROUND, EPISODE_TIMELINE, SECONDS_TIMELINE, entity_path
 from lw_torchrl.record.mujoco_scene import Motion
-from lw_torchrl.record.opening_step import COMPONENT
-from lw_torchrl.record.plan_text import log_plan
 from lw_torchrl.record.recorded_episode import RecordedEpisode
 from lw_torchrl.record.scene import log_scene
-from lw_torchrl.record.timelines import EPISODE_TIMELINE, SECONDS_TIMELINE, entity_path
-from lw_torchrl.record.verdict import verdict
+from lw_torchrl.record.timeline import log_curves, log_plan, log_timeline
+from lw_torchrl.record.verdict import Heading, decisive_step, telling_steps, verdict
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
@@ -50,8 +45,9 @@ class Page:
         trails: entities that are shown up to the cursor.
         eye: where the scene is seen from, and what is looked at.
         shown: the first and last step worth a look.
+        decisive: the step to open it at.
         curves: names of :data:`CURVES` that there are.
-        steps, lanes: how many the plan has, and how many there are.
+        steps, rows: how many steps the plan has, and how many rows the timeline.
         good: whether it succeeded.
     """
 
@@ -60,13 +56,14 @@ class Page:
     trails: Collection[str]
     eye: tuple[Point, Point]
     shown: tuple[int, int]
+    decisive: int
     curves: Collection[str]
     steps: int
-    lanes: int
+    rows: int
     good: bool
 
     def tab(self) -> rrb.Horizontal:
-        """Scene and curves on the left, words and lanes on the right."""
+        """Scene and curves on the left, words and timeline on the right."""
         import rerun.blueprint as rrb
 
         left: list[tuple[float, Any]] = [(13, self._scene("Scene"))]
@@ -75,21 +72,21 @@ class Page:
         right: list[tuple[float, Any]] = [(115 if self.good else 215, self._words("verdict", "Verdict"))]
         if self.steps:
             right.append((70 + 58 * min(self.steps, 6), self._words("plan", "Plan")))
-        right += self._lanes()
+        right += self._timeline()
         columns = [
             rrb.Vertical(*(view for _, view in part), row_shares=[share for share, _ in part]) for part in (left, right)
         ]
         return rrb.Horizontal(*columns, column_shares=[6, 5], name=self.title)
 
     def column(self, shown: tuple[int, int]) -> rrb.Vertical:
-        """Verdict, scene, lanes and distance in a column, to stand beside others; all of them show the same steps."""
+        """Verdict, scene, timeline and distance in a column, beside others that show the same steps."""
         import rerun.blueprint as rrb
 
         page = replace(self, shown=shown)
         parts: list[tuple[float, Any]] = [(130, page._words("verdict", self.title)), (420, page._scene("Scene"))]
         if "distance" in page.curves:
             parts.append((120, page._curve("distance")))
-        parts += page._lanes()
+        parts += page._timeline()
         return rrb.Vertical(*(view for _, view in parts), row_shares=[share for share, _ in parts], name=self.title)
 
     def _scene(self, name: str) -> rrb.Spatial3DView:
@@ -110,15 +107,15 @@ class Page:
 
         return rrb.TextDocumentView(origin=f"{self.root}/{part}", name=name)
 
-    def _lanes(self) -> list[tuple[float, Any]]:
+    def _timeline(self) -> list[tuple[float, Any]]:
         import rerun.blueprint as rrb
 
-        if not self.lanes:
+        if not self.rows:
             return []
         view = rrb.StateTimelineView(
-            origin=f"{self.root}/lanes", name="The step in force, and what holds", time_view=_window(self.shown)
+            origin=f"{self.root}/timeline", name="The step in force, and what holds", time_view=_window(self.shown)
         )
-        return [(50 + 40 * min(self.lanes, 8), view)]
+        return [(50 + 40 * min(self.rows, 8), view)]
 
     def _curve(self, name: str) -> rrb.TimeSeriesView:
         import rerun.blueprint as rrb
@@ -156,21 +153,18 @@ def send_page(
     root = entity_path(name)
     trails = log_scene(stream, root, episode, motion)
     stream.log(f"{root}/verdict", rr.TextDocument(verdict(heading, episode), media_type="text/markdown"), static=True)
-    # Layouts cannot set the viewer's cursor; whoever opens the file can.
-    stream.log(root, rr.AnyValues(**{COMPONENT: decisive_step(heading, episode)}), static=True)
     if episode.steps:
         log_plan(stream, root, episode)
-    curves = log_curves(stream, root, episode)
-    lanes = log_lanes(stream, root, episode)
     return Page(
         root,
         title,
         trails=trails,
         eye=SIMPLE_EYE if motion is None else ROBOT_EYE,
         shown=telling_steps(heading, episode),
-        curves=curves,
+        decisive=decisive_step(heading, episode),
+        curves=log_curves(stream, root, episode),
         steps=len(episode.steps),
-        lanes=lanes,
+        rows=log_timeline(stream, root, episode),
         good=episode.first_success is not None,
     )
 

@@ -1,11 +1,11 @@
-"""RecordedEpisode: one episode as checked arrays."""
+"""RecordedEpisode: one episode as checked arrays, and where its plan's skills move things to."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 
 from lw_torchrl.language.named_objects import GRIPPER
+from lw_torchrl.language.skills import SkillError, load_skills
 from lw_torchrl.language.tasks import Task
-from lw_torchrl.record.aims import Aim, aim_of
 
 NOBODY = -1
 """In the place of a step's number: no step is in force alone."""
@@ -36,6 +36,42 @@ class PlanLike(Protocol):
     def steps(self) -> Sequence[StepLike]: ...
 
 
+class TargetPose(NamedTuple):
+    """What a scripted skill moves and where to, in each of T rows.
+
+    Attributes:
+        position: T×3 float32, metres, where the skill goes; on an axis that it leaves alone, where ``moved`` is.
+        moved: T×3 float32, metres, what is to arrive there.
+        relative: the skill goes by a distance from the hand, not to a place, so it never arrives.
+    """
+
+    position: NDArray[np.float32]
+    moved: NDArray[np.float32]
+    relative: bool
+
+    @property
+    def distance(self) -> NDArray[np.float32]:
+        """T float32, metres; NaN for a relative one."""
+        gap = np.linalg.norm(self.position - self.moved, axis=1)
+        return np.full_like(gap, np.nan) if self.relative else gap
+
+
+def target_pose(skill: str, task: Task, observation: NDArray[np.float32]) -> TargetPose | None:
+    """The target pose of a skill's text in a task (T×39 observations); None where no scripted skill has this text."""
+    known = load_skills().get(skill)
+    if known is None:
+        return None
+    try:
+        found = known.for_task(task)
+    except SkillError:
+        return None
+    positions = task.positions(torch.from_numpy(observation))
+    moved = positions[found.moved].numpy()
+    towards = positions[found.target].numpy() + np.asarray(found.offset, np.float32)
+    position = np.where(np.asarray(found.gain) > 0, towards, moved).astype(np.float32)
+    return TargetPose(position, moved, found.target == GRIPPER)
+
+
 @dataclass(frozen=True)
 class RecordedEpisode:
     """T rows of one episode, checked, on the CPU; S is the number of steps of its plan.
@@ -51,7 +87,7 @@ class RecordedEpisode:
         reward: T float32, likewise, or None.
         corrected: T float32, how much of a correction counts, or None.
         steps: the S (condition, skill) texts; empty where there is no plan.
-        aims: of each step where its skill is going; None where it is no scripted skill.
+        target_poses: of each step; None where its skill is no scripted one.
     """
 
     observation: NDArray[np.float32]
@@ -64,7 +100,7 @@ class RecordedEpisode:
     reward: NDArray[np.float32] | None
     corrected: NDArray[np.float32] | None
     steps: tuple[tuple[str, str], ...]
-    aims: tuple[Aim | None, ...] = ()
+    target_poses: tuple[TargetPose | None, ...] = ()
 
     @property
     def skills(self) -> list[str]:
@@ -111,15 +147,16 @@ class RecordedEpisode:
         if self.in_force is None:
             return None
         found = np.full(len(self), np.nan, np.float32)
-        for step, aim in enumerate(self.aims):
-            if aim is not None:
+        for step, pose in enumerate(self.target_poses):
+            if pose is not None:
                 rows = self.in_force == step
-                found[rows] = aim.distance[rows]
+                found[rows] = pose.distance[rows]
         return None if np.isnan(found).all() else found
 
-    def with_aims(self, task: Task) -> RecordedEpisode:
-        """The episode with the aims of its plan's skills in ``task``."""
-        return replace(self, aims=tuple(aim_of(skill, task, self.observation) for _, skill in self.steps))
+    def with_target_poses(self, task: Task) -> RecordedEpisode:
+        """The episode with the target poses of its plan's skills in ``task``."""
+        poses = tuple(target_pose(skill, task, self.observation) for _, skill in self.steps)
+        return replace(self, target_poses=poses)
 
     def __len__(self) -> int:
         return len(self.observation)
@@ -136,12 +173,15 @@ class RecordedEpisode:
             raise ValueError(f"rollout must have batch size (T,) with T >= 1, got {tuple(rollout.batch_size)}{hint}")
         steps = tuple((str(step.condition), step.skill) for step in plan.steps) if plan is not None else ()
         length = rollout.batch_size[0]
+        executed = ("next", "executed_action")
+        action = "action" if rollout.get(executed, None) is None else executed
+        logits = _of_steps(rollout, "qaf_logits", length, len(steps))
         return cls(
             observation=_column(rollout, "observation", length, 39),
-            action=_action(rollout, length),
+            action=_column(rollout, action, length, 4),
             objects=_positions(objects, rollout, length),
             qaf=_truth(rollout, "qaf", length, len(steps)),
-            believed=_positive(_of_steps(rollout, "qaf_logits", length, len(steps))),
+            believed=None if logits is None else logits > 0,
             skill_weights=_of_steps(rollout, "skill_weights", length, len(steps)),
             success=_flat(_truth(rollout, ("next", "success"), length, 1)),
             reward=_flat(_of_steps(rollout, ("next", "reward"), length, 1)),
@@ -173,12 +213,6 @@ def _column(rollout: TensorDictBase, key: Any, length: int, size: int | None) ->
     return _array(value, f"rollout[{key!r}]", (length, size))
 
 
-def _action(rollout: TensorDictBase, length: int) -> NDArray[np.float32]:
-    """What was done, where the rollout says so; else the action."""
-    executed = ("next", "executed_action")
-    return _column(rollout, "action" if rollout.get(executed, None) is None else executed, length, 4)
-
-
 def _of_steps(rollout: TensorDictBase, key: Any, length: int, steps: int) -> NDArray[Any] | None:
     """An optional column with at least ``steps`` columns; those beyond are padding and dropped."""
     if rollout.get(key, None) is None:
@@ -194,10 +228,6 @@ def _truth(rollout: TensorDictBase, key: Any, length: int, steps: int) -> NDArra
     if array is not None and array.dtype != np.bool_:
         raise ValueError(f"rollout[{key!r}] must be bool, got {rollout.get(key).dtype}")
     return array
-
-
-def _positive(array: NDArray[Any] | None) -> NDArray[np.bool_] | None:
-    return None if array is None else array > 0
 
 
 def _flat(array: NDArray[Any] | None) -> NDArray[Any] | None:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import atexit
+import math
 import os
 import threading
+import time
 import uuid
 import warnings
 from collections.abc import Mapping, Sequence
+from itertools import count
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -19,11 +22,8 @@ from torch import Tensor
 from torchrl.record.loggers import Logger
 
 from lw_torchrl._checks import check_choice, checked
-from lw_torchrl.record.blueprint import make_blueprint
-from lw_torchrl.record.episodes import episode_name
-from lw_torchrl.record.heading import Heading
-from lw_torchrl.record.layout import Layout, MetricTabs
-from lw_torchrl.record.live import check_address
+from lw_torchrl.record.conventions import CONTROL_PERIOD, entity_path
+from lw_torchrl.record.layout import TABS, Layout
 from lw_torchrl.record.metrics import (
     check_image,
     check_name,
@@ -39,11 +39,10 @@ from lw_torchrl.record.metrics import (
     send_video,
 )
 from lw_torchrl.record.mujoco_scene import Motion
-from lw_torchrl.record.page import Page, send_page, side_by_side
+from lw_torchrl.record.page import send_page
 from lw_torchrl.record.recorded_episode import PlanLike, RecordedEpisode
-from lw_torchrl.record.recording_file import check_path
-from lw_torchrl.record.timelines import CONTROL_PERIOD, entity_path
-from lw_torchrl.record.writer import RecordingWriter
+from lw_torchrl.record.verdict import Heading
+from lw_torchrl.record.writer import RecordingWriter, check_address, check_path
 
 if TYPE_CHECKING:
     from rerun import RecordingStream
@@ -110,23 +109,18 @@ class RerunLogger(Logger):
         self._curves: dict[str, int] = {}
         self._counters: dict[str, int] = {}
         self._hparams: dict[str, str] = {}
-        self._pages: dict[str, Page] = {}
-        self._episodes: list[Any] = []
-        self._compared: list[Any] = []
-        self._tabs = MetricTabs()
-        self._shown = (0, 0)
+        self._layout, self._sent = Layout(), 0.0
         super().__init__(
             exp_name=name,
             log_dir=str(self.path.parent) if self.path else os.curdir,
         )
 
     def _create_experiment(self) -> RecordingStream:
-        self._layout = Layout(self.application_id)
         self._writer = RecordingWriter(self.path, self.connect, self.application_id, self.exp_name, self._send_waiting)
         stream = self._writer.stream
         # In another process (service_backend="process") torchrl ends the experiment, not the logger.
         stream.finish = self.shutdown
-        self._layout.send(stream, make_blueprint([], []))
+        self._layout.send(stream)
         atexit.register(self.shutdown)
         self._tell()
         return stream
@@ -175,7 +169,7 @@ class RerunLogger(Logger):
         row, parts = numbers(name, value), check_name(name).split("/")
         if len(row) > self._curves.get(name, 0):
             self._curves[name] = len(row)
-            self._tabs.add("metrics", parts[0])
+            self._layout.add_view("metrics", parts[0])
             name_curves(stream, entity_path("metrics", *parts), parts[-1], len(row))
         with self._lock:
             steps, values = self._scalars.setdefault(name, ([], []))
@@ -199,7 +193,7 @@ class RerunLogger(Logger):
         stream, parts, pixels = self._open(), check_name(name).split("/"), check_image(name, image)
         path = entity_path("images", *parts)
         send_image(stream, path, self._count(path, step), pixels)
-        self._tabs.add("images", *parts)
+        self._layout.add_view("images", *parts)
 
     def log_video(self, name: str, video: Tensor, step: int | None = None, **kwargs: Any) -> None:
         """Add a video as JPEG images "videos/<name>", frame i at step i of the episodes' timelines.
@@ -224,7 +218,7 @@ class RerunLogger(Logger):
         if step is not None:
             parts.append(f"step {int(step)}")
         send_video(stream, entity_path("videos", *parts), video, float(kwargs.get("fps", 1 / CONTROL_PERIOD)))
-        self._tabs.add("videos", *parts)
+        self._layout.add_view("videos", *parts)
 
     def log_hparams(self, cfg: Any) -> None:
         """Show the configuration as a table of keys and values in "hparams"; a later call adds to it.
@@ -236,7 +230,7 @@ class RerunLogger(Logger):
             raise TypeError(f"cfg must be a mapping, got {type(cfg).__name__}")
         self._hparams.update(flatten(cfg))
         send_hparams(self._open(), self._hparams)
-        self._tabs.add("hparams")
+        self._layout.add_view("hparams")
 
     def log_histogram(self, name: str, data: Sequence[float] | Tensor | NDArray[Any], **kwargs: Any) -> None:
         """Add the counts of ``data`` as a bar chart "histograms/<name>", on the timeline "global_step".
@@ -254,7 +248,7 @@ class RerunLogger(Logger):
         parts = check_name(name).split("/")
         path = entity_path("histograms", *parts)
         send_histogram(self._open(), path, self._count(path, kwargs.get("step")), counts, edges)
-        self._tabs.add("histograms", *parts)
+        self._layout.add_view("histograms", *parts)
 
     def flush(self, timeout: float | None = None) -> None:
         """Write what waits to the file, within ``timeout`` seconds; by itself that is done each half second."""
@@ -267,6 +261,8 @@ class RerunLogger(Logger):
         if not self._service_shutdown:
             self._service_shutdown = True
             atexit.unregister(self.shutdown)
+            if self._layout.is_due(math.inf):
+                self._layout.send(self._writer.stream)
             self._writer.close(timeout)
             self._tell()
 
@@ -298,18 +294,17 @@ class RerunLogger(Logger):
     def _send_waiting(self) -> None:
         """Send numbers that wait, and the layout where there is something new to show."""
         self._send_scalars()
-        shown = len(self._compared) + len(self._episodes), self._tabs.count()
-        if shown != self._shown:
-            self._shown = shown
-            blueprint = make_blueprint([*self._compared, *self._episodes], self._tabs.tabs())
-            self._layout.send(self._writer.stream, blueprint)
+        self._layout.save(self._writer.stream)
+        if self._layout.is_due(time.monotonic() - self._sent):
+            self._layout.send(self._writer.stream)
+            self._sent = time.monotonic()
 
     # ---------------------------------------------------------------- episodes
 
     @property
     def episodes(self) -> list[str]:
         """The names of the episodes so far."""
-        return list(self._pages)
+        return list(self._layout.pages)
 
     def log_episode(
         self,
@@ -362,11 +357,21 @@ class RerunLogger(Logger):
         """Add the page of an episode that was checked; returns its name. With a motion the robot is shown as it is."""
         stream = self._open()
         with self._adding:  # else two threads find the same name free
-            entity = episode_name(heading.name, name, self._pages)
+            entity = self._episode_name(heading.name, name)
             title = heading.title(episode, None if entity == heading.name else entity)
-            self._pages[entity] = page = send_page(stream, entity, title, heading, episode, motion)
-            self._episodes.append(page.tab())
+            self._layout.add_page(entity, send_page(stream, entity, title, heading, episode, motion))
         return entity
+
+    def _episode_name(self, wanted: str, name: str | None) -> str:
+        """The name of a new episode: the one given, or the one wanted, then "wanted-2"; one taken is a ValueError."""
+        taken = (*TABS, *self._layout.pages)
+        if name is None:
+            return next(free for i in count(1) if (free := wanted if i == 1 else f"{wanted}-{i}") not in taken)
+        if not isinstance(name, str) or not name.strip():
+            raise ValueError(f"name must be a non-empty string, got {name!r}")
+        if name in taken:
+            raise ValueError(f"name must be another than {', '.join(taken)}, got {name!r}")
+        return name
 
     def compare(self, names: Sequence[str], title: str = "Side by side") -> None:
         """Show episodes beside one another, in a tab before their own: one cursor moves in all of them.
@@ -382,5 +387,4 @@ class RerunLogger(Logger):
         names = [names] if isinstance(names, str) else list(names)
         if len(names) < 2:
             raise ValueError(f"names must be of two episodes or more, got {', '.join(names) or 'none'}")
-        pages = [self._pages[check_choice("names", name, self._pages)] for name in names]
-        self._compared.append(side_by_side(pages, title))
+        self._layout.compare(title, [check_choice("names", name, self._layout.pages) for name in names])

@@ -1,25 +1,28 @@
-"""log_rollout: a rollout as a page of a recording, with the robot as it moved."""
+"""log_rollout: a rollout as a page of a recording, with the robot as it moved, which is simulated again for it."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from lw_torchrl._checks import check_int, checked, missing_keys, shown
+from lw_torchrl.envs.engines import VectorizedEngine
+from lw_torchrl.envs.seeding import episode_seed
 from lw_torchrl.evaluation.failures import Failure
 from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.tasks import MT50, TASKS, Task, task_id
-from lw_torchrl.record.heading import Heading
 from lw_torchrl.record.mujoco_scene import Motion
 from lw_torchrl.record.recorded_episode import RecordedEpisode
 from lw_torchrl.record.rerun_logger import RerunLogger
-from lw_torchrl.record.resimulation import Difference, simulate_again
+from lw_torchrl.record.verdict import Heading
 
 
 @checked
@@ -134,8 +137,62 @@ def read_rollout(
         }
     episode = RecordedEpisode.from_rollout(rollout, objects, plan)
     if task is not None and plan is not None:
-        episode = episode.with_aims(task)
+        episode = episode.with_target_poses(task)
     return Heading(label, index, seed, policy, failure), episode
+
+
+class Difference(NamedTuple):
+    """Where a rollout and its simulation first differ.
+
+    Attributes:
+        step: the step of the episode, from 0.
+        entry: which number of the observation is furthest off there.
+        by: how far.
+    """
+
+    step: int
+    entry: int
+    by: float
+
+
+def simulate_again(
+    task: str, seed: int, episode: int, action: NDArray[np.float32], observation: NDArray[np.float32]
+) -> Motion | Difference:
+    """The motion of all bodies in an episode, of T + 1 rows, or where it turns out to be another episode.
+
+    The simulation depends on the seed and the actions alone, so equal observations, bit for bit, mean equal motion.
+
+    Args:
+        task: one of the 50.
+        seed, episode: the environment's seed and the episode's index.
+        action: T×4 float32 in [-1, 1], as executed.
+        observation: T×39 float32, each row that from which its action was taken.
+
+    Example:
+        >>> found = simulate_again("reach", 0, 0, np.zeros((1, 4), np.float32), np.zeros((1, 39), np.float32))
+        >>> found.step
+        0
+    """
+    engine = VectorizedEngine([task], num_threads=1)
+    try:
+        first = engine.reset([0], [episode_seed(task, seed, episode)])[0]
+        poses = engine.poses(0)
+        length = len(action)
+        positions = np.empty((length + 1, *poses.position.shape), np.float32)
+        quaternions = np.empty((length + 1, *poses.quaternion.shape), np.float32)
+        seen = first.astype(np.float32)
+        active = np.ones(1, bool)
+        for step in range(length):
+            if not np.array_equal(seen, observation[step]):
+                off = np.abs(seen.astype(np.float64) - observation[step])
+                return Difference(step, int(off.argmax()), float(off.max()))
+            positions[step], quaternions[step] = poses
+            seen = engine.step(action[step : step + 1], active).observation[0].astype(np.float32)
+            poses = engine.poses(0)
+        positions[length], quaternions[length] = poses
+        return Motion(engine.model(0), positions, quaternions)
+    finally:
+        engine.close()
 
 
 def _motion(heading: Heading, episode: RecordedEpisode) -> Motion | None:

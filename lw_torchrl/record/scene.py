@@ -1,4 +1,4 @@
-"""The 3-D scene of an episode: the robot and its task, and what the plan speaks of.
+"""The 3-D scene of an episode: the robot, its task, what the plan names, and where the skill in force moves things to.
 
 Meta-World's frame: metres, x to the robot's right, y away from the robot, z up, the table's top at z = 0.
 Static things are sent once; what moves is sent as whole columns, one call per entity.
@@ -13,20 +13,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lw_torchrl.language.named_objects import GRIPPER
-from lw_torchrl.record.colors import GOLD, GREEN, Color, step_color
+from lw_torchrl.record.conventions import GOLD, GREEN, STEEL, Color, entity_path, step_color, time_columns
 from lw_torchrl.record.mujoco_scene import Motion, log_model, log_motion, model_geometry
 from lw_torchrl.record.recorded_episode import RecordedEpisode
-from lw_torchrl.record.simple_scene import log_simple_robot, to_table
-from lw_torchrl.record.timelines import entity_path, time_columns
 
 if TYPE_CHECKING:
     from rerun import RecordingStream
 
-OBJECT_COLORS = ((80, 170, 255), (255, 120, 90), (200, 130, 255), (90, 220, 210))
+OBJECT_COLORS: tuple[Color, ...] = ((80, 170, 255), (255, 120, 90), (200, 130, 255), (90, 220, 210))
+
+# Measured in Meta-World's model: obs[3] is the distance between the fingers over 0.1 m; they slide along y
+# and reach 4.5 cm below obs[0:3], the position of the hand.
+FINGER_TRAVEL = 0.1
+FINGER_HALF = (0.010, 0.006, 0.024)
+FINGER_DROP = 0.026
+PALM_HALF = (0.018, 0.062, 0.014)
+PALM_RISE = 0.012
+WRIST_HALF = (0.012, 0.012, 0.055)
+WRIST_RISE = 0.081
+TABLE_CENTER, TABLE_HALF = (0.0, 0.6, -0.010), (0.7, 0.4, 0.010)
+TABLE, GRID = (58, 64, 74), (92, 99, 112)
 
 
 def log_scene(stream: RecordingStream, root: str, episode: RecordedEpisode, motion: Motion | None = None) -> list[str]:
-    """Draw the robot, the objects, the goal, the hand's path and what it is aiming at under ``root``/scene.
+    """Draw the robot, the objects, the goal, the hand's path and the target pose under ``root``/scene.
 
     Without a motion, the robot is a hand over a table, and what it handles are points.
 
@@ -38,7 +48,7 @@ def log_scene(stream: RecordingStream, root: str, episode: RecordedEpisode, moti
     scene, times = f"{root}/scene", time_columns(np.arange(len(episode)))
     stream.log(scene, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     if motion is None:
-        log_simple_robot(stream, scene, episode)
+        _log_simple_robot(stream, scene, episode)
     else:
         log_model(stream, f"{scene}/bodies", model_geometry(motion.model))
         log_motion(stream, f"{scene}/bodies", motion)
@@ -63,7 +73,7 @@ def log_scene(stream: RecordingStream, root: str, episode: RecordedEpisode, moti
         label, size = (None, 0.005) if name == GRIPPER else (name, 0.016 if motion is None else 0.008)
         point(f"objects{part}", position, label, size, color)
         if motion is None:
-            lines(f"heights{part}", to_table(position), 0.0012, (*color, 150))
+            lines(f"heights{part}", _to_table(position), 0.0012, (*color, 150))
         if motion is None or name == GRIPPER:
             # The whole way, faint, and the way so far.
             whole = rr.LineStrips3D([position], colors=[(*color, 70)], radii=[0.0012])
@@ -73,38 +83,89 @@ def log_scene(stream: RecordingStream, root: str, episode: RecordedEpisode, moti
 
     if goal.any():
         point("goal", goal, None if goals else "goal", 0.018, GREEN)
-    _log_aim(stream, scene, episode, times)
+    _log_target(stream, scene, episode, times)
     return trails
 
 
-def _log_aim(stream: RecordingStream, scene: str, episode: RecordedEpisode, times: Sequence[Any]) -> None:
+def _log_simple_robot(stream: RecordingStream, scene: str, episode: RecordedEpisode) -> None:
+    """The table and the gripper below ``scene``."""
+    import rerun as rr
+
+    times = time_columns(np.arange(len(episode)))
+    solid = rr.components.FillMode.Solid
+
+    def box(path: str, centers: Any, half_sizes: Any, color: Color, labels: list[str] | None = None) -> None:
+        boxes = rr.Boxes3D.from_fields(
+            centers=centers,
+            half_sizes=half_sizes,
+            colors=[color] * len(half_sizes),
+            fill_mode=solid,
+            labels=labels,
+            show_labels=labels is not None,
+        )
+        stream.log(f"{scene}/{path}", boxes, static=True)
+
+    box("table", [TABLE_CENTER], [TABLE_HALF], TABLE)
+    stream.log(f"{scene}/table/grid", rr.LineStrips3D(_grid(), colors=[GRID], radii=[0.0007]), static=True)
+    box("gripper/palm", [(0.0, 0.0, PALM_RISE)], [PALM_HALF], STEEL)
+    # Its name stands above the hand, where the objects that it handles are not.
+    box("gripper/wrist", [(0.0, 0.0, WRIST_RISE)], [WRIST_HALF], STEEL, [GRIPPER])
+    box("gripper/fingers", None, [FINGER_HALF] * 2, GOLD)
+    stream.send_columns(f"{scene}/gripper", times, rr.Transform3D.columns(translation=episode.objects[GRIPPER]))
+    fingers = rr.Boxes3D.columns(centers=_finger_centers(episode.observation[:, 3]))
+    stream.send_columns(f"{scene}/gripper/fingers", times, fingers.partition([2] * len(episode)))
+
+
+def _to_table(position: NDArray[np.float32]) -> NDArray[np.float32]:
+    """T×2×3 lines: from each row straight down (or up) to the table's top."""
+    return np.stack([position, position * np.array([1, 1, 0], np.float32)], axis=1)
+
+
+def _grid(spacing: float = 0.1) -> list[list[tuple[float, float, float]]]:
+    """Lines on the table, ``spacing`` metres apart."""
+    (left, near), (right, far) = (
+        tuple(c + sign * h for c, h in zip(TABLE_CENTER[:2], TABLE_HALF[:2], strict=True)) for sign in (-1, 1)
+    )
+    z = 0.0005
+    across = [[(left, y, z), (right, y, z)] for y in np.arange(near, far + 1e-6, spacing).tolist()]
+    along = [[(x, near, z), (x, far, z)] for x in np.arange(left, right + 1e-6, spacing).tolist()]
+    return across + along
+
+
+def _finger_centers(opening: NDArray[np.float32]) -> NDArray[np.float32]:
+    """2T×3 centres of the fingers of T rows, metres in the gripper's frame; ``opening`` T in [0,1]."""
+    half = opening * FINGER_TRAVEL / 2 + FINGER_HALF[1]
+    zero, drop = np.zeros_like(half), np.full_like(half, -FINGER_DROP)
+    return np.stack([zero, half, drop, zero, -half, drop], axis=1).reshape(-1, 3).astype(np.float32)
+
+
+def _log_target(stream: RecordingStream, scene: str, episode: RecordedEpisode, times: Sequence[Any]) -> None:
     """An arrow from what the skill in force moves to where it goes, in the step's colour; none where no scripted
     skill is in force."""
     import rerun as rr
 
-    if episode.in_force is None or not any(episode.aims):
+    if episode.in_force is None or not any(episode.target_poses):
         return
     start, end = np.zeros((2, len(episode), 3), np.float32)
     colors = np.zeros((len(episode), 4), np.uint8)
     shown = np.zeros(len(episode), bool)
-    for step, aim in enumerate(episode.aims):
-        if aim is not None:
+    for step, pose in enumerate(episode.target_poses):
+        if pose is not None:
             rows = episode.in_force == step
-            start[rows], end[rows] = aim.moved[rows], aim.point[rows]
+            start[rows], end[rows] = pose.moved[rows], pose.position[rows]
             colors[rows], shown[rows] = (*step_color(step), 255), True
     arrows = rr.Arrows3D.columns(origins=start[shown], vectors=(end - start)[shown], colors=colors[shown])
-    stream.log(f"{scene}/aim", rr.Arrows3D.from_fields(radii=[0.004]), static=True)
-    stream.send_columns(f"{scene}/aim", times, arrows.partition(shown.astype(int)))
-    balls = rr.Points3D.columns(positions=end[shown], colors=colors[shown])
-    stream.log(
-        f"{scene}/aim/point", rr.Points3D.from_fields(radii=[0.012], labels=["aim"], show_labels=True), static=True
-    )
-    stream.send_columns(f"{scene}/aim/point", times, balls.partition(shown.astype(int)))
+    stream.log(f"{scene}/target", rr.Arrows3D.from_fields(radii=[0.004]), static=True)
+    stream.send_columns(f"{scene}/target", times, arrows.partition(shown.astype(int)))
+    style = rr.Points3D.from_fields(radii=[0.012], labels=["target"], show_labels=True)
+    stream.log(f"{scene}/target/position", style, static=True)
+    points = rr.Points3D.columns(positions=end[shown], colors=colors[shown])
+    stream.send_columns(f"{scene}/target/position", times, points.partition(shown.astype(int)))
 
 
 def _colors(objects: Mapping[str, Any], goals: Sequence[str]) -> dict[str, Color]:
     others = [name for name in objects if name != GRIPPER]
-    palette: dict[str, Color] = {name: OBJECT_COLORS[i % len(OBJECT_COLORS)] for i, name in enumerate(others)}
+    palette = {name: OBJECT_COLORS[i % len(OBJECT_COLORS)] for i, name in enumerate(others)}
     return {GRIPPER: GOLD} | palette | dict.fromkeys([name for name in goals if name != GRIPPER], GREEN)
 
 

@@ -5,14 +5,13 @@ from commands import fails, run
 from rerun.chunk import RrdReader
 
 import lw_torchrl as lw
-from lw_torchrl.record.tabs import Tabs
+from lw_torchrl.record.layout import Layout
 
 SHORT = ("--max-steps", 120, "--seed", 1000)
 
 
 def tabs(recording):
-    reader = RrdReader(recording)
-    return Tabs(reader.stream(store=reader.blueprints()[-1]).to_chunks()).names()
+    return [tab.name for tab in Layout.read(RrdReader(recording)).tabs()]
 
 
 def test_an_expert_is_recorded_with_the_shipped_plan(capsys, tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import uuid
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,6 +13,7 @@ from torchrl.envs import TransformedEnv
 
 import lw_torchrl as lw
 from lw_torchrl.record import RerunLogger
+from lw_torchrl.record.layout import Layout
 from lw_torchrl.record.recorded_episode import GRIPPER
 
 STEPS = (
@@ -105,10 +107,48 @@ class Recording:
         first, _ = self.columns[entity, component][0]
         return (self.times(entity, component) if "step" in first else None,)
 
-    def lane(self, entity, length, first=0):
+    def states(self, entity, length, first=0):
         """The state at each of ``length`` steps, unrolled from its changes."""
         steps = self.times(entity, "StateChange:state")
         states = [row[0] for row in self.values(entity, "StateChange:state")]
         assert (steps[-1], states[-1]) == (first + length, "")
         at = np.searchsorted(steps, np.arange(length) + first, side="right") - 1
         return [states[i] for i in at]
+
+    def tabs(self):
+        """What the tabs are asked for by, which are as many as rerun's own layout has."""
+        names = [tab.name for tab in Layout.read(self.reader).tabs()]
+        assert len(names) == len(self.shown_tabs())
+        return names
+
+    def shown_tabs(self):
+        """The titles in rerun's own layout, and of what stands in each tab."""
+        values = self.blueprint()
+        (root,) = values["viewport", "root_container"]
+        contents = values.get((f"container/{uuid.UUID(bytes=bytes(root))}", "contents"), [])
+        titles = {}
+        for path in contents:
+            inside = values.get((path.strip("/"), "contents"), [])
+            titles[self._title(values, path)] = [self._title(values, child) for child in inside]
+        return titles
+
+    def front(self):
+        """The title of the tab in front, and the timeline in force."""
+        values = self.blueprint()
+        (root,) = values["viewport", "root_container"]
+        (path,) = values[f"container/{uuid.UUID(bytes=bytes(root))}", "active_tab"]
+        return self._title(values, path), values["time_panel", "timeline"][0]
+
+    def _title(self, values, path):
+        return values.get((path.strip("/"), "display_name"), [""])[0]
+
+    def blueprint(self):
+        """The values of rerun's layout, by entity and field."""
+        values = {}
+        for chunk in self.reader.stream(store=self.reader.blueprints()[-1]):
+            rows = chunk.to_record_batch()
+            for name in rows.schema.names:
+                for value in rows.column(name).to_pylist() if ":" in name else ():
+                    if value:
+                        values[chunk.entity_path.strip("/"), name.partition(":")[2]] = value
+        return values

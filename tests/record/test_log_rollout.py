@@ -16,7 +16,7 @@ import lw_torchrl as lw
 from lw_torchrl.envs.engines import MetaWorldEngine
 from lw_torchrl.envs.seeding import episode_seed
 from lw_torchrl.evaluation.failures import Failure
-from lw_torchrl.record.opening_step import opening_step
+from lw_torchrl.record.opening import opening_step
 from lw_torchrl.record.viewer import open_viewer
 
 PLANS = lw.load_plans("MT10")
@@ -139,7 +139,7 @@ def test_the_executed_action_counts(tmp_path, pushed):
     assert any("/bodies" in entity for entity in found.entities())
 
 
-def test_the_aim_is_the_skills(tmp_path, pushed):
+def test_the_target_pose_is_the_skills(tmp_path, pushed):
     _, found = logged(tmp_path / "a.rrd", pushed, plans=PLANS, seed=SEED)
     steps = PLANS["push"].steps
     in_force = pushed["skill_weights"].argmax(-1)
@@ -149,7 +149,7 @@ def test_the_aim_is_the_skills(tmp_path, pushed):
         positions = lw.TASKS["push"].positions(observation[row])
         aimed = positions[skill.target] + torch.tensor(skill.offset)
         expected = torch.where(torch.tensor(skill.gain) > 0, aimed, positions[skill.moved])
-        shown = found.at("/push-0/scene/aim/point", "Points3D:positions", row)[0]
+        shown = found.at("/push-0/scene/target/position", "Points3D:positions", row)[0]
         np.testing.assert_allclose(shown, expected, atol=1e-6)
         distance = found.at("/push-0/distance", "Scalars:scalars", row)[0]
         assert distance == pytest.approx(100 * float((expected - positions[skill.moved]).norm()), abs=1e-3)

@@ -17,7 +17,7 @@ from PIL import Image
 from recordings import PLAN, make_objects, make_rollout
 
 from lw_torchrl.record import RerunLogger, WebPage, write_html
-from lw_torchrl.record.cursor import request, sign
+from lw_torchrl.record.web_page import request, sign
 
 
 @pytest.fixture(scope="module")
@@ -101,8 +101,8 @@ def test_a_page_is_served_until_it_is_closed(tmp_path, recording):
 
 @pytest.mark.parametrize("begun", [b"", b"G", b"GET / HTTP/1.1\r\nX: ", b"GET /wasm.gz HTTP/1.0\r\n\r\n"])
 def test_who_asks_or_takes_too_slowly_holds_no_thread(monkeypatch, recording, begun):
-    monkeypatch.setattr("lw_torchrl.record.web.ASKING_SECONDS", 0.5)
-    monkeypatch.setattr("lw_torchrl.record.web.STALLED_SECONDS", 0.5)
+    monkeypatch.setattr("lw_torchrl.record.web_page.ASKING_SECONDS", 0.5)
+    monkeypatch.setattr("lw_torchrl.record.web_page.STALLED_SECONDS", 0.5)
     page = WebPage(recording)
     server = threading.Thread(target=page.serve)
     server.start()

@@ -10,10 +10,10 @@ import torch
 from recordings import PLAN, STEPS, Recording, make_objects, make_rollout, record
 
 from lw_torchrl.record import RerunLogger
-from lw_torchrl.record.lanes import EVENLY, NONE_HOLDS
 from lw_torchrl.record.recorded_episode import NOBODY, RecordedEpisode
+from lw_torchrl.record.timeline import EVENLY, NONE_HOLDS
 
-LANES = [f"/push/lanes/{i}_" + c.replace("'", "ʼ").replace(" ", "_") for i, (c, _) in enumerate(STEPS, 1)]
+ROWS = [f"/push/timeline/{i}_" + c.replace("'", "ʼ").replace(" ", "_") for i, (c, _) in enumerate(STEPS, 1)]
 
 
 def test_an_episode_survives_exactly(tmp_path):
@@ -33,11 +33,11 @@ def test_an_episode_survives_exactly(tmp_path):
     reward = found.array("/push/reward", "Scalars:scalars")
     np.testing.assert_array_equal(reward, rollout["next", "reward"].double())
 
-    for i, lane in enumerate(LANES):
+    for i, row in enumerate(ROWS):
         expected = ["true" if held else "false" for held in rollout["qaf"][:, i]]
-        assert found.lane(lane, 20) == expected
-    assert found.lane("/push/lanes/success", 20, first=1) == ["false"] * 10 + ["true"] * 10
-    assert len([entity for entity in found.entities() if "/lanes/" in entity]) == 4
+        assert found.states(row, 20) == expected
+    assert found.states("/push/timeline/success", 20, first=1) == ["false"] * 10 + ["true"] * 10
+    assert len([entity for entity in found.entities() if "/timeline/" in entity]) == 4
 
 
 def test_the_plan_follows_the_cursor(tmp_path):
@@ -59,14 +59,14 @@ def test_the_plan_follows_the_cursor(tmp_path):
     assert f"### → {two}" in texts[1]
 
 
-def test_the_step_in_force_has_a_lane(tmp_path):
+def test_the_step_in_force_has_a_timeline(tmp_path):
     rollout = make_rollout()
     found = record(tmp_path / "a.rrd", rollout)
     names = [f"{i} {skill}" for i, (_, skill) in enumerate(STEPS, 1)]
     assert found.values("/push/skill_weights", "SeriesLines:names") == [names]
-    labels = found.values("/push/lanes/0_in_force", "StateConfiguration:labels")[0]
+    labels = found.values("/push/timeline/0_in_force", "StateConfiguration:labels")[0]
     assert labels == [*names, NONE_HOLDS, EVENLY]
-    for row, state in enumerate(found.lane("/push/lanes/0_in_force", 20)):
+    for row, state in enumerate(found.states("/push/timeline/0_in_force", 20)):
         weights, truth = rollout["skill_weights"][row, :2], rollout["qaf"][row, :2]
         even = EVENLY if truth.any() else NONE_HOLDS
         assert state == (even if weights[0] == weights[1] else str(int(weights.argmax())))
@@ -77,7 +77,7 @@ def test_attention_that_is_never_soft_has_no_curve(tmp_path):
     rollout["skill_weights"] = torch.nn.functional.one_hot(torch.arange(20) % 2, 3).float()
     found = record(tmp_path / "a.rrd", rollout)
     assert "/push/skill_weights" not in found.entities()
-    assert found.lane("/push/lanes/0_in_force", 20) == ["0", "1"] * 10
+    assert found.states("/push/timeline/0_in_force", 20) == ["0", "1"] * 10
 
 
 def test_a_learned_evaluators_truth_stands_beside(tmp_path):
@@ -85,8 +85,8 @@ def test_a_learned_evaluators_truth_stands_beside(tmp_path):
     rollout["qaf_logits"] = torch.where(rollout["qaf"], 3.0, -3.0)
     rollout["qaf_logits"][5:, 0] *= -1
     found = record(tmp_path / "a.rrd", rollout)
-    believed = found.lane("/push/lanes/1b_as_the_evaluator_has_it", 20)
-    exact = found.lane(LANES[0], 20)
+    believed = found.states("/push/timeline/1b_as_the_evaluator_has_it", 20)
+    exact = found.states(ROWS[0], 20)
     assert [a == b for a, b in zip(believed, exact, strict=True)] == [True] * 5 + [False] * 15
     texts = [row[0] for row in found.values("/push/plan", "TextDocument:text")]
     assert ["(evaluator:" in text for text in texts] == [
@@ -104,7 +104,7 @@ def test_timelines(tmp_path):
 
 def test_control_period_is_metaworlds():
     from lw_torchrl.envs.engines.metaworld import make_metaworld_env
-    from lw_torchrl.record.timelines import CONTROL_PERIOD
+    from lw_torchrl.record.conventions import CONTROL_PERIOD
 
     env = make_metaworld_env("reach")
     period = env.frame_skip * env.model.opt.timestep
@@ -134,7 +134,7 @@ def test_what_is_absent_is_left_out(tmp_path):
 def test_without_a_plan_every_column_is_numbered(tmp_path):
     found = record(tmp_path / "a.rrd", make_rollout(5), plan=None)
     assert found.values("/push/skill_weights", "SeriesLines:names") == [["1", "2", "3"]]
-    assert "/push/lanes/3_condition" in found.entities()
+    assert "/push/timeline/3_condition" in found.entities()
 
 
 def test_a_goal_that_is_an_object_has_one_label(tmp_path):

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import os
+import shutil
 from types import SimpleNamespace
 
 import pytest
 from recordings import Recording, make_rollout
 
 from lw_torchrl.record import RerunLogger
-from lw_torchrl.record.opening import opened
-from lw_torchrl.record.rrd_stream import is_whole
+from lw_torchrl.record.opening import is_whole, opened
 
 
 def test_the_file_has_its_name_from_the_start(tmp_path):
@@ -23,6 +23,8 @@ def test_the_file_has_its_name_from_the_start(tmp_path):
     assert written.startswith(b"RRF2")
     assert written.endswith(bytes(16)), "it ends as a stream does"
     assert not is_whole(path)
+    with pytest.warns(UserWarning, match="was not closed"), opened(path) as copy:
+        assert "/metrics/loss" in Recording(copy).entities()
     logger.log_scalar("loss", 2.0)
     logger.flush()
     assert path.read_bytes().startswith(written[:-16]), "what was written stays as it is"
@@ -93,8 +95,6 @@ def test_a_recording_leaves_alone_the_one_that_has_its_name_now(tmp_path, end):
 
 
 def test_a_file_without_room_for_an_index_stays_as_it_is(tmp_path, monkeypatch):
-    import shutil
-
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=0))
     with RerunLogger(tmp_path / "a.rrd") as logger:
         logger.log_scalar("loss", 1.0)

@@ -12,13 +12,12 @@ import pytest
 import torch
 from PIL import Image
 from recordings import Recording
-from rerun.chunk import RrdReader
 from tensordict import TensorDict
 from torchrl.record import VideoRecorder
 from torchrl.record.loggers import Logger
 
 from lw_torchrl.record import RerunLogger
-from lw_torchrl.record.tabs import Tabs
+from lw_torchrl.record.layout import Layout
 
 
 def test_it_is_a_torchrl_logger(tmp_path):
@@ -80,34 +79,24 @@ def test_each_group_of_metrics_has_a_view(tmp_path):
         logger.log_image("scene", torch.rand(4, 4))
         logger.log_histogram("action", [1.0, 2.0])
         logger.log_video("view", torch.zeros(2, 3, 4, 4, dtype=torch.uint8), step=3)
-    titles = {title: tuple(inside) for title, inside in views(tmp_path / "a.rrd").items()}
-    assert titles == {
-        "Metrics": ("loss", "eval", "lr"),
-        "Histograms": ("action",),
-        "Images": ("scene",),
-        "Videos": ("view/step 3",),
+    assert Recording(tmp_path / "a.rrd").shown_tabs() == {
+        "Metrics": ["loss", "eval", "lr"],
+        "Histograms": ["action"],
+        "Images": ["scene"],
+        "Videos": ["view/step 3"],
     }
 
 
-def views(path):
-    """The titles of the views in each tab of a recording's layout."""
-    reader = RrdReader(path)
-    tabs = Tabs(reader.stream(store=reader.blueprints()[-1]).to_chunks())
-    found = {}
-    for way in tabs._tabs:
-        (found.setdefault(tabs._title(way[:2]), []) if len(way) > 2 else []).append(tabs._title(way))
-    return found
-
-
-def test_the_layout_costs_what_is_new(tmp_path):
-    path, sizes = tmp_path / "a.rrd", []
-    with RerunLogger(path) as logger:
-        for number in range(12):
-            logger.log_scalar(f"group {number}/loss", 1.0)
-            logger.flush()
-            sizes.append(path.stat().st_size)
-    growth = np.diff(sizes)
-    assert growth[-1] < 1.6 * growth[0], "not all views again"
+def test_many_tabs_do_not_make_the_layout_dear():
+    layout, sent = Layout(), []
+    for number in range(1000):
+        layout.add_view("metrics", f"group {number}")
+        if layout.is_due(seconds=1.0):
+            sent.append(number + 1)
+            layout._shown = number + 1
+    assert sent[:5] == [1, 2, 3, 4, 5], "the first are shown at once"
+    assert sum(sent) < 6 * 1000
+    assert layout.is_due(seconds=5000.0)
 
 
 def test_counters_are_saved_and_restored(tmp_path):

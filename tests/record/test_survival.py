@@ -15,14 +15,12 @@ import pytest
 import torch
 from logging_processes import LoggingProcesses
 from recordings import Recording, make_rollout
-from rerun.chunk import RrdReader
 
 from lw_torchrl.record import RerunLogger
 from lw_torchrl.record.opening import opened
 from lw_torchrl.record.rerun_binary import LOCAL, binary, free_port
-from lw_torchrl.record.tabs import Tabs
 
-MOMENTS = [random.Random(seed).uniform(1.2, 3.5) for seed in range(5)]
+MOMENTS = sorted(random.Random(seed).uniform(1.2, 3.5) for seed in range(5))
 
 
 @pytest.fixture(scope="module")
@@ -41,8 +39,8 @@ def copy_of(path):
             command = [binary(), "rrd", "verify", str(copy)]
             done = subprocess.run(command, capture_output=True, text=True, check=False)
             assert done.returncode == 0, done.stdout + done.stderr
-            reader = RrdReader(copy)
-            return Recording(copy), Tabs(reader.stream(store=reader.blueprints()[-1]).to_chunks()).names()
+            recording = Recording(copy)
+            return recording, recording.tabs()
 
 
 KILLED = """
@@ -65,7 +63,7 @@ while True:
 """
 
 
-@pytest.mark.parametrize("moment", MOMENTS)
+@pytest.mark.parametrize("moment", [MOMENTS[0], *(pytest.param(one, marks=pytest.mark.slow) for one in MOMENTS[1:])])
 def test_killed_at_any_moment_a_second_is_lost(processes, tmp_path, moment):
     path, told = tmp_path / "run.rrd", tmp_path / "told"
     child = processes.start(KILLED, path=str(path), told=str(told))
@@ -246,7 +244,7 @@ def wait_until_it_rests(file):
         time.sleep(1.5)
 
 
-@pytest.mark.parametrize("beside", [True, False])
+@pytest.mark.parametrize("beside", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_viewer_gets_everything(tmp_path, receiver, beside):
     process, address, file = receiver
     logger = RerunLogger(tmp_path / "a.rrd" if beside else None, connect=address)

@@ -16,12 +16,9 @@ from rerun.chunk import RrdReader
 from tensordict import TensorDict
 
 from lw_torchrl.record import RerunLogger, open_viewer, viewer
-from lw_torchrl.record.cursor import connect, go_to
-from lw_torchrl.record.opening import find_recording, opened
-from lw_torchrl.record.opening_step import opening_step
+from lw_torchrl.record.opening import find_recording, is_whole, opened, opening_step
 from lw_torchrl.record.rerun_binary import running
-from lw_torchrl.record.rrd_stream import is_whole
-from lw_torchrl.record.tabs import Tabs
+from lw_torchrl.record.viewer import connect, go_to
 
 
 def write(path, steps=20):
@@ -112,7 +109,7 @@ def entities_of_copy(path):
 
 
 def test_a_viewer_that_says_nothing_is_not_waited_for_for_ever(monkeypatch):
-    monkeypatch.setattr("lw_torchrl.record.cursor.START_SECONDS", 1.0)
+    monkeypatch.setattr("lw_torchrl.record.viewer.START_SECONDS", 1.0)
     with socket.create_server(("127.0.0.1", 0)) as mute:  # it takes connections, and that is all
         began = time.monotonic()
         with pytest.raises(TimeoutError, match="no answer within 1 seconds"):
@@ -180,11 +177,7 @@ def test_a_tab_is_brought_to_the_front(tmp_path, name, title, timeline):
         logger.log_scalar("loss/bc", 1.0)
     with opened(tmp_path / "a.rrd", name) as copy:
         assert Recording(copy).entities() == Recording(tmp_path / "a.rrd").entities()
-        reader = RrdReader(copy)
-        tabs = Tabs(reader.stream(store=reader.blueprints()[-1]).to_chunks())
-    (front,) = tabs._values[tabs._root(), "active_tab"]
-    assert tabs._values[front, "display_name"] == [title]
-    assert tabs._values["time_panel", "timeline"] == [timeline]
+        assert Recording(copy).front() == (title, timeline)
     with (
         pytest.raises(ValueError, match="episode must be one of 'reach', 'reach-2', 'Metrics', got 'rea'"),
         opened(tmp_path / "a.rrd", "rea"),
@@ -235,10 +228,9 @@ def test_episodes_are_compared_before_their_own_tabs(tmp_path):
             logger.compare(["reach"])
         with pytest.raises(ValueError, match="names must be one of 'reach', 'reach-2', got 'push'"):
             logger.compare(["reach", "push"])
-    reader = RrdReader(tmp_path / "a.rrd")
-    tabs = Tabs(reader.stream(store=reader.blueprints()[-1]).to_chunks())
-    assert tabs.names() == ["Side by side", "reach", "reach-2"]
-    assert tabs.episodes() == {"reach", "reach-2"}
+    recording = Recording(tmp_path / "a.rrd")
+    assert recording.tabs() == ["Side by side", "reach", "reach-2"]
+    assert recording.shown_tabs()["Side by side"] == ["reach", "reach-2"]
 
 
 def test_two_recordings_in_one_viewer_keep_a_layout_each(tmp_path):

@@ -1,4 +1,4 @@
-"""Where and when things stand in a recording: entity paths, and the timelines of episodes and of training."""
+"""What all parts of a recording share: entity paths, timelines, colours."""
 
 from __future__ import annotations
 
@@ -10,6 +10,26 @@ from numpy.typing import NDArray
 EPISODE_TIMELINE, SECONDS_TIMELINE, METRIC_TIMELINE = "step", "time", "global_step"
 CONTROL_PERIOD = 0.0125
 """Seconds between two actions in Meta-World: 5 simulation steps of 2.5 ms, hence 80 Hz."""
+
+Color = tuple[int, ...]
+BACKGROUND = (24, 27, 33)
+TRUE, FALSE = (70, 170, 105), (52, 56, 64)
+STEEL, GOLD, GREEN = (205, 210, 220), (255, 200, 60), (90, 220, 120)
+SERIES_COLORS: tuple[Color, ...] = (
+    (80, 170, 255),
+    (255, 150, 70),
+    (110, 215, 120),
+    (225, 110, 225),
+    (240, 215, 80),
+    (100, 215, 215),
+    (250, 110, 120),
+    (170, 150, 250),
+)
+
+
+def step_color(step: int) -> Color:
+    """The colour of a step of a plan, counted from 0, wherever it is shown."""
+    return SERIES_COLORS[step % len(SERIES_COLORS)]
 
 
 def entity_path(*parts: str) -> str:
