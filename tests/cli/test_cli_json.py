@@ -97,6 +97,18 @@ def test_check_tells_the_faults_and_ends_with_2(capsys):
     assert printed.err == "lw-torchrl: error: 1 fault in 1 file\n"
 
 
+def test_check_of_a_broken_table_leaves_a_document(capsys):
+    Path("bad.toml").write_text("[")
+    with pytest.raises(SystemExit) as caught:
+        main(["check", "bad.toml", "--json"])
+    printed = capsys.readouterr()
+    assert caught.value.code == 2
+    (row,) = json.loads(printed.out)["files"]
+    assert [*row] == documented("check")["files"][:4]
+    assert "bad.toml: " in row["faults"][0]
+    assert "bad.toml: " in printed.err
+
+
 def test_an_error_leaves_no_document(capsys):
     with pytest.raises(SystemExit):
         main(["tasks", "raech", "--json"])
