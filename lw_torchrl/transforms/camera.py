@@ -16,8 +16,7 @@ from torchrl.envs.batched_envs import BatchedEnvBase
 from lw_torchrl._checks import check_int, checked
 from lw_torchrl._keys import as_keys
 from lw_torchrl._rendering import check_cameras
-from lw_torchrl.transforms.containers import base_env
-from lw_torchrl.transforms.env_state import KeepsEnvState
+from lw_torchrl.transforms.environment import KeepsEnvState, base_env
 
 
 class CameraTransform(KeepsEnvState):
@@ -65,24 +64,16 @@ class CameraTransform(KeepsEnvState):
         self.cameras = check_cameras(cameras, height, width)
         self.height, self.width, self.every = height, width, check_int("every", every, minimum=1)
         super().__init__(in_keys=[], out_keys=as_keys("out_keys", out_keys, ("pixels",)))
-        self._taken: Tensor | None = None  # (N, height, width·C, 3) uint8
-        self._steps: Tensor | None = None  # (N,) int64, of each row's episode
+        self._forget_episodes()
 
     @property
     def shape(self) -> tuple[int, int, int]:
         """Of a row's pictures."""
         return self.height, self.width * len(self.cameras), 3
 
-    def clone(self) -> CameraTransform:
-        """One for another environment, in which no picture was taken."""
-        other: CameraTransform = super().clone()
-        other._taken = other._steps = None
-        return other
-
-    def set_extra_state(self, state: Tensor) -> None:
-        """As :class:`EnvState`; a step wants a reset first."""
-        super().set_extra_state(state)
-        self._taken = self._steps = None
+    def _forget_episodes(self) -> None:
+        self._taken: Tensor | None = None  # (N, height, width·C, 3) uint8
+        self._steps: Tensor | None = None  # (N,) int64, of each row's episode
 
     def set_container(self, container: Transform | EnvBase) -> None:
         """Join an environment."""
