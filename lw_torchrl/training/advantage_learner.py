@@ -9,8 +9,7 @@ from torchrl.objectives import SoftUpdate
 
 from lw_torchrl.modules.critics import QValue, Value
 from lw_torchrl.modules.policy import Policy
-from lw_torchrl.objectives.advantage_weighted import AdvantageWeightedLoss, standardize_by_task
-from lw_torchrl.objectives.expectile_value import ExpectileValueLoss
+from lw_torchrl.objectives.advantage_weighted import AdvantageWeightedLoss, ExpectileValueLoss, standardize_by_task
 from lw_torchrl.training.learner import Learner, encoder_like, make_optimizer
 from lw_torchrl.training.online_config import OnlineConfig
 

@@ -26,7 +26,7 @@ from lw_torchrl._checks import (
 )
 from lw_torchrl._devices import CPU, drawn_on
 from lw_torchrl._progress import Progress
-from lw_torchrl.objectives.n_steps import with_n_steps
+from lw_torchrl.objectives.reduction import with_n_steps
 from lw_torchrl.training.checkpoint import describe_data, describe_learning
 from lw_torchrl.training.interrupts import interrupts_between_steps
 from lw_torchrl.training.loss_state import (
