@@ -19,8 +19,8 @@ from lw_torchrl._progress import Progress
 from lw_torchrl.envs.episodes import FinishedEpisode, policy_of, read_action, run_episodes
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.evaluation.attribution import attribute_failures, keys_to_attribute
+from lw_torchrl.evaluation.counterfactuals import answered_by, make_env
 from lw_torchrl.evaluation.result import EpisodeResult, EvaluationResult
-from lw_torchrl.evaluation.swaps import answered_by, make_env
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.tasks import TASKS, Task, named_tasks
 from lw_torchrl.modules.networks import evaluating

@@ -16,8 +16,7 @@ from torch import Tensor
 
 from lw_torchrl._files import read_json, write_json
 from lw_torchrl._versions import package_versions
-from lw_torchrl.evaluation.failure_table import failure_table, read_failures
-from lw_torchrl.evaluation.failures import Failure
+from lw_torchrl.evaluation.failures import Failure, failure_table, read_failures
 
 FORMAT = "lw_torchrl.evaluation"
 FORMAT_VERSION = 1

@@ -12,6 +12,7 @@ Tukey 1958 for the jackknife with Student's t.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -162,6 +163,20 @@ def count_solved(rates: ArrayLike, threshold: float = 0.8) -> int:
     if not 0 < threshold <= 1:
         raise ValueError(f"threshold must be in (0, 1], got {threshold!r}")
     return int((check_rates("rates", rates).mean(0) >= threshold - 1e-9).sum())
+
+
+def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
+    """The 95 % Wilson score interval of a success rate over the episodes of one policy.
+
+    Example:
+        >>> low, high = wilson_interval(20, 20)
+        >>> round(low, 2), high
+        (0.84, 1.0)
+    """
+    rate, z = successes / trials, 1.96
+    center = (rate + z**2 / (2 * trials)) / (1 + z**2 / trials)
+    half = z / (1 + z**2 / trials) * math.sqrt(rate * (1 - rate) / trials + z**2 / (4 * trials**2))
+    return max(0.0, center - half), min(1.0, center + half)
 
 
 def _interquartile_mean(rates: Array) -> float:

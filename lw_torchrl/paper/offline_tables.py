@@ -10,7 +10,7 @@ from typing import Any
 
 from lw_torchrl._files import write_json, write_text
 from lw_torchrl.evaluation import EvaluationResult, MethodComparison, plot_methods, summarize
-from lw_torchrl.evaluation.comparison import markdown_table
+from lw_torchrl.evaluation.summary import markdown_table
 from lw_torchrl.paper.mixtures import MIXTURES
 from lw_torchrl.paper.offline_recipes import OFFLINE_METHODS, OfflineRecipe
 from lw_torchrl.paper.offline_runs import Advantages, OfflineRun

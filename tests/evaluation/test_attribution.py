@@ -13,9 +13,9 @@ from torch import nn
 import lw_torchrl as lw
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.evaluation import attribute_failures
-from lw_torchrl.evaluation.swaps import own_evaluators, with_true_answers
-from lw_torchrl.evaluation.verdict import decide, decide_pair
-from lw_torchrl.evaluation.visited import attended, chosen, settled, stay
+from lw_torchrl.evaluation.attribution import decide, decide_pair
+from lw_torchrl.evaluation.counterfactuals import own_evaluators, with_true_answers
+from lw_torchrl.evaluation.explanation import attended, chosen, settled, stay
 from lw_torchrl.transforms.qaf import plan_program
 
 TASK, SEED, STEPS = "drawer-open", 7, 80

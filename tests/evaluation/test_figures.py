@@ -19,7 +19,7 @@ from lw_torchrl.evaluation import (
     published_curves,
     summarize_rates,
 )
-from lw_torchrl.evaluation.figures import wilson_interval
+from lw_torchrl.evaluation.statistics import wilson_interval
 
 
 def make_result(rates, trials=4):

@@ -1,8 +1,9 @@
-"""Parts of a policy exchanged for sound ones, and the very same episodes run again with them."""
+"""Counterfactuals: failed episodes run again with one part of what acted exchanged for a sound one."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import warnings
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from copy import deepcopy
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ from lw_torchrl._progress import Progress
 from lw_torchrl.envs.episodes import policy_of, run_episodes
 from lw_torchrl.envs.experts import ExpertActor
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
-from lw_torchrl.evaluation.visited import Scripts, attended
+from lw_torchrl.evaluation.explanation import EpisodeStates, Scripts, attended, candidates, unlike_scripts
 from lw_torchrl.language.plan_tables import PlanTables
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.tasks import TASKS, Task, task_id
@@ -29,8 +30,9 @@ from lw_torchrl.modules.query_evaluator import QueryEvaluator
 from lw_torchrl.transforms.qaf import plan_program
 
 Acts = Callable[[TensorDictBase], TensorDictBase]
-Which = tuple[str, int]  # task, episode
+EpisodeId = tuple[str, int]  # task, episode
 _ROWS = 256
+_TRIED_STEPS = 3  # in which a skill is exchanged, one at a time, before it is in all steps
 
 
 class TrueAnswers(QueryEvaluator):
@@ -73,14 +75,12 @@ def with_true_answers(actor: Any) -> Any:
 
 
 def make_env(actor: Any, plans: Plans | None, base: LanguageWorldEnv, evaluator: Any = None) -> EnvBase:
-    """The environment with what must run before the actor, and the answers to the plans' queries beside it; behind it
-    an evaluator that is a transform, or what a module reads."""
+    """The environment with what must run before the actor: the answers to the plans' queries, and behind them an
+    evaluator that is a transform, or what a module reads."""
     if isinstance(evaluator, Transform):
         evaluator = evaluator.clone()  # a transform has one environment
-    elif isinstance(evaluator, QueryEvaluator):
-        evaluator = evaluator.transform()
     else:
-        evaluator = None
+        evaluator = evaluator.transform() if isinstance(evaluator, QueryEvaluator) else None
     before = [one for one in (transform_of(actor, plans), evaluator) if one is not None]
     return TransformedEnv(base, before[0] if len(before) == 1 else Compose(*before)) if before else base
 
@@ -116,7 +116,7 @@ class WithScripts(nn.Module):
         steps: for each episode, the step whose attention the scripts wait for; None to act wherever there is any.
     """
 
-    def __init__(self, actor: Acts, plans: Plans, scripts: Scripts, steps: Mapping[Which, int] | None) -> None:
+    def __init__(self, actor: Acts, plans: Plans, scripts: Scripts, steps: Mapping[EpisodeId, int] | None) -> None:
         super().__init__()
         self.actor, self.scripts = actor, scripts
         self._tables = PlanTables(plans)
@@ -157,7 +157,7 @@ class WithScripts(nn.Module):
 
 
 @dataclass(frozen=True)
-class Again:
+class Rerun:
     """Runs episodes again as they were run, whatever acts in them.
 
     Attributes:
@@ -167,7 +167,7 @@ class Again:
     """
 
     tasks: Mapping[str, Task]
-    firsts: Mapping[Which, Tensor]
+    firsts: Mapping[EpisodeId, Tensor]
     seed: int
     noise_scale: float
     max_steps: int
@@ -178,8 +178,8 @@ class Again:
     progress: bool
 
     def __call__(
-        self, what: str, which: Sequence[Which], actor: Any, plans: Plans, evaluator: Any = None, longer: int = 1
-    ) -> dict[Which, int | None]:
+        self, what: str, which: Sequence[EpisodeId], actor: Any, plans: Plans, evaluator: Any = None, longer: int = 1
+    ) -> dict[EpisodeId, int | None]:
         """Each episode's first successful step, counted from 0, or None.
 
         Args:
@@ -193,15 +193,13 @@ class Again:
         Raises:
             ValueError: an episode does not begin as it was recorded.
         """
-        if not which:
-            return {}
         wanted: dict[str, list[int]] = {}
         for task, episode in sorted(which):
             wanted.setdefault(task, []).append(episode)
         rows = len(wanted) * max(1, min(max(map(len, wanted.values())), _ROWS // len(wanted)))
         if self.num_envs is not None:
             rows = max(len(wanted), min(rows, self.num_envs))
-        max_steps = self.max_steps * longer
+        max_steps, scale = self.max_steps * longer, self.noise_scale
         base = LanguageWorldEnv(
             [self.tasks[task] for task in wanted],
             num_envs=rows,
@@ -211,10 +209,9 @@ class Again:
             max_steps=max_steps,
             strict=True,
         )
-        env = make_env(inner_policy(actor), plans, base, evaluator)
+        env = make_env(actor.actor if isinstance(actor, WithScripts) else actor, plans, base, evaluator)
         actor = answered_by(actor, evaluator)
-        found: dict[Which, int | None] = {}
-        scale = self.noise_scale
+        found: dict[EpisodeId, int | None] = {}
         try:
             with ExitStack() as stack:
                 if isinstance(actor, nn.Module):
@@ -232,28 +229,130 @@ class Again:
                     after_success=0,
                     on_progress=bar.update,
                 ):
-                    self._check_first(*one)
+                    if not torch.equal(one.steps.get("observation")[0], self.firsts[one.task, one.episode]):
+                        raise ValueError(
+                            f"rollouts: episode {one.episode} of {one.task!r} does not begin as episode {one.episode} "
+                            f"of seed={self.seed} does; give the seed and the engine that it was run with, and the "
+                            "episode from its first state on"
+                        )
                     first = one.first_success
                     found[one.task, one.episode] = None if first is None else first - 1
         finally:
             env.close()
         return found
 
-    def _check_first(self, task: str, episode: int, steps: TensorDictBase) -> None:
-        if not torch.equal(steps.get("observation")[0], self.firsts[task, episode]):
-            raise ValueError(
-                f"rollouts: episode {episode} of {task!r} does not begin as episode {episode} of seed={self.seed} "
-                "does; give the seed and the engine that it was run with, and the episode from its first state on"
+
+class Counterfactuals:
+    """Runs the exchanges that are worth it, and keeps what each gave.
+
+    Attributes:
+        found: an exchange's name to the episodes that it was tried in, and their first successful step.
+        step: of episodes that a script in one step mends, that step.
+    """
+
+    def __init__(
+        self, actor: Any, plans: Plans, evaluator: Any, reference: Plans | None, scripts: Scripts, rerun: Rerun
+    ) -> None:
+        self.actor, self.plans, self.evaluator, self.scripts, self.rerun = actor, plans, evaluator, scripts, rerun
+        self.found: dict[str, dict[EpisodeId, int | None]] = {}
+        self.step: dict[EpisodeId, int] = {}
+        self.reference: Plans | None = None
+        self.other, self.other_evaluator = None, evaluator  # that carry out the reference
+        different = [] if reference is None else [reference[task] for task in reference.differences(plans)]
+        if not different:
+            return
+        reference = Plans(different)
+        try:
+            self.other = actor.with_plans(reference)
+            if hasattr(evaluator, "with_plans"):
+                self.other_evaluator = evaluator.with_plans(reference)
+            self.reference = reference
+        except (AttributeError, ImportError, RuntimeError, TypeError, ValueError) as error:
+            self.other = None
+            warnings.warn(
+                f"reference: the policy cannot carry it out, so no plan is exchanged ({type(error).__name__}: {error})",
+                stacklevel=4,
             )
 
+    def run(self, seen: Sequence[EpisodeStates], same: Collection[EpisodeId] = ()) -> None:
+        """Run all exchanges that are worth it.
 
-def inner_policy(actor: Any) -> Any:
-    """The policy in the midst of what was put around it."""
-    while isinstance(actor, WithScripts | AnsweredBy):
-        actor = actor.actor
-    return actor
+        Args:
+            seen: the episodes.
+            same: those in whose states the reference never asks for anything else, so that it mends nothing.
+        """
+        every = [(one.task, one.episode) for one in seen]
+        wrong = [w for w, one in zip(every, seen, strict=True) if bool((one.given != one.truth).any())]
+        with_reference = [w for w in every if self.reference is not None and w[0] in self.reference]
+        true = with_true_answers(self.actor)
+        can_answer = self.evaluator is not None or true is not self.actor
+        if can_answer:
+            self._run("query", "true answers", wrong, true, self.plans)
+        self._run_skills(seen)
+        self._run("plan", "the reference plan", with_reference, self.other, self.reference, self.other_evaluator)
+        left = self._unmended(every, "query", "skill", "skills")
+        left = [one for one in left if one in same or not self._mends("plan", one)]
+        self._run("time", "twice the time", left, self.actor, self.plans, self.evaluator, longer=2)
+        left = self._unmended(left, "time")
+        if can_answer:
+            pair = [one for one in left if one in wrong]
+            self._run("query + skill", "true answers and scripts", pair, self._scripted(true, self.plans), self.plans)
+            if self.other is not None and self.reference is not None:
+                both = [one for one in pair if one in with_reference]
+                other = with_true_answers(self.other)
+                self._run("query + plan", "true answers and the reference plan", both, other, self.reference)
+        if self.other is not None and self.reference is not None:
+            left = [one for one in self._unmended(left, "query + skill", "query + plan") if one in with_reference]
+            other = self._scripted(self.other, self.reference)
+            what = "the reference plan and scripts"
+            self._run("plan + skill", what, left, other, self.reference, self.other_evaluator)
 
+    def _mends(self, name: str, which: EpisodeId) -> bool:
+        return self.found.get(name, {}).get(which) is not None
 
-def definitions(names: Sequence[str], plans: Plans) -> dict[str, Task]:
-    """The tasks as the simulator is told of them: ours, or else those of the plans."""
-    return {name: TASKS.get(name, plans[name].definition) for name in names}
+    def _unmended(self, which: Iterable[EpisodeId], *names: str) -> list[EpisodeId]:
+        return [one for one in which if not any(self._mends(name, one) for name in names)]
+
+    def _run(
+        self,
+        name: str,
+        what: str,
+        which: Sequence[EpisodeId],
+        actor: Any,
+        plans: Plans | None,
+        evaluator: Any = None,
+        longer: int = 1,
+    ) -> None:
+        if which and actor is not None and plans is not None:
+            self.found.setdefault(name, {}).update(self.rerun(what, which, actor, plans, evaluator, longer))
+
+    def _scripted(self, actor: Any, plans: Plans, steps: Mapping[EpisodeId, int] | None = None) -> WithScripts:
+        scripts = self.scripts if plans is self.plans else Scripts(plans, self.scripts.table)
+        return WithScripts(actor, plans, scripts, steps)
+
+    def _run_skills(self, seen: Sequence[EpisodeStates]) -> None:
+        """Scripts in one step, for the likeliest steps in turn, then in all of them."""
+        ranked = {}
+        for one in seen:
+            unlike = unlike_scripts(self.actor, one, self.scripts)
+            if unlike is None or unlike.any():
+                ranked[one.task, one.episode] = candidates(one, unlike)
+        for turn in range(_TRIED_STEPS):
+            which = self._unmended([w for w, steps in ranked.items() if len(steps) > turn], "skill")
+            steps = {one: ranked[one][turn] for one in which}
+            what = f"scripts in a step ({turn + 1} of up to {_TRIED_STEPS})"
+            scripted = self._scripted(self.actor, self.plans, steps)
+            self._run("skill", what, which, scripted, self.plans, self.evaluator)
+            self.step.update({one: steps[one] for one in which if self._mends("skill", one)})
+        which = self._unmended([w for w in ranked if len(self.plans[w[0]].steps) > 1], "skill")
+        scripted = self._scripted(self.actor, self.plans)
+        self._run("skills", "scripts in all steps", which, scripted, self.plans, self.evaluator)
+
+    def shares(self) -> dict[str, dict[str, float]]:
+        """Task to the share of its failed episodes that each exchange mends, of those it was tried in."""
+        found: dict[str, dict[str, float]] = {}
+        for name, results in self.found.items():
+            for task in {task for task, _ in results}:
+                bits = [hit is not None for (of, _), hit in results.items() if of == task]
+                found.setdefault(task, {})[name] = sum(bits) / len(bits)
+        return found
