@@ -157,18 +157,10 @@ def attribute_failures(
     told = {(one.task, one.episode): explain(one, answered, scripts, trusted, theirs) for one in seen}
     if actor is None:
         return [_by_rule(one, told[one.task, one.episode], seed) for one in seen]
-    rerun = Rerun(
-        tasks={name: TASKS.get(name, answered[name].definition) for name in names},
-        firsts={(one.task, one.episode): one.steps.get("observation")[0] for one in seen},
-        seed=seed,
-        noise_scale=noise_scale,
-        max_steps=max_steps,
-        num_envs=num_envs,
-        engine=engine,
-        num_threads=num_threads,
-        device=device,
-        progress=progress,
-    )
+    tasks = {name: TASKS.get(name, answered[name].definition) for name in names}
+    firsts = {(one.task, one.episode): one.steps.get("observation")[0] for one in seen}
+    env = {"seed": seed, "engine": engine, "num_threads": num_threads}
+    rerun = Rerun(tasks, firsts, env, noise_scale, max_steps, num_envs, device, progress)
     tried = Counterfactuals(actor, answered, evaluator, trusted, scripts, rerun)
     tried.run(seen, [which for which, one in told.items() if one.evidence.get("plan_departs") == 0.0])
     shares = tried.shares()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import nullcontext
 from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any
@@ -163,36 +163,24 @@ class Rerun:
     Attributes:
         tasks: their tasks by name.
         firsts: each episode's first observation, (39,) float32.
-        seed, noise_scale, max_steps, num_envs, engine, num_threads, device, progress: as for :func:`evaluate`.
+        env: the environment's options: seed, engine, num_threads.
+        noise_scale, max_steps, num_envs, device, progress: as for :func:`evaluate`.
     """
 
     tasks: Mapping[str, Task]
     firsts: Mapping[EpisodeId, Tensor]
-    seed: int
+    env: Mapping[str, Any]
     noise_scale: float
     max_steps: int
     num_envs: int | None
-    engine: Any
-    num_threads: int | None
     device: str | torch.device | None
     progress: bool
 
     def __call__(
         self, what: str, which: Sequence[EpisodeId], actor: Any, plans: Plans, evaluator: Any = None, longer: int = 1
     ) -> dict[EpisodeId, int | None]:
-        """Each episode's first successful step, counted from 0, or None.
-
-        Args:
-            what: is exchanged, in words.
-            which: the episodes.
-            actor: what acts in them.
-            plans: whose conditions are answered.
-            evaluator: what answers in the query answering function's place.
-            longer: how many times as long they may be.
-
-        Raises:
-            ValueError: an episode does not begin as it was recorded.
-        """
+        """Each episode's first successful step, counted from 0, or None; :class:`ValueError` if one does not begin as
+        it was recorded. Episodes may be ``longer`` by this factor."""
         wanted: dict[str, list[int]] = {}
         for task, episode in sorted(which):
             wanted.setdefault(task, []).append(episode)
@@ -200,26 +188,15 @@ class Rerun:
         if self.num_envs is not None:
             rows = max(len(wanted), min(rows, self.num_envs))
         max_steps, scale = self.max_steps * longer, self.noise_scale
-        base = LanguageWorldEnv(
-            [self.tasks[task] for task in wanted],
-            num_envs=rows,
-            seed=self.seed,
-            engine=self.engine,
-            num_threads=self.num_threads,
-            max_steps=max_steps,
-            strict=True,
-        )
+        tasks = [self.tasks[task] for task in wanted]
+        base = LanguageWorldEnv(tasks, num_envs=rows, max_steps=max_steps, strict=True, **self.env)
         env = make_env(actor.actor if isinstance(actor, WithScripts) else actor, plans, base, evaluator)
         actor = answered_by(actor, evaluator)
         found: dict[EpisodeId, int | None] = {}
         try:
-            with ExitStack() as stack:
-                if isinstance(actor, nn.Module):
-                    stack.enter_context(evaluating(actor))
-                stack.enter_context(torch.no_grad())
-                stack.enter_context(set_exploration_type(ExplorationType.DETERMINISTIC))
-                bar = Progress(f"again with {what}", len(which) * max_steps, "step", show=self.progress)
-                stack.enter_context(bar)
+            mode = evaluating(actor) if isinstance(actor, nn.Module) else nullcontext()
+            bar = Progress(f"again with {what}", len(which) * max_steps, "step", show=self.progress)
+            with mode, bar, torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
                 for one in run_episodes(
                     env,
                     policy_of(actor, self.device),
@@ -232,8 +209,8 @@ class Rerun:
                     if not torch.equal(one.steps.get("observation")[0], self.firsts[one.task, one.episode]):
                         raise ValueError(
                             f"rollouts: episode {one.episode} of {one.task!r} does not begin as episode {one.episode} "
-                            f"of seed={self.seed} does; give the seed and the engine that it was run with, and the "
-                            "episode from its first state on"
+                            f"of seed={self.env['seed']} does; give the seed and the engine that it was run with, and "
+                            "the episode from its first state on"
                         )
                     first = one.first_success
                     found[one.task, one.episode] = None if first is None else first - 1
@@ -292,7 +269,7 @@ class Counterfactuals:
         self._run("plan", "the reference plan", with_reference, self.other, self.reference, self.other_evaluator)
         left = self._unmended(every, "query", "skill", "skills")
         left = [one for one in left if one in same or not self._mends("plan", one)]
-        self._run("time", "twice the time", left, self.actor, self.plans, self.evaluator, longer=2)
+        self._run("time", "twice the time", left, self.actor, self.plans, self.evaluator, 2)
         left = self._unmended(left, "time")
         if can_answer:
             pair = [one for one in left if one in wrong]
@@ -313,18 +290,9 @@ class Counterfactuals:
     def _unmended(self, which: Iterable[EpisodeId], *names: str) -> list[EpisodeId]:
         return [one for one in which if not any(self._mends(name, one) for name in names)]
 
-    def _run(
-        self,
-        name: str,
-        what: str,
-        which: Sequence[EpisodeId],
-        actor: Any,
-        plans: Plans | None,
-        evaluator: Any = None,
-        longer: int = 1,
-    ) -> None:
+    def _run(self, name: str, what: str, which: Sequence[EpisodeId], actor: Any, plans: Any, *options: Any) -> None:
         if which and actor is not None and plans is not None:
-            self.found.setdefault(name, {}).update(self.rerun(what, which, actor, plans, evaluator, longer))
+            self.found.setdefault(name, {}).update(self.rerun(what, which, actor, plans, *options))
 
     def _scripted(self, actor: Any, plans: Plans, steps: Mapping[EpisodeId, int] | None = None) -> WithScripts:
         scripts = self.scripts if plans is self.plans else Scripts(plans, self.scripts.table)

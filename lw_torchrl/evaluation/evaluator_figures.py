@@ -127,10 +127,7 @@ def _off(evaluator: ImageQueryEvaluator, asked: Asked, row: int, clause: Clause)
 
 @checked
 def plot_wrong_answers(
-    evaluator: ImageQueryEvaluator,
-    data: LabelledQueries,
-    path: str | os.PathLike[str] | None = None,
-    most: int = 12,
+    evaluator: ImageQueryEvaluator, data: LabelledQueries, path: str | os.PathLike[str] | None = None, most: int = 12
 ) -> Figure:
     """Draw the surest wrong answers in held-out states: the pictures, what was asked, and how far from where they are
     the things were taken to be.

@@ -51,13 +51,13 @@ class PartScore:
 
     def accuracy(self, predicate: str | None = None) -> float:
         """The share of right answers, to one predicate or to all."""
-        names = list(self.asked) if predicate is None else [predicate]
+        names = self.asked if predicate is None else [predicate]
         return sum(sum(self.right[name]) for name in names) / sum(sum(self.asked[name]) for name in names)
 
     def balanced_accuracy(self, predicate: str | None = None) -> float:
         """The mean of the shares of right answers where the predicate holds and where it does not; of a truth that
         never comes there is none."""
-        names = list(self.asked) if predicate is None else [predicate]
+        names = self.asked if predicate is None else [predicate]
         pairs = [[sum(table[name][truth] for name in names) for table in (self.right, self.asked)] for truth in (0, 1)]
         shares = [right / asked for right, asked in pairs if asked]
         return sum(shares) / len(shares)
@@ -171,8 +171,7 @@ def _score(evaluator: ClauseEvaluator, data: LabelledQueries, part: str) -> Part
 
 
 def clause_logits(evaluator: ClauseEvaluator, asked: Asked) -> list[tuple[Tensor, Tensor]]:
-    """Logits (R, Q) that the predicates hold, and their truth; of an evaluator that reads texts also as it answers the
-    negations."""
+    """Logits (R, Q) that the predicates hold, and their truth; one that reads texts is asked negations too."""
     coded, vectors = evaluator.code([(asked.task, clause) for clause in asked.clauses])
     every = [
         evaluator.network(rows, coded.pick(torch.arange(len(coded.predicate)).expand(len(rows), -1)), vectors)
@@ -211,15 +210,12 @@ class Drift:
 
 @checked
 def condition_drift(policy: Any, states: TensorDictBase) -> list[Drift]:
-    """Compare the answers of a policy's evaluator with the query answering function's.
+    """Compare the answers of a policy's evaluator with the query answering function's, the least agreement first.
 
     Args:
         policy: one with an evaluator, or an evaluator.
         states: (R,) rows with ``observation`` (R, 39) float32, ``task_id`` (R,) int64 and what the evaluator reads, of
-            a replay buffer, ``replay[:]``, or a rollout.
-
-    Returns:
-        Each condition of the tasks that there are states of, those of the least agreement first.
+            a replay buffer, ``replay[:]``, or a rollout; conditions of other tasks are left out.
 
     Raises:
         ValueError: the policy has no evaluator.

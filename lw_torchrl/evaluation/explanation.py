@@ -176,8 +176,7 @@ def explain(
 ) -> Explanation:
     """The rule: wrong answers, else a plan that asks for something else than the reference, else a skill.
 
-    Without a reference plan: no condition that holds tells of a plan, one step all the while that does not get what it
-    moves where it goes, of a skill.
+    Without a reference, a plan is to blame where no condition holds, and a skill that stays in force far from its goal.
     """
     plan, length = plans[seen.task], len(seen.in_force)
     observation, task_id = seen.steps.get("observation"), seen.steps.get("task_id")
@@ -221,9 +220,8 @@ def explain(
                 f"'{plan.steps[step].skill}', where the reference says '{asked}'"
             )
         often = int(departs[-late:].sum())
-        why["plan"] = (
-            f"in {f'{often} of the last {late}' if often else f'{int(departs.sum())} of {length}'} states {said}"
-        )
+        states = f"{often} of the last {late}" if often else f"{int(departs.sum())} of {length}"
+        why["plan"] = f"in {states} states {said}"
     else:
         steps["plan"], at["plan"] = stuck, stay(none) if none.any() else at["undecided"]
         why["plan"] = f"no condition of the plan held in {int(none[-late:].sum())} of the last {late} states"

@@ -84,11 +84,7 @@ def failure_table(tasks: Sequence[str], episodes_per_task: int, failures: Sequen
 
 
 def read_failures(stated: Any, config: Mapping[str, Any], episodes: Sequence[EpisodeResult]) -> tuple[Failure, ...]:
-    """The failures of a file: one for each failed episode.
-
-    Raises:
-        ValueError: they are not.
-    """
+    """The failures of a file: one for each failed episode, else :class:`ValueError`."""
     if not isinstance(stated, list):
         raise ValueError(f"failures must be a list, got {short(stated)}")
     names = set(Failure.__dataclass_fields__)
@@ -124,7 +120,7 @@ def _rules(failure: Failure, config: Mapping[str, Any]) -> list[tuple[str, bool,
         ("step", step is None or (type(step) is int and 0 <= step < 2**31), "null or an integer of at least 0"),
         ("at", type(failure.at) is int and 0 <= failure.at < config["max_steps"], "a step of the episode"),
         ("why", isinstance(failure.why, str), "a text"),
-        ("evidence", isinstance(evidence, dict) and all(map(_is_number, evidence.values())), "names and numbers"),
+        ("evidence", isinstance(evidence, dict) and all(map(is_number, evidence.values())), "names and numbers"),
         (
             "swaps",
             isinstance(swaps, dict)
@@ -134,5 +130,6 @@ def _rules(failure: Failure, config: Mapping[str, Any]) -> list[tuple[str, bool,
     ]
 
 
-def _is_number(value: Any) -> bool:
+def is_number(value: Any) -> bool:
+    """Whether JSON's value is a finite number."""
     return type(value) in (int, float) and abs(value) < 1e300 and isfinite(value)

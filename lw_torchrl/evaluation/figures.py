@@ -78,18 +78,11 @@ def plot_success(result: EvaluationResult, path: str | os.PathLike[str] | None =
     tasks = sorted(rates, key=lambda task: (rates[task], task))
     figure = new_figure(8.0, 1.6 + 0.27 * len(tasks))
     axes = figure.subplots()
-    intervals = [wilson_interval(round(rates[task] * trials), trials) for task in tasks]
-    errors = [
-        [max(0.0, rates[task] - low) for task, (low, _) in zip(tasks, intervals, strict=True)],
-        [max(0.0, high - rates[task]) for task, (_, high) in zip(tasks, intervals, strict=True)],
-    ]
-    axes.barh(
-        tasks,
-        [rates[task] for task in tasks],
-        xerr=errors,
-        color="#4c78a8",
-        error_kw={"ecolor": "#333333", "elinewidth": 1, "capsize": 2},
-    )
+    values = [rates[task] for task in tasks]
+    intervals = [wilson_interval(round(rate * trials), trials) for rate in values]
+    ends = [(max(0.0, rate - low), max(0.0, high - rate)) for rate, (low, high) in zip(values, intervals, strict=True)]
+    bars = {"ecolor": "#333333", "elinewidth": 1, "capsize": 2}
+    axes.barh(tasks, values, xerr=list(zip(*ends, strict=True)), color="#4c78a8", error_kw=bars)
     axes.axvline(result.mean_success, color="#e45756", linestyle="--")
     axes.set_xlim(0, 1.02)
     axes.margins(y=0.5 / len(tasks))
@@ -237,9 +230,8 @@ def _draw_method(axes: Axes, method: str, rates: Array, color: str, order: str, 
     mean, x, seeds = rates.mean(1), range(len(rates)), rates.shape[1]
     spread = f"1 {of}" if seeds == 1 else f"{seeds} {of}s, min–max shaded"
     axes.fill_between(x, rates.min(1), rates.max(1), color=color, alpha=0.16, linewidth=0)
-    axes.plot(
-        x, mean, color=color, linewidth=2, marker=".", zorder=3, label=f"{method}: mean {mean.mean():.2f} ({spread})"
-    )
+    label = f"{method}: mean {mean.mean():.2f} ({spread})"
+    axes.plot(x, mean, color=color, linewidth=2, marker=".", zorder=3, label=label)
     axes.axhline(float(mean.mean()), color=color, linewidth=1.2, alpha=0.8)
 
 
@@ -336,9 +328,6 @@ def plot_methods(
         path: an image file, .png, .svg, .pdf or .jpg, replaced whole; None for none.
         title: above the figure.
 
-    Raises:
-        ValueError: no groups, or another format.
-
     Example:
         >>> from lw_torchrl.evaluation import summarize_rates
         >>> figure = plot_methods({"B": {"bc": summarize_rates({"push": [0.5, 0.7]})}})
@@ -346,7 +335,6 @@ def plot_methods(
         'B'
     """
 
-    path = None if path is None else Path(path)
     check_image(path)
     if not groups:
         raise ValueError("groups must hold at least one, got none")

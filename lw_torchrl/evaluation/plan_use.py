@@ -1,4 +1,4 @@
-"""How plans fare: which steps hold in which states, which were chosen, and where a policy got stuck."""
+"""How plans fare: which steps hold in which states, which were chosen, and where failed episodes got stuck."""
 
 from __future__ import annotations
 
@@ -86,9 +86,8 @@ class PlanUse:
         qaf = episode.steps.get("qaf")[: before + _AFTER, :steps]
         weights = episode.steps.get("skill_weights", None)
         chosen = None if weights is None else weights[: before + _AFTER, :steps].argmax(-1)
-        self._seen.setdefault(episode.task, []).append(
-            _Episode(episode.episode, qaf, chosen, before, success is not None)
-        )
+        one = _Episode(episode.episode, qaf, chosen, before, success is not None)
+        self._seen.setdefault(episode.task, []).append(one)
 
     def tasks(self) -> dict[str, TaskUse]:
         """What was seen of each task."""
@@ -164,9 +163,8 @@ def expert_use(
     rows = len(names) * min(episodes_per_task, -(-_ROWS // len(names)))
     env = TransformedEnv(LanguageWorldEnv(names, num_envs=rows, seed=seed, strict=True), QAFTransform(answered))
     episodes = {task: range(episodes_per_task) for task in names}
-    for finished in run_episodes(
-        env, ExpertActor(names), episodes, keys=["qaf", ("next", "success")], after_success=_AFTER
-    ):
+    keys = ["qaf", ("next", "success")]
+    for finished in run_episodes(env, ExpertActor(names), episodes, keys=keys, after_success=_AFTER):
         use(finished)
     env.close()
     return use.tasks()
@@ -202,24 +200,15 @@ def stuck_steps(use: PlanUse) -> list[StuckStep]:
         >>> import lw_torchrl as lw
         >>> plans = lw.load_plans("MT10")
         >>> use = PlanUse(plans)
-        >>> result = lw.evaluate(
-        ...     lw.PlanConditionedActor(plans),
-        ...     tasks="push",
-        ...     episodes_per_task=2,
-        ...     seed=1_000,
-        ...     max_steps=60,
-        ...     also_record=["qaf", "skill_weights"],
-        ...     on_episode=use,
-        ... )
+        >>> run = dict(tasks="push", episodes_per_task=2, seed=1_000, max_steps=60, on_episode=use)
+        >>> _ = lw.evaluate(lw.PlanConditionedActor(plans), also_record=["qaf", "skill_weights"], **run)
         >>> [(step.skill, step.stuck) for step in stuck_steps(use)][0]
         ('place the gripper above the puck', 2)
     """
     return [
-        StuckStep(
-            task, number, str(step.condition), step.skill, found.stuck[number], found.furthest[number], found.failed
-        )
+        StuckStep(task, k, str(step.condition), step.skill, found.stuck[k], found.furthest[k], found.failed)
         for task, found in use.tasks().items()
-        for number, step in enumerate(use.plans[task].steps)
+        for k, step in enumerate(use.plans[task].steps)
     ]
 
 
@@ -227,8 +216,8 @@ def stuck_steps(use: PlanUse) -> list[StuckStep]:
 def weakest_step(use: PlanUse, task: str | None = None) -> StuckStep:
     """The step that most failed episodes came to and not beyond, the first of them if there are several.
 
-    Not the step in which they ended: a puck that is dropped while it is carried lies there again, and the gripper ends
-    above it, in the first step, which is sound. Plans are written in the order in which their steps come.
+    It is not the step in which they ended: a puck that is dropped lies there again, and the gripper ends above it, in
+    the first step, which is sound. Plans are written in the order in which their steps come.
 
     Args:
         use: what evaluated episodes told.

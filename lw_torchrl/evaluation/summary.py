@@ -107,8 +107,7 @@ class Summary:
         for task, found in self.per_task.items():
             cells = "".join(f" {rates[task]:6.2f}" if task in rates else f" {'-':>6}" for _, rates in columns)
             lines.append(f"{task:28} {found.mean:6.2f} {found.min:6.2f} {found.max:6.2f}{cells}")
-        seeds = self.by_seed.values()
-        cells = ""
+        seeds, cells = self.by_seed.values(), ""
         for _, rates in columns:
             shared = [rates[task] for task in self.tasks if task in rates]
             cells += f" {sum(shared) / len(shared):6.2f}" if len(shared) == len(self.tasks) else f" {'-':>6}"
@@ -206,14 +205,8 @@ def summarize(results: Mapping[Any, EvaluationResult] | Sequence[EvaluationResul
                     f"results must share {key}, got {first.config.get(key)!r} for seed {first_seed!r} and "
                     f"{result.config.get(key)!r} for seed {seed!r}"
                 )
-    rates = {task: [_rate(result, task) for result in named.values()] for task in tasks}
+    rates: dict[str, Any] = {task: [result.success_once[task] for result in named.values()] for task in tasks}
     return summarize_rates(rates, seeds=list(named), **options)
-
-
-def _rate(result: EvaluationResult, task: str) -> float:
-    rate = result.success_once[task]
-    assert rate is not None  # any-step success is known of every episode
-    return rate
 
 
 @dataclass(frozen=True)
@@ -265,24 +258,20 @@ class MethodComparison:
         for other in others:
             if different := sorted(set(self.tasks) ^ set(self.summaries[other].tasks)):
                 raise ValueError(f"summaries of {first!r} and {other!r} do not share the tasks {different}")
-        self.pairs = [self._pair(first, other, confidence) for other in others]
-
-    def _pair(self, x: str, y: str, confidence: float) -> Pair:
-        order = [self.summaries[y].tasks.index(task) for task in self.tasks]
-        rates = self.summaries[x].array, self.summaries[y].array[:, order]
-        difference = mean_difference(*rates, confidence=confidence)
-        return Pair((x, y), difference, probability_of_improvement(*rates, confidence=confidence))
+        self.pairs: list[Pair] = []
+        for other in others:
+            order = [self.summaries[other].tasks.index(task) for task in self.tasks]
+            rates = self.summaries[first].array, self.summaries[other].array[:, order]
+            difference = mean_difference(*rates, confidence=confidence)
+            improvement = probability_of_improvement(*rates, confidence=confidence)
+            self.pairs.append(Pair((first, other), difference, improvement))
 
     def to_json(self) -> dict[str, Any]:
         """As plain numbers, lists and mappings."""
         return {
             "methods": {method: summary.to_json() for method, summary in self.summaries.items()},
             "pairs": [
-                {
-                    "methods": list(p.methods),
-                    "difference": p.difference.to_json(),
-                    "improvement": p.improvement.to_json(),
-                }
+                {"methods": [*p.methods], "difference": p.difference.to_json(), "improvement": p.improvement.to_json()}
                 for p in self.pairs
             ],
             "published_means": {label: self._mean(rates) for label, rates in self.published.items()},

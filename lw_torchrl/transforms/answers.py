@@ -115,22 +115,16 @@ class HeldAnswers(KeepsEnvState):
     """Writes logits (B, S) float32, asked for at a row's reset and then every so many steps of its episode, held in
     between and shown so many steps late; :meth:`HeldEvaluator.transform` makes it.
 
-    Only the rows whose answers are due are asked about; rows that a ``_step`` or ``_reset`` mask leaves out are not. It
-    reads what is there where it stands: after a transform that changes the observation, the changed one. In an
-    environment its ``state_dict`` holds the environment's, as :class:`EnvState` does; after ``load_state_dict`` the
+    Only the rows whose answers are due are asked about. Behind a transform that changes the observation it reads the
+    changed one. Its ``state_dict`` holds the environment's, as :class:`EnvState` does; after ``load_state_dict`` the
     environment must be reset.
 
     Args:
         ask: from a TensorDict of n rows with ``in_keys`` to their logits (n, S) float32.
         columns: S.
-        every: steps of a row's episode from one asking to the next, at least 1.
-        delay: steps until answers are shown, at least 0; until then a row is shown those of its reset.
+        every, delay: as for :class:`RowAnswers`.
         in_keys: what is read.
         out_key: where the logits go.
-
-    Raises:
-        ValueError: on a replay buffer; something that is to be read is absent; something before it writes ``out_key``.
-        RuntimeError: a step of an environment that was never reset, or not since ``load_state_dict``.
     """
 
     def __init__(
