@@ -69,8 +69,9 @@ class Scripts:
         found = {plan.definition: [_script(plan, step.skill, table) for step in plan.steps] for plan in plans.values()}
         self.known = {task.name: [skill is not None for skill in listed] for task, listed in found.items()}
         self.program = SkillProgram({task: [skill or _REST for skill in listed] for task, listed in found.items()})
-        rulers = {task: [_ruler(skill or _REST) for skill in listed] for task, listed in found.items()}
-        self._ruler = SkillProgram(rulers)
+        self._ruler = SkillProgram(
+            {task: [_ruler(skill or _REST) for skill in listed] for task, listed in found.items()}
+        )
 
     def distance(self, observation: Tensor, task_id: Tensor, step: int) -> Tensor:
         """(T,) metres, how far what a step's skill moves is from where it goes."""

@@ -13,7 +13,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Composite
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from torchrl.objectives import LossModule, SACLoss, TD3BCLoss
+from torchrl.objectives import SACLoss, TD3BCLoss
 
 from lw_torchrl._checks import check_choice, check_scale, checked, shown
 from lw_torchrl.objectives.reduction import Reduction, let_go, priority_weight
@@ -41,7 +41,7 @@ def imitation(action: Tensor, demonstrated: Tensor, is_demonstration: Tensor) ->
 
 
 if TYPE_CHECKING:
-    _Loss = LossModule
+    from torchrl.objectives import LossModule as _Loss
 else:
     _Loss = object  # a LossModule's metaclass would give its own forward
 
