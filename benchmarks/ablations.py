@@ -16,7 +16,7 @@ import tyro
 import lw_torchrl as lw
 from lw_torchrl._files import write_text
 from lw_torchrl.evaluation import count_solved
-from lw_torchrl.evaluation.comparison import markdown_table
+from lw_torchrl.evaluation.summary import markdown_table
 from lw_torchrl.language.named_objects import NamedObject
 from lw_torchrl.language.roles import role_object
 from lw_torchrl.language.tasks import Task

@@ -19,7 +19,7 @@ from lw_torchrl._checks import check_choice
 from lw_torchrl._files import write_json, write_text
 from lw_torchrl.data import collect_demonstrations
 from lw_torchrl.evaluation import CAUSES, attribute_failures, plot_failures
-from lw_torchrl.evaluation.comparison import markdown_table
+from lw_torchrl.evaluation.summary import markdown_table
 
 REFERENCE = Path(__file__).parent / "data" / "attribution_plans.json"
 SINGLE = {"wrong condition": "plan", "missing step": "plan", "wrong offset": "skill", "lying evaluator": "query"}

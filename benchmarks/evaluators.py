@@ -14,7 +14,7 @@ import tyro
 import lw_torchrl as lw
 from lw_torchrl._files import write_text
 from lw_torchrl.evaluation import EvaluationResult, condition_drift, drift_table, score_evaluator
-from lw_torchrl.evaluation.comparison import markdown_table
+from lw_torchrl.evaluation.summary import markdown_table
 from lw_torchrl.paper.demo import DemoConfig
 
 RECIPE = DemoConfig()

@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
 import lw_torchrl as lw
-from lw_torchrl.evaluation.visited import attended
+from lw_torchrl.evaluation.explanation import attended
 from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.language.plan_tables import PlanTables
 from lw_torchrl.language.skills import ScriptedSkill

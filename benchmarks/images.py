@@ -15,9 +15,8 @@ import lw_torchrl as lw
 from benchmarks.evaluators import WHO, demonstrations, evaluated
 from lw_torchrl._files import write_text
 from lw_torchrl.evaluation import EvaluationResult, plot_reliability, plot_wrong_answers, score_evaluator
-from lw_torchrl.evaluation.comparison import markdown_table
-from lw_torchrl.evaluation.figures import wilson_interval
-from lw_torchrl.evaluation.statistics import Estimate
+from lw_torchrl.evaluation.statistics import Estimate, wilson_interval
+from lw_torchrl.evaluation.summary import markdown_table
 
 
 @dataclass(frozen=True)

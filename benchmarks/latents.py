@@ -12,7 +12,7 @@ import tyro
 import lw_torchrl as lw
 from lw_torchrl._files import write_text
 from lw_torchrl.evaluation import count_solved
-from lw_torchrl.evaluation.comparison import markdown_table
+from lw_torchrl.evaluation.summary import markdown_table
 from lw_torchrl.paper.imitation import ImitationRun
 from lw_torchrl.paper.recipes import PRESETS, SETTINGS, Preset
 from lw_torchrl.paper.runs import execute_run

@@ -102,9 +102,8 @@ def train_evaluator(
     import torch
 
     import lw_torchrl as lw
+    from lw_torchrl.evaluation.evaluator_figures import plot_reliability, plot_wrong_answers
     from lw_torchrl.evaluation.evaluator_report import score_evaluator
-    from lw_torchrl.evaluation.reliability_figure import plot_reliability
-    from lw_torchrl.evaluation.wrong_answers import plot_wrong_answers
 
     options.use_one_thread()
     defaults = {"steps": 4000, "batch_size": 48, "learning_rate": 2e-3, "every": 5}

@@ -2,19 +2,20 @@
 
 import lw_torchrl._torchrl  # noqa: F401
 from lw_torchrl.evaluation.attribution import attribute_failures
-from lw_torchrl.evaluation.comparison import MethodComparison, Pair
-from lw_torchrl.evaluation.drift import Drift, condition_drift, drift_table
-from lw_torchrl.evaluation.evaluator_report import EvaluatorReport, score_evaluator
-from lw_torchrl.evaluation.failure_figure import plot_failures
+from lw_torchrl.evaluation.evaluator_figures import WrongAnswer, plot_reliability, plot_wrong_answers, wrong_answers
+from lw_torchrl.evaluation.evaluator_report import Drift, EvaluatorReport, condition_drift, drift_table, score_evaluator
 from lw_torchrl.evaluation.failures import CAUSES, Failure
-from lw_torchrl.evaluation.figures import plot_sorted_tasks, plot_success
-from lw_torchrl.evaluation.learning_curves import plot_learning_curves
+from lw_torchrl.evaluation.figures import (
+    plot_failures,
+    plot_learning_curves,
+    plot_methods,
+    plot_sorted_tasks,
+    plot_success,
+)
 from lw_torchrl.evaluation.many_plans import evaluate_plans
-from lw_torchrl.evaluation.method_figure import plot_methods
-from lw_torchrl.evaluation.plan_use import PlanUse
+from lw_torchrl.evaluation.plan_use import PlanUse, StuckStep, stuck_steps, stuck_table, weakest_step
 from lw_torchrl.evaluation.protocol import evaluate
 from lw_torchrl.evaluation.published import published, published_curves, published_plans
-from lw_torchrl.evaluation.reliability_figure import plot_reliability
 from lw_torchrl.evaluation.result import EpisodeResult, EvaluationResult
 from lw_torchrl.evaluation.statistics import (
     Estimate,
@@ -24,9 +25,7 @@ from lw_torchrl.evaluation.statistics import (
     mean_rate,
     probability_of_improvement,
 )
-from lw_torchrl.evaluation.stuck_steps import StuckStep, stuck_steps, stuck_table, weakest_step
-from lw_torchrl.evaluation.summary import Summary, TaskSummary, summarize, summarize_rates
-from lw_torchrl.evaluation.wrong_answers import WrongAnswer, plot_wrong_answers, wrong_answers
+from lw_torchrl.evaluation.summary import MethodComparison, Pair, Summary, TaskSummary, summarize, summarize_rates
 
 __all__ = [
     "CAUSES",

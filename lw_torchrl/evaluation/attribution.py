@@ -14,16 +14,37 @@ from torchrl.envs import EnvBase
 from lw_torchrl._checks import check_int, check_scale, checked, missing_keys
 from lw_torchrl._devices import device_of
 from lw_torchrl.envs.episodes import FinishedEpisode
-from lw_torchrl.evaluation.exchanges import Exchanges
-from lw_torchrl.evaluation.failures import Failure
-from lw_torchrl.evaluation.swaps import Again, Which, definitions, own_evaluators
-from lw_torchrl.evaluation.verdict import by_exchanges, by_rule
-from lw_torchrl.evaluation.visited import Scripts, explain, see
+from lw_torchrl.evaluation.counterfactuals import Counterfactuals, EpisodeId, Rerun, own_evaluators
+from lw_torchrl.evaluation.explanation import (
+    EpisodeStates,
+    Explanation,
+    Scripts,
+    explain,
+    in_charge,
+    settled,
+    states_of,
+)
+from lw_torchrl.evaluation.failures import Cause, Failure
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.skills import ScriptedSkill, load_skills
-from lw_torchrl.language.tasks import task_id
+from lw_torchrl.language.tasks import TASKS, task_id
 from lw_torchrl.modules.networks import evaluating
 from lw_torchrl.modules.policy import plans_of
+
+_MARGIN = 0.3  # minimum lead for a larger exchange to win, as a share of the task's failed episodes
+_EXCHANGES: dict[str, tuple[Cause, str]] = {  # the smaller ones first; time counts where nothing else mends
+    "query": ("query", "true answers"),
+    "skill": ("skill", "a script in one step"),
+    "plan": ("plan", "the reference plan"),
+    "skills": ("skill", "scripts in all steps"),
+    "time": ("out of time", "twice the time"),
+}
+_PARTS: dict[Cause, str] = {"query": "true answers", "plan": "the reference plan", "skill": "scripts"}
+_PAIRS: dict[str, tuple[Cause, Cause]] = {
+    "query + skill": ("query", "skill"),
+    "query + plan": ("query", "plan"),
+    "plan + skill": ("plan", "skill"),
+}
 
 
 @checked
@@ -44,30 +65,29 @@ def attribute_failures(
     device: str | torch.device | None = None,
     progress: bool = True,
 ) -> list[Failure]:
-    """Say of each failed episode whether a query was answered wrongly, the plan led astray, a skill was clumsy, or
-    more time was all it lacked.
+    """Say of each failed episode whether a query was answered wrongly, the plan led astray, a skill was clumsy, or it
+    only lacked time.
 
     **A rule explains.** *Query*, if the policy acted on other answers than the query answering function gives in the
     same states; else *plan*, if late in the episode the plan's true step asks for something else than the reference
-    plan's; else *skill*. Without ``actor`` that is all. Without a reference the rule is weak: it can tell wrong
-    answers, a plan of which no condition holds, and a skill that stays far from where it goes; what else there is, is
-    undecided. Even with one it is no proof, since another plan that succeeds asks for other things as well.
+    plan's; else *skill*. Without ``actor`` that is all. Without a reference the rule is weak: it tells wrong answers, a
+    plan of which no condition holds, and a skill that stays far from where it goes; the rest is undecided. Even with a
+    reference it is no proof, since another plan that succeeds may ask for other things.
 
-    **An exchange decides**, with ``actor``: the very same episode, its noise too, is run again with true answers, where
-    they were wrong; with scripted skills in one step of the plan, or, if that mends nothing, in all (where a text is
-    no scripted skill, with the expert's actions); with the reference plan; with twice the time. What alone mends the
+    **A counterfactual decides**, with ``actor``: the very same episode, its noise too, is run again with true answers,
+    where they were wrong; with scripted skills in one step of the plan, or, if that mends nothing, in all (where a text
+    is no scripted skill, with the expert's actions); with the reference plan; with twice the time. What alone mends the
     episode is its cause. Where several do, the smallest exchange counts: answers, a skill in one step, the plan,
-    skills in all steps, unless another one mends clearly more of the task's failed episodes. Time counts where
-    nothing else mends. Where no single exchange mends, pairs of them are tried, which give ``cause`` and ``also``.
-    One episode that is mended is one bit, and luck has its part in it: ``evidence`` holds how much of the task's failed
-    episodes each exchange mended.
+    skills in all steps, unless a larger one mends clearly more of the task's failed episodes. Time counts where
+    nothing else mends. Where no single exchange mends, pairs are tried, which give ``cause`` and ``also``. One mended
+    episode may be luck: ``evidence`` holds how much of the task's failed episodes each exchange mended.
 
     Args:
         rollouts: episodes as :func:`evaluate` gives them to ``on_episode``, or TensorDicts of batch (T,), each one
             episode from its first state on; those with success are left out. Keys: ``observation`` (T, 39) float32,
-            ``task_id`` (T,) int64, ``("next", "success")`` (T, 1) bool; of a TensorDict ``episode`` (T,) int64; where
-            they are there, ``qaf`` (T, S) bool, the answers that the policy acted on, ``qaf_logits`` (T, S) float32,
-            which count before ``qaf``, and ``skill_weights`` (T, S) float32, for the step in force.
+            ``task_id`` (T,) int64, ``("next", "success")`` (T, 1) bool; of a TensorDict ``episode`` (T,) int64.
+            Optional: ``qaf`` (T, S) bool, the answers that the policy acted on, or ``qaf_logits`` (T, S) float32, which
+            count before ``qaf``; ``skill_weights`` (T, S) float32, for the step in force.
         plans: the plans that were carried out.
         actor: what acted: anything with ``plans`` and ``with_plans`` that writes ``action`` and ``skill_weights``. None
             for the rule alone. One that draws its actions cannot be run again alike; its exchanges tell less.
@@ -115,7 +135,6 @@ def attribute_failures(
     Source: the plan's conditions, its steps and what carries them out are apart, so each can be exchanged.
     """
     answered = as_plans(plans)
-    check_int("seed", seed)
     check_scale("noise_scale", noise_scale)
     check_int("max_steps", max_steps, minimum=1)
     if num_envs is not None:
@@ -129,34 +148,25 @@ def attribute_failures(
     if not failed:
         return []
     names = sorted({task for task, _, _ in failed})
-    others = (
-        {}
-        if reference is None
-        else {task: plan for task, plan in as_plans(reference, "reference").items() if task in names}
-    )
+    others = {} if reference is None else as_plans(reference, "reference")
+    others = {task: plan for task, plan in others.items() if task in names}
     trusted = Plans(others) if others else None
-    seen = [see(task, k, steps, answered, _answers(steps, actor)) for task, k, steps in failed]
+    seen = [states_of(task, k, steps, answered, _answers(steps, actor)) for task, k, steps in failed]
     scripts = Scripts(answered, table)
     theirs = None if trusted is None else Scripts(trusted, table)
     told = {(one.task, one.episode): explain(one, answered, scripts, trusted, theirs) for one in seen}
     if actor is None:
-        return [by_rule(one, told[one.task, one.episode], seed) for one in seen]
-    again = Again(
-        tasks=definitions(names, answered),
-        firsts={(one.task, one.episode): one.steps.get("observation")[0] for one in seen},
-        seed=seed,
-        noise_scale=noise_scale,
-        max_steps=max_steps,
-        num_envs=num_envs,
-        engine=engine,
-        num_threads=num_threads,
-        device=device,
-        progress=progress,
-    )
-    exchanges = Exchanges(actor, answered, evaluator, trusted, scripts, table, again)
-    exchanges.run(seen, [which for which, one in told.items() if one.evidence.get("plan_departs") == 0.0])
-    shares = exchanges.shares()
-    return [by_exchanges(one, told[one.task, one.episode], exchanges, shares.get(one.task, {}), seed) for one in seen]
+        return [_by_rule(one, told[one.task, one.episode], seed) for one in seen]
+    tasks = {name: TASKS.get(name, answered[name].definition) for name in names}
+    firsts = {(one.task, one.episode): one.steps.get("observation")[0] for one in seen}
+    env = {"seed": seed, "engine": engine, "num_threads": num_threads}
+    rerun = Rerun(tasks, firsts, env, noise_scale, max_steps, num_envs, device, progress)
+    tried = Counterfactuals(actor, answered, evaluator, trusted, scripts, rerun)
+    tried.run(seen, [which for which, one in told.items() if one.evidence.get("plan_departs") == 0.0])
+    shares = tried.shares()
+    return [
+        _by_counterfactuals(one, told[one.task, one.episode], tried, shares.get(one.task, {}), seed) for one in seen
+    ]
 
 
 def _failed(
@@ -165,7 +175,7 @@ def _failed(
     """The failed episodes: task, episode and steps."""
     by_id = {task_id(task): task for task in plans}
     found: list[tuple[str, int, TensorDictBase]] = []
-    seen: set[Which] = set()
+    seen: set[EpisodeId] = set()
     for place, rollout in enumerate(rollouts):
         steps = rollout.steps if isinstance(rollout, FinishedEpisode) else rollout
         if not isinstance(steps, TensorDictBase) or steps.batch_dims != 1 or not len(steps):
@@ -220,3 +230,99 @@ def keys_to_attribute(actor: Any, env: EnvBase) -> list[NestedKey]:
     keys += [key for key in getattr(actor, "in_keys", ()) if key in there]
     keys += [key for key in ("skill_weights", "qaf_logits") if key in getattr(actor, "out_keys", ())]
     return list(dict.fromkeys(keys))
+
+
+def decide(mended: Iterable[str], shares: Mapping[str, float]) -> str | None:
+    """Of the single exchanges that mend an episode, the one that counts: the smallest, unless a larger one mends more
+    of the task's failed episodes by 0.3 of them. More time counts alone; None of none.
+
+    Args:
+        mended: of "query", "skill", a script in one step, "plan", "skills", scripts in all steps, and "time".
+        shares: for each, the share of the task's failed episodes that it mends.
+
+    Example:
+        >>> decide(["plan", "skill"], {"plan": 0.5, "skill": 0.5})
+        'skill'
+        >>> decide(["plan", "skill"], {"plan": 0.9, "skill": 0.1})
+        'plan'
+    """
+    given = set(mended)
+    best = None
+    for name in _EXCHANGES:
+        lead = best is None or (name != "time" and shares.get(name, 0.0) >= shares.get(best, 0.0) + _MARGIN)
+        best = name if name in given and lead else best
+    return best
+
+
+def decide_pair(mended: Iterable[str], shares: Mapping[str, float]) -> tuple[Cause, Cause] | None:
+    """The pair that counts, the first the cause: wrong answers, which are a fact; else what alone mends more of the
+    task's failed episodes."""
+    alone = {**shares, "skill": max(shares.get("skill", 0.0), shares.get("skills", 0.0))}
+    found = [_PAIRS[name] for name in mended if name in _PAIRS]
+    if not found:
+        return None
+    cause, also = max(found, key=lambda pair: sum(alone.get(name, 0.0) for name in pair))
+    later = cause != "query" and alone.get(also, 0.0) > alone.get(cause, 0.0)
+    return (also, cause) if later else (cause, also)
+
+
+def _by_rule(one: EpisodeStates, told: Explanation, seed: int) -> Failure:
+    """What the states alone tell."""
+    cause = told.cause
+    words = ["The states alone do not tell"] if cause == "undecided" else []
+    why = _text(*words, told.why[cause])
+    return Failure(one.task, seed, one.episode, cause, None, told.steps[cause], told.at[cause], why, told.evidence)
+
+
+def _by_counterfactuals(
+    one: EpisodeStates, told: Explanation, tried: Counterfactuals, shares: Mapping[str, float], seed: int
+) -> Failure:
+    """What the counterfactuals tell, explained by the states."""
+    which = one.task, one.episode
+    first = {name: results[which] for name, results in tried.found.items() if which in results}
+    mended = [name for name, hit in first.items() if hit is not None]
+    swaps: dict[str, bool] = {}
+    for name in first:
+        shown = "skill" if name == "skills" else name
+        swaps[shown] = swaps.get(shown, False) or name in mended
+    cause: Cause = "undecided"
+    also: Cause | None = None
+    same = told.evidence.get("plan_departs") == 0.0
+    best = decide([name for name in mended if not (same and name == "plan")], shares)
+    if best is not None:
+        cause, exchanged = _EXCHANGES[best]
+        words = f"With {exchanged} the same episode succeeds, at step {first[best]}"
+        if others := [name for name in mended if name in _EXCHANGES and name not in ("time", best)]:
+            words += f"; with {_listed(others, 'and')} too, which is more to exchange or mends less of the task"
+    elif (pair := decide_pair(mended, shares)) is not None:
+        cause, also = pair
+        words = f"Neither {_PARTS[cause]} nor {_PARTS[also]} alone mend it, both together do"
+    elif same and "plan" in mended:
+        words = "With the reference plan it succeeds, though in no state that asks for anything else"
+    elif told.cause == "query" and "query" not in first:
+        cause, words = "query", "These answers could not be exchanged"
+    elif first:
+        words = f"It fails as well with {_listed(first, 'or with')}"
+    else:
+        words = "There is nothing to exchange"
+    if cause == "undecided" and told.cause != "undecided":
+        words += f". By the states alone it would be the {told.cause}: {told.why[told.cause]}"
+    step, at, why = told.steps[cause], told.at[cause], told.why[cause]
+    if best == "skill":
+        step = tried.step[which]
+        at, why = settled(one, step), in_charge(one, tried.plans[one.task], step)
+    by = {f"mended_by_{name.replace(' + ', '_and_')}": share for name, share in shares.items()}
+    evidence = {**told.evidence, **by}
+    return Failure(one.task, seed, one.episode, cause, also, step, at, _text(why, words), evidence, swaps)
+
+
+def _listed(names: Iterable[str], joint: str) -> str:
+    words = [
+        _EXCHANGES[name][1] if name in _EXCHANGES else " and ".join(_PARTS[part] for part in _PAIRS[name])
+        for name in names
+    ]
+    return f" {joint} ".join(words) if len(words) < 3 else f"{', '.join(words[:-1])} {joint} {words[-1]}"
+
+
+def _text(*sentences: str) -> str:
+    return " ".join(f"{one[0].upper()}{one[1:]}." for one in sentences)

@@ -1,19 +1,24 @@
-"""EvaluatorReport: how often a query evaluator is right, where it is worst, and whether its doubts are true."""
+"""How a query evaluator answers: how often it is right, whether its doubts are true, where it left its words."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from lw_torchrl._checks import checked
 from lw_torchrl._files import write_json
+from lw_torchrl.language.tasks import task_id
 from lw_torchrl.modules.clause_evaluator import ClauseEvaluator
 from lw_torchrl.modules.networks import evaluating
+from lw_torchrl.modules.query_evaluator import QueryEvaluator
 from lw_torchrl.training.labelled_queries import Asked, LabelledQueries
+from lw_torchrl.transforms.qaf import plan_program
 
 BINS = 15
 PARTS = {
@@ -46,13 +51,13 @@ class PartScore:
 
     def accuracy(self, predicate: str | None = None) -> float:
         """The share of right answers, to one predicate or to all."""
-        names = list(self.asked) if predicate is None else [predicate]
+        names = self.asked if predicate is None else [predicate]
         return sum(sum(self.right[name]) for name in names) / sum(sum(self.asked[name]) for name in names)
 
     def balanced_accuracy(self, predicate: str | None = None) -> float:
         """The mean of the shares of right answers where the predicate holds and where it does not; of a truth that
         never comes there is none."""
-        names = list(self.asked) if predicate is None else [predicate]
+        names = self.asked if predicate is None else [predicate]
         pairs = [[sum(table[name][truth] for name in names) for table in (self.right, self.asked)] for truth in (0, 1)]
         shares = [right / asked for right, asked in pairs if asked]
         return sum(shares) / len(shares)
@@ -166,8 +171,7 @@ def _score(evaluator: ClauseEvaluator, data: LabelledQueries, part: str) -> Part
 
 
 def clause_logits(evaluator: ClauseEvaluator, asked: Asked) -> list[tuple[Tensor, Tensor]]:
-    """Logits (R, Q) that the predicates hold, and their truth; of an evaluator that reads texts also as it answers the
-    negations."""
+    """Logits (R, Q) that the predicates hold, and their truth; one that reads texts is asked negations too."""
     coded, vectors = evaluator.code([(asked.task, clause) for clause in asked.clauses])
     every = [
         evaluator.network(rows, coded.pick(torch.arange(len(coded.predicate)).expand(len(rows), -1)), vectors)
@@ -180,3 +184,73 @@ def clause_logits(evaluator: ClauseEvaluator, asked: Asked) -> list[tuple[Tensor
 def _add(table: dict[str, tuple[int, int]], name: str, more: list[int]) -> None:
     false, true = table.get(name, (0, 0))
     table[name] = (false + more[0], true + more[1])
+
+
+@dataclass(frozen=True)
+class Drift:
+    """What a condition has come to mean.
+
+    Attributes:
+        task: its plan's.
+        step: its number, from 0.
+        condition: its words.
+        states: how many were looked at.
+        exact, believed: the share of them in which it holds by its words, and by the evaluator.
+        agreement: the share in which both say the same.
+    """
+
+    task: str
+    step: int
+    condition: str
+    states: int
+    exact: float
+    believed: float
+    agreement: float
+
+
+@checked
+def condition_drift(policy: Any, states: TensorDictBase) -> list[Drift]:
+    """Compare the answers of a policy's evaluator with the query answering function's, the least agreement first.
+
+    Args:
+        policy: one with an evaluator, or an evaluator.
+        states: (R,) rows with ``observation`` (R, 39) float32, ``task_id`` (R,) int64 and what the evaluator reads, of
+            a replay buffer, ``replay[:]``, or a rollout; conditions of other tasks are left out.
+
+    Raises:
+        ValueError: the policy has no evaluator.
+
+    Example:
+        >>> import lw_torchrl as lw
+        >>> plans = lw.Plans({"reach": lw.load_plans("MT10")["reach"]})
+        >>> env = lw.LanguageWorldEnv("reach")
+        >>> states = env.rollout(5).reshape(-1)
+        >>> env.close()
+        >>> len(condition_drift(lw.StateQueryEvaluator(plans), states))
+        3
+    """
+    evaluator = policy if isinstance(policy, QueryEvaluator) else getattr(policy, "evaluator", None)
+    if not isinstance(evaluator, QueryEvaluator):
+        raise ValueError(f"policy must have an evaluator, {type(policy).__name__} has none")
+    program, found = plan_program(evaluator.plans), []
+    for task, plan in evaluator.plans.items():
+        rows = states[states.get("task_id") == task_id(task)]
+        if not len(rows):
+            continue
+        with torch.no_grad(), evaluating(evaluator):
+            believed = evaluator.answers(*(rows.get(key) for key in evaluator.in_keys)) > 0
+        exact = program(rows.get("observation"), rows.get("task_id"))
+        shares = [part.double().mean(0).tolist() for part in (exact, believed, exact == believed)]
+        for step, (one, *numbers) in enumerate(zip(plan.steps, *shares, strict=False)):
+            found.append(Drift(task, step, str(one.condition), len(rows), *numbers))
+    return sorted(found, key=lambda drift: (drift.agreement, drift.task, drift.step))
+
+
+@checked
+def drift_table(drifts: Sequence[Drift], most: int = 10) -> str:
+    """The first so many as text."""
+    lines = [f"{'agrees':>6} {'by its words':>12} {'believed':>8}  condition"]
+    for one in drifts[:most]:
+        where = f"{one.task}, step {one.step + 1}: {one.condition}"
+        lines.append(f"{one.agreement:6.2f} {one.exact:12.2f} {one.believed:8.2f}  {where}")
+    return "\n".join(lines)

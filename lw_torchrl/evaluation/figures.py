@@ -1,8 +1,7 @@
-"""Figures of results."""
+"""Figures of results: success, failures, methods, tasks sorted by success, learning."""
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,30 +11,50 @@ import numpy as np
 
 from lw_torchrl._checks import check_choice, checked, counted
 from lw_torchrl._files import replacing
-from lw_torchrl.evaluation.result import EvaluationResult
-from lw_torchrl.evaluation.statistics import Array, check_rates
+from lw_torchrl.evaluation.failures import CAUSES, count_causes
+from lw_torchrl.evaluation.result import EvaluationResult, attributed
+from lw_torchrl.evaluation.statistics import Array, check_rates, wilson_interval
 from lw_torchrl.evaluation.summary import Summary
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 _FORMATS = (".png", ".svg", ".pdf", ".jpg", ".jpeg")
-_Z = 1.96  # of a 95 % interval
+Rates = Mapping[str, float | Sequence[float]]
+COLORS = ("#4c78a8", "#f58518", "#54a24b", "#b279a2", "#9d755d", "#e45756")
+_DASHES = ((0, (5, 2)), (0, (1, 1.5)), (0, (5, 1, 1, 1)), (0, (3, 3)))
+_CAUSE_COLORS = dict(zip(CAUSES, ("#4c78a8", "#f58518", "#54a24b", "#b279a2", "#bab0ac"), strict=True))
+Curve = Sequence[tuple[float, float]]  # points: steps of the environment, success rate in [0, 1]
 
 
-def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
-    """The 95 % Wilson score interval of a success rate.
+def check_image(path: str | os.PathLike[str] | None) -> None:
+    """Raise :class:`ValueError` unless the file's name tells a format."""
+    if path is not None and (given := Path(path).suffix.lower()) not in _FORMATS:
+        raise ValueError(f"path must end in {', '.join(_FORMATS)}, got {given!r} of {str(path)!r}")
 
-    Example:
-        >>> low, high = wilson_interval(20, 20)
-        >>> round(low, 2), high
-        (0.84, 1.0)
-    """
-    rate, squared = successes / trials, _Z**2
-    center = (rate + squared / (2 * trials)) / (1 + squared / trials)
-    half = _Z / (1 + squared / trials) * math.sqrt(rate * (1 - rate) / trials + squared / (4 * trials**2))
-    return max(0.0, center - half), min(1.0, center + half)
+
+def new_figure(width: float, height: float) -> Figure:
+    """An empty figure of so many inches."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def saved(figure: Figure, path: str | os.PathLike[str] | None) -> Figure:
+    if path is not None:
+        with replacing(path) as temporary:
+            figure.savefig(temporary, dpi=140)
+    return figure
+
+
+def trim(axes: Axes, grid: Literal["x", "y"] | None = None) -> None:
+    """Take the upper and right spines away; lines across ``grid`` stand behind what is drawn."""
+    axes.spines[["top", "right"]].set_visible(False)
+    if grid is not None:
+        axes.grid(axis=grid, color="#dddddd", linewidth=0.6)
+        axes.set_axisbelow(True)
 
 
 @checked
@@ -44,14 +63,8 @@ def plot_success(result: EvaluationResult, path: str | os.PathLike[str] | None =
 
     Args:
         result: of :func:`evaluate`.
-        path: an image file, .png, .svg, .pdf or .jpg; it is replaced whole. None for none.
+        path: an image file, .png, .svg, .pdf or .jpg, replaced whole; None for none.
         title: above the figure.
-
-    Returns:
-        The figure.
-
-    Raises:
-        ValueError: another format.
 
     Example:
         >>> import lw_torchrl as lw
@@ -59,26 +72,17 @@ def plot_success(result: EvaluationResult, path: str | os.PathLike[str] | None =
         >>> plot_success(result).axes[0].get_title()
         'mean over 1 task: 1.000'
     """
-    from matplotlib.figure import Figure
-
     check_image(path)
     rates = {task: rate for task, rate in result.success_once.items() if rate is not None}
     trials = result.config["episodes_per_task"]
     tasks = sorted(rates, key=lambda task: (rates[task], task))
-    figure = Figure(figsize=(8.0, 1.6 + 0.27 * len(tasks)), layout="constrained")
+    figure = new_figure(8.0, 1.6 + 0.27 * len(tasks))
     axes = figure.subplots()
-    intervals = [wilson_interval(round(rates[task] * trials), trials) for task in tasks]
-    errors = [
-        [max(0.0, rates[task] - low) for task, (low, _) in zip(tasks, intervals, strict=True)],
-        [max(0.0, high - rates[task]) for task, (_, high) in zip(tasks, intervals, strict=True)],
-    ]
-    axes.barh(
-        tasks,
-        [rates[task] for task in tasks],
-        xerr=errors,
-        color="#4c78a8",
-        error_kw={"ecolor": "#333333", "elinewidth": 1, "capsize": 2},
-    )
+    values = [rates[task] for task in tasks]
+    intervals = [wilson_interval(round(rate * trials), trials) for rate in values]
+    ends = [(max(0.0, rate - low), max(0.0, high - rate)) for rate, (low, high) in zip(values, intervals, strict=True)]
+    bars = {"ecolor": "#333333", "elinewidth": 1, "capsize": 2}
+    axes.barh(tasks, values, xerr=list(zip(*ends, strict=True)), color="#4c78a8", error_kw=bars)
     axes.axvline(result.mean_success, color="#e45756", linestyle="--")
     axes.set_xlim(0, 1.02)
     axes.margins(y=0.5 / len(tasks))
@@ -86,13 +90,55 @@ def plot_success(result: EvaluationResult, path: str | os.PathLike[str] | None =
         f"episodes with success at any step (of {trials}; action noise {result.config['noise_scale']}; bars: 95 %)"
     )
     axes.set_title(f"{title}\nmean over {counted(len(tasks), 'task')}: {result.mean_success:.3f}".strip())
-    axes.spines[["top", "right"]].set_visible(False)
+    trim(axes)
     return saved(figure, path)
 
 
-Rates = Mapping[str, float | Sequence[float]]
-COLORS = ("#4c78a8", "#f58518", "#54a24b", "#b279a2", "#9d755d", "#e45756")
-_DASHES = ((0, (5, 2)), (0, (1, 1.5)), (0, (5, 1, 1, 1)), (0, (3, 3)))
+@checked
+def plot_failures(result: EvaluationResult, path: str | os.PathLike[str] | None = None, *, title: str = "") -> Figure:
+    """Draw how many episodes of each task failed, and of what; the task with most failures at the top.
+
+    Args:
+        result: of ``evaluate(..., attribute=True)``.
+        path: an image file, .png, .svg, .pdf or .jpg, replaced whole; None for none.
+        title: above the figure.
+
+    Raises:
+        ValueError: another format, or a result whose failures were not attributed.
+
+    Example:
+        >>> from lw_torchrl.evaluation import EpisodeResult, Failure
+        >>> config = {"tasks": ["reach"], "episodes_per_task": 1, "max_steps": 500, "seed": 0}
+        >>> episode = EpisodeResult("reach", 0, False, None, None, None)
+        >>> failure = Failure("reach", 0, 0, "skill", None, 1, 40, "It missed.")
+        >>> plot_failures(EvaluationResult(config, (episode,), failures=(failure,))).axes[0].get_title()
+        '1 of 1 episode failed'
+    """
+    from matplotlib.ticker import MaxNLocator
+
+    check_image(path)
+    failures, trials = attributed(result), result.config["episodes_per_task"]
+    counts = count_causes(result.config["tasks"], failures)
+    tasks = sorted((task for task in counts if sum(counts[task].values())), key=lambda t: (sum(counts[t].values()), t))
+    figure = new_figure(8.0, 1.9 + 0.27 * len(tasks))
+    axes = figure.subplots()
+    left = dict.fromkeys(tasks, 0)
+    for cause, meaning in CAUSES.items():
+        numbers = [counts[task][cause] for task in tasks]
+        label = f"{cause}: {meaning} ({sum(numbers)})"
+        bars = axes.barh(tasks, numbers, left=list(left.values()), color=_CAUSE_COLORS[cause], label=label, height=0.7)
+        axes.bar_label(bars, [str(n) if n else "" for n in numbers], label_type="center", color="white", fontsize=8)
+        for task, number in zip(tasks, numbers, strict=True):
+            left[task] += number
+    axes.set_xlim(0, trials * 1.02)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.margins(y=0.5 / max(1, len(tasks)))
+    axes.set_xlabel(f"failed episodes (of {trials}; tasks without any are left out)")
+    episodes = counted(trials * len(counts), "episode")
+    axes.set_title(f"{title}\n{len(failures)} of {episodes} failed".strip())
+    trim(axes)
+    figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=9)
+    return saved(figure, path)
 
 
 @checked
@@ -113,15 +159,12 @@ def plot_sorted_tasks(
     Args:
         curves: a method's name to its :class:`Summary`, or to (task to its rates, one per seed), in [0, 1]. All have
             the same tasks.
-        path: an image file, .png, .svg, .pdf or .jpg; it is replaced whole. None for none.
+        path: an image file, .png, .svg, .pdf or .jpg, replaced whole; None for none.
         published: label to (task to rate), of the same tasks at least; :func:`published_curves` gives them.
         order: "shared" sorts the tasks by the first method, so that each place on x is one named task; "own" sorts
             every curve for itself, as the paper does: x is then a rank.
         of: what a rate is of, for the legend: "seed", "plan".
         title: above the figure.
-
-    Returns:
-        The figure.
 
     Raises:
         ValueError: no curves, methods with different tasks, or rates outside [0, 1].
@@ -133,8 +176,6 @@ def plot_sorted_tasks(
 
     Source: paper, figures of section 'Conditional Plan Experiments'.
     """
-    from matplotlib.figure import Figure
-
     check_image(path)
     check_choice("order", order, ("shared", "own"))
     if not curves:
@@ -151,7 +192,7 @@ def plot_sorted_tasks(
         if missing := [task for task in tasks if task not in rates]:
             raise ValueError(f"published[{label!r}] lacks the tasks {missing}")
 
-    figure = Figure(figsize=(max(7.0, 3.5 + 0.21 * len(tasks)), 6.4), layout="constrained")
+    figure = new_figure(max(7.0, 3.5 + 0.21 * len(tasks)), 6.4)
     axes = figure.subplots()
     for k, (method, rates) in enumerate(named.items()):
         _draw_method(axes, method, np.stack([rates[task] for task in tasks]), COLORS[k % len(COLORS)], order, of)
@@ -163,25 +204,10 @@ def plot_sorted_tasks(
     axes.set_ylabel("episodes with success at any step")
     axes.set_xlim(-0.5, len(tasks) - 0.5)
     axes.set_ylim(-0.02, 1.02)
-    axes.grid(axis="y", color="#dddddd", linewidth=0.6)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
+    trim(axes, "y")
     axes.set_title(title)
     _add_legend(figure, axes, len(named))
     return saved(figure, path)
-
-
-def check_image(path: str | os.PathLike[str] | None) -> None:
-    """Raise :class:`ValueError` unless the file's name tells a format."""
-    if path is not None and (given := Path(path).suffix.lower()) not in _FORMATS:
-        raise ValueError(f"path must end in {', '.join(_FORMATS)}, got {given!r} of {str(path)!r}")
-
-
-def saved(figure: Figure, path: str | os.PathLike[str] | None) -> Figure:
-    if path is not None:
-        with replacing(path) as temporary:
-            figure.savefig(temporary, dpi=140)
-    return figure
 
 
 def _add_legend(figure: Figure, axes: Axes, methods: int) -> None:
@@ -204,9 +230,8 @@ def _draw_method(axes: Axes, method: str, rates: Array, color: str, order: str, 
     mean, x, seeds = rates.mean(1), range(len(rates)), rates.shape[1]
     spread = f"1 {of}" if seeds == 1 else f"{seeds} {of}s, min–max shaded"
     axes.fill_between(x, rates.min(1), rates.max(1), color=color, alpha=0.16, linewidth=0)
-    axes.plot(
-        x, mean, color=color, linewidth=2, marker=".", zorder=3, label=f"{method}: mean {mean.mean():.2f} ({spread})"
-    )
+    label = f"{method}: mean {mean.mean():.2f} ({spread})"
+    axes.plot(x, mean, color=color, linewidth=2, marker=".", zorder=3, label=label)
     axes.axhline(float(mean.mean()), color=color, linewidth=1.2, alpha=0.8)
 
 
@@ -227,3 +252,111 @@ def _as_rates(argument: str, given: Rates | Summary | Mapping[str, float]) -> di
         raise ValueError(f"{argument} must hold a rate per seed for each task, got different numbers of them")
     check_rates(argument, list(columns.values()))
     return columns
+
+
+@checked
+def plot_learning_curves(
+    curves: Mapping[str, Mapping[str, Sequence[Curve]]],
+    path: str | os.PathLike[str] | None = None,
+    *,
+    starts: Mapping[str, float] | None = None,
+    title: str = "",
+) -> Figure:
+    """Draw success by steps of the environment: a panel for each task, a line for each method.
+
+    A line is the mean over seeds, its band spans the least and the greatest seed.
+
+    Args:
+        curves: task to method to the curve of each seed; those of a method in a task have the same steps.
+        path: an image file, .png, .svg, .pdf or .jpg, replaced whole; None for none.
+        starts: task to the success rate before, as a dotted line.
+        title: above the figure.
+
+    Raises:
+        ValueError: no curves, seeds of different steps, or another format.
+
+    Example:
+        >>> figure = plot_learning_curves({"push": {"td3": [[(0, 0.2), (5000, 0.9)], [(0, 0.3), (5000, 0.7)]]}})
+        >>> figure.axes[0].get_title()
+        'push'
+    """
+    check_image(path)
+    if not curves:
+        raise ValueError("curves must hold at least one task, got none")
+    methods = list(dict.fromkeys(method for found in curves.values() for method in found))
+    columns = min(len(curves), 4)
+    rows = -(-len(curves) // columns)
+    figure = new_figure(max(4.8, 3.4 * columns), 3.0 * rows + 0.9)
+    panels = np.atleast_1d(figure.subplots(rows, columns, sharex=True, sharey=True)).ravel()
+    for axes, (task, found) in zip(panels, curves.items(), strict=False):
+        for method, seeds in found.items():
+            steps = [[step for step, _ in curve] for curve in seeds]
+            if any(one != steps[0] for one in steps):
+                raise ValueError(f"curves[{task!r}][{method!r}] must have the same steps in all seeds")
+            rates = np.array([[rate for _, rate in curve] for curve in seeds])
+            color, x = COLORS[methods.index(method) % len(COLORS)], np.array(steps[0]) / 1000
+            axes.fill_between(x, rates.min(0), rates.max(0), color=color, alpha=0.16, linewidth=0)
+            label = f"{method} ({counted(len(seeds), 'seed')})"
+            axes.plot(x, rates.mean(0), color=color, linewidth=2, marker=".", label=label)
+        if starts is not None and task in starts:
+            axes.axhline(starts[task], color="#333333", linewidth=1.2, linestyle=":", label="start, evaluated")
+        axes.set_title(task, fontsize=10)
+        axes.set_xlabel("thousand steps of the environment", fontsize=9)
+        axes.set_ylim(-0.02, 1.02)
+        trim(axes, "y")
+    for axes in panels[len(curves) :]:
+        axes.set_visible(False)
+    figure.supylabel("success in training", fontsize=10)
+    named: dict[str, Artist] = {}
+    for axes in panels[: len(curves)]:
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            named.setdefault(label, handle)
+    figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=4, frameon=False, fontsize=9)
+    figure.suptitle(title)
+    return saved(figure, path)
+
+
+@checked
+def plot_methods(
+    groups: Mapping[str, Mapping[str, Summary]], path: str | os.PathLike[str] | None = None, *, title: str = ""
+) -> Figure:
+    """Draw the mean success of each method: a bar for the mean over seeds and tasks with its 95 % interval, a dot for
+    each seed; methods from the top in the order in which they are given.
+
+    Args:
+        groups: a column's name to its methods' summaries by name.
+        path: an image file, .png, .svg, .pdf or .jpg, replaced whole; None for none.
+        title: above the figure.
+
+    Example:
+        >>> from lw_torchrl.evaluation import summarize_rates
+        >>> figure = plot_methods({"B": {"bc": summarize_rates({"push": [0.5, 0.7]})}})
+        >>> figure.axes[0].get_title()
+        'B'
+    """
+
+    check_image(path)
+    if not groups:
+        raise ValueError("groups must hold at least one, got none")
+    labels = list(dict.fromkeys(label for methods in groups.values() for label in methods))
+    figure = new_figure(2.6 + 3.0 * len(groups), 1.3 + 0.3 * len(labels))
+    columns = np.atleast_1d(figure.subplots(1, len(groups), sharey=True))
+    for axes, (group, methods) in zip(columns, groups.items(), strict=True):
+        for place, label in enumerate(labels):
+            if (found := methods.get(label)) is None:
+                continue
+            mean, seeds = found.mean, found.array.mean(1)
+            axes.barh(place, mean.value, color="#4c78a8" if place == 0 else "#b8c9de", height=0.7)
+            if mean.low is not None:
+                axes.plot([mean.low, mean.high], [place, place], color="#333333", linewidth=1.2)
+            axes.plot(seeds, np.full(len(seeds), place), ".", color="#f58518", markersize=5, zorder=3)
+            axes.text(1.04, place, f"{mean.value:.2f}", va="center", fontsize=8, color="#222222")
+        axes.set_title(group)
+        axes.set_xlim(0, 1.18)
+        axes.set_xticks(np.linspace(0, 1, 6))
+        axes.set_yticks(range(len(labels)), labels, fontsize=9)
+        trim(axes, "x")
+    figure.axes[0].invert_yaxis()
+    figure.supxlabel("episodes with success at any step; dots: seeds; lines: 95 %", fontsize=9)
+    figure.suptitle(title)
+    return saved(figure, path)

@@ -12,9 +12,9 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from lw_torchrl._checks import check_choice, check_int, check_scale, checked
+from lw_torchrl._checks import check_int, check_scale, checked
 from lw_torchrl._progress import Progress
-from lw_torchrl.envs.episodes import FinishedEpisode, policy_of, run_episodes
+from lw_torchrl.envs.episodes import policy_of, run_episodes
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.language.query_program import QueryProgram
@@ -45,8 +45,8 @@ def evaluate_plans(
     """Carry out many plans, several of a task too, by scripted skills: the success of each in episodes 0 to k - 1.
 
     All run in one environment, whose rows take the next episode of any plan of their task. Every plan meets the same
-    initial states. The result depends neither on ``num_envs`` nor on the plans beside: plans that are equal fare
-    equally. Where no condition holds, the last step's skill acts.
+    initial states. The result depends neither on ``num_envs`` nor on the plans beside. Where no condition holds, the
+    last step's skill acts.
 
     Args:
         plans: every step's skill is the text of a scripted one, as ``DecodedPlan.scripted`` has them.
@@ -79,8 +79,6 @@ def evaluate_plans(
     if not plans:
         raise ValueError("plans must be one at least, got none")
     check_int("episodes", episodes, minimum=1)
-    check_int("seed", seed)
-    check_choice("choose", choose, ("random", "first"))
     check_scale("noise_scale", noise_scale)
     check_int("num_envs", num_envs, minimum=1)
     by_task: dict[str, dict[str, list[int]]] = {}  # fingerprint to the plans of it
@@ -114,24 +112,13 @@ def evaluate_plans(
                 place=_PLACE,
                 on_progress=bar.update,
             ):
-                same = equal[one.task][int(one.steps.get(_PLACE)[0]) // episodes]
-                _note(won, same, one, episodes, on_plan)
+                for index in equal[one.task][int(one.steps.get(_PLACE)[0]) // episodes]:
+                    won.setdefault(index, {})[one.episode] = one.first_success is not None
+                    if len(won[index]) == episodes and on_plan is not None:
+                        on_plan(index, _in_order(won[index]))
     finally:
         env.close()
     return [_in_order(won[index]) for index in range(len(plans))]
-
-
-def _note(
-    won: dict[int, dict[int, bool]],
-    same: Sequence[int],
-    one: FinishedEpisode,
-    episodes: int,
-    on_plan: Callable[[int, tuple[bool, ...]], object] | None,
-) -> None:
-    for index in same:
-        won.setdefault(index, {})[one.episode] = one.first_success is not None
-        if len(won[index]) == episodes and on_plan is not None:
-            on_plan(index, _in_order(won[index]))
 
 
 def _in_order(found: Mapping[int, bool]) -> tuple[bool, ...]:
@@ -160,7 +147,9 @@ class _PlanOfRow(nn.Module):
         first: dict[str, int] = {}
         rows: list[list[tuple[int, int, bool]]] = []
         for task, listed in plans.items():
-            definition, first[task] = _one_definition(task, listed), len(rows)
+            definition, first[task] = listed[0].definition, len(rows)
+            if any(plan.definition != definition for plan in listed):
+                raise ValueError(f"plans of {task!r} must mean one task, got different definitions of it")
             asked = list(dict.fromkeys(step.condition for plan in listed for step in plan.steps))
             done = list(dict.fromkeys(step.skill for plan in listed for step in plan.steps))
             conditions[definition], texts[definition] = asked, done
@@ -200,14 +189,8 @@ class _PlanOfRow(nn.Module):
         return (torch.from_numpy((ranks >> np.uint64(12)).astype(np.int64)) + 1).masked_fill(~truth, 0).argmax(-1)
 
 
-def _one_definition(task: str, listed: Sequence[ConditionalPlan]) -> Any:
-    if any(plan.definition != listed[0].definition for plan in listed):
-        raise ValueError(f"plans of {task!r} must mean one task, got different definitions of it")
-    return listed[0].definition
-
-
 def _drawn(*keys: int | NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Numbers that hang on the keys alone, (N,) uint64 or what they broadcast to: splitmix64 after each."""
+    """Numbers that depend only on the keys, (N,) uint64 or what they broadcast to: splitmix64 after each."""
     found = np.zeros(1, dtype=np.uint64)
     for key in keys:
         found = found ^ (np.uint64(key % 2**64) if isinstance(key, int) else key)

@@ -1,8 +1,8 @@
-"""How plans fare: which steps hold in which states, which were chosen, and where a policy got stuck."""
+"""How plans fare: which steps hold in which states, which were chosen, and where failed episodes got stuck."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from statistics import median
 from typing import Any, NamedTuple
@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.nn.functional import one_hot
 from torchrl.envs import TransformedEnv
 
+from lw_torchrl._checks import check_choice, checked
 from lw_torchrl.envs.episodes import FinishedEpisode, run_episodes
 from lw_torchrl.envs.experts import ExpertActor
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
@@ -22,7 +23,7 @@ from lw_torchrl.transforms import QAFTransform
 _AFTER = 20  # steps after the first success that still count, as in training data
 _ROWS = 250  # or so, stepped together
 _A_WHILE = 5  # states in which a step must have been in charge for an episode to have reached it
-_STUCK = 50  # the last steps of a failed episode, in which it got nowhere
+_LATE = 50  # the last steps of a failed episode, in which it got nowhere
 
 
 @dataclass
@@ -85,13 +86,24 @@ class PlanUse:
         qaf = episode.steps.get("qaf")[: before + _AFTER, :steps]
         weights = episode.steps.get("skill_weights", None)
         chosen = None if weights is None else weights[: before + _AFTER, :steps].argmax(-1)
-        self._seen.setdefault(episode.task, []).append(
-            _Episode(episode.episode, qaf, chosen, before, success is not None)
-        )
+        one = _Episode(episode.episode, qaf, chosen, before, success is not None)
+        self._seen.setdefault(episode.task, []).append(one)
 
     def tasks(self) -> dict[str, TaskUse]:
         """What was seen of each task."""
         return {task: _summed(seen) for task, seen in sorted(self._seen.items())}
+
+
+def where_stuck(in_charge: Tensor, window: int) -> tuple[int, int]:
+    """Of the last so many states of an episode, the step most often in charge, and the last one in charge for a while.
+
+    Args:
+        in_charge: (T, S) int64, 1 where a step is in charge; several may be.
+        window: how many states.
+    """
+    states = in_charge[-window:].sum(0)
+    reached = (states >= states.max().clamp(1, _A_WHILE)).nonzero()
+    return int(states.argmax()), int(reached[-1]) if len(reached) else 0
 
 
 def _summed(seen: list[_Episode]) -> TaskUse:
@@ -102,10 +114,8 @@ def _summed(seen: list[_Episode]) -> TaskUse:
     for one in seen:
         if not one.success:
             in_charge = one.qaf.long() if one.chosen is None else one_hot(one.chosen, steps)
-            stuck[int(in_charge[-_STUCK:].sum(0).argmax())] += 1
-            states = in_charge.sum(0)
-            reached = (states >= states.max().clamp(1, _A_WHILE)).nonzero()
-            furthest[int(reached[-1]) if len(reached) else 0] += 1
+            stuck[where_stuck(in_charge, _LATE)[0]] += 1
+            furthest[where_stuck(in_charge, len(in_charge))[1]] += 1
     shares: list[float] = []
     chosen = [one.chosen for one in seen if one.chosen is not None]
     if len(chosen) == len(seen):
@@ -153,9 +163,93 @@ def expert_use(
     rows = len(names) * min(episodes_per_task, -(-_ROWS // len(names)))
     env = TransformedEnv(LanguageWorldEnv(names, num_envs=rows, seed=seed, strict=True), QAFTransform(answered))
     episodes = {task: range(episodes_per_task) for task in names}
-    for finished in run_episodes(
-        env, ExpertActor(names), episodes, keys=["qaf", ("next", "success")], after_success=_AFTER
-    ):
+    keys = ["qaf", ("next", "success")]
+    for finished in run_episodes(env, ExpertActor(names), episodes, keys=keys, after_success=_AFTER):
         use(finished)
     env.close()
     return use.tasks()
+
+
+@dataclass(frozen=True)
+class StuckStep:
+    """A step of a plan, and how many failed episodes ended in it, or came no further.
+
+    Attributes:
+        task: the plan's.
+        step: its number, counted from 0.
+        condition, skill: its words.
+        stuck: in how many failed episodes it was the one in charge in the last 50 steps.
+        furthest: in how many failed episodes it was the last of the plan's steps that was in charge for a while.
+        failed: episodes of the task that failed.
+    """
+
+    task: str
+    step: int
+    condition: str
+    skill: str
+    stuck: int
+    furthest: int
+    failed: int
+
+
+@checked
+def stuck_steps(use: PlanUse) -> list[StuckStep]:
+    """Every step of the plans of the tasks that were seen, in their order.
+
+    Example:
+        >>> import lw_torchrl as lw
+        >>> plans = lw.load_plans("MT10")
+        >>> use = PlanUse(plans)
+        >>> run = dict(tasks="push", episodes_per_task=2, seed=1_000, max_steps=60, on_episode=use)
+        >>> _ = lw.evaluate(lw.PlanConditionedActor(plans), also_record=["qaf", "skill_weights"], **run)
+        >>> [(step.skill, step.stuck) for step in stuck_steps(use)][0]
+        ('place the gripper above the puck', 2)
+    """
+    return [
+        StuckStep(task, k, str(step.condition), step.skill, found.stuck[k], found.furthest[k], found.failed)
+        for task, found in use.tasks().items()
+        for k, step in enumerate(use.plans[task].steps)
+    ]
+
+
+@checked
+def weakest_step(use: PlanUse, task: str | None = None) -> StuckStep:
+    """The step that most failed episodes came to and not beyond, the first of them if there are several.
+
+    It is not the step in which they ended: a puck that is dropped lies there again, and the gripper ends above it, in
+    the first step, which is sound. Plans are written in the order in which their steps come.
+
+    Args:
+        use: what evaluated episodes told.
+        task: whose step; None for any.
+
+    Raises:
+        ValueError: a task that was not seen; no episode failed.
+    """
+    found = stuck_steps(use)
+    if task is not None:
+        check_choice("task", task, use.tasks())
+        found = [step for step in found if step.task == task]
+    weakest = max(found, key=lambda step: step.furthest, default=None)
+    if weakest is None or not weakest.failed:
+        raise ValueError("use must hold failed episodes for a step to be the weakest, none failed")
+    return weakest
+
+
+@checked
+def stuck_table(steps: Sequence[StuckStep]) -> str:
+    """A line for each step, counted from 1: how many failed episodes ended in it, and how many came no further.
+
+    Example:
+        >>> print(stuck_table([StuckStep("reach", 0, "the gripper is open", "close the gripper", 3, 5, 8)]))
+        task   step  ended here  no further  skill              while
+        reach     1      3 of 8      5 of 8  close the gripper  the gripper is open
+    """
+    rows = [("task", "step", "ended here", "no further", "skill", "while")]
+    for s in steps:
+        ended, reached = (f"{count} of {s.failed}" for count in (s.stuck, s.furthest))
+        rows.append((s.task, str(s.step + 1), ended, reached, s.skill, s.condition))
+    task, skill = (max(len(row[column]) for row in rows) for column in (0, 4))
+    return "\n".join(
+        f"{row[0]:{task}}  {row[1]:>4}  {row[2]:>10}  {row[3]:>10}  {row[4]:{skill}}  {row[5]}" for row in rows
+    )

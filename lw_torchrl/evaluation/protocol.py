@@ -19,8 +19,8 @@ from lw_torchrl._progress import Progress
 from lw_torchrl.envs.episodes import FinishedEpisode, policy_of, read_action, run_episodes
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.evaluation.attribution import attribute_failures, keys_to_attribute
+from lw_torchrl.evaluation.counterfactuals import answered_by, make_env
 from lw_torchrl.evaluation.result import EpisodeResult, EvaluationResult
-from lw_torchrl.evaluation.swaps import answered_by, make_env
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.tasks import TASKS, Task, named_tasks
 from lw_torchrl.modules.networks import evaluating
@@ -35,14 +35,12 @@ def actor_plans(actor: Any, plans: Plans | Mapping[str, ConditionalPlan] | None)
     if plans is None:
         return own
     given = as_plans(plans)
-    if own is not None:
-        if different := given.differences(own):
-            raise ValueError(
-                f"plans differ from the actor's own for {', '.join(different)}; pass plans=None, or evaluate "
-                "actor.with_plans(plans)"
-            )
-        return own
-    return given
+    if own is not None and (different := given.differences(own)):
+        raise ValueError(
+            f"plans differ from the actor's own for {', '.join(different)}; pass plans=None, or evaluate "
+            "actor.with_plans(plans)"
+        )
+    return own or given
 
 
 def tasks_of(tasks: str | Task | Iterable[str | Task], plans: Plans | None) -> dict[str, Task]:
@@ -54,15 +52,10 @@ def tasks_of(tasks: str | Task | Iterable[str | Task], plans: Plans | None) -> d
 def _result(finished: FinishedEpisode, stopped_early: bool, keep_actions: bool) -> EpisodeResult:
     task, episode, steps = finished
     first = finished.first_success
-    return EpisodeResult(
-        task=task,
-        episode=episode,
-        success=first is not None,
-        first_success=first,
-        success_at_end=None if stopped_early else bool(steps.get(("next", "success"))[-1]),
-        episode_return=None if stopped_early else float(steps.get(("next", "reward")).double().sum()),
-        actions=steps.get("action").clone() if keep_actions else None,
-    )
+    at_end = None if stopped_early else bool(steps.get(("next", "success"))[-1])
+    total = None if stopped_early else float(steps.get(("next", "reward")).double().sum())
+    actions = steps.get("action").clone() if keep_actions else None
+    return EpisodeResult(task, episode, first is not None, first, at_end, total, actions)
 
 
 def _checked(
@@ -132,16 +125,14 @@ def evaluate(
         engine, num_threads: as for :class:`LanguageWorldEnv`.
         progress: show a progress bar when it takes longer than a second.
         also_record: more keys for ``on_episode`` to see: "qaf", "skill_weights".
-        on_episode: called with each finished episode as its one argument, a named tuple of ``task``, ``episode``, its
-            index, and ``steps``, a TensorDict of batch (T,) with the keys ``action``, ``("next", "success")``,
-            ``("next", "reward")`` and those of ``also_record``.
+        on_episode: called with each finished episode, a named tuple of ``task``, ``episode``, its index, and ``steps``,
+            a TensorDict of batch (T,) with ``action``, ``("next", "success")``, ``("next", "reward")`` and the keys of
+            ``also_record``.
         device: where the actor works: "cpu", "cuda", "cuda:1", "mps", or "auto"; it is moved there, and stays. None for
             where it is. The environment and its queries are always on the CPU.
-        evaluator: answers the conditions in the query answering function's place, between it and the actor, as for
-            :func:`attribute_failures`: a :class:`~lw_torchrl.CorruptQAF` say, or ``QAFTransform(plans, every=5)``; None
-            for exact truth at every step.
-        attribute: say of each failed episode why it failed, see :func:`attribute_failures`; these are run again a few
-            times.
+        evaluator: answers the conditions in the query answering function's place, as for :func:`attribute_failures`: a
+            :class:`~lw_torchrl.CorruptQAF`, or ``QAFTransform(plans, every=5)``; None for exact truth at every step.
+        attribute: run failed episodes again to say why each failed, see :func:`attribute_failures`.
         reference: trusted plans for the same tasks, with which failed episodes are run again.
 
     Warns:
@@ -181,8 +172,7 @@ def evaluate(
         raise ValueError("reference is for attribute=True, which runs failed episodes again with it")
     if isinstance(also_record, str) or not isinstance(also_record, Iterable):
         raise TypeError(f"also_record must be a list of keys, got {also_record!r}")
-    also_record = list(also_record)
-    for key in also_record:
+    for key in (also_record := list(also_record)):
         check_key("also_record", key)
     check_int("episodes_per_task", episodes_per_task, minimum=1)
     check_scale("noise_scale", noise_scale)
@@ -190,16 +180,8 @@ def evaluate(
     if num_envs is None:
         num_envs = len(names) * max(1, min(episodes_per_task, _ROWS // len(names)))
     num_envs = min(check_int("num_envs", num_envs), most)
-    base = LanguageWorldEnv(
-        list(chosen.values()),
-        num_envs=num_envs,
-        seed=seed,
-        engine=engine,
-        num_threads=num_threads,
-        reward=reward,
-        max_steps=max_steps,
-        strict=True,
-    )
+    shared: dict[str, Any] = {"seed": seed, "engine": engine, "num_threads": num_threads, "max_steps": max_steps}
+    base = LanguageWorldEnv(list(chosen.values()), num_envs=num_envs, reward=reward, strict=True, **shared)
     env = make_env(actor, answered, base, evaluator)
     policy = policy_of(answered_by(actor, evaluator), device)
     seen: dict[NestedKey, None] = dict.fromkeys(also_record)
@@ -227,33 +209,13 @@ def evaluate(
                     on_episode(finished)
     finally:
         env.close()
-    config = {
-        "tasks": list(names),
-        "episodes_per_task": episodes_per_task,
-        "seed": seed,
-        "noise_scale": noise_scale,
-        "stop_at_success": stop_at_success,
-        "reward": reward,
-        "max_steps": max_steps,
-    }
+    config = {"tasks": list(names), "episodes_per_task": episodes_per_task, "seed": seed, "noise_scale": noise_scale}
+    config |= {"stop_at_success": stop_at_success, "reward": reward, "max_steps": max_steps}
     failures = None
     if attribute:
         assert answered is not None
-        failures = tuple(
-            attribute_failures(
-                sorted(failed, key=lambda episode: (episode.task, episode.episode)),
-                answered,
-                actor=actor,
-                reference=reference,
-                evaluator=evaluator,
-                seed=seed,
-                noise_scale=noise_scale,
-                max_steps=max_steps,
-                num_envs=num_envs,
-                engine=engine,
-                num_threads=num_threads,
-                device=device,
-                progress=progress,
-            )
-        )
+        failed.sort(key=lambda episode: (episode.task, episode.episode))
+        shared |= {"noise_scale": noise_scale, "num_envs": num_envs, "device": device, "progress": progress}
+        options = {"actor": actor, "reference": reference, "evaluator": evaluator, **shared}
+        failures = tuple(attribute_failures(failed, answered, **options))
     return EvaluationResult(config, tuple(sorted(found, key=lambda e: (e.task, e.episode))), failures=failures)

@@ -34,9 +34,6 @@ def published(setting: str, method: str = "PCBC", which: Literal["last", "best"]
     Returns:
         Task to success rate, in [0, 1], sorted by name.
 
-    Raises:
-        ValueError: an argument that is none of these.
-
     Example:
         >>> rates = published("few-shot")
         >>> len(rates), round(sum(rates.values()) / 50, 3), rates["coffee-pull"]
@@ -61,9 +58,6 @@ def published_curves(setting: str, methods: str | Iterable[str] = ("PCBC",)) -> 
     Returns:
         Label to (task to success rate): for :func:`plot_sorted_tasks` and :meth:`Summary.table`.
 
-    Raises:
-        ValueError: an argument that is none of these.
-
     Example:
         >>> list(published_curves("zero-shot"))
         ['PCBC published, best of the last 10 evaluations', 'PCBC published, last']
@@ -86,9 +80,6 @@ def published_plans(model: str = "PaLM 2", format: str = "chain_py") -> dict[str
 
     Returns:
         Task to the rates of its 5 plans, in [0, 1], sorted by name.
-
-    Raises:
-        ValueError: another model or format.
 
     Example:
         >>> published_plans()["window-open"]

@@ -8,7 +8,6 @@ from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from functools import cached_property
 from hashlib import file_digest
-from math import isfinite
 from reprlib import repr as short
 from typing import Any
 
@@ -16,8 +15,7 @@ from torch import Tensor
 
 from lw_torchrl._files import read_json, write_json
 from lw_torchrl._versions import package_versions
-from lw_torchrl.evaluation.failure_table import failure_table, read_failures
-from lw_torchrl.evaluation.failures import Failure
+from lw_torchrl.evaluation.failures import Failure, failure_table, is_number, read_failures
 
 FORMAT = "lw_torchrl.evaluation"
 FORMAT_VERSION = 1
@@ -193,8 +191,7 @@ class EvaluationResult:
         return "\n".join(lines)
 
     def failure_table(self) -> str:
-        """Why episodes failed, as text in columns: a row for each task, a column for each cause, and the numbers of
-        episodes.
+        """Numbers of failed episodes, as text in columns: a row for each task, a column for each cause.
 
         Raises:
             ValueError: the failures were not attributed.
@@ -219,10 +216,6 @@ def _is_integer(value: Any, minimum: int, maximum: int = 2**63 - 1) -> bool:
     return type(value) is int and minimum <= value <= maximum
 
 
-def _is_number(value: Any) -> bool:
-    return type(value) in (int, float) and abs(value) < 1e300 and isfinite(value)
-
-
 def _check(holds: bool, name: str, wanted: str, given: Any) -> None:
     if not holds:
         raise ValueError(f"{name} must be {wanted}, got {short(given)}")
@@ -236,7 +229,7 @@ def _check_config(config: dict[str, Any]) -> None:
         _check(_is_integer(config[name], 1), f"config: {name}", "an integer of at least 1", config[name])
     _check(_is_integer(config["seed"], -(2**63)), "config: seed", "an integer", config["seed"])
     noise = config["noise_scale"]
-    _check(_is_number(noise) and noise >= 0, "config: noise_scale", "a number of at least 0", noise)
+    _check(is_number(noise) and noise >= 0, "config: noise_scale", "a number of at least 0", noise)
     stops = config["stop_at_success"]
     _check(isinstance(stops, bool), "config: stop_at_success", "true or false", stops)
 
@@ -265,7 +258,7 @@ def _read_episodes(stated: Any, config: dict[str, Any]) -> tuple[EpisodeResult, 
             _check(first is None, f"{at}: first_success", "null without success", first)
         _check(end is None or isinstance(end, bool), f"{at}: success_at_end", "true, false or null", end)
         _check(not end or episode.success, f"{at}: success_at_end", "false without success", end)
-        _check(total is None or _is_number(total), f"{at}: episode_return", "a number or null", total)
+        _check(total is None or is_number(total), f"{at}: episode_return", "a number or null", total)
         seen.add(which)
         count[episode.task] += 1
         found.append(episode)

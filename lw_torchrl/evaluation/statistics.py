@@ -2,9 +2,9 @@
 
 Every function takes success rates as an array (seeds, tasks): a row for each training seed, a column for each task.
 Intervals are Student's t over the seeds; the tasks stay the same. The standard error is the jackknife's over seeds,
-which for a mean is the usual one, so the interval of a mean is exactly Student's. Two methods' errors add as in
-Welch's test. A few seeds give wide intervals: with three, t is 4.3 standard errors, not 2. In simulation (20 tasks, 20
-episodes) the 95 % interval holds the true mean in 0.95 of the cases for 3, 5 and 20 seeds.
+which for a mean is the usual one. Two methods' errors add as in Welch's test. A few seeds give wide intervals: with
+three, t is 4.3 standard errors. In simulation (20 tasks, 20 episodes) the 95 % interval holds the true mean in 0.95 of
+the cases for 3, 5 and 20 seeds.
 
 Source: Agarwal et al. 2021, 'Deep Reinforcement Learning at the Edge of the Statistical Precipice', for the statistics;
 Tukey 1958 for the jackknife with Student's t.
@@ -12,6 +12,7 @@ Tukey 1958 for the jackknife with Student's t.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -50,12 +51,7 @@ class Estimate:
 
 
 def check_rates(argument: str, given: Any) -> Array:
-    """``given`` as a float64 array (seeds, tasks) of rates in [0, 1].
-
-    Raises:
-        ValueError: another shape, no rates at all, or rates that are NaN or outside [0, 1].
-        TypeError: what is no array of numbers.
-    """
+    """``given`` as a float64 array (seeds, tasks) of rates in [0, 1], NaN refused."""
     try:
         rates = np.asarray(given, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -76,9 +72,6 @@ def mean_rate(rates: ArrayLike, *, confidence: float = 0.95) -> Estimate:
         rates: (seeds, tasks), in [0, 1].
         confidence: of the interval, in (0, 1).
 
-    Raises:
-        ValueError, TypeError: a wrong argument.
-
     Example:
         >>> print(mean_rate([[1.0, 0.2], [0.9, 0.3], [1.0, 0.1]]))
         0.583 [0.512, 0.655]
@@ -94,9 +87,6 @@ def interquartile_mean(rates: ArrayLike, *, confidence: float = 0.95) -> Estimat
         rates: (seeds, tasks), in [0, 1].
         confidence: of the interval, in (0, 1).
 
-    Raises:
-        ValueError, TypeError: a wrong argument.
-
     Example:
         >>> print(interquartile_mean([[1.0, 0.2, 0.6, 0.7], [0.9, 0.3, 0.5, 0.9], [1.0, 0.1, 0.4, 0.8]]))
         0.650 [0.526, 0.774]
@@ -111,11 +101,8 @@ def mean_difference(x: ArrayLike, y: ArrayLike, *, confidence: float = 0.95) -> 
     """The mean over tasks of how much higher method X's rate is than Y's on the same task.
 
     Args:
-        x, y: (seeds, tasks), in [0, 1]: the same tasks in the same order; the seeds may differ in number.
+        x, y: (seeds, tasks), in [0, 1], of the same tasks in the same order; the seeds may differ in number.
         confidence: of the interval, in (0, 1). Seeds are not paired, also where both methods have the same ones.
-
-    Raises:
-        ValueError, TypeError: a wrong argument.
 
     Example:
         >>> print(mean_difference([[1.0, 0.5], [0.9, 0.4]], [[0.6, 0.3], [0.7, 0.3]]))
@@ -129,11 +116,8 @@ def probability_of_improvement(x: ArrayLike, y: ArrayLike, *, confidence: float 
     """How likely a seed of method X beats one of Y on a task drawn at random; a tie counts half.
 
     Args:
-        x, y: (seeds, tasks), in [0, 1]: the same tasks in the same order; the seeds may differ in number.
+        x, y: (seeds, tasks), in [0, 1], of the same tasks in the same order; the seeds may differ in number.
         confidence: of the interval, in (0, 1).
-
-    Raises:
-        ValueError, TypeError: a wrong argument.
 
     Example:
         >>> probability_of_improvement([[1.0, 0.5], [0.9, 0.3]], [[0.6, 0.3], [0.7, 0.3]]).value
@@ -152,9 +136,6 @@ def count_solved(rates: ArrayLike, threshold: float = 0.8) -> int:
         rates: (seeds, tasks), in [0, 1].
         threshold: in (0, 1].
 
-    Raises:
-        ValueError, TypeError: a wrong argument.
-
     Example:
         >>> count_solved([[0.8, 0.2, 1.0], [0.8, 0.9, 0.6]])
         2
@@ -162,6 +143,20 @@ def count_solved(rates: ArrayLike, threshold: float = 0.8) -> int:
     if not 0 < threshold <= 1:
         raise ValueError(f"threshold must be in (0, 1], got {threshold!r}")
     return int((check_rates("rates", rates).mean(0) >= threshold - 1e-9).sum())
+
+
+def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
+    """The 95 % Wilson score interval of a success rate over the episodes of one policy.
+
+    Example:
+        >>> low, high = wilson_interval(20, 20)
+        >>> round(low, 2), high
+        (0.84, 1.0)
+    """
+    rate, z = successes / trials, 1.96
+    center = (rate + z**2 / (2 * trials)) / (1 + z**2 / trials)
+    half = z / (1 + z**2 / trials) * math.sqrt(rate * (1 - rate) / trials + z**2 / (4 * trials**2))
+    return max(0.0, center - half), min(1.0, center + half)
 
 
 def _interquartile_mean(rates: Array) -> float:
@@ -203,9 +198,6 @@ def _estimate(
 
 def _jackknife(statistic: Callable[..., Any], methods: list[Array], number: int) -> float:
     """The variance of the statistic over the seeds of one method: each is left out once."""
-    n = len(methods[number])
-    left = [
-        statistic(*methods[:number], np.delete(methods[number], seed, axis=0), *methods[number + 1 :])
-        for seed in range(n)
-    ]
-    return float(np.var(left) * (n - 1))
+    before, rates, after = methods[:number], methods[number], methods[number + 1 :]
+    left = [statistic(*before, np.delete(rates, seed, axis=0), *after) for seed in range(len(rates))]
+    return float(np.var(left) * (len(rates) - 1))

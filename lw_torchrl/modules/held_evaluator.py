@@ -16,8 +16,8 @@ from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.networks import evaluating
 from lw_torchrl.modules.query_evaluator import QueryEvaluator, evaluator_from_description
+from lw_torchrl.transforms.answers import HeldAnswers
 from lw_torchrl.transforms.camera import CameraTransform
-from lw_torchrl.transforms.held_answers import HeldAnswers
 
 _MOST = 2**16  # steps; a policy file with more would be refused
 

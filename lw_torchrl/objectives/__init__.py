@@ -2,10 +2,9 @@
 that imitate demonstrations, and terms on skills' latents; and n steps for those that hide them."""
 
 import lw_torchrl._torchrl  # noqa: F401
-from lw_torchrl.objectives.advantage_weighted import AdvantageWeightedLoss, standardize_by_task
+from lw_torchrl.objectives.advantage_weighted import AdvantageWeightedLoss, ExpectileValueLoss, standardize_by_task
 from lw_torchrl.objectives.demonstrated import DemonstratedSACLoss, DemonstratedTD3Loss
-from lw_torchrl.objectives.expectile_value import ExpectileValueLoss
-from lw_torchrl.objectives.n_steps import with_n_steps
+from lw_torchrl.objectives.reduction import with_n_steps
 from lw_torchrl.objectives.skill_latents import SkillLatentLoss
 
 __all__ = [

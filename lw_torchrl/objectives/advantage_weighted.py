@@ -1,25 +1,182 @@
-"""AdvantageWeightedLoss: imitation of the rows that did better than others."""
+"""Learning without an environment: ExpectileValueLoss, the value of a state; AdvantageWeightedLoss, imitation of the
+rows that did better than others."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, dispatch
-from tensordict.utils import NestedKey
+from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
-from torchrl.objectives import LossModule
-from torchrl.objectives.utils import distance_loss
+from torchrl.objectives import LossModule, ValueEstimators
+from torchrl.objectives.utils import dispatch_value_estimator, distance_loss
 
-from lw_torchrl._checks import check_choice, check_scale, checked
+from lw_torchrl._checks import check_positive, check_probability, check_scale, checked
 from lw_torchrl._keys import read
 from lw_torchrl.language.value_checks import check_finite
-from lw_torchrl.objectives.reduction import Reduction, let_go, set_reduction
+from lw_torchrl.modules.critics import Value
+from lw_torchrl.modules.networks import evaluating
+from lw_torchrl.objectives.reduction import Reduction, let_go, priority_weight, set_reduction
 
-DISTANCES = ("l2", "l1", "smooth_l1", "log_prob")
+
+class ExpectileValueLoss(LossModule):
+    """The value V of a state, without a value of actions: |τ - 1(u < 0)|·u², where u is the target less V.
+
+    The target is the reward, of n steps where ``steps_to_next_obs`` says so, and what the target network says of the
+    state behind them, the mean over a critic's ensemble. With an expectile over one half V follows what better rows
+    reach. Where transitions are deterministic, as the simulator's are, a row's target less V is the advantage of what
+    it did (:meth:`advantage`), by which :class:`AdvantageWeightedLoss` imitates.
+
+    Reads what the network reads, here and in ``next``, ``("next", "reward")`` (B, 1) float32, ``("next", "done")`` and
+    ``("next", "terminated")`` (B, 1) bool, and, where they are, ``steps_to_next_obs`` (B,) int64 and
+    ``priority_weight`` (B,) float32. Gives ``loss_value`` () float32, (B,) by ``reduction="none"``, and ``value`` ()
+    float32, the mean of V, detached; it writes ``td_error`` (B,) float32, the largest of a row's u², into what it is
+    given, for :class:`torchrl.data.PrioritizedSampler`.
+
+    Args:
+        value_network: writes ``state_value`` (B, 1) float32. Where it writes ``state_values`` (B, E) float32, as
+            :class:`PlanConditionedValue` with an ensemble does, each member learns by itself: their losses are added.
+        expectile: τ, from 0 to 1.
+        delay_value: targets by a network of their own, which :class:`torchrl.objectives.SoftUpdate` moves.
+        reduction: "mean", "none" or "sum" of the rows' losses.
+
+    Raises:
+        ValueError: a wrong option; at call time, keys that the network does not write, or rows that lack one.
+
+    Noise on the network's features, of which critics have none by default, is on the targets too while the network
+    trains. ``train()`` and ``eval()`` reach the network, and :meth:`advantage` is always without noise.
+
+    Example:
+        >>> import lw_torchrl as lw, torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.objectives import SoftUpdate
+        >>> from lw_torchrl.modules import DescriptorEncoder, Value
+        >>> loss = lw.objectives.ExpectileValueLoss(Value(DescriptorEncoder("MT10"), ensemble=2), expectile=0.7)
+        >>> loss = loss.make_value_estimator(gamma=0.99)
+        >>> targets = SoftUpdate(loss, eps=0.995)
+        >>> state = {"observation": torch.rand(5, 39), "task_id": torch.full((5,), lw.task_id("reach"))}
+        >>> ended = torch.zeros(5, 1, dtype=torch.bool)
+        >>> next = TensorDict(**state, reward=torch.ones(5, 1), done=ended, terminated=ended)
+        >>> batch = TensorDict(**state, next=next).auto_batch_size_(1)
+        >>> loss(batch)["loss_value"].shape, loss.advantage(batch).shape
+        (torch.Size([]), torch.Size([5, 1]))
+
+    Source: Kostrikov, Nair, Levine, "Offline Reinforcement Learning with Implicit Q-Learning", 2021, equation 5, of
+    which this keeps V alone; on n steps as Sutton, Barto, "Reinforcement Learning", section 7.1.
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        value: NestedKey = "state_value"
+        values: NestedKey = "state_values"
+        reward: NestedKey = "reward"
+        done: NestedKey = "done"
+        terminated: NestedKey = "terminated"
+        steps_to_next_obs: NestedKey = "steps_to_next_obs"
+        priority: NestedKey = "td_error"
+        priority_weight: NestedKey = "priority_weight"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    default_value_estimator = ValueEstimators.TD0
+    _value_estimator_default_keys = ("value", "reward", "done", "terminated", "steps_to_next_obs")
+    out_keys = ["loss_value", "value"]
+    reduction = "mean"
+
+    value_network: TensorDictModule
+    value_network_params: TensorDictParams
+    target_value_network_params: TensorDictParams
+
+    @checked
+    def __init__(
+        self,
+        value_network: TensorDictModuleBase,
+        *,
+        expectile: float = 0.7,
+        delay_value: bool = True,
+        reduction: Reduction | None = None,
+    ) -> None:
+        super().__init__()
+        set_reduction(self, reduction)
+        self.expectile = check_probability("expectile", expectile)
+        self.convert_to_functional(value_network, "value_network", create_target_params=delay_value)
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        own, keys = self.value_network.in_keys, self.tensor_keys
+        following = [*own, keys.reward, keys.done, keys.terminated]
+        return list(dict.fromkeys([*own, *(unravel_key(("next", key)) for key in following)]))
+
+    def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> ExpectileValueLoss:
+        """Set how targets are estimated, and return the loss.
+
+        Args:
+            value_type: ``ValueEstimators.TD0``, or None for it; or any estimator as an object or a class.
+            **hyperparams: ``gamma``, the discount of a step, 0.99 by default.
+
+        Raises:
+            NotImplementedError: another one by name, which needs rows in the order of time.
+        """
+        value_type = self.default_value_estimator if value_type is None else value_type
+        if not isinstance(value_type, (str, ValueEstimators)):
+            return super().make_value_estimator(value_type, **hyperparams)
+        keys = {name: getattr(self.tensor_keys, name) for name in self._value_estimator_default_keys}
+        dispatch_value_estimator(
+            self, value_type, supported=(ValueEstimators.TD0,), tensor_keys=keys, value_network=None, **hyperparams
+        )
+        return self
+
+    def train(self, mode: bool = True) -> ExpectileValueLoss:
+        """Reach the network too, which is none of the loss's submodules."""
+        self.value_network.train(mode)
+        return super().train(mode)
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The loss; ``td_error`` is written."""
+        target = self._target(tensordict)
+        values = self._values(tensordict, self.value_network_params)
+        error = target - values
+        weight = torch.where(error < 0, 1.0 - self.expectile, self.expectile)
+        tensordict.set(self.tensor_keys.priority, error.detach().square().amax(-1))
+        by_row = (weight * error.square()).sum(-1)
+        loss = self._reduce_loss(by_row, tensordict, weights=priority_weight(self, tensordict))
+        found = TensorDict(loss_value=loss, value=values.detach().mean())
+        let_go(tensordict, found, self.value_network_params, self.target_value_network_params)
+        return found
+
+    @torch.no_grad()
+    def advantage(self, tensordict: TensorDictBase) -> Tensor:
+        """How much more a row's steps gave than its state is worth, (B, 1) float32: the target less the mean value,
+        both of the target network, without noise on its features. The rows given stay as they are."""
+        with evaluating(self.value_network):
+            value = self._values(tensordict, self.target_value_network_params).mean(-1, keepdim=True)
+            return self._target(tensordict) - value
+
+    @torch.no_grad()
+    def _target(self, tensordict: TensorDictBase) -> Tensor:
+        following = self._values(tensordict.get("next"), self.target_value_network_params)
+        return self.value_estimator.value_estimate(
+            tensordict.copy(), next_value=following.mean(-1, keepdim=True)
+        )  # a copy, since one that averages rewards writes them
+
+    def _values(self, tensordict: TensorDictBase, params: TensorDictParams) -> Tensor:
+        """(B, E), each member's; E is 1 for a network that writes ``state_value`` alone."""
+        network, keys = self.value_network, self.tensor_keys
+        key = keys.values if unravel_key(keys.values) in network.out_keys else keys.value
+        several = isinstance(network, Value) and len(network.heads) > 1
+        if unravel_key(key) not in network.out_keys or (several and key != keys.values):
+            raise ValueError(
+                f"the value network writes {network.out_keys}, which lack {keys.value!r} or, of an ensemble, "
+                f"{keys.values!r}: name them by loss.set_keys(value=..., values=...)"
+            )
+        with params.to_module(network, preserve_module_state=False):
+            (found,) = read(network(tensordict.select(*network.in_keys, strict=False)), [key])
+        return found
 
 
 class AdvantageWeightedLoss(LossModule):
@@ -86,16 +243,13 @@ class AdvantageWeightedLoss(LossModule):
         super().__init__()
         set_reduction(self, reduction)
         self.beta = check_scale("beta", beta)
-        self.max_weight = check_scale("max_weight", max_weight)
-        if not self.max_weight:
-            raise ValueError("max_weight must be over 0, got 0")
-        self.loss_function = check_choice("loss_function", loss_function, DISTANCES)
+        self.max_weight = check_positive("max_weight", max_weight)
+        self.loss_function = loss_function
         self.convert_to_functional(actor_network, "actor_network")
 
     @property
     def in_keys(self) -> list[NestedKey]:
-        keys = [*self.actor_network.in_keys, self.tensor_keys.action, self.tensor_keys.advantage]
-        return list(dict.fromkeys(keys))
+        return list(dict.fromkeys([*self.actor_network.in_keys, self.tensor_keys.action, self.tensor_keys.advantage]))
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import torch
 from tensordict import TensorDictBase
@@ -16,7 +16,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import SACLoss, TD3BCLoss
 
 from lw_torchrl._checks import check_choice, check_scale, checked, shown
-from lw_torchrl.objectives.reduction import REDUCTIONS, let_go, priority_weight
+from lw_torchrl.objectives.reduction import Reduction, let_go, priority_weight
 
 
 def imitation(action: Tensor, demonstrated: Tensor, is_demonstration: Tensor) -> Tensor:
@@ -40,38 +40,66 @@ def imitation(action: Tensor, demonstrated: Tensor, is_demonstration: Tensor) ->
     return distance * (rows.numel() / rows.sum().clamp(min=1))
 
 
-def _demonstrations(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-    """Which rows are demonstrations, (B,) or (B, 1) bool; :class:`ValueError` if nothing says so."""
-    found = tensordict.get(key, None)
-    if found is None:
-        raise ValueError(
-            f"the batch lacks {key!r}, which says which rows to imitate: a LanguageWorldExperienceReplay writes it, as "
-            f"does a buffer on a GrowingStorage; in a buffer of your own, set it, (B,) bool, or name it by set_keys"
-        )
-    if found.dtype != torch.bool:
-        raise ValueError(f"{key!r} must be torch.bool, true of demonstrations, got {found.dtype}")
-    return found
+if TYPE_CHECKING:
+    from torchrl.objectives import LossModule as _Loss
+else:
+    _Loss = object  # a LossModule's metaclass would give its own forward
 
 
-def _check_critics(given: Any) -> None:
-    critics = given if isinstance(given, list) else [given]
-    if not critics or not all(isinstance(critic, TensorDictModuleBase) for critic in critics):
-        raise TypeError(f"qvalue_network must be a TensorDictModule, or a list of these, got {shown(given)}")
+class _ImitatesDemonstrations(_Loss):
+    """What both losses share: the imitation of those rows of which ``is_demonstration`` is true."""
+
+    _fixed: Mapping[str, Any] = {}  # options that are not the user's
+    in_keys: list[NestedKey]
+
+    @checked
+    def __init__(
+        self,
+        actor_network: TensorDictModuleBase,
+        qvalue_network: TensorDictModuleBase | list[TensorDictModuleBase],
+        *,
+        bc_weight: float = 2.0,
+        **options: Any,
+    ) -> None:
+        if "alpha" in self._fixed and "alpha" in options:
+            raise ValueError("alpha is 1 here: give bc_weight, the weight of the imitation")
+        if options.get("reduction") is not None:
+            check_choice("reduction", options["reduction"], get_args(Reduction))
+        spec = options.get("action_spec")
+        if spec is not None and not isinstance(spec, Composite) and len(spec.shape) > 1:  # actions of as many rows
+            raise ValueError(
+                f"action_spec must be of one row, got one of shape {tuple(spec.shape)}: take env.action_spec_unbatched"
+            )
+        critics = qvalue_network if isinstance(qvalue_network, list) else [qvalue_network]
+        if not critics or not all(isinstance(critic, TensorDictModuleBase) for critic in critics):
+            raise TypeError(
+                f"qvalue_network must be a TensorDictModule, or a list of these, got {shown(qvalue_network)}"
+            )
+        super().__init__(actor_network, qvalue_network, **self._fixed, **options)
+        self.bc_weight = check_scale("bc_weight", bc_weight)
+        self.in_keys = [*self.in_keys, self.tensor_keys.is_demonstration]
+
+    def set_keys(self, **keys: NestedKey) -> None:
+        """Read and write under other names; see :class:`torchrl.objectives.LossModule`."""
+        super().set_keys(**keys)
+        self.in_keys = [*self.in_keys, self.tensor_keys.is_demonstration]
+
+    def _imitation(self, tensordict: TensorDictBase, action: Tensor) -> Tensor:
+        """The imitation by an action (B, A) of each row, (B,), without its weight."""
+        key = self.tensor_keys.is_demonstration
+        found = tensordict.get(key, None)
+        if found is None:
+            raise ValueError(
+                f"the batch lacks {key!r}, which says which rows to imitate: a LanguageWorldExperienceReplay writes "
+                f"it, as does a buffer on a GrowingStorage; in a buffer of your own, set it, (B,) bool, or name it by "
+                f"set_keys"
+            )
+        if found.dtype != torch.bool:
+            raise ValueError(f"{key!r} must be torch.bool, true of demonstrations, got {found.dtype}")
+        return imitation(action, tensordict.get(self.tensor_keys.action), found)
 
 
-def _check_options(options: Mapping[str, Any]) -> None:
-    """Raise for an unknown reduction, and for the spec of all rows of an environment, of which a loss would make an
-    action of as many rows."""
-    if options.get("reduction") is not None:
-        check_choice("reduction", options["reduction"], REDUCTIONS)
-    spec = options.get("action_spec")
-    if spec is not None and not isinstance(spec, Composite) and len(spec.shape) > 1:
-        raise ValueError(
-            f"action_spec must be of one row, got one of shape {tuple(spec.shape)}: take env.action_spec_unbatched"
-        )
-
-
-class DemonstratedTD3Loss(TD3BCLoss):
+class DemonstratedTD3Loss(_ImitatesDemonstrations, TD3BCLoss):
     """TD3 on a collector's rows and demonstrations alike, whose actor also imitates the demonstrations.
 
     The actor's loss is -Q / mean(abs(Q)) over all rows, where Q is the mean of the critics, plus ``bc_weight`` times
@@ -93,8 +121,7 @@ class DemonstratedTD3Loss(TD3BCLoss):
 
     Raises:
         ValueError: ``bc_weight`` is negative or no number; another ``reduction``; ``action_spec`` is of several rows;
-            at call time, rows
-            without ``is_demonstration``.
+            at call time, rows without ``is_demonstration``.
 
     Example:
         >>> import lw_torchrl as lw
@@ -113,35 +140,11 @@ class DemonstratedTD3Loss(TD3BCLoss):
 
     @dataclass
     class _AcceptedKeys(TD3BCLoss._AcceptedKeys):
-        """The names that ``set_keys`` takes: TD3BCLoss's, and ``is_demonstration``."""
-
         is_demonstration: NestedKey = "is_demonstration"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
-    in_keys: list[NestedKey]
-
-    @checked
-    def __init__(
-        self,
-        actor_network: TensorDictModuleBase,
-        qvalue_network: TensorDictModuleBase | list[TensorDictModuleBase],
-        *,
-        bc_weight: float = 2.0,
-        **options: Any,
-    ) -> None:
-        if "alpha" in options:
-            raise ValueError("alpha is 1 here: give bc_weight, the weight of the imitation")
-        _check_options(options)
-        _check_critics(qvalue_network)
-        super().__init__(actor_network, qvalue_network, alpha=1.0, **options)
-        self.bc_weight = check_scale("bc_weight", bc_weight)
-        self.in_keys = [*self.in_keys, self.tensor_keys.is_demonstration]
-
-    def set_keys(self, **keys: NestedKey) -> None:
-        """Read and write under other names; see :class:`torchrl.objectives.LossModule`."""
-        super().set_keys(**keys)
-        self.in_keys = [*self.in_keys, self.tensor_keys.is_demonstration]
+    _fixed = {"alpha": 1.0}
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict]:
         """The actor's loss, () float32, and ``bc_loss``, ``lmbd`` and ``state_action_value_actor``, detached."""
@@ -149,8 +152,7 @@ class DemonstratedTD3Loss(TD3BCLoss):
         with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
             seen = self.actor_network(seen)
         value = self._judged(seen).mean(0)
-        key, demonstrated = self.tensor_keys.action, _demonstrations(tensordict, self.tensor_keys.is_demonstration)
-        bc = imitation(seen.get(key), tensordict.get(key), demonstrated)
+        bc = self._imitation(tensordict, seen.get(self.tensor_keys.action))
         scale = self.alpha / value.abs().mean().detach().clamp(min=1e-6)
         weights = priority_weight(self, tensordict)
         loss = self._reduce_loss(self.bc_weight * bc - scale * value, tensordict=tensordict, weights=weights)
@@ -171,7 +173,7 @@ class DemonstratedTD3Loss(TD3BCLoss):
         return torch.vmap(judge, randomness=self.vmap_randomness)(asked, params).squeeze(-1)
 
 
-class DemonstratedSACLoss(SACLoss):
+class DemonstratedSACLoss(_ImitatesDemonstrations, SACLoss):
     """SAC on a collector's rows and demonstrations alike, whose actor also imitates the demonstrations.
 
     The actor's loss is SAC's over all rows, plus ``bc_weight`` times the mean squared distance of the distribution's
@@ -190,8 +192,7 @@ class DemonstratedSACLoss(SACLoss):
 
     Raises:
         ValueError: ``bc_weight`` is negative or no number; another ``reduction``; ``action_spec`` is of several rows;
-            at call time, rows
-            without ``is_demonstration``.
+            at call time, rows without ``is_demonstration``.
 
     Example:
         >>> import lw_torchrl as lw
@@ -208,33 +209,10 @@ class DemonstratedSACLoss(SACLoss):
 
     @dataclass
     class _AcceptedKeys(SACLoss._AcceptedKeys):
-        """The names that ``set_keys`` takes: SACLoss's, and ``is_demonstration``."""
-
         is_demonstration: NestedKey = "is_demonstration"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
-    in_keys: list[NestedKey]
-
-    @checked
-    def __init__(
-        self,
-        actor_network: TensorDictModuleBase,
-        qvalue_network: TensorDictModuleBase | list[TensorDictModuleBase],
-        *,
-        bc_weight: float = 2.0,
-        **options: Any,
-    ) -> None:
-        _check_options(options)
-        _check_critics(qvalue_network)
-        super().__init__(actor_network, qvalue_network, **options)
-        self.bc_weight = check_scale("bc_weight", bc_weight)
-        self.in_keys = [*self.in_keys, self.tensor_keys.is_demonstration]
-
-    def set_keys(self, **keys: NestedKey) -> None:
-        """Read and write under other names; see :class:`torchrl.objectives.LossModule`."""
-        super().set_keys(**keys)
-        self.in_keys = [*self.in_keys, self.tensor_keys.is_demonstration]
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """The actor's loss, () float32, and ``log_prob`` and ``bc_loss``, detached."""
@@ -244,8 +222,7 @@ class DemonstratedSACLoss(SACLoss):
             self.actor_network_params.to_module(self.actor_network, preserve_module_state=False),
         ):
             mode = self.actor_network.get_dist(tensordict.copy()).deterministic_sample
-        demonstrated = _demonstrations(tensordict, self.tensor_keys.is_demonstration)
-        bc = imitation(mode, tensordict.get(self.tensor_keys.action), demonstrated)
+        bc = self._imitation(tensordict, mode)
         weights = priority_weight(self, tensordict)
         term = self._reduce_loss(self.bc_weight * bc, tensordict=tensordict, weights=weights)
         return loss + term, {**metadata, "bc_loss": bc.mean().detach()}

@@ -1,24 +1,24 @@
-"""What losses share: how the rows' losses become one, the weights that a sampler gave rows, references to let go."""
+"""What losses do with a minibatch's rows: see n steps, take a sampler's weights, make one number of them."""
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.objectives import LossModule
+from torchrl.objectives import IQLLoss, LossModule, REDQLoss
 
-from lw_torchrl._checks import check_choice
+from lw_torchrl._checks import checked
 
 Reduction = Literal["none", "mean", "sum"]
-REDUCTIONS = ("none", "mean", "sum")
+_STEPS = "steps_to_next_obs"
 
 
-def set_reduction(loss: LossModule, given: Any) -> None:
-    """Take one of "none", "mean" and "sum"; None for "mean", which the loss's class says, as older checkpoints do."""
-    if given is not None and check_choice("reduction", given, REDUCTIONS) != loss.reduction:
-        loss.reduction = given
+def set_reduction(loss: LossModule, reduction: Reduction | None) -> None:
+    """Set a reduction other than the class's "mean", which files of trainings do not hold."""
+    if reduction not in (None, loss.reduction):
+        loss.reduction = reduction
 
 
 def priority_weight(loss: LossModule, tensordict: TensorDictBase) -> Tensor | None:
@@ -31,3 +31,39 @@ def let_go(*tensordicts: TensorDictBase) -> None:
     if torch.compiler.is_compiling():
         for one in tensordicts:
             one.clear_refs_for_compile_()
+
+
+@checked
+def with_n_steps(loss: LossModule, batch: TensorDictBase) -> TensorDictBase:
+    """A minibatch whose n steps the loss's value estimator sees: ``loss(with_n_steps(loss, batch))``.
+
+    TorchRL's :class:`~torchrl.objectives.IQLLoss` and :class:`~torchrl.objectives.REDQLoss` show their estimator only
+    what is under ``"next"``. ``steps_to_next_obs`` is not there, so they would bootstrap over one step. This sets it
+    there too, and has the estimator read it. For other losses, and rows without it, nothing happens.
+
+    Args:
+        loss: any loss; call ``make_value_estimator`` before.
+        batch: rows of a buffer, ``steps_to_next_obs`` (B,) int64 among them.
+
+    Returns:
+        ``batch`` itself, with ``("next", "steps_to_next_obs")`` (B,) int64 where it is needed.
+
+    Example:
+        >>> import lw_torchrl as lw, torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.objectives import IQLLoss
+        >>> plans = lw.load_plans("MT10")
+        >>> actor = lw.PlanConditionedActor(plans, distribution="tanh_normal")
+        >>> loss = IQLLoss(actor, lw.PlanConditionedQValue(plans), lw.PlanConditionedValue(plans))
+        >>> loss.make_value_estimator(gamma=0.99)
+        >>> batch = TensorDict(steps_to_next_obs=torch.tensor([5, 2]), next=TensorDict(), batch_size=[2])
+        >>> with_n_steps(loss, batch)["next", "steps_to_next_obs"].tolist()
+        [5, 2]
+
+    Source: Sutton, Barto, "Reinforcement Learning", section 7.1.
+    """
+    steps = batch.get(_STEPS, None)
+    if steps is None or not isinstance(loss, (IQLLoss, REDQLoss)):
+        return batch
+    loss.value_estimator.set_keys(steps_to_next_obs=("next", _STEPS))
+    return batch.set(("next", _STEPS), steps)

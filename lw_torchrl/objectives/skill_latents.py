@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 from torchrl.objectives import LossModule
 
-from lw_torchrl._checks import check_choice
+from lw_torchrl._checks import checked
 from lw_torchrl.modules.plan_encoder import PlanEncoder
 from lw_torchrl.objectives.reduction import Reduction, let_go, set_reduction
 
@@ -23,11 +23,10 @@ class SkillLatentLoss(LossModule):
     """A term on the latents of a plan's skills, to be added to any loss of the policy that has them.
 
     "consistency": skills whose texts are near stay near. The cosine of two latents is drawn to that of the texts'
-    vectors: the mean over pairs of the squared difference. A text that training has not seen is then where texts like
-    it are.
+    vectors: the mean over pairs of the squared difference. A new text then lies where texts like it are.
 
     "contrastive": latents of different skills keep apart. InfoNCE with each skill as its own positive and the others as
-    negatives, at temperature 0.1; 0 would be the least that is. It draws nothing at random.
+    negatives, at temperature 0.1; the least is 0. It draws nothing at random.
 
     It reads no batch, and gives ``loss_latents`` () float32, of K skills (K,) by ``reduction="none"``.
 
@@ -60,10 +59,11 @@ class SkillLatentLoss(LossModule):
     encoder_params: TensorDictParams
     target_encoder_params: TensorDictParams
 
+    @checked
     def __init__(self, network: Any, kind: Kind = "consistency", *, reduction: Reduction | None = None) -> None:
         super().__init__()
         set_reduction(self, reduction)
-        self.kind: Kind = check_choice("kind", kind, KINDS)
+        self.kind = kind
         self.convert_to_functional(skill_encoder("network", network), "encoder")
 
     def forward(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:

@@ -16,7 +16,7 @@ from lw_torchrl._files import held
 from lw_torchrl._tensor_archive import ArchiveError, TensorArchive, write_archive
 from lw_torchrl.data import BEHAVIOURS, LanguageWorldExperienceReplay, TaskBalancedSampler
 from lw_torchrl.evaluation import EvaluationResult, plot_methods
-from lw_torchrl.evaluation.comparison import markdown_table
+from lw_torchrl.evaluation.summary import markdown_table
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.modules import DescriptorEncoder, PlanEncoder, QValue, Value
 from lw_torchrl.modules.encoder import Encoder

@@ -12,9 +12,9 @@ from typing import Any, Literal
 from lw_torchrl._checks import differences
 from lw_torchrl._files import read_json, write_json
 from lw_torchrl._progress import Progress
-from lw_torchrl.evaluation.comparison import markdown_table
 from lw_torchrl.evaluation.many_plans import evaluate_plans
 from lw_torchrl.evaluation.statistics import mean_rate
+from lw_torchrl.evaluation.summary import markdown_table
 from lw_torchrl.language.decoding import decode_plan
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.language.tasks import TASKS, Task

@@ -13,7 +13,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from lw_torchrl._checks import check_int, checked, missing_keys, shown
-from lw_torchrl.envs.engines import VectorizedEngine
+from lw_torchrl.envs.engines.vectorized.engine import VectorizedEngine
 from lw_torchrl.envs.seeding import episode_seed
 from lw_torchrl.evaluation.failures import Failure
 from lw_torchrl.language.named_objects import GRIPPER

@@ -20,7 +20,7 @@ from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.record.mujoco_scene import Motion, model_geometry
 from lw_torchrl.record.rerun_logger import RerunLogger
 from lw_torchrl.record.rollout_pages import read_rollout
-from lw_torchrl.transforms.containers import base_env, refuse_changed
+from lw_torchrl.transforms.environment import base_env, refuse_changed
 
 _ROOM = 512  # steps, at first
 _FIXED = ("task_id", "episode", "qaf_plan")

@@ -27,7 +27,7 @@ from lw_torchrl._checks import (
     check_scale,
     checked_but,
 )
-from lw_torchrl.objectives.n_steps import with_n_steps
+from lw_torchrl.objectives.reduction import with_n_steps
 from lw_torchrl.training.buffers import check_minibatches
 from lw_torchrl.training.envelope import TRAINING
 from lw_torchrl.training.file_checks import tensors_of

@@ -3,7 +3,7 @@
 import lw_torchrl._torchrl  # noqa: F401
 from lw_torchrl.transforms.camera import CameraTransform
 from lw_torchrl.transforms.corrupt_qaf import CorruptQAF
-from lw_torchrl.transforms.env_state import EnvState
+from lw_torchrl.transforms.environment import EnvState
 from lw_torchrl.transforms.qaf import QAFTransform
 from lw_torchrl.transforms.random_yaw import RandomYaw
 

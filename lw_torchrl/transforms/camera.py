@@ -16,18 +16,17 @@ from torchrl.envs.batched_envs import BatchedEnvBase
 from lw_torchrl._checks import check_int, checked
 from lw_torchrl._keys import as_keys
 from lw_torchrl._rendering import check_cameras
-from lw_torchrl.transforms.containers import base_env
-from lw_torchrl.transforms.env_state import KeepsEnvState
+from lw_torchrl.transforms.environment import KeepsEnvState, base_env
 
 
 class CameraTransform(KeepsEnvState):
     """Writes ``pixels`` (B, height, width·C, 3) uint8, pictures by C cameras side by side, the first on the left.
 
     A picture of a row is taken at its reset and then every so many steps of its episode, and held in between; rows that
-    a ``_step`` or ``_reset`` mask leaves out are not drawn. It is of the state that the row is in, as ``observation``
-    is, and changes nothing in the simulation. In an environment its ``state_dict`` holds the environment's, as
-    :class:`EnvState` does; after ``load_state_dict`` the environment must be reset. With SerialEnv and ParallelEnv put
-    it into each worker. A replay buffer has no simulation to draw: :func:`add_pictures` draws a dataset's rows.
+    a ``_step`` or ``_reset`` mask leaves out are not drawn. It shows the row's state, as ``observation`` does, and
+    changes nothing in the simulation. Its ``state_dict`` holds the environment's, as :class:`EnvState` does; after
+    ``load_state_dict`` the environment must be reset. With SerialEnv and ParallelEnv put it into each worker. A replay
+    buffer has no simulation to draw: :func:`add_pictures` draws a dataset's rows.
 
     Args:
         cameras: "corner2", "corner", "corner3", "corner4", "topview", "behindGripper" or "gripperPOV", or several.
@@ -65,24 +64,16 @@ class CameraTransform(KeepsEnvState):
         self.cameras = check_cameras(cameras, height, width)
         self.height, self.width, self.every = height, width, check_int("every", every, minimum=1)
         super().__init__(in_keys=[], out_keys=as_keys("out_keys", out_keys, ("pixels",)))
-        self._taken: Tensor | None = None  # (N, height, width·C, 3) uint8
-        self._steps: Tensor | None = None  # (N,) int64, of each row's episode
+        self._forget_episodes()
 
     @property
     def shape(self) -> tuple[int, int, int]:
         """Of a row's pictures."""
         return self.height, self.width * len(self.cameras), 3
 
-    def clone(self) -> CameraTransform:
-        """One for another environment, in which no picture was taken."""
-        other: CameraTransform = super().clone()
-        other._taken = other._steps = None
-        return other
-
-    def set_extra_state(self, state: Tensor) -> None:
-        """As :class:`EnvState`; a step wants a reset first."""
-        super().set_extra_state(state)
-        self._taken = self._steps = None
+    def _forget_episodes(self) -> None:
+        self._taken: Tensor | None = None  # (N, height, width·C, 3) uint8
+        self._steps: Tensor | None = None  # (N,) int64, of each row's episode
 
     def set_container(self, container: Transform | EnvBase) -> None:
         """Join an environment."""
@@ -96,8 +87,8 @@ class CameraTransform(KeepsEnvState):
         if env is not None and not hasattr(env, "row_tasks"):
             raise TypeError(f"CameraTransform must be around a LanguageWorldEnv, got {type(env).__name__}")
 
-    def _take(self, which: Tensor) -> None:
-        """Draw rows, (N,) bool."""
+    def _draw(self, which: Tensor, tensordict: TensorDictBase) -> TensorDictBase:
+        """Draw rows, (N,) bool, and write all rows' pictures."""
         env: Any = base_env(self)
         rows = which.nonzero().flatten()
         if self._taken is None:
@@ -106,9 +97,6 @@ class CameraTransform(KeepsEnvState):
             size = {"height": self.height, "width": self.width, "rows": rows.tolist()}
             drawn = [env.render(camera=camera, **size) for camera in self.cameras]
             self._taken[rows] = torch.cat([one if one.dim() == 4 else one[None] for one in drawn], -2)
-
-    def _show(self, tensordict: TensorDictBase) -> TensorDictBase:
-        assert self._taken is not None
         return tensordict.set(self.out_keys[0], self._taken.clone().reshape(*tensordict.batch_size, *self.shape))
 
     def _rows(self, mask: Tensor | None) -> Tensor:
@@ -120,8 +108,7 @@ class CameraTransform(KeepsEnvState):
         begun = self._rows(tensordict.get("_reset", None))
         steps = torch.zeros(len(begun), dtype=torch.int64) if self._steps is None else self._steps
         self._steps = torch.where(begun, 0, steps)
-        self._take(begun)
-        return self._show(tensordict_reset)
+        return self._draw(begun, tensordict_reset)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         if self._steps is None:
@@ -131,8 +118,7 @@ class CameraTransform(KeepsEnvState):
             )
         moved = self._rows(tensordict.get("_step", None))
         self._steps = self._steps + moved
-        self._take(moved & (self._steps % self.every == 0))
-        return self._show(next_tensordict)
+        return self._draw(moved & (self._steps % self.every == 0), next_tensordict)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Raise: rows of a replay buffer are in no simulation."""

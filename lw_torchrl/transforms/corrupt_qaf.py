@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec
-from torchrl.envs import Transform
 
 from lw_torchrl._checks import check_int, check_probability, checked, missing_keys, shown, unknown_name
 from lw_torchrl._keys import as_keys, read
@@ -18,13 +16,14 @@ from lw_torchrl._seeding import episode_generator
 from lw_torchrl.language.plan_tables import PlanTables
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.queries import Query, read_query
-from lw_torchrl.transforms.held_truth import HeldTruth, kept
+from lw_torchrl.transforms.answers import RowAnswers, kept
+from lw_torchrl.transforms.environment import EpisodeTransform
 from lw_torchrl.transforms.qaf import plan_number_key
 
 _BLOCK = 64  # steps of an episode whose draws are made at once
 
 
-class CorruptQAF(Transform):
+class CorruptQAF(EpisodeTransform):
     """Spoils ``qaf`` in an environment, behind a :class:`QAFTransform`, to measure what wrong answers cost.
 
     Reads ``qaf`` (B, S) bool, ``task_id`` (B,) and ``episode`` (B,) int64, and ``qaf_plan`` (B,) int64 where it is;
@@ -36,9 +35,9 @@ class CorruptQAF(Transform):
       what sticks is the answer itself, not its opposite;
     - **drop**: the answers to these queries are always false.
 
-    Padding stays false. What is drawn for an answer hangs on (task, seed, episode, step) and the answer's place in its
-    plan, not on the number of environments nor on the tasks beside; of two probabilities the greater one spoils what
-    the smaller one spoils, and more. In :func:`lw_torchrl.evaluate` it is an ``evaluator``. A policy with a
+    Padding stays false. What is drawn for an answer depends only on (task, seed, episode, step) and the answer's place
+    in its plan, not on the number of environments nor on the tasks beside. Of two probabilities the greater one spoils
+    what the smaller one spoils, and more. In :func:`lw_torchrl.evaluate` it is an ``evaluator``. A policy with a
     :class:`QueryEvaluator` of its own does not read ``qaf``, and feels nothing.
 
     Args:
@@ -92,26 +91,14 @@ class CorruptQAF(Transform):
                 conditions = {str(step.condition) for plan in self.plans.values() for step in plan.steps}
                 raise unknown_name("drop", text, sorted(conditions))
             self._answered &= ~dropped
-        self._start()
-
-    def _start(self) -> None:
-        self._late = HeldTruth(delay=self.lag)
-        self._before: Tensor | None = None  # (B, S) bool, what sticks
         self._task: Tensor | None = None  # B int64, of the rows' episodes
         self._episode: Tensor | None = None
-        self._rows: Tensor | None = None  # B int64, where their plans are in the tables
+        self._plan: Tensor | None = None  # B int64, where their plans are in the tables
+        self._forget_episodes()
+
+    def _forget_episodes(self) -> None:
+        self._rows = RowAnswers(delay=self.lag)
         self._draws = {purpose: _Draws(purpose, self.seed, self._tables, self.plans) for purpose in ("stick", "flip")}
-
-    def clone(self) -> CorruptQAF:
-        """One for another environment, in which no episode has begun."""
-        other: CorruptQAF = super().clone()
-        other._start()
-        return other
-
-    def _load_from_state_dict(self, *args: Any) -> None:
-        """A step wants a reset first: episodes that were under way are no part of an environment's state."""
-        super()._load_from_state_dict(*args)
-        self._late.forget()
 
     def with_plans(self, plans: Plans | Mapping[str, ConditionalPlan]) -> CorruptQAF:
         """One that spoils the answers of other plans alike; queries that these lack are not dropped."""
@@ -125,47 +112,32 @@ class CorruptQAF(Transform):
         truth, task, episode = read(tensordict_reset, self.in_keys)
         begun = tensordict.get("_reset", None)
         self._task, self._episode = kept(self._task, task, begun), kept(self._episode, episode, begun)
-        self._rows = self._tables.rows(self._task)
+        self._plan = self._tables.rows(self._task)
         number = tensordict_reset.get(plan_number_key(self.in_keys[0]), None)
-        if number is not None and bool(((number != self._tables.number[self._rows]) & (number != 0)).any()):
+        if number is not None and bool(((number != self._tables.number[self._plan]) & (number != 0)).any()):
             raise ValueError("qaf answers other plans than CorruptQAF was given: give both the same plans")
-        self._check(truth)
-        shown = self._late.begin(truth, begun)
-        if begun is not None and self._before is not None and self._before.shape == shown.shape:
-            shown = torch.where(begun.reshape(task.shape).unsqueeze(-1), shown, self._before)
-        self._before = shown
-        return tensordict_reset.set(self.in_keys[0], self._spoilt(shown))
-
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        truth, moved = next_tensordict.get(self.in_keys[0]), tensordict.get("_step", None)
-        now = self._late.go_on(truth, moved)
-        if self.stick:
-            assert self._before is not None
-            sticks = self._drawn("stick") < self.stick
-            if moved is not None:
-                sticks |= ~moved.reshape(sticks.shape[:-1]).unsqueeze(-1)
-            now = torch.where(sticks, self._before, now)
-        self._before = now
-        return next_tensordict.set(self.in_keys[0], self._spoilt(now))
-
-    def _check(self, truth: Tensor) -> None:
-        assert self._rows is not None
-        shape = (*self._rows.shape, self.plans.num_steps)
+        shape = (*self._plan.shape, self.plans.num_steps)
         if truth.dtype != torch.bool or truth.shape != shape:
             raise ValueError(
                 f"qaf must be bool of shape {shape}, a column for each step of the longest of plans, got {truth.dtype} "
                 f"of shape {tuple(truth.shape)}"
             )
+        return tensordict_reset.set(self.in_keys[0], self._spoilt(self._rows.begin(truth, begun)))
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        stuck = (lambda: self._drawn("stick") < self.stick) if self.stick else None
+        now = self._rows.advance(next_tensordict.get(self.in_keys[0]), tensordict.get("_step", None), stuck)
+        return next_tensordict.set(self.in_keys[0], self._spoilt(now))
 
     def _drawn(self, purpose: str) -> Tensor:
-        assert self._rows is not None
+        assert self._plan is not None
         assert self._episode is not None
-        return self._draws[purpose](self._rows, self._episode, self._late.step)
+        return self._draws[purpose](self._plan, self._episode, self._rows.step)
 
     def _spoilt(self, answers: Tensor) -> Tensor:
         if self.flip:
             answers = answers ^ (self._drawn("flip") < self.flip)
-        return answers & self._answered[self._rows]
+        return answers & self._answered[self._plan]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Refused: rows of a buffer do not tell the steps of their episodes."""
@@ -184,14 +156,7 @@ class CorruptQAF(Transform):
 
 
 class _Draws:
-    """Uniform numbers for the answers of rows, in blocks of steps: (task, seed, episode, block) says which.
-
-    Args:
-        purpose: what they are for.
-        seed: of them.
-        tables: of the plans.
-        plans: the plans.
-    """
+    """Uniform numbers for the answers of rows, in blocks of steps, by (task, seed, episode, block)."""
 
     def __init__(self, purpose: str, seed: int, tables: PlanTables, plans: Plans) -> None:
         self._purpose, self._seed = purpose, seed

@@ -19,9 +19,8 @@ from lw_torchrl.language.plan_tables import PlanTables
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.query_program import QueryProgram
 from lw_torchrl.language.task_index import TaskTables
-from lw_torchrl.transforms.containers import base_env, refuse_changed, transforms_beside
-from lw_torchrl.transforms.env_state import KeepsEnvState
-from lw_torchrl.transforms.held_truth import HeldTruth, kept
+from lw_torchrl.transforms.answers import RowAnswers, kept
+from lw_torchrl.transforms.environment import KeepsEnvState, base_env, refuse_changed, transforms_beside
 
 _HALF = (torch.float16, torch.bfloat16)  # in which metres are not told apart as conditions do
 
@@ -50,16 +49,15 @@ class QAFTransform(KeepsEnvState):
     the environment's, as :class:`EnvState` does.
 
     Conditions speak of metres, so it comes before whatever changes the observation: a normaliser, :class:`RandomYaw`.
-    One that comes first and says so, by its ``out_keys``, is refused, also in the workers of a SerialEnv. What it
-    cannot see it answers wrongly: a transform that changes the observation without naming it among its keys, and one
-    in the processes of a ParallelEnv; put it into each worker, before them.
+    A transform that comes first and names the observation in its ``out_keys`` is refused, also in the workers of a
+    SerialEnv. What it cannot see it answers wrongly: a transform that changes the observation without naming it, and
+    one in the processes of a ParallelEnv. Put it into each worker, before them.
 
-    What answers may be slow. With ``every`` the answers of a row are taken at its reset and then every so many steps of
-    its episode, and held in between; with ``delay`` they come so many steps late: in step t, 0 at the reset, a row is
-    shown those of step every · ⌊max(t - delay, 0) / every⌋. Steps are those of the environment; a ``_step`` or
-    ``_reset`` mask counts for its rows alone. Answers of episodes under way are no part of ``state_dict``, nor are
-    their physics: after ``load_state_dict`` the environment must be reset. Rows of a replay buffer have no such steps:
-    a ``QAFTransform`` with either is refused there.
+    Answers may be slow. With ``every`` a row's answers are taken at its reset and then every so many steps of its
+    episode, and held in between. With ``delay`` they come so many steps late: in step t, 0 at the reset, a row is shown
+    those of step every · ⌊max(t - delay, 0) / every⌋. A ``_step`` or ``_reset`` mask counts for its rows alone. After
+    ``load_state_dict`` the environment must be reset: episodes under way are no part of it. Rows of a replay buffer
+    have no such steps, so a ``QAFTransform`` with either is refused there.
 
     Args:
         plans: a plan for each task that will be seen.
@@ -107,27 +105,17 @@ class QAFTransform(KeepsEnvState):
         self.program = plan_program(self.plans)
         tables = PlanTables(self.plans)
         self._number = TaskTables(tables.index, _Number(tables.number), f"tasks without a plan in {self.plans!r}")
-        self._held = HeldTruth(self.every, self.delay) if self.every > 1 or self.delay else None
         self._task: Tensor | None = None  # of each row, since its last reset
         self._beside = 0
         self._saw_workers = False
+        self._forget_episodes()
+
+    def _forget_episodes(self) -> None:
+        self._rows = RowAnswers(self.every, self.delay) if self.every > 1 or self.delay else None
 
     def with_plans(self, plans: Plans | Mapping[str, ConditionalPlan]) -> QAFTransform:
         """One that answers the conditions of other plans as often and as late."""
         return QAFTransform(plans, every=self.every, delay=self.delay, in_keys=self.in_keys, out_keys=self.out_keys[:1])
-
-    def clone(self) -> QAFTransform:
-        """One for another environment, in which no episode has begun."""
-        other: QAFTransform = super().clone()
-        if self._held is not None:
-            other._held = HeldTruth(self.every, self.delay)
-        return other
-
-    def set_extra_state(self, state: Tensor) -> None:
-        """As :class:`EnvState`; a step wants a reset first."""
-        super().set_extra_state(state)
-        if self._held is not None:
-            self._held.forget()
 
     def _write(self, tensordict: TensorDictBase, task_id: Tensor | None) -> None:
         observation = tensordict.get(self.in_keys[0], None)
@@ -153,21 +141,21 @@ class QAFTransform(KeepsEnvState):
         begun, task = tensordict.get("_reset", None), tensordict_reset.get(self.in_keys[1], None)
         self._task = task if task is None else kept(self._task, task, begun)
         self._write(tensordict_reset, self._task)
-        if self._held is not None:
+        if self._rows is not None:
             truth = tensordict_reset.get(self.out_keys[0])
-            tensordict_reset.set(self.out_keys[0], self._held.begin(truth, begun))
+            tensordict_reset.set(self.out_keys[0], self._rows.begin(truth, begun))
         return tensordict_reset
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         next_tensordict = self._call(next_tensordict)
-        if self._held is not None:
+        if self._rows is not None:
             truth = next_tensordict.get(self.out_keys[0])
-            next_tensordict.set(self.out_keys[0], self._held.go_on(truth, tensordict.get("_step", None)))
+            next_tensordict.set(self.out_keys[0], self._rows.advance(truth, tensordict.get("_step", None)))
         return next_tensordict
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write both keys, and those of ``next`` where there is a next observation."""
-        if self._held is not None:
+        if self._rows is not None:
             raise ValueError(
                 f"QAFTransform(every={self.every}, delay={self.delay}) counts the steps of an environment's episodes, "
                 "which rows of a replay buffer do not tell: put it into the environment, whose rows then carry qaf, or "

@@ -55,17 +55,16 @@ def _reach(action: Tensor) -> Tensor:
 class RandomYaw(Transform):
     """Turns each sampled row, its positions and its action alike, by a random angle about the vertical.
 
-    What is to the left of the hand in every demonstration of a task is a little in front of it or behind it in some
-    rows, so a policy learns to move along the way to the goal rather than in the direction that the demonstrations
-    happened to have. For replay buffers; where a :class:`QAFTransform` is used, put it first, since conditions speak of
-    the scene as it was.
+    A policy then learns to move towards the goal rather than in the direction that the demonstrations happened to have.
+    For replay buffers; where a :class:`QAFTransform` is used, put it first, since conditions speak of the scene as it
+    was.
 
     Changes ``observation`` (B, 39) float32 and ``action`` (B, 4) float32, and, where they are, ``expert_action`` and
     ``unclipped_action`` (B, 4) float32 and ``("next", "observation")``; writes ``observation_yaw`` (B,) float32, the
-    angle in radians, and ``("next", "observation_yaw")``. An action's way in the plane is shortened where
-    turning would lead it out of [-1, 1], its direction kept; one that was outside before keeps its length. Orientations
-    stay as they were: use it with features that do not hold them, "differences" or "relative". ``focus`` and ``roles``
-    turn fixed places by the angle. Angles are drawn from PyTorch's global generator; the trainers seed it.
+    angle in radians, and ``("next", "observation_yaw")``. An action's way in the plane is shortened where turning would
+    lead it out of [-1, 1]; one that was outside before keeps its length. Orientations stay as they were: use it with
+    features that do not hold them, "differences" or "relative". ``focus`` and ``roles`` turn fixed places by the angle.
+    Angles are drawn from PyTorch's global generator; the trainers seed it.
 
     Args:
         scale: standard deviation of the angle, in radians.

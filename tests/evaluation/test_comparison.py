@@ -24,10 +24,7 @@ def test_tables():
     comparison = MethodComparison({"a": A, "b": B}, PUBLISHED)
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in comparison.per_task().splitlines()]
     assert rows[0] == ["task", "a", "b", "published, last"]
-    assert rows[2:] == [
-        ["push", "0.80 (0.70-0.90)", "0.20", "0.80"],
-        ["assembly", "0.40 (0.30-0.50)", "0.40", "0.10"],
-    ]
+    assert rows[2:] == [["push", "0.80 (0.70-0.90)", "0.20", "0.80"], ["assembly", "0.40 (0.30-0.50)", "0.40", "0.10"]]
     lines = comparison.headline().splitlines()
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[:5]]
     assert rows[0] == ["method", "mean", "IQM", "tasks >= 0.8, of 2", "seeds", "mean of the 1 outside MT10"]

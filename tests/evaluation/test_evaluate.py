@@ -53,7 +53,7 @@ def assert_same(found, expected):
 # ---- which episodes
 
 
-@pytest.mark.parametrize("num_envs", [None, 2, 5, 20])
+@pytest.mark.parametrize("num_envs", [None, 5])
 def test_exactly_k_episodes_of_each_task(num_envs):
     result = run(ExpertActor(["push", "reach"]), ["reach", "push"], num_envs=num_envs, max_steps=4)
     assert [(e.task, e.episode) for e in result.episodes] == list(product(["push", "reach"], range(3)))
@@ -73,7 +73,7 @@ def alone():
     return run(make_actor(), ["drawer-open", "push"], num_envs=2)
 
 
-@pytest.mark.parametrize("num_envs", [None, 3, 7])
+@pytest.mark.parametrize("num_envs", [None, 5])
 def test_the_number_of_environments_changes_no_bit(alone, num_envs):
     assert_same(run(make_actor(), ["drawer-open", "push"], num_envs=num_envs), alone)
 
@@ -169,12 +169,18 @@ def trained(tmp_path_factory):
     return actor
 
 
-def test_a_trained_policys_actions_give_the_same_success_in_meta_worlds_own_environments(trained):
-    result = run(trained, ["drawer-open", "reach"], episodes_per_task=4, max_steps=150, num_envs=3)
-    assert result.mean_success > 0, "the test wants successes"
-    assert_true_in_metaworld(result)
+@pytest.fixture(scope="module")
+def whole(trained):
+    """The trained policy's run."""
+    return run(trained, ["drawer-open", "reach"], episodes_per_task=4, max_steps=150, num_envs=6)
 
 
+def test_a_trained_policys_actions_give_the_same_success_in_meta_worlds_own_environments(whole):
+    assert whole.mean_success > 0, "the test wants successes"
+    assert_true_in_metaworld(whole)
+
+
+@pytest.mark.slow
 def test_on_every_mt10_task_the_recorded_actions_give_the_same_success():
     result = run(ExpertActor("MT10"), "MT10", episodes_per_task=2, max_steps=500, num_envs=13)
     assert [e.success for e in result.episodes].count(True) >= 15
@@ -182,22 +188,22 @@ def test_on_every_mt10_task_the_recorded_actions_give_the_same_success():
     assert_true_in_metaworld(result)
 
 
-@pytest.mark.parametrize("num_envs", [None, 3])
-def test_stopping_at_success_changes_nothing_of_the_any_step_success(trained, num_envs):
-    options = dict(episodes_per_task=4, max_steps=120)
-    whole = run(trained, ["drawer-open", "reach"], **options)
-    stopped = run(trained, ["drawer-open", "reach"], stop_at_success=True, num_envs=num_envs, **options)
+@pytest.mark.parametrize("num_envs", [None, pytest.param(3, marks=pytest.mark.slow)])
+def test_stopping_at_success_changes_nothing_of_the_any_step_success(trained, whole, num_envs):
+    options = dict(episodes_per_task=4, max_steps=150, stop_at_success=True, num_envs=num_envs)
+    stopped = run(trained, ["drawer-open", "reach"], **options)
     assert stopped.success_once == whole.success_once
     assert stopped.first_success == whole.first_success
     for key, e in by_episode(stopped).items():
         other = by_episode(whole)[key]
-        length = e.first_success or 120
+        length = e.first_success or 150
         assert (e.success, e.first_success) == (other.success, other.first_success)
         assert torch.equal(e.actions, other.actions[:length])
         assert (e.success_at_end, e.episode_return) == (None, None)
     assert set(stopped.success_at_end.values()) == set(stopped.mean_return.values()) == {None}
     assert any(e.success for e in whole.episodes)
-    assert_true_in_metaworld(stopped)
+    if num_envs is not None:
+        assert_true_in_metaworld(stopped)
 
 
 def test_the_dense_reward_is_summed():
@@ -396,8 +402,8 @@ def test_keys_of_the_environment_and_of_the_actor_are_recorded():
 
 def test_the_experts_succeed_and_the_untrained_do_not():
     tasks = ["button-press-topdown", "reach"]
-    good = run(ExpertActor(tasks), tasks, max_steps=120, episodes_per_task=4)
-    bad = run(make_actor(), tasks, max_steps=120, episodes_per_task=4)
+    good = run(ExpertActor(tasks), tasks, max_steps=120, episodes_per_task=2)
+    bad = run(make_actor(), tasks, max_steps=120, episodes_per_task=2)
     assert good.mean_success > bad.mean_success
     assert good.success_once["reach"] == 1.0
     assert all(0 < (e.first_success or 1) <= 120 for e in good.episodes)

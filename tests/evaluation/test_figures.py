@@ -19,7 +19,7 @@ from lw_torchrl.evaluation import (
     published_curves,
     summarize_rates,
 )
-from lw_torchrl.evaluation.figures import wilson_interval
+from lw_torchrl.evaluation.statistics import wilson_interval
 
 
 def make_result(rates, trials=4):
@@ -161,10 +161,7 @@ def test_each_curve_can_be_sorted_for_itself(tmp_path):
 def test_published_curves_are_dashed_and_say_what_they_are(tmp_path):
     ours = {task: [rate, 1.0] for task, rate in published("few-shot").items()}
     figure = plot_sorted_tasks({"PCBC": ours}, tmp_path / "figure.png", published=published_curves("few-shot"))
-    labels = [
-        "PCBC published, best of the last 10 evaluations: mean 0.63",
-        "PCBC published, last: mean 0.39",
-    ]
+    labels = ["PCBC published, best of the last 10 evaluations: mean 0.63", "PCBC published, last: mean 0.39"]
     tasks = [label.get_text() for label in figure.axes[0].get_xticklabels()]
     assert lines(figure)[labels[1]] == [published("few-shot")[task] for task in tasks]
     for line in figure.axes[0].lines:

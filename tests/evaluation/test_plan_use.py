@@ -5,7 +5,7 @@ from tensordict import TensorDict
 
 import lw_torchrl as lw
 from lw_torchrl.envs.episodes import FinishedEpisode
-from lw_torchrl.evaluation.plan_use import PlanUse, expert_use
+from lw_torchrl.evaluation.plan_use import PlanUse, expert_use, where_stuck
 
 PLANS = {"reach": lw.load_plans("MT10")["reach"]}  # three steps
 
@@ -56,6 +56,14 @@ def test_without_a_policy_that_chooses():
     assert found.to_json()["states"] == 3
 
 
+def test_one_rule_says_where_an_episode_got_stuck():
+    in_charge = torch.nn.functional.one_hot(torch.tensor([0] * 60 + [2] * 6 + [1] * 3 + [0] * 31), 4)
+    assert where_stuck(in_charge, 100) == (0, 2)
+    assert where_stuck(in_charge, 40) == (0, 2)
+    assert where_stuck(in_charge, 34) == (0, 0), "step 1 was in charge for less than 5 states"
+    assert where_stuck(in_charge * 0, 100) == (0, 0)
+
+
 def test_experts_are_stopped_where_nothing_counts_any_more():
     tasks, plans = ["drawer-open", "reach"], lw.load_plans("MT10")
     whole = PlanUse(plans)
@@ -63,10 +71,11 @@ def test_experts_are_stopped_where_nothing_counts_any_more():
         lw.ExpertActor(tasks),
         tasks=tasks,
         plans=plans,
-        episodes_per_task=3,
+        episodes_per_task=2,
         seed=4,
+        max_steps=250,
         noise_scale=0.0,
         also_record=["qaf"],
         on_episode=whole,
     )
-    assert expert_use(plans, tasks, episodes_per_task=3, seed=4) == whole.tasks()
+    assert expert_use(plans, tasks, episodes_per_task=2, seed=4) == whole.tasks()

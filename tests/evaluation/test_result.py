@@ -174,7 +174,7 @@ def test_a_wrong_file_is_refused_and_left_alone(tmp_path, name):
     assert path.read_bytes() == before
 
 
-@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
 def test_a_file_of_another_shape_is_refused_or_holds_together(tmp_path, data):
     path = tmp_path / "results.json"

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import example, given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import lw_torchrl as lw
@@ -85,6 +85,7 @@ def test_one_seed_has_no_interval():
     assert "mean 0.500, IQM 0.500; 1 of 3 tasks >= 0.8; 1 seed" in summary.table()
 
 
+@settings(max_examples=40, deadline=None)
 @given(
     st.integers(1, 4).flatmap(
         lambda seeds: st.dictionaries(

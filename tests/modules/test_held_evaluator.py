@@ -13,8 +13,8 @@ from torchrl.envs import Compose, SerialEnv, TransformedEnv, check_env_specs
 
 import lw_torchrl as lw
 from lw_torchrl._devices import BLOCK
-from lw_torchrl.evaluation.drift import condition_drift
-from lw_torchrl.evaluation.swaps import TrueAnswers, own_evaluators, with_true_answers
+from lw_torchrl.evaluation.counterfactuals import TrueAnswers, own_evaluators, with_true_answers
+from lw_torchrl.evaluation.evaluator_report import condition_drift
 from lw_torchrl.record.rollouts import run_recorded
 
 

@@ -11,7 +11,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 import lw_torchrl as lw
 from lw_torchrl._tensor_archive import write_archive
-from lw_torchrl.evaluation.drift import condition_drift
+from lw_torchrl.evaluation.evaluator_report import condition_drift
 from lw_torchrl.training.behavioral_cloning import EvaluatorAnchor
 
 # --- files ---------------------------------------------------------------------------------------------------------

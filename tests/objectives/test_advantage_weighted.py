@@ -164,7 +164,10 @@ def test_without_a_largest_weight_a_shift_of_all_changes_nothing(shift):
     "ignore:.*LeafSpec:FutureWarning",
     "ignore:.*torch.jit:DeprecationWarning",
 )
-@pytest.mark.parametrize(("name", "distribution"), [("l2", None), ("smooth_l1", "normal"), ("log_prob", "normal")])
+@pytest.mark.parametrize(
+    ("name", "distribution"),
+    [("l2", None), *(pytest.param(name, "normal", marks=pytest.mark.slow) for name in ("smooth_l1", "log_prob"))],
+)
 def test_compiled_it_is_one_graph_with_the_same_gradients(name, distribution):
     torch._dynamo.reset()
     loss = lw.objectives.AdvantageWeightedLoss(make_actor(distribution=distribution), loss_function=name)

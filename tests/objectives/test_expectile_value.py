@@ -173,6 +173,7 @@ def test_without_an_updater_torchrl_warns():
     "ignore:.*LeafSpec:FutureWarning",
     "ignore:.*torch.jit:DeprecationWarning",
 )
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", CRITICS)
 def test_compiled_it_is_one_graph_with_the_same_gradients(kind):
     torch._dynamo.reset()

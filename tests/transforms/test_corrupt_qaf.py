@@ -59,7 +59,7 @@ masks = st.lists(st.booleans(), min_size=ROWS, max_size=ROWS).map(torch.tensor)
 moves = st.lists(st.tuples(st.sampled_from(["step", "step", "step", "reset"]), masks), max_size=20)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(st.sampled_from(SPOILT), moves)
 def test_it_is_what_a_plain_program_gives_over_any_resets(options, done):
     env = both(RandomStates(ROWS), **options)

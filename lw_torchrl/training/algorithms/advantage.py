@@ -9,8 +9,7 @@ from torch import nn
 from torchrl.objectives import SoftUpdate
 
 from lw_torchrl.modules.critics import QValue, Value
-from lw_torchrl.objectives.advantage_weighted import AdvantageWeightedLoss, standardize_by_task
-from lw_torchrl.objectives.expectile_value import ExpectileValueLoss
+from lw_torchrl.objectives.advantage_weighted import AdvantageWeightedLoss, ExpectileValueLoss, standardize_by_task
 from lw_torchrl.training.algorithms.learner import Learner, adamw, encoder_like
 
 

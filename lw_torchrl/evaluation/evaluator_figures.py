@@ -1,4 +1,4 @@
-"""The picture of an ImageQueryEvaluator's wrong answers: what it saw, and how far off it took things to be."""
+"""Figures of query evaluators: how reliable their probabilities are, and an ImageQueryEvaluator's wrong answers."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from lw_torchrl._checks import checked
-from lw_torchrl.evaluation.evaluator_report import clause_logits
-from lw_torchrl.evaluation.figures import check_image, saved
+from lw_torchrl.evaluation.evaluator_report import BINS, PARTS, EvaluatorReport, clause_logits
+from lw_torchrl.evaluation.figures import check_image, new_figure, saved, trim
 from lw_torchrl.language.queries import Clause
 from lw_torchrl.modules.image_query_evaluator import ImageQueryEvaluator
 from lw_torchrl.modules.networks import evaluating
@@ -21,6 +21,44 @@ from lw_torchrl.training.labelled_queries import Asked, LabelledQueries
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+
+@checked
+def plot_reliability(report: EvaluatorReport, path: str | os.PathLike[str] | None = None) -> Figure:
+    """Draw, for each part of a report, the share of answers that are true over their mean probability, and how many
+    answers there are.
+
+    Args:
+        report: of :func:`score_evaluator`.
+        path: an image file, .png, .svg, .pdf or .jpg, replaced whole; None for none.
+
+    Example:
+        >>> import torch
+        >>> from lw_torchrl.evaluation.evaluator_report import PartScore
+        >>> score = PartScore({"near": (9, 1)}, {"near": (9, 1)}, torch.ones(15, 3, dtype=torch.float64))
+        >>> len(plot_reliability(EvaluatorReport({"states": score}, {})).axes)
+        2
+    """
+    check_image(path)
+    figure = new_figure(4.2 * len(report.parts), 5.0)
+    both = figure.subplots(2, len(report.parts), squeeze=False, sharex=True, height_ratios=(3, 1))
+    for (part, score), upper, lower in zip(report.parts.items(), *both, strict=True):
+        number, told, true = score.reliability.numpy().T
+        there = number > 0
+        upper.plot([0, 1], [0, 1], color="#bab0ac", linewidth=1)
+        upper.plot(told[there] / number[there], true[there] / number[there], "o-", color="#4c78a8", markersize=4)
+        upper.set_title(
+            f"{PARTS[part]}\naccuracy {score.accuracy():.4f}, calibration error {score.calibration_error:.4f}",
+            fontsize=9,
+        )
+        upper.set_ylabel("share that holds")
+        lower.bar([(place + 0.5) / BINS for place in range(BINS)], number, width=0.9 / BINS, color="#4c78a8")
+        lower.set_yscale("log")
+        lower.set_ylabel("answers")
+        lower.set_xlabel("probability that it holds")
+        for axes in (upper, lower):
+            trim(axes)
+    return saved(figure, path)
 
 
 @dataclass(frozen=True)
@@ -89,25 +127,18 @@ def _off(evaluator: ImageQueryEvaluator, asked: Asked, row: int, clause: Clause)
 
 @checked
 def plot_wrong_answers(
-    evaluator: ImageQueryEvaluator,
-    data: LabelledQueries,
-    path: str | os.PathLike[str] | None = None,
-    most: int = 12,
+    evaluator: ImageQueryEvaluator, data: LabelledQueries, path: str | os.PathLike[str] | None = None, most: int = 12
 ) -> Figure:
     """Draw the surest wrong answers in held-out states: the pictures, what was asked, and how far from where they are
     the things were taken to be.
 
     Args:
         evaluator, data, most: as for :func:`wrong_answers`.
-        path: an image file, .png, .svg, .pdf or .jpg; it is replaced whole. None for none.
-
-    Returns:
-        The figure.
+        path: an image file, .png, .svg, .pdf or .jpg, replaced whole; None for none.
 
     Raises:
         ValueError: another format; no state is held out.
     """
-    from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     check_image(path)
@@ -116,7 +147,8 @@ def plot_wrong_answers(
     found = wrong_answers(evaluator, data, most)
     columns = min(3, max(1, len(found)))
     rows = max(1, -(-len(found) // columns))
-    figure = Figure(figsize=(3.9 * columns, 2.7 * rows), layout=ConstrainedLayoutEngine(h_pad=0.12))
+    figure = new_figure(3.9 * columns, 2.7 * rows)
+    figure.set_layout_engine(ConstrainedLayoutEngine(h_pad=0.12))
     panels = figure.subplots(rows, columns, squeeze=False).reshape(-1)
     for axes in panels:
         axes.axis("off")

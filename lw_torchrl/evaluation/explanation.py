@@ -1,81 +1,63 @@
-"""What the states of a failed episode tell: which answers were wrong, where the plan asks for something else than a
-reference, which step it ended in."""
+"""What the states of a failed episode tell: which answers were wrong, where the plan departs from a reference, which
+step it ended in."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn.functional import one_hot
 
+from lw_torchrl._devices import device_of
 from lw_torchrl.evaluation.failures import Cause
+from lw_torchrl.evaluation.plan_use import where_stuck
 from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.language.observation import HAND
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.language.skill_program import SkillProgram
 from lw_torchrl.language.skills import ScriptedSkill
+from lw_torchrl.modules.networks import evaluating
 from lw_torchrl.transforms.qaf import plan_program
 
-LATE = 100  # the last states, in which a failed episode got nowhere
-A_WHILE = 5  # states in which a step was in force that the episode came to
+_LATE = 100  # the last states, in which a failed episode got nowhere
 _AHEAD, _STILL = 10, 0.01  # a hand that within so many states comes less than a centimetre further
 _AWAY = 25  # states that a stay in a step may be left for: two steps that alternate are one stay
-WRONG = 0.01  # the share of states with wrong answers from which they count
-OTHER = 0.3  # how far two actions differ, on some axis, that are not meant to do the same
+_WRONG = 0.01  # the share of states with wrong answers from which they count
+_OTHER = 0.3  # how far two actions differ, on some axis, that are not meant to do the same
+_SAME = 0.02  # how far an action may be from the script's and still be the script's
 _REST = ScriptedSkill("", GRIPPER, gain=(0.0, 0.0, 0.0))  # in the place of a text that is no scripted skill
 _RULER = 1e-3  # action per metre, so small that no distance is cut off
 
 
-class Visited(NamedTuple):
-    """A failed episode, and what its states say of a plan.
-
-    Attributes:
-        task, episode: which.
-        steps: TensorDict of batch (T,).
-        truth: (T, S) bool, the query answering function's own answers.
-        given: (T, S) bool, those that the policy acted on.
-        weights: (T, S) float32, the policy's attention over the plan's steps.
-        in_force: (T,) int64, the step with most of it; -1 where all have the same, so that none is in force.
-    """
+class EpisodeStates(NamedTuple):
+    """A failed episode, and what its T states say of a plan of S steps."""
 
     task: str
     episode: int
-    steps: TensorDictBase
-    truth: Tensor
-    given: Tensor
-    weights: Tensor
-    in_force: Tensor
+    steps: TensorDictBase  # of batch (T,)
+    truth: Tensor  # (T, S) bool, the query answering function's own answers
+    given: Tensor  # (T, S) bool, those that the policy acted on
+    weights: Tensor  # (T, S) float32, the policy's attention over the plan's steps
+    in_force: Tensor  # (T,) int64, the step with most of it; -1 where all have the same, so that none is in force
 
 
 @dataclass(frozen=True)
 class Explanation:
-    """What the states say by themselves.
+    """What the states say by themselves."""
 
-    Attributes:
-        cause: "undecided" where they do not tell.
-        steps: for each cause, the step that it would hang on.
-        at: for each cause, the state to look at.
-        why: for each cause, half a sentence with its numbers.
-        evidence: name to number.
-    """
-
-    cause: Cause
-    steps: Mapping[str, int | None]
-    at: Mapping[str, int]
-    why: Mapping[str, str]
-    evidence: Mapping[str, float] = field(default_factory=dict)
+    cause: Cause  # "undecided" where they do not tell
+    steps: Mapping[str, int | None]  # for each cause, the plan's step that would be to blame
+    at: Mapping[str, int]  # for each cause, the state to look at
+    why: Mapping[str, str]  # for each cause, half a sentence with its numbers
+    evidence: Mapping[str, float]  # name to number
 
 
 class Scripts:
-    """The scripted skills of plans' steps, as far as there are any.
-
-    Args:
-        plans: the plans.
-        table: text to scripted skill.
+    """The scripted skills of plans' steps, as far as a table of text to scripted skill has any.
 
     Attributes:
         known: task to which of its plan's steps there are scripts for.
@@ -83,6 +65,7 @@ class Scripts:
     """
 
     def __init__(self, plans: Plans, table: Mapping[str, ScriptedSkill]) -> None:
+        self.table = table
         found = {plan.definition: [_script(plan, step.skill, table) for step in plan.steps] for plan in plans.values()}
         self.known = {task.name: [skill is not None for skill in listed] for task, listed in found.items()}
         self.program = SkillProgram({task: [skill or _REST for skill in listed] for task, listed in found.items()})
@@ -112,15 +95,9 @@ def chosen(truth: Tensor, steps: int) -> Tensor:
 
 
 def attended(weights: Tensor, steps: Tensor) -> Tensor:
-    """The step in force: the first of those with most attention; -1 where all steps have the same, since no condition
-    holds or every one does.
+    """The step in force, (...) int64: the first of those with most attention, ``weights`` (..., S) float32.
 
-    Args:
-        weights: (..., S) float32.
-        steps: (..., S) bool, those that there are.
-
-    Returns:
-        (...) int64.
+    -1 where all ``steps`` (..., S) bool that there are have the same, since no condition holds or every one does.
     """
     most = weights.masked_fill(~steps, -1.0).amax(-1, keepdim=True)
     least = weights.masked_fill(~steps, 2.0).amin(-1, keepdim=True)
@@ -129,7 +106,7 @@ def attended(weights: Tensor, steps: Tensor) -> Tensor:
     return torch.where(none, -1, first)
 
 
-def see(task: str, episode: int, steps: TensorDictBase, plans: Plans, given: Tensor | None) -> Visited:
+def states_of(task: str, episode: int, steps: TensorDictBase, plans: Plans, given: Tensor | None) -> EpisodeStates:
     """A failed episode under the policy's plan; ``given`` are the answers it acted on, None for what is recorded."""
     number = len(plans[task].steps)
     truth = plan_program(Plans([plans[task]]))(steps.get("observation"), steps.get("task_id"))[:, :number]
@@ -141,29 +118,25 @@ def see(task: str, episode: int, steps: TensorDictBase, plans: Plans, given: Ten
     weights = steps.get("skill_weights", None)
     weights = one_hot(chosen(given, number), number).float() if weights is None else weights[:, :number]
     in_force = attended(weights, torch.ones_like(weights, dtype=torch.bool))
-    return Visited(task, episode, steps, truth, given, weights, in_force)
+    return EpisodeStates(task, episode, steps, truth, given, weights, in_force)
 
 
-def candidates(seen: Visited, among: Tensor | None = None) -> list[int]:
-    """The steps that a failure may hang on, the likeliest first: of those in force for a while late in the episode the
-    furthest and the most frequent, then the furthest of all, then the others.
+def candidates(seen: EpisodeStates, among: Tensor | None = None) -> list[int]:
+    """The steps that may be to blame for a failure, the likeliest first: of those in force for a while late in the
+    episode the furthest and the most frequent, then the furthest of all, then the others.
 
     Args:
         seen: the episode.
         among: (T,) bool, the states that count; None for all.
     """
-    late = torch.zeros(len(seen.in_force), dtype=torch.bool)
-    late[-LATE:] = True
     counted = seen.in_force >= 0 if among is None else (seen.in_force >= 0) & among
     if not counted.any():
         return []
+    in_charge = one_hot(seen.in_force.clamp(min=0), seen.truth.shape[1]) * counted.unsqueeze(-1)
     ranked: list[int] = []
-    for states in (late & counted, counted):
-        if not states.any():
-            continue
-        count = torch.bincount(seen.in_force[states], minlength=seen.truth.shape[1])
-        reached = (count >= count.max().clamp(1, A_WHILE)).nonzero().flatten()
-        ranked += [int(reached[-1]), int(count.argmax())]
+    for window in (_LATE, len(in_charge)):
+        if counted[-window:].any():
+            ranked += reversed(where_stuck(in_charge, window))
     ranked += torch.bincount(seen.in_force[counted]).argsort(descending=True).tolist()
     present = set(seen.in_force[counted].tolist())
     return [step for step in dict.fromkeys(ranked) if step in present]
@@ -182,7 +155,7 @@ def stay(states: Tensor) -> int:
     return begin
 
 
-def settled(seen: Visited, step: int) -> int:
+def settled(seen: EpisodeStates, step: int) -> int:
     """Where the last stay in a step shows: the first state in it after which the hand gets no further, else its
     beginning."""
     inside = seen.in_force == step
@@ -192,24 +165,23 @@ def settled(seen: Visited, step: int) -> int:
     return begin + (int(still.int().argmax()) if still.any() else 0)
 
 
-def in_charge(seen: Visited, plan: ConditionalPlan, step: int) -> str:
+def in_charge(seen: EpisodeStates, plan: ConditionalPlan, step: int) -> str:
     """How long a step was in force, in words."""
-    late = min(LATE, len(seen.in_force))
+    late = min(_LATE, len(seen.in_force))
     inside = int((seen.in_force == step)[-late:].sum())
     return f"step {step + 1}, '{plan.steps[step].skill}', was in force in {inside} of the last {late} states"
 
 
 def explain(
-    seen: Visited, plans: Plans, scripts: Scripts, reference: Plans | None, reference_scripts: Scripts | None
+    seen: EpisodeStates, plans: Plans, scripts: Scripts, reference: Plans | None, reference_scripts: Scripts | None
 ) -> Explanation:
     """The rule: wrong answers, else a plan that asks for something else than the reference, else a skill.
 
-    Without a reference plan: no condition that holds tells of a plan, one step all the while that does not get what it
-    moves where it goes, of a skill.
+    Without a reference, a plan is to blame where no condition holds, and a skill that stays in force far from its goal.
     """
     plan, length = plans[seen.task], len(seen.in_force)
     observation, task_id = seen.steps.get("observation"), seen.steps.get("task_id")
-    late = min(LATE, length)
+    late = min(_LATE, length)
     stuck = next(iter(candidates(seen)), len(plan.steps) - 1)
     steps: dict[str, int | None] = {"out of time": stuck, "undecided": stuck}
     at = {"out of time": length - 1, "undecided": settled(seen, stuck)}
@@ -249,9 +221,8 @@ def explain(
                 f"'{plan.steps[step].skill}', where the reference says '{asked}'"
             )
         often = int(departs[-late:].sum())
-        why["plan"] = (
-            f"in {f'{often} of the last {late}' if often else f'{int(departs.sum())} of {length}'} states {said}"
-        )
+        states = f"{often} of the last {late}" if often else f"{int(departs.sum())} of {length}"
+        why["plan"] = f"in {states} states {said}"
     else:
         steps["plan"], at["plan"] = stuck, stay(none) if none.any() else at["undecided"]
         why["plan"] = f"no condition of the plan held in {int(none[-late:].sum())} of the last {late} states"
@@ -268,7 +239,7 @@ def explain(
     why["out of time"] = why["undecided"] = told
 
     cause: Cause = "undecided"
-    if share >= WRONG:
+    if share >= _WRONG:
         cause = "query"
     elif "plan_departs_late" in evidence:
         cause = "plan" if evidence["plan_departs_late"] > 0.5 else "skill"
@@ -280,7 +251,7 @@ def explain(
 
 
 def _departs(
-    seen: Visited, plan: ConditionalPlan, scripts: Scripts, other: ConditionalPlan, other_scripts: Scripts
+    seen: EpisodeStates, plan: ConditionalPlan, scripts: Scripts, other: ConditionalPlan, other_scripts: Scripts
 ) -> tuple[Tensor, Tensor, Tensor]:
     """(T,) bool, whether the plan's true step is to do something else than the reference's, and which steps these are;
     skills that are no scripts differ where their texts do."""
@@ -290,7 +261,29 @@ def _departs(
     rows = torch.arange(len(ours))
     done = scripts.program(observation, task_id)[rows, ours]
     wanted = other_scripts.program(observation, task_id)[rows, theirs]
-    differ = (done - wanted).abs().amax(-1) > OTHER
+    differ = (done - wanted).abs().amax(-1) > _OTHER
     same_text = torch.tensor([[a.skill == b.skill for b in other.steps] for a in plan.steps])[ours, theirs]
     scripted = torch.tensor(scripts.known[plan.task])[ours] & torch.tensor(other_scripts.known[other.task])[theirs]
     return torch.where(scripted, differ, ~same_text), ours, theirs
+
+
+def unlike_scripts(actor: Any, seen: EpisodeStates, scripts: Scripts) -> Tensor | None:
+    """(T,) bool, the states in which the policy does something else than the scripted skills of the steps it is in.
+
+    None where it cannot be asked, since it reads what was not recorded or draws its actions.
+    """
+    if getattr(actor, "draws", True):
+        return None
+    keys = [key for key in actor.in_keys if key != "qaf"]
+    if any(seen.steps.get(key, None) is None for key in keys):
+        return None
+    states = seen.steps.select(*keys).clone()
+    if "qaf" in actor.in_keys:
+        width = actor.plans.num_steps
+        states.set("qaf", torch.nn.functional.pad(seen.given, (0, width - seen.given.shape[1])))
+    with torch.no_grad(), evaluating(actor):
+        action = actor(states.to(device_of(actor))).get("action").cpu()
+    program = scripts.program(seen.steps.get("observation"), seen.steps.get("task_id"))[:, : seen.weights.shape[1]]
+    wanted = (seen.weights.unsqueeze(-1) * program).sum(-2)
+    unscripted = ~torch.tensor(scripts.known[seen.task])[seen.in_force]
+    return (seen.in_force >= 0) & (((action - wanted).abs().amax(-1) > _SAME) | unscripted)

@@ -1,0 +1,326 @@
+"""Counterfactuals: failed episodes run again with one part of what acted exchanged for a sound one."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from contextlib import nullcontext
+from copy import deepcopy
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from lw_torchrl._progress import Progress
+from lw_torchrl.envs.episodes import policy_of, run_episodes
+from lw_torchrl.envs.experts import ExpertActor
+from lw_torchrl.envs.language_world_env import LanguageWorldEnv
+from lw_torchrl.evaluation.explanation import EpisodeStates, Scripts, attended, candidates, unlike_scripts
+from lw_torchrl.language.plan_tables import PlanTables
+from lw_torchrl.language.plans import Plans
+from lw_torchrl.language.tasks import TASKS, Task, task_id
+from lw_torchrl.modules.networks import evaluating
+from lw_torchrl.modules.plan_encoder import IN_FORCE
+from lw_torchrl.modules.policy import transform_of
+from lw_torchrl.modules.query_evaluator import QueryEvaluator
+from lw_torchrl.transforms.qaf import plan_program
+
+Acts = Callable[[TensorDictBase], TensorDictBase]
+EpisodeId = tuple[str, int]  # task, episode
+_ROWS = 256
+_TRIED_STEPS = 3  # in which a skill is exchanged, one at a time, before it is in all steps
+
+
+class TrueAnswers(QueryEvaluator):
+    """The query answering function in an evaluator's place: 5 where a condition holds, else -5."""
+
+    def __init__(self, plans: Plans) -> None:
+        super().__init__(plans)
+        self.program = plan_program(plans)
+
+    def logits(self, *read: Tensor) -> Tensor:
+        observation, task = read
+        return 10.0 * self.program(observation, task).to(torch.float32) - 5.0
+
+
+def own_evaluators(actor: Any) -> list[QueryEvaluator]:
+    """The evaluators that a policy asks itself; not those that these ask in their turn."""
+    if isinstance(actor, QueryEvaluator):
+        return [actor]
+    children = actor.children() if isinstance(actor, nn.Module) else ()
+    return list(dict.fromkeys(found for child in children for found in own_evaluators(child)))
+
+
+def with_true_answers(actor: Any) -> Any:
+    """The policy with the query answering function in the place of its own evaluators; itself if it has none."""
+    if not own_evaluators(actor):
+        return actor
+    other = deepcopy(actor)
+    read = {key for evaluator in own_evaluators(actor) for key in evaluator.in_keys} - {"observation", "task_id"}
+    for module in list(other.modules()):
+        if hasattr(module, "in_keys"):
+            module.in_keys = [key for key in module.in_keys if key not in read]  # pictures, say
+        if isinstance(module, QueryEvaluator):  # what it asks in its turn goes with it
+            continue
+        for name, child in list(module.named_children()):
+            if isinstance(child, QueryEvaluator):
+                setattr(module, name, TrueAnswers(child.plans))
+                if "answers" in (config := getattr(module, "config", {})):
+                    module.config = {**config, "answers": "logit"}  # exact truth is worth what it is
+    return other
+
+
+def make_env(actor: Any, plans: Plans | None, base: LanguageWorldEnv, evaluator: Any = None) -> EnvBase:
+    """The environment with what must run before the actor: the answers to the plans' queries, and behind them an
+    evaluator that is a transform, or what a module reads."""
+    if isinstance(evaluator, Transform):
+        evaluator = evaluator.clone()  # a transform has one environment
+    else:
+        evaluator = evaluator.transform() if isinstance(evaluator, QueryEvaluator) else None
+    before = [one for one in (transform_of(actor, plans), evaluator) if one is not None]
+    return TransformedEnv(base, before[0] if len(before) == 1 else Compose(*before)) if before else base
+
+
+class AnsweredBy(nn.Module):
+    """A policy that acts on an evaluator's answers, which take the place of ``qaf``."""
+
+    def __init__(self, actor: Acts, evaluator: Acts) -> None:
+        super().__init__()
+        self.actor, self.evaluator = actor, evaluator
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        answered = self.evaluator(tensordict)
+        if isinstance(self.evaluator, QueryEvaluator):
+            answered.set("qaf", answered.get("qaf_logits") > 0)
+        return self.actor(answered)
+
+
+def answered_by(actor: Any, evaluator: Any) -> Any:
+    """The actor behind an evaluator that is a module or a function; a transform belongs into the environment."""
+    return actor if evaluator is None or isinstance(evaluator, Transform) else AnsweredBy(actor, evaluator)
+
+
+class WithScripts(nn.Module):
+    """A policy whose skills are scripted ones: its attention mixes their actions, where it singles any steps out.
+
+    Where the step in force has no scripted skill, the action is the expert's.
+
+    Args:
+        actor: the policy; its plan, its answers and its attention stay as they are.
+        plans: its plans.
+        scripts: of their steps.
+        steps: for each episode, the step whose attention the scripts wait for; None to act wherever there is any.
+    """
+
+    def __init__(self, actor: Acts, plans: Plans, scripts: Scripts, steps: Mapping[EpisodeId, int] | None) -> None:
+        super().__init__()
+        self.actor, self.scripts = actor, scripts
+        self._tables = PlanTables(plans)
+        self._known = torch.zeros_like(self._tables.mask)
+        for row, task in enumerate(self._tables.index.tasks):
+            self._known[row, : len(plans[task].steps)] = torch.tensor(scripts.known[task])
+        self._steps = None if steps is None else {(task_id(task), k): step for (task, k), step in steps.items()}
+        unscripted = [task for task, known in scripts.known.items() if not all(known) and task in TASKS]
+        self._expert = ExpertActor(unscripted) if unscripted else None
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        seen = tensordict.select("observation", "task_id", "episode", "_step", strict=False).clone()
+        tensordict = self.actor(tensordict)
+        action, task = tensordict.get("action"), seen.get("task_id")
+        rows = self._tables.rows(task)
+        mask, known = self._tables.mask.to(action.device)[rows], self._known.to(action.device)[rows]
+        weights = tensordict.get("skill_weights", None)
+        if weights is None:
+            truth = tensordict.get("qaf") & mask
+            first = torch.where(truth.any(-1), truth.int().argmax(-1), mask.sum(-1) - 1)
+            weights = torch.nn.functional.one_hot(first, mask.shape[-1]).float()
+        step = attended(weights, mask)
+        replaced = step >= 0
+        if self._steps is not None:
+            which = zip(task.tolist(), seen.get("episode").tolist(), strict=True)
+            asked = torch.tensor([self._steps.get(one, -1) for one in which], device=action.device)
+            there = weights.gather(-1, asked.clamp(min=0).unsqueeze(-1)).squeeze(-1) > IN_FORCE
+            replaced = replaced & there & (asked >= 0)
+        scripted = (weights * known).unsqueeze(-1) * self.scripts.program(seen.get("observation"), task)
+        proper = scripted.sum(-2).to(action.dtype)
+        unknown = ~known.gather(-1, step.clamp(min=0).unsqueeze(-1)).squeeze(-1)
+        if self._expert is None:
+            replaced = replaced & ~unknown
+        elif (needed := replaced & unknown).any():
+            expert = self._expert(seen.set("_step", needed).cpu()).get("action").to(action.device)
+            proper = torch.where(unknown.unsqueeze(-1), expert, proper)
+        return tensordict.set("action", torch.where(replaced.unsqueeze(-1), proper, action))
+
+
+@dataclass(frozen=True)
+class Rerun:
+    """Runs episodes again as they were run, whatever acts in them.
+
+    Attributes:
+        tasks: their tasks by name.
+        firsts: each episode's first observation, (39,) float32.
+        env: the environment's options: seed, engine, num_threads.
+        noise_scale, max_steps, num_envs, device, progress: as for :func:`evaluate`.
+    """
+
+    tasks: Mapping[str, Task]
+    firsts: Mapping[EpisodeId, Tensor]
+    env: Mapping[str, Any]
+    noise_scale: float
+    max_steps: int
+    num_envs: int | None
+    device: str | torch.device | None
+    progress: bool
+
+    def __call__(
+        self, what: str, which: Sequence[EpisodeId], actor: Any, plans: Plans, evaluator: Any = None, longer: int = 1
+    ) -> dict[EpisodeId, int | None]:
+        """Each episode's first successful step, counted from 0, or None; :class:`ValueError` if one does not begin as
+        it was recorded. Episodes may be ``longer`` by this factor."""
+        wanted: dict[str, list[int]] = {}
+        for task, episode in sorted(which):
+            wanted.setdefault(task, []).append(episode)
+        rows = len(wanted) * max(1, min(max(map(len, wanted.values())), _ROWS // len(wanted)))
+        if self.num_envs is not None:
+            rows = max(len(wanted), min(rows, self.num_envs))
+        max_steps, scale = self.max_steps * longer, self.noise_scale
+        tasks = [self.tasks[task] for task in wanted]
+        base = LanguageWorldEnv(tasks, num_envs=rows, max_steps=max_steps, strict=True, **self.env)
+        env = make_env(actor.actor if isinstance(actor, WithScripts) else actor, plans, base, evaluator)
+        actor = answered_by(actor, evaluator)
+        found: dict[EpisodeId, int | None] = {}
+        try:
+            mode = evaluating(actor) if isinstance(actor, nn.Module) else nullcontext()
+            bar = Progress(f"again with {what}", len(which) * max_steps, "step", show=self.progress)
+            with mode, bar, torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+                for one in run_episodes(
+                    env,
+                    policy_of(actor, self.device),
+                    wanted,
+                    keys=["observation", ("next", "success")],
+                    noise=(lambda _: (scale,) * 4) if scale else None,
+                    after_success=0,
+                    on_progress=bar.update,
+                ):
+                    if not torch.equal(one.steps.get("observation")[0], self.firsts[one.task, one.episode]):
+                        raise ValueError(
+                            f"rollouts: episode {one.episode} of {one.task!r} does not begin as episode {one.episode} "
+                            f"of seed={self.env['seed']} does; give the seed and the engine that it was run with, and "
+                            "the episode from its first state on"
+                        )
+                    first = one.first_success
+                    found[one.task, one.episode] = None if first is None else first - 1
+        finally:
+            env.close()
+        return found
+
+
+class Counterfactuals:
+    """Runs the exchanges that are worth it, and keeps what each gave.
+
+    Attributes:
+        found: an exchange's name to the episodes that it was tried in, and their first successful step.
+        step: of episodes that a script in one step mends, that step.
+    """
+
+    def __init__(
+        self, actor: Any, plans: Plans, evaluator: Any, reference: Plans | None, scripts: Scripts, rerun: Rerun
+    ) -> None:
+        self.actor, self.plans, self.evaluator, self.scripts, self.rerun = actor, plans, evaluator, scripts, rerun
+        self.found: dict[str, dict[EpisodeId, int | None]] = {}
+        self.step: dict[EpisodeId, int] = {}
+        self.reference: Plans | None = None
+        self.other, self.other_evaluator = None, evaluator  # that carry out the reference
+        different = [] if reference is None else [reference[task] for task in reference.differences(plans)]
+        if not different:
+            return
+        reference = Plans(different)
+        try:
+            self.other = actor.with_plans(reference)
+            if hasattr(evaluator, "with_plans"):
+                self.other_evaluator = evaluator.with_plans(reference)
+            self.reference = reference
+        except (AttributeError, ImportError, RuntimeError, TypeError, ValueError) as error:
+            self.other = None
+            warnings.warn(
+                f"reference: the policy cannot carry it out, so no plan is exchanged ({type(error).__name__}: {error})",
+                stacklevel=4,
+            )
+
+    def run(self, seen: Sequence[EpisodeStates], same: Collection[EpisodeId] = ()) -> None:
+        """Run all exchanges that are worth it.
+
+        Args:
+            seen: the episodes.
+            same: those in whose states the reference never asks for anything else, so that it mends nothing.
+        """
+        every = [(one.task, one.episode) for one in seen]
+        wrong = [w for w, one in zip(every, seen, strict=True) if bool((one.given != one.truth).any())]
+        with_reference = [w for w in every if self.reference is not None and w[0] in self.reference]
+        true = with_true_answers(self.actor)
+        can_answer = self.evaluator is not None or true is not self.actor
+        if can_answer:
+            self._run("query", "true answers", wrong, true, self.plans)
+        self._run_skills(seen)
+        self._run("plan", "the reference plan", with_reference, self.other, self.reference, self.other_evaluator)
+        left = self._unmended(every, "query", "skill", "skills")
+        left = [one for one in left if one in same or not self._mends("plan", one)]
+        self._run("time", "twice the time", left, self.actor, self.plans, self.evaluator, 2)
+        left = self._unmended(left, "time")
+        if can_answer:
+            pair = [one for one in left if one in wrong]
+            self._run("query + skill", "true answers and scripts", pair, self._scripted(true, self.plans), self.plans)
+            if self.other is not None and self.reference is not None:
+                both = [one for one in pair if one in with_reference]
+                other = with_true_answers(self.other)
+                self._run("query + plan", "true answers and the reference plan", both, other, self.reference)
+        if self.other is not None and self.reference is not None:
+            left = [one for one in self._unmended(left, "query + skill", "query + plan") if one in with_reference]
+            other = self._scripted(self.other, self.reference)
+            what = "the reference plan and scripts"
+            self._run("plan + skill", what, left, other, self.reference, self.other_evaluator)
+
+    def _mends(self, name: str, which: EpisodeId) -> bool:
+        return self.found.get(name, {}).get(which) is not None
+
+    def _unmended(self, which: Iterable[EpisodeId], *names: str) -> list[EpisodeId]:
+        return [one for one in which if not any(self._mends(name, one) for name in names)]
+
+    def _run(self, name: str, what: str, which: Sequence[EpisodeId], actor: Any, plans: Any, *options: Any) -> None:
+        if which and actor is not None and plans is not None:
+            self.found.setdefault(name, {}).update(self.rerun(what, which, actor, plans, *options))
+
+    def _scripted(self, actor: Any, plans: Plans, steps: Mapping[EpisodeId, int] | None = None) -> WithScripts:
+        scripts = self.scripts if plans is self.plans else Scripts(plans, self.scripts.table)
+        return WithScripts(actor, plans, scripts, steps)
+
+    def _run_skills(self, seen: Sequence[EpisodeStates]) -> None:
+        """Scripts in one step, for the likeliest steps in turn, then in all of them."""
+        ranked = {}
+        for one in seen:
+            unlike = unlike_scripts(self.actor, one, self.scripts)
+            if unlike is None or unlike.any():
+                ranked[one.task, one.episode] = candidates(one, unlike)
+        for turn in range(_TRIED_STEPS):
+            which = self._unmended([w for w, steps in ranked.items() if len(steps) > turn], "skill")
+            steps = {one: ranked[one][turn] for one in which}
+            what = f"scripts in a step ({turn + 1} of up to {_TRIED_STEPS})"
+            scripted = self._scripted(self.actor, self.plans, steps)
+            self._run("skill", what, which, scripted, self.plans, self.evaluator)
+            self.step.update({one: steps[one] for one in which if self._mends("skill", one)})
+        which = self._unmended([w for w in ranked if len(self.plans[w[0]].steps) > 1], "skill")
+        scripted = self._scripted(self.actor, self.plans)
+        self._run("skills", "scripts in all steps", which, scripted, self.plans, self.evaluator)
+
+    def shares(self) -> dict[str, dict[str, float]]:
+        """Task to the share of its failed episodes that each exchange mends, of those it was tried in."""
+        found: dict[str, dict[str, float]] = {}
+        for name, results in self.found.items():
+            for task in {task for task, _ in results}:
+                bits = [hit is not None for (of, _), hit in results.items() if of == task]
+                found.setdefault(task, {})[name] = sum(bits) / len(bits)
+        return found

@@ -1,0 +1,166 @@
+"""What transforms know of the environment under them, what runs before them, and EnvState, which keeps its state."""
+
+from __future__ import annotations
+
+import io
+import warnings
+from itertools import product
+from typing import Any, Self
+
+import torch
+from tensordict import unravel_key
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.envs import Compose, EnvBase, RenameTransform, SerialEnv, Transform, TransformedEnv
+from torchrl.envs.batched_envs import BatchedEnvBase
+
+
+def base_env(transform: Transform) -> EnvBase | None:
+    """The environment under all transforms, None on a replay buffer and in a Compose that is nowhere yet."""
+    try:
+        env = transform.container
+    except ValueError:
+        return None
+    while isinstance(env, TransformedEnv):
+        env = env.base_env
+    return env
+
+
+def refuse_changed(transform: Transform, key: NestedKey) -> None:
+    """Raise :class:`ValueError` where a transform that runs before this one changes what it is to read.
+
+    It goes by the keys that transforms say they write, and looks into a SerialEnv once that runs, not into processes.
+    """
+    for entry, chain in product((key, unravel_key(("next", key))), _before(transform)):
+        for earlier in reversed(chain):
+            written = [unravel_key(out) for out in earlier.__dict__.get("_out_keys") or ()]
+            if entry not in written:
+                continue
+            if isinstance(earlier, RenameTransform):
+                entry = unravel_key(earlier.in_keys[written.index(entry)])
+                continue
+            name = type(transform).__name__
+            raise ValueError(
+                f"{type(earlier).__name__} changes {entry!r} before {name} reads it, which is made for the observation "
+                f"as it was: put {name} before {type(earlier).__name__}"
+            )
+
+
+def transforms_beside(transform: Transform) -> int:
+    """How many transforms its Compose has, 0 where it is in none: the cheap sign that one was put there."""
+    container = _container(transform)
+    return len(container.transforms) if isinstance(container, Compose) else 0
+
+
+def _before(transform: Transform) -> list[list[Transform]]:
+    """What runs before a transform; of several workers, a list for each."""
+    found: list[Transform] = []
+    inner, container = transform, _container(transform)
+    while isinstance(container, Compose):
+        place = next(n for n, member in enumerate(container.transforms) if member is inner)
+        found = [one for member in container.transforms[:place] for one in _flat(member)] + found
+        inner, container = container, _container(container)
+    while isinstance(container, TransformedEnv) and isinstance(container := container.base_env, TransformedEnv):
+        found = _flat(container.transform) + found
+    return [inner + found for inner in _inside(container)]
+
+
+def _inside(env: Compose | EnvBase | None) -> list[list[Transform]]:
+    """The transforms in an environment, a list for each worker of a SerialEnv that runs."""
+    if isinstance(env, TransformedEnv):
+        return [inner + _flat(env.transform) for inner in _inside(env.base_env)]
+    workers = env.__dict__.get("_envs", ()) if isinstance(env, SerialEnv) else ()
+    return [chain for worker in workers for chain in _inside(worker)] or [[]]
+
+
+def _container(transform: Transform) -> Compose | EnvBase | None:
+    reference = transform.__dict__.get("_container")
+    return None if reference is None else reference()
+
+
+def _flat(transform: Transform) -> list[Transform]:
+    if isinstance(transform, Compose):
+        return [one for member in transform.transforms for one in _flat(member)]
+    return [transform]
+
+
+class EpisodeTransform(Transform):
+    """A transform that keeps something of each row's episode.
+
+    Its clone, for another environment, and one whose state was loaded have seen no episode: a step wants a reset first.
+    """
+
+    def _forget_episodes(self) -> None:
+        """No episode has begun."""
+
+    def clone(self) -> Self:
+        other: Self = super().clone()
+        other._forget_episodes()
+        return other
+
+    def _load_from_state_dict(self, *args: Any) -> None:
+        super()._load_from_state_dict(*args)
+        self._forget_episodes()
+
+
+class KeepsEnvState(EpisodeTransform):
+    """A transform whose ``state_dict`` holds that of the environment under it, for TorchRL asks no one else."""
+
+    def get_extra_state(self) -> Tensor:
+        """The environment's ``state_dict``, as bytes (n,) uint8; empty on a replay buffer."""
+        env = base_env(self)
+        if env is None:
+            return torch.zeros(0, dtype=torch.uint8)
+        if isinstance(env, BatchedEnvBase) and env.is_closed:
+            warnings.warn(
+                f"this {type(env).__name__} is not running, so the state_dict says nothing of its episodes",
+                stacklevel=2,
+            )
+            return torch.zeros(0, dtype=torch.uint8)
+        buffer = io.BytesIO()
+        torch.save(env.state_dict(), buffer)
+        return torch.frombuffer(bytearray(buffer.getvalue()), dtype=torch.uint8)
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """Hand the environment its state; a replay buffer has no use for it."""
+        env = base_env(self)
+        if env is None:
+            return
+        if not state.numel():
+            raise ValueError("state_dict says nothing of an environment's episodes: none was running when it was taken")
+        env.load_state_dict(torch.load(io.BytesIO(state.cpu().numpy().tobytes()), weights_only=True))
+        if (flags := env.__dict__.get("_shm_done_flags")) is not None:
+            # TorchRL 0.14.1 leaves them up after loading: a ParallelEnv would answer the next reset too early.
+            flags[:] = [0] * len(flags)
+
+
+class EnvState(KeepsEnvState):
+    """Keeps the environment's seed and episode counters in a TransformedEnv's ``state_dict``, and so in a Collector's.
+
+    A TransformedEnv's ``state_dict`` is that of its transforms alone. Without this one, or a :class:`QAFTransform`,
+    which does the same, a collector that is resumed would run the same episodes again. It changes no entry. After
+    ``load_state_dict`` the environment must be reset (``collector.reset()``). Put it around a ParallelEnv too: the
+    ``load_state_dict`` of a ParallelEnv alone leaves TorchRL 0.14.1 one answer behind, unless it has
+    ``use_buffers=False``; this one mends that.
+
+    Raises:
+        ValueError: at loading, a state of other tasks or rows, or of no environment.
+
+    Warns:
+        UserWarning: a SerialEnv or ParallelEnv that has been closed, or not started, has no state to save.
+
+    Example:
+        >>> from torchrl.envs import TransformedEnv
+        >>> import lw_torchrl as lw
+        >>> env, other = (TransformedEnv(lw.LanguageWorldEnv("reach"), lw.transforms.EnvState()) for _ in range(2))
+        >>> env.reset()["episode"], env.reset()["episode"]
+        (tensor([0]), tensor([1]))
+        >>> other.load_state_dict(env.state_dict())
+        >>> other.reset()["episode"]
+        tensor([2])
+        >>> env.close(), other.close()
+        (None, None)
+    """
+
+    def __init__(self) -> None:
+        super().__init__(in_keys=[], out_keys=[])
