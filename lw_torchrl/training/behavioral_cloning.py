@@ -245,7 +245,7 @@ class BehavioralCloningTrainer(Training):
 
     def means(self, losses: Tensor) -> dict[str, float]:
         assert self.schedule is not None
-        return {"loss": _mean(losses), "learning_rate": self.schedule.get_last_lr()[0]}
+        return {"loss": _mean(losses), "learning_rate": float(self.schedule.get_last_lr()[0])}
 
     def train(self, until: int | None = None) -> float:
         """Train to the last step, from wherever training stands.

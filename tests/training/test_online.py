@@ -76,7 +76,14 @@ def undisturbed(demos):
     return find
 
 
-@pytest.mark.parametrize(("method", "stops"), [("td3", [2, 3]), *((method, [1]) for method in LEARNERS)])
+@pytest.mark.parametrize(
+    ("method", "stops"),
+    [
+        ("td3", [2, 3]),
+        ("ppo", [1]),
+        *(pytest.param(method, [1], marks=pytest.mark.slow) for method in LEARNERS if method != "ppo"),
+    ],
+)
 def test_stopped_in_a_round_it_ends_with_the_same_bits(demos, undisturbed, tmp_path, method, stops):
     whole = undisturbed(method)
     path = tmp_path / "checkpoint.zip"

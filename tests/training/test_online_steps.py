@@ -71,6 +71,7 @@ def test_without_steps_there_is_noise_everywhere(demos):
     assert ((rows["action"] - expected).abs().max(-1).values > 1e-3).all()
 
 
+@pytest.mark.slow
 def test_stopped_in_a_round_it_ends_with_the_same_bits(demos, tmp_path):
     steps = {"push": [0, 1], "reach": [0]}
     whole = make_online(demos, "residual", actor=make_residual(steps))
