@@ -160,7 +160,7 @@ def test_slices_never_join_what_does_not_follow(cached):
 
 
 def test_rows_with_gaps_are_told():
-    with pytest.warns(UserWarning, match="19 of 20 rows are not what the rows before them became"):
+    with pytest.warns(UserWarning, match="19 of 20 rows are not the .* of the rows before them"):
         buffer().extend(own_rows([40], first=0.0)[::2])
     assert len(buffer().storage) == 12
 

@@ -76,7 +76,7 @@ def test_episodes_of_two_simulators_are_not_mixed_in_a_dataset(half_made, instal
 def test_another_library_is_a_warning_and_the_first_stays_on_record(half_made, installed, name):
     recorded = package_versions()
     installed(**{name: "9.9.9"})
-    message = rf"begun under other versions \({name} {recorded[name].replace('+', '.')}, now 9.9.9\): it is gone on"
+    message = rf"begun under other versions \({name} {recorded[name].replace('+', '.')}, now 9.9.9\): it is continued"
     with pytest.warns(UserWarning, match=message):
         made = collect(half_made)
     assert made.versions == read_metadata(half_made).versions == recorded
