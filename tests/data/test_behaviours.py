@@ -373,7 +373,7 @@ class Odd(lw.Policy):
         (Odd("dtype"), {}, ValueError, "must be float32"),
         (Odd("shape"), {}, ValueError, r"must be float32 of shape \(2, 4\), got torch.float32 of shape \(2, 3\)"),
         (lw.ScriptedSkillActor(PLANS, "random"), {}, ValueError, "would depend on num_envs and on interruptions"),
-        (lw.ActorEnsemble([lw.ScriptedSkillActor(PLANS, "random")]), {}, ValueError, "draws in the order"),
+        (lw.modules.ActorEnsemble([lw.ScriptedSkillActor(PLANS, "random")]), {}, ValueError, "draws in the order"),
         (lw.ScriptedSkillActor(PLANS, skills=lw.load_skills()), {}, TypeError, "skills of your own"),
     ],
 )
