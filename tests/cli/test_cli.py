@@ -221,7 +221,7 @@ def test_collect_writes_what_it_was_told(capsys, demos):
     assert f"1000 steps in {demos}" in printed
     error = fails(capsys, "collect", "push", "--out", demos, "--episodes", 1)
     assert "another configuration" in error
-    assert "tasks ['push', 'reach'], now ['push']" in error
+    assert "tasks (['push', 'reach'], now ['push'])" in error
 
 
 def test_train_writes_a_policy_and_carries_on(capsys, demos, checkpoint):

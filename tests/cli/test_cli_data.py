@@ -184,7 +184,7 @@ def test_collect_by_a_behaviour_of_a_name(capsys, tmp_path, asked):
     assert (found.config.policy.name, found.config.policy.right) == ("mine", 0.3)
     assert found.config.gripper_noise_factor == 1.0
     error = fails(capsys, *args, "--behaviour", "other", "--gripper-noise", 1, "--noise", 0.1)
-    assert "policy.name 'mine', now 'other'" in error
+    assert "policy.name ('mine', now 'other')" in error
 
 
 def test_collect_by_a_policys_file(capsys, tmp_path, asked):

@@ -57,6 +57,6 @@ def test_what_cannot_be_is_refused(capsys, tmp_path, policy):
     assert "--steps must be at least 1" in fails(capsys, "train-evaluator", "reach", *out, "--steps", 0)
     assert "--behaviours must be one of" in fails(capsys, "train-evaluator", "reach", *out, "--behaviours", "bold")
     assert "--evaluator is for a policy with plans" in fails(capsys, "evaluate", "expert", "--evaluator", policy)
-    assert "it is a policy's, give the evaluator's" in fails(capsys, "evaluate", policy, "--evaluator", policy)
+    assert "give an evaluator's" in fails(capsys, "evaluate", policy, "--evaluator", policy)
     assert "no file" in fails(capsys, "evaluate", policy, "--evaluator", tmp_path / "none.zip")
     assert not (tmp_path / "x").exists()

@@ -230,7 +230,7 @@ def test_a_policy_trains_on_joined_data_and_a_checkpoint_knows_the_episodes(base
         return BehavioralCloningTrainer(actor, replay, config, checkpoint=tmp_path / "one.zip", progress=False)
 
     assert trainer(1).train() < 2
-    assert trainer(1).state.step == 3
+    assert trainer(1).steps == 3
     with pytest.raises(ValueError, match="its data differs in episodes"):
         trainer(2)
 

@@ -111,7 +111,7 @@ def test_a_killed_call_leaves_whole_files(root, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         lw.data.add_pictures(root, ("corner", "topview"), progress=False, **SIZE)
     assert files(root) == written
-    with pytest.raises(ValueError, match=r"has no pictures of .*lw\.add_pictures"):
+    with pytest.raises(ValueError, match=r"has no pictures of .*lw\.data\.add_pictures"):
         load(lw.LanguageWorldExperienceReplay(root))
     monkeypatch.setattr(pictures, "_write", kept)
     lw.data.add_pictures(root, ("corner", "topview"), progress=False, **SIZE)

@@ -151,7 +151,7 @@ def test_wrong_answers_are_wrong_and_drawn(replay, tmp_path):
 
 def test_what_does_not_fit_is_named(replay, tmp_path):
     plain = lw.LanguageWorldExperienceReplay(replay.root, label="executed")
-    with pytest.raises(ValueError, match=r"data must have the column 'pixels'.*lw\.add_pictures"):
+    with pytest.raises(ValueError, match=r"data must have the column 'pixels'.*lw\.data\.add_pictures"):
         make_trainer(plain)
     with pytest.raises(TypeError, match=r"config must be an ImageQueryEvaluatorConfig"):
         lw.training.ImageQueryEvaluatorTrainer(

@@ -113,7 +113,7 @@ original = getattr(place, method)
 def noted(self, *args):
     setattr(place, method, original)
     with open(begun, "w") as file:
-        file.write(f"{{getattr(self, "steps", 0)}}\\n")
+        file.write(f"{{getattr(self, 'steps', 0)}}\\n")
     return original(self, *args)
 
 setattr(place, method, noted)

@@ -144,7 +144,7 @@ def test_a_replay_buffer_is_told_of_add_pictures():
     env = lw.LanguageWorldEnv("reach")
     buffer.extend(env.rollout(4).reshape(-1))
     env.close()
-    with pytest.raises(ValueError, match=r"lw\.add_pictures.*load_pictures"):
+    with pytest.raises(ValueError, match=r"lw\.data\.add_pictures.*load_pictures"):
         buffer.sample()
 
 
