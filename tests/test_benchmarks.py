@@ -25,6 +25,7 @@ ROOT = Path(__file__).parent.parent
 FIELDS = {"name", "ours", "unit", "rival", "theirs", "ratio", "spread", "target", "met", "note"}
 
 
+@pytest.mark.slow
 def test_a_quick_run_writes_a_table_and_json(tmp_path):
     command = [sys.executable, "-m", "benchmarks", "samplers", "queries", "overhead", "--quick", "--out", str(tmp_path)]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
@@ -125,6 +126,7 @@ def test_patches_leave_out_what_they_say_and_are_undone():
 
 
 @pytest.mark.parametrize("setting", ["few-shot", "zero-shot"])
+@pytest.mark.slow
 def test_ablations_write_a_table_of_what_was_run(setting, monkeypatch, tmp_path, capsys):
     seen = []
 

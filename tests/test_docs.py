@@ -16,6 +16,7 @@ from pictures import why_no_pictures
 import lw_torchrl
 
 ROOT = Path(__file__).parent.parent
+FAST_PAGES = {"README.md", "training.md", "queries.md", "plans.md"}
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("**/*.md"))]
 BLOCK = re.compile(
     r"(?P<skip><!--\s*no-run\s*-->\s*\n)?"
@@ -71,7 +72,15 @@ def test_every_public_class_says_what_it_is():
     assert not [name for name, found in classes.items() if not found.__doc__ or found.__doc__.startswith(f"{name}(")]
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if any(blocks(page))], ids=lambda page: page.name)
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, marks=() if page.name in FAST_PAGES else pytest.mark.slow)
+        for page in PAGES
+        if any(blocks(page))
+    ],
+    ids=lambda page: page.name,
+)
 def test_the_blocks_of_a_page_run_one_after_another(page):
     namespace = {"__name__": "__main__"}
     for line, kind, code in blocks(page):

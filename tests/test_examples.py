@@ -62,12 +62,14 @@ def run(path, folder, *options):
     return done
 
 
+@pytest.mark.slow
 def test_ppo_runs(tmp_path):
     done = run("ppo.py", tmp_path, "--updates", 2, "--rows", 4, "--horizon", 20, "--clone", 5)
     assert "update   1  reward" in done.stdout
     assert "window-open" in done.stdout
 
 
+@pytest.mark.slow
 def test_td3_learns_beside_demonstrations(tmp_path):
     done = run("online_from_demonstrations.py", tmp_path, "--frames", 200, "--clone", 20, "--episodes", 1)
     lines = [line for line in done.stdout.splitlines() if line.startswith("step ")]
@@ -78,6 +80,7 @@ def test_td3_learns_beside_demonstrations(tmp_path):
     assert {"Collector", "DemonstratedTD3Loss", "SoftUpdate"} <= names(EXAMPLES / "online_from_demonstrations.py")
 
 
+@pytest.mark.slow
 def test_one_step_of_a_plan_is_tuned(tmp_path):
     done = run("tune_one_step.py", tmp_path, "--frames", 400, "--clone", 20, "--episodes", 2)
     lines = done.stdout.splitlines()
@@ -89,6 +92,7 @@ def test_one_step_of_a_plan_is_tuned(tmp_path):
     assert not left, "it leaves nothing behind"
 
 
+@pytest.mark.slow
 def test_a_training_is_recorded(tmp_path):
     options = ["--steps", 20, "--demonstrations", 1, "--rollouts", 2, "--length", 30]
     done = run("rerun_training.py", tmp_path, *options)
@@ -99,6 +103,7 @@ def test_a_training_is_recorded(tmp_path):
     assert {f"/{task}\\ after\\ {step}/action" for task in ("drawer-open", "window-open") for step in (10, 20)} <= found
 
 
+@pytest.mark.slow
 def test_co_learning_runs_on_ones_own_data(tmp_path):
     done = run("co_learning.py", tmp_path, "--steps", 20, "--demonstrations", 1, "--episodes", 1)
     assert "the target's rows 50" in done.stdout
@@ -108,6 +113,7 @@ def test_co_learning_runs_on_ones_own_data(tmp_path):
     assert not left, "it leaves nothing behind"
 
 
+@pytest.mark.slow
 def test_offline_rl_runs(tmp_path):
     done = run("offline_rl.py", tmp_path, "--steps", 3, "--episodes", 1, "--data", 6)
     lines = done.stdout.splitlines()
@@ -117,6 +123,7 @@ def test_offline_rl_runs(tmp_path):
     assert {"ExpectileValueLoss", "AdvantageWeightedLoss", "SoftUpdate"} <= names(EXAMPLES / "offline_rl.py")
 
 
+@pytest.mark.slow
 def test_a_policy_is_exported(tmp_path):
     lw.save_actor(lw.PlanConditionedActor(lw.load_plans("MT10"), width=16), tmp_path / "policy.zip")
     done = run("export_policy.py", tmp_path, "policy.zip", "policy.pt2")
@@ -124,6 +131,7 @@ def test_a_policy_is_exported(tmp_path):
     assert (tmp_path / "policy.pt2").is_file()
 
 
+@pytest.mark.slow
 def test_a_trainer_of_torchrls_runs(tmp_path):
     done = run("torchrl_trainer.py", tmp_path, "--updates", 3, "--rows", 4, "--horizon", 25)
     assert len(done.stdout.split("update:")[1].splitlines()[0].split()) == 3

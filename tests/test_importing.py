@@ -45,6 +45,7 @@ def test_another_failure_of_the_import_is_not_explained_away(monkeypatch):
 @pytest.mark.parametrize(
     ("backend", "library", "package"), [("osmesa", "OSMesa", "libosmesa6"), ("egl", "EGL", "libegl1")]
 )
+@pytest.mark.slow
 def test_a_library_that_is_really_absent_is_named(python, backend, library, package):
     if ctypes.util.find_library(library):
         pytest.skip(f"{library} is installed")

@@ -88,6 +88,7 @@ def test_units_and_their_summary(capsys, tmp_path, tiny):
     assert (folder / "dc" / "seed1" / "results.json").read_text() == first
 
 
+@pytest.mark.slow
 def test_the_best_of_several_evaluations_stands_beside_the_published(capsys, tmp_path, tiny):
     out = run(capsys, *arguments(tmp_path, "--preset", "paper", "--passes", 50, methods=["dc"]))
     assert "| dc, best of the last 3 evaluations " in out
@@ -100,6 +101,7 @@ def test_the_best_of_several_evaluations_stands_beside_the_published(capsys, tmp
     assert "dc, best of the last 3 evaluations" in (folder / "summary.md").read_text()
 
 
+@pytest.mark.slow
 def test_plans_of_ones_own(capsys, tmp_path, tiny):
     pairs = {task: [["the gripper is open", "move the gripper to the target"]] for task in lw.MT50}
     (tmp_path / "mine.json").write_text(json.dumps(pairs))

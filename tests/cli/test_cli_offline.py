@@ -73,6 +73,7 @@ def test_a_table_is_made_and_shown(capsys, filled, tiny):
     assert again.split("\nquick\n")[1] == printed.split("\nquick\n")[1]
 
 
+@pytest.mark.slow
 def test_runs_have_names_and_are_done_one_by_one(capsys, data, tmp_path, tiny):
     names = run(capsys, *arguments(tmp_path, "--list")).split()
     assert names == [

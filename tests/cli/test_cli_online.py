@@ -100,6 +100,7 @@ def test_any_method_begins_with_a_policy_of_ones_own(capsys, tmp_path, tiny, met
     )
 
 
+@pytest.mark.slow
 def test_a_start_may_be_conditioned_otherwise(capsys, tmp_path, tiny):
     assert "one-hot/reach/td3/seed0: " in run(capsys, *arguments(tmp_path, "--condition", "one-hot", methods=["td3"]))
     policy = lw.load_actor(tmp_path / "one-hot" / "reach" / "td3" / "seed0" / "policy.zip")

@@ -124,6 +124,7 @@ def test_held_answers_are_not_trained(capsys, demos, trained, tmp_path):
     assert not (tmp_path / "x.zip").exists()
 
 
+@pytest.mark.slow
 def test_cameras(capsys, demos, tmp_path):
     if missing := why_no_pictures():
         pytest.skip(missing)

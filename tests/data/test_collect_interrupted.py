@@ -173,6 +173,7 @@ def fifo(path):
 
 
 @pytest.mark.parametrize("damage", [truncate, empty, scribble, foreign, compress, swell, link, fifo])
+@pytest.mark.slow
 def test_a_damaged_episode_is_done_again(half_made, made, damage, monkeypatch):
     damage(sorted((half_made / ".partial").glob("*.npz"))[0])
     done, put = [], EpisodeFiles.put

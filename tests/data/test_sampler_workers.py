@@ -61,6 +61,7 @@ def test_several_workers_that_would_draw_the_same_rows_are_refused():
         drawn(lambda replay, worker: replay, 2)
 
 
+@pytest.mark.slow
 def test_one_worker_goes_on_where_the_buffer_stood():
     replay = make_replay()
     replay.sample()

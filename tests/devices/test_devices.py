@@ -20,7 +20,8 @@ needs_a_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a 
 needs_no_gpu = pytest.mark.skipif(torch.accelerator.is_available(), reason="needs a machine without a GPU")
 
 
-@pytest.mark.parametrize("which", ["not slow", pytest.param("slow", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("which", ["not slow", "slow"])
 def test_on_a_pretend_device_nobody_waits(which):
     paths = [str(HERE), *(str(HERE.parent / room) for room in ("training", "objectives", "paper")), *sys.path]
     done = subprocess.run(
@@ -108,6 +109,7 @@ def test_the_command_line_says_so(demos, tmp_path, monkeypatch, capsys, command,
     assert not list(tmp_path.iterdir()), "before any work"
 
 
+@pytest.mark.slow
 def test_the_command_line_trains_and_evaluates_there(demos, tmp_path, capsys):
     out = tmp_path / "p.zip"
     main(["train", str(demos), "--out", str(out), "--steps", "3", "--batch-size", "10", "--device", "auto"])

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from speed import first_fast
 from torchrl.collectors import Collector, MultiAsyncCollector, MultiSyncCollector
 from torchrl.envs import AsyncEnvPool
 from worker_envs import make_actor, make_push_reach, make_single
@@ -65,7 +66,7 @@ def episodes(batch) -> set[tuple[int, int]]:
     return set(zip(batch["task_id"].flatten().tolist(), batch["episode"].flatten().tolist(), strict=True))
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", first_fast(KINDS))
 def test_workers_get_new_weights_and_differ(kind):
     actor = make_actor()
     collector = make_collector(kind, actor)
@@ -150,6 +151,7 @@ def test_one_that_was_killed_goes_on_with_the_next_episodes(kind, tmp_path):
         assert min(number for _, number in after) == max(number for _, number in seen) + 2
 
 
+@pytest.mark.slow
 def test_a_pool_of_processes_with_a_policy():
     pool = AsyncEnvPool([make_single] * 2, backend="multiprocessing", exchange="queue")
     with torch.no_grad():

@@ -10,6 +10,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from speed import first_fast
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import nn
@@ -290,7 +291,7 @@ def test_noise_leaves_the_clean_action_unclipped():
 # --- stopping early ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("after", [0, 7])
+@pytest.mark.parametrize("after", first_fast([0, 7]))
 @pytest.mark.parametrize("make", [plain_env, transformed_env])
 def test_stopping_after_success_gives_the_same_success(make, after):
     length = 110

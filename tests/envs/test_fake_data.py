@@ -31,6 +31,7 @@ MAKERS = {
     [lw.PlanConditionedActor, lw.ScriptedSkillActor, lambda plans: lw.DescriptorConditionedActor(tuple(plans))],
     ids=["plan", "scripted", "description"],
 )
+@pytest.mark.slow
 def test_a_policy_acts_on_fake_data(name, policy):
     env = MAKERS[name]()
     fake = env.fake_tensordict()

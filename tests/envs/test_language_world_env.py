@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from rows import ENGINES, FEW, ROWS, STEPS, actions_of, advance, same, trajectories
+from speed import first_fast
 from tensordict import TensorDict
 from torchrl.envs import TransformedEnv, check_env_specs
 
@@ -25,7 +26,7 @@ def test_specs_of_every_task(task, plans):
     env.close()
 
 
-@pytest.mark.parametrize("contiguous", [True, False])
+@pytest.mark.parametrize("contiguous", first_fast([True, False]))
 def test_specs_of_mt50(mt50, plans, contiguous):
     assert len({len(plan.steps) for plan in plans.values()}) > 3, "plans of different lengths"
     check_env_specs(mt50, seed=1, return_contiguous=contiguous)
@@ -176,7 +177,7 @@ def test_every_task_starts_and_moves_as_metaworlds_own(mt50, metaworld_env):
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-@pytest.mark.parametrize("scale", [1.0, 3.0])
+@pytest.mark.parametrize("scale", first_fast([1.0, 3.0]))
 def test_eighty_steps_and_dense_reward_are_metaworlds_own(metaworld_env, scale, engine):
     """Also with actions out of range, which Meta-World clips by itself."""
     tasks = ["button-press-topdown", "coffee-pull", "drawer-open", "handle-press", "pick-place", "stick-push"]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from pictures import why_no_pictures
+from speed import first_fast
 from torchrl.envs import Compose, StepCounter, TransformedEnv, check_env_specs
 from torchrl.record import PixelRenderTransform, VideoRecorder
 from torchrl.record.loggers import CSVLogger
@@ -215,6 +216,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 def test_a_process_forked_after_a_picture_is_told_and_does_not_hang():
     done = subprocess.run([sys.executable, "-c", _FORK], capture_output=True, text=True, check=True)
     assert "forked from one that took pictures" in done.stdout
@@ -230,6 +232,7 @@ def test_pixels_are_of_one_episode_once_the_specs_are_known():
     env.close()
 
 
+@pytest.mark.slow
 def test_an_environment_left_open_ends_in_silence():
     done = subprocess.run(
         [sys.executable, "-c", _SHOW.replace("env.close()", "")], capture_output=True, text=True, check=True
@@ -237,7 +240,7 @@ def test_an_environment_left_open_ends_in_silence():
     assert not done.stderr
 
 
-@pytest.mark.parametrize("backend", ["glfw", "disable"])
+@pytest.mark.parametrize("backend", first_fast(["glfw", "disable"]))
 def test_without_open_gl_the_error_says_what_to_install(backend):
     environment = {**os.environ, "MUJOCO_GL": backend}
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):

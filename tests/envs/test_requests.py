@@ -62,6 +62,7 @@ def test_a_rollout_from_a_state_goes_on_too(any_env):
 
 @pytest.mark.filterwarnings("ignore:No explicit `?device")
 @pytest.mark.parametrize("name", BATCHED)
+@pytest.mark.slow
 def test_batched_environments_go_on_and_may_be_asked(name):
     env = BATCHED[name]()
     env.set_seed(3)

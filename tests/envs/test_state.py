@@ -9,6 +9,7 @@ import pickle
 
 import pytest
 import torch
+from speed import first_fast
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.collectors import Collector
@@ -76,7 +77,7 @@ def buffered(state: dict):
     return file
 
 
-@pytest.mark.parametrize("name", MAKERS)
+@pytest.mark.parametrize("name", first_fast(MAKERS, 2))
 def test_what_loads_the_state_goes_on(name):
     expected, got = expected_and_got(MAKERS[name], seed=77)
     assert expected[0].min() >= 2, "the third episodes"

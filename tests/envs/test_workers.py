@@ -9,6 +9,7 @@ from functools import partial
 
 import pytest
 import torch
+from speed import first_fast
 from torchrl.collectors import Collector, MultiAsyncCollector, MultiSyncCollector
 from torchrl.envs import AsyncEnvPool, EnvCreator, ParallelEnv, SerialEnv
 from worker_envs import make_env, make_serial, make_transformed, still
@@ -37,7 +38,7 @@ BATCHED = {
 
 
 @pytest.mark.parametrize("make", [make_env, make_transformed])
-@pytest.mark.parametrize("name", BATCHED)
+@pytest.mark.parametrize("name", first_fast(BATCHED, 2))
 def test_a_batch_of_environments_runs_what_one_large_one_would(name, make):
     for _ in range(1 if "spawn" in name else 2):  # whatever ran before in this process
         env = BATCHED[name](make)
@@ -93,6 +94,7 @@ def collected(kind, makers, **options) -> list[torch.Tensor]:
     return batches
 
 
+@pytest.mark.slow
 def test_collectors_in_processes_differ_and_repeat_themselves():
     runs = [collected(MultiSyncCollector, [make_env] * 2, cat_results="stack") for _ in range(2)]
     assert all(torch.equal(left, right) for left, right in zip(*runs, strict=True)), "the seed says it all"
@@ -101,6 +103,7 @@ def test_collectors_in_processes_differ_and_repeat_themselves():
     assert {int(e) for e in episodes if e < MANY} == {0, 1, 2, 3}
 
 
+@pytest.mark.slow
 def test_asynchronous_collectors_differ():
     found = torch.cat(collected(MultiAsyncCollector, [make_env] * 2))
     assert found[:, 0].unique().numel() == found[:, 1].unique().numel()
@@ -119,6 +122,7 @@ def test_spawned_environments_of_spawned_collectors():
     assert found[:, 0].unique().numel() == found[:, 1].unique().numel() >= 8
 
 
+@pytest.mark.slow
 def test_a_pool_of_processes_and_one_of_threads():
     pool = AsyncEnvPool([partial(make_env, num_envs=1)] * 2, backend="multiprocessing", exchange="queue")
     assert pool.reset()["episode"].flatten().tolist() == [0, 1]

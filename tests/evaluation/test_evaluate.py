@@ -175,6 +175,7 @@ def whole(trained):
     return run(trained, ["drawer-open", "reach"], episodes_per_task=4, max_steps=150, num_envs=6)
 
 
+@pytest.mark.slow
 def test_a_trained_policys_actions_give_the_same_success_in_meta_worlds_own_environments(whole):
     assert whole.mean_success > 0, "the test wants successes"
     assert_true_in_metaworld(whole)

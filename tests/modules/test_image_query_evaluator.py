@@ -188,6 +188,7 @@ class TestActing:
         result = lw.evaluate(actor, record_actions=True, **settings | options)
         return [one.actions for one in result.episodes]
 
+    @pytest.mark.slow
     def test_results_do_not_depend_on_num_envs(self):
         actor = lw.PlanConditionedActor(PLANS, evaluator=make(), width=8)
         found = [self.evaluated(actor, num_envs=n, num_threads=t) for n, t in ((2, 1), (4, 2))]
@@ -201,6 +202,7 @@ class TestActing:
         for one, other in zip(own, behind, strict=True):
             assert torch.equal(one, other)
 
+    @pytest.mark.slow
     def test_failures_are_told_with_true_answers_in_its_place(self):
         result = lw.evaluate(
             lw.ScriptedSkillActor(PLANS, evaluator=make()),

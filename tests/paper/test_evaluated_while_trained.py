@@ -37,6 +37,7 @@ def load(folder):
 
 
 @by_setting
+@pytest.mark.slow
 def test_what_is_learned_is_the_same(undisturbed, tmp_path, setting):
     one = a_run(setting=setting)
     plain, watched = execute(one, tmp_path), execute(one, undisturbed, WATCHED)

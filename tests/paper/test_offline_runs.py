@@ -128,7 +128,7 @@ def test_data_are_of_the_behaviours_that_mixtures_name(made):
 
 
 @pytest.mark.parametrize("method", OFFLINE_METHODS)
-@pytest.mark.parametrize(("actor", "critic"), [("pcbc", "pcbc"), ("dc", "one-hot")])
+@pytest.mark.parametrize(("actor", "critic"), [("pcbc", "pcbc"), pytest.param("dc", "one-hot", marks=pytest.mark.slow)])
 def test_every_method_learns_and_is_evaluated(made, method, actor, critic):
     run = tiny(method, actor, critic)
     result = execute_run(run, PLANS, made, progress=False)

@@ -285,6 +285,7 @@ def test_passes_count_rows(undisturbed, tmp_path, monkeypatch, setting, trainer,
 @pytest.mark.parametrize(
     "one", [a_run(), a_run("dc"), a_run("one-hot", setting=TINY_ONE_SHOT)], ids=["pcbc", "dc", "one-hot one-shot"]
 )
+@pytest.mark.slow
 def test_a_text_encoder_of_ones_own(one, tmp_path):
     own = replace(one, encoder_name="my_texts:lengths")
     assert own.folder != one.folder

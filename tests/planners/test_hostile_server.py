@@ -52,6 +52,7 @@ DRIPS = {
 
 
 @pytest.mark.parametrize("name", DRIPS)
+@pytest.mark.slow
 def test_an_answers_time_is_one_whatever_drips(tmp_path, name):
     with talking(DRIPS[name]) as address:
         began = time.monotonic()

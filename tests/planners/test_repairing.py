@@ -37,6 +37,7 @@ def planner(tmp_path, monkeypatch):
     return make
 
 
+@pytest.mark.slow
 def test_a_plan_is_repaired_by_what_became_of_it(planner, tmp_path):
     server = FakeServer(learns)
     with serving(server) as address:
@@ -73,6 +74,7 @@ def test_a_model_that_learns_nothing_is_asked_so_many_times(planner):
     assert "no plan was found" in server.requests[-1]["messages"][-1]["content"]
 
 
+@pytest.mark.slow
 def test_a_model_is_told_where_its_json_was_cut_off(planner):
     """The text in the format, made of the JSON, has no trace of it."""
     whole = write_structured(PLANS["push"], PLAN_FORMATS["chain_py"].style)

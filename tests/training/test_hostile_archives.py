@@ -61,6 +61,7 @@ def test_entries_that_no_file_of_ours_has_are_refused(good, tmp_path, name):
     assert {file.name for file in tmp_path.iterdir()} == {"c.zip"}
 
 
+@pytest.mark.slow
 def test_compressed_entries_are_refused_before_they_are_unpacked(good, tmp_path):
     """2.8 MB that unpack to 3 GB."""
     description, _ = parts(good)

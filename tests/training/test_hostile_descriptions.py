@@ -111,7 +111,13 @@ except ValueError as error:
 """
 
 
-@pytest.mark.parametrize(("name", "value"), [("width", 60_000), ("depth", 10**9), ("latent_size", 10**8)])
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("width", 60_000),
+        *(pytest.param(*one, marks=pytest.mark.slow) for one in [("depth", 10**9), ("latent_size", 10**8)]),
+    ],
+)
 def test_sizes_are_checked_before_anything_is_built(good, tmp_path, name, value):
     description, groups = parts(good)
     description["actor"]["options"][name] = value

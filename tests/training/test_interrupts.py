@@ -156,6 +156,7 @@ OTHERS = (
 
 
 @pytest.mark.parametrize("arguments", OTHERS, ids=lambda arguments: arguments[0])
+@pytest.mark.slow
 def test_other_work(forks, tmp_path, arguments):
     given = [tmp_path / "out" if one == "OUT" else one for one in arguments]
     assert interrupted(forks, tmp_path, given, 2, "LanguageWorldEnv", "_step") == [(130, 0)] * 2

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import textwrap
 
+import pytest
 import torch
 
 import lw_torchrl as lw
@@ -72,6 +73,7 @@ KILLER = """
 """
 
 
+@pytest.mark.slow
 def test_killed_at_any_line_of_saving_the_old_or_the_new_file_is_there(tmp_path):
     folder = tmp_path / "run"
     folder.mkdir()

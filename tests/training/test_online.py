@@ -40,6 +40,7 @@ methods = pytest.mark.parametrize("method", LEARNERS)
 
 
 @methods
+@pytest.mark.slow
 def test_it_learns_something_and_can_be_kept(demos, tmp_path, method):
     actor = make_actor()
     before = {name: value.clone() for name, value in actor.state_dict().items()}
@@ -174,6 +175,7 @@ KILLER = """
 """
 
 
+@pytest.mark.slow
 def test_killed_at_any_moment_the_checkpoint_is_whole_and_training_the_same(demos, tmp_path):
     here = str(Path(__file__).parent)
     command = [sys.executable, "-W", "ignore", "-c", textwrap.dedent(KILLER), str(demos), str(tmp_path / "c.zip"), here]
@@ -258,6 +260,7 @@ def test_it_is_logged_by_steps_of_the_environment(demos, tmp_path):
 
 @pytest.mark.parametrize("method", ["dc", "one-hot"])
 @pytest.mark.parametrize("how", ["td3", "residual", "ppo"])
+@pytest.mark.slow
 def test_other_conditions_learn_too(demos, method, how):
     trainer = make_online(demos, how, actor=make_actor(method), config=replace(CONFIG, frames=120))
     trainer.train()

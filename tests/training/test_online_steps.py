@@ -43,6 +43,7 @@ def rows_that_came(trainer):
 
 @pytest.mark.parametrize("method", ["residual", "td3"])
 @pytest.mark.parametrize("steps", [{"push": [0]}, {"push": [0, 1, 2, 3], "reach": [0]}])
+@pytest.mark.slow
 def test_what_is_done_outside_of_the_steps_is_what_the_base_does_without_noise(demos, steps, method):
     actor = make_residual(steps)
     trainer = make_online(demos, method, actor=actor, config=OFTEN)
@@ -106,6 +107,7 @@ def test_a_training_of_another_step_is_not_gone_on_with(demos, tmp_path):
             make_online(demos, "residual", path, actor=make_residual(steps), config=short)
 
 
+@pytest.mark.slow
 def test_the_other_tasks_of_the_policy_fare_exactly_as_before(demos):
     actor = make_residual({"push": [0, 1]})
     start = make_actor()

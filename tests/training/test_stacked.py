@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from speed import first_fast
 from torchrl.envs import Compose
 
 import lw_torchrl as lw
@@ -34,7 +35,7 @@ def make(kind, seed):
     return lw.DescriptorConditionedActor(TASKS, width=32, condition=kind)
 
 
-@pytest.mark.parametrize("kind", ["plan", "focused plan", "mixed actions", "description", "one-hot"])
+@pytest.mark.parametrize("kind", first_fast(["plan", "focused plan", "mixed actions", "description", "one-hot"]))
 def test_every_loss_is_the_one_it_has_alone(demos, kind):
     together = lw.training.StackedBehavioralCloning(
         [make(kind, seed) for seed in range(3)], [replay(demos) for _ in range(3)], CONFIG, progress=False
