@@ -21,14 +21,7 @@ from lw_torchrl._checks import check_int, checked
 from lw_torchrl._rendering import check_picture
 from lw_torchrl.envs.engine import ACTION_SIZE, Engine
 from lw_torchrl.envs.engines import make_engine
-from lw_torchrl.envs.row_states import (
-    RowStates,
-    action_spec,
-    clipped_action,
-    done_spec,
-    observation_spec,
-    row_mask,
-)
+from lw_torchrl.envs.row_states import RowStates, action_spec, clipped_action, done_spec, observation_spec, row_mask
 from lw_torchrl.envs.seeding import EpisodeCounter, check_worker, stated_episode
 from lw_torchrl.envs.workers import OneThread, one_thread_at_a_time, torchrl_worker
 from lw_torchrl.language.tasks import Task, named_tasks
