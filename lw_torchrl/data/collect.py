@@ -50,8 +50,7 @@ from lw_torchrl.modules.policy import Policy
 def _open_episode_files(
     root: Path, config: CollectConfig, made_with: dict[str, str] | None = None
 ) -> tuple[EpisodeFiles, dict[str, str]]:
-    """The episodes so far, and the versions of the packages that the dataset was begun with; a damaged dataset that is
-    taken apart gives its own, ``made_with``."""
+    """The episodes so far, and the versions they were begun with: ``made_with`` for a damaged dataset."""
     folder = root / PARTIAL
     stated, of_packages = folder / "config.json", folder / "versions.json"
     begun = stated.is_file()
@@ -132,7 +131,6 @@ def _take_apart(root: Path, config: CollectConfig, whole: list[EpisodeInfo], rea
 def _assemble(
     root: Path, config: CollectConfig, versions: dict[str, str], files: EpisodeFiles, kept: dict[str, list[int]]
 ) -> None:
-    """Make the dataset of the kept episodes."""
     listed = [(task, episode) for task in config.tasks for episode in kept[task]]
     infos: list[EpisodeInfo] = []
 
@@ -208,8 +206,8 @@ def collect_demonstrations(
     on interruptions or damage.
 
     Each row is a step, in TorchRL's TED layout (R rows):
-        observation: (R, 39) float32, metres; next/observation likewise.
-        task_id, episode: (R,) int64; next/task_id likewise. collector/traj_ids: (R,) int64, unique per episode.
+        observation, next/observation: (R, 39) float32, metres.
+        task_id, next/task_id, episode: (R,) int64. collector/traj_ids: (R,) int64, unique per episode.
         action: (R, 4) float32 in [-1, 1], as executed, noise included.
         expert_action: (R, 4) float32 in [-1, 1], what the expert, or whoever acted, wanted in the same state;
             unclipped_action: (R, 4) float32, what its script asked for.
@@ -226,7 +224,7 @@ def collect_demonstrations(
             random actions; a :class:`Behaviour`; or a trained :class:`Policy`, run as :func:`evaluate` runs it.
         behaviour: the label of its episodes, for :class:`EpisodeFilter`; None for its name. A Policy needs one.
         seed: evaluate on another one.
-        noise_scale: standard deviation of the noise on the executed action; a sequence gives one to each episode, in
+        noise_scale: standard deviation of the noise on the executed action; a sequence gives one to each episode in
             turn.
         noise_hold: steps for which each draw of the noise is kept; the longer, the further it leads the expert astray.
         gripper_noise_factor: multiplies the noise on the gripper.
@@ -235,9 +233,6 @@ def collect_demonstrations(
         num_envs: environments stepped together.
         progress: show a progress bar when it takes longer than a second.
 
-    Returns:
-        The finished dataset's description.
-
     Warns:
         UserWarning: a finished dataset was damaged; or one that is continued was begun under another version of numpy,
             torch or this package.
@@ -245,7 +240,6 @@ def collect_demonstrations(
     Raises:
         DatasetError: (a ValueError) ``root`` holds something else, or episodes of another version of MuJoCo or
             Meta-World, or another call is at work in it.
-        TypeError: ``tasks`` holds a :class:`~lw_torchrl.Task`.
         OSError: it cannot be written, for lack of room, say; nothing is lost.
         RuntimeError: redrawing found too few successes.
 

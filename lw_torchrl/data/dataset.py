@@ -51,8 +51,7 @@ class CollectConfig:
         noise_hold: the steps for which each draw of the noise is kept.
         gripper_noise_factor: multiplies the gripper's noise, which makes grasps fail.
         redraw_failures: keep only successful episodes, and draw another for each failure.
-        max_steps: steps of an episode.
-        policy: who acts.
+        max_steps, policy: steps of an episode, and who acts.
     """
 
     tasks: tuple[str, ...]
@@ -100,12 +99,9 @@ class EpisodeInfo:
     """One episode of a dataset.
 
     Attributes:
-        task: the task's name.
-        episode: its index; ``episode_seed(task, seed, episode)`` is its seed.
-        start: its first row.
-        length: its number of rows.
-        success: whether it succeeded at some step.
-        first_success: the first successful step, from 1; None without success.
+        task, episode: the task's name, and the index; ``episode_seed(task, seed, episode)`` is its seed.
+        start, length: its first row, and its number of rows.
+        success, first_success: whether it succeeded at some step; the first successful one, from 1, or None.
         checksum: CRC-32 of its rows, column after column.
     """
 
@@ -123,8 +119,7 @@ class Demonstrations:
     """A finished dataset, described; :class:`LanguageWorldExperienceReplay` reads its rows.
 
     Attributes:
-        root: its folder.
-        config: how it was collected.
+        root, config: its folder, and how it was collected.
         versions: of the packages that it was begun with.
         task_ids: task name to its number in the files; rows are shown with the present :func:`~lw_torchrl.task_id`.
         episodes: in the order of the rows.
@@ -140,7 +135,6 @@ class Demonstrations:
 
     @property
     def num_steps(self) -> int:
-        """The number of rows."""
         return sum(episode.length for episode in self.episodes)
 
     @property
@@ -179,12 +173,7 @@ def write_metadata(
 
 
 def read_metadata(root: str | os.PathLike[str]) -> Demonstrations:
-    """Describe the dataset in a folder.
-
-    Raises:
-        FileNotFoundError: there is no such folder.
-        DatasetError: (a ValueError) the dataset is half-written, damaged, or of another format or version.
-    """
+    """Describe the dataset in a folder; DatasetError if it is half-written, damaged, or of another format or version."""
     folder = Path(root)
     path = folder / METADATA
     if not folder.is_dir():
@@ -240,8 +229,7 @@ def read_config(path: Path) -> CollectConfig:
 
 
 def read_versions(path: Path) -> dict[str, str]:
-    """The package versions that a half-made dataset was begun with, {} if it does not say; a damaged file is a
-    :class:`DatasetError`."""
+    """The package versions that a half-made dataset was begun with, {} if it does not say; as :func:`read_config`."""
     with _half_made(path), suppress(FileNotFoundError):
         return _versions(read_json(path, "root: the versions"))
     return {}

@@ -31,8 +31,8 @@ class GrowingStorage(JoinedStorage):
 
     Batches may have any dimensions, the last of which is time; the columns of the parts are stored, see
     :func:`collected_rows`. ``("collector", "traj_ids")`` gets new numbers, above those of the parts: a trajectory keeps
-    its number from batch to batch as long as its newest row is in the ring, and no other trajectory ever gets it. A
-    row follows another if both have the collector's id, the other is not done, and its "next" is bit for bit this row.
+    its number from batch to batch as long as its newest row is in the ring, and no other trajectory ever gets it. A row
+    follows another if both have the collector's id, the other is not done, and its "next" is bit for bit this row.
 
     Samples have one column more, ``is_demonstration`` (B,) bool: true of the parts' rows, false of those written.
 
@@ -44,9 +44,7 @@ class GrowingStorage(JoinedStorage):
         check: called with the columns of a restored state; it raises if they are wrong.
 
     Attributes:
-        num_joined: rows of the parts.
-        grow: rows of the ring.
-        count: rows ever written.
+        num_joined, count: rows of the parts, and rows ever written.
 
     Raises:
         ValueError: as for :class:`JoinedStorage`; at writing, a batch of more rows than the ring has, or what
@@ -62,11 +60,8 @@ class GrowingStorage(JoinedStorage):
         ...     ids = torch.full((number,), trajectory)
         ...     found = {"time": time, "task_id": ids * 0, "collector": {"traj_ids": ids}, "next": after}
         ...     return TensorDict(found, [number])
-        >>> replay = TensorDictReplayBuffer(
-        ...     storage=GrowingStorage([rows(6, 0)], grow=4),
-        ...     writer=GrowingWriter(),
-        ...     collate_fn=lambda batch: batch,
-        ... )
+        >>> storage, writer = GrowingStorage([rows(6, 0)], grow=4), GrowingWriter()
+        >>> replay = TensorDictReplayBuffer(storage=storage, writer=writer, collate_fn=lambda batch: batch)
         >>> for _ in range(2):
         ...     _ = replay.extend(rows(3, 0))
         >>> replay[:]["collector", "traj_ids"].tolist(), replay[6:]["time"].tolist()
@@ -115,14 +110,12 @@ class GrowingStorage(JoinedStorage):
 
     @property
     def num_grown(self) -> int:
-        """The rows of the ring that are written."""
         return min(self.count, self.grow)
 
     def __len__(self) -> int:
         return self.num_joined + self.num_grown
 
     def keys(self) -> list[NestedKey]:
-        """The names of the columns."""
         return [*super().keys(), DEMONSTRATION]
 
     def _read(self, index: Tensor, keys: Sequence[NestedKey]) -> dict[NestedKey, Tensor]:
@@ -219,14 +212,12 @@ class GrowingStorage(JoinedStorage):
         self._write(serial, rows, previous)
 
     def dumps(self, path: Any) -> None:
-        """Write the state to a folder, as one file that is there whole or not at all."""
         state = self.state_dict()
         rows, opened = state.pop("rows"), state.pop("open")
         Path(path).mkdir(parents=True, exist_ok=True)
         write_archive(Path(path) / "grown.zip", state, {"rows": rows, "open": opened})
 
     def loads(self, path: Any) -> None:
-        """Read what :meth:`dumps` wrote."""
         with reading(path, "growing storage's state"):
             archive = TensorArchive(Path(path) / "grown.zip")
             groups = {name: archive.tensors(name) for name in ("rows", "open")}
@@ -251,7 +242,7 @@ class GrowingWriter(Writer):
         return self._storage.count
 
     def extend(self, data: TensorDictBase) -> Tensor:
-        """Write the rows of a batch; their places, int64 of the batch's shape."""
+        """As :meth:`GrowingStorage.extend`."""
         index = self._storage.extend(data)
         for entity in self._storage._attached_entities_iter():
             entity.mark_update(index.reshape(-1))

@@ -53,7 +53,6 @@ def _identity(batch: TensorDictBase) -> TensorDictBase:
 
 
 def _choices(episodes: Any, roots: int, joined: bool) -> list[EpisodeChoice]:
-    """The choice of episodes for each folder."""
     if not roots:
         raise ValueError("root must hold at least one folder, got an empty list")
     if not joined or episodes is None:
@@ -71,16 +70,16 @@ _NOT_COLLECTED = ("behaviour", "expert_action", "unclipped_action", ("next", "re
 class LanguageWorldExperienceReplay(RestorableReplay):
     """The rows of datasets that :func:`collect_demonstrations` made; several are joined, and none is copied.
 
-    Samples hold observation (B, 39) float32, action (B, 4) float32, task_id and episode (B,) int64, and what
-    ``label`` leaves; a :class:`QAFTransform` adds ``qaf`` and ``qaf_plan``. collector/traj_ids (B,) int64 is unique for
-    each episode of all datasets; behaviour (B,) int64 says who acted, an index of ``behaviours``. is_demonstration
-    (B,) bool is true of a dataset's rows, and false of those that :meth:`extend` wrote.
+    Samples hold observation (B, 39) float32, action (B, 4) float32, task_id and episode (B,) int64, and what ``label``
+    leaves; a :class:`QAFTransform` adds ``qaf`` and ``qaf_plan``. collector/traj_ids (B,) int64 is unique for each
+    episode of all datasets; behaviour (B,) int64 says who acted, an index of ``behaviours``. is_demonstration (B,) bool
+    is true of a dataset's rows, and false of those that :meth:`extend` wrote.
 
     Args:
         root: the dataset's folder, or a list of folders, in the order of the rows. A folder may come twice only if
             ``episodes`` says what to show of each.
-        episodes: which episodes to show. None: all; a number: the first so many of each task; a mapping: for each task
-            to show, the first so many, or a list of indices of episodes. For a list of folders, a list of such choices.
+        episodes: which to show. None: all; a number: the first so many of each task; a mapping: for each task to show,
+            the first so many, or a list of indices of episodes. For a list of folders, a list of such choices.
         keep: of these, the successes, the best tenth, those of one behaviour, ...; see :class:`EpisodeFilter`.
         batch_size: rows of a sample.
         sampler: a TorchRL sampler, :class:`TaskBalancedSampler` say; None for uniform.
@@ -94,9 +93,8 @@ class LanguageWorldExperienceReplay(RestorableReplay):
         after_success: drop the steps that come more than so many after the first success; None keeps all.
         terminate_on_success: end each episode at its first success, with ``("next", "terminated")``, as
             ``LanguageWorldEnv(terminate_on_success=True)`` does; with label="executed".
-        n_steps: how many steps ``("next", ...)`` is ahead, within the episode that is shown; see
-            :class:`JoinedStorage`.
-        gamma: the discount of the rewards on the way, for ``n_steps`` of 2 or more; the loss must use the same.
+        n_steps, gamma: how many steps ``("next", ...)`` is ahead, within the episode that is shown, and from 2 on the
+            discount of the rewards on the way, which the loss must have too; see :class:`JoinedStorage`.
         grow: rows of a ring that :meth:`extend` writes to, whose oldest are overwritten; see :class:`GrowingStorage`.
             Samples then leave out the expert's actions and the other reward, which a collector does not give.
         device: where the rows are kept and transforms work: None or "cpu" for the files, memory-mapped; "cuda",
@@ -108,22 +106,19 @@ class LanguageWorldExperienceReplay(RestorableReplay):
             several threads would draw in an order that differs from run to run.
 
     Attributes:
-        demonstrations: the dataset's description; a :class:`JoinedDemonstrations` where folders are joined or
-            episodes chosen.
-        roots: the folders.
+        demonstrations: the description; a :class:`JoinedDemonstrations` where folders are joined or episodes chosen.
+        roots, behaviours: the folders, and the labels of who acted, sorted.
         columns: of :meth:`add_column`, the name to a digest of the values.
-        behaviours: the labels of who acted, sorted.
 
     Warns:
         UserWarning: the folders were collected with different versions of MuJoCo or Meta-World; or, with ``grow``, with
             others than the installed ones.
 
     Raises:
-        ValueError: a task or an episode that the dataset does not hold; ``n_steps`` or ``grow`` without
-            label="executed"; a transform that does nothing to samples, such as ``MultiStepTransform``, which
-            ``n_steps`` replaces. From :meth:`extend`: rows that do not fit the demonstrations, or have another reward.
+        ValueError: an episode that the dataset does not hold; ``n_steps`` or ``grow`` without label="executed"; a
+            transform that does nothing to samples, such as ``MultiStepTransform``, which ``n_steps`` replaces. From
+            :meth:`extend`: rows that do not fit the demonstrations, or have another reward.
         RuntimeError: :meth:`extend` without ``grow``; an assignment to rows.
-        FileNotFoundError: there is no such folder.
         DatasetError: (a ValueError) the dataset is half-written, damaged, or of another format or version.
 
     Example:
@@ -252,10 +247,7 @@ class LanguageWorldExperienceReplay(RestorableReplay):
         )
 
     def set_sampler(self, sampler: Sampler) -> Sampler:
-        """Take another sampler, which draws from the buffer's generator; returns the one before.
-
-        In a worker of a DataLoader it gets no generator until ``set_rng``, since all workers have copies of one.
-        """
+        """Take another sampler, which draws from the buffer's generator, in a DataLoader's worker after ``set_rng``."""
         if self._grows:
             check_growing(sampler, {})
         before = super().set_sampler(sampler)
@@ -264,7 +256,7 @@ class LanguageWorldExperienceReplay(RestorableReplay):
         return before
 
     def append_transform(self, transform: Transform, *, invert: bool = False) -> LanguageWorldExperienceReplay:
-        """Apply a transform, or with ``invert`` its inverse, to each sample, after those that are there."""
+        """Apply a transform, or with ``invert`` its inverse, to each sample, after the others."""
         if not invert:
             check_transform(transform)
         return super().append_transform(transform, invert=invert)
@@ -287,10 +279,9 @@ class LanguageWorldExperienceReplay(RestorableReplay):
         return super().share(shared)
 
     def add_column(self, name: str, values: Tensor, *, of: LanguageWorldExperienceReplay | None = None) -> None:
-        """Give samples a new column, held in memory: each row's advantage, say.
+        """Give samples a new column ``name``, held in memory: each row's advantage, say.
 
         Args:
-            name: of the column, a new one.
             values: (R, ...), for each row in the order of ``replay[:]``; a copy is kept on the device of the rows.
             of: the buffer that the values were computed from, if it is another one, with n steps say. It must show the
                 same rows in the same order, and so the same episodes where a filter keeps some by their return.

@@ -25,8 +25,7 @@ _FILE = "sampler.zip"
 
 
 def column(storage: Storage, key: NestedKey, index: Tensor | None = None) -> Tensor:
-    """One column of all rows of a storage, or of those at an index, on the CPU; rows of a storage of several dimensions
-    are numbered in row-major order."""
+    """One column of all rows of a storage, row-major if it has several dimensions, or of those at an index, on the CPU."""
     if isinstance(storage, JoinedStorage):
         return storage.column(key, index).cpu()
     rows = storage.get(slice(0, len(storage)))
@@ -48,15 +47,13 @@ class GroupSampler(Sampler):
     """Exact numbers from groups of rows; within a group every row comes once before any comes again.
 
     A subclass gives the group of each row (:meth:`_label`) and the rows of each group in a batch (:meth:`_shares`). A
-    batch holds the groups one after another. A group's pass continues in the next batch; where a pass ends within a
-    batch, the rest comes from the next pass, in a new order.
+    batch holds the groups one after another. Where a group's pass ends within a batch, the rest comes from the next
+    pass, in a new order. For a storage of several dimensions (``ndim=2``) an index is a tuple of as many tensors.
 
     Rows may be written and overwritten. If the subclass tells a row's group by a column (:meth:`_keys`), groups and
     passes are updated: a new row takes a random place in what is left of its group's pass, and the work is that of the
     new rows. Otherwise, and when a group comes or goes or the storage has several dimensions, all rows are grouped
     again and all passes begin.
-
-    For a storage of several dimensions (``ndim=2``) an index is a tuple of as many tensors, as TorchRL's samplers give.
     """
 
     def __init__(self) -> None:
@@ -110,7 +107,6 @@ class GroupSampler(Sampler):
             self._passes.shuffle(group, self._rng)
 
     def _know(self, storage: Storage) -> None:
-        """Note the key of each group."""
         found = self._keys(storage, self._passes.order[self._passes.start]) if storage.ndim == 1 else None
         self._known = None if found is None else found.reshape(-1).cpu()
 
@@ -142,7 +138,6 @@ class GroupSampler(Sampler):
         return self._laid_out[1:]
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor | tuple[Tensor, ...], dict[str, Any]]:
-        """Draw ``batch_size`` indices, group after group."""
         batch_size = check_int("batch_size", batch_size, minimum=1)
         worker = get_worker_info()
         if worker is not None and worker.num_workers > 1 and self._process != os.getpid():
@@ -176,7 +171,6 @@ class GroupSampler(Sampler):
         return (index if storage.ndim == 1 else torch.unravel_index(index, storage.shape)), {}
 
     def add(self, index: Any) -> None:
-        """Note that rows were written or overwritten."""
         rows = torch.as_tensor(index, device="cpu").reshape(-1)
         self._written.append(rows)
         if sum(map(len, self._written)) > 2 * self._length:
@@ -215,8 +209,8 @@ class GroupSampler(Sampler):
         self._restored = True
 
     def _check_restored(self, storage: Storage) -> None:
-        """Raise unless a restored state is of the storage's rows, in their groups; if rows were written since and the
-        others are in other groups, all are grouped again."""
+        """Raise unless a restored state is of the storage's rows, in their groups; rows written since may cost the
+        state."""
         rows, groups = self._passes.order, torch.repeat_interleave(self._passes.size)
         length = self._covered(storage)
         if self._written:
@@ -248,17 +242,13 @@ class TaskBalancedSampler(GroupSampler):
     """Equal numbers from every task, exactly; within a task every row comes once before any comes again.
 
     The buffer may grow: new rows take random places in the present passes, and overwritten ones leave them; when a task
-    comes or goes, all passes begin anew. A batch costs no more than the rows written since the last one.
-
-    It draws from the replay buffer's generator, so ``ReplayBuffer(..., generator=...)`` fixes the batches. Its state is
-    saved with the buffer's. Each task has passes of its own; an epoch is a pass over the largest task.
-
-    Args:
-        task_key: the entry of the storage that holds the task.
+    comes or goes, all passes begin anew. A batch costs no more than the rows written since the last one. It draws from
+    the replay buffer's generator, so ``ReplayBuffer(..., generator=...)`` fixes the batches; its state is saved with
+    the buffer's. An epoch is a pass over the largest task. ``task_key`` is the entry of the storage that holds the
+    task.
 
     Raises:
-        ValueError: at sampling, a batch size that the number of tasks does not divide (with the nearest that it
-            does), or an empty storage.
+        ValueError: at sampling, a batch size that the number of tasks does not divide (with the nearest that it does).
 
     Example:
         >>> import torch
