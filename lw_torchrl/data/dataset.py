@@ -173,7 +173,7 @@ def write_metadata(
 
 
 def read_metadata(root: str | os.PathLike[str]) -> Demonstrations:
-    """Describe the dataset in a folder; DatasetError if it is half-written, damaged, or of another format or version."""
+    """Describe the dataset in a folder; DatasetError if it is half-written, damaged, or of another version."""
     folder = Path(root)
     path = folder / METADATA
     if not folder.is_dir():

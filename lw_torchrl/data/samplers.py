@@ -25,7 +25,7 @@ _FILE = "sampler.zip"
 
 
 def column(storage: Storage, key: NestedKey, index: Tensor | None = None) -> Tensor:
-    """One column of all rows of a storage, row-major if it has several dimensions, or of those at an index, on the CPU."""
+    """One column of all rows of a storage, row-major if of several dimensions, or of those at an index, on the CPU."""
     if isinstance(storage, JoinedStorage):
         return storage.column(key, index).cpu()
     rows = storage.get(slice(0, len(storage)))

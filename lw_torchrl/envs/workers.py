@@ -56,12 +56,9 @@ _WORKER_PROCESSES: dict[tuple[str, str], Callable[[Locals], tuple[int, int]]] = 
 
 
 def torchrl_worker() -> tuple[int, int]:
-    """(rank, of) of the worker that this is called in, (0, 1) outside; a RuntimeError in a ThreadingAsyncEnvPool.
-
-    Workers within workers are counted through. SerialEnv and ParallelEnv say how many there are; for collectors and
-    AsyncEnvPool ``of`` is :data:`MANY`. Workers of a ParallelEnv without shared buffers are known by the order in which
-    they were started.
-    """
+    """(rank, of) of the worker that this is called in, (0, 1) outside; workers within workers are counted through. For
+    collectors and AsyncEnvPool ``of`` is :data:`MANY`. Workers of a ParallelEnv without shared buffers are known by the
+    order in which they were started."""
     rank, of, processes = 0, 1, 0
     frame: FrameType | None = sys._getframe(1)
     while frame is not None:
@@ -84,10 +81,8 @@ Method = TypeVar("Method", bound=Callable[..., Any])
 
 class OneThread:
     """Lets one thread in at a time, which may enter again; two would break MuJoCo's memory or, silently, its numbers.
-    Entering raises a RuntimeError if another thread is in for longer than ``patience`` seconds.
-
-    The lock is an RLock: a Lock would stay taken if an interrupt came between taking it and the block.
-    """
+    Entering raises a RuntimeError if another thread is in for longer than ``patience`` seconds. A Lock, unlike the
+    RLock, would stay taken if an interrupt came between taking it and the block."""
 
     def __init__(self, lock: Any, patience: float = 0.0) -> None:
         self._lock, self._patience = lock, patience

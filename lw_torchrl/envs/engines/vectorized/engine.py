@@ -41,7 +41,6 @@ FINGERS = np.array([1.0, -1.0])
 
 
 def available_cores() -> int:
-    """The cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -68,8 +67,7 @@ class VectorizedEngine:
         >>> engine = VectorizedEngine(["reach", "push"], num_threads=1)
         >>> engine.reset([0, 1], seeds=[7, 8]).shape
         (2, 39)
-        >>> result = engine.step(np.zeros((2, 4), np.float32), np.array([True, True]))
-        >>> result.success
+        >>> engine.step(np.zeros((2, 4), np.float32), np.array([True, True])).success
         array([False, False])
         >>> engine.close()
     """
@@ -126,7 +124,6 @@ class VectorizedEngine:
         self._running: _RunningRows | None = None
 
     def reset(self, rows: Sequence[int], seeds: Sequence[int]) -> Array:
-        """Start an episode in each of ``rows``, as Meta-World's ``env.seed(seed); env.reset()`` does."""
         index = np.asarray(rows, dtype=np.intp).reshape(-1)
         if len(index) != len(seeds):
             raise ValueError(f"seeds must be as many as rows, {len(index)}, got {len(seeds)}")
@@ -148,7 +145,6 @@ class VectorizedEngine:
         return self._observation[index]
 
     def step(self, action: NDArray[Any], active: Mask) -> EngineStep:
-        """Step the rows where ``active`` (N, bool) with ``action`` (N, 4), in the action's own precision."""
         n = len(self._rows)
         action, active = np.asarray(action), np.asarray(active, dtype=bool)
         if action.shape != (n, ACTION_SIZE) or active.shape != (n,):
@@ -168,17 +164,14 @@ class VectorizedEngine:
         return EngineStep(self._observation.copy(), reward, success, active & self._faulted)
 
     def render(self, rows: Sequence[int], *, camera: str, height: int, width: int) -> NDArray[np.uint8]:
-        """Pictures of rows, (len(rows), height, width, 3) uint8; they change nothing in the simulation."""
         cameras = self._cameras = self._cameras or Cameras()
         pictures = [self._rows[row].picture(cameras, camera=camera, height=height, width=width) for row in rows]
         return np.stack(pictures)
 
     def model(self, row: int) -> RowModel:
-        """The compiled model of a row, which other rows use too."""
         return self._rows[row].model
 
     def poses(self, row: int) -> BodyPoses:
-        """Where the bodies of a row are now."""
         return self._rows[row].poses()
 
     def close(self) -> None:

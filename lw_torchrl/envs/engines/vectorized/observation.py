@@ -44,9 +44,8 @@ MATRIX_OF = "matrix of "
 
 
 class StateView:
-    """The arrays of a MuJoCo state, which are in one block of memory, as one, so that a single ``take`` reads from any
-    of them. Joining ten small arrays costs four times as much: each is a Python object that has left the processor's
-    cache since the last step. The state must live as long as this view.
+    """The arrays of a MuJoCo state, which are in one block of memory, as one, so that a single ``take`` reads from any:
+    joining ten small arrays, out of the processor's cache, costs four times as much. The state must outlive this view.
     """
 
     def __init__(self, model: Any, data: Any) -> None:
@@ -74,7 +73,6 @@ class StateView:
         return self._matrices[kind][number]
 
     def quaternion(self, place: str) -> Array:
-        """The quaternion of a body."""
         kind, number = self._find(place)
         if kind != "body":
             raise ValueError(f"only a body has a quaternion of its own, got {place!r}")
@@ -143,8 +141,7 @@ DIAL_RADIUS = 0.05  # metres
 
 
 class Observer:
-    """Makes the observations of a fixed set of rows, by Meta-World's operations in its order, so that the last bit
-    agrees."""
+    """Makes the observations of a fixed set of rows, by Meta-World's operations in its order, bit for bit."""
 
     def __init__(self, sources: Sequence[TaskSources]) -> None:
         self._matrices = np.flatnonzero([row.quaternion.startswith(MATRIX_OF) for row in sources])

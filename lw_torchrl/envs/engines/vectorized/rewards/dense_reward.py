@@ -44,7 +44,6 @@ class EpisodeStarts:
         self.less = self.task.less.copy()
 
     def begin(self, row: int, program: Any) -> None:
-        """Note the start of a row's episode from Meta-World's program, just reset."""
         reward = self.rewards[row]
         features = np.zeros(FEATURES)
         features[CONSTANT] = waypoint_numbers(reward)

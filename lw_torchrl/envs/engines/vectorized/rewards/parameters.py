@@ -22,7 +22,7 @@ from lw_torchrl.envs.engines.vectorized.observation import (
     SECOND,
     Array,
 )
-from lw_torchrl.envs.engines.vectorized.tables import FIRST_DISTANCE, Cage, Funnel, Held, TaskReward, Term
+from lw_torchrl.envs.engines.vectorized.tables import FIRST_DISTANCE, POINTS, Cage, Funnel, Held, TaskReward, Term
 
 # The columns of the features: first the sensors, then these. The first four are constant within an episode.
 START, TCP_START, MARK, CONSTANT, GOAL, TCP, GRIP = (
@@ -31,19 +31,9 @@ START, TCP_START, MARK, CONSTANT, GOAL, TCP, GRIP = (
 EPISODE = slice(START.start, CONSTANT.stop)
 FEATURES = GRIP.stop
 
-COLUMNS = {
-    "hand": HAND,
-    "object": OBJECT,
-    "second": SECOND,
-    "goal": GOAL,
-    "tcp": TCP,
-    "left pad": LEFT_PAD,
-    "grip": GRIP,
-    "place": PLACE,
-    "start": START,
-    "tcp at start": TCP_START,
-    "mark": MARK,
-}
+# The columns of each of POINTS but the last, the waypoint.
+_COLUMNS = HAND, OBJECT, SECOND, GOAL, TCP, LEFT_PAD, GRIP, PLACE, START, TCP_START, MARK
+COLUMNS = dict(zip(POINTS[:-1], _COLUMNS, strict=True))
 
 NEAR, PLACED, VIA, ACROSS = range(4)
 
@@ -53,22 +43,17 @@ _NO_FUNNEL = Funnel(over="hand", about=("object",), rim=0.0, slope=0.0, height=0
 
 
 class Parameters(SimpleNamespace):
-    """Arrays over the rows: the numbers of :class:`TaskReward`, and of its parts ``cage``, ``funnel`` and ``held``, by
-    the names that the head of data/rewards.toml explains.
-
-    The last axes of ``points`` and ``offset`` are [distance or margin][first point, second point][term][x, y, z], of
-    the other arrays of terms the term.
-    """
+    """Arrays over the rows: the numbers of :class:`TaskReward`, and of its parts ``cage``, ``funnel`` and ``held``. The
+    last axes of ``points`` and ``offset`` are [distance or margin][first point, second point][term][x, y, z], of the
+    other arrays of terms the term."""
 
     def of(self, rows: Any) -> Parameters:
-        """The same for some of the rows."""
         return Parameters(
             **{key: own.of(rows) if isinstance(own, Parameters) else own[rows] for key, own in vars(self).items()}
         )
 
 
 def make_parameters(rewards: Sequence[TaskReward]) -> Parameters:
-    """The arrays of these rows."""
     kinds = list({id(reward): reward for reward in rewards}.values())
     place = {id(reward): number for number, reward in enumerate(kinds)}
     return _parameters(kinds).of(np.array([place[id(reward)] for reward in rewards]))
@@ -110,7 +95,6 @@ def _parameters(rewards: Sequence[TaskReward]) -> Parameters:
 
 
 def _numbers(kind: Any, parts: Sequence[Any]) -> dict[str, Any]:
-    """An array of each numeric field."""
     return {
         one.name: np.array([getattr(part, one.name) for part in parts], dtype=_DTYPES[one.type])
         for one in fields(kind)

@@ -117,12 +117,9 @@ class CagingTerm:
         self._pinch = (cage.radius + cage.pinch)[self._pinching][:, None]
 
     def __call__(self, features: Array, near: Proximity, closed: Numbers, narrow: Mask) -> tuple[Array, Mask]:
-        """Measure features (rows, FEATURES).
-
-        ``closed`` (rows,) is how far the gripper is told to close, in the action's precision, and ``narrow`` (rows,)
-        where it is a number of the action itself, not a bound of its range. Returns values (rows,) from 0 to 1, and
-        where they were computed in the action's precision, because ``closed`` takes part.
-        """
+        """Values (rows,) from 0 to 1 of features (rows, FEATURES), and where they have the action's precision, because
+        ``closed`` takes part. ``closed`` (rows,) is how far the gripper is told to close, in that precision; ``narrow``
+        (rows,) where it is a number of the action itself, not a bound of its range."""
         rows = self._rows
         numbers = features.reshape(-1)
         pads, where = numbers.take(self._pads), numbers.take(self._object)
