@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from multiprocessing.context import get_spawning_popen
 from pathlib import Path
 from typing import Any, NoReturn
@@ -17,9 +17,14 @@ from lw_torchrl._checks import check_int
 from lw_torchrl._files import reading
 from lw_torchrl._tensor_archive import TensorArchive, write_archive
 from lw_torchrl.data.storage import DEMONSTRATION, DONE, REWARD, TRAJECTORY, JoinedStorage, column_name
-from lw_torchrl.data.trajectories import OpenTrajectories, check_grown_state, collected_rows, link_rows, shared_keys
-
-Columns = Mapping[NestedKey, Tensor]
+from lw_torchrl.data.trajectories import (
+    Columns,
+    OpenTrajectories,
+    check_grown_state,
+    collected_rows,
+    link_rows,
+    shared_keys,
+)
 
 
 class GrowingStorage(JoinedStorage):
@@ -256,14 +261,9 @@ class GrowingWriter(Writer):
         pass
 
     def state_dict(self) -> dict[str, Any]:
-        """Nothing; the storage knows how many rows were written."""
         return {}
 
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Nothing to restore."""
+    def load_state_dict(self, state_dict: Any) -> None:
+        """Nothing: the storage knows how many rows were written."""
 
-    def dumps(self, path: Any) -> None:
-        """Nothing to write."""
-
-    def loads(self, path: Any) -> None:
-        """Nothing to read."""
+    dumps = loads = load_state_dict

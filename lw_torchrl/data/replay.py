@@ -20,21 +20,11 @@ from torchrl.envs import Transform
 
 from lw_torchrl._checks import check_int, check_path, checked_but
 from lw_torchrl._devices import CPU, check_device
+from lw_torchrl.data import replay_checks
 from lw_torchrl.data.buffer_state import RestorableReplay, fingerprint
 from lw_torchrl.data.dataset import DATA, Demonstrations, read_metadata
 from lw_torchrl.data.growing import GrowingStorage, GrowingWriter
 from lw_torchrl.data.memory_map import verify
-from lw_torchrl.data.replay_checks import (
-    admit_rows,
-    check_apart,
-    check_behaviours,
-    check_column,
-    check_growing,
-    check_label,
-    check_rows,
-    check_transform,
-    warn_of_simulators,
-)
 from lw_torchrl.data.rewards import RewardName, check_n_steps
 from lw_torchrl.data.selection import (
     EpisodeChoice,
@@ -154,7 +144,7 @@ class LanguageWorldExperienceReplay(RestorableReplay):
         **kwargs: Any,
     ) -> None:
         check_n_steps(n_steps, gamma)
-        check_transform(transform)
+        replay_checks.check_transform(transform)
         if (prefetch := kwargs.get("prefetch") or 0) > 1:
             raise ValueError(
                 f"prefetch must be None, 0 or 1, got {prefetch}: several threads draw the batches in an order that "
@@ -163,7 +153,7 @@ class LanguageWorldExperienceReplay(RestorableReplay):
         if (n_steps > 1 or grow is not None) and label != "executed":
             raise ValueError(f"n_steps and grow need label='executed', whose actions the rewards are of, got {label!r}")
         if grow is not None:
-            check_growing(sampler, kwargs)
+            replay_checks.check_growing(sampler, kwargs)
         if batch_size is not None:
             check_int("batch_size", batch_size, minimum=1)
         if after_success is not None:
@@ -181,12 +171,12 @@ class LanguageWorldExperienceReplay(RestorableReplay):
             check_path("root", folder)
         self.roots = tuple(map(Path, root)) if joined else (Path(root),)  # type: ignore[arg-type]
         if episodes is None:
-            check_apart(self.roots)
+            replay_checks.check_apart(self.roots)
         choices = _choices(episodes, len(self.roots), joined)
         whole = [read_metadata(folder) for folder in self.roots]
-        check_label(label, whole)
-        check_behaviours(whole)
-        warn_of_simulators(whole, grow is not None)
+        replay_checks.check_label(label, whole)
+        replay_checks.check_behaviours(whole)
+        replay_checks.warn_of_simulators(whole, grow is not None)
         shown = [
             choose_episodes(found, choice, f"episodes[{number}]" if joined else "episodes")
             for number, (found, choice) in enumerate(zip(whole, choices, strict=True))
@@ -227,8 +217,8 @@ class LanguageWorldExperienceReplay(RestorableReplay):
                 grow=grow,
                 n_steps=n_steps,
                 gamma=gamma,
-                admit=partial(admit_rows, reward, terminate_on_success),
-                check=partial(check_rows, reward, terminate_on_success),
+                admit=partial(replay_checks.admit_rows, reward, terminate_on_success),
+                check=partial(replay_checks.check_rows, reward, terminate_on_success),
             )
         elif several or n_steps > 1 or where != CPU:
             storage = JoinedStorage(parts, kept, n_steps=n_steps, gamma=gamma)
@@ -249,7 +239,7 @@ class LanguageWorldExperienceReplay(RestorableReplay):
     def set_sampler(self, sampler: Sampler) -> Sampler:
         """Take another sampler, which draws from the buffer's generator, in a DataLoader's worker after ``set_rng``."""
         if self._grows:
-            check_growing(sampler, {})
+            replay_checks.check_growing(sampler, {})
         before = super().set_sampler(sampler)
         if get_worker_info() is None:
             self.set_rng(self._rng)
@@ -258,7 +248,7 @@ class LanguageWorldExperienceReplay(RestorableReplay):
     def append_transform(self, transform: Transform, *, invert: bool = False) -> LanguageWorldExperienceReplay:
         """Apply a transform, or with ``invert`` its inverse, to each sample, after the others."""
         if not invert:
-            check_transform(transform)
+            replay_checks.check_transform(transform)
         return super().append_transform(transform, invert=invert)
 
     def insert_transform(
@@ -266,7 +256,7 @@ class LanguageWorldExperienceReplay(RestorableReplay):
     ) -> LanguageWorldExperienceReplay:
         """Apply a transform, or with ``invert`` its inverse, to each sample, before the one at ``index``."""
         if not invert:
-            check_transform(transform)
+            replay_checks.check_transform(transform)
         return super().insert_transform(index, transform, invert=invert)
 
     def share(self, shared: bool = True) -> LanguageWorldExperienceReplay:
@@ -292,7 +282,7 @@ class LanguageWorldExperienceReplay(RestorableReplay):
         """
         if self._grows:
             raise ValueError(f"add_column: {name!r} would be of no row that comes later, and this buffer grows")
-        check_column(name, values, len(self), self.storage.get(slice(0, 1)).keys(), self.transform)
+        replay_checks.check_column(name, values, len(self), self.storage.get(slice(0, 1)).keys(), self.transform)
         if of is not None and not torch.equal(*(each.storage[:].get("observation").cpu() for each in (self, of))):
             raise ValueError(
                 "of must show the rows of this buffer, in their order: the same folders, episodes and keep"

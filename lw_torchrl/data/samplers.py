@@ -56,6 +56,9 @@ class GroupSampler(Sampler):
     again and all passes begin.
     """
 
+    ran_out = False
+    """Whether the last batch ended an epoch: a pass over the group that takes the most batches."""
+
     def __init__(self) -> None:
         self._process = os.getpid()
         self._empty()
@@ -66,7 +69,7 @@ class GroupSampler(Sampler):
         self._passes = Passes(none, none)
         self._known: Tensor | None = None  # the key of each group's rows
         self._written: list[Tensor] = []  # rows written since the last batch
-        self._ran_out = False
+        self.ran_out = False
         self._restored = False
         self._laid_out: tuple[int, Tensor, Tensor, Tensor] | None = None  # see _layout
 
@@ -85,15 +88,6 @@ class GroupSampler(Sampler):
     def _covered(self, storage: Storage) -> int:
         """How many of the first rows are grouped."""
         return len(storage) if storage.ndim == 1 else storage.shape.numel()
-
-    @property
-    def ran_out(self) -> bool:
-        """Whether the last batch ended an epoch: a pass over the group that takes the most batches."""
-        return self._ran_out
-
-    @ran_out.setter
-    def ran_out(self, value: bool) -> None:
-        self._ran_out = value
 
     def _group(self, storage: Storage) -> None:
         label = self._label(storage).cpu()
@@ -156,7 +150,7 @@ class GroupSampler(Sampler):
         passes = self._passes
         at = (passes.start + passes.cursor)[group].add_(place).clamp_(max=len(passes.order) - 1)
         index = passes.order[at]
-        self._ran_out = False
+        self.ran_out = False
         ending = passes.cursor + shares >= passes.size
         passes.cursor += torch.where(ending, 0, shares)
         if ending.any():
@@ -166,7 +160,7 @@ class GroupSampler(Sampler):
             for number in ending.nonzero().flatten().tolist():
                 rows, ended = passes.take(number, int(shares[number]), self._rng)
                 index[first[number] : first[number] + len(rows)] = rows
-                self._ran_out |= ended and bool(longest[number])
+                self.ran_out |= ended and bool(longest[number])
         index = to_device_of(storage, index)
         return (index if storage.ndim == 1 else torch.unravel_index(index, storage.shape)), {}
 
@@ -195,13 +189,13 @@ class GroupSampler(Sampler):
             "cursor": self._passes.cursor.clone() if begun else none,
             "known": self._known.clone() if begun and self._known is not None else none,
             "written": torch.cat(self._written) if begun and self._written else none,
-            "ran_out": torch.tensor(self._ran_out),
+            "ran_out": torch.tensor(self.ran_out),
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore a state; :class:`ValueError` if it is none, or at the next sample if it is of other rows."""
         state = check_state(state_dict)
-        self._length, self._ran_out = state["length"], state["ran_out"]
+        self._length, self.ran_out = state["length"], state["ran_out"]
         self._passes = Passes(state["order"].clone(), state["size"].clone(), state["cursor"].clone())
         self._known = state["known"].clone() if len(state["known"]) else None
         self._written = [state["written"].clone()] if len(state["written"]) else []
