@@ -41,18 +41,8 @@ def _whole_number(argument: str, given: Any, minimum: int) -> int:
 
 @dataclass(frozen=True)
 class CollectConfig:
-    """How demonstrations are made; equal configurations give equal datasets.
-
-    Attributes:
-        tasks: the tasks' names, sorted.
-        episodes_per_task: kept episodes of each task.
-        seed: with task and episode, fixes the initial state, the goal and the noise.
-        noise_scale: standard deviations of the execution noise, one an episode in turn; (0.0,) for none.
-        noise_hold: the steps for which each draw of the noise is kept.
-        gripper_noise_factor: multiplies the gripper's noise, which makes grasps fail.
-        redraw_failures: keep only successful episodes, and draw another for each failure.
-        max_steps, policy: steps of an episode, and who acts.
-    """
+    """How demonstrations are made, by the arguments of :func:`collect_demonstrations`; equal configurations give equal
+    datasets. ``tasks`` are names, sorted; ``noise_scale`` holds a number for each episode in turn, (0.0,) for none."""
 
     tasks: tuple[str, ...]
     episodes_per_task: int
@@ -96,14 +86,9 @@ class CollectConfig:
 
 @dataclass(frozen=True)
 class EpisodeInfo:
-    """One episode of a dataset.
-
-    Attributes:
-        task, episode: the task's name, and the index; ``episode_seed(task, seed, episode)`` is its seed.
-        start, length: its first row, and its number of rows.
-        success, first_success: whether it succeeded at some step; the first successful one, from 1, or None.
-        checksum: CRC-32 of its rows, column after column.
-    """
+    """One episode of a dataset: ``episode_seed(task, seed, episode)`` is its seed, ``start`` its first row,
+    ``first_success`` the first successful step, from 1, or None, and ``checksum`` the CRC-32 of its rows, column after
+    column."""
 
     task: str
     episode: int

@@ -20,21 +20,13 @@ from torchrl.envs import Transform
 
 from lw_torchrl._checks import check_int, check_path, checked_but
 from lw_torchrl._devices import CPU, check_device
-from lw_torchrl.data import replay_checks
+from lw_torchrl.data import replay_checks, selection
 from lw_torchrl.data.buffer_state import RestorableReplay, fingerprint
-from lw_torchrl.data.dataset import DATA, Demonstrations, read_metadata
+from lw_torchrl.data.dataset import DATA, read_metadata
 from lw_torchrl.data.growing import GrowingStorage, GrowingWriter
 from lw_torchrl.data.memory_map import verify
 from lw_torchrl.data.rewards import RewardName, check_n_steps
-from lw_torchrl.data.selection import (
-    EpisodeChoice,
-    EpisodeFilter,
-    JoinedDemonstrations,
-    Label,
-    choose_episodes,
-    read_part,
-    returns_of,
-)
+from lw_torchrl.data.selection import EpisodeChoice, EpisodeFilter, JoinedDemonstrations, Label
 from lw_torchrl.data.storage import DeviceStorage, JoinedStorage, WholeStorage
 
 
@@ -178,7 +170,7 @@ class LanguageWorldExperienceReplay(RestorableReplay):
         replay_checks.check_behaviours(whole)
         replay_checks.warn_of_simulators(whole, grow is not None)
         shown = [
-            choose_episodes(found, choice, f"episodes[{number}]" if joined else "episodes")
+            selection.choose_episodes(found, choice, f"episodes[{number}]" if joined else "episodes")
             for number, (found, choice) in enumerate(zip(whole, choices, strict=True))
         ]
         for found, chosen in zip(whole, shown, strict=True) if check else ():
@@ -186,40 +178,27 @@ class LanguageWorldExperienceReplay(RestorableReplay):
         if keep is not None:
             after = 0 if terminate_on_success else after_success
             pairs = zip(whole, shown, strict=True)
-            shown = keep.choose(shown, [returns_of(found, chosen, reward, after) for found, chosen in pairs])
+            shown = keep.choose(shown, [selection.returns_of(found, chosen, reward, after) for found, chosen in pairs])
         self.behaviours = tuple(sorted({found.config.behaviour for found in whole}))
         parts: list[TensorDictBase] = []
         kept: list[Tensor | None] = []
         trajectories = 0
+        what: dict[str, Any] = {"label": label, "reward": reward}
+        what |= {"after_success": after_success, "terminate_on_success": terminate_on_success}
         for found, chosen in zip(whole, shown, strict=True):
-            rows, taken = read_part(
-                found,
-                chosen,
-                label=label,
-                reward=reward,
-                after_success=after_success,
-                terminate_on_success=terminate_on_success,
-                first_trajectory=trajectories,
-                behaviour=self.behaviours.index(found.config.behaviour),
-            )
+            who = self.behaviours.index(found.config.behaviour)
+            rows, taken = selection.read_part(found, chosen, first_trajectory=trajectories, behaviour=who, **what)
             parts.append(rows if grow is None else rows.exclude(*_NOT_COLLECTED))
             kept.append(taken)
             trajectories += len(found.episodes)
         storage: JoinedStorage
         several = joined or episodes is not None or keep is not None
-        self.demonstrations: Demonstrations | JoinedDemonstrations = (
-            JoinedDemonstrations(tuple(shown)) if several else shown[0]
-        )
+        self.demonstrations = JoinedDemonstrations(tuple(shown)) if several else shown[0]
         if grow is not None:
-            storage = GrowingStorage(
-                parts,
-                kept,
-                grow=grow,
-                n_steps=n_steps,
-                gamma=gamma,
-                admit=partial(replay_checks.admit_rows, reward, terminate_on_success),
-                check=partial(replay_checks.check_rows, reward, terminate_on_success),
-            )
+            admit = partial(replay_checks.admit_rows, reward, terminate_on_success)
+            check_rows = partial(replay_checks.check_rows, reward, terminate_on_success)
+            options: dict[str, Any] = {"n_steps": n_steps, "gamma": gamma, "admit": admit, "check": check_rows}
+            storage = GrowingStorage(parts, kept, grow=grow, **options)
         elif several or n_steps > 1 or where != CPU:
             storage = JoinedStorage(parts, kept, n_steps=n_steps, gamma=gamma)
             storage = storage if where == CPU else DeviceStorage(storage, where)

@@ -28,10 +28,9 @@ class EpisodeFilter:
 
     Attributes:
         success: keep those that succeeded at some step, or, if False, those that did not.
-        least_return: keep those with at least this return.
+        least_return, behaviours: keep those with at least this return; those of these labels, "spoilt-30" say.
         best: of those that meet the other conditions, the fraction of each task's episodes to keep, at least one, those
             of the highest return, the shorter at a tie.
-        behaviours: keep those of these labels, "spoilt-30" say.
         else_best: for a task without an episode that meets the conditions, the fraction of all its episodes to keep,
             chosen as for ``best``; None for an error.
 

@@ -115,14 +115,10 @@ def link_rows(
     """The serial number of the row before each, (n,) int64, -1 where a trajectory begins; each trajectory's number,
     (n,) int64; and the trajectories that may continue.
 
-    A row follows another if both have the same ``key``, the other is not ``done``, and its "next" is bit for bit this
-    row. Otherwise a trajectory begins: a collector was reset, or another one counts from 0 as well.
-
-    Args:
-        key: the collector's ids, (n,) int64; rows of the same key are in the order of time.
-        done, batch: the rows, (n,) bool and the columns.
-        opened: the trajectories that may continue, whose last rows are in ``ring`` at ``slots``, (K,) int64.
-        serial, number: of the first row, and of the next trajectory.
+    A row follows another if both have the same ``key``, (n,) int64, the collector's id, the other is not ``done``, and
+    its "next" is bit for bit this row. Otherwise a trajectory begins: a collector was reset, or another one counts from
+    0 as well. Rows of a key are in the order of time. ``opened`` trajectories may continue, whose last rows are in
+    ``ring`` at ``slots``, (K,) int64. ``serial`` and ``number`` are those of the first row, and of the next trajectory.
     """
     order = key.argsort(stable=True)
     one, next_one = order[:-1], order[1:]

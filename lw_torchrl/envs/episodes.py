@@ -76,8 +76,8 @@ def run_episodes(
         policy: called on all N rows, with a ``_step`` mask of those that count.
         episodes: task name to episode indices; one that is listed several times is run as often.
         keys: what to record of each step, ``("next", "success")`` say; ``action`` is the executed one.
-        noise: episode index to the four standard deviations of the noise added to the action; None for none.
-        noise_hold: steps for which each draw of the noise is kept.
+        noise, noise_hold: episode index to the four standard deviations of the noise added to the action, and the steps
+            for which each draw is kept.
         after_success: end an episode so many steps after its first successful one; None for never.
         clean_action, place: keys for the action before the noise, and for the place of each row's episode in its task's
             list, (N,) int64, for the policy to read.

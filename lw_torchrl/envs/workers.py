@@ -1,8 +1,4 @@
-"""Which of TorchRL's workers an environment is made in, and the lock that lets in one thread at a time.
-
-One factory, called in each worker, must not give the same episodes, but TorchRL tells it nothing of its worker. The
-TorchRL functions that call it know: they are found on the call stack, which needs no state.
-"""
+"""Which of TorchRL's workers makes an environment, found on the call stack; and a lock for one thread at a time."""
 
 from __future__ import annotations
 
@@ -36,7 +32,8 @@ def _remote(found: Locals) -> tuple[int, int]:
     return (0, 1) if index is None or parent_process() is not None else (index, MANY)
 
 
-# Where TorchRL (0.14) calls a factory: module and function to its (rank, of), from the function's local variables.
+# Where TorchRL (0.14), which tells a factory nothing of its worker, calls one: module and function to its (rank, of),
+# from the function's local variables. A factory must not give each worker the same episodes.
 _WORKERS: dict[tuple[str, str], Callable[[Locals], tuple[int, int]]] = {
     ("torchrl.envs.batched_envs", "SerialEnv._start_workers"): lambda found: (found["idx"], found["_num_workers"]),
     # An environment of environments, which starts its own at its first reset.

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from lw_torchrl._checks import check_choice, check_int
 from lw_torchrl.envs.cameras import Cameras
 from lw_torchrl.envs.engine import ACTION_SIZE, OBSERVATION_SIZE, BodyPoses, EngineStep, RowModel
-from lw_torchrl.envs.engines.vectorized.observation import CURRENT, REWARD_WIDTH, WIDTH, Array, Index, Mask, Observer
+from lw_torchrl.envs.engines.vectorized import observation as at
+from lw_torchrl.envs.engines.vectorized.observation import Array, Index, Mask, Observer, SuccessFunction
 from lw_torchrl.envs.engines.vectorized.rewards.dense_reward import DenseReward, EpisodeStarts
 from lw_torchrl.envs.engines.vectorized.simulated_rows import (
     WARNING_KINDS,
@@ -24,7 +25,6 @@ from lw_torchrl.envs.engines.vectorized.simulated_rows import (
     is_stable,
     split_into_groups,
 )
-from lw_torchrl.envs.engines.vectorized.success import SuccessFunction
 from lw_torchrl.envs.engines.vectorized.tables import reward_table, simulation_table
 from lw_torchrl.envs.engines.vectorized.task_programs import (
     SharedModel,
@@ -47,21 +47,15 @@ def available_cores() -> int:
 
 
 class VectorizedEngine:
-    """Simulates all rows together: physics in threads, everything else in NumPy over all rows at once.
+    """Simulates all rows together: physics in threads, by default one a core, everything else in NumPy over all rows at
+    once.
 
     Its numbers are those of :class:`~lw_torchrl.envs.engines.metaworld.MetaWorldEngine`, bit for bit, whatever the
-    number of threads. The rows of one XML file share a compiled model; each has a state of its own.
+    number of threads. The rows of one XML file share a compiled model; each has a state of its own. Another Meta-World
+    or MuJoCo than the one this engine was compared with is an ImportError.
 
     A row faults when its action is not finite, or when its simulation becomes unstable. It then repeats its last stable
     observation and is not simulated until it is reset; other rows are not affected.
-
-    Args:
-        tasks: the task of each row.
-        reward: "sparse" for the success as 0 and 1, "dense" for Meta-World's own reward.
-        num_threads: by default the cores this process may use.
-
-    Raises:
-        ImportError: another Meta-World or MuJoCo than the one this engine was compared with.
 
     Example:
         >>> engine = VectorizedEngine(["reach", "push"], num_threads=1)
@@ -96,7 +90,7 @@ class VectorizedEngine:
                 builders[row] = programs[tasks[row]]
         rewards = [reward_table()[task] if dense else None for task in tasks]
         self._starts = EpisodeStarts([reward for reward in rewards if reward is not None]) if dense else None
-        self._width = REWARD_WIDTH if dense else WIDTH
+        self._width = at.REWARD_WIDTH if dense else at.WIDTH
         self._rows = [
             SimulatedRow(table[task], models[number], builder, task_reward)
             for task, number, builder, task_reward in zip(tasks, self._group_of_row, builders, rewards, strict=True)
@@ -139,7 +133,7 @@ class VectorizedEngine:
                 self._starts.begin(row, self._rows[row].program)
 
         self._pool.work(self._by_group(index), reset)
-        self._current[index] = self._observation[index, CURRENT]
+        self._current[index] = self._observation[index, at.CURRENT]
         self._faulted[index] = False
         self._started[index] = True
         return self._observation[index]
