@@ -45,8 +45,7 @@ class RestorableReplay(BaseDatasetExperienceReplay):
         return (shown,) if isinstance(shown, Demonstrations) else shown.parts
 
     def verify(self) -> None:
-        """Check the episodes that are shown, unless the files are as when this process did; DatasetError if they are
-        damaged."""
+        """Check the episodes that are shown, once while the files stay the same; DatasetError if they are damaged."""
         for part in self.parts:
             verify(read_metadata(part.root), part.episodes)
 
@@ -99,8 +98,7 @@ class RestorableReplay(BaseDatasetExperienceReplay):
         write_archive(Path(path) / _FILE, {"format_version": _VERSION, "state": tree}, {"tensors": tensors})
 
     def loads(self, path: str | os.PathLike[str]) -> None:
-        """Restore what :meth:`dumps` saved, after :meth:`verify`; ValueError, and no change, if it is damaged or of
-        others."""
+        """Restore what :meth:`dumps` saved, after :meth:`verify`; ValueError, and no change, if it is damaged."""
         self.verify()
         with reading(path, "buffer's state"):
             archive = TensorArchive(Path(path) / _FILE)

@@ -203,8 +203,7 @@ class GroupSampler(Sampler):
         self._restored = True
 
     def _check_restored(self, storage: Storage) -> None:
-        """Raise unless a restored state is of the storage's rows, in their groups; rows written since may cost the
-        state."""
+        """Raise unless a restored state is of the storage's rows; with rows written since, all may be grouped again."""
         rows, groups = self._passes.order, torch.repeat_interleave(self._passes.size)
         length = self._covered(storage)
         if self._written:

@@ -230,8 +230,7 @@ def read_part(
 
 @dataclass(frozen=True)
 class JoinedConfig:
-    """How the ``parts`` of joined demonstrations were collected; and for each, task name to the indices of chosen
-    ``episodes``."""
+    """How the ``parts`` of joined demonstrations were collected; and for each, task name to chosen ``episodes``."""
 
     parts: tuple[CollectConfig, ...]
     episodes: tuple[dict[str, list[int]], ...]
@@ -242,8 +241,7 @@ class JoinedConfig:
 
 @dataclass(frozen=True)
 class JoinedDemonstrations:
-    """Chosen episodes of one or more datasets, as :class:`LanguageWorldExperienceReplay` joins them; ``parts`` describe
-    these."""
+    """Chosen episodes of one or more datasets, as a replay buffer joins them; ``parts`` describe these."""
 
     parts: tuple[Demonstrations, ...]
 

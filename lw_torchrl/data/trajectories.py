@@ -64,8 +64,8 @@ Columns = Mapping[NestedKey, Tensor]
 
 @dataclass(frozen=True)
 class OpenTrajectories:
-    """Trajectories that have not ended, in the order of their last rows: the collector's ids, our numbers, and the last
-    rows' serial numbers, (K,) int64 each."""
+    """Trajectories that have not ended: the collector's ids, ours, and their last rows' serial numbers, sorted, (K,)
+    int64."""
 
     key: Tensor
     number: Tensor

@@ -69,8 +69,7 @@ class RowModel(NamedTuple):
 
 
 class BodyPoses(NamedTuple):
-    """Where the bodies of a row are: (bodies, 3) float64, metres, in the world's frame, and (bodies, 4) float64, w
-    first."""
+    """Where the bodies are: (bodies, 3) float64, metres, in the world's frame, and (bodies, 4) float64, w first."""
 
     position: NDArray[np.float64]
     quaternion: NDArray[np.float64]

@@ -123,8 +123,7 @@ class RowGroup:
 
 
 def split_into_groups(keys: Sequence[str], num_threads: int) -> list[RowGroup]:
-    """Put the rows with one key (the model's file) together, in several groups only if one would keep a thread busy for
-    more than half of its share."""
+    """Put the rows with one key together, apart only if they would keep a thread busy for over half of its share."""
     by_key: dict[str, list[int]] = defaultdict(list)
     for row, key in enumerate(keys):
         by_key[key].append(row)
