@@ -16,15 +16,9 @@ from torchrl.data.replay_buffers.writers import Writer
 from lw_torchrl._checks import check_int
 from lw_torchrl._files import reading
 from lw_torchrl._tensor_archive import TensorArchive, write_archive
+from lw_torchrl.data import trajectories
 from lw_torchrl.data.storage import DEMONSTRATION, DONE, REWARD, TRAJECTORY, JoinedStorage, column_name
-from lw_torchrl.data.trajectories import (
-    Columns,
-    OpenTrajectories,
-    check_grown_state,
-    collected_rows,
-    link_rows,
-    shared_keys,
-)
+from lw_torchrl.data.trajectories import Columns, OpenTrajectories
 
 
 class GrowingStorage(JoinedStorage):
@@ -91,7 +85,7 @@ class GrowingStorage(JoinedStorage):
         super().__init__([part.exclude(DEMONSTRATION) for part in parts], rows, n_steps=n_steps, gamma=gamma)
         if absent := [column_name(key) for key in (TRAJECTORY, DONE) if key not in self._columns]:
             raise ValueError(f"grow={self.grow} needs the columns {', '.join(absent)}, which parts do not have")
-        if not shared_keys(self._columns):
+        if not trajectories.shared_keys(self._columns):
             raise ValueError("parts must have a column and its ('next', ...), by which it shows what follows what")
         known = [int(leaf.max()) for leaf in self._columns[TRAJECTORY] if len(leaf)]
         self._number, self._open = max(known, default=-1) + 1, OpenTrajectories.none()
@@ -129,7 +123,7 @@ class GrowingStorage(JoinedStorage):
 
     def extend(self, batch: TensorDictBase) -> Tensor:
         """Write the rows of a batch; their places, int64 of the batch's shape."""
-        found: Columns = collected_rows(batch, self._ring)
+        found: Columns = trajectories.collected_rows(batch, self._ring)
         number = len(found[DONE])
         if not 0 < number <= self.grow:
             raise ValueError(f"batch must have 1 to {self.grow} rows, as many as grow says, got {number}")
@@ -137,7 +131,7 @@ class GrowingStorage(JoinedStorage):
             found = self._admit(found)
         key, done = found[TRAJECTORY].reshape(-1), found[DONE].reshape(-1)
         slots, begin = self._open.last % self.grow, {"serial": self.count, "number": self._number}
-        previous, numbers, opened = link_rows(key, done, found, self._open, self._ring, slots, **begin)
+        previous, numbers, opened = trajectories.link_rows(key, done, found, self._open, self._ring, slots, **begin)
         if (cut := len(numbers.unique()) - len(key.unique())) > number // 2:
             warnings.warn(
                 f"batch: {cut} of {number} rows are not the ('next', ...) of the rows before them, though of the same "
@@ -201,7 +195,7 @@ class GrowingStorage(JoinedStorage):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore a state; :class:`ValueError` if it is of other columns, another ``grow``, or other demonstrations."""
         super().load_state_dict(state_dict)
-        count, number, rows, opened = check_grown_state(state_dict, self.grow, self._ring)
+        count, number, rows, opened = trajectories.check_grown_state(state_dict, self.grow, self._ring)
         if self._check is not None and count:
             self._check(rows)
         self._empty()
