@@ -20,7 +20,7 @@ def _without(some: Tensor, others: Tensor) -> Tensor:
 
 
 def choose(first: Tensor, size: Tensor, count: Tensor, generator: torch.Generator | None) -> Tensor:
-    """``count[g]`` places of the ``size[g]`` from ``first[g]`` on, sorted, uniform, in the time of ``count``."""
+    """``count[g]`` different places of ``size[g]`` from ``first[g]`` on, sorted, uniform, in the time of ``count``."""
     few = 2 * count <= size
     wanted = torch.where(few, count, size - count)  # where those that are not chosen are fewer, draw these
     found, missing = wanted.new_empty(0), wanted
