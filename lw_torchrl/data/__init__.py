@@ -13,20 +13,7 @@ from lw_torchrl.data.selection import EpisodeFilter, JoinedDemonstrations
 from lw_torchrl.data.storage import JoinedStorage
 
 __all__ = [
-    "BEHAVIOURS",
-    "Behaviour",
-    "CoLearningSampler",
-    "CollectConfig",
-    "DatasetError",
-    "Demonstrations",
-    "EpisodeFilter",
-    "GrowingStorage",
-    "GrowingWriter",
-    "JoinedDemonstrations",
-    "JoinedStorage",
-    "LanguageWorldExperienceReplay",
-    "TaskBalancedSampler",
-    "add_pictures",
-    "collect_demonstrations",
-    "load_pictures",
-]
+    "BEHAVIOURS", "Behaviour", "CoLearningSampler", "CollectConfig", "DatasetError", "Demonstrations", "EpisodeFilter",
+    "GrowingStorage", "GrowingWriter", "JoinedDemonstrations", "JoinedStorage", "LanguageWorldExperienceReplay",
+    "TaskBalancedSampler", "add_pictures", "collect_demonstrations", "load_pictures",
+]  # fmt: skip

@@ -32,15 +32,15 @@ class Behaviour:
     """Who acts in an episode, as a dataset's metadata say it; equal ones act alike.
 
     A behaviour of kind "segments" acts in pieces of an episode. In each it follows the plan by scripted skills with
-    probability ``right``, and does something else otherwise. What it draws depends only on (task, seed, episode).
+    probability ``right``, and does something else otherwise. Its draws depend only on (task, seed, episode).
 
     Attributes:
         name: the label of its episodes.
         kind: "expert", Meta-World's script; "segments"; or "policy", a trained one.
-        right: of "segments", the probability that a piece follows the plan.
+        right, shortest, longest: of "segments", the probability that a piece follows the plan, and the steps of a
+            piece.
         otherwise: of "segments", what it does elsewhere: "skill", any one of the plan's, or "action", one in [-1, 1].
-        shortest, longest: of "segments", steps of a piece.
-        fingerprint: of the plans of "segments"; of the description and weights of "policy"; None until it is known.
+        fingerprint: of the plans of "segments", or of a policy's description and weights; None until it is known.
 
     Example:
         >>> Behaviour("half-right", right=0.5).otherwise
@@ -157,17 +157,11 @@ def policy_fingerprint(policy: Policy) -> str:
 
 
 class SegmentActor(TensorDictModuleBase):
-    """Acts as a :class:`Behaviour` of kind "segments", in episodes that are run from their beginning.
+    """Acts as a :class:`Behaviour` of kind "segments", in episodes of ``max_steps`` that are run from their beginning.
 
     Reads ``observation`` (N, 39) float32, ``task_id`` and ``episode`` (N,) int64, ``qaf`` (N, S) bool and ``_step``
     (N,) bool, the rows that count; writes ``action`` (N, 4) float32 in [-1, 1]. An episode begins in a row whose task
-    or episode differs from the last call's.
-
-    Args:
-        behaviour: how it acts.
-        plans: a plan for each task, all of scripted skills.
-        seed: of the episodes.
-        max_steps: of an episode.
+    or episode differs from the last call's. ``plans`` has a plan of scripted skills for each task.
     """
 
     row_by_row = True  # no network: its rows need no blocks of one size
@@ -188,7 +182,6 @@ class SegmentActor(TensorDictModuleBase):
         self._held = torch.zeros(*steps, 4)
 
     def _draw(self, row: int, task: int, episode: int) -> None:
-        """Draw the pieces of the row's new episode."""
         how, definition = self.behaviour, self._task[task]
         draws = episode_generator("segments", definition, self.seed, episode)
         length = draws.integers(how.shortest, how.longest + 1, -(-self.max_steps // how.shortest))
@@ -202,7 +195,6 @@ class SegmentActor(TensorDictModuleBase):
         self._done[row] = 0
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``action``."""
         weights, actions = self.script.prepare(tensordict)
         rows = torch.arange(len(weights))
         if len(self._begun) != len(rows):

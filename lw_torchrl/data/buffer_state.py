@@ -33,11 +33,7 @@ def fingerprint(parts: Sequence[Demonstrations], *cuts: Any) -> str:
 
 
 class RestorableReplay(BaseDatasetExperienceReplay):
-    """A buffer that shows rows of datasets, which it neither changes nor saves.
-
-    Attributes:
-        demonstrations: what is shown.
-    """
+    """A buffer that shows rows of datasets, its ``demonstrations``, which it neither changes nor saves."""
 
     demonstrations: Demonstrations | JoinedDemonstrations
     _fingerprint: str
@@ -49,11 +45,7 @@ class RestorableReplay(BaseDatasetExperienceReplay):
         return (shown,) if isinstance(shown, Demonstrations) else shown.parts
 
     def verify(self) -> None:
-        """Check the episodes that are shown against their checksums, unless this process has since the files changed.
-
-        Raises:
-            DatasetError: (a ValueError) they are not as they were written.
-        """
+        """Check the episodes that are shown, once while the files stay the same; DatasetError if they are damaged."""
         for part in self.parts:
             verify(read_metadata(part.root), part.episodes)
 
@@ -78,11 +70,7 @@ class RestorableReplay(BaseDatasetExperienceReplay):
         return super().state_dict() | {"rows": self._fingerprint}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore a state, after :meth:`verify`.
-
-        Raises:
-            ValueError: it is no state, or of a buffer that shows other rows; then nothing has changed.
-        """
+        """Restore a state, after :meth:`verify`; ValueError, and no change, if it is none of this buffer's rows."""
         self.verify()
         self._restore(state_dict)
 
@@ -110,12 +98,7 @@ class RestorableReplay(BaseDatasetExperienceReplay):
         write_archive(Path(path) / _FILE, {"format_version": _VERSION, "state": tree}, {"tensors": tensors})
 
     def loads(self, path: str | os.PathLike[str]) -> None:
-        """Restore what :meth:`dumps` saved, after :meth:`verify`.
-
-        Raises:
-            FileNotFoundError: there is no such file.
-            ValueError: it is damaged, or of a buffer that shows other rows; then nothing has changed.
-        """
+        """Restore what :meth:`dumps` saved, after :meth:`verify`; ValueError, and no change, if it is damaged."""
         self.verify()
         with reading(path, "buffer's state"):
             archive = TensorArchive(Path(path) / _FILE)

@@ -58,28 +58,26 @@ class CoLearningSampler(GroupSampler):
 
     Target and base tasks are drawn without replacement, each in passes of its own: every row of a group comes once
     before any comes again. An epoch, at whose end ``ran_out`` is true, is the pass that takes the most batches, as a
-    rule that of the largest base task. It draws from the replay buffer's generator; its state, restored in the middle
-    of an epoch, continues with the same batches.
+    rule that of the largest base task. The sampler draws from the replay buffer's generator; its state, restored in the
+    middle of an epoch, continues with the same batches.
 
-    The target "grown" stands for the rows that the buffer was extended with, a collector's, say: each is drawn with the
-    same probability, with replacement. The demonstrations of all tasks are the base, as above.
+    The target "grown" stands for the rows that the buffer was extended with: each is drawn with the same probability,
+    with replacement. The demonstrations of all tasks are the base.
 
     Where a target by name is itself a base task, its base demonstrations are left out. A batch holds the target's rows,
-    then those of the base tasks in the order of their ids; each row has, beside the storage's own columns:
-        is_target: (B,) bool, whether it is the target's.
+    then those of the base tasks in the order of their ids, and one more column, ``is_target`` (B,) bool.
 
     Args:
-        target: "grown"; a task's name; or one bool for each episode, in the order of
-            ``replay.demonstrations.episodes``. A name stands for all demonstrations of the task; in a storage that
-            joins datasets, for those of the last dataset that has any.
+        target: "grown"; a task's name, for all demonstrations of the task, or in a storage that joins datasets, those
+            of the last one that has any; or one bool for each of ``replay.demonstrations.episodes``, in their order.
         target_fraction: the target's share of a minibatch, between 0 and 1, such as 0.5, 1/3 or Fraction(2, 7).
-        task_key: the entry of the storage that holds the task.
-        episode_key: the entry that holds the episode, for a mask; episodes are numbered in its order.
+        task_key, episode_key: the entries of the storage that hold the task, and, for a mask, the episode, in whose
+            order episodes are numbered.
 
     Raises:
-        ValueError: an unknown task, with the nearest; a mask that is all true or all false. At sampling: a batch size
-            that cannot be exact, with the nearest that can; no row of the target or of a base task; a mask of another
-            number of episodes; "grown" without a storage that grows, or another target with one.
+        ValueError: a mask that is all true or all false. At sampling: a batch size that cannot be exact, with the
+            nearest that can; no row of the target or of a base task; a mask of another number of episodes; "grown"
+            without a storage that grows, or another target with one.
 
     Example:
         >>> import torch
@@ -194,7 +192,6 @@ class CoLearningSampler(GroupSampler):
     extend = add
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor | tuple[Tensor, ...], dict[str, Any]]:
-        """Draw ``batch_size`` indices, the target's first, and ``is_target``."""
         self._check_storage(storage)
         if not isinstance(storage, GrowingStorage):
             index, info = super().sample(storage, batch_size)

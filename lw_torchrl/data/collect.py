@@ -16,31 +16,10 @@ from tensordict import TensorDictBase
 from lw_torchrl._checks import checked, differences
 from lw_torchrl._files import flush, held, write_json
 from lw_torchrl._versions import SIMULATORS, package_versions, version_changes
+from lw_torchrl.data import dataset, memory_map
 from lw_torchrl.data.behaviours import Behaviour, behaviour_of
-from lw_torchrl.data.dataset import (
-    DATA,
-    LOCK,
-    METADATA,
-    PARTIAL,
-    CollectConfig,
-    DamagedDatasetError,
-    DatasetError,
-    Demonstrations,
-    EpisodeInfo,
-    read_config,
-    read_metadata,
-    read_versions,
-    write_metadata,
-)
-from lw_torchrl.data.memory_map import (
-    ROW_BYTES,
-    describe_episode,
-    holds_columns,
-    load_rows,
-    read_rows,
-    whole_episodes,
-    write_rows,
-)
+from lw_torchrl.data.dataset import CollectConfig, DamagedDatasetError, DatasetError, Demonstrations, write_metadata
+from lw_torchrl.data.memory_map import write_rows
 from lw_torchrl.data.missing_episodes import EpisodeFiles, run_missing_episodes, write_failed
 from lw_torchrl.language.tasks import resolve_tasks, task_id
 from lw_torchrl.modules.networks import evaluating
@@ -50,14 +29,13 @@ from lw_torchrl.modules.policy import Policy
 def _open_episode_files(
     root: Path, config: CollectConfig, made_with: dict[str, str] | None = None
 ) -> tuple[EpisodeFiles, dict[str, str]]:
-    """The episodes so far, and the versions of the packages that the dataset was begun with; a damaged dataset that is
-    taken apart gives its own, ``made_with``."""
-    folder = root / PARTIAL
+    """The episodes so far, and the versions they were begun with: ``made_with`` for a damaged dataset."""
+    folder = root / dataset.PARTIAL
     stated, of_packages = folder / "config.json", folder / "versions.json"
     begun = stated.is_file()
     if begun:
-        _check_same(read_config(stated), config, f"root: {str(root)!r} holds a half-made dataset")
-    recorded = made_with or (read_versions(of_packages) if begun else {})
+        _check_same(dataset.read_config(stated), config, f"root: {str(root)!r} holds a half-made dataset")
+    recorded = made_with or (dataset.read_versions(of_packages) if begun else {})
     versions = package_versions()
     if recorded and (made_with or any(folder.glob("*.npz"))):
         _check_versions(root, recorded)
@@ -98,43 +76,42 @@ def _check_same(before: CollectConfig, config: CollectConfig, what: str) -> None
 
 def _read_through(
     root: Path, config: CollectConfig, progress: bool
-) -> tuple[Demonstrations | None, list[EpisodeInfo], str]:
+) -> tuple[Demonstrations | None, list[dataset.EpisodeInfo], str]:
     """The dataset in a folder if all of it is as it was written; else its whole episodes, and what is wrong."""
     try:
-        found = read_metadata(root)
+        found = dataset.read_metadata(root)
     except DamagedDatasetError as error:
-        if not holds_columns(root / DATA):
+        if not memory_map.holds_columns(root / dataset.DATA):
             raise DatasetError(
                 f"root: {str(root)!r} holds no dataset, or one damaged beyond telling ({error}); choose another "
                 "folder, or delete it to start again"
             ) from error
         return None, [], str(error)
     _check_same(found.config, config, f"root: {str(root)!r} holds a dataset")
-    whole = whole_episodes(found, progress=progress)
+    whole = memory_map.whole_episodes(found, progress=progress)
     try:
-        load_rows(found)
+        memory_map.load_rows(found)
     except DamagedDatasetError as error:
         return None, whole, str(error)
     return found if len(whole) == len(found.episodes) else None, whole, "rows differ from their checksums"
 
 
-def _take_apart(root: Path, config: CollectConfig, whole: list[EpisodeInfo], reason: str) -> None:
+def _take_apart(root: Path, config: CollectConfig, whole: list[dataset.EpisodeInfo], reason: str) -> None:
     """Make a damaged dataset a half-made one: what is whole goes back among the episode files."""
     kept = f"{len(whole)} of {config.episodes_per_task * len(config.tasks)} episodes"
     warnings.warn(f"root: {str(root)!r} is damaged; {kept} are kept, the others are run again ({reason})", stacklevel=4)
-    files, _ = _open_episode_files(root, config, read_metadata(root).versions if whole else None)
+    files, _ = _open_episode_files(root, config, dataset.read_metadata(root).versions if whole else None)
     for info in whole:
         if not files.has(info.task, info.episode):
-            files.put(info.task, info.episode, read_rows(root / DATA, info.start, info.length))
-    (root / METADATA).unlink()
+            files.put(info.task, info.episode, memory_map.read_rows(root / dataset.DATA, info.start, info.length))
+    (root / dataset.METADATA).unlink()
 
 
 def _assemble(
     root: Path, config: CollectConfig, versions: dict[str, str], files: EpisodeFiles, kept: dict[str, list[int]]
 ) -> None:
-    """Make the dataset of the kept episodes."""
     listed = [(task, episode) for task in config.tasks for episode in kept[task]]
-    infos: list[EpisodeInfo] = []
+    infos: list[dataset.EpisodeInfo] = []
 
     def episodes() -> Iterator[TensorDictBase]:
         start = 0
@@ -143,21 +120,21 @@ def _assemble(
             for key in ("task_id", ("next", "task_id")):
                 rows.set(key, torch.full(rows.batch_size, task_id(task)))  # they may have had other numbers then
             rows.set(("collector", "traj_ids"), torch.full(rows.batch_size, number))
-            infos.append(describe_episode(task, episode, start, rows))
+            infos.append(memory_map.describe_episode(task, episode, start, rows))
             start += len(rows)
             yield rows
 
     building = files.folder / "rows"
-    for old in (building, root / DATA):
+    for old in (building, root / dataset.DATA):
         shutil.rmtree(old, ignore_errors=True)
     try:
         write_rows(building, episodes())
-        os.replace(building, root / DATA)
+        os.replace(building, root / dataset.DATA)
         flush(root)
         write_metadata(root, config, versions, infos, {task: max(kept[task]) + 1 for task in config.tasks})
     except OSError as error:
         shutil.rmtree(building, ignore_errors=True)
-        raise write_failed(root, len(listed) * config.max_steps * ROW_BYTES, error) from error
+        raise write_failed(root, len(listed) * config.max_steps * memory_map.ROW_BYTES, error) from error
 
 
 def _made(
@@ -165,11 +142,11 @@ def _made(
 ) -> Demonstrations:
     """The dataset, finished or repaired if need be; the folder must be held, and another call may have come first."""
     found, damaged = None, None
-    if (root / METADATA).is_file():
+    if (root / dataset.METADATA).is_file():
         found, whole, reason = _read_through(root, config, progress)
         damaged = whole, reason
     if found is None:
-        for path in (root / DATA, root / PARTIAL):
+        for path in (root / dataset.DATA, root / dataset.PARTIAL):
             if path.is_symlink() or (path.exists() and not path.is_dir()):
                 raise DatasetError(
                     f"root: {str(path)!r} must be a folder for the dataset to be collected or mended, it is a "
@@ -179,8 +156,8 @@ def _made(
             _take_apart(root, config, *damaged)
         files, versions = _open_episode_files(root, config)
         _assemble(root, config, versions, files, run_missing_episodes(config, policy, files, num_envs, progress))
-        found = read_metadata(root)
-    shutil.rmtree(root / PARTIAL, ignore_errors=True)
+        found = dataset.read_metadata(root)
+    shutil.rmtree(root / dataset.PARTIAL, ignore_errors=True)
     return found
 
 
@@ -208,8 +185,8 @@ def collect_demonstrations(
     on interruptions or damage.
 
     Each row is a step, in TorchRL's TED layout (R rows):
-        observation: (R, 39) float32, metres; next/observation likewise.
-        task_id, episode: (R,) int64; next/task_id likewise. collector/traj_ids: (R,) int64, unique per episode.
+        observation, next/observation: (R, 39) float32, metres.
+        task_id, next/task_id, episode: (R,) int64. collector/traj_ids: (R,) int64, unique per episode.
         action: (R, 4) float32 in [-1, 1], as executed, noise included.
         expert_action: (R, 4) float32 in [-1, 1], what the expert, or whoever acted, wanted in the same state;
             unclipped_action: (R, 4) float32, what its script asked for.
@@ -226,7 +203,7 @@ def collect_demonstrations(
             random actions; a :class:`Behaviour`; or a trained :class:`Policy`, run as :func:`evaluate` runs it.
         behaviour: the label of its episodes, for :class:`EpisodeFilter`; None for its name. A Policy needs one.
         seed: evaluate on another one.
-        noise_scale: standard deviation of the noise on the executed action; a sequence gives one to each episode, in
+        noise_scale: standard deviation of the noise on the executed action; a sequence gives one to each episode in
             turn.
         noise_hold: steps for which each draw of the noise is kept; the longer, the further it leads the expert astray.
         gripper_noise_factor: multiplies the noise on the gripper.
@@ -235,9 +212,6 @@ def collect_demonstrations(
         num_envs: environments stepped together.
         progress: show a progress bar when it takes longer than a second.
 
-    Returns:
-        The finished dataset's description.
-
     Warns:
         UserWarning: a finished dataset was damaged; or one that is continued was begun under another version of numpy,
             torch or this package.
@@ -245,7 +219,6 @@ def collect_demonstrations(
     Raises:
         DatasetError: (a ValueError) ``root`` holds something else, or episodes of another version of MuJoCo or
             Meta-World, or another call is at work in it.
-        TypeError: ``tasks`` holds a :class:`~lw_torchrl.Task`.
         OSError: it cannot be written, for lack of room, say; nothing is lost.
         RuntimeError: redrawing found too few successes.
 
@@ -278,15 +251,16 @@ def collect_demonstrations(
         policy=behaviour_of(policy, names, behaviour),
     )
     folder = Path(root)
+    partial = folder / dataset.PARTIAL
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"root must be a folder, {str(folder)!r} is a file")
     found = None
-    if (folder / METADATA).is_file():
+    if (folder / dataset.METADATA).is_file():
         with suppress(OSError):  # another call may be repairing it
             found = _read_through(folder, config, progress)[0]
-    elif folder.is_dir() and {path.name for path in folder.iterdir()} - {LOCK} and not (folder / PARTIAL).is_dir():
+    elif folder.is_dir() and not partial.is_dir() and {path.name for path in folder.iterdir()} - {dataset.LOCK}:
         raise DatasetError(f"root: {str(folder)!r} is not empty and holds no dataset; choose another folder")
-    if found is None or (folder / PARTIAL).is_dir():
+    if found is None or partial.is_dir():
         lock = held(folder, "root", "collect_demonstrations", folder=True, error=DatasetError)
         with lock, nullcontext() if actor is None else evaluating(actor):
             found = _made(folder, config, actor, num_envs, progress)

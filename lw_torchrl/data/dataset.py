@@ -41,19 +41,8 @@ def _whole_number(argument: str, given: Any, minimum: int) -> int:
 
 @dataclass(frozen=True)
 class CollectConfig:
-    """How demonstrations are made; equal configurations give equal datasets.
-
-    Attributes:
-        tasks: the tasks' names, sorted.
-        episodes_per_task: kept episodes of each task.
-        seed: with task and episode, fixes the initial state, the goal and the noise.
-        noise_scale: standard deviations of the execution noise, one an episode in turn; (0.0,) for none.
-        noise_hold: the steps for which each draw of the noise is kept.
-        gripper_noise_factor: multiplies the gripper's noise, which makes grasps fail.
-        redraw_failures: keep only successful episodes, and draw another for each failure.
-        max_steps: steps of an episode.
-        policy: who acts.
-    """
+    """How demonstrations are made, by the arguments of :func:`collect_demonstrations`; equal configurations give equal
+    datasets. ``tasks`` are names, sorted; ``noise_scale`` holds a number for each episode in turn, (0.0,) for none."""
 
     tasks: tuple[str, ...]
     episodes_per_task: int
@@ -97,17 +86,9 @@ class CollectConfig:
 
 @dataclass(frozen=True)
 class EpisodeInfo:
-    """One episode of a dataset.
-
-    Attributes:
-        task: the task's name.
-        episode: its index; ``episode_seed(task, seed, episode)`` is its seed.
-        start: its first row.
-        length: its number of rows.
-        success: whether it succeeded at some step.
-        first_success: the first successful step, from 1; None without success.
-        checksum: CRC-32 of its rows, column after column.
-    """
+    """One episode of a dataset: ``episode_seed(task, seed, episode)`` is its seed, ``start`` its first row,
+    ``first_success`` the first successful step, from 1, or None, and ``checksum`` the CRC-32 of its rows, column after
+    column."""
 
     task: str
     episode: int
@@ -123,8 +104,7 @@ class Demonstrations:
     """A finished dataset, described; :class:`LanguageWorldExperienceReplay` reads its rows.
 
     Attributes:
-        root: its folder.
-        config: how it was collected.
+        root, config: its folder, and how it was collected.
         versions: of the packages that it was begun with.
         task_ids: task name to its number in the files; rows are shown with the present :func:`~lw_torchrl.task_id`.
         episodes: in the order of the rows.
@@ -140,7 +120,6 @@ class Demonstrations:
 
     @property
     def num_steps(self) -> int:
-        """The number of rows."""
         return sum(episode.length for episode in self.episodes)
 
     @property
@@ -179,12 +158,7 @@ def write_metadata(
 
 
 def read_metadata(root: str | os.PathLike[str]) -> Demonstrations:
-    """Describe the dataset in a folder.
-
-    Raises:
-        FileNotFoundError: there is no such folder.
-        DatasetError: (a ValueError) the dataset is half-written, damaged, or of another format or version.
-    """
+    """Describe the dataset in a folder; DatasetError if it is half-written, damaged, or of another version."""
     folder = Path(root)
     path = folder / METADATA
     if not folder.is_dir():
@@ -240,8 +214,7 @@ def read_config(path: Path) -> CollectConfig:
 
 
 def read_versions(path: Path) -> dict[str, str]:
-    """The package versions that a half-made dataset was begun with, {} if it does not say; a damaged file is a
-    :class:`DatasetError`."""
+    """The package versions that a half-made dataset was begun with, {} if it does not say; as :func:`read_config`."""
     with _half_made(path), suppress(FileNotFoundError):
         return _versions(read_json(path, "root: the versions"))
     return {}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from multiprocessing.context import get_spawning_popen
 from pathlib import Path
 from typing import Any, NoReturn
@@ -16,10 +16,9 @@ from torchrl.data.replay_buffers.writers import Writer
 from lw_torchrl._checks import check_int
 from lw_torchrl._files import reading
 from lw_torchrl._tensor_archive import TensorArchive, write_archive
+from lw_torchrl.data import trajectories
 from lw_torchrl.data.storage import DEMONSTRATION, DONE, REWARD, TRAJECTORY, JoinedStorage, column_name
-from lw_torchrl.data.trajectories import OpenTrajectories, check_grown_state, collected_rows, link_rows, shared_keys
-
-Columns = Mapping[NestedKey, Tensor]
+from lw_torchrl.data.trajectories import Columns, OpenTrajectories
 
 
 class GrowingStorage(JoinedStorage):
@@ -31,8 +30,8 @@ class GrowingStorage(JoinedStorage):
 
     Batches may have any dimensions, the last of which is time; the columns of the parts are stored, see
     :func:`collected_rows`. ``("collector", "traj_ids")`` gets new numbers, above those of the parts: a trajectory keeps
-    its number from batch to batch as long as its newest row is in the ring, and no other trajectory ever gets it. A
-    row follows another if both have the collector's id, the other is not done, and its "next" is bit for bit this row.
+    its number from batch to batch as long as its newest row is in the ring, and no other trajectory ever gets it. A row
+    follows another if both have the collector's id, the other is not done, and its "next" is bit for bit this row.
 
     Samples have one column more, ``is_demonstration`` (B,) bool: true of the parts' rows, false of those written.
 
@@ -44,9 +43,7 @@ class GrowingStorage(JoinedStorage):
         check: called with the columns of a restored state; it raises if they are wrong.
 
     Attributes:
-        num_joined: rows of the parts.
-        grow: rows of the ring.
-        count: rows ever written.
+        num_joined, count: rows of the parts, and rows ever written.
 
     Raises:
         ValueError: as for :class:`JoinedStorage`; at writing, a batch of more rows than the ring has, or what
@@ -62,11 +59,8 @@ class GrowingStorage(JoinedStorage):
         ...     ids = torch.full((number,), trajectory)
         ...     found = {"time": time, "task_id": ids * 0, "collector": {"traj_ids": ids}, "next": after}
         ...     return TensorDict(found, [number])
-        >>> replay = TensorDictReplayBuffer(
-        ...     storage=GrowingStorage([rows(6, 0)], grow=4),
-        ...     writer=GrowingWriter(),
-        ...     collate_fn=lambda batch: batch,
-        ... )
+        >>> storage, writer = GrowingStorage([rows(6, 0)], grow=4), GrowingWriter()
+        >>> replay = TensorDictReplayBuffer(storage=storage, writer=writer, collate_fn=lambda batch: batch)
         >>> for _ in range(2):
         ...     _ = replay.extend(rows(3, 0))
         >>> replay[:]["collector", "traj_ids"].tolist(), replay[6:]["time"].tolist()
@@ -91,7 +85,7 @@ class GrowingStorage(JoinedStorage):
         super().__init__([part.exclude(DEMONSTRATION) for part in parts], rows, n_steps=n_steps, gamma=gamma)
         if absent := [column_name(key) for key in (TRAJECTORY, DONE) if key not in self._columns]:
             raise ValueError(f"grow={self.grow} needs the columns {', '.join(absent)}, which parts do not have")
-        if not shared_keys(self._columns):
+        if not trajectories.shared_keys(self._columns):
             raise ValueError("parts must have a column and its ('next', ...), by which it shows what follows what")
         known = [int(leaf.max()) for leaf in self._columns[TRAJECTORY] if len(leaf)]
         self._number, self._open = max(known, default=-1) + 1, OpenTrajectories.none()
@@ -115,14 +109,12 @@ class GrowingStorage(JoinedStorage):
 
     @property
     def num_grown(self) -> int:
-        """The rows of the ring that are written."""
         return min(self.count, self.grow)
 
     def __len__(self) -> int:
         return self.num_joined + self.num_grown
 
     def keys(self) -> list[NestedKey]:
-        """The names of the columns."""
         return [*super().keys(), DEMONSTRATION]
 
     def _read(self, index: Tensor, keys: Sequence[NestedKey]) -> dict[NestedKey, Tensor]:
@@ -131,7 +123,7 @@ class GrowingStorage(JoinedStorage):
 
     def extend(self, batch: TensorDictBase) -> Tensor:
         """Write the rows of a batch; their places, int64 of the batch's shape."""
-        found: Columns = collected_rows(batch, self._ring)
+        found: Columns = trajectories.collected_rows(batch, self._ring)
         number = len(found[DONE])
         if not 0 < number <= self.grow:
             raise ValueError(f"batch must have 1 to {self.grow} rows, as many as grow says, got {number}")
@@ -139,7 +131,7 @@ class GrowingStorage(JoinedStorage):
             found = self._admit(found)
         key, done = found[TRAJECTORY].reshape(-1), found[DONE].reshape(-1)
         slots, begin = self._open.last % self.grow, {"serial": self.count, "number": self._number}
-        previous, numbers, opened = link_rows(key, done, found, self._open, self._ring, slots, **begin)
+        previous, numbers, opened = trajectories.link_rows(key, done, found, self._open, self._ring, slots, **begin)
         if (cut := len(numbers.unique()) - len(key.unique())) > number // 2:
             warnings.warn(
                 f"batch: {cut} of {number} rows are not the ('next', ...) of the rows before them, though of the same "
@@ -203,7 +195,7 @@ class GrowingStorage(JoinedStorage):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore a state; :class:`ValueError` if it is of other columns, another ``grow``, or other demonstrations."""
         super().load_state_dict(state_dict)
-        count, number, rows, opened = check_grown_state(state_dict, self.grow, self._ring)
+        count, number, rows, opened = trajectories.check_grown_state(state_dict, self.grow, self._ring)
         if self._check is not None and count:
             self._check(rows)
         self._empty()
@@ -219,14 +211,12 @@ class GrowingStorage(JoinedStorage):
         self._write(serial, rows, previous)
 
     def dumps(self, path: Any) -> None:
-        """Write the state to a folder, as one file that is there whole or not at all."""
         state = self.state_dict()
         rows, opened = state.pop("rows"), state.pop("open")
         Path(path).mkdir(parents=True, exist_ok=True)
         write_archive(Path(path) / "grown.zip", state, {"rows": rows, "open": opened})
 
     def loads(self, path: Any) -> None:
-        """Read what :meth:`dumps` wrote."""
         with reading(path, "growing storage's state"):
             archive = TensorArchive(Path(path) / "grown.zip")
             groups = {name: archive.tensors(name) for name in ("rows", "open")}
@@ -251,7 +241,7 @@ class GrowingWriter(Writer):
         return self._storage.count
 
     def extend(self, data: TensorDictBase) -> Tensor:
-        """Write the rows of a batch; their places, int64 of the batch's shape."""
+        """As :meth:`GrowingStorage.extend`."""
         index = self._storage.extend(data)
         for entity in self._storage._attached_entities_iter():
             entity.mark_update(index.reshape(-1))
@@ -265,14 +255,9 @@ class GrowingWriter(Writer):
         pass
 
     def state_dict(self) -> dict[str, Any]:
-        """Nothing; the storage knows how many rows were written."""
         return {}
 
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Nothing to restore."""
+    def load_state_dict(self, state_dict: Any) -> None:
+        """Nothing: the storage knows how many rows were written."""
 
-    def dumps(self, path: Any) -> None:
-        """Nothing to write."""
-
-    def loads(self, path: Any) -> None:
-        """Nothing to read."""
+    dumps = loads = load_state_dict

@@ -65,8 +65,7 @@ def _meta(rows: int) -> dict[str, dict[str, Any]]:
 
 
 def write_rows(folder: Path, episodes: Iterable[TensorDictBase]) -> None:
-    """Write episodes of :data:`COLUMNS`, one after another, and flush them to the disk; after an :class:`OSError` the
-    folder holds a part of them."""
+    """Write episodes one after another, and flush them to the disk; an :class:`OSError` leaves a part of them."""
     rows = 0
     for name in _meta(0):
         (folder / name).mkdir(parents=True, exist_ok=True)
@@ -98,7 +97,6 @@ def read_rows(folder: Path, start: int, length: int) -> TensorDict | None:
 
 
 def describe_episode(task: str, episode: int, start: int, rows: TensorDictBase) -> EpisodeInfo:
-    """The metadata of an episode of these rows."""
     checksum = 0
     for key in COLUMNS:
         checksum = crc32(rows.get(key).contiguous().numpy().data, checksum)
@@ -116,7 +114,6 @@ def _surplus(folder: Path) -> list[str]:
 
 
 def holds_columns(folder: Path) -> bool:
-    """Whether a folder holds columns of a dataset, and nothing else."""
     return any(_path(folder, key).is_file() for key in COLUMNS) and not _surplus(folder)
 
 
@@ -155,8 +152,7 @@ class MappedColumn(Tensor):
 
 
 def map_rows(demonstrations: Demonstrations) -> TensorDict:
-    """The rows of a dataset as they are in the files, memory-mapped; DatasetError if a column is missing, or not as
-    long as the metadata say, or there are other files."""
+    """The rows of a dataset as in the files, memory-mapped; DatasetError if these are not as the metadata say."""
     folder, number = demonstrations.root / DATA, demonstrations.num_steps
     if odd := _surplus(folder):
         raise DatasetError(
@@ -176,8 +172,7 @@ def map_rows(demonstrations: Demonstrations) -> TensorDict:
 
 
 def load_rows(demonstrations: Demonstrations) -> TensorDict:
-    """:func:`map_rows`; if tasks had other numbers when the dataset was made, ``task_id`` and ``("next", "task_id")``
-    are the present ones, in memory."""
+    """:func:`map_rows`; if tasks had other numbers once, both ``task_id`` are the present ones, in memory."""
     rows = map_rows(demonstrations)
     if any(task_id(task) != stored for task, stored in demonstrations.task_ids.items()):
         episodes = demonstrations.episodes
@@ -213,8 +208,7 @@ def _as_written(demonstrations: Demonstrations, info: EpisodeInfo, rows: TensorD
 
 
 def whole_episodes(demonstrations: Demonstrations, *, progress: bool) -> list[EpisodeInfo]:
-    """The episodes whose rows are as they were written, by their checksums and the other metadata; a column that is too
-    short does not matter for the episodes that it holds."""
+    """The episodes whose rows are as they were written; a column may be too short for other episodes."""
     whole = []
     with Progress("checking", len(demonstrations.episodes), "episode", show=progress) as bar:
         for info in demonstrations.episodes:

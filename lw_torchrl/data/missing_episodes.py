@@ -34,8 +34,7 @@ _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 class EpisodeFiles:
-    """The episodes so far, one file each, so that a kill costs only those under way; a file that says FAILED stands
-    for an episode that was not kept."""
+    """The episodes so far, one file each, so that a kill costs only those under way; FAILED stands for one not kept."""
 
     def __init__(self, folder: Path, tasks: Sequence[str], max_steps: int) -> None:
         self.folder, self.tasks, self.max_steps = folder, tasks, max_steps
@@ -44,7 +43,6 @@ class EpisodeFiles:
         return self.folder / f"{task}.{episode}.npz"
 
     def put(self, task: str, episode: int, steps: TensorDictBase | None) -> None:
-        """Write an episode's rows, or that it was not kept."""
         content = _FAILED
         if steps is not None:
             stream = BytesIO()
@@ -57,11 +55,9 @@ class EpisodeFiles:
             raise write_failed(self.folder, len(content), error) from error
 
     def has(self, task: str, episode: int) -> bool:
-        """Whether the episode was run."""
         return self._path(task, episode).is_file()
 
     def kept(self, task: str, episode: int) -> bool:
-        """Whether an episode that was run was kept."""
         return self._path(task, episode).stat().st_size != len(_FAILED)
 
     def get(self, task: str, episode: int) -> TensorDict:
@@ -130,8 +126,7 @@ _MAX_ATTEMPTS = 20  # episodes run for each one that is kept, before redrawing g
 
 
 def _kept_and_missing(config: CollectConfig, files: EpisodeFiles) -> tuple[dict[str, list[int]], dict[str, list[int]]]:
-    """The kept episodes of each task, and those still to run. Candidates are taken in the order of their index, so
-    which are kept depends neither on the number of environments nor on interruptions."""
+    """The kept episodes of each task, and those still to run; neither ``num_envs`` nor interruptions matter."""
     kept: dict[str, list[int]] = {}
     wanted: dict[str, list[int]] = {}
     for task in config.tasks:
@@ -163,7 +158,6 @@ def _clipped(policy: _Actor) -> _Actor:
 
 
 def _env_and_actor(config: CollectConfig, policy: Policy | None, env: LanguageWorldEnv) -> tuple[EnvBase, _Actor]:
-    """The environment with the actor's transforms, and the actor."""
     if config.policy.kind == "expert":
         return env, ExpertActor(config.tasks)
     if policy is None:
@@ -177,12 +171,7 @@ def _env_and_actor(config: CollectConfig, policy: Policy | None, env: LanguageWo
 def run_missing_episodes(
     config: CollectConfig, policy: Policy | None, files: EpisodeFiles, num_envs: int | None, progress: bool
 ) -> dict[str, list[int]]:
-    """Run episodes until the files hold all; returns the kept ones of each task.
-
-    Raises:
-        OSError: there is no room.
-        RuntimeError: redrawing found too few successes.
-    """
+    """Run episodes until the files hold all; returns the kept ones of each task."""
     kept, wanted = _kept_and_missing(config, files)
     missing = sum(map(len, wanted.values()))
     if not missing:

@@ -20,8 +20,7 @@ def _without(some: Tensor, others: Tensor) -> Tensor:
 
 
 def choose(first: Tensor, size: Tensor, count: Tensor, generator: torch.Generator | None) -> Tensor:
-    """``count[g]`` different places of the ``size[g]`` from ``first[g]`` on, uniformly, sorted; the work is of
-    the order of ``count``, however large ``size`` is."""
+    """``count[g]`` different places of ``size[g]`` from ``first[g]`` on, sorted, uniform, in the time of ``count``."""
     few = 2 * count <= size
     wanted = torch.where(few, count, size - count)  # where those that are not chosen are fewer, draw these
     found, missing = wanted.new_empty(0), wanted
@@ -53,7 +52,6 @@ class Passes:
         self._place: Tensor | None = None  # of each row in the order, -1 for none; made when rows change
 
     def shuffle(self, group: int, generator: torch.Generator | None) -> None:
-        """Begin a pass of a group."""
         start, size = int(self.start[group]), int(self.size[group])
         rows = self.order[start : start + size]
         self.order[start : start + size] = rows[torch.randperm(size, generator=generator)]

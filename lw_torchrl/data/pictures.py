@@ -36,8 +36,6 @@ _LARGEST = 64 * 2**20  # bytes of a file of pictures
 
 @dataclass(frozen=True)
 class _Wanted:
-    """Which pictures, as for :class:`CameraTransform`."""
-
     cameras: tuple[str, ...]
     height: int
     width: int
@@ -52,7 +50,6 @@ class _Wanted:
         return root / "pictures" / folder / f"{episode.task}.{episode.episode}.zip"
 
     def count(self, episode: EpisodeInfo) -> int:
-        """Pictures of an episode."""
         return -(-episode.length // self.every)
 
 
@@ -113,7 +110,6 @@ def add_pictures(
 def _taken(
     found: Demonstrations, rows: TensorDictBase, episodes: Sequence[EpisodeInfo], wanted: _Wanted
 ) -> list[list[np.ndarray[Any, Any]]]:
-    """The pictures of some episodes of a task."""
     base = LanguageWorldEnv(
         episodes[0].task, num_envs=len(episodes), seed=found.config.seed, max_steps=found.config.max_steps
     )
@@ -192,18 +188,12 @@ def load_pictures(
     width: int = 64,
     every: int = 1,
 ) -> Tensor:
-    """The pictures of a buffer's rows, for ``replay.add_column("pixels", ...)``, in memory.
+    """The pictures of a buffer's rows, for ``replay.add_column("pixels", ...)``: (R, height, width·C, 3) uint8, in
+    memory.
 
-    Args:
-        replay: a buffer of datasets that :func:`add_pictures` drew.
-        cameras, height, width, every: as given there.
-
-    Returns:
-        (R, height, width·C, 3) uint8, of ``observation``, in the order of ``replay[:]``; between two pictures of an
-        episode, the earlier one.
-
-    Raises:
-        DatasetError: (a ValueError) a dataset has no such pictures, or they are damaged.
+    They are those of ``observation``, in the order of ``replay[:]``; between two pictures of an episode, the earlier
+    one. ``cameras``, ``height``, ``width`` and ``every`` are as given to :func:`add_pictures`. Without such pictures,
+    or if they are damaged, a :class:`DatasetError`, which is a ValueError, is raised.
     """
     wanted = _wanted(cameras, height, width, every)
     _, lengths = torch.unique_consecutive(replay.storage.column(("collector", "traj_ids")), return_counts=True)

@@ -20,31 +20,13 @@ from torchrl.envs import Transform
 
 from lw_torchrl._checks import check_int, check_path, checked_but
 from lw_torchrl._devices import CPU, check_device
+from lw_torchrl.data import replay_checks, selection
 from lw_torchrl.data.buffer_state import RestorableReplay, fingerprint
-from lw_torchrl.data.dataset import DATA, Demonstrations, read_metadata
+from lw_torchrl.data.dataset import DATA, read_metadata
 from lw_torchrl.data.growing import GrowingStorage, GrowingWriter
 from lw_torchrl.data.memory_map import verify
-from lw_torchrl.data.replay_checks import (
-    admit_rows,
-    check_apart,
-    check_behaviours,
-    check_column,
-    check_growing,
-    check_label,
-    check_rows,
-    check_transform,
-    warn_of_simulators,
-)
 from lw_torchrl.data.rewards import RewardName, check_n_steps
-from lw_torchrl.data.selection import (
-    EpisodeChoice,
-    EpisodeFilter,
-    JoinedDemonstrations,
-    Label,
-    choose_episodes,
-    read_part,
-    returns_of,
-)
+from lw_torchrl.data.selection import EpisodeChoice, EpisodeFilter, JoinedDemonstrations, Label
 from lw_torchrl.data.storage import DeviceStorage, JoinedStorage, WholeStorage
 
 
@@ -53,7 +35,6 @@ def _identity(batch: TensorDictBase) -> TensorDictBase:
 
 
 def _choices(episodes: Any, roots: int, joined: bool) -> list[EpisodeChoice]:
-    """The choice of episodes for each folder."""
     if not roots:
         raise ValueError("root must hold at least one folder, got an empty list")
     if not joined or episodes is None:
@@ -71,16 +52,16 @@ _NOT_COLLECTED = ("behaviour", "expert_action", "unclipped_action", ("next", "re
 class LanguageWorldExperienceReplay(RestorableReplay):
     """The rows of datasets that :func:`collect_demonstrations` made; several are joined, and none is copied.
 
-    Samples hold observation (B, 39) float32, action (B, 4) float32, task_id and episode (B,) int64, and what
-    ``label`` leaves; a :class:`QAFTransform` adds ``qaf`` and ``qaf_plan``. collector/traj_ids (B,) int64 is unique for
-    each episode of all datasets; behaviour (B,) int64 says who acted, an index of ``behaviours``. is_demonstration
-    (B,) bool is true of a dataset's rows, and false of those that :meth:`extend` wrote.
+    Samples hold observation (B, 39) float32, action (B, 4) float32, task_id and episode (B,) int64, and what ``label``
+    leaves; a :class:`QAFTransform` adds ``qaf`` and ``qaf_plan``. collector/traj_ids (B,) int64 is unique for each
+    episode of all datasets; behaviour (B,) int64 says who acted, an index of ``behaviours``. is_demonstration (B,) bool
+    is true of a dataset's rows, and false of those that :meth:`extend` wrote.
 
     Args:
         root: the dataset's folder, or a list of folders, in the order of the rows. A folder may come twice only if
             ``episodes`` says what to show of each.
-        episodes: which episodes to show. None: all; a number: the first so many of each task; a mapping: for each task
-            to show, the first so many, or a list of indices of episodes. For a list of folders, a list of such choices.
+        episodes: which to show. None: all; a number: the first so many of each task; a mapping: for each task to show,
+            the first so many, or a list of indices of episodes. For a list of folders, a list of such choices.
         keep: of these, the successes, the best tenth, those of one behaviour, ...; see :class:`EpisodeFilter`.
         batch_size: rows of a sample.
         sampler: a TorchRL sampler, :class:`TaskBalancedSampler` say; None for uniform.
@@ -94,9 +75,8 @@ class LanguageWorldExperienceReplay(RestorableReplay):
         after_success: drop the steps that come more than so many after the first success; None keeps all.
         terminate_on_success: end each episode at its first success, with ``("next", "terminated")``, as
             ``LanguageWorldEnv(terminate_on_success=True)`` does; with label="executed".
-        n_steps: how many steps ``("next", ...)`` is ahead, within the episode that is shown; see
-            :class:`JoinedStorage`.
-        gamma: the discount of the rewards on the way, for ``n_steps`` of 2 or more; the loss must use the same.
+        n_steps, gamma: how many steps ``("next", ...)`` is ahead, within the episode that is shown, and from 2 on the
+            discount of the rewards on the way, which the loss must have too; see :class:`JoinedStorage`.
         grow: rows of a ring that :meth:`extend` writes to, whose oldest are overwritten; see :class:`GrowingStorage`.
             Samples then leave out the expert's actions and the other reward, which a collector does not give.
         device: where the rows are kept and transforms work: None or "cpu" for the files, memory-mapped; "cuda",
@@ -108,22 +88,19 @@ class LanguageWorldExperienceReplay(RestorableReplay):
             several threads would draw in an order that differs from run to run.
 
     Attributes:
-        demonstrations: the dataset's description; a :class:`JoinedDemonstrations` where folders are joined or
-            episodes chosen.
-        roots: the folders.
+        demonstrations: the description; a :class:`JoinedDemonstrations` where folders are joined or episodes chosen.
+        roots, behaviours: the folders, and the labels of who acted, sorted.
         columns: of :meth:`add_column`, the name to a digest of the values.
-        behaviours: the labels of who acted, sorted.
 
     Warns:
         UserWarning: the folders were collected with different versions of MuJoCo or Meta-World; or, with ``grow``, with
             others than the installed ones.
 
     Raises:
-        ValueError: a task or an episode that the dataset does not hold; ``n_steps`` or ``grow`` without
-            label="executed"; a transform that does nothing to samples, such as ``MultiStepTransform``, which
-            ``n_steps`` replaces. From :meth:`extend`: rows that do not fit the demonstrations, or have another reward.
+        ValueError: an episode that the dataset does not hold; ``n_steps`` or ``grow`` without label="executed"; a
+            transform that does nothing to samples, such as ``MultiStepTransform``, which ``n_steps`` replaces. From
+            :meth:`extend`: rows that do not fit the demonstrations, or have another reward.
         RuntimeError: :meth:`extend` without ``grow``; an assignment to rows.
-        FileNotFoundError: there is no such folder.
         DatasetError: (a ValueError) the dataset is half-written, damaged, or of another format or version.
 
     Example:
@@ -159,7 +136,7 @@ class LanguageWorldExperienceReplay(RestorableReplay):
         **kwargs: Any,
     ) -> None:
         check_n_steps(n_steps, gamma)
-        check_transform(transform)
+        replay_checks.check_transform(transform)
         if (prefetch := kwargs.get("prefetch") or 0) > 1:
             raise ValueError(
                 f"prefetch must be None, 0 or 1, got {prefetch}: several threads draw the batches in an order that "
@@ -168,7 +145,7 @@ class LanguageWorldExperienceReplay(RestorableReplay):
         if (n_steps > 1 or grow is not None) and label != "executed":
             raise ValueError(f"n_steps and grow need label='executed', whose actions the rewards are of, got {label!r}")
         if grow is not None:
-            check_growing(sampler, kwargs)
+            replay_checks.check_growing(sampler, kwargs)
         if batch_size is not None:
             check_int("batch_size", batch_size, minimum=1)
         if after_success is not None:
@@ -186,14 +163,14 @@ class LanguageWorldExperienceReplay(RestorableReplay):
             check_path("root", folder)
         self.roots = tuple(map(Path, root)) if joined else (Path(root),)  # type: ignore[arg-type]
         if episodes is None:
-            check_apart(self.roots)
+            replay_checks.check_apart(self.roots)
         choices = _choices(episodes, len(self.roots), joined)
         whole = [read_metadata(folder) for folder in self.roots]
-        check_label(label, whole)
-        check_behaviours(whole)
-        warn_of_simulators(whole, grow is not None)
+        replay_checks.check_label(label, whole)
+        replay_checks.check_behaviours(whole)
+        replay_checks.warn_of_simulators(whole, grow is not None)
         shown = [
-            choose_episodes(found, choice, f"episodes[{number}]" if joined else "episodes")
+            selection.choose_episodes(found, choice, f"episodes[{number}]" if joined else "episodes")
             for number, (found, choice) in enumerate(zip(whole, choices, strict=True))
         ]
         for found, chosen in zip(whole, shown, strict=True) if check else ():
@@ -201,40 +178,27 @@ class LanguageWorldExperienceReplay(RestorableReplay):
         if keep is not None:
             after = 0 if terminate_on_success else after_success
             pairs = zip(whole, shown, strict=True)
-            shown = keep.choose(shown, [returns_of(found, chosen, reward, after) for found, chosen in pairs])
+            shown = keep.choose(shown, [selection.returns_of(found, chosen, reward, after) for found, chosen in pairs])
         self.behaviours = tuple(sorted({found.config.behaviour for found in whole}))
         parts: list[TensorDictBase] = []
         kept: list[Tensor | None] = []
         trajectories = 0
+        what: dict[str, Any] = {"label": label, "reward": reward}
+        what |= {"after_success": after_success, "terminate_on_success": terminate_on_success}
         for found, chosen in zip(whole, shown, strict=True):
-            rows, taken = read_part(
-                found,
-                chosen,
-                label=label,
-                reward=reward,
-                after_success=after_success,
-                terminate_on_success=terminate_on_success,
-                first_trajectory=trajectories,
-                behaviour=self.behaviours.index(found.config.behaviour),
-            )
+            who = self.behaviours.index(found.config.behaviour)
+            rows, taken = selection.read_part(found, chosen, first_trajectory=trajectories, behaviour=who, **what)
             parts.append(rows if grow is None else rows.exclude(*_NOT_COLLECTED))
             kept.append(taken)
             trajectories += len(found.episodes)
         storage: JoinedStorage
         several = joined or episodes is not None or keep is not None
-        self.demonstrations: Demonstrations | JoinedDemonstrations = (
-            JoinedDemonstrations(tuple(shown)) if several else shown[0]
-        )
+        self.demonstrations = JoinedDemonstrations(tuple(shown)) if several else shown[0]
         if grow is not None:
-            storage = GrowingStorage(
-                parts,
-                kept,
-                grow=grow,
-                n_steps=n_steps,
-                gamma=gamma,
-                admit=partial(admit_rows, reward, terminate_on_success),
-                check=partial(check_rows, reward, terminate_on_success),
-            )
+            admit = partial(replay_checks.admit_rows, reward, terminate_on_success)
+            check_rows = partial(replay_checks.check_rows, reward, terminate_on_success)
+            options: dict[str, Any] = {"n_steps": n_steps, "gamma": gamma, "admit": admit, "check": check_rows}
+            storage = GrowingStorage(parts, kept, grow=grow, **options)
         elif several or n_steps > 1 or where != CPU:
             storage = JoinedStorage(parts, kept, n_steps=n_steps, gamma=gamma)
             storage = storage if where == CPU else DeviceStorage(storage, where)
@@ -252,21 +216,18 @@ class LanguageWorldExperienceReplay(RestorableReplay):
         )
 
     def set_sampler(self, sampler: Sampler) -> Sampler:
-        """Take another sampler, which draws from the buffer's generator; returns the one before.
-
-        In a worker of a DataLoader it gets no generator until ``set_rng``, since all workers have copies of one.
-        """
+        """Take another sampler, which draws from the buffer's generator, in a DataLoader's worker after ``set_rng``."""
         if self._grows:
-            check_growing(sampler, {})
+            replay_checks.check_growing(sampler, {})
         before = super().set_sampler(sampler)
         if get_worker_info() is None:
             self.set_rng(self._rng)
         return before
 
     def append_transform(self, transform: Transform, *, invert: bool = False) -> LanguageWorldExperienceReplay:
-        """Apply a transform, or with ``invert`` its inverse, to each sample, after those that are there."""
+        """Apply a transform, or with ``invert`` its inverse, to each sample, after the others."""
         if not invert:
-            check_transform(transform)
+            replay_checks.check_transform(transform)
         return super().append_transform(transform, invert=invert)
 
     def insert_transform(
@@ -274,7 +235,7 @@ class LanguageWorldExperienceReplay(RestorableReplay):
     ) -> LanguageWorldExperienceReplay:
         """Apply a transform, or with ``invert`` its inverse, to each sample, before the one at ``index``."""
         if not invert:
-            check_transform(transform)
+            replay_checks.check_transform(transform)
         return super().insert_transform(index, transform, invert=invert)
 
     def share(self, shared: bool = True) -> LanguageWorldExperienceReplay:
@@ -287,10 +248,9 @@ class LanguageWorldExperienceReplay(RestorableReplay):
         return super().share(shared)
 
     def add_column(self, name: str, values: Tensor, *, of: LanguageWorldExperienceReplay | None = None) -> None:
-        """Give samples a new column, held in memory: each row's advantage, say.
+        """Give samples a new column ``name``, held in memory: each row's advantage, say.
 
         Args:
-            name: of the column, a new one.
             values: (R, ...), for each row in the order of ``replay[:]``; a copy is kept on the device of the rows.
             of: the buffer that the values were computed from, if it is another one, with n steps say. It must show the
                 same rows in the same order, and so the same episodes where a filter keeps some by their return.
@@ -301,7 +261,7 @@ class LanguageWorldExperienceReplay(RestorableReplay):
         """
         if self._grows:
             raise ValueError(f"add_column: {name!r} would be of no row that comes later, and this buffer grows")
-        check_column(name, values, len(self), self.storage.get(slice(0, 1)).keys(), self.transform)
+        replay_checks.check_column(name, values, len(self), self.storage.get(slice(0, 1)).keys(), self.transform)
         if of is not None and not torch.equal(*(each.storage[:].get("observation").cpu() for each in (self, of))):
             raise ValueError(
                 "of must show the rows of this buffer, in their order: the same folders, episodes and keep"

@@ -19,13 +19,8 @@ _MOST = 10.0  # Meta-World's dense reward, which it gives at success
 
 @dataclass(frozen=True)
 class Reward:
-    """A reward of a step: ``(source + shift) * scale``.
-
-    Attributes:
-        source: what the environment must give, "sparse" or "dense".
-        shift, scale: of the source.
-        at_success: the reward of a step that succeeds; None for the source's own.
-    """
+    """A reward of a step: ``(source + shift) * scale`` of the environment's "sparse" or "dense" one, ``at_success`` if
+    that is not None at a step that succeeds."""
 
     source: Literal["sparse", "dense"]
     shift: float = 0.0
@@ -34,7 +29,6 @@ class Reward:
 
     @property
     def is_source(self) -> bool:
-        """Whether it is the environment's own reward."""
         return (self.shift, self.scale, self.at_success) == (0.0, 1.0, None)
 
     def of(self, source: Tensor, success: Tensor) -> Tensor:
@@ -59,8 +53,7 @@ reward lacks of 10, as a cost of at most about 0.1 a step, none at success. Cost
 
 
 def check_reward(name: RewardName, reward: Tensor, success: Tensor) -> None:
-    """Raise :class:`ValueError` if rows (R, 1) plainly have another reward than the one named; one of several steps,
-    from ``frame_skip``, shows where it is over 10."""
+    """Raise :class:`ValueError` if rows (R, 1) plainly have another reward; that of several steps shows over 10."""
     stated = REWARDS[name]
     sparse = success.to(torch.float32)
     if stated.source == "sparse":
@@ -102,8 +95,7 @@ def check_n_steps(n_steps: Any, gamma: Any) -> tuple[int, float]:
 
 
 def last_rows(end: Tensor, n_steps: int) -> Tensor:
-    """The row in which ``n_steps`` steps from each row end: (R,) int64, at most the last of its trajectory, where
-    ``end``, (R,) bool, is true."""
+    """The row in which ``n_steps`` steps from each row end: (R,) int64, at most the next ``end``, (R,) bool."""
     rows = torch.arange(len(end))
     ends = torch.where(end, rows, max(len(end) - 1, 0))
     return torch.minimum(rows + n_steps - 1, ends.flip(0).cummin(0).values.flip(0))

@@ -25,8 +25,7 @@ _FILE = "sampler.zip"
 
 
 def column(storage: Storage, key: NestedKey, index: Tensor | None = None) -> Tensor:
-    """One column of all rows of a storage, or of those at an index, on the CPU; rows of a storage of several dimensions
-    are numbered in row-major order."""
+    """One column of all rows of a storage, row-major if of several dimensions, or of those at an index, on the CPU."""
     if isinstance(storage, JoinedStorage):
         return storage.column(key, index).cpu()
     rows = storage.get(slice(0, len(storage)))
@@ -48,16 +47,17 @@ class GroupSampler(Sampler):
     """Exact numbers from groups of rows; within a group every row comes once before any comes again.
 
     A subclass gives the group of each row (:meth:`_label`) and the rows of each group in a batch (:meth:`_shares`). A
-    batch holds the groups one after another. A group's pass continues in the next batch; where a pass ends within a
-    batch, the rest comes from the next pass, in a new order.
+    batch holds the groups one after another. Where a group's pass ends within a batch, the rest comes from the next
+    pass, in a new order. For a storage of several dimensions (``ndim=2``) an index is a tuple of as many tensors.
 
     Rows may be written and overwritten. If the subclass tells a row's group by a column (:meth:`_keys`), groups and
     passes are updated: a new row takes a random place in what is left of its group's pass, and the work is that of the
     new rows. Otherwise, and when a group comes or goes or the storage has several dimensions, all rows are grouped
     again and all passes begin.
-
-    For a storage of several dimensions (``ndim=2``) an index is a tuple of as many tensors, as TorchRL's samplers give.
     """
+
+    ran_out = False
+    """Whether the last batch ended an epoch: a pass over the group that takes the most batches."""
 
     def __init__(self) -> None:
         self._process = os.getpid()
@@ -69,7 +69,7 @@ class GroupSampler(Sampler):
         self._passes = Passes(none, none)
         self._known: Tensor | None = None  # the key of each group's rows
         self._written: list[Tensor] = []  # rows written since the last batch
-        self._ran_out = False
+        self.ran_out = False
         self._restored = False
         self._laid_out: tuple[int, Tensor, Tensor, Tensor] | None = None  # see _layout
 
@@ -89,15 +89,6 @@ class GroupSampler(Sampler):
         """How many of the first rows are grouped."""
         return len(storage) if storage.ndim == 1 else storage.shape.numel()
 
-    @property
-    def ran_out(self) -> bool:
-        """Whether the last batch ended an epoch: a pass over the group that takes the most batches."""
-        return self._ran_out
-
-    @ran_out.setter
-    def ran_out(self, value: bool) -> None:
-        self._ran_out = value
-
     def _group(self, storage: Storage) -> None:
         label = self._label(storage).cpu()
         order = torch.argsort(label, stable=True)
@@ -110,7 +101,6 @@ class GroupSampler(Sampler):
             self._passes.shuffle(group, self._rng)
 
     def _know(self, storage: Storage) -> None:
-        """Note the key of each group."""
         found = self._keys(storage, self._passes.order[self._passes.start]) if storage.ndim == 1 else None
         self._known = None if found is None else found.reshape(-1).cpu()
 
@@ -142,7 +132,6 @@ class GroupSampler(Sampler):
         return self._laid_out[1:]
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor | tuple[Tensor, ...], dict[str, Any]]:
-        """Draw ``batch_size`` indices, group after group."""
         batch_size = check_int("batch_size", batch_size, minimum=1)
         worker = get_worker_info()
         if worker is not None and worker.num_workers > 1 and self._process != os.getpid():
@@ -161,7 +150,7 @@ class GroupSampler(Sampler):
         passes = self._passes
         at = (passes.start + passes.cursor)[group].add_(place).clamp_(max=len(passes.order) - 1)
         index = passes.order[at]
-        self._ran_out = False
+        self.ran_out = False
         ending = passes.cursor + shares >= passes.size
         passes.cursor += torch.where(ending, 0, shares)
         if ending.any():
@@ -171,12 +160,11 @@ class GroupSampler(Sampler):
             for number in ending.nonzero().flatten().tolist():
                 rows, ended = passes.take(number, int(shares[number]), self._rng)
                 index[first[number] : first[number] + len(rows)] = rows
-                self._ran_out |= ended and bool(longest[number])
+                self.ran_out |= ended and bool(longest[number])
         index = to_device_of(storage, index)
         return (index if storage.ndim == 1 else torch.unravel_index(index, storage.shape)), {}
 
     def add(self, index: Any) -> None:
-        """Note that rows were written or overwritten."""
         rows = torch.as_tensor(index, device="cpu").reshape(-1)
         self._written.append(rows)
         if sum(map(len, self._written)) > 2 * self._length:
@@ -201,13 +189,13 @@ class GroupSampler(Sampler):
             "cursor": self._passes.cursor.clone() if begun else none,
             "known": self._known.clone() if begun and self._known is not None else none,
             "written": torch.cat(self._written) if begun and self._written else none,
-            "ran_out": torch.tensor(self._ran_out),
+            "ran_out": torch.tensor(self.ran_out),
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore a state; :class:`ValueError` if it is none, or at the next sample if it is of other rows."""
         state = check_state(state_dict)
-        self._length, self._ran_out = state["length"], state["ran_out"]
+        self._length, self.ran_out = state["length"], state["ran_out"]
         self._passes = Passes(state["order"].clone(), state["size"].clone(), state["cursor"].clone())
         self._known = state["known"].clone() if len(state["known"]) else None
         self._written = [state["written"].clone()] if len(state["written"]) else []
@@ -215,8 +203,7 @@ class GroupSampler(Sampler):
         self._restored = True
 
     def _check_restored(self, storage: Storage) -> None:
-        """Raise unless a restored state is of the storage's rows, in their groups; if rows were written since and the
-        others are in other groups, all are grouped again."""
+        """Raise unless a restored state is of the storage's rows; with rows written since, all may be grouped again."""
         rows, groups = self._passes.order, torch.repeat_interleave(self._passes.size)
         length = self._covered(storage)
         if self._written:
@@ -248,17 +235,13 @@ class TaskBalancedSampler(GroupSampler):
     """Equal numbers from every task, exactly; within a task every row comes once before any comes again.
 
     The buffer may grow: new rows take random places in the present passes, and overwritten ones leave them; when a task
-    comes or goes, all passes begin anew. A batch costs no more than the rows written since the last one.
-
-    It draws from the replay buffer's generator, so ``ReplayBuffer(..., generator=...)`` fixes the batches. Its state is
-    saved with the buffer's. Each task has passes of its own; an epoch is a pass over the largest task.
-
-    Args:
-        task_key: the entry of the storage that holds the task.
+    comes or goes, all passes begin anew. A batch costs no more than the rows written since the last one. It draws from
+    the replay buffer's generator, so ``ReplayBuffer(..., generator=...)`` fixes the batches; its state is saved with
+    the buffer's. An epoch is a pass over the largest task. ``task_key`` is the entry of the storage that holds the
+    task.
 
     Raises:
-        ValueError: at sampling, a batch size that the number of tasks does not divide (with the nearest that it
-            does), or an empty storage.
+        ValueError: at sampling, a batch size that the number of tasks does not divide (with the nearest that it does).
 
     Example:
         >>> import torch

@@ -28,10 +28,9 @@ class EpisodeFilter:
 
     Attributes:
         success: keep those that succeeded at some step, or, if False, those that did not.
-        least_return: keep those with at least this return.
-        best: the fraction of each task's episodes to keep, those of the highest return, the shorter at a tie; of those
-            that meet the other conditions, and at least one.
-        behaviours: keep those of these labels, "spoilt-30" say.
+        least_return, behaviours: keep those with at least this return; those of these labels, "spoilt-30" say.
+        best: of those that meet the other conditions, the fraction of each task's episodes to keep, at least one, those
+            of the highest return, the shorter at a tie.
         else_best: for a task without an episode that meets the conditions, the fraction of all its episodes to keep,
             chosen as for ``best``; None for an error.
 
@@ -193,12 +192,8 @@ def read_part(
     first_trajectory: int = 0,
     behaviour: int = 0,
 ) -> tuple[TensorDictBase, Tensor | None]:
-    """All rows of a dataset, memory-mapped, and which of them to show: (n,) int64, None for all.
-
-    Columns that differ from the files are in memory, one number a row: the ends of episodes that are cut short, which
-    are ``terminated`` with ``terminate_on_success``; a reward that is not on disk; the trajectories' ids plus
-    ``first_trajectory``; and the number ``behaviour``.
-    """
+    """All rows of a dataset, memory-mapped, and which of them to show: (n,) int64, None for all. Columns that differ
+    from the files are in memory: ends of episodes that are cut short, rewards, ids, ``behaviour``."""
     rows = load_rows(whole)
     if label == "executed":
         rows = rows.clone(recurse=False)
@@ -235,12 +230,7 @@ def read_part(
 
 @dataclass(frozen=True)
 class JoinedConfig:
-    """How the parts of joined demonstrations were collected, and which episodes were chosen.
-
-    Attributes:
-        parts: the configuration of each dataset.
-        episodes: for each dataset, task name to the indices of the chosen episodes.
-    """
+    """How the ``parts`` of joined demonstrations were collected; and for each, task name to chosen ``episodes``."""
 
     parts: tuple[CollectConfig, ...]
     episodes: tuple[dict[str, list[int]], ...]
@@ -251,11 +241,7 @@ class JoinedConfig:
 
 @dataclass(frozen=True)
 class JoinedDemonstrations:
-    """Chosen episodes of one or more datasets, as :class:`LanguageWorldExperienceReplay` joins them.
-
-    Attributes:
-        parts: each dataset's description, of the chosen episodes alone.
-    """
+    """Chosen episodes of one or more datasets, as a replay buffer joins them; ``parts`` describe these."""
 
     parts: tuple[Demonstrations, ...]
 
@@ -271,7 +257,6 @@ class JoinedDemonstrations:
 
     @property
     def config(self) -> JoinedConfig:
-        """How the parts were collected, and which episodes were chosen."""
         chosen: list[dict[str, list[int]]] = []
         for part in self.parts:
             chosen.append({})

@@ -24,7 +24,6 @@ _MAX_RUNS = 4  # runs of one part in a batch, for each part, up to which they ar
 
 
 def column_name(key: NestedKey) -> str:
-    """A column's name as one word."""
     return key if isinstance(key, str) else "/".join(key)
 
 
@@ -84,7 +83,6 @@ class JoinedStorage(Storage):
 
     Raises:
         ValueError: the parts' columns differ, or a column that ``n_steps`` needs is missing.
-        IndexError: a row outside its part.
         RuntimeError: at an attempt to write.
 
     Example:
@@ -162,7 +160,6 @@ class JoinedStorage(Storage):
         return self._read(torch.arange(len(self)) if index is None else index, [key])[key]
 
     def keys(self) -> list[NestedKey]:
-        """The names of the columns."""
         return [*self._columns, *([STEPS] if self.n_steps > 1 else [])]
 
     def _read(self, index: Tensor, keys: Sequence[NestedKey]) -> dict[NestedKey, Tensor]:
@@ -232,7 +229,6 @@ class JoinedStorage(Storage):
         raise RuntimeError("this storage is read-only: it shows datasets as they are on disk")
 
     def set(self, cursor: Any, data: Any, *, set_cursor: bool = True) -> NoReturn:
-        """Raise: nothing can be written."""
         self._read_only()
 
     def _empty(self) -> NoReturn:
@@ -248,11 +244,9 @@ class JoinedStorage(Storage):
             raise ValueError(f"state_dict must be of {self.num_joined} rows, got one of {short(length)}")
 
     def dumps(self, path: Any) -> None:
-        """Write the number of rows."""
         write_json(Path(path) / "joined.json", self.state_dict())
 
     def loads(self, path: Any) -> None:
-        """Check that what :meth:`dumps` wrote is of as many rows."""
         with reading(path, "storage's state"):
             self.load_state_dict(read_json(Path(path) / "joined.json", "the file"))
 
@@ -262,8 +256,7 @@ class JoinedStorage(Storage):
 
 
 class WholeStorage(JoinedStorage):
-    """A :class:`JoinedStorage` of all rows of one tensordict, whose slices are views: a write to one changes later
-    batches."""
+    """A :class:`JoinedStorage` of one tensordict, whose slices are views: a write to one changes later batches."""
 
     def __init__(self, rows: TensorDictBase) -> None:
         super().__init__([rows])
@@ -291,12 +284,8 @@ def to_device_of(storage: Storage, index: Tensor) -> Tensor:
 class DeviceStorage(JoinedStorage):
     """The rows of a :class:`JoinedStorage`, copied once to a device's memory.
 
-    Samplers draw on the CPU, with the buffer's generator, so minibatches are the same on every device.
-
-    Attributes:
-        device: of the rows.
-
-    Source: ``torchrl.data.LazyTensorStorage(device=...)``, whose samplers need a generator of the device.
+    Samplers draw on the CPU, with the buffer's generator, so minibatches are the same on every device. Source:
+    ``torchrl.data.LazyTensorStorage(device=...)``, whose samplers need a generator of the device.
     """
 
     def __init__(self, storage: JoinedStorage, device: torch.device) -> None:

@@ -21,11 +21,9 @@ MASK = ("collector", "mask")
 def collected_rows(batch: TensorDictBase, columns: Mapping[NestedKey, Tensor]) -> dict[NestedKey, Tensor]:
     """The ``columns`` of a collector's batch (n, ...), flattened to one dimension.
 
-    ``action`` is ``("next", "executed_action")`` where the batch has that; a policy's own may be outside [-1, 1].
-
-    Raises:
-        ValueError: a column is missing, or of another dtype or shape; a number is NaN or infinite; an action is outside
-            [-1, 1]; rows are of n steps already, or padding, by ``("collector", "mask")``.
+    ``action`` is ``("next", "executed_action")`` where the batch has that; a policy's own may be outside [-1, 1], which
+    is refused, as are other columns, dtypes or shapes, NaN, and rows of n steps or of padding, by ``("collector",
+    "mask")``.
     """
     names = set(batch.keys(True, True))
     if STEPS in names:
@@ -66,8 +64,8 @@ Columns = Mapping[NestedKey, Tensor]
 
 @dataclass(frozen=True)
 class OpenTrajectories:
-    """Trajectories that have not ended, in the order of their last rows: the collector's id of each, ours, and the
-    serial number of the last row, (K,) int64 each."""
+    """Trajectories that have not ended: the collector's ids, ours, and their last rows' serial numbers, sorted, (K,)
+    int64."""
 
     key: Tensor
     number: Tensor
@@ -114,20 +112,13 @@ def link_rows(
     serial: int,
     number: int,
 ) -> tuple[Tensor, Tensor, OpenTrajectories]:
-    """The row before each, and the number of its trajectory.
+    """The serial number of the row before each, (n,) int64, -1 where a trajectory begins; each trajectory's number,
+    (n,) int64; and the trajectories that may continue.
 
-    A row follows another if both have the same ``key``, the other is not ``done``, and its "next" is bit for bit this
-    row. Otherwise a trajectory begins: a collector was reset, or another one counts from 0 as well.
-
-    Args:
-        key: the collector's ids, (n,) int64; rows of the same key are in the order of time.
-        done, batch: the rows, (n,) bool and the columns.
-        opened: the trajectories that may continue, whose last rows are in ``ring`` at ``slots``, (K,) int64.
-        serial, number: of the first row, and of the next trajectory.
-
-    Returns:
-        The serial number of the row before each, (n,) int64, -1 where a trajectory begins; each trajectory's number,
-        (n,) int64; and the trajectories that may continue.
+    A row follows another if both have the same ``key``, (n,) int64, the collector's id, the other is not ``done``, and
+    its "next" is bit for bit this row. Otherwise a trajectory begins: a collector was reset, or another one counts from
+    0 as well. Rows of a key are in the order of time. ``opened`` trajectories may continue, whose last rows are in
+    ``ring`` at ``slots``, (K,) int64. ``serial`` and ``number`` are those of the first row, and of the next trajectory.
     """
     order = key.argsort(stable=True)
     one, next_one = order[:-1], order[1:]

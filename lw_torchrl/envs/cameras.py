@@ -52,12 +52,7 @@ def _close_all() -> None:
 
 
 class Cameras:
-    """Takes pictures, in any thread but one at a time; a model's meshes and textures are loaded at its first picture.
-
-    Raises:
-        ImportError: there is no OpenGL, at once or with the first picture.
-        RuntimeError: this process was forked from one that took pictures.
-    """
+    """Takes pictures, in any thread, one at a time; a model's meshes and textures are loaded at its first picture."""
 
     def __init__(self) -> None:
         if _processes - {os.getpid()}:
@@ -77,8 +72,7 @@ class Cameras:
         self._loaded: dict[str, tuple[Any, Any]] = {}
 
     def picture(self, scene: str, model: Any, data: Any, *, camera: str, height: int, width: int) -> NDArray[np.uint8]:
-        """One picture of a state, (height, width, 3) uint8, the first line on top; models with the same meshes share
-        the name of a ``scene``."""
+        """One picture of a state, (height, width, 3) uint8; models with the same meshes share a ``scene``'s name."""
         self._gl.make_current()
         try:
             return self._picture(scene, model, data, camera, height, width)
@@ -113,7 +107,6 @@ class Cameras:
         return pixels[:, ::-1] if camera in _ROLLED else pixels[::-1]
 
     def close(self) -> None:
-        """Free the context and what it holds."""
         if self not in _open or os.getpid() not in _processes:
             return
         _open.remove(self)

@@ -18,16 +18,15 @@ __all__ = ["ACTION_SIZE", "OBSERVATION_SIZE", "BodyPoses", "Engine", "EngineStep
 
 
 class EngineStep(NamedTuple):
-    """The result of one step of all rows, in fresh arrays.
+    """The result of one step of all rows, in fresh arrays; rows that were not active repeat their last observation,
+    with reward 0, success False and fault False.
 
     Attributes:
         observation: (N, 39) float64, Meta-World's vector (metres; gripper opening in [0, 1]; quaternions).
-        reward: (N,) float64; Meta-World's dense reward, or the success as 0 and 1.
-        success: (N,) bool, Meta-World's success at this step.
+        reward, success: (N,) float64, Meta-World's dense reward, or the success as 0 and 1; (N,) bool, Meta-World's
+            success.
         fault: (N,) bool, true where the simulation became unstable; such a row repeats its last stable observation
             until it is reset.
-
-    Rows that were not active repeat their last observation, with reward 0, success False and fault False.
     """
 
     observation: NDArray[np.float64]
@@ -62,24 +61,15 @@ class Pictured(Engine, Protocol):
 
 
 class RowModel(NamedTuple):
-    """The compiled MuJoCo model of a row, to read.
-
-    Attributes:
-        path: its XML file; models of one file have the same geoms and meshes.
-        model: the MjModel. Rows share it, so its ``body_pos`` and ``site_pos`` may be another row's.
-    """
+    """The compiled MuJoCo model of a row, to read, and the ``path`` of its XML file; models of one file have the same
+    meshes. Rows share a model, so its ``body_pos`` and ``site_pos`` may be another row's."""
 
     path: str
     model: Any
 
 
 class BodyPoses(NamedTuple):
-    """Where the bodies of a row are, in fresh arrays.
-
-    Attributes:
-        position: (bodies, 3) float64, metres, in the world's frame.
-        quaternion: (bodies, 4) float64, w first.
-    """
+    """Where the bodies are: (bodies, 3) float64, metres, in the world's frame, and (bodies, 4) float64, w first."""
 
     position: NDArray[np.float64]
     quaternion: NDArray[np.float64]

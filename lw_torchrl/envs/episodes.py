@@ -34,8 +34,7 @@ class FinishedEpisode(NamedTuple):
 
 
 def policy_of(actor: Any, device: str | torch.device | None = None) -> Callable[[TensorDictBase], TensorDictBase]:
-    """The actor as episodes are run with it, on a device, or where it is. Networks run on blocks of rows of one size,
-    so that no row depends on the others."""
+    """The actor, on a device or where it is; networks run on blocks of one size, so no row depends on the others."""
     there = place(actor, device)
     policy = actor if getattr(actor, "row_by_row", False) else in_blocks(actor)
     if there == CPU:
@@ -77,12 +76,11 @@ def run_episodes(
         policy: called on all N rows, with a ``_step`` mask of those that count.
         episodes: task name to episode indices; one that is listed several times is run as often.
         keys: what to record of each step, ``("next", "success")`` say; ``action`` is the executed one.
-        noise: episode index to the four standard deviations of the noise added to the action, drawn from the
-            episode's (task, seed, episode); None for none.
-        noise_hold: steps for which each draw of the noise is kept.
+        noise, noise_hold: episode index to the four standard deviations of the noise added to the action, and the steps
+            for which each draw is kept.
         after_success: end an episode so many steps after its first successful one; None for never.
-        clean_action: the key for the action before the noise.
-        place: the key for the place of each row's episode in its task's list, (N,) int64, for the policy to read.
+        clean_action, place: keys for the action before the noise, and for the place of each row's episode in its task's
+            list, (N,) int64, for the policy to read.
         on_progress: called after each step with the number of steps done, with those that an early end saves.
     """
     base = env.base_env if isinstance(env, TransformedEnv) else env

@@ -24,16 +24,13 @@ _quiet = Lock()  # Python's filters of warnings are the process's: two threads w
 class ExpertActor(TensorDictModuleBase):
     """Meta-World's scripted policy of each row's task.
 
-    Reads ``observation`` (B, 39) float32 and ``task_id`` (B,) int64; writes ``action`` (B, 4) float32, clipped to
-    [-1, 1], and ``unclipped_action`` (B, 4) float32, what the script asked for, usually far more. Rows that a
-    ``_step`` mask (B,) leaves out get zeros.
+    Reads ``observation`` (B, 39) float32 and ``task_id`` (B,) int64; writes ``action`` (B, 4) float32, clipped to [-1,
+    1], and ``unclipped_action`` (B, 4) float32, what the script asked for, usually far more. Rows that a ``_step`` mask
+    (B,) leaves out get zeros. A task_id outside ``tasks`` raises a ValueError.
 
     Args:
         tasks: the tasks it must know, as for :func:`resolve_tasks`.
         in_keys, out_keys: other names for these keys, in the order above; nested ones too.
-
-    Raises:
-        ValueError: an unknown task, or at call time a task_id outside ``tasks``.
 
     Example:
         >>> import lw_torchrl as lw
@@ -63,7 +60,6 @@ class ExpertActor(TensorDictModuleBase):
 
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``out_keys``."""
         observation, given = (tensordict.get(key, None) for key in self.in_keys)
         if observation is None or given is None:
             raise missing_keys(tensordict.keys(True, True), *self.in_keys)

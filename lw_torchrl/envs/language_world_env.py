@@ -21,22 +21,15 @@ from lw_torchrl._checks import check_int, checked
 from lw_torchrl._rendering import check_picture
 from lw_torchrl.envs.engine import ACTION_SIZE, Engine
 from lw_torchrl.envs.engines import make_engine
-from lw_torchrl.envs.row_states import (
-    RowStates,
-    action_spec,
-    clipped_action,
-    done_spec,
-    observation_spec,
-    row_mask,
-)
+from lw_torchrl.envs.row_states import RowStates, action_spec, clipped_action, done_spec, observation_spec, row_mask
 from lw_torchrl.envs.seeding import EpisodeCounter, check_worker, stated_episode
 from lw_torchrl.envs.workers import OneThread, one_thread_at_a_time, torchrl_worker
 from lw_torchrl.language.tasks import Task, named_tasks
 
 
 class LanguageWorldEnv(EnvBase):
-    """N environments over any mixture of the 50 tasks, stepped together, by the MT50-rand protocol: a random
-    initial state and goal at every reset, the goal observed, 500 steps, ended only by truncation.
+    """N environments over any mixture of the 50 tasks, stepped together, by the MT50-rand protocol: a random initial
+    state and goal at every reset, the goal observed, 500 steps, ended only by truncation.
 
     Row i has the task ``tasks[i % n]``. The m-th reset of the r-th of a task's R rows is that task's episode m·R + r.
     An episode starts as Meta-World's own environment does after ``env.seed(episode_seed(task, seed, episode));
@@ -55,23 +48,20 @@ class LanguageWorldEnv(EnvBase):
 
     ``state_dict`` holds the seed and the counters; an environment that loads it must be reset, and continues with the
     next episodes. A TransformedEnv, and a Collector with it, saves it by its
-    :class:`~lw_torchrl.transforms.QAFTransform` or :class:`~lw_torchrl.transforms.EnvState`; call
-    ``collector.reset()`` after ``collector.load_state_dict``.
+    :class:`~lw_torchrl.transforms.QAFTransform` or :class:`~lw_torchrl.transforms.EnvState`; call ``collector.reset()``
+    after ``collector.load_state_dict``.
 
-    Keys (B = (N,)):
+    Keys (B = (N,)); a ``_step`` mask leaves rows where they are, a ``_reset`` mask resets only its rows:
         observation: (N, 39) float32, Meta-World's vector: metres, gripper opening in [0, 1], quaternions.
-        task_id: (N,) int64, rank of the task's name among the 50 sorted names.
-        episode: (N,) int64, index of the episode.
+        task_id, episode: (N,) int64, rank of the task's name among the 50 sorted names, and index of the episode.
         success: (N, 1) bool, Meta-World's success at this step.
         fault: (N, 1) bool, the row was truncated because its action was NaN or its simulation became unstable.
         action: (N, 4) float32, end-effector displacement xyz and gripper effort, each in [-1, 1]. The environment never
             writes it: a policy's numbers out of range keep their likelihood.
         executed_action: (N, 4) float32 in [-1, 1], the action of the step that led here, clipped as Meta-World does.
             Zeros after a reset, and for a row that was not stepped.
-        reward: (N, 1) float32; done, terminated, truncated: (N, 1) bool; terminated stays false unless
-            ``terminate_on_success``.
-
-    A ``_step`` mask leaves rows where they are; a ``_reset`` mask resets only its rows.
+        reward: (N, 1) float32.
+        done, terminated, truncated: (N, 1) bool; terminated stays false unless ``terminate_on_success``.
 
     Args:
         tasks: "MT10", "MT50", a task's name, or a list of names. A :class:`~lw_torchrl.Task` stands for its name; one
@@ -90,7 +80,6 @@ class LanguageWorldEnv(EnvBase):
         batch_size: () for a single environment without the dimension of rows, for AsyncEnvPool.
 
     Raises:
-        ValueError: an unknown task or engine, ``num_envs`` under the number of tasks, or a wrong ``episode``.
         RuntimeError: a step of a row that has ended; a reset or step in a forked process that did not make it, or while
             another thread is in one, or draws.
         TypeError: it is pickled or copied; pass the function that makes it.
@@ -195,11 +184,7 @@ class LanguageWorldEnv(EnvBase):
             self._rows.over[:] = True
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
-        """Take seed and episode counters from another's ``state_dict()``, and require a reset.
-
-        Raises:
-            ValueError: the state is of other tasks or rows; with ``strict``, there is none.
-        """
+        """Take seed and episode counters from another's ``state_dict()``, of the same rows, and require a reset."""
         if strict and not state_dict:
             raise ValueError(
                 "state_dict is empty: a Collector saves the state of an environment only in a TransformedEnv with a "
@@ -298,7 +283,7 @@ class LanguageWorldEnv(EnvBase):
         self, *, camera: str = "corner2", height: int = 240, width: int = 320, rows: Sequence[int] | None = None
     ) -> Tensor:
         """Pictures of rows as they are now, for TorchRL's PixelRenderTransform and VideoRecorder, and
-        :class:`CameraTransform`.
+        :class:`CameraTransform`: (len(rows), height, width, 3) uint8, (height, width, 3) with ``batch_size=()``.
 
         OpenGL draws them, without shadows; on Linux without a display and MUJOCO_GL it is EGL. A picture changes
         nothing in the simulation. With a PixelRenderTransform, read the environment's ``observation_spec`` before the
@@ -309,11 +294,7 @@ class LanguageWorldEnv(EnvBase):
             height, width: pixels.
             rows: which to draw, by their numbers; None for all.
 
-        Returns:
-            (len(rows), height, width, 3) uint8, (height, width, 3) with ``batch_size=()``.
-
         Raises:
-            ValueError: an unknown camera or size, or no such row.
             RuntimeError: a row that was never reset; or the process was forked from one that took pictures.
             ImportError: there is no OpenGL; it names what to install.
             NotImplementedError: your own engine has no ``render``.

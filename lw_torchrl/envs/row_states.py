@@ -17,7 +17,7 @@ from lw_torchrl.language.tasks import MT50, task_id
 
 
 class TaskIds(Categorical):
-    """Each row's task: a Categorical of n whose zero is the row's own id, (N,) int64, so that policies can act on
+    """Each row's task: a Categorical whose zero is the row's own id, (N,) int64, so that policies can act on
     ``fake_tensordict()``, which is of zeros: they may not know the task of id 0."""
 
     ids: Tensor | None = None
@@ -78,12 +78,10 @@ def observation_spec(task_id: Tensor) -> Composite:
 
 
 def action_spec(n: int) -> Bounded:
-    """The action of each of n rows."""
     return Bounded(-1.0, 1.0, (n, ACTION_SIZE))
 
 
 def done_spec(n: int) -> Composite:
-    """How each of n rows may end."""
     return Composite(done=_flag(n), terminated=_flag(n), truncated=_flag(n), shape=(n,))
 
 
@@ -130,7 +128,6 @@ class RowStates:
         self.over[:] = True
 
     def begin(self, rows: Rows, episodes: NDArray[np.int64], observation: NDArray[np.float64]) -> None:
-        """Put rows at the beginning of an episode."""
         self.observation[rows] = observation
         self.episode[rows] = episodes
         self.steps[rows] = 0

@@ -19,15 +19,8 @@ from lw_torchrl.language.tasks import Task
 
 
 def episode_seed(task: str | Task, seed: int, episode: int) -> int:
-    """The seed of one episode: a stable hash, so that no two (task, seed, episode) share their randomness.
-
-    Args:
-        task: a task's name, "pick-place"; for a task of one's own, the Task.
-        seed: the environment's seed, any integer.
-        episode: index of the episode, from 0.
-
-    Returns:
-        An integer in [0, 2**63), for Meta-World's ``env.seed``.
+    """The seed of one episode, in [0, 2**63), for Meta-World's ``env.seed``: a stable hash, so that no two (task, seed,
+    episode) share their randomness. The task is a name, "pick-place", or for one of one's own the Task.
 
     Example:
         >>> episode_seed("reach", 0, 0) == episode_seed("reach", 0, 0)
@@ -39,8 +32,7 @@ def episode_seed(task: str | Task, seed: int, episode: int) -> int:
 
 
 def action_noise(task: str | Task, seed: int, episode: int, steps: int, hold: int = 1) -> NDArray[np.float32]:
-    """Standard normal noise for the actions of one episode, (steps, 4) float32, the same wherever it is drawn; each
-    draw is kept for ``hold`` steps."""
+    """Standard normal noise for an episode's actions, (steps, 4) float32; each draw is kept for ``hold`` steps."""
     draws = episode_generator("noise", task, seed, episode).standard_normal((-(-steps // hold), 4), dtype=np.float32)
     return draws.repeat(hold, axis=0)[:steps]
 
@@ -94,7 +86,6 @@ class EpisodeCounter:
         self.resets[:] = 0
 
     def next(self, rows: Rows) -> Episodes:
-        """The episodes that come next in ``rows``."""
         return (self.resets * self._stride + self._first)[rows]
 
     def asked(self, episode: int | Tensor, rows: Rows) -> Episodes:
@@ -117,7 +108,6 @@ class EpisodeCounter:
         return found
 
     def seeds(self, rows: Rows, episodes: Episodes) -> list[int]:
-        """The simulator's seed of each row's episode."""
         return [
             episode_seed(self.tasks[row], self.seed, int(episode)) for row, episode in zip(rows, episodes, strict=True)
         ]

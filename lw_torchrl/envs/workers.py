@@ -1,8 +1,4 @@
-"""Which of TorchRL's workers an environment is made in, and the lock that lets in one thread at a time.
-
-One factory, called in each worker, must not give the same episodes, but TorchRL tells it nothing of its worker. The
-TorchRL functions that call it know: they are found on the call stack, which needs no state.
-"""
+"""Which of TorchRL's workers makes an environment, found on the call stack; and a lock for one thread at a time."""
 
 from __future__ import annotations
 
@@ -36,7 +32,8 @@ def _remote(found: Locals) -> tuple[int, int]:
     return (0, 1) if index is None or parent_process() is not None else (index, MANY)
 
 
-# Where TorchRL (0.14) calls a factory: module and function to its (rank, of), from the function's local variables.
+# Where TorchRL (0.14), which tells a factory nothing of its worker, calls one: module and function to its (rank, of),
+# from the function's local variables. A factory must not give each worker the same episodes.
 _WORKERS: dict[tuple[str, str], Callable[[Locals], tuple[int, int]]] = {
     ("torchrl.envs.batched_envs", "SerialEnv._start_workers"): lambda found: (found["idx"], found["_num_workers"]),
     # An environment of environments, which starts its own at its first reset.
@@ -56,12 +53,9 @@ _WORKER_PROCESSES: dict[tuple[str, str], Callable[[Locals], tuple[int, int]]] = 
 
 
 def torchrl_worker() -> tuple[int, int]:
-    """(rank, of) of the worker that this is called in, (0, 1) outside; a RuntimeError in a ThreadingAsyncEnvPool.
-
-    Workers within workers are counted through. SerialEnv and ParallelEnv say how many there are; for collectors and
-    AsyncEnvPool ``of`` is :data:`MANY`. Workers of a ParallelEnv without shared buffers are known by the order in which
-    they were started.
-    """
+    """(rank, of) of the worker that this is called in, (0, 1) outside; workers within workers are counted through. For
+    collectors and AsyncEnvPool ``of`` is :data:`MANY`. Workers of a ParallelEnv without shared buffers are known by the
+    order in which they were started."""
     rank, of, processes = 0, 1, 0
     frame: FrameType | None = sys._getframe(1)
     while frame is not None:
@@ -84,10 +78,8 @@ Method = TypeVar("Method", bound=Callable[..., Any])
 
 class OneThread:
     """Lets one thread in at a time, which may enter again; two would break MuJoCo's memory or, silently, its numbers.
-    Entering raises a RuntimeError if another thread is in for longer than ``patience`` seconds.
-
-    The lock is an RLock: a Lock would stay taken if an interrupt came between taking it and the block.
-    """
+    Entering raises a RuntimeError if another thread is in for longer than ``patience`` seconds. A Lock, unlike the
+    RLock, would stay taken if an interrupt came between taking it and the block."""
 
     def __init__(self, lock: Any, patience: float = 0.0) -> None:
         self._lock, self._patience = lock, patience

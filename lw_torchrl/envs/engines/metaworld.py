@@ -23,10 +23,8 @@ def import_metaworld() -> Any:
 
 
 def make_metaworld_env(task: str, *, max_steps: int = 500) -> Any:
-    """Meta-World's own environment of ``task``, goal observable, a new initial state and goal at every reset.
-
-    Seed it with ``env.seed(seed)``; Meta-World ignores ``reset(seed=...)``.
-    """
+    """Meta-World's own environment of ``task``, goal observable, a new initial state and goal at every reset. Seed it
+    with ``env.seed(seed)``; Meta-World ignores ``reset(seed=...)``."""
     import_metaworld()
     from metaworld.env_dict import ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE
 
@@ -39,13 +37,7 @@ def make_metaworld_env(task: str, *, max_steps: int = 500) -> Any:
 
 
 class MetaWorldEngine:
-    """Meta-World's ``env.step`` in a loop: slow, and the oracle for every other engine.
-
-    Args:
-        tasks: the task of each row.
-        reward: "sparse" for the success as 0 and 1, "dense" for Meta-World's own reward.
-        num_threads: ignored; Meta-World runs in one thread.
-    """
+    """Meta-World's ``env.step`` in a loop, in one thread: slow, and the oracle for every other engine."""
 
     def __init__(
         self, tasks: Sequence[str], *, reward: Literal["sparse", "dense"] = "sparse", num_threads: int | None = None

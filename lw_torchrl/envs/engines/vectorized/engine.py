@@ -14,26 +14,11 @@ from numpy.typing import NDArray
 from lw_torchrl._checks import check_choice, check_int
 from lw_torchrl.envs.cameras import Cameras
 from lw_torchrl.envs.engine import ACTION_SIZE, OBSERVATION_SIZE, BodyPoses, EngineStep, RowModel
-from lw_torchrl.envs.engines.vectorized.observation import CURRENT, REWARD_WIDTH, WIDTH, Array, Index, Mask, Observer
+from lw_torchrl.envs.engines.vectorized import observation as at
+from lw_torchrl.envs.engines.vectorized import simulated_rows, task_programs
+from lw_torchrl.envs.engines.vectorized.observation import Array, Index, Mask, Observer, SuccessFunction
 from lw_torchrl.envs.engines.vectorized.rewards.dense_reward import DenseReward, EpisodeStarts
-from lw_torchrl.envs.engines.vectorized.simulated_rows import (
-    WARNING_KINDS,
-    RowGroup,
-    SimulatedRow,
-    WorkerPool,
-    is_stable,
-    split_into_groups,
-)
-from lw_torchrl.envs.engines.vectorized.success import SuccessFunction
 from lw_torchrl.envs.engines.vectorized.tables import reward_table, simulation_table
-from lw_torchrl.envs.engines.vectorized.task_programs import (
-    SharedModel,
-    borrow_model,
-    check_versions,
-    make_task_program,
-    model_path,
-    return_models,
-)
 from lw_torchrl.language.tasks import check_task
 
 FINGERS = np.array([1.0, -1.0])
@@ -41,35 +26,26 @@ FINGERS = np.array([1.0, -1.0])
 
 
 def available_cores() -> int:
-    """The cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 class VectorizedEngine:
-    """Simulates all rows together: physics in threads, everything else in NumPy over all rows at once.
+    """Simulates all rows together: physics in threads, by default one a core, everything else in NumPy over all rows.
 
     Its numbers are those of :class:`~lw_torchrl.envs.engines.metaworld.MetaWorldEngine`, bit for bit, whatever the
-    number of threads. The rows of one XML file share a compiled model; each has a state of its own.
+    number of threads. The rows of one XML file share a compiled model; each has a state of its own. Another Meta-World
+    or MuJoCo than the one this engine was compared with is an ImportError.
 
     A row faults when its action is not finite, or when its simulation becomes unstable. It then repeats its last stable
     observation and is not simulated until it is reset; other rows are not affected.
-
-    Args:
-        tasks: the task of each row.
-        reward: "sparse" for the success as 0 and 1, "dense" for Meta-World's own reward.
-        num_threads: by default the cores this process may use.
-
-    Raises:
-        ImportError: another Meta-World or MuJoCo than the one this engine was compared with.
 
     Example:
         >>> engine = VectorizedEngine(["reach", "push"], num_threads=1)
         >>> engine.reset([0, 1], seeds=[7, 8]).shape
         (2, 39)
-        >>> result = engine.step(np.zeros((2, 4), np.float32), np.array([True, True]))
-        >>> result.success
+        >>> engine.step(np.zeros((2, 4), np.float32), np.array([True, True])).success
         array([False, False])
         >>> engine.close()
     """
@@ -77,33 +53,34 @@ class VectorizedEngine:
     def __init__(
         self, tasks: Sequence[str], *, reward: Literal["sparse", "dense"] = "sparse", num_threads: int | None = None
     ) -> None:
-        check_versions()
+        task_programs.check_versions()
         dense = check_choice("reward", reward, ("sparse", "dense")) == "dense"
         if num_threads is None:
             num_threads = available_cores()
         num_threads = check_int("num_threads", num_threads, minimum=1)
         table = simulation_table()
         tasks = [check_task(task) for task in tasks]
-        self._groups = split_into_groups([model_path(task) for task in tasks], num_threads)
+        self._groups = simulated_rows.split_into_groups([task_programs.model_path(task) for task in tasks], num_threads)
         self._group_of_row = np.empty(len(tasks), dtype=np.intp)
         builders: list[Any] = [None] * len(tasks)
-        models: list[SharedModel] = []
+        models: list[task_programs.SharedModel] = []
         # A borrowed model goes back even if the engine is never closed.
-        self._return_models = weakref.finalize(self, return_models, models)
+        self._return_models = weakref.finalize(self, task_programs.return_models, models)
         for number, group in enumerate(self._groups):
-            models.append(borrow_model(model_path(tasks[group.rows[0]])))
-            programs = {task: make_task_program(task, models[-1]) for task in {tasks[row] for row in group.rows}}
+            models.append(task_programs.borrow_model(task_programs.model_path(tasks[group.rows[0]])))
+            here = {tasks[row] for row in group.rows}
+            programs = {task: task_programs.make_task_program(task, models[-1]) for task in here}
             for row in group.rows:
                 self._group_of_row[row] = number
                 builders[row] = programs[tasks[row]]
         rewards = [reward_table()[task] if dense else None for task in tasks]
         self._starts = EpisodeStarts([reward for reward in rewards if reward is not None]) if dense else None
-        self._width = REWARD_WIDTH if dense else WIDTH
+        self._width = at.REWARD_WIDTH if dense else at.WIDTH
         self._rows = [
-            SimulatedRow(table[task], models[number], builder, task_reward)
+            simulated_rows.SimulatedRow(table[task], models[number], builder, task_reward)
             for task, number, builder, task_reward in zip(tasks, self._group_of_row, builders, rewards, strict=True)
         ]
-        self._pool = WorkerPool(num_threads)
+        self._pool = simulated_rows.WorkerPool(num_threads)
         self._cameras: Cameras | None = None
 
         n = len(tasks)
@@ -126,7 +103,6 @@ class VectorizedEngine:
         self._running: _RunningRows | None = None
 
     def reset(self, rows: Sequence[int], seeds: Sequence[int]) -> Array:
-        """Start an episode in each of ``rows``, as Meta-World's ``env.seed(seed); env.reset()`` does."""
         index = np.asarray(rows, dtype=np.intp).reshape(-1)
         if len(index) != len(seeds):
             raise ValueError(f"seeds must be as many as rows, {len(index)}, got {len(seeds)}")
@@ -142,13 +118,12 @@ class VectorizedEngine:
                 self._starts.begin(row, self._rows[row].program)
 
         self._pool.work(self._by_group(index), reset)
-        self._current[index] = self._observation[index, CURRENT]
+        self._current[index] = self._observation[index, at.CURRENT]
         self._faulted[index] = False
         self._started[index] = True
         return self._observation[index]
 
     def step(self, action: NDArray[Any], active: Mask) -> EngineStep:
-        """Step the rows where ``active`` (N, bool) with ``action`` (N, 4), in the action's own precision."""
         n = len(self._rows)
         action, active = np.asarray(action), np.asarray(active, dtype=bool)
         if action.shape != (n, ACTION_SIZE) or active.shape != (n,):
@@ -168,17 +143,14 @@ class VectorizedEngine:
         return EngineStep(self._observation.copy(), reward, success, active & self._faulted)
 
     def render(self, rows: Sequence[int], *, camera: str, height: int, width: int) -> NDArray[np.uint8]:
-        """Pictures of rows, (len(rows), height, width, 3) uint8; they change nothing in the simulation."""
         cameras = self._cameras = self._cameras or Cameras()
         pictures = [self._rows[row].picture(cameras, camera=camera, height=height, width=width) for row in rows]
         return np.stack(pictures)
 
     def model(self, row: int) -> RowModel:
-        """The compiled model of a row, which other rows use too."""
         return self._rows[row].model
 
     def poses(self, row: int) -> BodyPoses:
-        """Where the bodies of a row are now."""
         return self._rows[row].poses()
 
     def close(self) -> None:
@@ -197,7 +169,7 @@ class VectorizedEngine:
         mocap = np.minimum(np.maximum(self._mocap[rows] + shift, running.mocap_low), running.mocap_high)
         self._mocap[rows] = mocap
         sensors = np.empty((len(rows), self._width))
-        warnings = np.empty((len(rows), WARNING_KINDS), dtype=np.int32)
+        warnings = np.empty((len(rows), simulated_rows.WARNING_KINDS), dtype=np.int32)
         control = action[:, 3:] * FINGERS
 
         def simulate(k: int) -> None:
@@ -211,7 +183,7 @@ class VectorizedEngine:
         np.clip(observation, running.low, running.high, out=observation)
         achieved = running.success(sensors, current, goal)
         rewards = achieved if running.reward is None else running.reward(sensors, observation, goal, action)
-        stable = is_stable(observation, warnings)
+        stable = simulated_rows.is_stable(observation, warnings)
         if not stable.all():
             self._faulted[rows[~stable]] = True
             rows, current, observation = rows[stable], current[stable], observation[stable]
@@ -228,7 +200,7 @@ class VectorizedEngine:
             self._running = _RunningRows(self, running, key)
         return self._running
 
-    def _by_group(self, rows: Index) -> list[tuple[RowGroup, list[int]]]:
+    def _by_group(self, rows: Index) -> list[tuple[simulated_rows.RowGroup, list[int]]]:
         items: dict[int, list[int]] = defaultdict(list)
         for row, number in zip(rows.tolist(), self._group_of_row[rows].tolist(), strict=True):
             items[number].append(row)

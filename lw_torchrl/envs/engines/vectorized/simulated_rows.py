@@ -29,11 +29,9 @@ VELOCITIES_DONE = int(mujoco.mjtStage.mjSTAGE_VEL)
 
 
 class SimulatedRow:
-    """A state, the positions that its last reset gave to bodies and sites, and Meta-World's program for its task.
-
-    No other thread may use the ``shared`` model while this row simulates or resets. Each episode takes a copy of
-    ``builder``, the task's program on that model. The dense reward says which sensors it needs.
-    """
+    """A state, the positions that its last reset gave to bodies and sites, and Meta-World's program for its task, a
+    copy of ``builder`` for each episode. No other thread may use the ``shared`` model while this row simulates or
+    resets."""
 
     def __init__(self, sources: TaskSources, shared: SharedModel, builder: Any, reward: TaskReward | None) -> None:
         self.sources = sources
@@ -83,15 +81,12 @@ class SimulatedRow:
 
     @property
     def model(self) -> RowModel:
-        """The model that the row shares."""
         return RowModel(self.shared.path, self._model)
 
     def poses(self) -> BodyPoses:
-        """Where the bodies are."""
         return BodyPoses(self._data.xpos.copy(), self._data.xquat.copy())
 
     def picture(self, cameras: Cameras, **size: Any) -> NDArray[np.uint8]:
-        """A picture of the row as it is now."""
         self._take_model()
         return cameras.picture(self.shared.path, self._model, self._data, **size)
 
@@ -120,8 +115,7 @@ def is_stable(observation: Array, warnings: NDArray[np.int32]) -> NDArray[np.boo
 
 
 class RowGroup:
-    """Index that share a model, and so take turns; ``seconds`` is the time of each row's last work, an estimate of the
-    next."""
+    """Rows that share a model, and so take turns; ``seconds`` is the time of each row's last work."""
 
     def __init__(self, rows: Sequence[int]) -> None:
         self.rows = tuple(rows)
@@ -129,8 +123,7 @@ class RowGroup:
 
 
 def split_into_groups(keys: Sequence[str], num_threads: int) -> list[RowGroup]:
-    """Put the rows with one key (the model's file) together, in several groups only if one would keep a thread busy for
-    more than half of its share."""
+    """Put the rows with one key together, apart only if they would keep a thread busy for over half of its share."""
     by_key: dict[str, list[int]] = defaultdict(list)
     for row, key in enumerate(keys):
         by_key[key].append(row)
@@ -144,10 +137,8 @@ def split_into_groups(keys: Sequence[str], num_threads: int) -> list[RowGroup]:
 
 
 class WorkerPool:
-    """Threads that take one group after another until none is left, those that took long last time first.
-
-    One thread at a time works on a group, so its rows may share a model; which thread changes no result.
-    """
+    """Threads that take one group after another, those that took long last time first, until none is left. One thread
+    at a time works on a group, so its rows may share a model; which thread changes no result."""
 
     def __init__(self, num_threads: int) -> None:
         self._helpers = num_threads - 1
@@ -184,6 +175,5 @@ class WorkerPool:
             raise error
 
     def close(self) -> None:
-        """End the threads."""
         if self._threads is not None:
             self._threads.shutdown()

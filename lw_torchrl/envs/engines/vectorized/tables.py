@@ -226,7 +226,7 @@ def parse_simulation_table(text: str) -> dict[str, TaskSources]:
 
 
 def parse_reward_table(text: str) -> dict[str, TaskReward]:
-    """Read TOML; :class:`ValueError` names the task of an entry that is not understood."""
+    """As :func:`parse_simulation_table`."""
     parts = {"near": Term, "placed": Term, "via": Term, "cage": Cage, "funnel": Funnel, "held": Held}
     return _parse(text, "reward", TaskReward, parts)
 
@@ -237,11 +237,9 @@ def _shipped(name: str) -> str:
 
 @cache
 def simulation_table() -> Mapping[str, TaskSources]:
-    """The sources of all 50 tasks, by task name."""
     return MappingProxyType(parse_simulation_table(_shipped("simulation.toml")))
 
 
 @cache
 def reward_table() -> Mapping[str, TaskReward]:
-    """The rewards of all 50 tasks, by task name."""
     return MappingProxyType(parse_reward_table(_shipped("rewards.toml")))

@@ -36,9 +36,9 @@ def check_versions() -> None:
 
 
 class SharedModel:
-    """A compiled model that many rows use in turn, never at the same time: a reset of a Meta-World task moves bodies
-    and sites of the model itself, so each row keeps its own ``body_pos`` and ``site_pos``, and loads them before its
-    physics unless it is still the ``holder``."""
+    """A compiled model that many rows use in turn: a reset of a Meta-World task moves bodies and sites of the model
+    itself, so each row keeps its own ``body_pos`` and ``site_pos``, and loads them before its physics unless it is
+    still the ``holder``."""
 
     def __init__(self, path: str, model: Any) -> None:
         self.path = path
@@ -50,13 +50,11 @@ class SharedModel:
         self.holder: object = None
 
     def load(self, holder: object, body_pos: NDArray[np.float64], site_pos: NDArray[np.float64]) -> None:
-        """Put the holder's bodies and sites into the model."""
         self.holder = holder
         self.body_pos[...] = body_pos
         self.site_pos[...] = site_pos
 
     def restore(self) -> None:
-        """Put the bodies and sites back where the XML file has them."""
         self.load(None, self.compiled_body_pos, self.compiled_site_pos)
 
     def duplicate(self) -> SharedModel:
@@ -100,10 +98,8 @@ counts here instead: nothing is written, and a count that is another number tell
 
 
 class TaskProgram:
-    """A Meta-World environment without a simulator of its own, mixed into one of Meta-World's classes.
-
-    It is built once for each model; every episode of every row runs on a light copy (:meth:`on`) that shares everything
-    but the state.
+    """A Meta-World environment without a simulator of its own, mixed into one of Meta-World's classes. It is built once
+    for each model; every episode of every row runs on a light copy (:meth:`on`) that shares everything but the state.
     """
 
     model: Any
@@ -143,12 +139,10 @@ class TaskProgram:
         return program
 
     def start_episode(self, seed: int) -> NDArray[np.float64]:
-        """Reset as Meta-World's ``env.seed(seed); env.reset()`` does; returns the first observation.
-
-        Meta-World places everything twice and simulates the hand's way to its start both times. Of the first round only
-        the random draws and the positions of bodies and sites survive, which do not depend on the hand, so here the
-        first round does not move it.
-        """
+        """Reset as Meta-World's ``env.seed(seed); env.reset()`` does; returns the first observation. Meta-World places
+        everything twice and simulates the hand's way both times. Of the first round only the random draws and the
+        positions of bodies and sites survive, which do not depend on the hand, so here the first round does not move
+        it."""
         self.np_random, _ = seeding.np_random(seed)
         mujoco.mj_resetData(self.model, self.data)
         self.data.warning.number[:] = WARNED_ALREADY
@@ -192,5 +186,4 @@ def model_path(task: str) -> str:
 
 
 def make_task_program(task: str, shared: SharedModel) -> Any:
-    """Meta-World's program of ``task`` on a shared model."""
     return _program_class(task)(shared.model)

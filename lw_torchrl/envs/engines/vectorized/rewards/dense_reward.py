@@ -10,21 +10,8 @@ from numpy.typing import NDArray
 
 from lw_torchrl._checks import check_choice
 from lw_torchrl.envs.engines.vectorized.observation import CURRENT, GRIPPER, OBJECT, Array, Index, Mask
+from lw_torchrl.envs.engines.vectorized.rewards import terms
 from lw_torchrl.envs.engines.vectorized.rewards.formulas import FORMULAS, LIFTS, StepState
-from lw_torchrl.envs.engines.vectorized.rewards.parameters import (
-    CONSTANT,
-    EPISODE,
-    FEATURES,
-    MARK,
-    NEAR,
-    PLACED,
-    START,
-    TCP_START,
-    gather_features,
-    make_parameters,
-    waypoint_numbers,
-)
-from lw_torchrl.envs.engines.vectorized.rewards.terms import CagingTerm, FunnelTerm, Proximity, ProximityTerms, limited
 from lw_torchrl.envs.engines.vectorized.tables import FIRST_DISTANCE, TaskReward
 
 FULL_REWARD = 10.0
@@ -39,19 +26,18 @@ class EpisodeStarts:
             if reward.lift is not None:
                 check_choice("lift", reward.lift, LIFTS)
         self.rewards = tuple(rewards)
-        self.task = make_parameters(rewards)
-        self.points = np.zeros((len(rewards), EPISODE.stop - EPISODE.start))
+        self.task = terms.make_parameters(rewards)
+        self.points = np.zeros((len(rewards), terms.EPISODE.stop - terms.EPISODE.start))
         self.less = self.task.less.copy()
 
     def begin(self, row: int, program: Any) -> None:
-        """Note the start of a row's episode from Meta-World's program, just reset."""
         reward = self.rewards[row]
-        features = np.zeros(FEATURES)
-        features[CONSTANT] = waypoint_numbers(reward)
-        for columns, name in ((START, reward.start), (TCP_START, "init_tcp"), (MARK, reward.mark)):
+        features = np.zeros(terms.FEATURES)
+        features[terms.CONSTANT] = terms.waypoint_numbers(reward)
+        for columns, name in ((terms.START, reward.start), (terms.TCP_START, "init_tcp"), (terms.MARK, reward.mark)):
             if name is not None:
                 features[columns] = getattr(program, name)
-        self.points[row] = features[EPISODE]
+        self.points[row] = features[terms.EPISODE]
         self.less[row] = self.task.less[row]
         for number, term in enumerate(reward.terms):
             if isinstance(term.margin, str) and term.margin != FIRST_DISTANCE:
@@ -64,9 +50,9 @@ class DenseReward:
     def __init__(self, starts: EpisodeStarts, rows: Index) -> None:
         self._starts, self._rows = starts, rows
         self._task = task = starts.task.of(rows)
-        self._proximity = ProximityTerms(task)
-        self._caging = CagingTerm(task)
-        self._funnels = FunnelTerm(task)
+        self._proximity = terms.ProximityTerms(task)
+        self._caging = terms.CagingTerm(task)
+        self._funnels = terms.FunnelTerm(task)
         self._every_row = np.arange(len(rows))
         self._lifts = [(LIFTS[name], np.flatnonzero(task.lift == name)) for name in np.unique(task.lift) if name]
         self._formulas = [(FORMULAS[name], np.flatnonzero(task.formula == name)) for name in np.unique(task.formula)]
@@ -78,12 +64,12 @@ class DenseReward:
         with np.errstate(all="ignore"):
             less = self._starts.less[self._rows]
             points = self._starts.points[self._rows]
-            features = gather_features(self._task, sensors, observation[:, CURRENT], goal, points)
+            features = terms.gather_features(self._task, sensors, observation[:, CURRENT], goal, points)
             proximity = self._proximity(features, less)
             self._starts.less[self._rows] = less
             return self._reward(features, proximity, action[:, 3])
 
-    def _reward(self, features: Array, proximity: Proximity, action: NDArray[Any]) -> Array:
+    def _reward(self, features: Array, proximity: terms.Proximity, action: NDArray[Any]) -> Array:
         task = self._task
         precision = np.result_type(action.dtype, 1.0)
         action = action.astype(precision)
@@ -108,7 +94,7 @@ class DenseReward:
             grasp=grasp,
             narrow=(narrow_grasp & ~perfect) | (narrow & task.gripper),
             closed=closed,
-            effort=(limited(action, -1, 1) + 1.0) / 2.0,
+            effort=(terms.limited(action, -1, 1) + 1.0) / 2.0,
             held=held,
         )
         for lift, rows in self._lifts:
@@ -120,15 +106,15 @@ class DenseReward:
             for formula, rows in self._formulas:
                 if (some := rows[state.narrow[rows]]).size:
                     reward[some] = formula(state, some, lambda numbers: numbers.astype(precision))
-        distance = proximity.distance[:, PLACED]
+        distance = proximity.distance[:, terms.PLACED]
         reward[(distance < task.done_under) | (distance <= task.done_within)] = FULL_REWARD
         return reward
 
-    def _held(self, features: Array, proximity: Proximity) -> Mask:
+    def _held(self, features: Array, proximity: terms.Proximity) -> Mask:
         task = self._task
-        near, opening = proximity.distance[:, NEAR], features[:, GRIPPER]
+        near, opening = proximity.distance[:, terms.NEAR], features[:, GRIPPER]
         height = features[self._every_row, OBJECT.start + task.held.lifted_axis]
-        moved = proximity.margin[:, PLACED] - proximity.distance[:, PLACED]
+        moved = proximity.margin[:, terms.PLACED] - proximity.distance[:, terms.PLACED]
         held = (near < task.held.near) & (near <= task.held.within)
         held &= (opening > task.held.opened) & (opening >= task.held.opened_from) & (opening < task.held.opened_under)
-        return held & (height - task.held.lifted > features[:, START.stop - 1]) & (moved > task.held.moved)
+        return held & (height - task.held.lifted > features[:, terms.START.stop - 1]) & (moved > task.held.moved)

@@ -8,29 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from lw_torchrl.envs.engines.vectorized.observation import (
-    CORNERS,
-    GRIPPER,
-    HAND,
-    JOINT,
-    OBJECT,
-    PLACE,
-    QUATERNION,
-    SECOND,
-    Array,
-    Index,
-    Mask,
-    row_norm,
-)
-from lw_torchrl.envs.engines.vectorized.rewards.parameters import GOAL, PLACED, START, TCP, VIA, Parameters
-from lw_torchrl.envs.engines.vectorized.rewards.terms import (
-    Numbers,
-    Proximity,
-    hamacher_product,
-    limited,
-    square,
-    tolerance,
-)
+from lw_torchrl.envs.engines.vectorized import observation as at
+from lw_torchrl.envs.engines.vectorized.observation import Array, Index, Mask, row_norm
+from lw_torchrl.envs.engines.vectorized.rewards import terms
+from lw_torchrl.envs.engines.vectorized.rewards.terms import Numbers, hamacher_product, limited, square, tolerance
 
 Cast = Callable[[Any], Any]
 """Brings numbers to the precision that a formula is computed in: single, where a number of a float32 action takes part,
@@ -44,9 +25,9 @@ Formula = Callable[["StepState", Index, Cast], Numbers]
 class StepState:
     """All rows after one step, one entry a row."""
 
-    task: Parameters
+    task: terms.Parameters
     features: Array  # (rows, FEATURES)
-    proximity: Proximity
+    proximity: terms.Proximity
     near: Array  # the values of these terms
     placed: Array
     via: Array
@@ -76,7 +57,7 @@ def reach(s: StepState, rows: Index, cast: Cast) -> Array:
 
 def press(s: StepState, rows: Index, cast: Cast) -> Array:
     """Be near with the gripper open (``shut``: closed); where held, press as well. ``weights`` of the two."""
-    opening = s.features[rows, GRIPPER]
+    opening = s.features[rows, at.GRIPPER]
     opening = np.where(s.task.shut[rows], 1 - opening, opening)
     first, second = s.task.weights[rows].T
     reward = first * hamacher_product(opening, s.near[rows])
@@ -85,7 +66,7 @@ def press(s: StepState, rows: Index, cast: Cast) -> Array:
 
 def press_behind_wall(s: StepState, rows: Index, cast: Cast) -> Array:
     """Come near with the gripper closed, then open it and press."""
-    opening = s.features[rows, GRIPPER]
+    opening = s.features[rows, at.GRIPPER]
     coming = 2 * hamacher_product((1 - opening) / 2.0, s.near[rows])
     return np.where(s.held[rows], 2 + 2 * (1 + opening) + 4 * square(s.placed[rows]), coming)
 
@@ -105,29 +86,29 @@ def both(s: StepState, rows: Index, cast: Cast) -> Any:
 
 def slide(s: StepState, rows: Index, cast: Cast) -> Array:
     """Come near; low down and near, slide."""
-    low = s.features[rows, TCP.start + 2] <= 0.03
+    low = s.features[rows, terms.TCP.start + 2] <= 0.03
     return np.where(low & s.held[rows], 2 + 7 * s.placed[rows], 1.5 * s.near[rows])
 
 
 def door(s: StepState, rows: Index, cast: Cast) -> Array:
     """Come to the handle from above, told to close the gripper, and turn the door."""
     features = s.features[rows]
-    handle, angle = features[:, OBJECT], -features[:, JOINT.start]
-    near = tolerance(row_norm(features[:, HAND] - (handle + TO_HANDLE) - BESIDE_HANDLE), 0.0, 0.06, 0.5)
+    handle, angle = features[:, at.OBJECT], -features[:, at.JOINT.start]
+    near = tolerance(row_norm(features[:, at.HAND] - (handle + TO_HANDLE) - BESIDE_HANDLE), 0.0, 0.06, 0.5)
     ready = hamacher_product(s.above[rows], near)
     turned = tolerance(np.pi / 2.0 + np.pi / 6 - angle, 0.0, 0.5, np.pi / 3.0)
     opened = 0.2 * (-angle < -np.pi / 90.0) + 0.8 * turned
     reward = 2.0 * hamacher_product(ready, s.effort[rows]) + 8.0 * opened
-    return np.where(np.abs(handle[:, 0] - features[:, GOAL.start]) <= 0.08, 10.0, reward)
+    return np.where(np.abs(handle[:, 0] - features[:, terms.GOAL.start]) <= 0.08, 10.0, reward)
 
 
 def lid(s: StepState, rows: Index, cast: Cast) -> Array:
     """Come to the lid from above, told to close the gripper, lift it and bring it over the box, all of it upright."""
     ready = hamacher_product(s.above[rows], s.near[rows])
-    lifted = 0.2 * (s.features[rows, OBJECT.stop - 1] + 0.02 > 0.04) + 0.8 * s.placed[rows]
+    lifted = 0.2 * (s.features[rows, at.OBJECT.stop - 1] + 0.02 > 0.04) + 0.8 * s.placed[rows]
     reward = 2.0 * hamacher_product(s.effort[rows], ready) + 8.0 * lifted
-    reward = np.where(s.proximity.distance[rows, VIA] < 0.08, 10.0, reward)
-    return reward * turned_like(s.features[rows, QUATERNION], UPRIGHT, 0.2)
+    reward = np.where(s.proximity.distance[rows, terms.VIA] < 0.08, 10.0, reward)
+    return reward * turned_like(s.features[rows, at.QUATERNION], UPRIGHT, 0.2)
 
 
 def turned_like(quaternion: Array, ideal: Array, margin: float) -> Array:
@@ -152,7 +133,7 @@ def carry_over_wall(s: StepState, rows: Index, cast: Cast) -> Any:
     gripped = hamacher_product(cast(s.grasp[rows]), cast(s.via[rows]))
     rising = gripped + 1.0 + cast(4.0 * s.via[rows])
     sinking = gripped + 1.0 + 4.0 + cast(3.0 * s.placed[rows])
-    carried = np.where(s.features[rows, OBJECT.start + 1] > 0.75, sinking, rising)
+    carried = np.where(s.features[rows, at.OBJECT.start + 1] > 0.75, sinking, rising)
     return np.where(s.held[rows], carried, gripped)
 
 
@@ -166,14 +147,14 @@ def push_round_wall(s: StepState, rows: Index, cast: Cast) -> Any:
     reward = 2 * cast(s.grasp[rows])
     coming = reward + 1.0 + cast(4.0 * s.via[rows])
     going = reward + 1.0 + 4.0 + cast(3.0 * s.placed[rows])
-    pushed = np.where(s.features[rows, OBJECT.start + 1] > 0.75, going, coming)
+    pushed = np.where(s.features[rows, at.OBJECT.start + 1] > 0.75, going, coming)
     return np.where(s.held[rows], pushed, reward)
 
 
 def unplug(s: StepState, rows: Index, cast: Cast) -> Any:
     """Grip; once the plug has moved a little, pull it to the goal."""
     reward = 2 * cast(s.grasp[rows])
-    moved = s.features[rows, OBJECT.start] - s.features[rows, START.start] > 0.015
+    moved = s.features[rows, at.OBJECT.start] - s.features[rows, terms.START.start] > 0.015
     return np.where(s.held[rows] & moved, 1 + reward + cast(5 * s.placed[rows]), reward)
 
 
@@ -184,7 +165,7 @@ def sweep(s: StepState, rows: Index, cast: Cast) -> Any:
 
 def soccer(s: StepState, rows: Index, cast: Cast) -> Any:
     """Less where the ball comes to the goal line beside the goal."""
-    ball, goal = s.features[rows, OBJECT], s.features[rows, GOAL]
+    ball, goal = s.features[rows, at.OBJECT], s.features[rows, terms.GOAL]
     placed, line = s.placed[rows], goal[:, 1] - 0.1
     missed = (ball[:, 1] > line) & (np.abs(ball[:, 0] - goal[:, 0]) > 0.1)
     beyond = 2 * ((ball[:, 1] - line) / (1 - line))
@@ -195,8 +176,8 @@ def soccer(s: StepState, rows: Index, cast: Cast) -> Any:
 def peg(s: StepState, rows: Index, cast: Cast) -> Any:
     """Bring the ring over the peg: far away high up, then down."""
     features = s.features[rows]
-    ring = features[:, PLACE]
-    error = features[:, GOAL] - ring
+    ring = features[:, at.PLACE]
+    error = features[:, terms.GOAL] - ring
     radius = row_norm(error[:, :2])
     on_peg = (radius < 0.02) & (error[:, 2] > 0.0)
     rim = np.where(on_peg, 0.02, 0.01)
@@ -204,24 +185,24 @@ def peg(s: StepState, rows: Index, cast: Cast) -> Any:
     error[:, 2] = height - ring[:, 2]
     lifted = (ring[:, 2] > 0.02) | (radius < rim)
     placed = 0.1 * lifted + 0.9 * tolerance(row_norm(error * TALL), 0.0, 0.02, 0.4)
-    reward = _with_tool(s, rows, cast, placed, turned_like(features[:, QUATERNION], UPRIGHT, 0.4))
+    reward = _with_tool(s, rows, cast, placed, turned_like(features[:, at.QUATERNION], UPRIGHT, 0.4))
     return np.where(on_peg, 10.0, reward)
 
 
 def unpeg(s: StepState, rows: Index, cast: Cast) -> Any:
     """Lift the ring from the peg."""
     features = s.features[rows]
-    placed = 0.1 * (features[:, PLACE.start + 2] > 0.02) + 0.9 * s.placed[rows]
-    reward = _with_tool(s, rows, cast, placed, turned_like(features[:, QUATERNION], UPRIGHT, 0.4))
-    return np.where(features[:, OBJECT.start + 2] > features[:, GOAL.start + 2], 10.0, reward)
+    placed = 0.1 * (features[:, at.PLACE.start + 2] > 0.02) + 0.9 * s.placed[rows]
+    reward = _with_tool(s, rows, cast, placed, turned_like(features[:, at.QUATERNION], UPRIGHT, 0.4))
+    return np.where(features[:, at.OBJECT.start + 2] > features[:, terms.GOAL.start + 2], 10.0, reward)
 
 
 def hammer(s: StepState, rows: Index, cast: Cast) -> Any:
     """Bring the hammer's head to the nail, and drive it in."""
     features = s.features[rows]
-    placed = 0.1 * (features[:, OBJECT.start + 2] > 0.02) + 0.9 * s.placed[rows]
-    reward = _with_tool(s, rows, cast, placed, turned_like(features[:, QUATERNION], LYING, 0.4))
-    return np.where((features[:, JOINT.start] > 0.09) & (reward > 5.0), 10.0, reward)
+    placed = 0.1 * (features[:, at.OBJECT.start + 2] > 0.02) + 0.9 * s.placed[rows]
+    reward = _with_tool(s, rows, cast, placed, turned_like(features[:, at.QUATERNION], LYING, 0.4))
+    return np.where((features[:, at.JOINT.start] > 0.09) & (reward > 5.0), 10.0, reward)
 
 
 def _with_tool(s: StepState, rows: Index, cast: Cast, placed: Array, turned: Array) -> Any:
@@ -231,21 +212,22 @@ def _with_tool(s: StepState, rows: Index, cast: Cast, placed: Array, turned: Arr
 def stick_push(s: StepState, rows: Index, cast: Cast) -> Any:
     """Grip the stick; held, bring it and with it the container to the goal."""
     carried = 2.0 + 5.0 * s.via[rows] + 3.0 * s.placed[rows]
-    carried = np.where(s.proximity.distance[rows, PLACED] <= 0.12, 10.0, carried)
+    carried = np.where(s.proximity.distance[rows, terms.PLACED] <= 0.12, 10.0, carried)
     return np.where(s.held[rows], carried, cast(s.grasp[rows]))
 
 
 def stick_pull(s: StepState, rows: Index, cast: Cast) -> Any:
     """Grip the stick, bring it to the handle; once through it, pull the container to the goal."""
     features = s.features[rows]
-    stick, handle, end, goal = features[:, OBJECT], features[:, SECOND], features[:, PLACE], features[:, GOAL]
+    stick, handle = features[:, at.OBJECT], features[:, at.SECOND]
+    end, goal = features[:, at.PLACE], features[:, terms.GOAL]
     gripped = hamacher_product(cast(s.grasp[rows]), cast(s.via[rows]))
     reward = np.where(s.held[rows], 1.0 + gripped + cast(5.0 * s.via[rows]), gripped)
     aside = np.abs(end - handle)
     through = s.held[rows] & (end[:, 0] >= handle[:, 0]) & (aside[:, 1] <= 0.04) & (aside[:, 2] <= 0.06)
     if not through.any():
         return reward
-    at_goal = tolerance(row_norm(stick - goal), 0.0, 0.05, row_norm(features[:, START] - goal))
+    at_goal = tolerance(row_norm(stick - goal), 0.0, 0.05, row_norm(features[:, terms.START] - goal))
     pulled = 1.0 + gripped + 5.0 + 2.0 * at_goal + 1.0 * s.placed[rows]
     pulled = np.where(row_norm(handle - goal) <= 0.12, 10.0, pulled)
     return np.where(through, pulled, reward)
@@ -268,8 +250,8 @@ def over_funnel(s: StepState, rows: Index) -> None:
 def into_box(s: StepState, rows: Index) -> None:
     """The peg's head counts as less placed within two corners of the box, where it would collide."""
     features = s.features[rows]
-    head = features[:, PLACE]
-    zero_1, one_1, zero_2, one_2 = features[:, CORNERS].reshape(-1, 4, 3).transpose(1, 0, 2)
+    head = features[:, at.PLACE]
+    zero_1, one_1, zero_2, one_2 = features[:, at.CORNERS].reshape(-1, 4, 3).transpose(1, 0, 2)
     (first, in_first), (second, in_second) = _within_prism(head, zero_1, one_1), _within_prism(head, zero_2, one_2)
     s.placed[rows] = s.lift[rows] = hamacher_product(s.placed[rows], hamacher_product(second, first))
     s.narrow[rows] &= ~(in_first | in_second)  # a NumPy number then, to which single precision gives way
@@ -285,7 +267,7 @@ def _within_prism(point: Array, zero: Array, one: Array) -> tuple[Array, Any]:
 def onto_shelf(s: StepState, rows: Index) -> None:
     """In front of the shelf and below its board the object counts as less placed, under the board as not at all."""
     features = s.features[rows]
-    thing, goal, placed = features[:, OBJECT], features[:, GOAL], s.placed[rows]
+    thing, goal, placed = features[:, at.OBJECT], features[:, terms.GOAL], s.placed[rows]
     x, y, z = thing.T
     low = (z > 0.0) & (z < 0.24) & (goal[:, 0] - 0.15 < x) & (x < goal[:, 0] + 0.15)
     edge = goal[:, 1] - 3 * 0.05
