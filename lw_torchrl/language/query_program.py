@@ -45,9 +45,6 @@ class QueryProgram(nn.Module):
         tasks: the names of the tasks it answers for, sorted.
         num_queries: S, the length of the longest list.
 
-    Raises:
-        ValueError: an unknown task or one given twice, a text outside the query language, a task without queries.
-
     Example:
         >>> import torch
         >>> from lw_torchrl.language.tasks import task_id
@@ -104,10 +101,8 @@ class QueryProgram(nn.Module):
             task_id: (...) int64.
 
         Returns:
-            (..., S) bool on the observation's device, in the order of the task's list; padding is false.
-
-        Raises:
-            ValueError: wrong shape or dtype, NaN or infinity in the observation, or a task without queries.
+            (..., S) bool on the observation's device, in the order of the task's list; padding is false. NaN or
+            infinity in the observation, or a task without queries, is a :class:`ValueError`.
         """
         _check_batch(observation, task_id)
         if (kernel := self._kernel(observation, task_id)) is not None:
@@ -134,9 +129,6 @@ class QueryProgram(nn.Module):
 
         Returns:
             (..., S) float32 logits on the observation's device, of size 1e-6 to 1e4; padding is -1e4.
-
-        Raises:
-            ValueError: as for the hard truth; or the temperature is out of range.
 
         Example:
             >>> import torch, lw_torchrl as lw

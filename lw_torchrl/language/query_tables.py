@@ -39,9 +39,8 @@ class Atom(NamedTuple):
     def offset(self) -> list[float]:
         """What is added to the difference of the positions, metres."""
         moved = (self.shift[0], self.shift[1], self.shift[2] + self.part.raise_z)
-        return [
-            self._sign * metres if axis in self.part.axes else 0.0 for axis, metres in zip("xyz", moved, strict=True)
-        ]
+        used = zip("xyz", moved, strict=True)
+        return [self._sign * metres if axis in self.part.axes else 0.0 for axis, metres in used]
 
     @property
     def threshold(self) -> float:
@@ -164,8 +163,7 @@ class QueryFacts(NamedTuple):
 
 
 def _task_facts(task: Task, queries: Sequence[Query]) -> tuple[dict[Atom, int], dict[int, int], list[tuple[int, int]]]:
-    """The places of a task's atoms; the bit that says that all atoms of some bits hold; and of each query the bits that
-    it cares for, and which of them must be true."""
+    """A task's atoms' places; the bit that all atoms of some bits hold; each query's care bits, and which are true."""
     places: dict[Atom, int] = {}
 
     def bits(clause: Clause) -> int:

@@ -46,10 +46,7 @@ def plan_roles(plan: ConditionalPlan, skills: Mapping[str, ScriptedSkill] | None
     for a mug), the condition does. If the gripper goes to a thing and the condition compares it with a point on that
     thing, the point is the target. If the text moves a thing that the condition says is held, the thing is moved,
     though a script steers the gripper. "the target location" is the goal in every task.
-
-    Args:
-        plan: the plan; its ``definition`` says which objects and points there are.
-        skills: the scripted skills by their text; None for the shipped ones, an empty mapping for words alone.
+    ``skills`` are the scripted skills by their text; None for the shipped ones, an empty mapping for words alone.
 
     Example:
         >>> from lw_torchrl.language.plan_files import load_plans

@@ -37,10 +37,6 @@ class SkillProgram(nn.Module):
     Attributes:
         num_skills: S, the length of the longest list.
 
-    Raises:
-        SkillError: (a ValueError) a skill names objects that its task lacks.
-        ValueError: an unknown task or text, with the nearest.
-
     Example:
         >>> import torch
         >>> from lw_torchrl.language.tasks import task_id
@@ -98,10 +94,7 @@ class SkillProgram(nn.Module):
 
         Returns:
             (..., S, 4) of the observation's dtype: displacement xyz and gripper effort, each in [-1, 1]; zeros
-            beyond the task's last skill.
-
-        Raises:
-            ValueError: a wrong shape, or a task without skills.
+            beyond the task's last skill. A task without skills is a :class:`ValueError`.
         """
         if observation.shape[-1:] != (OBSERVATION_SIZE,) or task_id.shape != observation.shape[:-1]:
             raise ValueError(

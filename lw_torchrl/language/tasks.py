@@ -83,16 +83,11 @@ class Task:
         def coordinate(at: Coordinate, shift: float) -> Tensor:
             return (observation[..., at] if isinstance(at, int) else torch.full_like(observation[..., 0], at)) + shift
 
-        return {
-            named.name: torch.stack(list(map(coordinate, named.position, named.offset)), -1) for named in self.objects
-        }
+        return {one.name: torch.stack(list(map(coordinate, one.position, one.offset)), -1) for one in self.objects}
 
     def to_json(self) -> dict[str, Any]:
-        """The task as a row of tasks.toml.
-
-        Raises:
-            TaskError: (a ValueError) a row cannot hold it: the gripper is elsewhere, or a point has an offset from a
-                place without an object.
+        """The task as a row of tasks.toml; a :class:`TaskError` where a row cannot hold it: the gripper is elsewhere,
+        or a point has an offset from a place without an object.
 
         Example:
             >>> TASKS["reach"].to_json()["objects"]
@@ -164,9 +159,6 @@ def task_id(name: str) -> int:
     """The integer of a task: of the 50, the rank among the sorted names, from 0; of any other, a number from 50 to
     2³¹ - 1 that depends only on the name. So it is the same in every process and file. A misspelt name has an id too.
 
-    Raises:
-        ValueError: the name is not lower-case words joined by hyphens.
-
     Example:
         >>> task_id("assembly"), task_id("window-open"), task_id("stack-blocks")
         (0, 49, 650718257)
@@ -183,9 +175,6 @@ def resolve_tasks(names: str | Iterable[str], *, tasks: Mapping[str, Task] = TAS
     Args:
         names: "MT10", "MT50", one task's name, or an iterable of names.
         tasks: the tasks there are, by name, as from :func:`~lw_torchrl.load_tasks`.
-
-    Raises:
-        ValueError: a name is unknown (with the nearest allowed ones), repeated, or the list is empty.
 
     Example:
         >>> resolve_tasks(["push", "door-open"])
@@ -240,14 +229,12 @@ def load_tasks(path: str | os.PathLike[str]) -> Mapping[str, Task]:
     """All 50 tasks and those of your own file: some of the 50 with other objects, points or words, or new tasks.
 
     Args:
-        path: a file in the format of data/tasks.toml. A task with a new name must name its objects.
+        path: a file in the format of data/tasks.toml, else a :class:`TaskError`. A task with a new name must name its
+            objects.
 
     Returns:
         Task name to :class:`Task`, sorted; pass one wherever a task is asked for, or all of them to
         :func:`~lw_torchrl.load_plans` and :func:`~lw_torchrl.resolve_tasks`.
-
-    Raises:
-        TaskError: (a ValueError) the file is no TOML, or a task in it is malformed.
 
     Example:
         >>> import os, tempfile
