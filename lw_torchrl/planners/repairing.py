@@ -34,9 +34,7 @@ class Repair:
 
 
 def plan_facts(check: PlanCheck, task: Task, notes: Sequence[str] = ()) -> str:
-    """What became of a plan, in words for the model that wrote it.
-
-    ``notes`` are those of the answer; the model is told the one that it can mend, that it was cut off.
+    """What became of a plan, in words for the model that wrote it; of the answer's ``notes``, that it was cut off.
 
     Example:
         >>> from lw_torchrl.language.tasks import TASKS
@@ -118,7 +116,6 @@ def repair_plans(
         progress: show progress bars.
 
     Raises:
-        ValueError: answers of several formats.
         PlannerError: an answer did not come; those that came are kept.
     """
     check_int("rounds", rounds, minimum=1)
