@@ -11,21 +11,9 @@ from numba import njit
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def answer(
-    observation: Any,
-    task_id: Any,
-    ids: Any,
-    row_of: Any,
-    ends: Any,
-    places: Any,
-    metres: Any,
-    bit: Any,
-    flipped: Any,
-    conjunction: Any,
-    care: Any,
-    want: Any,
-    constants: Any,
-    truth: Any,
-) -> bool:
+    observation: Any, task_id: Any, ids: Any, row_of: Any, ends: Any, places: Any, metres: Any, bit: Any, flipped: Any,
+    conjunction: Any, care: Any, want: Any, constants: Any, truth: Any,
+) -> bool:  # fmt: skip
     """Write the truth (B, S) bool of each row's queries, with the operations of the tables, in their order.
 
     ``observation`` is (B, 39) float32 or float64, metres, ``task_id`` (B,) int64; ``ids`` and what follows are the

@@ -44,18 +44,15 @@ class Atom(NamedTuple):
 
     @property
     def threshold(self) -> float:
-        """The atom's value is below it where it holds, metres."""
-        return self.part.threshold * self._sign
+        return self.part.threshold * self._sign  # metres; the value is below it where the atom holds
 
     @property
     def far(self) -> bool:
-        """Whether the opposite of a length is compared."""
-        return self.part.length and self.part.sense != "<"
+        return self.part.length and self.part.sense != "<"  # the opposite of a length is compared
 
     @property
     def flipped(self) -> bool:
-        """Whether the atom holds where its value is not below the threshold."""
-        return self.part.sense == "<="
+        return self.part.sense == "<="  # the atom holds where its value is not below the threshold
 
 
 _ORIGIN = typed((0.0, 0.0, 0.0))

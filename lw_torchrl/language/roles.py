@@ -140,10 +140,8 @@ def _carried(roles: Roles, step: PlanStep, task: Task) -> Roles:
 
 def _holds(step: PlanStep, relation: str, name: str) -> bool:
     """Whether the condition says so of the gripper and a thing, or of the gripper."""
-    return any(
-        clause.predicate == relation and not clause.negated and name in (clause.subject, clause.object)
-        for clause in step.condition.clauses
-    )
+    said = [clause for clause in step.condition.clauses if clause.predicate == relation and not clause.negated]
+    return any(name in (clause.subject, clause.object) for clause in said)
 
 
 def _same_thing(first: str, second: str, task: Task) -> bool:

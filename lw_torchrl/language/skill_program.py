@@ -97,10 +97,8 @@ class SkillProgram(nn.Module):
             beyond the task's last skill. A task without skills is a :class:`ValueError`.
         """
         if observation.shape[-1:] != (OBSERVATION_SIZE,) or task_id.shape != observation.shape[:-1]:
-            raise ValueError(
-                f"observation must be of shape (..., {OBSERVATION_SIZE}) and task_id of (...), got "
-                f"{tuple(observation.shape)} and {tuple(task_id.shape)}"
-            )
+            got = f"{tuple(observation.shape)} and {tuple(task_id.shape)}"
+            raise ValueError(f"observation must be of shape (..., {OBSERVATION_SIZE}) and task_id of (...), got {got}")
         tables = self._tables.select(task_id.reshape(-1), observation)
         state = torch.cat((observation.reshape(-1, OBSERVATION_SIZE), tables.constants), 1)
         way = state.gather(1, tables.target) - state.gather(1, tables.moved)

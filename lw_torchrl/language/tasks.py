@@ -37,8 +37,7 @@ class Task:
     Attributes:
         name: "drawer-open", Meta-World's name without its version; or your own, lower-case words joined by hyphens.
         description: one sentence that says what is to be done.
-        objects: at most 64 named objects with different names: the robot's gripper first, the points that we named
-            last.
+        objects: at most 64 with different names: the robot's gripper first, the points that we named last.
     """
 
     name: str
@@ -253,11 +252,8 @@ def load_tasks(path: str | os.PathLike[str]) -> Mapping[str, Task]:
         try:
             found[name] = Task.from_json(name, row)
             if name not in TASKS and len(found[name].objects) == 1:
-                close = nearest(name, TASKS, n=1)
-                raise TaskError(
-                    f"task {name!r}: is none of the 50, so it must name its objects"
-                    + (f"; did you mean {close[0]!r}?" if close else "")
-                )
+                near = "".join(f"; did you mean {other!r}?" for other in nearest(name, TASKS, n=1))
+                raise TaskError(f"task {name!r}: is none of the 50, so it must name its objects{near}")
         except TaskError as error:
             raise TaskError(f"{file}, {error}") from error
     return MappingProxyType(dict(sorted(found.items())))

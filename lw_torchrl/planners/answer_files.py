@@ -59,10 +59,8 @@ def settle_folder(folder: Path, settings: Mapping[str, Any], *, reading: bool = 
         if reading and there.get("model", settings["model"]) == settings["model"]:
             return
         differ = ", ".join(differences(there, settings)) if there else f"it has no {_SETTINGS} that says which"
-        raise ValueError(
-            f"out: {str(folder)!r} holds answers of other settings: {differ}; give these again, or the new answers "
-            "another name (--name) or out"
-        )
+        how = "give these again, or the new answers another name (--name) or out"
+        raise ValueError(f"out: {str(folder)!r} holds answers of other settings: {differ}; {how}")
     if not reading:
         write_json(file, dict(settings))
 

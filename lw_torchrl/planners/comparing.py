@@ -79,7 +79,7 @@ class PlanComparison:
         return max((format for name, format in self.groups if name == model), key=lambda one: self.mean(model, one))
 
     def best_of(self, model: str, format: str) -> float:
-        """The mean over tasks of the odd episodes' success of the answer best in the even ones; NaN with one episode."""
+        """The mean over tasks of the odd episodes' success of the answer best in the even ones; NaN of one episode."""
         chosen: dict[str, tuple[float, float]] = {}
         for one in self._of(model, format):
             tried, fresh = _mean(one.success[::2]), _mean(one.success[1::2])

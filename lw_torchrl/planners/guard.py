@@ -226,7 +226,6 @@ class _Gone(Exception):
 
 
 async def _whole(headers: dict[bytes, str], receive: Any) -> bytes:
-    """The body of a request."""
     said, body = headers.get(b"content-length", "0"), bytearray()
     too_large = Refused(413, f"a request may have {BODY_LIMIT} bytes", "too_large")
     if len(said) > 9 or not said.isdecimal() or int(said) > BODY_LIMIT:
