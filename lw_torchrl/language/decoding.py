@@ -22,34 +22,19 @@ from lw_torchrl.language.tasks import TASKS, Task, check_task
 
 @dataclass(frozen=True)
 class DecodedStep:
-    """One clause of a text, and what became of it.
+    """One clause of a text, and what became of it; distances are from 0, a text that is a query or a skill, to 1."""
 
-    Distances are from 0, a text that is itself a query or a skill, to 1.
-
-    Attributes:
-        line: where it stands in the text, from 1.
-        written_condition: the condition in the text's words.
-        written_skill: the skill in the text's words: ``robot.put("gripper above mug")`` is "put gripper above mug".
-        condition: the nearest query; None if none is near enough.
-        condition_distance: the largest distance of a clause of the condition.
-        scripted: the text of the nearest scripted skill; None if none is near enough.
-        skill_distance: between the skill and that one.
-        written_goal: the state to reach in the text's words, "" if it says none.
-        goal, goal_distance: as ``condition`` and ``condition_distance``.
-        dropped: why it is no step of the plan; "" if it is one.
-    """
-
-    line: int
-    written_condition: str
-    written_skill: str
-    condition: Query | None
-    condition_distance: float
-    scripted: str | None
+    line: int  # where it stands in the text, from 1
+    written_condition: str  # in the text's words
+    written_skill: str  # in the text's words: ``robot.put("gripper above mug")`` is "put gripper above mug"
+    condition: Query | None  # the nearest query; None if none is near enough
+    condition_distance: float  # the largest of its clauses
+    scripted: str | None  # the text of the nearest scripted skill; None if none is near enough
     skill_distance: float
-    written_goal: str = ""
-    goal: Query | None = None
+    written_goal: str = ""  # the state to reach in the text's words, "" if it says none
+    goal: Query | None = None  # as ``condition``
     goal_distance: float = 0.0
-    dropped: str = ""
+    dropped: str = ""  # why it is no step of the plan; "" if it is one
 
 
 @dataclass(frozen=True)
@@ -108,14 +93,11 @@ def decode_plan(
         text: the answer; what follows 65,536 characters or 1,000 steps is left out.
         task: the task that was asked for, or its name.
         format: the format that was asked for, a name in :data:`~lw_torchrl.PLAN_FORMATS`.
-        by: nearest in spelling ("edit"), or in meaning ("embedding"), which needs the extra ``[text]``.
-        limit: the largest distance, from 0 to 1, at which a condition or a goal is taken for a query.
-        skill_limit: the same for scripted skills.
+        by: nearest in spelling ("edit"), or in meaning ("embedding"; an ImportError without the extra ``[text]``).
+        limit, skill_limit: the largest distance, from 0 to 1, at which a condition or a goal is taken for a query, and
+            a skill for a scripted one.
         skills: the scripted skills to choose from; None for the shipped ones.
         tasks: where a task's name is looked up, as from :func:`~lw_torchrl.load_tasks`.
-
-    Raises:
-        ImportError: by="embedding" without the extra ``[text]``.
 
     Example:
         >>> answer = '''Sure! Here you go:

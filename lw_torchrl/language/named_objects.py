@@ -47,9 +47,6 @@ class NamedObject:
         position: x, y and z: an int is an index into the 39 numbers of the observation, a float is in metres.
         offset: added to it, metres; for a point beside an object.
         ours: a point that we named, which the published object list lacks.
-
-    Raises:
-        ValueError: the name is not plain lower-case words, or a coordinate lies outside the observation.
     """
 
     name: str

@@ -61,14 +61,10 @@ def nearest_query(
     is taken for the negation of the base query nearest to the rest of it, so that truth is never inverted.
 
     Args:
-        text: any words.
+        text: any words, of at most 64 parts.
         task: a task or its name, whose objects the query may name.
-        by: "edit", closest in spelling; "embedding", closest in meaning, by the sentence encoder.
+        by: "edit", closest in spelling; "embedding", closest in meaning (an ImportError without the extra ``[text]``).
         published_only: leave out the points that we named, and relations that were added.
-
-    Raises:
-        ValueError: an unknown task, or a text of more than 64 parts.
-        ImportError: by="embedding" without the extra ``[text]``.
 
     Example:
         >>> match = nearest_query("the gripper isn't touching the puck", "push")
@@ -166,13 +162,9 @@ def nearest_skill(
 
     Args:
         text: what to do, in any words.
-        task: consider only skills whose objects this task has.
+        task: consider only skills whose objects this task has; with none it is a :class:`SkillError`.
         skills: to choose from; None for the shipped ones.
-        by: "edit", closest in spelling; "embedding", closest in meaning, by the sentence encoder.
-
-    Raises:
-        SkillError: (a ValueError) no skill suits the task.
-        ImportError: by="embedding" without the extra ``[text]``.
+        by: as for :func:`nearest_query`.
 
     Example:
         >>> nearest_skill("put gripper above puck", task="push")[0].text

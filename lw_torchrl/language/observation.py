@@ -19,20 +19,10 @@ POSITIONS = (HAND, FIRST, SECOND, GOAL)
 
 
 def places(part: slice) -> tuple[int, ...]:
-    """The numbers' indices.
-
-    Example:
-        >>> places(GOAL)
-        (36, 37, 38)
-    """
+    """The numbers' indices: (36, 37, 38) for the goal."""
     return tuple(range(part.start, part.stop))
 
 
 def a_step_before(part: slice) -> slice:
-    """Where the same stands of the step before; the goal has no past.
-
-    Example:
-        >>> a_step_before(FIRST)
-        slice(22, 25, None)
-    """
+    """Where the same stands of the step before; the goal has no past."""
     return slice(part.start + BEFORE.start, part.stop + BEFORE.start)

@@ -21,7 +21,7 @@ from lw_torchrl.language.plans import (
     Plans,
     PlanStep,
     as_plans,
-    one_line,
+    format_plan,
     too_many_steps,
 )
 from lw_torchrl.language.queries import Query, QueryError, check_query
@@ -115,12 +115,7 @@ def _no_task(where: str, name: str, tasks: Mapping[str, Task]) -> str:
 def check_plan(
     text: str, task: str | None = None, source: str = "plan", tasks: Mapping[str, Task] = TASKS
 ) -> tuple[ConditionalPlan | None, list[str]]:
-    """As :func:`parse_plan`, but the plan, None if it has faults, and all its faults in the order of the lines.
-
-    Example:
-        >>> check_plan("nonsense")
-        (None, ["plan, line 1: expected 'def task_name(robot):' before 'nonsense'"])
-    """
+    """As :func:`parse_plan`, but the plan, None if it has faults, and all its faults in the order of the lines."""
     faults: list[str] = []
     return _read(text, task, source, tasks, faults.append), faults
 
@@ -138,14 +133,10 @@ def parse_plan(
     A goal that is not the skill's usual one stands behind it: ``robot.place("...", goal="the gripper is open")``.
 
     Args:
-        text: the plan.
+        text: the plan; its first fault is a :class:`PlanError` with the line.
         task: the task it must be for; None takes the one its ``def`` line names.
         source: what to call the text in errors, a file's name.
         tasks: whose objects the conditions name, by task name, as from :func:`~lw_torchrl.load_tasks`.
-
-    Raises:
-        PlanError: (a ValueError) the first fault, with its line: a line of another form, a condition outside the query
-            language, a plan without steps, or one for another task.
 
     Source: paper section 'Conditional Plan Generation' and its figure of a chain_py plan.
     """
@@ -156,30 +147,6 @@ def parse_plan(
     plan = _read(text, task, source, tasks, refuse)
     assert plan is not None  # or a fault was refused
     return plan
-
-
-def quote(text: str) -> str:
-    """A text in quotes, as :func:`parse_plan` and Python read it."""
-    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
-
-
-def format_plan(plan: ConditionalPlan) -> str:
-    """The plan as text in the chain_py format; :func:`parse_plan` reads it back."""
-    lines = []
-    for step in plan.steps:
-        if reason := one_line(step.reason).lstrip("# "):
-            lines.append(f"    # {reason}")
-        verb, _, details = step.skill.partition(" ")
-        said = [quote(details)]
-        if step.goal is not None:
-            said.append(f"goal={quote(str(step.goal))}")
-        lines += [f"    if check({quote(str(step.condition))}):", f"        robot.{verb}({', '.join(said)})"]
-    return function_head(plan.definition) + "".join(f"{line}\n" for line in lines)
-
-
-def function_head(task: Task) -> str:
-    """The lines with which the function of a task begins."""
-    return f"# {task.name}: {one_line(task.description)}\ndef {task.name.replace('-', '_')}(robot):\n"
 
 
 _MOST_PAIRS = 2_000  # of a file, each compared with all queries of its task
@@ -202,13 +169,9 @@ def load_plans(
             worded as in the plans of MT10, for policies that have only seen these.
         tasks: whose objects the conditions name, by task name, as from :func:`~lw_torchrl.load_tasks`.
 
-    Returns:
-        The plans, by task name.
-
     Raises:
         FileNotFoundError: there is no such file or folder, or the folder holds no plans.
         PlanError: (a ValueError) a file holds no valid plan, or one for another task than the one it is named after.
-        ValueError: ``skills="MT10"`` with plans of your own.
 
     Example:
         >>> load_plans("MT10")["reach"].task
@@ -229,10 +192,8 @@ def load_plans(
     # A name with a dot in front is what a killed save_plans leaves.
     listed = [path] if path.is_file() else sorted(p for p in path.glob("*.plan") if p.name[0] != ".")
     if not listed:
-        raise FileNotFoundError(
-            f"the folder {str(path)!r} holds no .plan files; of a folder of models' answers `lw-torchrl plan compare` "
-            "makes them"
-        )
+        how = "of a folder of models' answers `lw-torchrl plan compare` makes them"
+        raise FileNotFoundError(f"the folder {str(path)!r} holds no .plan files; {how}")
     return _read_all(list[Traversable](listed), tasks)
 
 
@@ -291,3 +252,9 @@ def save_plans(plans: Plans | Mapping[str, ConditionalPlan], folder: str | os.Pa
     for file, text in texts.items():
         write_text(file, text)
     return list(texts)
+
+
+def shipped_texts() -> list[str]:
+    """The task descriptions and the skills of the shipped plans, sorted."""
+    skills = {*load_plans("MT50").skills, *load_plans("MT50", skills="MT10").skills}
+    return sorted({task.description for task in TASKS.values()} | skills)

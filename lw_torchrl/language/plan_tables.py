@@ -13,20 +13,11 @@ from lw_torchrl.language.value_checks import asserted, plain, readable
 class PlanTables:
     """What transforms, attention and actors read of plans.
 
-    Args:
-        plans: the plans.
-
     Attributes:
         index: from task ids to rows, T of them.
         mask: (T, S) bool, the steps that there are.
         skill_index: (T, S) int64, the number of each step's skill in ``plans.skills``; 0 beyond the last step.
         number: (T,) int64, the number of each plan, as in :attr:`Plans.numbers`.
-
-    Example:
-        >>> from lw_torchrl.language.plan_files import load_plans
-        >>> plans = load_plans("MT10")
-        >>> PlanTables(plans).mask.sum().item() == sum(len(plan.steps) for plan in plans.values())
-        True
     """
 
     def __init__(self, plans: Plans) -> None:
@@ -47,11 +38,9 @@ class PlanTables:
         return self.index.rows(task_id, self._problem)
 
     def refuse_others(self, number: Tensor | None, rows: Tensor) -> None:
-        """Raise :class:`ValueError` where queries were answered of other plans.
+        """Raise :class:`ValueError` where queries were answered of other plans than those of ``rows``, (...) int64.
 
-        Args:
-            number: (...) int64, the number of the plan whose queries were answered; 0 where unknown, None for all.
-            rows: (...) int64, as from :meth:`rows`.
+        ``number``, (...) int64, is that of the plan whose queries were answered; 0 where unknown, None for all.
         """
         if number is None:
             return

@@ -45,20 +45,12 @@ def usual_goal(skill: str, task: Task) -> Query | None:
 
 @dataclass(frozen=True)
 class PlanStep:
-    """One step: while ``condition`` holds, do ``skill``.
-
-    Attributes:
-        condition: a query of the plan's task.
-        skill: plain English, "place the gripper above the puck".
-        reason: why, a comment for the reader; it does not change what the plan does.
-        goal: the state that the skill is to reach, a query of the plan's task, if it differs from the skill's usual
-            one; :attr:`ConditionalPlan.goals` has them all.
-    """
+    """One step: while ``condition`` holds, do ``skill``. Its queries are of the plan's task."""
 
     condition: Query
-    skill: str
-    reason: str = field(default="", compare=False)
-    goal: Query | None = None
+    skill: str  # plain English, "place the gripper above the puck"
+    reason: str = field(default="", compare=False)  # a comment for the reader; it does not change what the plan does
+    goal: Query | None = None  # the state to reach, if not the skill's usual one; :attr:`ConditionalPlan.goals` has all
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -74,10 +66,6 @@ class ConditionalPlan:
             plan: conditions as ``str(query)`` gives them, skills with "the" before the task's nouns. Plans with equal
             conditions, skills and goals are equal.
         definition: the :class:`Task` whose objects the conditions name; None for ours of that name.
-
-    Raises:
-        PlanError: (a ValueError) too few or many steps, a skill that does not begin with a plain word, or a condition
-            or a goal that names objects of another task.
 
     Example:
         >>> plan = ConditionalPlan.from_pairs("reach", [("gripper is open", "move the gripper to the target")])
@@ -133,9 +121,31 @@ class ConditionalPlan:
         return tuple(step.goal or usual_goal(step.skill, self.definition) for step in self.steps)
 
     def __str__(self) -> str:
-        from lw_torchrl.language.plan_files import format_plan
-
         return format_plan(self)
+
+
+def quote(text: str) -> str:
+    """A text in quotes, as plans and Python have it."""
+    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
+
+
+def format_plan(plan: ConditionalPlan) -> str:
+    """The plan as text in the chain_py format; :func:`~lw_torchrl.language.plan_files.parse_plan` reads it back."""
+    lines = []
+    for step in plan.steps:
+        if reason := one_line(step.reason).lstrip("# "):
+            lines.append(f"    # {reason}")
+        verb, _, details = step.skill.partition(" ")
+        said = [quote(details)]
+        if step.goal is not None:
+            said.append(f"goal={quote(str(step.goal))}")
+        lines += [f"    if check({quote(str(step.condition))}):", f"        robot.{verb}({', '.join(said)})"]
+    return function_head(plan.definition) + "".join(f"{line}\n" for line in lines)
+
+
+def function_head(task: Task) -> str:
+    """The lines with which the function of a task begins."""
+    return f"# {task.name}: {one_line(task.description)}\ndef {task.name.replace('-', '_')}(robot):\n"
 
 
 class Plans(Mapping[str, ConditionalPlan]):

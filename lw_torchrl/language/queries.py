@@ -91,7 +91,6 @@ def supported_queries(task: str | Task, published_only: bool = False) -> tuple[s
     the negations of open and closed, and conjunctions of all these.
 
     Args:
-        task: a task or its name.
         published_only: the paper's queries alone, without the points that we named and relations that were added.
 
     Example:
@@ -204,11 +203,9 @@ def parse_query(text: str, task: str | Task) -> Query:
     ("... is open and not above the puck").
 
     Args:
-        text: "Is the gripper open and not above the puck?", or any other accepted spelling, of at most 64 clauses.
+        text: "Is the gripper open and not above the puck?", or any other accepted spelling, of at most 64 clauses. For
+            any other text a :class:`QueryError` points at the word and names the nearest query.
         task: the task whose objects the query names.
-
-    Raises:
-        QueryError: (a ValueError) the text is no query of the task; it points at the word and names the nearest query.
 
     Example:
         >>> str(parse_query("the gripper above the puck", task="push"))

@@ -11,31 +11,13 @@ from numba import njit
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def answer(
-    observation: Any,
-    task_id: Any,
-    ids: Any,
-    row_of: Any,
-    ends: Any,
-    places: Any,
-    metres: Any,
-    bit: Any,
-    flipped: Any,
-    conjunction: Any,
-    care: Any,
-    want: Any,
-    constants: Any,
-    truth: Any,
-) -> bool:
-    """Write the truth of each row's queries, with the operations of the tables, in their order.
+    observation: Any, task_id: Any, ids: Any, row_of: Any, ends: Any, places: Any, metres: Any, bit: Any, flipped: Any,
+    conjunction: Any, care: Any, want: Any, constants: Any, truth: Any,
+) -> bool:  # fmt: skip
+    """Write the truth (B, S) bool of each row's queries, with the operations of the tables, in their order.
 
-    Args:
-        observation: (B, 39) float32 or float64, metres.
-        task_id: (B,) int64.
-        ids and what follows: the tables of :class:`QueryFacts`, in its order.
-        truth: (B, S) bool, written.
-
-    Returns:
-        False for a task without queries, or an observation that holds NaN or infinity.
+    ``observation`` is (B, 39) float32 or float64, metres, ``task_id`` (B,) int64; ``ids`` and what follows are the
+    tables of :class:`QueryFacts`. False for a task without queries, or an observation that holds NaN or infinity.
     """
     size = observation.shape[1]
     numbers = np.empty(size + constants.shape[0], observation.dtype)

@@ -45,9 +45,6 @@ class QueryProgram(nn.Module):
         tasks: the names of the tasks it answers for, sorted.
         num_queries: S, the length of the longest list.
 
-    Raises:
-        ValueError: an unknown task or one given twice, a text outside the query language, a task without queries.
-
     Example:
         >>> import torch
         >>> from lw_torchrl.language.tasks import task_id
@@ -88,8 +85,7 @@ class QueryProgram(nn.Module):
         in_order = dict(sorted(compiled.items(), key=lambda item: index.row(item[0].name)))
         tables = compile_queries(in_order)
         self._any_far = bool(tables.far.any())
-        problem = f"tasks without queries in {self!r}"
-        self._tables = TaskTables(index, tables, problem)
+        self._tables = TaskTables(index, tables, f"tasks without queries in {self!r}")
         facts = compile_facts(in_order)
         self._facts = {} if facts is None else {dtype: facts.of(kind) for dtype, kind in _COMPILED.items()}
 
@@ -104,10 +100,8 @@ class QueryProgram(nn.Module):
             task_id: (...) int64.
 
         Returns:
-            (..., S) bool on the observation's device, in the order of the task's list; padding is false.
-
-        Raises:
-            ValueError: wrong shape or dtype, NaN or infinity in the observation, or a task without queries.
+            (..., S) bool on the observation's device, in the order of the task's list; padding is false. NaN or
+            infinity in the observation, or a task without queries, is a :class:`ValueError`.
         """
         _check_batch(observation, task_id)
         if (kernel := self._kernel(observation, task_id)) is not None:
@@ -134,9 +128,6 @@ class QueryProgram(nn.Module):
 
         Returns:
             (..., S) float32 logits on the observation's device, of size 1e-6 to 1e4; padding is -1e4.
-
-        Raises:
-            ValueError: as for the hard truth; or the temperature is out of range.
 
         Example:
             >>> import torch, lw_torchrl as lw
@@ -199,8 +190,7 @@ def _check_batch(observation: Tensor, task_id: Tensor) -> None:
             raise TypeError(f"{name} must be a tensor, got {type(given).__name__}; torch.as_tensor makes one")
     shape, ids = tuple(observation.shape), tuple(task_id.shape)
     if shape[-1:] != (OBSERVATION_SIZE,) or not observation.is_floating_point():
-        raise ValueError(
-            f"observation must be float of shape (..., {OBSERVATION_SIZE}), got {observation.dtype} of shape {shape}"
-        )
+        got = f"{observation.dtype} of shape {shape}"
+        raise ValueError(f"observation must be float of shape (..., {OBSERVATION_SIZE}), got {got}")
     if ids != shape[:-1] or task_id.dtype not in (torch.int64, torch.int32):
         raise ValueError(f"task_id must be int64 of shape {shape[:-1]}, got {task_id.dtype} of shape {ids}")

@@ -39,24 +39,20 @@ class Atom(NamedTuple):
     def offset(self) -> list[float]:
         """What is added to the difference of the positions, metres."""
         moved = (self.shift[0], self.shift[1], self.shift[2] + self.part.raise_z)
-        return [
-            self._sign * metres if axis in self.part.axes else 0.0 for axis, metres in zip("xyz", moved, strict=True)
-        ]
+        used = zip("xyz", moved, strict=True)
+        return [self._sign * metres if axis in self.part.axes else 0.0 for axis, metres in used]
 
     @property
     def threshold(self) -> float:
-        """The atom's value is below it where it holds, metres."""
-        return self.part.threshold * self._sign
+        return self.part.threshold * self._sign  # metres; the value is below it where the atom holds
 
     @property
     def far(self) -> bool:
-        """Whether the opposite of a length is compared."""
-        return self.part.length and self.part.sense != "<"
+        return self.part.length and self.part.sense != "<"  # the opposite of a length is compared
 
     @property
     def flipped(self) -> bool:
-        """Whether the atom holds where its value is not below the threshold."""
-        return self.part.sense == "<="
+        return self.part.sense == "<="  # the atom holds where its value is not below the threshold
 
 
 _ORIGIN = typed((0.0, 0.0, 0.0))
@@ -164,8 +160,7 @@ class QueryFacts(NamedTuple):
 
 
 def _task_facts(task: Task, queries: Sequence[Query]) -> tuple[dict[Atom, int], dict[int, int], list[tuple[int, int]]]:
-    """The places of a task's atoms; the bit that says that all atoms of some bits hold; and of each query the bits that
-    it cares for, and which of them must be true."""
+    """A task's atoms' places; the bit that all atoms of some bits hold; each query's care bits, and which are true."""
     places: dict[Atom, int] = {}
 
     def bits(clause: Clause) -> int:

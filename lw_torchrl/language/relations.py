@@ -25,11 +25,7 @@ class Comparison:
         threshold: in metres.
         length: the Euclidean length over the axes; otherwise the signed coordinate of the one axis.
         raise_z: added to dz first, in metres.
-        temperature: of the soft truth, metres (or shares of the gripper's opening) to one logit.
-
-    Raises:
-        ValueError: other axes, a signed coordinate of several axes, another sense, a threshold that is no finite
-            number, or a temperature that is not above 0.
+        temperature: of the soft truth, metres (or shares of the gripper's opening) to one logit, above 0.
     """
 
     axes: str

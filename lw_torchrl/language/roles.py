@@ -46,10 +46,7 @@ def plan_roles(plan: ConditionalPlan, skills: Mapping[str, ScriptedSkill] | None
     for a mug), the condition does. If the gripper goes to a thing and the condition compares it with a point on that
     thing, the point is the target. If the text moves a thing that the condition says is held, the thing is moved,
     though a script steers the gripper. "the target location" is the goal in every task.
-
-    Args:
-        plan: the plan; its ``definition`` says which objects and points there are.
-        skills: the scripted skills by their text; None for the shipped ones, an empty mapping for words alone.
+    ``skills`` are the scripted skills by their text; None for the shipped ones, an empty mapping for words alone.
 
     Example:
         >>> from lw_torchrl.language.plan_files import load_plans
@@ -143,10 +140,8 @@ def _carried(roles: Roles, step: PlanStep, task: Task) -> Roles:
 
 def _holds(step: PlanStep, relation: str, name: str) -> bool:
     """Whether the condition says so of the gripper and a thing, or of the gripper."""
-    return any(
-        clause.predicate == relation and not clause.negated and name in (clause.subject, clause.object)
-        for clause in step.condition.clauses
-    )
+    said = [clause for clause in step.condition.clauses if clause.predicate == relation and not clause.negated]
+    return any(name in (clause.subject, clause.object) for clause in said)
 
 
 def _same_thing(first: str, second: str, task: Task) -> bool:

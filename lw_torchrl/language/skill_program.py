@@ -37,10 +37,6 @@ class SkillProgram(nn.Module):
     Attributes:
         num_skills: S, the length of the longest list.
 
-    Raises:
-        SkillError: (a ValueError) a skill names objects that its task lacks.
-        ValueError: an unknown task or text, with the nearest.
-
     Example:
         >>> import torch
         >>> from lw_torchrl.language.tasks import task_id
@@ -98,16 +94,11 @@ class SkillProgram(nn.Module):
 
         Returns:
             (..., S, 4) of the observation's dtype: displacement xyz and gripper effort, each in [-1, 1]; zeros
-            beyond the task's last skill.
-
-        Raises:
-            ValueError: a wrong shape, or a task without skills.
+            beyond the task's last skill. A task without skills is a :class:`ValueError`.
         """
         if observation.shape[-1:] != (OBSERVATION_SIZE,) or task_id.shape != observation.shape[:-1]:
-            raise ValueError(
-                f"observation must be of shape (..., {OBSERVATION_SIZE}) and task_id of (...), got "
-                f"{tuple(observation.shape)} and {tuple(task_id.shape)}"
-            )
+            got = f"{tuple(observation.shape)} and {tuple(task_id.shape)}"
+            raise ValueError(f"observation must be of shape (..., {OBSERVATION_SIZE}) and task_id of (...), got {got}")
         tables = self._tables.select(task_id.reshape(-1), observation)
         state = torch.cat((observation.reshape(-1, OBSERVATION_SIZE), tables.constants), 1)
         way = state.gather(1, tables.target) - state.gather(1, tables.moved)

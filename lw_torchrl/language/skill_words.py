@@ -20,8 +20,7 @@ _LONGEST_BEFORE = max(map(len, _BEFORE_NOUN))
 def canonical_skill(skill: str, task: Task) -> str:
     """The skill in plain English: articles go before the nouns that lack one, as in the paper.
 
-    A noun lacks one at the beginning and after a word like "above"; after any other word ("the coffee mug") it
-    is part of something longer and is left alone.
+    A noun lacks one at the beginning and after a word like "above"; else ("the coffee mug") it is left alone.
     """
     first, _, details = " ".join(skill.split()).partition(" ")
     verb, *rest = first.replace("_", " ").split() or [""]
@@ -68,9 +67,5 @@ def closes(skill: str) -> bool:
 def has_direction(skill: str) -> bool:
     """Whether a skill says a direction in the plane, as seen by the robot or by the thing: "to the left", "toward the
     robot", "in front of the drawer handle", "into the hole"; "toward the reach target" and "above the puck" say none.
-
-    Example:
-        >>> has_direction("push the window handle to the left"), has_direction("move the puck to the target location")
-        (True, False)
     """
     return not _DIRECTIONS.isdisjoint(skill.split())

@@ -10,16 +10,12 @@ from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from lw_torchrl._checks import checked, nearest, shown
 from lw_torchrl._files import read_toml
 from lw_torchrl.language.named_objects import GRIPPER, is_number
 from lw_torchrl.language.tasks import TASKS, Task, check_task, get_task
-
-if TYPE_CHECKING:
-    pass
-
 
 Triple = tuple[float, float, float]
 
@@ -41,9 +37,6 @@ class ScriptedSkill:
         gripper: effort in [-1, 1]; -1 opens, 1 closes.
         goal: the state it steers to, as a query of the tasks that it suits; "" where the language has no words for it.
         variants: task name to what differs there, any of the above but the text.
-
-    Raises:
-        SkillError: (a ValueError) a number is not finite or out of range, or a name or the goal is no text.
 
     Example:
         >>> skill = ScriptedSkill("place the gripper above the puck", "puck", offset=(0.0, 0.0, 0.1), gripper=-1.0)
@@ -151,11 +144,8 @@ def load_skills(
 
     Args:
         path: a file like data/skills.toml, whose skills join ours or replace those with the same text; None for
-            ours alone.
+            ours alone. One that is no TOML in UTF-8, or has a malformed skill, is a :class:`SkillError`.
         tasks: whose names its ``for`` tables may have, as from :func:`~lw_torchrl.load_tasks`.
-
-    Raises:
-        SkillError: (a ValueError) the file is no TOML in UTF-8, or a skill in it is malformed.
 
     Example:
         >>> load_skills()["place the gripper above the puck"].target

@@ -19,14 +19,7 @@ Tables = TypeVar("Tables", bound=tuple[Tensor, ...])
 class TaskIndex:
     """The rows that tasks have in a table, in the order of their ids. It follows the ids to their device.
 
-    Args:
-        tasks: names, in any order.
-
-    Attributes:
-        tasks: the names in the order of their rows.
-
-    Raises:
-        ValueError: two names have the same id, or one is given twice.
+    ``tasks`` are the names in the order of their rows. Two that have the same id are a ValueError.
 
     Example:
         >>> index = TaskIndex(["reach", "stack-blocks", "push"])
@@ -52,17 +45,10 @@ class TaskIndex:
         return self.tasks.index(task)
 
     def rows(self, task_id: Tensor, problem: str) -> Tensor:
-        """The row of each task.
+        """The row of each task, (...) int64 to (...) int64.
 
-        Args:
-            task_id: (...) int64.
-            problem: what the error says of an id that has no row, "tasks without a plan".
-
-        Returns:
-            (...) int64. Inside ``torch.vmap`` an unknown id gets a row beyond the last.
-
-        Raises:
-            ValueError: another dtype, or an id that has no row; compiled or on a GPU, a RuntimeError when it runs.
+        An id that has no row is a ValueError, which names the ``problem``, "tasks without a plan"; compiled or on a
+        GPU a RuntimeError when it runs. Inside ``torch.vmap`` it gets a row beyond the last.
         """
         if task_id.dtype not in (torch.int64, torch.int32):
             raise ValueError(f"task_id must be int64, got {task_id.dtype}")
@@ -97,11 +83,7 @@ class TaskTables(nn.Module, Generic[Tables]):
 
     The tables are buffers that follow the module to a device, keep their precision and are not saved. What a batch
     selected is kept for the next, since the rows of an environment keep their tasks.
-
-    Args:
-        index: which row is whose.
-        tables: a named tuple of tensors, each (T, ...).
-        problem: as for :meth:`TaskIndex.rows`.
+    ``tables`` is a named tuple of tensors, each (T, ...), ``problem`` is as for :meth:`TaskIndex.rows`.
     """
 
     def __init__(self, index: TaskIndex, tables: Tables, problem: str) -> None:
@@ -122,20 +104,11 @@ class TaskTables(nn.Module, Generic[Tables]):
         return plain(*tensors, next(iter(self._buffers.values())))  # type: ignore[arg-type]
 
     def select(self, task_id: Tensor, observation: Tensor) -> Tables:
-        """The tables' rows for a batch.
-
-        Args:
-            task_id: (B,) int64.
-            observation: gives the tables its device, and tables of floats its dtype.
-
-        Returns:
-            The tables, each (B, ...).
-        """
+        """The tables' rows (B, ...) for a batch of ids, (B,) int64; the observation gives them its device and dtype."""
         device, dtype = observation.device, observation.dtype
         if not self.plain(observation, task_id):
             return self._pick(self._to(device, dtype), task_id)
-        # Autograd refuses what was made in inference mode.
-        kind = device, dtype, torch.is_inference_mode_enabled()
+        kind = device, dtype, torch.is_inference_mode_enabled()  # autograd refuses what was made in inference mode
         looked_at = not waits(task_id)
         if self._last is not None and looked_at:
             ids, of, selected = self._last

@@ -37,8 +37,7 @@ class Task:
     Attributes:
         name: "drawer-open", Meta-World's name without its version; or your own, lower-case words joined by hyphens.
         description: one sentence that says what is to be done.
-        objects: at most 64 named objects with different names: the robot's gripper first, the points that we named
-            last.
+        objects: at most 64 with different names: the robot's gripper first, the points that we named last.
     """
 
     name: str
@@ -83,16 +82,11 @@ class Task:
         def coordinate(at: Coordinate, shift: float) -> Tensor:
             return (observation[..., at] if isinstance(at, int) else torch.full_like(observation[..., 0], at)) + shift
 
-        return {
-            named.name: torch.stack(list(map(coordinate, named.position, named.offset)), -1) for named in self.objects
-        }
+        return {one.name: torch.stack(list(map(coordinate, one.position, one.offset)), -1) for one in self.objects}
 
     def to_json(self) -> dict[str, Any]:
-        """The task as a row of tasks.toml.
-
-        Raises:
-            TaskError: (a ValueError) a row cannot hold it: the gripper is elsewhere, or a point has an offset from a
-                place without an object.
+        """The task as a row of tasks.toml; a :class:`TaskError` where a row cannot hold it: the gripper is elsewhere,
+        or a point has an offset from a place without an object.
 
         Example:
             >>> TASKS["reach"].to_json()["objects"]
@@ -164,9 +158,6 @@ def task_id(name: str) -> int:
     """The integer of a task: of the 50, the rank among the sorted names, from 0; of any other, a number from 50 to
     2³¹ - 1 that depends only on the name. So it is the same in every process and file. A misspelt name has an id too.
 
-    Raises:
-        ValueError: the name is not lower-case words joined by hyphens.
-
     Example:
         >>> task_id("assembly"), task_id("window-open"), task_id("stack-blocks")
         (0, 49, 650718257)
@@ -183,9 +174,6 @@ def resolve_tasks(names: str | Iterable[str], *, tasks: Mapping[str, Task] = TAS
     Args:
         names: "MT10", "MT50", one task's name, or an iterable of names.
         tasks: the tasks there are, by name, as from :func:`~lw_torchrl.load_tasks`.
-
-    Raises:
-        ValueError: a name is unknown (with the nearest allowed ones), repeated, or the list is empty.
 
     Example:
         >>> resolve_tasks(["push", "door-open"])
@@ -240,14 +228,12 @@ def load_tasks(path: str | os.PathLike[str]) -> Mapping[str, Task]:
     """All 50 tasks and those of your own file: some of the 50 with other objects, points or words, or new tasks.
 
     Args:
-        path: a file in the format of data/tasks.toml. A task with a new name must name its objects.
+        path: a file in the format of data/tasks.toml, else a :class:`TaskError`. A task with a new name must name its
+            objects.
 
     Returns:
         Task name to :class:`Task`, sorted; pass one wherever a task is asked for, or all of them to
         :func:`~lw_torchrl.load_plans` and :func:`~lw_torchrl.resolve_tasks`.
-
-    Raises:
-        TaskError: (a ValueError) the file is no TOML, or a task in it is malformed.
 
     Example:
         >>> import os, tempfile
@@ -266,11 +252,8 @@ def load_tasks(path: str | os.PathLike[str]) -> Mapping[str, Task]:
         try:
             found[name] = Task.from_json(name, row)
             if name not in TASKS and len(found[name].objects) == 1:
-                close = nearest(name, TASKS, n=1)
-                raise TaskError(
-                    f"task {name!r}: is none of the 50, so it must name its objects"
-                    + (f"; did you mean {close[0]!r}?" if close else "")
-                )
+                near = "".join(f"; did you mean {other!r}?" for other in nearest(name, TASKS, n=1))
+                raise TaskError(f"task {name!r}: is none of the 50, so it must name its objects{near}")
         except TaskError as error:
             raise TaskError(f"{file}, {error}") from error
     return MappingProxyType(dict(sorted(found.items())))

@@ -14,8 +14,6 @@ import torch
 from torch import Tensor
 
 from lw_torchrl._files import replacing
-from lw_torchrl.language.plan_files import load_plans
-from lw_torchrl.language.tasks import TASKS
 
 TEXT_DIMENSION = 384
 TABLE = "embeddings.npz"
@@ -64,16 +62,9 @@ def sentence_encoder(texts: Sequence[str]) -> Tensor:
 
 
 def encode_texts(texts: Sequence[str]) -> Tensor:
-    """The default encoder: shipped vectors for the shipped texts, the sentence encoder for all others.
+    """The default encoder: n texts to (n, 384) float32, each of length 1.
 
-    Args:
-        texts: n skills or task descriptions.
-
-    Returns:
-        (n, 384) float32, each of length 1.
-
-    Raises:
-        ImportError: a text is not shipped, and the extra ``[text]`` is not installed.
+    The shipped texts have shipped vectors; for all others the extra ``[text]`` is needed, an ImportError without it.
 
     Example:
         >>> from lw_torchrl.language.tasks import TASKS
@@ -101,22 +92,17 @@ def encoded(texts: Sequence[str], encoder: TextEncoder | None) -> Tensor:
     return found.detach().to(torch.float32)
 
 
-def shipped_texts() -> list[str]:
-    """The task descriptions and the skills of the shipped plans, sorted."""
-    skills = {*load_plans("MT50").skills, *load_plans("MT50", skills="MT10").skills}
-    return sorted({task.description for task in TASKS.values()} | skills)
-
-
 def write_table(path: Path, texts: Iterable[str]) -> None:
     """Encode ``texts`` and write them with their vectors, half precision, as an .npz without pickles."""
     listed = list(texts)
+    vectors = sentence_encoder(listed).numpy().astype(np.float16)
     with replacing(path) as temporary:
-        np.savez_compressed(
-            temporary, texts=np.array(listed), vectors=sentence_encoder(listed).numpy().astype(np.float16)
-        )
+        np.savez_compressed(temporary, texts=np.array(listed), vectors=vectors)
 
 
 if __name__ == "__main__":
+    from lw_torchrl.language.plan_files import shipped_texts
+
     target = Path(__file__).parent / "data" / TABLE
     write_table(target, shipped_texts())
     print(f"{len(shipped_texts())} texts written to {target.name}")

@@ -11,17 +11,6 @@ from lw_torchrl.planners.planner import FilePlanner, Planner
 from lw_torchrl.planners.prompts import plan_prompt, prompt_examples
 
 __all__ = [
-    "Answer",
-    "Answers",
-    "FilePlanner",
-    "OpenAIPlanner",
-    "Planner",
-    "PlannerError",
-    "Tokens",
-    "answer_path",
-    "folder_name",
-    "plan_prompt",
-    "plan_schema",
-    "prompt_examples",
-    "write_answer",
-]
+    "Answer", "Answers", "FilePlanner", "OpenAIPlanner", "Planner", "PlannerError", "Tokens", "answer_path",
+    "folder_name", "plan_prompt", "plan_schema", "prompt_examples", "write_answer",
+]  # fmt: skip

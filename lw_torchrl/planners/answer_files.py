@@ -26,12 +26,7 @@ _Place = tuple[str, str, int]  # format, task, attempt
 
 @checked
 def folder_name(model: str) -> str:
-    """A model's name as that of a folder.
-
-    Example:
-        >>> folder_name("meta-llama/Llama-3.1-8B"), folder_name("PaLM 2")
-        ('meta-llama_Llama-3.1-8B', 'PaLM 2')
-    """
+    """A model's name as that of a folder: "meta-llama_Llama-3.1-8B"."""
     return re.sub(r"[^\w .+-]+", "_", model).strip(" ._")[:100].rstrip(" .") or "model"
 
 
@@ -54,13 +49,7 @@ def write_answer(folder: str | os.PathLike[str], model: str, answer: Answer) -> 
 def settle_folder(folder: Path, settings: Mapping[str, Any], *, reading: bool = False) -> None:
     """Write what determines a model's answers to ``folder/settings.json``, unless it is there.
 
-    Args:
-        folder: of one model's answers, ``out/<name>``.
-        settings: what determines them, as JSON has it.
-        reading: nothing will be written, so only the model has to be the same.
-
-    Raises:
-        ValueError: the folder has answers of other settings, or of settings that are not recorded.
+    A ValueError if the folder has answers of others; with ``reading``, only the model has to be the same.
     """
     file = folder / _SETTINGS
     there = read_json(file, "out: the settings") if file.is_file() else {}
@@ -70,10 +59,8 @@ def settle_folder(folder: Path, settings: Mapping[str, Any], *, reading: bool = 
         if reading and there.get("model", settings["model"]) == settings["model"]:
             return
         differ = ", ".join(differences(there, settings)) if there else f"it has no {_SETTINGS} that says which"
-        raise ValueError(
-            f"out: {str(folder)!r} holds answers of other settings: {differ}; give these again, or the new answers "
-            "another name (--name) or out"
-        )
+        how = "give these again, or the new answers another name (--name) or out"
+        raise ValueError(f"out: {str(folder)!r} holds answers of other settings: {differ}; {how}")
     if not reading:
         write_json(file, dict(settings))
 
@@ -86,10 +73,7 @@ def recorded_answer(
     kept: Reply | None,
     skills: Mapping[str, ScriptedSkill] | None = None,
 ) -> Answer | None:
-    """The answer to a question that is recorded in ``out/<model>``, None if there is none.
-
-    ``kept`` is the reply in the cache, if any, which knows more about the answer than its file.
-    """
+    """The answer recorded in ``out/<model>``, if any; ``kept`` is the reply in the cache, which knows more of it."""
     path = answer_path(out, model, format, question.task.name, question.attempt)
     if not path.is_file():
         return None
@@ -171,12 +155,7 @@ def _of_lines(file: Path) -> dict[str, dict[_Place, str | Path]]:
 
 
 def answer_key(request: dict[str, Any]) -> str:
-    """The name of an answer in the cache: 64 hex digits of all that determines it.
-
-    Example:
-        >>> answer_key({"model": "a", "attempt": 0}) == answer_key({"attempt": 0, "model": "a"})
-        True
-    """
+    """The name of an answer in the cache: 64 hex digits of all that determines it, in any order."""
     return sha256(json.dumps([_VERSION, request], sort_keys=True).encode()).hexdigest()
 
 

@@ -33,10 +33,7 @@ class PlannerError(RuntimeError):
 
 
 def unanswered(errors: Sequence[Exception], came: int, total: int, folder: Path) -> Exception:
-    """The error for questions without an answer; ``came`` of ``total`` answers are kept in ``folder``.
-
-    One of ``errors`` that is no :class:`PlannerError` goes first, as it is.
-    """
+    """The error for questions without an answer, or the first that is no :class:`PlannerError`, as it is."""
     first = next((error for error in errors if not isinstance(error, PlannerError)), errors[0])
     if not isinstance(first, PlannerError):
         return first
@@ -69,12 +66,7 @@ def is_count(value: object) -> TypeGuard[int]:
 
 
 def storable(text: str) -> str:
-    r"""A text as a file gives it back: without half characters and byte order marks, and with "\n" as line ends.
-
-    Example:
-        >>> storable("\ufeffone\r\ntwo \ud800")
-        'one\ntwo ?'
-    """
+    r"""A text as a file gives it back: without half characters and byte order marks, and with "\n" as line ends."""
     whole = text.encode("utf-8", "replace").decode()
     return whole.replace("\r\n", "\n").replace("\r", "\n").lstrip("\ufeff")
 
@@ -92,29 +84,17 @@ class Reply:
 
 @dataclass(frozen=True)
 class Answer:
-    """What a planner answered to one question.
-
-    Attributes:
-        task: the task's name.
-        format: the format that was asked for.
-        attempt: which of several answers to the same question, from 0.
-        text: the answer in the format, for :func:`~lw_torchrl.decode_plan`.
-        raw: as it came; JSON if the model was held to a schema, else the same as ``text``.
-        decoded: what was made of it.
-        tokens: what it cost when it was asked for.
-        cached: it had been asked for before.
-        notes: further remarks: that it was cut off, that the server did not keep to the schema.
-    """
+    """What a planner answered to one question."""
 
     task: str
-    format: str
-    attempt: int
-    text: str
-    raw: str
-    decoded: DecodedPlan
-    tokens: Tokens = NO_TOKENS
-    cached: bool = False
-    notes: tuple[str, ...] = ()
+    format: str  # that was asked for
+    attempt: int  # which of several answers to the same question, from 0
+    text: str  # the answer in the format, for :func:`~lw_torchrl.decode_plan`
+    raw: str  # as it came; JSON if the model was held to a schema, else the same as ``text``
+    decoded: DecodedPlan  # what was made of it
+    tokens: Tokens = NO_TOKENS  # what it cost when it was asked for
+    cached: bool = False  # it had been asked for before
+    notes: tuple[str, ...] = ()  # further remarks: it was cut off, the server did not keep to the schema
 
 
 class Answers(Sequence[Answer]):
@@ -155,11 +135,7 @@ def read_reply(
 ) -> Answer:
     """The answer in a reply to a question for a plan; whatever the server claims, it is read as any text is.
 
-    Args:
-        reply: what the server said.
-        task, format, attempt: what was asked for.
-        skills: the scripted skills to choose from; None for the shipped ones.
-        schema: what the model was to be held to; JSON is expected then, and becomes a text in the format.
+    With a ``schema``, which the model was to be held to, JSON is expected, and becomes a text in the format.
     """
     read = PLAN_FORMATS[format].read if schema is None else read_structured
     raw = storable(reply.text)

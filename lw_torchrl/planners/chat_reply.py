@@ -51,12 +51,7 @@ def bounded_client(openai: Any, timeout: float) -> Any:
 
 
 class NoCompletion(ValueError):
-    """What came is no chat completion.
-
-    Attributes:
-        hint: what to try.
-        fatal: any other question would end the same way.
-    """
+    """What came is no chat completion; ``hint`` says what to try, and with ``fatal`` any other ends the same way."""
 
     def __init__(self, message: str, hint: str, fatal: bool = False) -> None:
         super().__init__(message)
@@ -66,10 +61,8 @@ class NoCompletion(ValueError):
 def read_completion(content: bytes, hide: Callable[[str], str]) -> tuple[Reply, str]:
     """The answer in a reply's body, and the model that the server says gave it; ``hide`` takes out secrets.
 
-    A wrong ``finish_reason``, ``refusal`` or ``usage`` is noted, and takes nothing from the answer.
-
-    Raises:
-        NoCompletion: it is too large, no JSON, or has no message whose content is a text or null.
+    A wrong ``finish_reason``, ``refusal`` or ``usage`` is noted, and takes nothing from the answer. One that is too
+    large, no JSON, or has no message whose content is a text or null, is :class:`NoCompletion`.
     """
     if len(content) > REPLY_LIMIT:
         what = f"the reply is larger than {REPLY_LIMIT // 2**20} MiB"

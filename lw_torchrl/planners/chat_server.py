@@ -23,12 +23,7 @@ _KEY = "OPENAI_API_KEY"
 
 
 def server_address(base_url: str | None) -> str:
-    """The address of a server, without a name and a password, or a query.
-
-    Example:
-        >>> server_address("http://me:secret@127.0.0.1:8000/v1/")
-        'http://127.0.0.1:8000/v1'
-    """
+    """The address of a server, without a name and a password, or a query."""
     try:
         found = urlsplit(_given(base_url))
         host = f"[{found.hostname}]" if found.hostname and ":" in found.hostname else found.hostname
@@ -70,13 +65,8 @@ class Dialect:
 class ChatServer:
     """A server, while the block lasts; any number of threads may ask it at once.
 
-    Args:
-        model, base_url, timeout, retries: as for :class:`~lw_torchrl.OpenAIPlanner`.
-        dialect: what the server is known to write.
-
-    Raises:
-        ImportError: the extra ``[llm]`` is absent.
-        PlannerError: OpenAI's server has no key, or the key cannot be sent.
+    Arguments are as for :class:`~lw_torchrl.OpenAIPlanner`; without the extra ``[llm]`` it is an ImportError, without a
+    key for OpenAI's server, or with one that cannot be sent, a PlannerError.
     """
 
     def __init__(
@@ -134,12 +124,10 @@ class ChatServer:
             work.close()  # where the loop was closed before it began
 
     def ask(self, request: Mapping[str, Any], question: str) -> Reply:
-        """The answer to a request; if none came that can be read, a :class:`PlannerError`.
+        """The answer to a request; if none came that can be read, a :class:`PlannerError` that names the question.
 
-        Args:
-            request: "messages", "schema" (None for any text), "max_tokens", and "temperature", "seed" and "options",
-                None for the server's own.
-            question: what to call it in an error.
+        It has "messages", "schema" (None for any text), "max_tokens", and "temperature", "seed" and "options", None for
+        the server's own.
         """
         fault: Exception
         while True:
@@ -240,8 +228,7 @@ def ask_at_once(
 ) -> Iterator[tuple[Item, Result | Exception]]:
     """Each item with what ``work`` gives of it, or raises, in the order in which they end.
 
-    After an error that is no :class:`PlannerError`, or a fatal one, no further item is begun; those under way are
-    waited for, unless the caller stops listening.
+    After an error that is no :class:`PlannerError`, or a fatal one, only those under way are waited for.
     """
     waiting, ended = deque(items), SimpleQueue[tuple[Item, Result | Exception] | None]()
     stop = threading.Event()

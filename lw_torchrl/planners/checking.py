@@ -81,11 +81,9 @@ def check_plan(
     skills: Mapping[str, ScriptedSkill] | None = None,
     tasks: Mapping[str, Task] = TASKS,
 ) -> PlanCheck:
-    """Decode a text, and look where its plan's conditions hold.
+    """Decode a text, as :func:`~lw_torchrl.decode_plan`, and look where its plan's conditions hold.
 
-    Args:
-        text, task, format, skills, tasks: as for :func:`~lw_torchrl.decode_plan`; the task is one of Meta-World's.
-        episodes, seed: of the expert, and of the plan by scripted skills.
+    The task is one of Meta-World's; ``episodes`` and ``seed`` are the expert's, and of the plan by scripted skills.
 
     Example:
         >>> import lw_torchrl as lw

@@ -45,12 +45,7 @@ class ComparedAnswer:
 
 
 class PlanComparison:
-    """Answers of models, compared by what scripted skills make of them.
-
-    Attributes:
-        answers: each with how it fared; sorted by model, format, task and attempt.
-        settings: of the episodes.
-    """
+    """Answers of models, sorted by model, format, task and attempt, and the settings of their episodes."""
 
     def __init__(self, answers: Sequence[ComparedAnswer], settings: Mapping[str, Any]) -> None:
         self.answers = tuple(sorted(answers, key=lambda one: (one.model, one.format, one.task, one.attempt)))
@@ -84,8 +79,7 @@ class PlanComparison:
         return max((format for name, format in self.groups if name == model), key=lambda one: self.mean(model, one))
 
     def best_of(self, model: str, format: str) -> float:
-        """The mean over tasks of the odd episodes' success, of the answer that does best in the even ones; NaN with
-        one episode."""
+        """The mean over tasks of the odd episodes' success of the answer best in the even ones; NaN of one episode."""
         chosen: dict[str, tuple[float, float]] = {}
         for one in self._of(model, format):
             tried, fresh = _mean(one.success[::2]), _mean(one.success[1::2])
@@ -148,16 +142,12 @@ def compare_plans(
     """Decode recorded answers, and carry out all their plans by scripted skills in one simulation.
 
     Args:
-        source: a folder ``<model>/<format>/<task>-<attempt>.<ext>``, as planners write it, or a .jsonl file as for
-            :class:`~lw_torchrl.FilePlanner`.
+        source: a folder or a .jsonl file, as for :class:`~lw_torchrl.FilePlanner`.
         episodes, seed, choose, noise_scale, max_steps, num_envs, num_threads: as for
             :func:`~lw_torchrl.evaluation.evaluate_plans`.
         tasks: where tasks' names are looked up, as from :func:`~lw_torchrl.load_tasks`.
         resume: a file that keeps how plans fared, every few seconds; what it has is not run again.
         progress: show progress bars.
-
-    Raises:
-        ValueError: there are no answers, one is of an unknown task, or ``resume`` is of other settings or damaged.
 
     Example:
         >>> import tempfile, lw_torchrl as lw

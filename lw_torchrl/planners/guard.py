@@ -28,13 +28,8 @@ class Refused(ValueError):
 def read_request(body: bytes, model: str, context: int) -> bytes:
     """The body of a request, checked and rewritten for llama-cpp-python's server: a schema is ``json_object`` there.
 
-    Args:
-        body: as it came.
-        model: the only one there is; a request without a name means it too.
-        context: tokens that an answer may have.
-
-    Raises:
-        Refused: it is no JSON, or has an unknown field or a value that is not allowed.
+    A request without a model's name means ``model``, the only one; an answer may have ``context`` tokens. What is no
+    JSON, or has an unknown field or a value that is not allowed, is :class:`Refused`.
     """
     try:
         request = parse_json(body)
@@ -156,13 +151,8 @@ class Guard:
     """An ASGI application before that of llama-cpp-python.
 
     It takes only ``GET /v1/models`` and ``POST /v1/chat/completions``, reads a request whole, and passes it on in its
-    turn if :func:`read_request` allows it. A request whose client has gone while it waited is dropped.
-
-    Args:
-        app: the application behind it.
-        model: the name of its model.
-        context: tokens of a question and its answer.
-        names: what a request may call this machine, so that no web page can ask by another name; None for any.
+    turn if :func:`read_request` allows it. A request whose client has gone while it waited is dropped. ``names`` are
+    what a request may call this machine, so that no web page can ask by another name; None for any.
     """
 
     def __init__(self, app: Any, model: str, context: int, names: Collection[str] | None = None) -> None:
@@ -236,7 +226,6 @@ class _Gone(Exception):
 
 
 async def _whole(headers: dict[bytes, str], receive: Any) -> bytes:
-    """The body of a request."""
     said, body = headers.get(b"content-length", "0"), bytearray()
     too_large = Refused(413, f"a request may have {BODY_LIMIT} bytes", "too_large")
     if len(said) > 9 or not said.isdecimal() or int(said) > BODY_LIMIT:

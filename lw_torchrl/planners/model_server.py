@@ -61,9 +61,8 @@ def serve_model(
 
     Raises:
         ImportError: the extra ``[serve]`` is absent.
-        FileNotFoundError: there is no such file.
-        ValueError: the file is no GGUF file or cannot be loaded, or a number is too small.
-        OSError: the port is taken, or the host is none of this machine's.
+        ValueError: the file is no GGUF file or cannot be loaded.
+        OSError: there is no such file, the port is taken, or the host is none of this machine's.
 
     Example:
         >>> serve_model("Llama-3.2-3B-Instruct-Q4_K_M.gguf", port=8001)  # doctest: +SKIP

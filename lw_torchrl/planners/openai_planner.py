@@ -57,9 +57,6 @@ class OpenAIPlanner:
             The wait doubles from half a second to 8, or is what the server says, up to two minutes.
         timeout: seconds that each try may take as a whole, from the connection to the answer's last byte.
 
-    Raises:
-        ValueError: a number is too small, ``base_url`` is no address, or ``free_skills`` without ``constrain``.
-
     Example:
         >>> planner = OpenAIPlanner("meta-llama/Llama-3.1-8B", base_url="http://127.0.0.1:8000/v1", constrain=True)
         >>> planner
@@ -166,9 +163,6 @@ class OpenAIPlanner:
             recorded: take the answers that ``out`` has as they are, and ask only for the others.
             progress: show how many have come.
 
-        Returns:
-            An answer for each task and attempt.
-
         Raises:
             PlannerError: an answer did not come. Those that came are kept; called again it asks for the others.
             ImportError: something is to be asked, and the extra ``[llm]`` is absent.
@@ -201,10 +195,7 @@ class OpenAIPlanner:
             round: of several; the name of the folder ends with it.
             tasks: where the tasks' names are looked up.
             out: a folder; answers are written to ``out/<name>-round<round>/<format>/<task>-<attempt>.<ext>``.
-            progress: as for :meth:`plans`, as are the errors.
-
-        Raises:
-            ValueError: answers of several formats, not as many facts, or ``out`` has another answer to a question.
+            progress: as for :meth:`plans`, as are the errors; ``out`` with another answer is a ValueError.
         """
         before, told = list(answers), list(facts)
         formats = {answer.format for answer in before}

@@ -35,15 +35,10 @@ def plan_schema(
     three choices, not one of hundreds: OpenAI takes at most 1,000 words to choose from; the largest task has 320.
 
     Args:
-        task: the task, or its name.
-        format: gives the style: with a reason before each clause if it explains, with the state to reach if it is a
-            goal format.
-        skills: the scripted skills to choose from; None for the shipped ones.
+        task, tasks: as for :func:`~lw_torchrl.decode_plan`.
+        format: gives the style: a reason before each clause if it explains, the state to reach in a goal format.
+        skills: the scripted skills to choose from; None for the shipped ones. If none suits, it is a ValueError.
         free_skills: skills in any words instead.
-        tasks: where a task's name is looked up, as from :func:`~lw_torchrl.load_tasks`.
-
-    Raises:
-        SkillError: (a ValueError) no scripted skill suits the task.
 
     Example:
         >>> schema = plan_schema("reach")

@@ -16,14 +16,12 @@ from lw_torchrl.planners.answers import Answer, Answers, PlannerError
 
 @runtime_checkable
 class Planner(Protocol):
-    """Whatever writes plans: :class:`~lw_torchrl.OpenAIPlanner`, :class:`~lw_torchrl.FilePlanner`, or one of yours.
-
-    Attributes:
-        name: the model's name, fit for a folder's.
-    """
+    """Whatever writes plans: :class:`~lw_torchrl.OpenAIPlanner`, :class:`~lw_torchrl.FilePlanner`, or one of yours."""
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """The model's name, fit for a folder's."""
+        ...
 
     def plans(
         self,
@@ -58,10 +56,6 @@ class FilePlanner:
     Attributes:
         name: the model's name, fit for a folder's.
         recorded: (format, task, attempt) of each answer there is, sorted.
-
-    Raises:
-        ValueError: there are no answers, or of several models and none is named; a line is no answer; or two models
-            have the same name for a folder.
 
     Example:
         >>> import json, pathlib, lw_torchrl as lw

@@ -28,13 +28,11 @@ def prompt_examples(
 ) -> tuple[ConditionalPlan, ...]:
     """The plans that a prompt shows: pick-place's, and those of the tasks whose descriptions are nearest in edits.
 
-    Args:
-        task: the task, or its name; its own plan is never among them.
-        plans: to choose from; None for the hand-written ones of MT10.
-        tasks: where a task's name is looked up, as from :func:`~lw_torchrl.load_tasks`.
+    They are up to three, without the task's own; the nearest last, so that it stands beside the question.
 
-    Returns:
-        Up to three plans; the nearest last, so that it stands beside the question.
+    Args:
+        task, tasks: as for :func:`~lw_torchrl.decode_plan`.
+        plans: to choose from; None for the hand-written ones of MT10.
 
     Example:
         >>> [plan.task for plan in prompt_examples("coffee-push")]
@@ -78,11 +76,9 @@ def plan_prompt(
     model that completes texts goes on from there; :func:`~lw_torchrl.decode_plan` reads its answer.
 
     Args:
-        task: the task, or its name.
-        format: a name in :data:`~lw_torchrl.PLAN_FORMATS`.
+        task, format, tasks: as for :func:`~lw_torchrl.decode_plan`.
         plans: the plans to choose the examples from; None for the hand-written ones of MT10.
         vocabulary: also say which things the task has, and what can be asked about them.
-        tasks: where a task's name is looked up, as from :func:`~lw_torchrl.load_tasks`.
 
     Example:
         >>> print(plan_prompt("drawer-open", "chain_py").splitlines()[-2])
@@ -123,11 +119,6 @@ def chat_messages(
     """The messages that ask for a plan: a prompt, and a system message that tells a chat model how to go on from there.
 
     If the model is held to a schema, that shows the last example as JSON.
-
-    Example:
-        >>> from lw_torchrl.language.tasks import TASKS
-        >>> [message["role"] for message in chat_messages(TASKS["drawer-open"], "chain_py")]
-        ['system', 'user']
     """
     how = f"You write plans for a robot arm. Answer with the plan for `{task.name}` alone, "
     if constrain:

@@ -34,9 +34,7 @@ class Repair:
 
 
 def plan_facts(check: PlanCheck, task: Task, notes: Sequence[str] = ()) -> str:
-    """What became of a plan, in words for the model that wrote it.
-
-    ``notes`` are those of the answer; the model is told the one that it can mend, that it was cut off.
+    """What became of a plan, in words for the model that wrote it; of the answer's ``notes``, that it was cut off.
 
     Example:
         >>> from lw_torchrl.language.tasks import TASKS
@@ -56,16 +54,13 @@ def plan_facts(check: PlanCheck, task: Task, notes: Sequence[str] = ()) -> str:
     if check.own is None:
         lines = ["The plan was not carried out: the robot has no skill that is near one of its steps."]
     lines += unread
-    lines += [
-        f"The condition of step {step + 1}, '{check.decoded.plan.steps[step].condition}', held at no time."
-        for step in check.never
-    ]
+    for step in check.never:
+        condition = check.decoded.plan.steps[step].condition
+        lines.append(f"The condition of step {step + 1}, '{condition}', held at no time.")
     if check.own is not None and check.own.failed:
         stuck = check.own.stuck.index(max(check.own.stuck))
-        lines.append(
-            f"It got stuck in step {stuck + 1}, '{check.decoded.plan.steps[stuck].skill}', in {check.own.stuck[stuck]} "
-            f"of {check.own.failed} failed episodes."
-        )
+        often = f"{check.own.stuck[stuck]} of {check.own.failed} failed episodes"
+        lines.append(f"It got stuck in step {stuck + 1}, '{check.decoded.plan.steps[stuck].skill}', in {often}.")
         lines += _distances(task, check.failed)
     return "\n".join([*lines, again])
 
@@ -84,9 +79,8 @@ def _distances(task: Task, failed: Iterable[Tensor]) -> list[str]:
         far = [(one[a] - one[b]).norm(dim=-1) for one in episodes]
         least = torch.stack([distance.min() for distance in far]).median()
         last = torch.stack([distance[-1] for distance in far]).median()
-        lines.append(
-            f"The {a} came within {100 * float(least):.0f} cm of the {b}, and ended {100 * float(last):.0f} cm from it."
-        )
+        near = f"The {a} came within {100 * float(least):.0f} cm of the {b}"
+        lines.append(f"{near}, and ended {100 * float(last):.0f} cm from it.")
     return lines
 
 
@@ -118,7 +112,6 @@ def repair_plans(
         progress: show progress bars.
 
     Raises:
-        ValueError: answers of several formats.
         PlannerError: an answer did not come; those that came are kept.
     """
     check_int("rounds", rounds, minimum=1)

@@ -41,10 +41,6 @@ def encode_plan(plan: ConditionalPlan, format: str) -> str:
     goals. Reasons are written where a format explains; a goal that is not its skill's usual one has no place in the
     basic and chain formats.
 
-    Args:
-        plan: the plan.
-        format: a name in :data:`PLAN_FORMATS`.
-
     Example:
         >>> from lw_torchrl.language.plan_files import load_plans
         >>> print(encode_plan(load_plans("MT10")["window-open"], "basic_md").splitlines()[2])

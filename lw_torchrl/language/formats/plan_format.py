@@ -99,10 +99,7 @@ class Reading:
 
 
 def listed_steps(text: str, count: int) -> list[str]:
-    """The items of a list of ``count`` steps, "1. first  2. second"; empty if it is no such list.
-
-    Two spaces stand between items; one space is accepted too.
-    """
+    """The items of a list of ``count`` steps, "1. first  2. second"; empty if it is none. One space is accepted too."""
     for gap in (r"\s\s+(?=\[?\d)", r"\s(?=\[?\d{1,3}[.):\]]\s)"):
         items = [item(part) for part in re.split(gap, text.strip())]
         if len(items) == count and all(found and found[0] == number for number, found in enumerate(items, 1)):

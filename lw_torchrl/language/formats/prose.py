@@ -47,26 +47,19 @@ def _write(plan: ConditionalPlan, style: Style) -> str:
 
 
 _NAMED = re.compile(r"[\s#>*\"'`]*(?:the\s+)?task\b[\s:]*([`\"'“‘*]*)([A-Za-z0-9][\w-]*)", re.IGNORECASE)
-
 _ALONE = re.compile(r"[\s#>*\"'`]*([a-z0-9]+(?:[-_][a-z0-9]+)*)[\s\"'`:,*]*")
-
 _BULLET = re.compile(r"\s*(?:[-*•–+>]|\(?\[?\d{1,3}[.)\]]|[a-z]\))\s+")
-
 _WHEN = re.compile(
     r"(?:<[^<>]*>|[\"'`*])*(?:(?:finally|then|next|first|lastly|and|or|else),?\s+)?"
     r"(when|whenever|if|once|while|as long as|as soon as|after)\s+(.+)",
     re.IGNORECASE,
 )
-
 _SHOULD = re.compile(
     r",?\s(?:then\s)?(?:the\s)?(?:robot|it)\s(?:should|must|needs to|has to|will|can|shall)\s(?:then\s|just\s)?",
     re.IGNORECASE,
 )
-
 _UNTIL = re.compile(r",?\s(?:then\s)?move\s(?:the\s)?(?:robot's\s)?gripper\suntil\s", re.IGNORECASE)
-
 _COMMA = re.compile(r",\s(?:then\s)?")
-
 _NO_SKILL = frozenset(("the", "a", "an", "it", "this", "that", "you", "we", "they", "there", "and", "or"))
 
 

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from lw_torchrl._checks import shown
 from lw_torchrl.language.formats.plan_format import END, Clause, PlanFormat, Reading, Style, item
 from lw_torchrl.language.named_objects import GRIPPER
-from lw_torchrl.language.plan_files import function_head, quote
-from lw_torchrl.language.plans import ConditionalPlan, PlanStep, one_line
+from lw_torchrl.language.plans import ConditionalPlan, PlanStep, function_head, one_line, quote
 from lw_torchrl.language.queries import Query
 from lw_torchrl.language.tasks import TASKS, Task
 
@@ -31,7 +30,6 @@ def py(style: Style) -> PlanFormat:
 
 
 def _write(plan: ConditionalPlan, style: Style) -> str:
-    """The plan as a function."""
     lines = []
     if style.explains:
         lines += ["# Steps:", *(f"#  {number}. {step.skill}" for number, step in enumerate(plan.steps, 1))]

@@ -38,10 +38,8 @@ def write_structured(plan: ConditionalPlan, style: Style) -> str:
 def _clauses(query: Query) -> list[dict[str, str]]:
     listed = []
     for clause in query.clauses:
-        said = {
-            "first": f"the {clause.subject}",
-            "is": f"not {clause.predicate}" if clause.negated else clause.predicate,
-        }
+        predicate = f"not {clause.predicate}" if clause.negated else clause.predicate
+        said = {"first": f"the {clause.subject}", "is": predicate}
         listed.append(said if clause.object is None else {**said, "second": f"the {clause.object}"})
     return listed
 
