@@ -8,12 +8,10 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from lw_torchrl._checks import unknown_name
-from lw_torchrl.record.conventions import EPISODE_TIMELINE, METRIC_TIMELINE, entity_path
+from lw_torchrl.record.conventions import EPISODE_TIMELINE, METRIC_TIMELINE, entity_path, rr, rrb
 from lw_torchrl.record.page import Page, side_by_side
 
 if TYPE_CHECKING:
-    import rerun.blueprint as rrb
-    from rerun import RecordingStream
     from rerun.chunk import RrdReader
 
 TABS = {
@@ -84,10 +82,8 @@ class Layout:
                 layout.add_view(name, *content)
         return layout if found else None
 
-    def save(self, stream: RecordingStream) -> None:
+    def save(self, stream: rr.RecordingStream) -> None:
         """Write the new tabs as properties of a recording."""
-        import rerun as rr
-
         for number in range(self._saved, len(self._entries)):
             values = rr.AnyValues(entry=self._entries[number])
             stream.log(f"__properties/{_PROPERTY}/{number}", values, static=True)
@@ -99,7 +95,7 @@ class Layout:
         new = len(self._entries) - self._shown
         return bool(new) and (4 * new >= self._shown or seconds >= 5 * self._shown)
 
-    def send(self, stream: RecordingStream, tab: str | None = None) -> None:
+    def send(self, stream: rr.RecordingStream, tab: str | None = None) -> None:
         """Have the viewer show the tabs, ``tab`` in front.
 
         Raises:
@@ -110,8 +106,6 @@ class Layout:
 
     def blueprint(self, tab: str | None = None) -> rrb.Blueprint:
         """The layout as rerun's; its time panel plays episodes at Meta-World's 80 steps a second."""
-        import rerun.blueprint as rrb
-
         tabs: list[Any] = [side_by_side([self.pages[name] for name in names], title) for title, names in self._compared]
         tabs += [page.tab() for page in self.pages.values()]
         for kind, views in self._views.items():
@@ -168,8 +162,6 @@ class Layout:
 
 
 def _view(kind: str, names: Sequence[str]) -> Any:
-    import rerun.blueprint as rrb
-
     origin, name = entity_path(kind, *names), "/".join(names)
     if kind == "metrics":
         legend = rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=True)

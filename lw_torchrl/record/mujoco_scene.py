@@ -7,17 +7,14 @@ are left out, and a texture is its mean colour.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from lw_torchrl.envs.engine import RowModel
-from lw_torchrl.record.conventions import entity_path, time_columns
-
-if TYPE_CHECKING:
-    from rerun import RecordingStream
+from lw_torchrl.record.conventions import entity_path, rr, time_columns
 
 SHOWN_GROUPS = (0, 1, 2)
 """Meta-World keeps what only collides in group 4."""
@@ -67,17 +64,15 @@ def model_geometry(model: RowModel) -> ModelGeometry:
     return found
 
 
-def log_model(stream: RecordingStream, root: str, geometry: ModelGeometry) -> None:
+def log_model(stream: rr.RecordingStream, root: str, geometry: ModelGeometry) -> None:
     """The geoms below ``root``, each under its body's name; they never change."""
     for body, part, archetypes in geometry.parts:
         stream.log(f"{root}{entity_path(body, part)}", *archetypes, static=True)
 
 
-def log_motion(stream: RecordingStream, root: str, motion: Motion) -> None:
+def log_motion(stream: rr.RecordingStream, root: str, motion: Motion) -> None:
     """The poses of the bodies below ``root``, row t at step t: a static one of a body that does not move, else a row
     wherever it does."""
-    import rerun as rr
-
     for body, name in model_geometry(motion.model).bodies.items():
         path = f"{root}{entity_path(name)}"
         place, turn = motion.position[:, body], motion.quaternion[:, body][:, [1, 2, 3, 0]]
@@ -108,16 +103,12 @@ def _prepare(model: Any) -> ModelGeometry:
 
 
 def _pose(model: Any, geom: int) -> Any:
-    import rerun as rr
-
     turn = rr.Quaternion(xyzw=model.geom_quat[geom][[1, 2, 3, 0]])
     return rr.Transform3D(translation=model.geom_pos[geom], quaternion=turn)
 
 
 def _shape(model: Any, geom: int, color: NDArray[np.uint8]) -> Any:
     """The geom as rerun draws it, None for a plane."""
-    import rerun as rr
-
     kinds = mujoco.mjtGeom
     kind, size = model.geom_type[geom], model.geom_size[geom]
     look: dict[str, Any] = {"colors": [color], "fill_mode": rr.components.FillMode.Solid}

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from lw_torchrl._checks import check_int
+from lw_torchrl.record.conventions import rr
 from lw_torchrl.record.layout import Layout
 from lw_torchrl.record.rerun_binary import binary, plain
 
@@ -89,7 +90,6 @@ def copy_recording(source: Path, target: Path, tab: str | None = None) -> None:
         ValueError: it cannot be read, or there is no such tab.
         OSError: the copy could not be written whole.
     """
-    import rerun as rr
     from rerun.chunk import OptimizationProfile, RrdReader
 
     try:

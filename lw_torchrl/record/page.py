@@ -4,18 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from lw_torchrl.record.conventions import BACKGROUND, EPISODE_TIMELINE, SECONDS_TIMELINE, entity_path
+from lw_torchrl.record.conventions import BACKGROUND, EPISODE_TIMELINE, SECONDS_TIMELINE, entity_path, rr, rrb
 from lw_torchrl.record.mujoco_scene import Motion
 from lw_torchrl.record.recorded_episode import RecordedEpisode
 from lw_torchrl.record.scene import log_scene
 from lw_torchrl.record.timeline import log_curves, log_plan, log_timeline
 from lw_torchrl.record.verdict import Heading, decisive_step, telling_steps, verdict
-
-if TYPE_CHECKING:
-    import rerun.blueprint as rrb
-    from rerun import RecordingStream
 
 Point = tuple[float, float, float]
 
@@ -64,8 +60,6 @@ class Page:
 
     def tab(self) -> rrb.Horizontal:
         """Scene and curves on the left, words and timeline on the right."""
-        import rerun.blueprint as rrb
-
         left: list[tuple[float, Any]] = [(13, self._scene("Scene"))]
         left += [(share, self._curve(name)) for name, (_, share) in CURVES.items() if name in self.curves]
         # Shares are about as many pixels as a view needs; what is longer scrolls.
@@ -80,8 +74,6 @@ class Page:
 
     def column(self, shown: tuple[int, int]) -> rrb.Vertical:
         """Verdict, scene, timeline and distance in a column, beside others that show the same steps."""
-        import rerun.blueprint as rrb
-
         page = replace(self, shown=shown)
         parts: list[tuple[float, Any]] = [(130, page._words("verdict", self.title)), (420, page._scene("Scene"))]
         if "distance" in page.curves:
@@ -90,8 +82,6 @@ class Page:
         return rrb.Vertical(*(view for _, view in parts), row_shares=[share for share, _ in parts], name=self.title)
 
     def _scene(self, name: str) -> rrb.Spatial3DView:
-        import rerun.blueprint as rrb
-
         trail = rrb.VisibleTimeRanges([_up_to_now(timeline) for timeline in (EPISODE_TIMELINE, SECONDS_TIMELINE)])
         return rrb.Spatial3DView(
             origin=f"{self.root}/scene",
@@ -103,13 +93,9 @@ class Page:
         )
 
     def _words(self, part: str, name: str) -> rrb.TextDocumentView:
-        import rerun.blueprint as rrb
-
         return rrb.TextDocumentView(origin=f"{self.root}/{part}", name=name)
 
     def _timeline(self) -> list[tuple[float, Any]]:
-        import rerun.blueprint as rrb
-
         if not self.rows:
             return []
         view = rrb.StateTimelineView(
@@ -118,8 +104,6 @@ class Page:
         return [(50 + 40 * min(self.rows, 8), view)]
 
     def _curve(self, name: str) -> rrb.TimeSeriesView:
-        import rerun.blueprint as rrb
-
         limits = LIMITS.get(name)
         many = name in ("action", "skill_weights")
         return rrb.TimeSeriesView(
@@ -133,14 +117,12 @@ class Page:
 
 def side_by_side(pages: Sequence[Page], title: str) -> rrb.Horizontal:
     """Episodes beside one another, a column each."""
-    import rerun.blueprint as rrb
-
     shown = min(page.shown[0] for page in pages), max(page.shown[1] for page in pages)
     return rrb.Horizontal(*(page.column(shown) for page in pages), name=title)
 
 
 def send_page(
-    stream: RecordingStream,
+    stream: rr.RecordingStream,
     name: str,
     title: str,
     heading: Heading,
@@ -148,8 +130,6 @@ def send_page(
     motion: Motion | None = None,
 ) -> Page:
     """Log an episode under ``name``; what its views, a tab called ``title``, are to show."""
-    import rerun as rr
-
     root = entity_path(name)
     trails = log_scene(stream, root, episode, motion)
     stream.log(f"{root}/verdict", rr.TextDocument(verdict(heading, episode), media_type="text/markdown"), static=True)
@@ -170,16 +150,11 @@ def send_page(
 
 
 def _window(shown: tuple[int, int]) -> Any:
-    import rerun as rr
-    import rerun.blueprint as rrb
-
     first, last = (rr.TimeRangeBoundary.absolute(seq=step) for step in shown)
     return rrb.TimeAxis(view_range=rr.TimeRange(start=first, end=last))
 
 
 def _up_to_now(timeline: str) -> Any:
-    import rerun as rr
-
     return rr.VisibleTimeRange(
         timeline, start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.cursor_relative()
     )

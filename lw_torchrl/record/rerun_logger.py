@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from itertools import count
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ from torch import Tensor
 from torchrl.record.loggers import Logger
 
 from lw_torchrl._checks import check_choice, checked
-from lw_torchrl.record.conventions import CONTROL_PERIOD, entity_path
+from lw_torchrl.record.conventions import CONTROL_PERIOD, entity_path, rr
 from lw_torchrl.record.layout import TABS, Layout
 from lw_torchrl.record.metrics import (
     check_image,
@@ -43,9 +43,6 @@ from lw_torchrl.record.page import send_page
 from lw_torchrl.record.recorded_episode import PlanLike, RecordedEpisode
 from lw_torchrl.record.verdict import Heading
 from lw_torchrl.record.writer import RecordingWriter, check_address, check_path
-
-if TYPE_CHECKING:
-    from rerun import RecordingStream
 
 BUFFERED_SCALARS = 1024
 
@@ -86,7 +83,7 @@ class RerunLogger(Logger):
         True
     """
 
-    experiment: RecordingStream
+    experiment: rr.RecordingStream
     _service_shutdown: bool = False
 
     @checked
@@ -115,7 +112,7 @@ class RerunLogger(Logger):
             log_dir=str(self.path.parent) if self.path else os.curdir,
         )
 
-    def _create_experiment(self) -> RecordingStream:
+    def _create_experiment(self) -> rr.RecordingStream:
         self._writer = RecordingWriter(self.path, self.connect, self.application_id, self.exp_name, self._send_waiting)
         stream = self._writer.stream
         # In another process (service_backend="process") torchrl ends the experiment, not the logger.
@@ -142,7 +139,7 @@ class RerunLogger(Logger):
     ) -> None:
         self.shutdown()
 
-    def _open(self) -> RecordingStream:
+    def _open(self) -> rr.RecordingStream:
         if self._service_shutdown:
             raise RuntimeError(f"{self!r} takes nothing more; make a new RerunLogger")
         self._tell()

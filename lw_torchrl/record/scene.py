@@ -7,18 +7,15 @@ Static things are sent once; what moves is sent as whole columns, one call per e
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lw_torchrl.language.named_objects import GRIPPER
-from lw_torchrl.record.conventions import GOLD, GREEN, STEEL, Color, entity_path, step_color, time_columns
+from lw_torchrl.record.conventions import GOLD, GREEN, STEEL, Color, entity_path, rr, step_color, time_columns
 from lw_torchrl.record.mujoco_scene import Motion, log_model, log_motion, model_geometry
 from lw_torchrl.record.recorded_episode import RecordedEpisode
-
-if TYPE_CHECKING:
-    from rerun import RecordingStream
 
 OBJECT_COLORS: tuple[Color, ...] = ((80, 170, 255), (255, 120, 90), (200, 130, 255), (90, 220, 210))
 
@@ -35,7 +32,9 @@ TABLE_CENTER, TABLE_HALF = (0.0, 0.6, -0.010), (0.7, 0.4, 0.010)
 TABLE, GRID = (58, 64, 74), (92, 99, 112)
 
 
-def log_scene(stream: RecordingStream, root: str, episode: RecordedEpisode, motion: Motion | None = None) -> list[str]:
+def log_scene(
+    stream: rr.RecordingStream, root: str, episode: RecordedEpisode, motion: Motion | None = None
+) -> list[str]:
     """Draw the robot, the objects, the goal, the hand's path and the target pose under ``root``/scene.
 
     Without a motion, the robot is a hand over a table, and what it handles are points.
@@ -43,8 +42,6 @@ def log_scene(stream: RecordingStream, root: str, episode: RecordedEpisode, moti
     Returns:
         The entity paths of the trails: one short line per row, to be shown up to the time cursor.
     """
-    import rerun as rr
-
     scene, times = f"{root}/scene", time_columns(np.arange(len(episode)))
     stream.log(scene, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     if motion is None:
@@ -87,10 +84,8 @@ def log_scene(stream: RecordingStream, root: str, episode: RecordedEpisode, moti
     return trails
 
 
-def _log_simple_robot(stream: RecordingStream, scene: str, episode: RecordedEpisode) -> None:
+def _log_simple_robot(stream: rr.RecordingStream, scene: str, episode: RecordedEpisode) -> None:
     """The table and the gripper below ``scene``."""
-    import rerun as rr
-
     times = time_columns(np.arange(len(episode)))
     solid = rr.components.FillMode.Solid
 
@@ -139,11 +134,9 @@ def _finger_centers(opening: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.stack([zero, half, drop, zero, -half, drop], axis=1).reshape(-1, 3).astype(np.float32)
 
 
-def _log_target(stream: RecordingStream, scene: str, episode: RecordedEpisode, times: Sequence[Any]) -> None:
+def _log_target(stream: rr.RecordingStream, scene: str, episode: RecordedEpisode, times: Sequence[Any]) -> None:
     """An arrow from what the skill in force moves to where it goes, in the step's colour; none where no scripted
     skill is in force."""
-    import rerun as rr
-
     if episode.in_force is None or not any(episode.target_poses):
         return
     start, end = np.zeros((2, len(episode), 3), np.float32)

@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl.record.conventions import FALSE, STEEL, TRUE, Color, entity_path, step_color, time_columns
+from lw_torchrl.record.conventions import FALSE, STEEL, TRUE, Color, entity_path, rr, step_color, time_columns
 from lw_torchrl.record.recorded_episode import NOBODY, RecordedEpisode
-
-if TYPE_CHECKING:
-    from rerun import RecordingStream
 
 NONE_HOLDS, EVENLY = "no condition holds", "evenly mixed"
 ACTION_NAMES = ("dx", "dy", "dz", "gripper")
 MARKS = {True: "✓", False: "✗", None: "·"}
 
 
-def log_timeline(stream: RecordingStream, root: str, episode: RecordedEpisode) -> int:
+def log_timeline(stream: rr.RecordingStream, root: str, episode: RecordedEpisode) -> int:
     """The timeline of the step in force, of each condition and of success, a row each below ``root``/timeline.
 
     A row has an entry where its state changes, and an empty one at the end. The viewer shows a row's path as its title,
@@ -29,8 +25,6 @@ def log_timeline(stream: RecordingStream, root: str, episode: RecordedEpisode) -
     Returns:
         The number of rows.
     """
-    import rerun as rr
-
     rows = 0
 
     def send(name: str, first: int, states: Sequence[str], styles: Mapping[str, tuple[str, Color]]) -> None:
@@ -81,10 +75,8 @@ def _states_in_force(episode: RecordedEpisode) -> list[str]:
     ]
 
 
-def log_plan(stream: RecordingStream, root: str, episode: RecordedEpisode) -> None:
+def log_plan(stream: rr.RecordingStream, root: str, episode: RecordedEpisode) -> None:
     """The plan in ``root``/plan, with a text wherever truth or the step in force change."""
-    import rerun as rr
-
     length = len(episode)
     columns = [
         np.full((length, 1), -1) if episode.in_force is None else episode.in_force[:, None],
@@ -113,7 +105,7 @@ def _plan_text(episode: RecordedEpisode, row: int) -> str:
     return "\n".join(parts)
 
 
-def log_curves(stream: RecordingStream, root: str, episode: RecordedEpisode) -> list[str]:
+def log_curves(stream: rr.RecordingStream, root: str, episode: RecordedEpisode) -> list[str]:
     """``root``/action, and, where there is any, /distance (cm), /reward, /skill_weights, /corrected; returns which."""
     rows = np.arange(len(episode))
     sent = ["action"]
@@ -137,25 +129,23 @@ def log_curves(stream: RecordingStream, root: str, episode: RecordedEpisode) -> 
 
 
 def _send(
-    stream: RecordingStream,
+    stream: rr.RecordingStream,
     path: str,
     steps: NDArray[np.int64],
     values: NDArray[np.float32],
     names: Sequence[str],
     colors: Sequence[Color] | None = None,
 ) -> None:
-    import rerun as rr
-
     colors = colors or [step_color(i) for i in range(len(names))]
     stream.log(path, rr.SeriesLines(names=names, colors=colors, widths=[1.5] * len(names)), static=True)
     columns = rr.Scalars.columns(scalars=values.ravel()).partition([values.shape[1]] * len(values))
     stream.send_columns(path, time_columns(steps), columns)
 
 
-def _send_distance(stream: RecordingStream, path: str, distance: NDArray[np.float32], episode: RecordedEpisode) -> None:
+def _send_distance(
+    stream: rr.RecordingStream, path: str, distance: NDArray[np.float32], episode: RecordedEpisode
+) -> None:
     """One line in centimetres, in the colour of the step in force."""
-    import rerun as rr
-
     assert episode.in_force is not None
     stream.log(path, rr.SeriesLines(names=["distance [cm]"], widths=[2.0]), static=True)
     colors = [FALSE if step == NOBODY else step_color(step) for step in episode.in_force.tolist()]

@@ -18,6 +18,7 @@ from pathlib import Path
 from queue import SimpleQueue
 
 from lw_torchrl._files import replacing
+from lw_torchrl.record.conventions import rr
 from lw_torchrl.record.opening import copy_recording
 
 PERIOD = 0.5
@@ -59,8 +60,6 @@ class RecordingWriter:
     def __init__(
         self, path: Path | None, connect: str | None, application_id: str, name: str, prepare: Callable[[], None]
     ) -> None:
-        import rerun as rr
-
         self._file = None if path is None else RecordingFile(path)
         self.previous = None if self._file is None else self._file.previous
         self._prepare = prepare
@@ -273,8 +272,6 @@ class LiveViewer:
             return
         finally:
             self._tried.set()
-        import rerun as rr
-
         application_id, recording_id = self._ids
         stream = rr.RecordingStream(application_id, recording_id=recording_id, send_properties=False)
         try:
