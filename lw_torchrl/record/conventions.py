@@ -57,7 +57,4 @@ def entity_path(*parts: str) -> str:
 def time_columns(steps: NDArray[np.int64], period: float = CONTROL_PERIOD) -> list[Any]:
     """The two timelines of an episode: steps, and seconds at ``period`` each."""
     nanoseconds = (steps * round(period * 1e9)).astype("timedelta64[ns]")
-    return [
-        rr.TimeColumn(EPISODE_TIMELINE, sequence=steps),
-        rr.TimeColumn(SECONDS_TIMELINE, duration=nanoseconds),
-    ]
+    return [rr.TimeColumn(EPISODE_TIMELINE, sequence=steps), rr.TimeColumn(SECONDS_TIMELINE, duration=nanoseconds)]

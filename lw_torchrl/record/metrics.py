@@ -26,7 +26,7 @@ def check_name(name: str) -> str:
 
 
 def numbers(name: str, value: Any) -> list[float]:
-    """A metric's value as a list, of one number or of several; else :class:`ValueError`."""
+    """A metric's value as a list of numbers; else :class:`ValueError`."""
     if type(value) is float or type(value) is int:
         return [float(value)]
     try:
@@ -43,9 +43,7 @@ def numbers(name: str, value: Any) -> list[float]:
     return found
 
 
-def send_scalars(
-    stream: rr.RecordingStream, path: str, steps: Sequence[int], values: Sequence[Sequence[float]]
-) -> None:
+def send_scalars(stream: rr.RecordingStream, path: str, steps: Sequence[int], values: Sequence[list[float]]) -> None:
     """Add a row of numbers for each step to the curves ``path``."""
     index = [rr.TimeColumn(METRIC_TIMELINE, sequence=steps)]
     columns = rr.Scalars.columns(scalars=[number for row in values for number in row])

@@ -41,10 +41,7 @@ def find_recording(path: str | os.PathLike[str]) -> Path:
 def opened(recording: Path, tab: str | None = None) -> Iterator[Path]:
     """The recording as a viewer can open it: itself, or a copy that ends properly and opens at ``tab``.
 
-    Rerun's viewer waits for the rest of a recording that was cut, by a kill or a full disk, or that still grows.
-
-    Raises:
-        ValueError: nothing in it can be read, or it has no such tab.
+    Rerun's viewer waits for the rest of one that was cut or still grows. One that cannot be read is a ValueError.
     """
     from rerun.chunk import RrdReader
 
@@ -84,12 +81,7 @@ def is_whole(path: Path) -> bool:
 
 
 def copy_recording(source: Path, target: Path, tab: str | None = None) -> None:
-    """Write a recording again: compact, with an index, and with ``tab`` in front.
-
-    Raises:
-        ValueError: it cannot be read, or there is no such tab.
-        OSError: the copy could not be written whole.
-    """
+    """Write a recording again: compact, with an index, and with ``tab`` in front. ValueError: it cannot be read."""
     from rerun.chunk import OptimizationProfile, RrdReader
 
     try:
@@ -119,19 +111,10 @@ def copy_recording(source: Path, target: Path, tab: str | None = None) -> None:
 
 
 def opening_step(path: str | os.PathLike[str], tab: str | None = None, step: int | None = None) -> int | None:
-    """The step that a viewer's cursor is to stand at in a tab, the first tab if none is named.
+    """The step for a viewer's cursor in a tab (None: the first); None for a tab of no episode.
 
-    Args:
-        path: the recording.
-        tab: the tab's title, or its episode's name.
-        step: the step that was asked for; None takes an episode's decisive one (where its failure is seen, its first
-            success, or its end; of episodes side by side the earliest).
-
-    Returns:
-        The step; None for a tab of no episode, or a recording without steps.
-
-    Raises:
-        TypeError, ValueError: ``step`` is no whole number, or the recording does not go so far.
+    It is ``step``, if the recording goes so far, else a ValueError. Without one it is the decisive step of the episode:
+    where its failure is seen, its first success, or its end; of episodes side by side the earliest.
     """
     from rerun.chunk import RrdReader
 

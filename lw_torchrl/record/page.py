@@ -36,15 +36,11 @@ class Page:
     """What was logged of an episode, as far as its views depend on it.
 
     Attributes:
-        root: the entity that all lies under.
-        title: of its tab.
         trails: entities that are shown up to the cursor.
         eye: where the scene is seen from, and what is looked at.
         shown: the first and last step worth a look.
         decisive: the step to open it at.
-        curves: names of :data:`CURVES` that there are.
         steps, rows: how many steps the plan has, and how many rows the timeline.
-        good: whether it succeeded.
     """
 
     root: str
@@ -67,10 +63,7 @@ class Page:
         if self.steps:
             right.append((70 + 58 * min(self.steps, 6), self._words("plan", "Plan")))
         right += self._timeline()
-        columns = [
-            rrb.Vertical(*(view for _, view in part), row_shares=[share for share, _ in part]) for part in (left, right)
-        ]
-        return rrb.Horizontal(*columns, column_shares=[6, 5], name=self.title)
+        return rrb.Horizontal(_stacked(left), _stacked(right), column_shares=[6, 5], name=self.title)
 
     def column(self, shown: tuple[int, int]) -> rrb.Vertical:
         """Verdict, scene, timeline and distance in a column, beside others that show the same steps."""
@@ -79,7 +72,7 @@ class Page:
         if "distance" in page.curves:
             parts.append((120, page._curve("distance")))
         parts += page._timeline()
-        return rrb.Vertical(*(view for _, view in parts), row_shares=[share for share, _ in parts], name=self.title)
+        return _stacked(parts, self.title)
 
     def _scene(self, name: str) -> rrb.Spatial3DView:
         trail = rrb.VisibleTimeRanges([_up_to_now(timeline) for timeline in (EPISODE_TIMELINE, SECONDS_TIMELINE)])
@@ -98,9 +91,8 @@ class Page:
     def _timeline(self) -> list[tuple[float, Any]]:
         if not self.rows:
             return []
-        view = rrb.StateTimelineView(
-            origin=f"{self.root}/timeline", name="The step in force, and what holds", time_view=_window(self.shown)
-        )
+        origin, name = f"{self.root}/timeline", "The step in force, and what holds"
+        view = rrb.StateTimelineView(origin=origin, name=name, time_view=_window(self.shown))
         return [(50 + 40 * min(self.rows, 8), view)]
 
     def _curve(self, name: str) -> rrb.TimeSeriesView:
@@ -115,6 +107,11 @@ class Page:
         )
 
 
+def _stacked(parts: Sequence[tuple[float, Any]], name: str | None = None) -> rrb.Vertical:
+    """Views with their shares of the height, one below another."""
+    return rrb.Vertical(*(view for _, view in parts), row_shares=[share for share, _ in parts], name=name)
+
+
 def side_by_side(pages: Sequence[Page], title: str) -> rrb.Horizontal:
     """Episodes beside one another, a column each."""
     shown = min(page.shown[0] for page in pages), max(page.shown[1] for page in pages)
@@ -122,12 +119,7 @@ def side_by_side(pages: Sequence[Page], title: str) -> rrb.Horizontal:
 
 
 def send_page(
-    stream: rr.RecordingStream,
-    name: str,
-    title: str,
-    heading: Heading,
-    episode: RecordedEpisode,
-    motion: Motion | None = None,
+    stream: rr.RecordingStream, name: str, title: str, heading: Heading, episode: RecordedEpisode, motion: Motion | None
 ) -> Page:
     """Log an episode under ``name``; what its views, a tab called ``title``, are to show."""
     root = entity_path(name)
@@ -155,6 +147,5 @@ def _window(shown: tuple[int, int]) -> Any:
 
 
 def _up_to_now(timeline: str) -> Any:
-    return rr.VisibleTimeRange(
-        timeline, start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.cursor_relative()
-    )
+    first, now = rr.TimeRangeBoundary.infinite(), rr.TimeRangeBoundary.cursor_relative()
+    return rr.VisibleTimeRange(timeline, start=first, end=now)

@@ -37,7 +37,7 @@ def log_rollout(
     failure: Failure | Sequence[Failure | None] | None = None,
     tasks: Iterable[Task] = (),
 ) -> Any:
-    """Add a rollout to a recording: the robot in 3-D, a verdict, the plan at the cursor, lanes and curves.
+    """Add a rollout to a recording: the robot in 3-D, a verdict, the plan at the cursor, the timeline and curves.
 
     Where the environment's seed is given, the episode is simulated again, from its task, ``seed``, ``episode`` and
     actions, and the robot is shown as it moved. The observations must come out the same, bit for bit; where they do
@@ -46,7 +46,7 @@ def log_rollout(
     Args:
         logger: the recording.
         rollout: batch size (T,), one episode from its first state on: "observation" T×39 float32 (metres), "task_id" T
-            int64, "action" T×4 float32 in [-1, 1], as executed, and ("next", "success") T×1 bool. Where they are there:
+            int64, "action" T×4 float32 in [-1, 1], as executed, and ("next", "success") T×1 bool. Optional are
             ("next", "executed_action") T×4, which is taken in the place of the action, "episode" T int64, "qaf" T×S
             bool, "qaf_plan" T int64, "qaf_logits" T×S float32 (positive: true), "skill_weights" T×S float32,
             "action_corrected" T×1 and ("next", "reward") T×1 float32. Or batch size (N, T), an episode in each row.
@@ -61,13 +61,8 @@ def log_rollout(
         The name; of N rows a list of names.
 
     Raises:
-        ValueError: a key is missing, has another shape or dtype or holds a NaN; the rows are of several episodes;
-            ``qaf`` answers other plans, or the failure is another episode's; with a seed, there is no ``episode``.
+        ValueError: the rows are of several episodes; ``qaf`` answers other plans; the failure is another episode's.
         PlanError: (a ValueError) there is no plan for the task.
-        TypeError: ``rollout`` is no TensorDict.
-
-    Warns:
-        UserWarning: the simulation gave other observations.
 
     Example:
         >>> import tempfile
@@ -87,16 +82,12 @@ def log_rollout(
         failures = failure if isinstance(failure, Sequence) else [failure] * len(rollout)
         if len(failures) != len(rollout):
             raise ValueError(f"failure must be one for each of {len(rollout)} rows, got {len(failures)}")
-        rows, tasks = zip(rollout, failures, strict=True), list(tasks)
-        return [
-            log_rollout(logger, row, plans, seed=seed, policy=policy, failure=why, tasks=tasks) for row, why in rows
-        ]
+        rows, same = zip(rollout, failures, strict=True), {"seed": seed, "policy": policy, "tasks": list(tasks)}
+        return [log_rollout(logger, row, plans, failure=why, **same) for row, why in rows]
     if isinstance(failure, Sequence):
         raise ValueError(f"failure must be one Failure for one episode, got {len(failure)}")
     heading, episode = read_rollout(rollout, plans, seed=seed, policy=policy, failure=failure, tasks=tasks)
-    motion = None
-    if seed is not None and heading.task in TASKS:
-        motion = _motion(heading, episode)
+    motion = _motion(heading, episode) if seed is not None and heading.task in TASKS else None
     return logger.add_page(heading, episode, motion=motion, name=name)
 
 
@@ -132,9 +123,8 @@ def read_rollout(
     observation = rollout.get("observation", None)
     objects: dict[str, Tensor] = {}
     if task is not None and observation is not None and observation.shape[1:] == (39,):
-        objects = {
-            named: position for named, position in task.positions(observation).items() if _is_told_of(named, plan)
-        }
+        positions = task.positions(observation).items()
+        objects = {named: position for named, position in positions if _is_told_of(named, plan)}
     episode = RecordedEpisode.from_rollout(rollout, objects, plan)
     if task is not None and plan is not None:
         episode = episode.with_target_poses(task)
@@ -142,13 +132,7 @@ def read_rollout(
 
 
 class Difference(NamedTuple):
-    """Where a rollout and its simulation first differ.
-
-    Attributes:
-        step: the step of the episode, from 0.
-        entry: which number of the observation is furthest off there.
-        by: how far.
-    """
+    """Where a rollout and its simulation first differ: in which step, from 0, in which entry most, and by how much."""
 
     step: int
     entry: int
@@ -161,12 +145,7 @@ def simulate_again(
     """The motion of all bodies in an episode, of T + 1 rows, or where it turns out to be another episode.
 
     The simulation depends on the seed and the actions alone, so equal observations, bit for bit, mean equal motion.
-
-    Args:
-        task: one of the 50.
-        seed, episode: the environment's seed and the episode's index.
-        action: T×4 float32 in [-1, 1], as executed.
-        observation: T×39 float32, each row that from which its action was taken.
+    Actions are T×4 float32 in [-1, 1], as executed; observations T×39 float32, those from which they were taken.
 
     Example:
         >>> found = simulate_again("reach", 0, 0, np.zeros((1, 4), np.float32), np.zeros((1, 39), np.float32))
@@ -219,9 +198,8 @@ def _single(rollout: TensorDictBase, key: str, *, required: bool) -> int | None:
         return None
     length = tuple(rollout.batch_size)
     if column.is_floating_point() or tuple(column.shape) not in (length, (*length, 1)):
-        raise ValueError(
-            f"rollout[{key!r}] must be integers of shape {length}, got {column.dtype} {tuple(column.shape)}"
-        )
+        given = f"{column.dtype} {tuple(column.shape)}"
+        raise ValueError(f"rollout[{key!r}] must be integers of shape {length}, got {given}")
     found = torch.unique(column).tolist()
     if len(found) != 1:
         raise ValueError(f"rollout must be one episode of one task, got {key!r} {found[:5]}; split it")

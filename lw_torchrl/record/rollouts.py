@@ -38,22 +38,16 @@ def run_recorded(
     engine: Any = "vectorized",
     progress: bool = False,
 ) -> list[FinishedEpisode]:
-    """Episodes with all that a recording shows of them, the same as :func:`lw_torchrl.evaluate` runs them.
+    """Episodes with all that :func:`lw_torchrl.log_rollout` shows of them, run as :func:`lw_torchrl.evaluate` does.
 
     Args:
-        actor: a policy, or a module as for :func:`lw_torchrl.evaluate`.
-        tasks: as there.
         plans: whose queries to answer; None for the actor's own.
-        seed: of the environment.
         episodes: indices, of each task.
-        noise_scale, max_steps, engine: as there.
         progress: show a bar where it takes longer than a second.
+        others: as for :func:`lw_torchrl.evaluate`.
 
     Returns:
-        By task, as they were given, and episode: a TensorDict of batch (T,), observation (T, 39) and action (T, 4)
-        float32, the executed one, task_id and episode (T,) int64, next/success (T, 1) bool, next/reward (T, 1) float32;
-        with plans qaf (T, S) bool, and skill_weights (T, S) and action_corrected (T, 1) float32 where the actor writes
-        them; where it has an evaluator of queries, its qaf_logits (T, S) float32.
+        By task, as they were given, and episode: TensorDicts of batch (T,).
     """
     answered = actor_plans(actor, plans)
     chosen = tasks_of(tasks, answered)
@@ -90,15 +84,9 @@ def write_recording(
     policy: str | None = None,
     tasks: Iterable[Task] = (),
 ) -> None:
-    """Write episodes to a rerun file, each with its plan where there is one; the file is replaced whole.
+    """Write episodes of :func:`run_recorded` to a rerun file, which is replaced whole.
 
-    Args:
-        path: the .rrd file.
-        episodes: as from :func:`run_recorded`.
-        plans: what their queries answer.
-        seed: that they were run with; None draws a hand over a table in the place of the robot.
-        policy: who acted, in a word.
-        tasks: of your own, where the plans do not say what they are.
+    The other arguments are as for :func:`lw_torchrl.log_rollout`.
     """
     tasks = list(tasks)
     with replacing(path) as file, RerunLogger(file, exp_name=Path(path).stem) as logger:
