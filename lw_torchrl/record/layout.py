@@ -98,7 +98,7 @@ class Layout:
                 shown = [_view(kind, names) for names in views]
                 tabs.append(shown[0] if kind == "hparams" else rrb.Grid(*shown, name=TABS[kind]))
         front = None if tab is None else self._find(tab)
-        time = {"timeline": self.timeline(tab), "fps": 80.0, "play_state": "paused", "loop_mode": "all"}
+        time: dict[str, Any] = {"timeline": self.timeline(tab), "fps": 80.0, "play_state": "paused", "loop_mode": "all"}
         panels = [rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed")]
         panels.append(rrb.TimePanel(state="collapsed", **time))
         return rrb.Blueprint(rrb.Tabs(*tabs, active_tab=front), *panels, auto_views=False)

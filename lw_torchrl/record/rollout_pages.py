@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from lw_torchrl._checks import check_int, checked, missing_keys, shown
+from lw_torchrl._checks import checked, missing_keys, shown
 from lw_torchrl.envs.engines.vectorized.engine import VectorizedEngine
 from lw_torchrl.envs.seeding import episode_seed
 from lw_torchrl.evaluation.failures import Failure
@@ -74,16 +74,16 @@ def log_rollout(
         'reach-0'
         >>> env.close()
     """
-    if not isinstance(rollout, TensorDictBase):
-        raise TypeError(f"rollout must be a TensorDict, got {type(rollout).__name__}")
     if len(rollout.batch_size) == 2:
         if name is not None:
             raise ValueError(f"name is of one episode, but rollout holds {len(rollout)}; got {name!r}")
         failures = failure if isinstance(failure, Sequence) else [failure] * len(rollout)
         if len(failures) != len(rollout):
             raise ValueError(f"failure must be one for each of {len(rollout)} rows, got {len(failures)}")
-        rows, same = zip(rollout, failures, strict=True), {"seed": seed, "policy": policy, "tasks": list(tasks)}
-        return [log_rollout(logger, row, plans, failure=why, **same) for row, why in rows]
+        rows, tasks = zip(rollout, failures, strict=True), list(tasks)
+        return [
+            log_rollout(logger, row, plans, seed=seed, policy=policy, failure=why, tasks=tasks) for row, why in rows
+        ]
     if isinstance(failure, Sequence):
         raise ValueError(f"failure must be one Failure for one episode, got {len(failure)}")
     heading, episode = read_rollout(rollout, plans, seed=seed, policy=policy, failure=failure, tasks=tasks)
@@ -102,8 +102,6 @@ def read_rollout(
 ) -> tuple[Heading, RecordedEpisode]:
     """What a page shows of a rollout (T,), checked, as :func:`log_rollout` has it."""
     plans = None if plans is None else as_plans(plans)
-    if seed is not None:
-        check_int("seed", seed)
     number = _single(rollout, "task_id", required=True)
     index = _single(rollout, "episode", required=seed is not None)
     assert number is not None

@@ -130,7 +130,7 @@ class RolloutRecorder(Transform):
             dropped = f"{len(rollout)} steps of an episode of {running.task.name!r} are dropped"
             warnings.warn(f"{dropped}: the logger was closed before the environment", stacklevel=4)
             return
-        known = {"tasks": [running.task], "seed": running.seed, "policy": self.policy}
+        known: dict[str, Any] = {"tasks": [running.task], "seed": running.seed, "policy": self.policy}
         heading, episode = read_rollout(rollout, self.plans, **known)
         self.logger.add_page(heading, episode, motion=motion)
 

@@ -40,11 +40,12 @@ def run_recorded(
 ) -> list[FinishedEpisode]:
     """Episodes with all that :func:`lw_torchrl.log_rollout` shows of them, run as :func:`lw_torchrl.evaluate` does.
 
+    The arguments are as there, but for these.
+
     Args:
         plans: whose queries to answer; None for the actor's own.
         episodes: indices, of each task.
         progress: show a bar where it takes longer than a second.
-        others: as for :func:`lw_torchrl.evaluate`.
 
     Returns:
         By task, as they were given, and episode: TensorDicts of batch (T,).
@@ -95,10 +96,8 @@ def write_recording(
 
 
 def active_skills(episode: FinishedEpisode, plan: ConditionalPlan) -> list[tuple[str, int]]:
-    """The skills in the order in which they led, with how many steps each did, up to the first success.
-
-    A skill leads where it has the largest weight; steps in which no condition holds count as "no condition holds".
-    """
+    """The skills, or "no condition holds", in the order in which they led (had the largest weight), with how many steps
+    each did, up to the first success."""
     end = episode.first_success
     leading = episode.steps.get("skill_weights")[:end].argmax(-1).tolist()
     answered = episode.steps.get("qaf")[:end].any(-1).tolist()

@@ -1,7 +1,6 @@
 """The 3-D scene of an episode: the robot, its task, what the plan names, and where the skill in force moves things to.
 
 Meta-World's frame: metres, x to the robot's right, y away from the robot, z up, the table's top at z = 0.
-Static things are sent once; what moves is sent as whole columns, one call per entity.
 """
 
 from __future__ import annotations
@@ -35,12 +34,10 @@ TABLE, GRID = (58, 64, 74), (92, 99, 112)
 def log_scene(
     stream: rr.RecordingStream, root: str, episode: RecordedEpisode, motion: Motion | None = None
 ) -> list[str]:
-    """Draw the robot, the objects, the goal, the hand's path and the target pose under ``root``/scene.
+    """Draw robot, objects, goal, the hand's path and the target pose under ``root``/scene; returns the trails' paths.
 
-    Without a motion, the robot is a hand over a table, and what it handles are points.
-
-    Returns:
-        The entity paths of the trails: one short line per row, to be shown up to the time cursor.
+    A trail is one short line per row, to be shown up to the time cursor. Without a motion, the robot is a hand over a
+    table, and what it handles are points.
     """
     scene, times = f"{root}/scene", time_columns(np.arange(len(episode)))
     stream.log(scene, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
@@ -87,17 +84,11 @@ def log_scene(
 def _log_simple_robot(stream: rr.RecordingStream, scene: str, episode: RecordedEpisode) -> None:
     """The table and the gripper below ``scene``."""
     times = time_columns(np.arange(len(episode)))
-    solid = rr.components.FillMode.Solid
 
     def box(path: str, centers: Any, half_sizes: Any, color: Color, labels: list[str] | None = None) -> None:
-        boxes = rr.Boxes3D.from_fields(
-            centers=centers,
-            half_sizes=half_sizes,
-            colors=[color] * len(half_sizes),
-            fill_mode=solid,
-            labels=labels,
-            show_labels=labels is not None,
-        )
+        size = {"centers": centers, "half_sizes": half_sizes}
+        look = {"colors": [color] * len(half_sizes), "fill_mode": rr.components.FillMode.Solid}
+        boxes = rr.Boxes3D.from_fields(**size, **look, labels=labels, show_labels=labels is not None)
         stream.log(f"{scene}/{path}", boxes, static=True)
 
     box("table", [TABLE_CENTER], [TABLE_HALF], TABLE)
@@ -118,10 +109,8 @@ def _to_table(position: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def _grid(spacing: float = 0.1) -> list[list[tuple[float, float, float]]]:
     """Lines on the table, ``spacing`` metres apart."""
-    (left, near), (right, far) = (
-        tuple(c + sign * h for c, h in zip(TABLE_CENTER[:2], TABLE_HALF[:2], strict=True)) for sign in (-1, 1)
-    )
-    z = 0.0005
+    middle, half = np.array(TABLE_CENTER[:2]), np.array(TABLE_HALF[:2])
+    (left, near), (right, far), z = (middle - half).tolist(), (middle + half).tolist(), 0.0005
     across = [[(left, y, z), (right, y, z)] for y in np.arange(near, far + 1e-6, spacing).tolist()]
     along = [[(x, near, z), (x, far, z)] for x in np.arange(left, right + 1e-6, spacing).tolist()]
     return across + along
@@ -135,8 +124,7 @@ def _finger_centers(opening: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _log_target(stream: rr.RecordingStream, scene: str, episode: RecordedEpisode, times: Sequence[Any]) -> None:
-    """An arrow from what the skill in force moves to where it goes, in the step's colour; none where no scripted
-    skill is in force."""
+    """An arrow from what the scripted skill in force moves to where it goes, in the step's colour."""
     if episode.in_force is None or not any(episode.target_poses):
         return
     start, end = np.zeros((2, len(episode), 3), np.float32)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,14 +17,10 @@ MARKS = {True: "✓", False: "✗", None: "·"}
 
 
 def log_timeline(stream: rr.RecordingStream, root: str, episode: RecordedEpisode) -> int:
-    """The timeline of the step in force, of each condition and of success, a row each below ``root``/timeline.
+    """Rows for the step in force, each condition and success below ``root``/timeline; returns how many.
 
     A row has an entry where its state changes, and an empty one at the end. The viewer shows a row's path as its title,
-    with a backslash before whatever is no letter, so the names are words joined by underscores; it sorts the rows, so
-    the names begin with numbers.
-
-    Returns:
-        The number of rows.
+    with a backslash before whatever is no letter or underscore, and sorts the rows, so the names begin with numbers.
     """
     rows = 0
 
@@ -66,13 +63,9 @@ def log_timeline(stream: rr.RecordingStream, root: str, episode: RecordedEpisode
 def _states_in_force(episode: RecordedEpisode) -> list[str]:
     """The number of the step in force in each row, or why there is none."""
     assert episode.in_force is not None
-    answers = episode.answers
-    nobody = np.full(len(episode), EVENLY)
-    if answers is not None:
-        nobody = np.where(answers.any(axis=1), EVENLY, NONE_HOLDS)
-    return [
-        str(step) if step != NOBODY else str(why) for step, why in zip(episode.in_force.tolist(), nobody, strict=True)
-    ]
+    answered = True if episode.answers is None else episode.answers.any(axis=1)
+    nobody = np.where(np.broadcast_to(answered, len(episode)), EVENLY, NONE_HOLDS)
+    return np.where(episode.in_force == NOBODY, nobody, episode.in_force.astype(str)).tolist()
 
 
 def log_plan(stream: rr.RecordingStream, root: str, episode: RecordedEpisode) -> None:
@@ -117,7 +110,7 @@ def log_curves(stream: rr.RecordingStream, root: str, episode: RecordedEpisode) 
     if episode.reward is not None and not (
         episode.success is not None and np.array_equal(episode.reward, episode.success)
     ):
-        _send(stream, f"{root}/reward", rows + 1, episode.reward[:, None], ["reward"], [STEEL])
+        _send(stream, f"{root}/reward", rows + 1, episode.reward[:, None], ["reward"], STEEL)
         sent.append("reward")
     if episode.skill_weights is not None and episode.attends_softly:
         _send(stream, f"{root}/skill_weights", rows, episode.skill_weights, episode.skills)
@@ -129,22 +122,15 @@ def log_curves(stream: rr.RecordingStream, root: str, episode: RecordedEpisode) 
 
 
 def _send(
-    stream: rr.RecordingStream,
-    path: str,
-    steps: NDArray[np.int64],
-    values: NDArray[np.float32],
-    names: Sequence[str],
-    colors: Sequence[Color] | None = None,
+    stream: Any, path: str, steps: NDArray[np.int64], values: NDArray[np.float32], names: Sequence[str], *color: Color
 ) -> None:
-    colors = colors or [step_color(i) for i in range(len(names))]
+    colors = list(color) or [step_color(i) for i in range(len(names))]
     stream.log(path, rr.SeriesLines(names=names, colors=colors, widths=[1.5] * len(names)), static=True)
     columns = rr.Scalars.columns(scalars=values.ravel()).partition([values.shape[1]] * len(values))
     stream.send_columns(path, time_columns(steps), columns)
 
 
-def _send_distance(
-    stream: rr.RecordingStream, path: str, distance: NDArray[np.float32], episode: RecordedEpisode
-) -> None:
+def _send_distance(stream: Any, path: str, distance: NDArray[np.float32], episode: RecordedEpisode) -> None:
     """One line in centimetres, in the colour of the step in force."""
     assert episode.in_force is not None
     stream.log(path, rr.SeriesLines(names=["distance [cm]"], widths=[2.0]), static=True)
