@@ -28,6 +28,8 @@ EPISODE_TIMELINE, SECONDS_TIMELINE, METRIC_TIMELINE = "step", "time", "global_st
 CONTROL_PERIOD = 0.0125
 """Seconds between two actions in Meta-World: 5 simulation steps of 2.5 ms, hence 80 Hz."""
 
+Stream = Any
+"""A rerun RecordingStream."""
 Color = tuple[int, ...]
 BACKGROUND = (24, 27, 33)
 TRUE, FALSE = (70, 170, 105), (52, 56, 64)

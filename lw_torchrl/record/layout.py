@@ -8,7 +8,7 @@ from dataclasses import asdict
 from typing import Any, NamedTuple
 
 from lw_torchrl._checks import unknown_name
-from lw_torchrl.record.conventions import EPISODE_TIMELINE, METRIC_TIMELINE, entity_path, rr, rrb
+from lw_torchrl.record.conventions import EPISODE_TIMELINE, METRIC_TIMELINE, Stream, entity_path, rr, rrb
 from lw_torchrl.record.page import Page, side_by_side
 
 TABS = {kind: kind.title() for kind in ("metrics", "histograms", "images", "videos")} | {"hparams": "Hyperparameters"}
@@ -72,7 +72,7 @@ class Layout:
                 layout.add_view(name, *content)
         return layout if found else None
 
-    def save(self, stream: rr.RecordingStream) -> None:
+    def save(self, stream: Stream) -> None:
         """Write the new tabs as properties of a recording."""
         for number in range(self._saved, len(self._entries)):
             values = rr.AnyValues(entry=self._entries[number])
@@ -84,7 +84,7 @@ class Layout:
         new = len(self._entries) - self._shown
         return bool(new) and (4 * new >= self._shown or seconds >= 5 * self._shown)
 
-    def send(self, stream: rr.RecordingStream, tab: str | None = None) -> None:
+    def send(self, stream: Stream, tab: str | None = None) -> None:
         """Have the viewer show the tabs, ``tab`` in front; an unknown one is a ValueError."""
         self._shown = len(self._entries)
         stream.send_blueprint(self.blueprint(tab))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lw_torchrl.record.conventions import METRIC_TIMELINE, rr, time_columns
+from lw_torchrl.record.conventions import METRIC_TIMELINE, Stream, rr, time_columns
 
 MOST_CURVES = 64
 JPEG_QUALITY = 90
@@ -43,19 +43,6 @@ def numbers(name: str, value: Any) -> list[float]:
     return found
 
 
-def send_scalars(stream: rr.RecordingStream, path: str, steps: Sequence[int], values: Sequence[list[float]]) -> None:
-    """Add a row of numbers for each step to the curves ``path``."""
-    index = [rr.TimeColumn(METRIC_TIMELINE, sequence=steps)]
-    columns = rr.Scalars.columns(scalars=[number for row in values for number in row])
-    stream.send_columns(path, index, columns.partition([len(row) for row in values]))
-
-
-def name_curves(stream: rr.RecordingStream, path: str, name: str, curves: int) -> None:
-    """Name the curves of ``path`` in the legend: "bc", or "bc 0", "bc 1" where there are several."""
-    names = [name] if curves == 1 else [f"{name} {i}" for i in range(curves)]
-    stream.log(path, rr.SeriesLines(names=names, widths=[1.5] * curves), static=True)
-
-
 def histogram(name: str, data: Any, bins: Any) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """The counts of ``data`` and the edges of the bins, whose number or edges ``bins`` are."""
     values = np.asarray(torch.as_tensor(data).detach().cpu().to(torch.float64)).ravel()
@@ -65,9 +52,7 @@ def histogram(name: str, data: Any, bins: Any) -> tuple[NDArray[np.int64], NDArr
     return counts.astype(np.int64), edges
 
 
-def send_histogram(
-    stream: rr.RecordingStream, path: str, step: int, counts: NDArray[np.int64], edges: NDArray[np.float64]
-) -> None:
+def send_histogram(stream: Stream, path: str, step: int, counts: NDArray[np.int64], edges: NDArray[np.float64]) -> None:
     """Add counts as a bar chart."""
     index = [rr.TimeColumn(METRIC_TIMELINE, sequence=[step])]
     centers, widths = (edges[1:] + edges[:-1]) / 2, np.diff(edges)
@@ -84,7 +69,7 @@ def check_video(name: str, video: Tensor) -> None:
         )
 
 
-def send_video(stream: rr.RecordingStream, path: str, video: Tensor, fps: float) -> None:
+def send_video(stream: Stream, path: str, video: Tensor, fps: float) -> None:
     """Add the frames T×C×H×W of a video, each a JPEG."""
     pixels = video.permute(0, 2, 3, 1).contiguous().numpy()
     stream.log(path, rr.EncodedImage.from_fields(media_type="image/jpeg"), static=True)
@@ -119,14 +104,14 @@ def check_image(name: str, image: Any) -> NDArray[np.uint8]:
     return pixels.contiguous().numpy()
 
 
-def send_image(stream: rr.RecordingStream, path: str, step: int, pixels: NDArray[np.uint8]) -> None:
+def send_image(stream: Stream, path: str, step: int, pixels: NDArray[np.uint8]) -> None:
     """Add an image H×W×C as a JPEG."""
     stream.log(path, rr.EncodedImage.from_fields(media_type="image/jpeg"), static=True)
     index = [rr.TimeColumn(METRIC_TIMELINE, sequence=[step])]
     stream.send_columns(path, index, rr.EncodedImage.columns(blob=[jpeg(pixels)]))
 
 
-def send_hparams(stream: rr.RecordingStream, hparams: Mapping[str, str]) -> None:
+def send_hparams(stream: Stream, hparams: Mapping[str, str]) -> None:
     """Show hyperparameters as a table, sorted by name."""
     rows = [f"| {_cell(key)} | {_cell(value)} |" for key, value in sorted(hparams.items())]
     text = "\n".join(["| key | value |", "|---|---|", *rows])

@@ -45,31 +45,27 @@ def opened(recording: Path, tab: str | None = None) -> Iterator[Path]:
     """
     from rerun.chunk import RrdReader
 
-    if is_whole(recording):
+    whole, source = is_whole(recording), recording
+    if whole:
         _run_rerun(recording, "verify", recording)
         if tab is None:
             yield recording
             return
-        with tempfile.TemporaryDirectory() as folder:
-            copy = Path(folder) / recording.name
-            copy_recording(recording, copy, tab)
-            yield copy
-        return
-    warnings.warn(
-        f"recording {str(recording)!r} was not closed: its writer still writes, or was stopped; "
-        "what is in it so far is shown",
-        stacklevel=4,
-    )
+    else:
+        why = "its writer still writes, or was stopped; what is in it so far is shown"
+        warnings.warn(f"recording {str(recording)!r} was not closed: {why}", stacklevel=4)
     with tempfile.TemporaryDirectory() as folder:
-        mended, copy = Path(folder) / "mended.rrd", Path(folder) / recording.name
-        _run_rerun(recording, "merge", recording, "-o", mended)
-        reader = RrdReader(mended)
-        if not reader.recordings():
-            raise _damaged(recording, "it holds nothing yet")
-        if Layout.read(reader) is None and tab is None:  # it has a layout of another's
-            yield mended
-            return
-        copy_recording(mended, copy, tab)
+        if not whole:
+            source = Path(folder) / "mended.rrd"
+            _run_rerun(recording, "merge", recording, "-o", source)
+            reader = RrdReader(source)
+            if not reader.recordings():
+                raise _damaged(recording, "it holds nothing yet")
+            if Layout.read(reader) is None and tab is None:  # it has a layout of another's
+                yield source
+                return
+        copy = Path(folder) / recording.name
+        copy_recording(source, copy, tab)
         yield copy
 
 

@@ -6,7 +6,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from lw_torchrl.record.conventions import BACKGROUND, EPISODE_TIMELINE, SECONDS_TIMELINE, entity_path, rr, rrb
+from lw_torchrl.record.conventions import BACKGROUND, EPISODE_TIMELINE, SECONDS_TIMELINE, Stream, entity_path, rr, rrb
 from lw_torchrl.record.mujoco_scene import Motion
 from lw_torchrl.record.recorded_episode import RecordedEpisode
 from lw_torchrl.record.scene import log_scene
@@ -119,7 +119,7 @@ def side_by_side(pages: Sequence[Page], title: str) -> rrb.Horizontal:
 
 
 def send_page(
-    stream: rr.RecordingStream, name: str, title: str, heading: Heading, episode: RecordedEpisode, motion: Motion | None
+    stream: Stream, name: str, title: str, heading: Heading, episode: RecordedEpisode, motion: Motion | None
 ) -> Page:
     """Log an episode under ``name``; what its views, a tab called ``title``, are to show."""
     root = entity_path(name)

@@ -20,20 +20,11 @@ NOBODY = -1
 """In the place of a step's number: no step is in force alone."""
 
 
-class StepLike(Protocol):
-    """A (condition, skill) pair: ``str(condition)`` is English, ``skill`` is a string."""
-
-    @property
-    def condition(self) -> object: ...
-    @property
-    def skill(self) -> str: ...
-
-
 class PlanLike(Protocol):
-    """Anything with ``steps``, such as :class:`lw_torchrl.ConditionalPlan`."""
+    """Anything with ``steps`` that have a ``condition``, whose ``str`` is English, and a ``skill``, a string."""
 
     @property
-    def steps(self) -> Sequence[StepLike]: ...
+    def steps(self) -> Sequence[Any]: ...
 
 
 class TargetPose(NamedTuple):

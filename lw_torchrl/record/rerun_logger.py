@@ -22,7 +22,7 @@ from torchrl.record.loggers import Logger
 
 from lw_torchrl._checks import check_choice, checked
 from lw_torchrl.record import metrics
-from lw_torchrl.record.conventions import CONTROL_PERIOD, entity_path, rr
+from lw_torchrl.record.conventions import CONTROL_PERIOD, METRIC_TIMELINE, entity_path, rr
 from lw_torchrl.record.layout import TABS, Layout
 from lw_torchrl.record.metrics import check_name
 from lw_torchrl.record.mujoco_scene import Motion
@@ -140,7 +140,9 @@ class RerunLogger(Logger):
         if len(row) > self._curves.get(name, 0):
             self._curves[name] = len(row)
             self._layout.add_view("metrics", parts[0])
-            metrics.name_curves(stream, entity_path("metrics", *parts), parts[-1], len(row))
+            names = [parts[-1]] if len(row) == 1 else [f"{parts[-1]} {i}" for i in range(len(row))]
+            lines = rr.SeriesLines(names=names, widths=[1.5] * len(row))
+            stream.log(entity_path("metrics", *parts), lines, static=True)
         with self._lock:
             steps, values = self._scalars.setdefault(name, ([], []))
             steps.append(self._count(f"metrics/{name}", step))
@@ -245,7 +247,10 @@ class RerunLogger(Logger):
         with self._lock:
             waiting, self._scalars = self._scalars, {}
         for name, (steps, values) in waiting.items():
-            metrics.send_scalars(self._writer.stream, entity_path("metrics", *name.split("/")), steps, values)
+            index = [rr.TimeColumn(METRIC_TIMELINE, sequence=steps)]
+            columns = rr.Scalars.columns(scalars=[number for row in values for number in row])
+            path = entity_path("metrics", *name.split("/"))
+            self._writer.stream.send_columns(path, index, columns.partition([len(row) for row in values]))
 
     def _send_waiting(self) -> None:
         """Send numbers that wait, and the layout where there is something new to show."""

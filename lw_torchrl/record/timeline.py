@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl.record.conventions import FALSE, STEEL, TRUE, Color, entity_path, rr, step_color, time_columns
+from lw_torchrl.record.conventions import FALSE, STEEL, TRUE, Color, Stream, entity_path, rr, step_color, time_columns
 from lw_torchrl.record.recorded_episode import NOBODY, RecordedEpisode
 
 NONE_HOLDS, EVENLY = "no condition holds", "evenly mixed"
@@ -16,7 +16,7 @@ ACTION_NAMES = ("dx", "dy", "dz", "gripper")
 MARKS = {True: "✓", False: "✗", None: "·"}
 
 
-def log_timeline(stream: rr.RecordingStream, root: str, episode: RecordedEpisode) -> int:
+def log_timeline(stream: Stream, root: str, episode: RecordedEpisode) -> int:
     """Rows for the step in force, each condition and success below ``root``/timeline; returns how many.
 
     A row has an entry where its state changes, and an empty one at the end. The viewer shows a row's path as its title,
@@ -68,7 +68,7 @@ def _states_in_force(episode: RecordedEpisode) -> list[str]:
     return np.where(episode.in_force == NOBODY, nobody, episode.in_force.astype(str)).tolist()
 
 
-def log_plan(stream: rr.RecordingStream, root: str, episode: RecordedEpisode) -> None:
+def log_plan(stream: Stream, root: str, episode: RecordedEpisode) -> None:
     """The plan in ``root``/plan, with a text wherever truth or the step in force change."""
     length = len(episode)
     columns = [
@@ -98,7 +98,7 @@ def _plan_text(episode: RecordedEpisode, row: int) -> str:
     return "\n".join(parts)
 
 
-def log_curves(stream: rr.RecordingStream, root: str, episode: RecordedEpisode) -> list[str]:
+def log_curves(stream: Stream, root: str, episode: RecordedEpisode) -> list[str]:
     """``root``/action, and, where there is any, /distance (cm), /reward, /skill_weights, /corrected; returns which."""
     rows = np.arange(len(episode))
     sent = ["action"]
@@ -121,16 +121,14 @@ def log_curves(stream: rr.RecordingStream, root: str, episode: RecordedEpisode) 
     return sent
 
 
-def _send(
-    stream: Any, path: str, steps: NDArray[np.int64], values: NDArray[np.float32], names: Sequence[str], *color: Color
-) -> None:
+def _send(stream: Stream, path: str, steps: Any, values: Any, names: Sequence[str], *color: Color) -> None:
     colors = list(color) or [step_color(i) for i in range(len(names))]
     stream.log(path, rr.SeriesLines(names=names, colors=colors, widths=[1.5] * len(names)), static=True)
     columns = rr.Scalars.columns(scalars=values.ravel()).partition([values.shape[1]] * len(values))
     stream.send_columns(path, time_columns(steps), columns)
 
 
-def _send_distance(stream: Any, path: str, distance: NDArray[np.float32], episode: RecordedEpisode) -> None:
+def _send_distance(stream: Stream, path: str, distance: NDArray[np.float32], episode: RecordedEpisode) -> None:
     """One line in centimetres, in the colour of the step in force."""
     assert episode.in_force is not None
     stream.log(path, rr.SeriesLines(names=["distance [cm]"], widths=[2.0]), static=True)
