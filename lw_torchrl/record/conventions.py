@@ -2,15 +2,34 @@
 
 from __future__ import annotations
 
-from typing import Any
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import rerun as rr
+    import rerun.blueprint as rrb
+else:
+
+    class _Later:
+        """A module that is imported when something of it is first used."""
+
+        def __init__(self, name: str) -> None:
+            self._name = name
+
+        def __getattr__(self, attribute: str) -> Any:
+            return getattr(import_module(self._name), attribute)
+
+    rr, rrb = _Later("rerun"), _Later("rerun.blueprint")
 
 EPISODE_TIMELINE, SECONDS_TIMELINE, METRIC_TIMELINE = "step", "time", "global_step"
 CONTROL_PERIOD = 0.0125
 """Seconds between two actions in Meta-World: 5 simulation steps of 2.5 ms, hence 80 Hz."""
 
+Stream = Any
+"""A rerun RecordingStream."""
 Color = tuple[int, ...]
 BACKGROUND = (24, 27, 33)
 TRUE, FALSE = (70, 170, 105), (52, 56, 64)
@@ -34,17 +53,10 @@ def step_color(step: int) -> Color:
 
 def entity_path(*parts: str) -> str:
     """An absolute entity path of parts that may hold any character."""
-    import rerun as rr
-
     return "".join("/" + rr.escape_entity_path_part(part) for part in parts)
 
 
 def time_columns(steps: NDArray[np.int64], period: float = CONTROL_PERIOD) -> list[Any]:
     """The two timelines of an episode: steps, and seconds at ``period`` each."""
-    import rerun as rr
-
     nanoseconds = (steps * round(period * 1e9)).astype("timedelta64[ns]")
-    return [
-        rr.TimeColumn(EPISODE_TIMELINE, sequence=steps),
-        rr.TimeColumn(SECONDS_TIMELINE, duration=nanoseconds),
-    ]
+    return [rr.TimeColumn(EPISODE_TIMELINE, sequence=steps), rr.TimeColumn(SECONDS_TIMELINE, duration=nanoseconds)]

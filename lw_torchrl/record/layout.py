@@ -5,32 +5,21 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from lw_torchrl._checks import unknown_name
-from lw_torchrl.record.conventions import EPISODE_TIMELINE, METRIC_TIMELINE, entity_path
+from lw_torchrl.record.conventions import EPISODE_TIMELINE, METRIC_TIMELINE, Stream, entity_path, rr, rrb
 from lw_torchrl.record.page import Page, side_by_side
 
-if TYPE_CHECKING:
-    import rerun.blueprint as rrb
-    from rerun import RecordingStream
-    from rerun.chunk import RrdReader
-
-TABS = {
-    "metrics": "Metrics",
-    "histograms": "Histograms",
-    "images": "Images",
-    "videos": "Videos",
-    "hparams": "Hyperparameters",
-}
-"""The titles of the tabs of what is no episode. Their keys begin entity paths, so no episode has such a name."""
+TABS = {kind: kind.title() for kind in ("metrics", "histograms", "images", "videos")} | {"hparams": "Hyperparameters"}
+"""Titles of the tabs that show no episode. Their keys begin entity paths, so no episode has such a name."""
 OF_TRAINING = {"metrics", "histograms", "images"}
-"""What lies on the timeline of training, not of episodes."""
+"""What lies on the timeline of training; the rest lies on that of episodes."""
 _PROPERTY = "layout"
 
 
 class Tab(NamedTuple):
-    """A tab: what it is asked for by (the episode's name, or the title), its title, and the episodes that it shows."""
+    """A tab; its name is its episode's, or the title."""
 
     name: str
     title: str
@@ -38,10 +27,9 @@ class Tab(NamedTuple):
 
 
 class Layout:
-    """The tabs of a recording. Rerun's blueprint is made from them whenever they are sent, with any tab in front.
+    """The tabs of a recording, from which rerun's blueprint is made whenever they are sent, with any tab in front.
 
-    A recording holds its tabs as properties too, so that whoever opens it can choose one, and so that a recording whose
-    writer was killed has all of them.
+    They are saved as properties too: whoever opens the recording can choose one, even if its writer was killed.
     """
 
     def __init__(self) -> None:
@@ -68,7 +56,7 @@ class Layout:
             self._entries.append(json.dumps(["view", kind, names]))
 
     @classmethod
-    def read(cls, reader: RrdReader) -> Layout | None:
+    def read(cls, reader: Any) -> Layout | None:
         """The layout of a recording; None if this library did not write it, or an earlier version did."""
         found = {}
         for chunk in reader.stream().filter(content=f"/__properties/{_PROPERTY}/**"):
@@ -84,34 +72,25 @@ class Layout:
                 layout.add_view(name, *content)
         return layout if found else None
 
-    def save(self, stream: RecordingStream) -> None:
+    def save(self, stream: Stream) -> None:
         """Write the new tabs as properties of a recording."""
-        import rerun as rr
-
         for number in range(self._saved, len(self._entries)):
             values = rr.AnyValues(entry=self._entries[number])
             stream.log(f"__properties/{_PROPERTY}/{number}", values, static=True)
         self._saved = len(self._entries)
 
     def is_due(self, seconds: float) -> bool:
-        """Whether to send the layout again, ``seconds`` after it was sent. Rerun takes it only whole, 0.1 MB a page, so
-        that many pages are sent only when a quarter more came, or after 5 seconds a page."""
+        """Whether to send the layout again, ``seconds`` later: rerun takes it only whole, and a page is 0.1 MB."""
         new = len(self._entries) - self._shown
         return bool(new) and (4 * new >= self._shown or seconds >= 5 * self._shown)
 
-    def send(self, stream: RecordingStream, tab: str | None = None) -> None:
-        """Have the viewer show the tabs, ``tab`` in front.
-
-        Raises:
-            ValueError: there is no such tab.
-        """
+    def send(self, stream: Stream, tab: str | None = None) -> None:
+        """Have the viewer show the tabs, ``tab`` in front; an unknown one is a ValueError."""
         self._shown = len(self._entries)
         stream.send_blueprint(self.blueprint(tab))
 
     def blueprint(self, tab: str | None = None) -> rrb.Blueprint:
         """The layout as rerun's; its time panel plays episodes at Meta-World's 80 steps a second."""
-        import rerun.blueprint as rrb
-
         tabs: list[Any] = [side_by_side([self.pages[name] for name in names], title) for title, names in self._compared]
         tabs += [page.tab() for page in self.pages.values()]
         for kind, views in self._views.items():
@@ -119,16 +98,10 @@ class Layout:
                 shown = [_view(kind, names) for names in views]
                 tabs.append(shown[0] if kind == "hparams" else rrb.Grid(*shown, name=TABS[kind]))
         front = None if tab is None else self._find(tab)
-        panel = rrb.TimePanel(
-            state="collapsed", timeline=self.timeline(tab), fps=80.0, play_state="paused", loop_mode="all"
-        )
-        return rrb.Blueprint(
-            rrb.Tabs(*tabs, active_tab=front),
-            rrb.BlueprintPanel(state="collapsed"),
-            rrb.SelectionPanel(state="collapsed"),
-            panel,
-            auto_views=False,
-        )
+        time: dict[str, Any] = {"timeline": self.timeline(tab), "fps": 80.0, "play_state": "paused", "loop_mode": "all"}
+        panels = [rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed")]
+        panels.append(rrb.TimePanel(state="collapsed", **time))
+        return rrb.Blueprint(rrb.Tabs(*tabs, active_tab=front), *panels, auto_views=False)
 
     def tabs(self) -> list[Tab]:
         """The tabs from left to right."""
@@ -139,11 +112,7 @@ class Layout:
         ]
 
     def _find(self, name: str | None) -> int:
-        """The place of the tab of that name or title, or of the only one whose title holds it; without one the first.
-
-        Raises:
-            ValueError: there is no such tab.
-        """
+        """The place of the tab of that name or title, or of the only one whose title holds it; of None the first."""
         tabs = self.tabs()
         exact = [i for i, tab in enumerate(tabs) if name in (tab.name, tab.title, None)]
         holding = [i for i, tab in enumerate(tabs) if str(name).lower() in tab.title.lower()]
@@ -168,8 +137,6 @@ class Layout:
 
 
 def _view(kind: str, names: Sequence[str]) -> Any:
-    import rerun.blueprint as rrb
-
     origin, name = entity_path(kind, *names), "/".join(names)
     if kind == "metrics":
         legend = rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=True)

@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lw_torchrl.record.conventions import METRIC_TIMELINE, time_columns
-
-if TYPE_CHECKING:
-    from rerun import RecordingStream
-
+from lw_torchrl.record.conventions import METRIC_TIMELINE, Stream, rr, time_columns
 
 MOST_CURVES = 64
 JPEG_QUALITY = 90
@@ -30,7 +26,7 @@ def check_name(name: str) -> str:
 
 
 def numbers(name: str, value: Any) -> list[float]:
-    """A metric's value as a list, of one number or of several; else :class:`ValueError`."""
+    """A metric's value as a list of numbers; else :class:`ValueError`."""
     if type(value) is float or type(value) is int:
         return [float(value)]
     try:
@@ -47,23 +43,6 @@ def numbers(name: str, value: Any) -> list[float]:
     return found
 
 
-def send_scalars(stream: RecordingStream, path: str, steps: Sequence[int], values: Sequence[Sequence[float]]) -> None:
-    """Add a row of numbers for each step to the curves ``path``."""
-    import rerun as rr
-
-    index = [rr.TimeColumn(METRIC_TIMELINE, sequence=steps)]
-    columns = rr.Scalars.columns(scalars=[number for row in values for number in row])
-    stream.send_columns(path, index, columns.partition([len(row) for row in values]))
-
-
-def name_curves(stream: RecordingStream, path: str, name: str, curves: int) -> None:
-    """Name the curves of ``path`` in the legend: "bc", or "bc 0", "bc 1" where there are several."""
-    import rerun as rr
-
-    names = [name] if curves == 1 else [f"{name} {i}" for i in range(curves)]
-    stream.log(path, rr.SeriesLines(names=names, widths=[1.5] * curves), static=True)
-
-
 def histogram(name: str, data: Any, bins: Any) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """The counts of ``data`` and the edges of the bins, whose number or edges ``bins`` are."""
     values = np.asarray(torch.as_tensor(data).detach().cpu().to(torch.float64)).ravel()
@@ -73,12 +52,8 @@ def histogram(name: str, data: Any, bins: Any) -> tuple[NDArray[np.int64], NDArr
     return counts.astype(np.int64), edges
 
 
-def send_histogram(
-    stream: RecordingStream, path: str, step: int, counts: NDArray[np.int64], edges: NDArray[np.float64]
-) -> None:
+def send_histogram(stream: Stream, path: str, step: int, counts: NDArray[np.int64], edges: NDArray[np.float64]) -> None:
     """Add counts as a bar chart."""
-    import rerun as rr
-
     index = [rr.TimeColumn(METRIC_TIMELINE, sequence=[step])]
     centers, widths = (edges[1:] + edges[:-1]) / 2, np.diff(edges)
     chart = rr.BarChart.columns(values=[counts], abscissa=[centers], widths=[widths], color=[BARS])
@@ -94,10 +69,8 @@ def check_video(name: str, video: Tensor) -> None:
         )
 
 
-def send_video(stream: RecordingStream, path: str, video: Tensor, fps: float) -> None:
+def send_video(stream: Stream, path: str, video: Tensor, fps: float) -> None:
     """Add the frames T×C×H×W of a video, each a JPEG."""
-    import rerun as rr
-
     pixels = video.permute(0, 2, 3, 1).contiguous().numpy()
     stream.log(path, rr.EncodedImage.from_fields(media_type="image/jpeg"), static=True)
     times = time_columns(np.arange(len(pixels)), 1 / fps)
@@ -131,19 +104,15 @@ def check_image(name: str, image: Any) -> NDArray[np.uint8]:
     return pixels.contiguous().numpy()
 
 
-def send_image(stream: RecordingStream, path: str, step: int, pixels: NDArray[np.uint8]) -> None:
+def send_image(stream: Stream, path: str, step: int, pixels: NDArray[np.uint8]) -> None:
     """Add an image H×W×C as a JPEG."""
-    import rerun as rr
-
     stream.log(path, rr.EncodedImage.from_fields(media_type="image/jpeg"), static=True)
     index = [rr.TimeColumn(METRIC_TIMELINE, sequence=[step])]
     stream.send_columns(path, index, rr.EncodedImage.columns(blob=[jpeg(pixels)]))
 
 
-def send_hparams(stream: RecordingStream, hparams: Mapping[str, str]) -> None:
+def send_hparams(stream: Stream, hparams: Mapping[str, str]) -> None:
     """Show hyperparameters as a table, sorted by name."""
-    import rerun as rr
-
     rows = [f"| {_cell(key)} | {_cell(value)} |" for key, value in sorted(hparams.items())]
     text = "\n".join(["| key | value |", "|---|---|", *rows])
     stream.log("hparams", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)

@@ -1,23 +1,19 @@
 """A MuJoCo model in a recording: its geoms once, as they stand in their bodies; then where the bodies are.
 
-Drawn is what Meta-World's cameras show: the geoms of groups 0 to 2 that are not transparent. Planes, which have no end,
-are left out, and a texture is its mean colour.
+Meta-World's cameras show the same geoms, but planes are left out, and a texture becomes its mean colour.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from lw_torchrl.envs.engine import RowModel
-from lw_torchrl.record.conventions import entity_path, time_columns
-
-if TYPE_CHECKING:
-    from rerun import RecordingStream
+from lw_torchrl.record.conventions import Stream, entity_path, rr, time_columns
 
 SHOWN_GROUPS = (0, 1, 2)
 """Meta-World keeps what only collides in group 4."""
@@ -33,13 +29,7 @@ _prepared: dict[str, ModelGeometry] = {}
 
 @dataclass(frozen=True)
 class Motion:
-    """Where the bodies of a model were, T rows, B bodies.
-
-    Attributes:
-        model: the model.
-        position: T×B×3 float32, metres, of the world.
-        quaternion: T×B×4 float32, w first.
-    """
+    """Where the B bodies of a model were: ``position`` T×B×3 float32, metres; ``quaternion`` T×B×4 float32, w first."""
 
     model: RowModel
     position: NDArray[np.float32]
@@ -48,12 +38,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class ModelGeometry:
-    """What is drawn of a model.
-
-    Attributes:
-        bodies: body number to its entity's name, of those that have something to show.
-        parts: a body's name, the part's name in it, and what is logged there.
-    """
+    """What is drawn of a model: its bodies' entities by number; for each part, body, name, and what is logged there."""
 
     bodies: dict[int, str]
     parts: tuple[tuple[str, str, tuple[Any, ...]], ...]
@@ -67,17 +52,14 @@ def model_geometry(model: RowModel) -> ModelGeometry:
     return found
 
 
-def log_model(stream: RecordingStream, root: str, geometry: ModelGeometry) -> None:
+def log_model(stream: Stream, root: str, geometry: ModelGeometry) -> None:
     """The geoms below ``root``, each under its body's name; they never change."""
     for body, part, archetypes in geometry.parts:
         stream.log(f"{root}{entity_path(body, part)}", *archetypes, static=True)
 
 
-def log_motion(stream: RecordingStream, root: str, motion: Motion) -> None:
-    """The poses of the bodies below ``root``, row t at step t: a static one of a body that does not move, else a row
-    wherever it does."""
-    import rerun as rr
-
+def log_motion(stream: Stream, root: str, motion: Motion) -> None:
+    """The poses of the bodies below ``root``, row t at step t: static where a body never moves."""
     for body, name in model_geometry(motion.model).bodies.items():
         path = f"{root}{entity_path(name)}"
         place, turn = motion.position[:, body], motion.quaternion[:, body][:, [1, 2, 3, 0]]
@@ -108,16 +90,12 @@ def _prepare(model: Any) -> ModelGeometry:
 
 
 def _pose(model: Any, geom: int) -> Any:
-    import rerun as rr
-
     turn = rr.Quaternion(xyzw=model.geom_quat[geom][[1, 2, 3, 0]])
     return rr.Transform3D(translation=model.geom_pos[geom], quaternion=turn)
 
 
 def _shape(model: Any, geom: int, color: NDArray[np.uint8]) -> Any:
     """The geom as rerun draws it, None for a plane."""
-    import rerun as rr
-
     kinds = mujoco.mjtGeom
     kind, size = model.geom_type[geom], model.geom_size[geom]
     look: dict[str, Any] = {"colors": [color], "fill_mode": rr.components.FillMode.Solid}
@@ -125,12 +103,8 @@ def _shape(model: Any, geom: int, color: NDArray[np.uint8]) -> Any:
         return None
     if kind == kinds.mjGEOM_MESH:
         mesh = _clustered(*_corners(model, model.geom_dataid[geom]))
-        return rr.Mesh3D(
-            vertex_positions=mesh.vertices,
-            vertex_normals=mesh.normals,
-            triangle_indices=mesh.triangles,
-            albedo_factor=color,
-        )
+        geometry = {"vertex_positions": mesh.vertices, "vertex_normals": mesh.normals}
+        return rr.Mesh3D(**geometry, triangle_indices=mesh.triangles, albedo_factor=color)
     if kind == kinds.mjGEOM_BOX:
         return rr.Boxes3D(half_sizes=[size], **look)
     if kind == kinds.mjGEOM_SPHERE:
@@ -179,13 +153,7 @@ def _mean_color(model: Any, texture: int) -> NDArray[np.float64]:
 
 
 class _Mesh(NamedTuple):
-    """Triangles with a normal for each vertex.
-
-    Attributes:
-        vertices: V×3 float32, metres.
-        normals: V×3 float32, unit vectors.
-        triangles: F×3 uint32, indices of vertices.
-    """
+    """V vertices (metres) with unit normals, and F triangles of indices."""
 
     vertices: NDArray[np.float32]
     normals: NDArray[np.float32]
@@ -193,10 +161,9 @@ class _Mesh(NamedTuple):
 
 
 def _clustered(corners: NDArray[np.float64], normals: NDArray[np.float64]) -> _Mesh:
-    """A mesh of triangles' corners (F×3×3, metres) and their normals (F×3×3), coarse enough to be kept in a file.
+    """A coarse mesh of triangles' corners (F×3×3, metres) and their normals (F×3×3).
 
-    The corners in a cube move to their mean, so no gap opens; corners whose normals differ stay apart, so edges stay
-    sharp. Triangles that shrink to a line are left out.
+    The corners in a cube move to their mean, so no gap opens; those whose normals differ stay apart: edges stay sharp.
     """
     points, directions = corners.reshape(-1, 3), normals.reshape(-1, 3)
     low = points.min(axis=0)

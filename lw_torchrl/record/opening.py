@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from lw_torchrl._checks import check_int
+from lw_torchrl.record.conventions import rr
 from lw_torchrl.record.layout import Layout
 from lw_torchrl.record.rerun_binary import binary, plain
 
@@ -40,38 +41,31 @@ def find_recording(path: str | os.PathLike[str]) -> Path:
 def opened(recording: Path, tab: str | None = None) -> Iterator[Path]:
     """The recording as a viewer can open it: itself, or a copy that ends properly and opens at ``tab``.
 
-    Rerun's viewer waits for the rest of a recording that was cut, by a kill or a full disk, or that still grows.
-
-    Raises:
-        ValueError: nothing in it can be read, or it has no such tab.
+    Rerun's viewer waits for the rest of one that was cut or still grows. One that cannot be read is a ValueError.
     """
     from rerun.chunk import RrdReader
 
-    if is_whole(recording):
+    whole, source = is_whole(recording), recording
+    if whole:
         _run_rerun(recording, "verify", recording)
         if tab is None:
             yield recording
             return
-        with tempfile.TemporaryDirectory() as folder:
-            copy = Path(folder) / recording.name
-            copy_recording(recording, copy, tab)
-            yield copy
-        return
-    warnings.warn(
-        f"recording {str(recording)!r} was not closed: its writer still writes, or was stopped; "
-        "what is in it so far is shown",
-        stacklevel=4,
-    )
+    else:
+        why = "its writer still writes, or was stopped; what is in it so far is shown"
+        warnings.warn(f"recording {str(recording)!r} was not closed: {why}", stacklevel=4)
     with tempfile.TemporaryDirectory() as folder:
-        mended, copy = Path(folder) / "mended.rrd", Path(folder) / recording.name
-        _run_rerun(recording, "merge", recording, "-o", mended)
-        reader = RrdReader(mended)
-        if not reader.recordings():
-            raise _damaged(recording, "it holds nothing yet")
-        if Layout.read(reader) is None and tab is None:  # it has a layout of another's
-            yield mended
-            return
-        copy_recording(mended, copy, tab)
+        if not whole:
+            source = Path(folder) / "mended.rrd"
+            _run_rerun(recording, "merge", recording, "-o", source)
+            reader = RrdReader(source)
+            if not reader.recordings():
+                raise _damaged(recording, "it holds nothing yet")
+            if Layout.read(reader) is None and tab is None:  # it has a layout of another's
+                yield source
+                return
+        copy = Path(folder) / recording.name
+        copy_recording(source, copy, tab)
         yield copy
 
 
@@ -83,13 +77,7 @@ def is_whole(path: Path) -> bool:
 
 
 def copy_recording(source: Path, target: Path, tab: str | None = None) -> None:
-    """Write a recording again: compact, with an index, and with ``tab`` in front.
-
-    Raises:
-        ValueError: it cannot be read, or there is no such tab.
-        OSError: the copy could not be written whole.
-    """
-    import rerun as rr
+    """Write a recording again: compact, with an index, and with ``tab`` in front. ValueError: it cannot be read."""
     from rerun.chunk import OptimizationProfile, RrdReader
 
     try:
@@ -119,19 +107,10 @@ def copy_recording(source: Path, target: Path, tab: str | None = None) -> None:
 
 
 def opening_step(path: str | os.PathLike[str], tab: str | None = None, step: int | None = None) -> int | None:
-    """The step that a viewer's cursor is to stand at in a tab, the first tab if none is named.
+    """The step for a viewer's cursor in a tab (None: the first); None for a tab of no episode.
 
-    Args:
-        path: the recording.
-        tab: the tab's title, or its episode's name.
-        step: the step that was asked for; None takes an episode's decisive one (where its failure is seen, its first
-            success, or its end; of episodes side by side the earliest).
-
-    Returns:
-        The step; None for a tab of no episode, or a recording without steps.
-
-    Raises:
-        TypeError, ValueError: ``step`` is no whole number, or the recording does not go so far.
+    It is ``step``, if the recording goes so far, else a ValueError. Without one it is the decisive step of the episode:
+    where its failure is seen, its first success, or its end; of episodes side by side the earliest.
     """
     from rerun.chunk import RrdReader
 

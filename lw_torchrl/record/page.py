@@ -4,18 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from lw_torchrl.record.conventions import BACKGROUND, EPISODE_TIMELINE, SECONDS_TIMELINE, entity_path
+from lw_torchrl.record.conventions import BACKGROUND, EPISODE_TIMELINE, SECONDS_TIMELINE, Stream, entity_path, rr, rrb
 from lw_torchrl.record.mujoco_scene import Motion
 from lw_torchrl.record.recorded_episode import RecordedEpisode
 from lw_torchrl.record.scene import log_scene
 from lw_torchrl.record.timeline import log_curves, log_plan, log_timeline
 from lw_torchrl.record.verdict import Heading, decisive_step, telling_steps, verdict
-
-if TYPE_CHECKING:
-    import rerun.blueprint as rrb
-    from rerun import RecordingStream
 
 Point = tuple[float, float, float]
 
@@ -40,15 +36,11 @@ class Page:
     """What was logged of an episode, as far as its views depend on it.
 
     Attributes:
-        root: the entity that all lies under.
-        title: of its tab.
         trails: entities that are shown up to the cursor.
         eye: where the scene is seen from, and what is looked at.
         shown: the first and last step worth a look.
         decisive: the step to open it at.
-        curves: names of :data:`CURVES` that there are.
         steps, rows: how many steps the plan has, and how many rows the timeline.
-        good: whether it succeeded.
     """
 
     root: str
@@ -64,8 +56,6 @@ class Page:
 
     def tab(self) -> rrb.Horizontal:
         """Scene and curves on the left, words and timeline on the right."""
-        import rerun.blueprint as rrb
-
         left: list[tuple[float, Any]] = [(13, self._scene("Scene"))]
         left += [(share, self._curve(name)) for name, (_, share) in CURVES.items() if name in self.curves]
         # Shares are about as many pixels as a view needs; what is longer scrolls.
@@ -73,25 +63,18 @@ class Page:
         if self.steps:
             right.append((70 + 58 * min(self.steps, 6), self._words("plan", "Plan")))
         right += self._timeline()
-        columns = [
-            rrb.Vertical(*(view for _, view in part), row_shares=[share for share, _ in part]) for part in (left, right)
-        ]
-        return rrb.Horizontal(*columns, column_shares=[6, 5], name=self.title)
+        return rrb.Horizontal(_stacked(left), _stacked(right), column_shares=[6, 5], name=self.title)
 
     def column(self, shown: tuple[int, int]) -> rrb.Vertical:
         """Verdict, scene, timeline and distance in a column, beside others that show the same steps."""
-        import rerun.blueprint as rrb
-
         page = replace(self, shown=shown)
         parts: list[tuple[float, Any]] = [(130, page._words("verdict", self.title)), (420, page._scene("Scene"))]
         if "distance" in page.curves:
             parts.append((120, page._curve("distance")))
         parts += page._timeline()
-        return rrb.Vertical(*(view for _, view in parts), row_shares=[share for share, _ in parts], name=self.title)
+        return _stacked(parts, self.title)
 
     def _scene(self, name: str) -> rrb.Spatial3DView:
-        import rerun.blueprint as rrb
-
         trail = rrb.VisibleTimeRanges([_up_to_now(timeline) for timeline in (EPISODE_TIMELINE, SECONDS_TIMELINE)])
         return rrb.Spatial3DView(
             origin=f"{self.root}/scene",
@@ -103,23 +86,16 @@ class Page:
         )
 
     def _words(self, part: str, name: str) -> rrb.TextDocumentView:
-        import rerun.blueprint as rrb
-
         return rrb.TextDocumentView(origin=f"{self.root}/{part}", name=name)
 
     def _timeline(self) -> list[tuple[float, Any]]:
-        import rerun.blueprint as rrb
-
         if not self.rows:
             return []
-        view = rrb.StateTimelineView(
-            origin=f"{self.root}/timeline", name="The step in force, and what holds", time_view=_window(self.shown)
-        )
+        origin, name = f"{self.root}/timeline", "The step in force, and what holds"
+        view = rrb.StateTimelineView(origin=origin, name=name, time_view=_window(self.shown))
         return [(50 + 40 * min(self.rows, 8), view)]
 
     def _curve(self, name: str) -> rrb.TimeSeriesView:
-        import rerun.blueprint as rrb
-
         limits = LIMITS.get(name)
         many = name in ("action", "skill_weights")
         return rrb.TimeSeriesView(
@@ -131,25 +107,21 @@ class Page:
         )
 
 
+def _stacked(parts: Sequence[tuple[float, Any]], name: str | None = None) -> rrb.Vertical:
+    """Views with their shares of the height, one below another."""
+    return rrb.Vertical(*(view for _, view in parts), row_shares=[share for share, _ in parts], name=name)
+
+
 def side_by_side(pages: Sequence[Page], title: str) -> rrb.Horizontal:
     """Episodes beside one another, a column each."""
-    import rerun.blueprint as rrb
-
     shown = min(page.shown[0] for page in pages), max(page.shown[1] for page in pages)
     return rrb.Horizontal(*(page.column(shown) for page in pages), name=title)
 
 
 def send_page(
-    stream: RecordingStream,
-    name: str,
-    title: str,
-    heading: Heading,
-    episode: RecordedEpisode,
-    motion: Motion | None = None,
+    stream: Stream, name: str, title: str, heading: Heading, episode: RecordedEpisode, motion: Motion | None
 ) -> Page:
     """Log an episode under ``name``; what its views, a tab called ``title``, are to show."""
-    import rerun as rr
-
     root = entity_path(name)
     trails = log_scene(stream, root, episode, motion)
     stream.log(f"{root}/verdict", rr.TextDocument(verdict(heading, episode), media_type="text/markdown"), static=True)
@@ -170,16 +142,10 @@ def send_page(
 
 
 def _window(shown: tuple[int, int]) -> Any:
-    import rerun as rr
-    import rerun.blueprint as rrb
-
     first, last = (rr.TimeRangeBoundary.absolute(seq=step) for step in shown)
     return rrb.TimeAxis(view_range=rr.TimeRange(start=first, end=last))
 
 
 def _up_to_now(timeline: str) -> Any:
-    import rerun as rr
-
-    return rr.VisibleTimeRange(
-        timeline, start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.cursor_relative()
-    )
+    first, now = rr.TimeRangeBoundary.infinite(), rr.TimeRangeBoundary.cursor_relative()
+    return rr.VisibleTimeRange(timeline, start=first, end=now)

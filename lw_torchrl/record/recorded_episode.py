@@ -20,29 +20,18 @@ NOBODY = -1
 """In the place of a step's number: no step is in force alone."""
 
 
-class StepLike(Protocol):
-    """A (condition, skill) pair: ``str(condition)`` is English, ``skill`` is a string."""
-
-    @property
-    def condition(self) -> object: ...
-    @property
-    def skill(self) -> str: ...
-
-
 class PlanLike(Protocol):
-    """Anything with ``steps``, such as :class:`lw_torchrl.ConditionalPlan`."""
+    """Anything with ``steps`` that have a ``condition``, whose ``str`` is English, and a ``skill``, a string."""
 
     @property
-    def steps(self) -> Sequence[StepLike]: ...
+    def steps(self) -> Sequence[Any]: ...
 
 
 class TargetPose(NamedTuple):
-    """What a scripted skill moves and where to, in each of T rows.
+    """What a scripted skill moves (``moved``) and where to (``position``), each T×3 float32, metres.
 
-    Attributes:
-        position: T×3 float32, metres, where the skill goes; on an axis that it leaves alone, where ``moved`` is.
-        moved: T×3 float32, metres, what is to arrive there.
-        relative: the skill goes by a distance from the hand, not to a place, so it never arrives.
+    On an axis that the skill leaves alone they are equal. A ``relative`` one goes by a distance from the hand, not to a
+    place, so it never arrives.
     """
 
     position: NDArray[np.float32]
@@ -81,7 +70,7 @@ class RecordedEpisode:
         action: T×4 float32, displacement xyz and gripper effort in [-1,1].
         objects: name -> T×3 float32 position in metres; the gripper is among them.
         qaf: T×S bool, truth of each condition, or None.
-        believed: T×S bool, the truth that a learned evaluator gives, or None.
+        believed: T×S bool, what a learned evaluator takes for it, or None.
         skill_weights: T×S float32, attention over the steps, or None.
         success: T bool, of the state that the row's action led to, or None.
         reward: T float32, likewise, or None.
@@ -116,8 +105,7 @@ class RecordedEpisode:
 
     @cached_property
     def in_force(self) -> NDArray[np.int64] | None:
-        """T, the step of the plan with the largest weight, or without weights the first whose condition holds;
-        -1 where none stands out. None where there are neither."""
+        """T, the step with the largest weight, or without weights the first that holds; -1 where none stands out."""
         if self.skill_weights is not None:
             weights = self.skill_weights
             if weights.shape[1] == 1:
@@ -142,8 +130,7 @@ class RecordedEpisode:
         return int(self.success.argmax()) + 1
 
     def distance(self) -> NDArray[np.float32] | None:
-        """T float32, metres: how far what the skill in force moves is from where it goes; NaN where no scripted skill
-        that goes to a place is in force, None where that is everywhere."""
+        """T float32, metres: how far what the skill in force moves is from where it goes; NaN where it goes nowhere."""
         if self.in_force is None:
             return None
         found = np.full(len(self), np.nan, np.float32)

@@ -29,7 +29,7 @@ REASONS = (
         "--web serves a page, --html writes one",
     ),
     (
-        r"No glyph for",
+        "No glyph for",
         "a text in the recording has a character outside the one font that pictures are drawn with. "
         "Without --screenshot the viewer uses the system's fonts too",
     ),

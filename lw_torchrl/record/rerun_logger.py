@@ -12,8 +12,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from itertools import count
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from numpy.typing import NDArray
@@ -22,30 +21,15 @@ from torch import Tensor
 from torchrl.record.loggers import Logger
 
 from lw_torchrl._checks import check_choice, checked
-from lw_torchrl.record.conventions import CONTROL_PERIOD, entity_path
+from lw_torchrl.record import metrics
+from lw_torchrl.record.conventions import CONTROL_PERIOD, METRIC_TIMELINE, entity_path, rr
 from lw_torchrl.record.layout import TABS, Layout
-from lw_torchrl.record.metrics import (
-    check_image,
-    check_name,
-    check_video,
-    flatten,
-    histogram,
-    name_curves,
-    numbers,
-    send_histogram,
-    send_hparams,
-    send_image,
-    send_scalars,
-    send_video,
-)
+from lw_torchrl.record.metrics import check_name
 from lw_torchrl.record.mujoco_scene import Motion
 from lw_torchrl.record.page import send_page
 from lw_torchrl.record.recorded_episode import PlanLike, RecordedEpisode
 from lw_torchrl.record.verdict import Heading
 from lw_torchrl.record.writer import RecordingWriter, check_address, check_path
-
-if TYPE_CHECKING:
-    from rerun import RecordingStream
 
 BUFFERED_SCALARS = 1024
 
@@ -53,27 +37,23 @@ BUFFERED_SCALARS = 1024
 class RerunLogger(Logger):
     """A torchrl Logger that makes one rerun recording: metrics, images, videos, and whole episodes in 3-D.
 
-    Everything is written within half a second, with the layout, to a file that has its name from the start: whoever
-    is killed leaves a recording that opens. An older file of that name is kept, as "run.previous.rrd", then
-    "run.previous-2.rrd". A viewer that is absent or goes away, and a full disk, cost one warning each, and training
-    goes on. The recording is the logger's own: rerun's global one is neither used nor changed.
+    Everything is written within half a second to a file that has its name from the start, so a killed run leaves a
+    recording that opens. An older file of that name is kept, as "run.previous.rrd", then "run.previous-2.rrd". A viewer
+    that is absent or goes away, and a full disk, cost one warning each, and training goes on.
 
     Args:
         path: the file, ending in ".rrd"; missing folders are made. None writes no file.
         connect: the address of a viewer that shows the recording as it grows, "127.0.0.1:9876" or
             "rerun+http://127.0.0.1:9876/proxy"; start it with ``rerun``.
         exp_name: the name of the run; None takes the file's, without ".rrd".
-        application_id: recordings of one application share their layout in rerun's viewer, the last one's; None takes
-            one of its own, made of ``exp_name`` and chance.
+        application_id: recordings of one application share the last one's layout in rerun's viewer; None makes one of
+            ``exp_name`` and chance.
 
     Attributes:
-        path: the file, as a Path, or None.
         previous: where an older file of that name is kept, or None.
-        experiment: the rerun RecordingStream, for logging more by hand.
+        experiment: the rerun RecordingStream, for logging more by hand. Rerun's global one is not used.
 
     Raises:
-        ValueError: there is neither ``path`` nor ``connect``; ``path`` does not end in ".rrd", is a folder, or lies
-            below a file; ``connect`` is no address.
         OSError: the file cannot be made.
 
     Example:
@@ -86,7 +66,7 @@ class RerunLogger(Logger):
         True
     """
 
-    experiment: RecordingStream
+    experiment: rr.RecordingStream
     _service_shutdown: bool = False
 
     @checked
@@ -110,12 +90,9 @@ class RerunLogger(Logger):
         self._counters: dict[str, int] = {}
         self._hparams: dict[str, str] = {}
         self._layout, self._sent = Layout(), 0.0
-        super().__init__(
-            exp_name=name,
-            log_dir=str(self.path.parent) if self.path else os.curdir,
-        )
+        super().__init__(exp_name=name, log_dir=str(self.path.parent) if self.path else os.curdir)
 
-    def _create_experiment(self) -> RecordingStream:
+    def _create_experiment(self) -> rr.RecordingStream:
         self._writer = RecordingWriter(self.path, self.connect, self.application_id, self.exp_name, self._send_waiting)
         stream = self._writer.stream
         # In another process (service_backend="process") torchrl ends the experiment, not the logger.
@@ -137,12 +114,10 @@ class RerunLogger(Logger):
     def __enter__(self) -> RerunLogger:
         return self.start()
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.shutdown()
 
-    def _open(self) -> RecordingStream:
+    def _open(self) -> rr.RecordingStream:
         if self._service_shutdown:
             raise RuntimeError(f"{self!r} takes nothing more; make a new RerunLogger")
         self._tell()
@@ -152,8 +127,6 @@ class RerunLogger(Logger):
         for trouble in self._writer.take_troubles():
             warnings.warn(trouble, stacklevel=4)
 
-    # ---------------------------------------------------------------- torchrl's Logger
-
     def log_scalar(self, name: str, value: Any, step: int | None = None) -> None:
         """Add a number, or several, to the curves "metrics/<name>", on the timeline "global_step".
 
@@ -161,16 +134,15 @@ class RerunLogger(Logger):
             name: "loss/bc"; what comes before the first slash is the group, which has a view and an axis of its own.
             value: a number, or up to 64 of them (a tensor, an array, a list), each a curve; NaN leaves a gap.
             step: the training step; None counts the calls with this name from 0.
-
-        Raises:
-            ValueError: ``value`` is not made of 1 to 64 numbers, or ``name`` not of words joined by slashes.
         """
         stream = self._open()
-        row, parts = numbers(name, value), check_name(name).split("/")
+        row, parts = metrics.numbers(name, value), check_name(name).split("/")
         if len(row) > self._curves.get(name, 0):
             self._curves[name] = len(row)
             self._layout.add_view("metrics", parts[0])
-            name_curves(stream, entity_path("metrics", *parts), parts[-1], len(row))
+            names = [parts[-1]] if len(row) == 1 else [f"{parts[-1]} {i}" for i in range(len(row))]
+            lines = rr.SeriesLines(names=names, widths=[1.5] * len(row))
+            stream.log(entity_path("metrics", *parts), lines, static=True)
         with self._lock:
             steps, values = self._scalars.setdefault(name, ([], []))
             steps.append(self._count(f"metrics/{name}", step))
@@ -183,29 +155,21 @@ class RerunLogger(Logger):
         """Add an image "images/<name>", a JPEG on the timeline "global_step".
 
         Args:
-            name: "eval/scene".
             image: H×W, H×W×C or C×H×W, C = 1 or 3; uint8, or floats in [0, 1].
             step: the training step; None counts the calls with this name from 0.
-
-        Raises:
-            ValueError: the image has another shape or dtype.
         """
-        stream, parts, pixels = self._open(), check_name(name).split("/"), check_image(name, image)
+        stream, parts, pixels = self._open(), check_name(name).split("/"), metrics.check_image(name, image)
         path = entity_path("images", *parts)
-        send_image(stream, path, self._count(path, step), pixels)
+        metrics.send_image(stream, path, self._count(path, step), pixels)
         self._layout.add_view("images", *parts)
 
     def log_video(self, name: str, video: Tensor, step: int | None = None, **kwargs: Any) -> None:
         """Add a video as JPEG images "videos/<name>", frame i at step i of the episodes' timelines.
 
         Args:
-            name: "eval/corner2".
             video: T×C×H×W uint8, C = 1 or 3; or N×T×C×H×W, stored as "videos/<name>/0" and so on.
             step: the training step; it becomes part of the path, "videos/<name>/step 1000".
             **kwargs: ``fps``, frames a second (80, the rate of Meta-World's control); others are ignored.
-
-        Raises:
-            ValueError: the video has another shape or dtype, or no frames.
         """
         video = torch.as_tensor(video).detach().cpu()
         if video.ndim == 5 and len(video) != 1:
@@ -213,41 +177,35 @@ class RerunLogger(Logger):
                 self.log_video(f"{name}/{i}", one, step, **kwargs)
             return
         video = video[0] if video.ndim == 5 else video
-        check_video(name, video)
+        metrics.check_video(name, video)
         stream, parts = self._open(), check_name(name).split("/")
         if step is not None:
             parts.append(f"step {int(step)}")
-        send_video(stream, entity_path("videos", *parts), video, float(kwargs.get("fps", 1 / CONTROL_PERIOD)))
+        metrics.send_video(stream, entity_path("videos", *parts), video, float(kwargs.get("fps", 1 / CONTROL_PERIOD)))
         self._layout.add_view("videos", *parts)
 
     def log_hparams(self, cfg: Any) -> None:
-        """Show the configuration as a table of keys and values in "hparams"; a later call adds to it.
+        """Show a mapping (a DictConfig too) as the table "hparams"; nested keys are written "actor.width".
 
-        Args:
-            cfg: a mapping (a DictConfig too), nested ones are written "actor.width".
+        A later call adds to the table.
         """
         if not isinstance(cfg, Mapping):
             raise TypeError(f"cfg must be a mapping, got {type(cfg).__name__}")
-        self._hparams.update(flatten(cfg))
-        send_hparams(self._open(), self._hparams)
+        self._hparams.update(metrics.flatten(cfg))
+        metrics.send_hparams(self._open(), self._hparams)
         self._layout.add_view("hparams")
 
     def log_histogram(self, name: str, data: Sequence[float] | Tensor | NDArray[Any], **kwargs: Any) -> None:
         """Add the counts of ``data`` as a bar chart "histograms/<name>", on the timeline "global_step".
 
         Args:
-            name: "actor/action".
             data: numbers of any shape, all finite.
-            **kwargs: ``step``, the training step (None counts the calls), and ``bins``, their number or their
-                edges (30).
-
-        Raises:
-            ValueError: ``data`` is empty or holds a NaN or an infinity.
+            **kwargs: ``step``, the training step (None counts the calls), and ``bins``, their number or edges (30).
         """
-        counts, edges = histogram(name, data, kwargs.get("bins", 30))
+        counts, edges = metrics.histogram(name, data, kwargs.get("bins", 30))
         parts = check_name(name).split("/")
         path = entity_path("histograms", *parts)
-        send_histogram(self._open(), path, self._count(path, kwargs.get("step")), counts, edges)
+        metrics.send_histogram(self._open(), path, self._count(path, kwargs.get("step")), counts, edges)
         self._layout.add_view("histograms", *parts)
 
     def flush(self, timeout: float | None = None) -> None:
@@ -289,7 +247,10 @@ class RerunLogger(Logger):
         with self._lock:
             waiting, self._scalars = self._scalars, {}
         for name, (steps, values) in waiting.items():
-            send_scalars(self._writer.stream, entity_path("metrics", *name.split("/")), steps, values)
+            index = [rr.TimeColumn(METRIC_TIMELINE, sequence=steps)]
+            columns = rr.Scalars.columns(scalars=[number for row in values for number in row])
+            path = entity_path("metrics", *name.split("/"))
+            self._writer.stream.send_columns(path, index, columns.partition([len(row) for row in values]))
 
     def _send_waiting(self) -> None:
         """Send numbers that wait, and the layout where there is something new to show."""
@@ -298,8 +259,6 @@ class RerunLogger(Logger):
         if self._layout.is_due(time.monotonic() - self._sent):
             self._layout.send(self._writer.stream)
             self._sent = time.monotonic()
-
-    # ---------------------------------------------------------------- episodes
 
     @property
     def episodes(self) -> list[str]:
@@ -315,7 +274,7 @@ class RerunLogger(Logger):
         plan: PlanLike | None = None,
         name: str | None = None,
     ) -> str:
-        """Add one episode of anything: a simple scene in 3-D, the verdict, the plan, lanes and curves.
+        """Add one episode of anything: a simple scene in 3-D, the verdict, the plan, the timeline and curves.
 
         For Meta-World's robot as it is, see :func:`lw_torchrl.log_rollout`. Row t stands at step t and
         t · 0.0125 seconds; success and reward, its action's outcome, at t + 1.
@@ -332,10 +291,6 @@ class RerunLogger(Logger):
 
         Returns:
             The name.
-
-        Raises:
-            ValueError: a key is missing, has another shape or dtype, or holds a NaN; the name is taken.
-            TypeError: ``rollout`` is no TensorDict, ``objects`` no mapping of strings.
 
         Example:
             >>> import tempfile, torch
@@ -379,9 +334,6 @@ class RerunLogger(Logger):
         Args:
             names: of two episodes or more, as :func:`lw_torchrl.log_rollout` returned them.
             title: of the tab.
-
-        Raises:
-            ValueError: there are not two, or no episode of such a name.
         """
         self._open()
         names = [names] if isinstance(names, str) else list(names)

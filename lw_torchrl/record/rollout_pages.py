@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from lw_torchrl._checks import check_int, checked, missing_keys, shown
+from lw_torchrl._checks import checked, missing_keys, shown
 from lw_torchrl.envs.engines.vectorized.engine import VectorizedEngine
 from lw_torchrl.envs.seeding import episode_seed
 from lw_torchrl.evaluation.failures import Failure
@@ -37,7 +37,7 @@ def log_rollout(
     failure: Failure | Sequence[Failure | None] | None = None,
     tasks: Iterable[Task] = (),
 ) -> Any:
-    """Add a rollout to a recording: the robot in 3-D, a verdict, the plan at the cursor, lanes and curves.
+    """Add a rollout to a recording: the robot in 3-D, a verdict, the plan at the cursor, the timeline and curves.
 
     Where the environment's seed is given, the episode is simulated again, from its task, ``seed``, ``episode`` and
     actions, and the robot is shown as it moved. The observations must come out the same, bit for bit; where they do
@@ -46,7 +46,7 @@ def log_rollout(
     Args:
         logger: the recording.
         rollout: batch size (T,), one episode from its first state on: "observation" T×39 float32 (metres), "task_id" T
-            int64, "action" T×4 float32 in [-1, 1], as executed, and ("next", "success") T×1 bool. Where they are there:
+            int64, "action" T×4 float32 in [-1, 1], as executed, and ("next", "success") T×1 bool. Optional are
             ("next", "executed_action") T×4, which is taken in the place of the action, "episode" T int64, "qaf" T×S
             bool, "qaf_plan" T int64, "qaf_logits" T×S float32 (positive: true), "skill_weights" T×S float32,
             "action_corrected" T×1 and ("next", "reward") T×1 float32. Or batch size (N, T), an episode in each row.
@@ -61,13 +61,8 @@ def log_rollout(
         The name; of N rows a list of names.
 
     Raises:
-        ValueError: a key is missing, has another shape or dtype or holds a NaN; the rows are of several episodes;
-            ``qaf`` answers other plans, or the failure is another episode's; with a seed, there is no ``episode``.
+        ValueError: the rows are of several episodes; ``qaf`` answers other plans; the failure is another episode's.
         PlanError: (a ValueError) there is no plan for the task.
-        TypeError: ``rollout`` is no TensorDict.
-
-    Warns:
-        UserWarning: the simulation gave other observations.
 
     Example:
         >>> import tempfile
@@ -79,8 +74,6 @@ def log_rollout(
         'reach-0'
         >>> env.close()
     """
-    if not isinstance(rollout, TensorDictBase):
-        raise TypeError(f"rollout must be a TensorDict, got {type(rollout).__name__}")
     if len(rollout.batch_size) == 2:
         if name is not None:
             raise ValueError(f"name is of one episode, but rollout holds {len(rollout)}; got {name!r}")
@@ -94,9 +87,7 @@ def log_rollout(
     if isinstance(failure, Sequence):
         raise ValueError(f"failure must be one Failure for one episode, got {len(failure)}")
     heading, episode = read_rollout(rollout, plans, seed=seed, policy=policy, failure=failure, tasks=tasks)
-    motion = None
-    if seed is not None and heading.task in TASKS:
-        motion = _motion(heading, episode)
+    motion = _motion(heading, episode) if seed is not None and heading.task in TASKS else None
     return logger.add_page(heading, episode, motion=motion, name=name)
 
 
@@ -111,8 +102,6 @@ def read_rollout(
 ) -> tuple[Heading, RecordedEpisode]:
     """What a page shows of a rollout (T,), checked, as :func:`log_rollout` has it."""
     plans = None if plans is None else as_plans(plans)
-    if seed is not None:
-        check_int("seed", seed)
     number = _single(rollout, "task_id", required=True)
     index = _single(rollout, "episode", required=seed is not None)
     assert number is not None
@@ -132,9 +121,8 @@ def read_rollout(
     observation = rollout.get("observation", None)
     objects: dict[str, Tensor] = {}
     if task is not None and observation is not None and observation.shape[1:] == (39,):
-        objects = {
-            named: position for named, position in task.positions(observation).items() if _is_told_of(named, plan)
-        }
+        positions = task.positions(observation).items()
+        objects = {named: position for named, position in positions if _is_told_of(named, plan)}
     episode = RecordedEpisode.from_rollout(rollout, objects, plan)
     if task is not None and plan is not None:
         episode = episode.with_target_poses(task)
@@ -142,13 +130,7 @@ def read_rollout(
 
 
 class Difference(NamedTuple):
-    """Where a rollout and its simulation first differ.
-
-    Attributes:
-        step: the step of the episode, from 0.
-        entry: which number of the observation is furthest off there.
-        by: how far.
-    """
+    """Where a rollout and its simulation first differ: in which step, from 0, in which entry most, and by how much."""
 
     step: int
     entry: int
@@ -161,12 +143,7 @@ def simulate_again(
     """The motion of all bodies in an episode, of T + 1 rows, or where it turns out to be another episode.
 
     The simulation depends on the seed and the actions alone, so equal observations, bit for bit, mean equal motion.
-
-    Args:
-        task: one of the 50.
-        seed, episode: the environment's seed and the episode's index.
-        action: T×4 float32 in [-1, 1], as executed.
-        observation: T×39 float32, each row that from which its action was taken.
+    Actions are T×4 float32 in [-1, 1], as executed; observations T×39 float32, those from which they were taken.
 
     Example:
         >>> found = simulate_again("reach", 0, 0, np.zeros((1, 4), np.float32), np.zeros((1, 39), np.float32))
@@ -219,9 +196,8 @@ def _single(rollout: TensorDictBase, key: str, *, required: bool) -> int | None:
         return None
     length = tuple(rollout.batch_size)
     if column.is_floating_point() or tuple(column.shape) not in (length, (*length, 1)):
-        raise ValueError(
-            f"rollout[{key!r}] must be integers of shape {length}, got {column.dtype} {tuple(column.shape)}"
-        )
+        given = f"{column.dtype} {tuple(column.shape)}"
+        raise ValueError(f"rollout[{key!r}] must be integers of shape {length}, got {given}")
     found = torch.unique(column).tolist()
     if len(found) != 1:
         raise ValueError(f"rollout must be one episode of one task, got {key!r} {found[:5]}; split it")

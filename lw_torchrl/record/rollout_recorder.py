@@ -32,25 +32,17 @@ _AFTER = ("executed_action", "success", "reward")
 class RolloutRecorder(Transform):
     """Records episodes of chosen rows of a :class:`~lw_torchrl.LanguageWorldEnv` as they run, and changes no entry.
 
-    At each step it reads where the bodies of those rows are, and copies what :func:`lw_torchrl.log_rollout` shows of
-    them; at an episode's end it adds the page to the recording. An episode that is cut off, by a reset or by closing
-    the environment, is recorded as far as it came. Put it after :class:`~lw_torchrl.QAFTransform` and before what
-    changes the observation, and close the environment before the logger.
+    It adds a page like :func:`lw_torchrl.log_rollout`'s at an episode's end; one that is cut off, by a reset or by
+    closing the environment, is recorded as far as it came. Put it after :class:`~lw_torchrl.QAFTransform` and before
+    what changes the observation, and close the environment before the logger. An environment in a worker of another
+    process cannot be recorded.
 
     Args:
-        logger: a :class:`~lw_torchrl.RerunLogger`.
+        logger: the recording.
         rows: which rows of the environment.
         plans: what ``qaf`` answers, with a plan for the task of each of the rows; None for no plan.
         every: record the first episode of a row, and then every so manieth.
         policy: who acts, in a word, for the tab.
-
-    Raises:
-        TypeError: the environment is no LanguageWorldEnv. One in a worker of another process cannot be recorded.
-        ValueError: a row that the environment does not have, or ``every`` under 1.
-        PlanError: (a ValueError) there is no plan for the task of a row.
-
-    Warns:
-        UserWarning: an unfinished episode is dropped, for the logger was closed before the environment.
 
     Example:
         >>> import tempfile
@@ -130,20 +122,16 @@ class RolloutRecorder(Transform):
             self._end(running)
 
     def _end(self, running: _Row) -> None:
-        """Add the page of the episode that runs in a row, if it is one to record and has begun."""
+        """Add the page of a row's episode, if it is one to record and has begun."""
         rollout, motion = running.finish()
         if rollout is None:
             return
         if not self.logger.is_alive:
-            warnings.warn(
-                f"{len(rollout)} steps of an episode of {running.task.name!r} are dropped: the logger was closed "
-                "before the environment",
-                stacklevel=4,
-            )
+            dropped = f"{len(rollout)} steps of an episode of {running.task.name!r} are dropped"
+            warnings.warn(f"{dropped}: the logger was closed before the environment", stacklevel=4)
             return
-        heading, episode = read_rollout(
-            rollout, self.plans, tasks=[running.task], seed=running.seed, policy=self.policy
-        )
+        known: dict[str, Any] = {"tasks": [running.task], "seed": running.seed, "policy": self.policy}
+        heading, episode = read_rollout(rollout, self.plans, **known)
         self.logger.add_page(heading, episode, motion=motion)
 
 
@@ -193,9 +181,7 @@ class _Row:
         if not length:
             return None, None
         names: list[NestedKey] = [*now, *(("next", key) for key in then)]
-        columns: dict[NestedKey, Any] = {
-            name: torch.from_numpy(column) for name, column in zip(names, steps.columns(), strict=True)
-        }
+        columns: dict[NestedKey, Any] = dict(zip(names, map(torch.from_numpy, steps.columns()), strict=True))
         columns |= {key: torch.from_numpy(value).reshape(-1).expand(length) for key, value in self._fixed.items()}
         rollout = TensorDict(columns, [length])
         if self._model is None:

@@ -38,22 +38,17 @@ def run_recorded(
     engine: Any = "vectorized",
     progress: bool = False,
 ) -> list[FinishedEpisode]:
-    """Episodes with all that a recording shows of them, the same as :func:`lw_torchrl.evaluate` runs them.
+    """Episodes with all that :func:`lw_torchrl.log_rollout` shows of them, run as :func:`lw_torchrl.evaluate` does.
+
+    The arguments are as there, but for these.
 
     Args:
-        actor: a policy, or a module as for :func:`lw_torchrl.evaluate`.
-        tasks: as there.
         plans: whose queries to answer; None for the actor's own.
-        seed: of the environment.
         episodes: indices, of each task.
-        noise_scale, max_steps, engine: as there.
         progress: show a bar where it takes longer than a second.
 
     Returns:
-        By task, as they were given, and episode: a TensorDict of batch (T,), observation (T, 39) and action (T, 4)
-        float32, the executed one, task_id and episode (T,) int64, next/success (T, 1) bool, next/reward (T, 1) float32;
-        with plans qaf (T, S) bool, and skill_weights (T, S) and action_corrected (T, 1) float32 where the actor writes
-        them; where it has an evaluator of queries, its qaf_logits (T, S) float32.
+        By task, as they were given, and episode: TensorDicts of batch (T,).
     """
     answered = actor_plans(actor, plans)
     chosen = tasks_of(tasks, answered)
@@ -90,15 +85,9 @@ def write_recording(
     policy: str | None = None,
     tasks: Iterable[Task] = (),
 ) -> None:
-    """Write episodes to a rerun file, each with its plan where there is one; the file is replaced whole.
+    """Write episodes of :func:`run_recorded` to a rerun file, which is replaced whole.
 
-    Args:
-        path: the .rrd file.
-        episodes: as from :func:`run_recorded`.
-        plans: what their queries answer.
-        seed: that they were run with; None draws a hand over a table in the place of the robot.
-        policy: who acted, in a word.
-        tasks: of your own, where the plans do not say what they are.
+    The other arguments are as for :func:`lw_torchrl.log_rollout`.
     """
     tasks = list(tasks)
     with replacing(path) as file, RerunLogger(file, exp_name=Path(path).stem) as logger:
@@ -107,10 +96,8 @@ def write_recording(
 
 
 def active_skills(episode: FinishedEpisode, plan: ConditionalPlan) -> list[tuple[str, int]]:
-    """The skills in the order in which they led, with how many steps each did, up to the first success.
-
-    A skill leads where it has the largest weight; steps in which no condition holds count as "no condition holds".
-    """
+    """The skills, or "no condition holds", in the order in which they led (had the largest weight), with how many steps
+    each did, up to the first success."""
     end = episode.first_success
     leading = episode.steps.get("skill_weights")[:end].argmax(-1).tolist()
     answered = episode.steps.get("qaf")[:end].any(-1).tolist()

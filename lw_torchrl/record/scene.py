@@ -1,24 +1,20 @@
 """The 3-D scene of an episode: the robot, its task, what the plan names, and where the skill in force moves things to.
 
 Meta-World's frame: metres, x to the robot's right, y away from the robot, z up, the table's top at z = 0.
-Static things are sent once; what moves is sent as whole columns, one call per entity.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lw_torchrl.language.named_objects import GRIPPER
-from lw_torchrl.record.conventions import GOLD, GREEN, STEEL, Color, entity_path, step_color, time_columns
+from lw_torchrl.record.conventions import GOLD, GREEN, STEEL, Color, Stream, entity_path, rr, step_color, time_columns
 from lw_torchrl.record.mujoco_scene import Motion, log_model, log_motion, model_geometry
 from lw_torchrl.record.recorded_episode import RecordedEpisode
-
-if TYPE_CHECKING:
-    from rerun import RecordingStream
 
 OBJECT_COLORS: tuple[Color, ...] = ((80, 170, 255), (255, 120, 90), (200, 130, 255), (90, 220, 210))
 
@@ -35,16 +31,12 @@ TABLE_CENTER, TABLE_HALF = (0.0, 0.6, -0.010), (0.7, 0.4, 0.010)
 TABLE, GRID = (58, 64, 74), (92, 99, 112)
 
 
-def log_scene(stream: RecordingStream, root: str, episode: RecordedEpisode, motion: Motion | None = None) -> list[str]:
-    """Draw the robot, the objects, the goal, the hand's path and the target pose under ``root``/scene.
+def log_scene(stream: Stream, root: str, episode: RecordedEpisode, motion: Motion | None = None) -> list[str]:
+    """Draw robot, objects, goal, the hand's path and the target pose under ``root``/scene; returns the trails' paths.
 
-    Without a motion, the robot is a hand over a table, and what it handles are points.
-
-    Returns:
-        The entity paths of the trails: one short line per row, to be shown up to the time cursor.
+    A trail is one short line per row, to be shown up to the time cursor. Without a motion, the robot is a hand over a
+    table, and what it handles are points.
     """
-    import rerun as rr
-
     scene, times = f"{root}/scene", time_columns(np.arange(len(episode)))
     stream.log(scene, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     if motion is None:
@@ -87,22 +79,14 @@ def log_scene(stream: RecordingStream, root: str, episode: RecordedEpisode, moti
     return trails
 
 
-def _log_simple_robot(stream: RecordingStream, scene: str, episode: RecordedEpisode) -> None:
+def _log_simple_robot(stream: Stream, scene: str, episode: RecordedEpisode) -> None:
     """The table and the gripper below ``scene``."""
-    import rerun as rr
-
     times = time_columns(np.arange(len(episode)))
-    solid = rr.components.FillMode.Solid
 
     def box(path: str, centers: Any, half_sizes: Any, color: Color, labels: list[str] | None = None) -> None:
-        boxes = rr.Boxes3D.from_fields(
-            centers=centers,
-            half_sizes=half_sizes,
-            colors=[color] * len(half_sizes),
-            fill_mode=solid,
-            labels=labels,
-            show_labels=labels is not None,
-        )
+        size = {"centers": centers, "half_sizes": half_sizes}
+        look = {"colors": [color] * len(half_sizes), "fill_mode": rr.components.FillMode.Solid}
+        boxes = rr.Boxes3D.from_fields(**size, **look, labels=labels, show_labels=labels is not None)
         stream.log(f"{scene}/{path}", boxes, static=True)
 
     box("table", [TABLE_CENTER], [TABLE_HALF], TABLE)
@@ -123,10 +107,8 @@ def _to_table(position: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def _grid(spacing: float = 0.1) -> list[list[tuple[float, float, float]]]:
     """Lines on the table, ``spacing`` metres apart."""
-    (left, near), (right, far) = (
-        tuple(c + sign * h for c, h in zip(TABLE_CENTER[:2], TABLE_HALF[:2], strict=True)) for sign in (-1, 1)
-    )
-    z = 0.0005
+    middle, half = np.array(TABLE_CENTER[:2]), np.array(TABLE_HALF[:2])
+    (left, near), (right, far), z = (middle - half).tolist(), (middle + half).tolist(), 0.0005
     across = [[(left, y, z), (right, y, z)] for y in np.arange(near, far + 1e-6, spacing).tolist()]
     along = [[(x, near, z), (x, far, z)] for x in np.arange(left, right + 1e-6, spacing).tolist()]
     return across + along
@@ -139,11 +121,8 @@ def _finger_centers(opening: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.stack([zero, half, drop, zero, -half, drop], axis=1).reshape(-1, 3).astype(np.float32)
 
 
-def _log_target(stream: RecordingStream, scene: str, episode: RecordedEpisode, times: Sequence[Any]) -> None:
-    """An arrow from what the skill in force moves to where it goes, in the step's colour; none where no scripted
-    skill is in force."""
-    import rerun as rr
-
+def _log_target(stream: Stream, scene: str, episode: RecordedEpisode, times: Sequence[Any]) -> None:
+    """An arrow from what the scripted skill in force moves to where it goes, in the step's colour."""
     if episode.in_force is None or not any(episode.target_poses):
         return
     start, end = np.zeros((2, len(episode), 3), np.float32)

@@ -3,34 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl.record.conventions import FALSE, STEEL, TRUE, Color, entity_path, step_color, time_columns
+from lw_torchrl.record.conventions import FALSE, STEEL, TRUE, Color, Stream, entity_path, rr, step_color, time_columns
 from lw_torchrl.record.recorded_episode import NOBODY, RecordedEpisode
-
-if TYPE_CHECKING:
-    from rerun import RecordingStream
 
 NONE_HOLDS, EVENLY = "no condition holds", "evenly mixed"
 ACTION_NAMES = ("dx", "dy", "dz", "gripper")
 MARKS = {True: "✓", False: "✗", None: "·"}
 
 
-def log_timeline(stream: RecordingStream, root: str, episode: RecordedEpisode) -> int:
-    """The timeline of the step in force, of each condition and of success, a row each below ``root``/timeline.
+def log_timeline(stream: Stream, root: str, episode: RecordedEpisode) -> int:
+    """Rows for the step in force, each condition and success below ``root``/timeline; returns how many.
 
     A row has an entry where its state changes, and an empty one at the end. The viewer shows a row's path as its title,
-    with a backslash before whatever is no letter, so the names are words joined by underscores; it sorts the rows, so
-    the names begin with numbers.
-
-    Returns:
-        The number of rows.
+    with a backslash before whatever is no letter or underscore, and sorts the rows, so the names begin with numbers.
     """
-    import rerun as rr
-
     rows = 0
 
     def send(name: str, first: int, states: Sequence[str], styles: Mapping[str, tuple[str, Color]]) -> None:
@@ -72,19 +63,13 @@ def log_timeline(stream: RecordingStream, root: str, episode: RecordedEpisode) -
 def _states_in_force(episode: RecordedEpisode) -> list[str]:
     """The number of the step in force in each row, or why there is none."""
     assert episode.in_force is not None
-    answers = episode.answers
-    nobody = np.full(len(episode), EVENLY)
-    if answers is not None:
-        nobody = np.where(answers.any(axis=1), EVENLY, NONE_HOLDS)
-    return [
-        str(step) if step != NOBODY else str(why) for step, why in zip(episode.in_force.tolist(), nobody, strict=True)
-    ]
+    answered = True if episode.answers is None else episode.answers.any(axis=1)
+    nobody = np.where(np.broadcast_to(answered, len(episode)), EVENLY, NONE_HOLDS)
+    return np.where(episode.in_force == NOBODY, nobody, episode.in_force.astype(str)).tolist()
 
 
-def log_plan(stream: RecordingStream, root: str, episode: RecordedEpisode) -> None:
+def log_plan(stream: Stream, root: str, episode: RecordedEpisode) -> None:
     """The plan in ``root``/plan, with a text wherever truth or the step in force change."""
-    import rerun as rr
-
     length = len(episode)
     columns = [
         np.full((length, 1), -1) if episode.in_force is None else episode.in_force[:, None],
@@ -113,7 +98,7 @@ def _plan_text(episode: RecordedEpisode, row: int) -> str:
     return "\n".join(parts)
 
 
-def log_curves(stream: RecordingStream, root: str, episode: RecordedEpisode) -> list[str]:
+def log_curves(stream: Stream, root: str, episode: RecordedEpisode) -> list[str]:
     """``root``/action, and, where there is any, /distance (cm), /reward, /skill_weights, /corrected; returns which."""
     rows = np.arange(len(episode))
     sent = ["action"]
@@ -125,7 +110,7 @@ def log_curves(stream: RecordingStream, root: str, episode: RecordedEpisode) -> 
     if episode.reward is not None and not (
         episode.success is not None and np.array_equal(episode.reward, episode.success)
     ):
-        _send(stream, f"{root}/reward", rows + 1, episode.reward[:, None], ["reward"], [STEEL])
+        _send(stream, f"{root}/reward", rows + 1, episode.reward[:, None], ["reward"], STEEL)
         sent.append("reward")
     if episode.skill_weights is not None and episode.attends_softly:
         _send(stream, f"{root}/skill_weights", rows, episode.skill_weights, episode.skills)
@@ -136,26 +121,15 @@ def log_curves(stream: RecordingStream, root: str, episode: RecordedEpisode) -> 
     return sent
 
 
-def _send(
-    stream: RecordingStream,
-    path: str,
-    steps: NDArray[np.int64],
-    values: NDArray[np.float32],
-    names: Sequence[str],
-    colors: Sequence[Color] | None = None,
-) -> None:
-    import rerun as rr
-
-    colors = colors or [step_color(i) for i in range(len(names))]
+def _send(stream: Stream, path: str, steps: Any, values: Any, names: Sequence[str], *color: Color) -> None:
+    colors = list(color) or [step_color(i) for i in range(len(names))]
     stream.log(path, rr.SeriesLines(names=names, colors=colors, widths=[1.5] * len(names)), static=True)
     columns = rr.Scalars.columns(scalars=values.ravel()).partition([values.shape[1]] * len(values))
     stream.send_columns(path, time_columns(steps), columns)
 
 
-def _send_distance(stream: RecordingStream, path: str, distance: NDArray[np.float32], episode: RecordedEpisode) -> None:
+def _send_distance(stream: Stream, path: str, distance: NDArray[np.float32], episode: RecordedEpisode) -> None:
     """One line in centimetres, in the colour of the step in force."""
-    import rerun as rr
-
     assert episode.in_force is not None
     stream.log(path, rr.SeriesLines(names=["distance [cm]"], widths=[2.0]), static=True)
     colors = [FALSE if step == NOBODY else step_color(step) for step in episode.in_force.tolist()]

@@ -15,14 +15,7 @@ AFTER_SUCCESS, AROUND_FAILURE = 20, 60
 
 @dataclass(frozen=True)
 class Heading:
-    """What a page says of its episode.
-
-    Attributes:
-        task: the task's name.
-        episode, seed: which episode, and of which environment; None where nobody said.
-        policy: who acted, in a word.
-        failure: why it failed, if that was found out.
-    """
+    """What a page says of its episode: which it is, of which environment's seed, who acted, and why it failed."""
 
     task: str
     episode: int | None = None
@@ -37,12 +30,9 @@ class Heading:
 
     def parts(self) -> list[str]:
         """Task, episode, seed and policy, those that there are."""
-        return [
-            self.task,
-            *([] if self.episode is None else [f"episode {self.episode}"]),
-            *([] if self.seed is None else [f"seed {self.seed}"]),
-            *([] if self.policy is None else [self.policy]),
-        ]
+        numbers = {"episode": self.episode, "seed": self.seed}
+        known = [f"{name} {number}" for name, number in numbers.items() if number is not None]
+        return [self.task, *known, *([] if self.policy is None else [self.policy])]
 
     def outcome(self, episode: RecordedEpisode) -> str:
         """How it ended: "success at 87", "failed: skill", "failed"; nothing where the rollout does not say."""
@@ -85,10 +75,8 @@ def verdict(heading: Heading, episode: RecordedEpisode) -> str:
         if episode.success is not None and not episode.success[-1]:
             lines.append(f"It did not last: the task stood done in {held} steps, and at the end no more.")
     elif heading.failure is not None:
-        lines = [
-            f"## FAILED, {heading.failure.cause}: {CAUSES[heading.failure.cause]}",
-            *_why(heading.failure, episode),
-        ]
+        cause = heading.failure.cause
+        lines = [f"## FAILED, {cause}: {CAUSES[cause]}", *_why(heading.failure, episode)]
     elif episode.success is not None:
         lines = [f"## FAILED in {length} steps", *_facts(episode)]
     else:
@@ -105,11 +93,8 @@ def _why(failure: Failure, episode: RecordedEpisode) -> list[str]:
         seen += f", in {_step(episode, failure.step)}"
     lines.append(f"{seen}.")
     mended, useless = ([swap for swap, worked in failure.swaps.items() if worked == good] for good in (True, False))
-    told = []
-    if mended:
-        told.append(f"exchanging {' or '.join(mended)} made it a success")
-    if useless:
-        told.append(f"exchanging {' or '.join(useless)} did not help")
+    told = [f"exchanging {' or '.join(mended)} made it a success"] if mended else []
+    told += [f"exchanging {' or '.join(useless)} did not help"] if useless else []
     if told:
         lines.append("; ".join(told).capitalize() + ".")
     return lines

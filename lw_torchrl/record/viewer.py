@@ -41,14 +41,13 @@ def open_viewer(
         path: the .rrd file, or a folder that holds one.
         screenshot: a PNG file to write instead of opening a window; it is replaced whole or not at all.
         window_size: of the picture or the window, "1400x900" points.
-        step: of the episode, or of the training, that the time cursor stands at; None takes the one that tells most of
-            an episode, its first success, say, and of a training the last.
+        step: where the time cursor stands; None takes the step that tells most of an episode, its first success, say,
+            and of a training the last.
         episode: the tab to open at, by its title ("Metrics") or its episode's name; None takes the layout's.
 
     Raises:
         FileNotFoundError: there is no such file, or rerun's viewer is not installed.
-        ValueError: the file is no recording, or a damaged one; the picture's name does not end in ".png", the size is
-            no "WxH", or the recording has no such step or tab.
+        ValueError: the file is no recording, or a damaged one, or it has no such step or tab.
         RuntimeError: the viewer ended with an error; the message says what to do about it.
 
     Example:
@@ -74,11 +73,7 @@ def open_viewer(
 
 
 def _take_picture(recording: Path, picture: Path, window_size: str, step: int | None) -> None:
-    """Write a PNG of what the viewer shows of ``recording``, at ``step`` of the timeline that is in force.
-
-    Raises:
-        RuntimeError: the viewer ended with an error, or drew nothing.
-    """
+    """Write a PNG of what the viewer shows of ``recording``, at ``step`` of the timeline that is in force."""
     port = free_port()
     arguments = (recording, "--headless", "--port", str(port), "--window-size", window_size)
     with running(*arguments) as (process, output):
@@ -114,11 +109,7 @@ def _settle(client: Any, picture: Path) -> None:
 
 
 def connect(process: subprocess.Popen[bytes], port: int) -> tuple[Any, Any]:
-    """A client of the viewer and what it says of the recording, once it has loaded it.
-
-    Raises:
-        TimeoutError: the viewer ended, or did not answer in time.
-    """
+    """A client of the viewer and what it says of the recording, once it has loaded it; else a TimeoutError."""
     from rerun.experimental import ViewerClient
 
     deadline = time.monotonic() + START_SECONDS

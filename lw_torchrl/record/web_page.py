@@ -17,7 +17,6 @@ from functools import cache
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from string import Template
-from types import TracebackType
 from urllib.error import URLError
 
 from lw_torchrl._checks import checked
@@ -35,7 +34,6 @@ _INSIDE = """const load = (name) => {
   for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
   return unpack(new Blob([bytes]).stream());
 };"""
-
 
 ASKING_SECONDS, STALLED_SECONDS = 30.0, 30.0
 """How long a request may take to come as a whole, and each piece of an answer to be taken."""
@@ -67,7 +65,7 @@ def write_html(
 
     Raises:
         FileNotFoundError: there is no such recording, or rerun is not installed.
-        ValueError: the recording is damaged or has no such tab or step, or ``page`` does not end in ".html".
+        ValueError: the recording is damaged or has no such tab or step.
 
     Example:
         >>> write_html("runs/demo/rollout.rrd", "rollout.html")  # doctest: +SKIP
@@ -81,10 +79,8 @@ def write_html(
     script, data["wasm"] = _viewer_files()
     script = script.replace("</script", "<\\/script")
     inline = [f"<script>{script}</script>"]
-    inline += [
-        f'<script type="text/plain" id="{name}">{base64.b64encode(content).decode()}</script>'
-        for name, content in data.items()
-    ]
+    for name, content in data.items():
+        inline.append(f'<script type="text/plain" id="{name}">{base64.b64encode(content).decode()}</script>')
     text = _page(recording.stem, "\n".join(inline), _INSIDE, at)
     with replacing(target) as file:
         file.write_text(text, encoding="utf-8")
@@ -145,9 +141,7 @@ class WebPage(AbstractContextManager["WebPage"]):
         self._server.shutdown()
         self._server.server_close()
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._server.server_close()
 
 
@@ -220,9 +214,8 @@ def _viewer_files() -> tuple[str, bytes]:
         return script.decode(), gzip.compress(get(f"http://{LOCAL}:{port}/re_viewer_bg.wasm", timeout=60).read(), 6)
 
 
-# Neither a layout nor an address sets the cursor of a viewer in a page. Its ``viewer_control`` does, which takes a
-# protobuf message, and nothing that a page can load from the installed rerun writes one; so these two are spelled out.
-# They are of rerun 0.41, and a viewer that does not know them shows the recording's start.
+# Only ``viewer_control`` sets the cursor of a viewer in a page. It takes a protobuf message, which nothing that a page
+# can load writes; so two of rerun 0.41 are spelled out. A viewer that does not know them shows the recording's start.
 
 
 def request(step: int) -> bytes:

@@ -18,6 +18,7 @@ from pathlib import Path
 from queue import SimpleQueue
 
 from lw_torchrl._files import replacing
+from lw_torchrl.record.conventions import rr
 from lw_torchrl.record.opening import copy_recording
 
 PERIOD = 0.5
@@ -39,28 +40,18 @@ _URL = re.compile(
 
 
 class RecordingWriter:
-    """A rerun stream and where it goes. It goes to memory first, so that no file and no viewer holds up rerun.
+    """A rerun stream and where it goes: to memory first, so that no file and no viewer holds up rerun.
 
     Args:
-        path: the file; None for none. An older one of that name is set aside.
-        connect: the address of a viewer; None for none.
+        path: the file, or None. An older one of that name is set aside, and ``previous`` is its new name.
+        connect: the address of a viewer, or None.
         application_id, name: of the recording.
         prepare: called before each write, in whatever thread it is; sends what its owner holds back.
-
-    Attributes:
-        stream: the rerun RecordingStream.
-        previous: the older file's new name, or None.
-        troubles: what went wrong and was not told yet, one line each; see :meth:`take_troubles`.
-
-    Raises:
-        OSError: the file cannot be made.
     """
 
     def __init__(
         self, path: Path | None, connect: str | None, application_id: str, name: str, prepare: Callable[[], None]
     ) -> None:
-        import rerun as rr
-
         self._file = None if path is None else RecordingFile(path)
         self.previous = None if self._file is None else self._file.previous
         self._prepare = prepare
@@ -151,14 +142,7 @@ class RecordingWriter:
 class RecordingFile:
     """A file that grows by pieces of a rerun stream; between two of them, it is a recording that any viewer opens.
 
-    Args:
-        path: the file's; an older one of that name is set aside.
-
-    Attributes:
-        previous: the older file's new name, or None.
-
-    Raises:
-        OSError: the file cannot be made.
+    An older file of its name is set aside; ``previous`` is that one's new name, or None.
     """
 
     def __init__(self, path: Path) -> None:
@@ -173,11 +157,7 @@ class RecordingFile:
         self._length = 0
 
     def append(self, piece: bytes) -> None:
-        """Add the messages of a piece, in the place of the end, and an end.
-
-        Raises:
-            OSError: there is no room; the file is as it was before.
-        """
+        """Add the messages of a piece, in the place of the end, and an end; after an OSError the file is as before."""
         if not self._length:
             self._write(piece[:HEADER_BYTES], 0)
             self._length = HEADER_BYTES
@@ -226,12 +206,7 @@ class RecordingFile:
 
 
 class LiveViewer:
-    """Sends pieces of a recording to a viewer. What goes wrong is said in ``trouble``; nothing is raised.
-
-    Args:
-        address: of the viewer, see :func:`check_address`.
-        application_id, recording_id: of the recording, by which the viewer joins the pieces.
-    """
+    """Sends pieces of a recording, joined by its ids, to a viewer. ``trouble`` says what went wrong."""
 
     def __init__(self, address: str, application_id: str, recording_id: str) -> None:
         self.url, self._host, self._port = check_address(address)
@@ -273,8 +248,6 @@ class LiveViewer:
             return
         finally:
             self._tried.set()
-        import rerun as rr
-
         application_id, recording_id = self._ids
         stream = rr.RecordingStream(application_id, recording_id=recording_id, send_properties=False)
         try:
@@ -316,10 +289,7 @@ def check_path(path: str | os.PathLike[str]) -> Path:
 
 
 def set_aside(path: Path) -> Path | None:
-    """Give a file that has the name ``path`` another, "run.previous.rrd" or "run.previous-2.rrd"; None: there is none.
-
-    An empty file holds nothing to keep.
-    """
+    """Rename a file, "run.previous.rrd" or "run.previous-2.rrd"; None: there is none, or it is empty."""
     if not path.is_file() or not path.stat().st_size:
         return None
     names = (f"{path.stem}.previous{'' if i == 1 else f'-{i}'}{path.suffix}" for i in count(1))
