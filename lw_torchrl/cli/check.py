@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 def check(
     file: Positional[Annotated[Path, arg(metavar="FILE")]],
     /,
-    task: str | None = None,
+    task: str | None = None,  # the task that a plan must be for
     skill_file: SkillFile = None,
     task_file: TaskFile = None,
     json: Json = False,
@@ -32,7 +32,6 @@ def check(
 
     Args:
         file: a .plan file, a folder of them, or a .toml file of skills or of tasks.
-        task: the task that a plan must be for.
     """
     import lw_torchrl as lw
     from lw_torchrl._files import read_text

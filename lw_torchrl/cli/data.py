@@ -34,18 +34,18 @@ _WIDTH = 120
 
 
 def collect(
-    tasks: Positional[Annotated[tuple[str, ...], arg(metavar="TASKS ...")]],
+    tasks: Positional[Annotated[tuple[str, ...], arg(metavar="TASKS ...")]],  # MT10, MT50, or names of tasks
     /,
-    out: Path,
-    episodes: int = 10,
-    seed: int = 0,
-    noise: tuple[float, ...] = (0.0,),
-    noise_hold: int = 10,
-    gripper_noise: float = 0.2,
-    redraw_failures: bool = False,
+    out: Path,  # the dataset's folder
+    episodes: int = 10,  # kept for each task
+    seed: int = 0,  # evaluate on another one
+    noise: tuple[float, ...] = (0.0,),  # standard deviations of the execution noise, used in turn, one per episode
+    noise_hold: int = 10,  # steps for which each draw of the noise is kept; a longer one leads further from the path
+    gripper_noise: float = 0.2,  # factor of the noise on the gripper, which makes grasps fail
+    redraw_failures: bool = False,  # keep successful episodes only
     policy: str = "expert",
-    behaviour: str | None = None,
-    num_envs: int | None = None,
+    behaviour: str | None = None,  # the label of its episodes; by default the name of who acts, or of the policy's file
+    num_envs: int | None = None,  # environments stepped together; the dataset does not depend on it
     json: options.Json = False,
 ) -> Output:
     """Collect demonstrations of the scripted experts, or of others. If it is stopped, the same command resumes it.
@@ -53,19 +53,9 @@ def collect(
     Example: lw-torchrl collect MT10 --out demos/mt10 --noise 0 0.1 0.2 --redraw-failures
 
     Args:
-        tasks: MT10, MT50, or names of tasks.
-        out: the dataset's folder.
-        episodes: kept for each task.
-        seed: evaluate on another one.
-        noise: standard deviations of the execution noise, used in turn, one per episode.
-        noise_hold: steps for which each draw of the noise is kept; a longer one leads further from the path.
-        gripper_noise: factor of the noise on the gripper, which makes grasps fail.
-        redraw_failures: keep successful episodes only.
         policy: who acts: expert, Meta-World's scripts; scripted, plans with scripted skills; spoilt-60 or spoilt-30,
             the same in so many of 100 pieces of an episode; wrong, any skill of the plan; random; or a policy's file,
             of `lw-torchrl train`.
-        behaviour: the label of its episodes; by default the name of who acts, or of the policy's file.
-        num_envs: environments stepped together; the dataset does not depend on it.
     """
     options.check_folder("--out", out)
     options.check_actor("policy", policy)
@@ -105,20 +95,15 @@ def collect(
 
 
 def data(
-    action: Positional[Annotated[Literal["show"], arg(metavar="show")]],
-    folders: Positional[Annotated[tuple[Path, ...], arg(metavar="FOLDERS ...")]],
+    action: Positional[Annotated[Literal["show"], arg(metavar="show")]],  # the word show
+    folders: Positional[Annotated[tuple[Path, ...], arg(metavar="FOLDERS ...")]],  # of `lw-torchrl collect`
     /,
-    check: bool = False,
+    check: bool = False,  # also read them through against their checksums
     json: options.Json = False,
 ) -> Output:
     """Show what datasets hold: who acted, in what, how often it succeeded, what it earned. Several are a mixture.
 
     Example: lw-torchrl data show demos/mt10 demos/spoilt --check
-
-    Args:
-        action: the word show.
-        folders: of `lw-torchrl collect`.
-        check: also read them through against their checksums.
     """
     if not folders:
         raise ValueError("folders must name at least one dataset")

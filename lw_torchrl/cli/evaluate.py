@@ -19,21 +19,21 @@ if TYPE_CHECKING:
 
 
 def evaluate(
-    checkpoint: Positional[Annotated[Path, arg(metavar="CHECKPOINT")]],
+    checkpoint: Positional[Annotated[Path, arg(metavar="CHECKPOINT")]],  # of `lw-torchrl train`, or the word expert
     /,
     tasks: tuple[str, ...] = (),
     plans: tuple[str, ...] = (),
     task_file: options.TaskFile = None,
     text_encoder: options.OwnEncoder = None,
-    episodes: int = 20,
-    seed: int = 1000,
-    noise: float = 0.1,
-    stop_at_success: bool = False,
-    num_envs: int | None = None,
+    episodes: int = 20,  # of each task
+    seed: int = 1000,  # fixes initial states, goals and noise; not one that the demonstrations used
+    noise: float = 0.1,  # standard deviation of the noise on the executed action
+    stop_at_success: bool = False,  # end an episode at its first success; any-step success stays the same
+    num_envs: int | None = None,  # environments stepped together; the result does not depend on it
     attribute: bool = False,
     reference: tuple[str, ...] = (),
-    evaluator: Path | None = None,
-    out: Path | None = None,
+    evaluator: Path | None = None,  # a network that answers the conditions, of `lw-torchrl train-evaluator`
+    out: Path | None = None,  # folder for results.json, success.png and rollout.rrd; with --attribute also failures.png
     device: options.Device = "cpu",
     json: options.Json = False,
 ) -> Output:
@@ -42,22 +42,14 @@ def evaluate(
     Example: lw-torchrl evaluate runs/mt10.zip --out runs/mt10
 
     Args:
-        checkpoint: of `lw-torchrl train`, or the word expert.
         tasks: MT10, MT50, or names of tasks; if none is given, those of --plans, or else those that the policy was
             trained on.
         plans: carry out these instead of the policy's own: MT10, MT50, .plan or .json files, or folders; where several
             have a plan for a task, the last one's counts.
-        episodes: of each task.
-        seed: fixes initial states, goals and noise; not one that the demonstrations used.
-        noise: standard deviation of the noise on the executed action.
-        stop_at_success: end an episode at its first success; any-step success stays the same.
-        num_envs: environments stepped together; the result does not depend on it.
         attribute: say why each failed episode failed: a query, the plan, a skill or time. They are run again a few
             times.
         reference: with --attribute, trusted plans for running failed episodes again: MT10, MT50, .plan or .json files,
             or folders.
-        evaluator: a network that answers the conditions, of `lw-torchrl train-evaluator`.
-        out: folder for results.json, success.png and rollout.rrd; with --attribute also failures.png.
     """
     if out is not None:
         options.check_folder("--out", out)
@@ -154,15 +146,15 @@ def _default_tasks(policy: Policy, checkpoint: Path, *, trained: bool) -> tuple[
 def scripted(
     names: Positional[Annotated[tuple[str, ...], arg(metavar="[NAMES ...]")]] = ("MT10",),
     /,
-    episodes: int = 50,
-    seed: int = 1000,
+    episodes: int = 50,  # of each task
+    seed: int = 1000,  # fixes initial states and goals
     select: Literal["first", "random", "mix"] = "first",
-    noise: float = 0.0,
+    noise: float = 0.0,  # standard deviation of the noise on the executed action
     plans: options.PlanSources = ("MT50",),
     skill_file: options.SkillFile = None,
     task_file: options.TaskFile = None,
-    full: bool = False,
-    out: Path = Path("runs/scripted"),
+    full: bool = False,  # run all 500 steps, instead of stopping at the first success
+    out: Path = Path("runs/scripted"),  # folder for results.json, plan_use.json and success.png
     json: options.Json = False,
 ) -> Output:
     """Carry out plans with scripted skills, and say how each step fared: no training, no expert.
@@ -171,12 +163,7 @@ def scripted(
 
     Args:
         names: MT10, MT50, or names of tasks.
-        episodes: of each task.
-        seed: fixes initial states and goals.
         select: of several true steps, take the first, a random one, as in the paper, or mix them.
-        noise: standard deviation of the noise on the executed action.
-        full: run all 500 steps, instead of stopping at the first success.
-        out: folder for results.json, plan_use.json and success.png.
     """
     options.check_folder("--out", out)
     known = options.read_tasks(task_file)

@@ -56,9 +56,9 @@ def tasks(
 
 
 def skills(
-    task: Positional[Annotated[str | None, arg(metavar="[TASK]")]] = None,
+    task: Positional[Annotated[str | None, arg(metavar="[TASK]")]] = None,  # only those that this task can use
     /,
-    nearest: str | None = None,
+    nearest: str | None = None,  # a text; the closest skill is shown
     skill_file: options.SkillFile = None,
     task_file: options.TaskFile = None,
     json: options.Json = False,
@@ -66,10 +66,6 @@ def skills(
     """List the scripted skills, or find the one closest to a text.
 
     Example: lw-torchrl skills push --nearest "grab the puck"
-
-    Args:
-        task: only those that this task can use.
-        nearest: a text; the closest skill is shown.
     """
     from lw_torchrl.language.named_objects import GRIPPER
     from lw_torchrl.language.nearest import nearest_skill
@@ -108,7 +104,7 @@ def _numbers(values: Iterable[float]) -> str:
 
 
 def plans(
-    names: Positional[Annotated[tuple[str, ...], arg(metavar="[NAMES ...]")]] = (),
+    names: Positional[Annotated[tuple[str, ...], arg(metavar="[NAMES ...]")]] = (),  # MT10, MT50, or names of tasks
     /,
     plans: options.PlanSources = ("MT50",),
     skill_set: Literal["own", "MT10"] = "own",
@@ -121,7 +117,6 @@ def plans(
     Example: lw-torchrl plans drawer-open --roles
 
     Args:
-        names: MT10, MT50, or names of tasks.
         skill_set: of the shipped plans, those with scripted skills of their own, or those worded as MT10's are.
         roles: a table of the steps, what each moves and what it goes to, and what told: "skill", the text is a scripted
             skill's; "words", the text's; "condition", the things that it compares; "nothing".
@@ -170,10 +165,10 @@ def _written(plan: ConditionalPlan) -> dict[str, Any]:
 
 
 def queries(
-    task: Positional[Annotated[str, arg(metavar="TASK")]],
+    task: Positional[Annotated[str, arg(metavar="TASK")]],  # a task's name
     text: Positional[Annotated[str | None, arg(metavar="[TEXT]")]] = None,
     /,
-    by: Literal["edit", "embedding"] = "edit",
+    by: Literal["edit", "embedding"] = "edit",  # closest in spelling, or in meaning, which wants the extra [text]
     task_file: options.TaskFile = None,
     json: options.Json = False,
 ) -> Output:
@@ -182,9 +177,7 @@ def queries(
     Example: lw-torchrl queries push "the gripper touches the puck"
 
     Args:
-        task: a task's name.
         text: any words; what the query answering function makes of them is shown.
-        by: closest in spelling, or in meaning, which wants the extra [text].
     """
     import lw_torchrl as lw
     from lw_torchrl.language.nearest import nearest_query
@@ -207,12 +200,12 @@ def queries(
 
 
 def query(
-    task: Positional[Annotated[str, arg(metavar="TASK")]],
+    task: Positional[Annotated[str, arg(metavar="TASK")]],  # a task's name
     text: Positional[Annotated[str | None, arg(metavar="[TEXT]")]] = None,
     /,
-    step: int = 0,
-    seed: int = 0,
-    episode: int = 0,
+    step: int = 0,  # how many steps the expert does first, 0 to 500
+    seed: int = 0,  # of the episode
+    episode: int = 0,  # its index
     task_file: options.TaskFile = None,
     json: options.Json = False,
 ) -> Output:
@@ -221,11 +214,7 @@ def query(
     Example: lw-torchrl query pick-place "Is the gripper open and not above the puck?" --step 40
 
     Args:
-        task: a task's name.
         text: the query; without one, all supported queries that hold are listed.
-        step: how many steps the expert does first, 0 to 500.
-        seed: of the episode.
-        episode: its index.
     """
     import lw_torchrl as lw
     from lw_torchrl._checks import check_int

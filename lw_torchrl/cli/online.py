@@ -24,20 +24,20 @@ WEAKEST = "weakest"
 
 
 def online(
-    tasks: Positional[tuple[str, ...]],
+    tasks: Positional[tuple[str, ...]],  # each gets a policy of its own: names, MT10 or MT50
     /,
-    schedule: Scheduled,
+    schedule: Scheduled,  # which runs are done, and where
     methods: tuple[OnlineMethod, ...] = ("td3", "expert-iteration"),
-    seeds: tuple[int, ...] = (0, 1, 2),
-    frames: int = 60_000,
-    demonstrations: int = 1,
+    seeds: tuple[int, ...] = (0, 1, 2),  # of demonstrations, weights, episodes and minibatches
+    frames: int = 60_000,  # steps of the environment, the same for every method
+    demonstrations: int = 1,  # of each task, without noise
     start: Path | None = None,
     condition: Literal["pcbc", "dc", "one-hot"] = "pcbc",
     plans: PlanSources = ("MT50",),
-    episodes: int = 40,
+    episodes: int = 40,  # evaluated, on seeds that no training used, action noise 0.1
     step: str | None = None,
     logger: Literal["none", "csv", "tensorboard", "wandb"] = "none",
-    out: Path = Path("runs/online"),
+    out: Path = Path("runs/online"),  # where everything goes; on a cluster, a folder that all its machines share
     json: Json = False,
 ) -> Output:
     """Train policies in their environment, beside demonstrations. If it is stopped, the same command resumes it.
@@ -49,21 +49,14 @@ def online(
     Example: lw-torchrl online peg-insert-side hammer --methods td3 expert-iteration --seeds 0 1 2
 
     Args:
-        tasks: each gets a policy of its own: names, MT10 or MT50.
-        schedule: which runs are done, and where.
         methods: td3, sac and residual (a small network that corrects the start), half of each minibatch demonstrations;
             ppo; expert-iteration, behavioral cloning of demonstrations and of own successes. The first is compared with
             the others, and with the start.
-        seeds: of demonstrations, weights, episodes and minibatches.
-        frames: steps of the environment, the same for every method.
-        demonstrations: of each task, without noise.
         start: a policy to begin with, as train writes it; by default one is cloned from the demonstrations.
         condition: what that one is conditioned on: plans, the task's description, its number.
-        episodes: evaluated, on seeds that no training used, action noise 0.1.
         step: of residual, correct the actions in this step of the task's plan alone, by 1 at most, and leave all others
             as they are: its number, from 1, or weakest, the one that failed episodes reached and did not pass.
         logger: also log success and losses, to a folder logs beside each policy.
-        out: where everything goes; on a cluster, a folder that all its machines share.
     """
     schedule.check(out)
     from lw_torchrl._checks import counted

@@ -78,7 +78,7 @@ def generate(
     tasks: Positional[options.TaskNames] = ("MT10",),
     /,
     *,
-    asking: Annotated[Asking, OmitArgPrefixes],
+    asking: Annotated[Asking, OmitArgPrefixes],  # which model is asked, and how
     format: tuple[str, ...] = ("chain_py",),
     json: options.Json = False,
 ) -> Output:
@@ -92,7 +92,6 @@ def generate(
     Example: lw-torchrl plan generate MT10 --model llama3.1 --base-url http://127.0.0.1:11434/v1 --attempts 4
 
     Args:
-        asking: which model is asked, and how.
         format: how plans are written, one or several: basic, chain or goal, then _py, _py_md or _md; "all" for nine.
     """
     planner, chosen, _ = asking.begin(tasks)
@@ -137,12 +136,12 @@ def repair(
     tasks: Positional[options.TaskNames],
     /,
     *,
-    asking: Annotated[Asking, OmitArgPrefixes],
-    format: str = "chain_py",
-    rounds: int = 3,
-    enough: float = 0.8,
-    episodes: int = 10,
-    episode_seed: int = 0,
+    asking: Annotated[Asking, OmitArgPrefixes],  # which model is asked, and how
+    format: str = "chain_py",  # how plans are written: basic, chain or goal, then _py, _py_md or _md
+    rounds: int = 3,  # how often the model is told, at most
+    enough: float = 0.8,  # the success rate from which a plan is left as it is
+    episodes: int = 10,  # of each plan
+    episode_seed: int = 0,  # of these; compare on another one
     json: options.Json = False,
 ) -> Output:
     """Ask a model for plans, carry them out by scripted skills, tell it what became of those that fail, and ask again.
@@ -153,14 +152,6 @@ def repair(
     compare. If it is stopped, the same command resumes it.
 
     Example: lw-torchrl plan repair MT10 --model llama3.1 --base-url http://127.0.0.1:11434/v1 --rounds 3
-
-    Args:
-        asking: which model is asked, and how.
-        format: how plans are written: basic, chain or goal, then _py, _py_md or _md.
-        rounds: how often the model is told, at most.
-        enough: the success rate from which a plan is left as it is.
-        episodes: of each plan.
-        episode_seed: of these; compare on another one.
     """
     planner, chosen, known = asking.begin(tasks)
     from lw_torchrl.language.formats import PLAN_FORMATS

@@ -22,19 +22,19 @@ if TYPE_CHECKING:
 
 
 def record(
-    names: Positional[Annotated[tuple[str, ...], arg(metavar="TASK ...")]],
+    names: Positional[Annotated[tuple[str, ...], arg(metavar="TASK ...")]],  # tasks, or MT10 or MT50
     /,
     policy: str = "expert",
-    compare: str | None = None,
-    episodes: tuple[int, ...] = (0,),
+    compare: str | None = None,  # another one, in the same initial states and with the same noise, side by side
+    episodes: tuple[int, ...] = (0,),  # their indices, as in an evaluation with this seed
     plans: tuple[str, ...] = (),
     attribute: bool = False,
-    reference: tuple[str, ...] = (),
+    reference: tuple[str, ...] = (),  # with --attribute, trusted plans for running failed episodes again
     task_file: options.TaskFile = None,
     text_encoder: options.OwnEncoder = None,
-    seed: int = 1000,
-    noise: float = 0.1,
-    max_steps: int = 500,
+    seed: int = 1000,  # fixes initial states, goals and noise
+    noise: float = 0.1,  # standard deviation of the noise on the executed action
+    max_steps: int = 500,  # of an episode
     out: Path | None = None,
     json: options.Json = False,
 ) -> Output:
@@ -43,19 +43,12 @@ def record(
     Example: lw-torchrl record drawer-open --policy runs/mt10.zip --compare scripted --episodes 0 1
 
     Args:
-        names: tasks, or MT10 or MT50.
         policy: expert, Meta-World's script; scripted, the plan by scripted skills; random; spoilt-60, spoilt-30 or
             wrong, the plan by skills that are right in 60, 30 or 0 of 100 pieces; or a policy's file.
-        compare: another one, in the same initial states and with the same noise, side by side.
-        episodes: their indices, as in an evaluation with this seed.
         plans: whose steps and conditions are shown and, by policies that read plans, carried out: MT10, MT50, .plan or
             .json files, or folders. If none is given, a policy's own, or else the shipped ones.
         attribute: say why each failed episode failed: a query, the plan, a skill or time. It is run again a few times.
             For scripted and for policies with plans.
-        reference: with --attribute, trusted plans for running failed episodes again.
-        seed: fixes initial states, goals and noise.
-        noise: standard deviation of the noise on the executed action.
-        max_steps: of an episode.
         out: the file; runs/recordings/TASK-POLICY.rrd if none is given. One that is there is replaced.
     """
     if reference and not attribute:
@@ -145,29 +138,22 @@ def _line(episode: FinishedEpisode, who: str, failure: Failure | None) -> str:
 
 
 def view(
-    recording: Positional[Annotated[Path, arg(metavar="RUN|FILE")]],
+    recording: Positional[Annotated[Path, arg(metavar="RUN|FILE")]],  # an .rrd file, or a folder that holds one
     /,
-    episode: str | None = None,
+    episode: str | None = None,  # open at this tab, by its title or its episode's name
     screenshot: Path | None = None,
-    step: int | None = None,
-    window_size: str = "1400x900",
-    html: Path | None = None,
-    web: bool = False,
-    port: int = 0,
+    step: int | None = None,  # the step to open at; by default the most telling one, of a training the last
+    window_size: str = "1400x900",  # of the picture or the window, WIDTHxHEIGHT
+    html: Path | None = None,  # write one self-contained page here, some 20 MB, that opens from disk in a browser
+    web: bool = False,  # serve a page on this machine and print its address, until Ctrl-C
+    port: int = 0,  # of the page; 0 takes a free one
 ) -> None:
     """Open a recording in the rerun viewer; or take a picture of it, write it as one page, or serve it as one.
 
     Example: lw-torchrl view runs/demo --episode drawer-open --screenshot picture.png --step 80
 
     Args:
-        recording: an .rrd file, or a folder that holds one.
-        episode: open at this tab, by its title or its episode's name.
         screenshot: write a .png here and open no window; wants Debian's mesa-vulkan-drivers and libvulkan1.
-        step: the step to open at; by default the most telling one, of a training the last.
-        window_size: of the picture or the window, WIDTHxHEIGHT.
-        html: write one self-contained page here, some 20 MB, that opens from disk in a browser.
-        web: serve a page on this machine and print its address, until Ctrl-C.
-        port: of the page; 0 takes a free one.
     """
     given = [f"--{name}" for name, value in (("screenshot", screenshot), ("html", html), ("web", web)) if value]
     if len(given) > 1:

@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 
 
 def train(
-    data: Positional[Annotated[Path, arg(metavar="DATA")]],
+    data: Positional[Annotated[Path, arg(metavar="DATA")]],  # a dataset's folder, of `lw-torchrl collect`
     /,
-    out: Path,
+    out: Path,  # the policy, one file
     tasks: tuple[str, ...] = (),
     plans: options.PlanSources = ("MT10",),
     task_file: options.TaskFile = None,
@@ -30,18 +30,18 @@ def train(
     method: str = "pcbc",
     mix: Literal["latents", "actions"] | None = None,
     features: Literal["raw", "differences", "relative", "both"] = "differences",
-    width: int = 256,
-    depth: int = 3,
-    steps: int = 8000,
-    batch_size: int = 500,
-    learning_rate: float = 1e-3,
-    after_success: int | None = 20,
+    width: int = 256,  # of the action decoder's hidden layers
+    depth: int = 3,  # number of them
+    steps: int = 8000,  # minibatches
+    batch_size: int = 500,  # rows of a minibatch, equally many of each task
+    learning_rate: float = 1e-3,  # at the start; a cosine brings it to 0
+    after_success: int | None = 20,  # leave out steps so long after an episode's first success; None keeps all
     latent_consistency: float = 0.0,
-    begin: Path | None = None,
+    begin: Path | None = None,  # a trained policy to start from: its weights, plans, options and statistics
     evaluator: str | None = None,
     answers: Literal["logit", "tanh", "hard"] | None = None,
     qaf_anchor: float = 0.0,
-    seed: int = 0,
+    seed: int = 0,  # of the initial weights and the minibatches
     logger: Literal["csv", "tensorboard", "wandb"] | None = None,
     device: options.Device = "cpu",
     json: options.Json = False,
@@ -53,27 +53,17 @@ def train(
     Example: lw-torchrl train demos/mt10 --out runs/tuned.zip --begin runs/mt10.zip --evaluator runs/eyes/evaluator.zip
 
     Args:
-        data: a dataset's folder, of `lw-torchrl collect`.
-        out: the policy, one file.
         tasks: MT10, or names of tasks, to train on only their demonstrations; by default all of the dataset.
         method: pcbc, conditioned on the plan; or a baseline: dc, on the task's description, one-hot, on its number.
         mix: of a policy with plans, mix the skills' latents, as in the paper and by default, or their actions.
         features: what the policy sees: the raw observation; differences between hand, objects and goal; relative, these
             without the hand's height and the gripper's opening; or both the first and the second.
-        width: of the action decoder's hidden layers.
-        depth: number of them.
-        steps: minibatches.
-        batch_size: rows of a minibatch, equally many of each task.
-        learning_rate: at the start; a cosine brings it to 0.
-        after_success: leave out steps so long after an episode's first success; None keeps all.
         latent_consistency: weight of a term that keeps skills with similar texts similar; of a policy with plans.
-        begin: a trained policy to start from: its weights, plans, options and statistics.
         evaluator: a network that answers the conditions inside the policy and is trained with it: a file of
             `lw-torchrl train-evaluator`, or the word new. If it reads pictures, they are drawn beside DATA.
         answers: how its answers enter the attention, see docs/evaluators.md; by default tanh, with --begin hard.
         qaf_anchor: weight of the error of its answers, beside the error of the actions. Without it conditions may drift
             from their words; a new evaluator needs it.
-        seed: of the initial weights and the minibatches.
         logger: also write loss and learning rate, below logs/ beside the policy.
     """
     options.check_file("--out", out)
