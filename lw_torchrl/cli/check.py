@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
 from lw_torchrl._checks import counted
-from lw_torchrl.cli.options import Json, SkillFile, TaskFile, read_skills, read_tasks
+from lw_torchrl.cli.options import File, Json, SkillFile, TaskFile, read_skills, read_tasks
 from lw_torchrl.cli.output import Output
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def check(
-    file: Positional[Annotated[Path, arg(metavar="FILE")]],
+    file: Positional[File],  # a .plan file, a folder of them, or a .toml file of skills or of tasks
     /,
     task: str | None = None,  # the task that a plan must be for
     skill_file: SkillFile = None,
@@ -29,9 +29,6 @@ def check(
     """Validate a file of plans, skills or tasks of your own: what is wrong, where, and the nearest allowed text.
 
     Example: lw-torchrl check my-plans/push.plan
-
-    Args:
-        file: a .plan file, a folder of them, or a .toml file of skills or of tasks.
     """
     import lw_torchrl as lw
     from lw_torchrl._files import read_text

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 def evaluate(
     checkpoint: Positional[Annotated[Path, arg(metavar="CHECKPOINT")]],  # of `lw-torchrl train`, or the word expert
     /,
-    tasks: tuple[str, ...] = (),
+    tasks: tuple[str, ...] = (),  # MT10, MT50, or names; if none, those of --plans, or else those it was trained on
     plans: tuple[str, ...] = (),
     task_file: options.TaskFile = None,
     text_encoder: options.OwnEncoder = None,
@@ -30,8 +30,8 @@ def evaluate(
     noise: float = 0.1,  # standard deviation of the noise on the executed action
     stop_at_success: bool = False,  # end an episode at its first success; any-step success stays the same
     num_envs: int | None = None,  # environments stepped together; the result does not depend on it
-    attribute: bool = False,
-    reference: tuple[str, ...] = (),
+    attribute: bool = False,  # say why failed episodes failed: a query, the plan, a skill or time; they run again
+    reference: tuple[str, ...] = (),  # with --attribute, trusted plans to run failed episodes again, as for --plans
     evaluator: Path | None = None,  # a network that answers the conditions, of `lw-torchrl train-evaluator`
     out: Path | None = None,  # folder for results.json, success.png and rollout.rrd; with --attribute also failures.png
     device: options.Device = "cpu",
@@ -42,14 +42,8 @@ def evaluate(
     Example: lw-torchrl evaluate runs/mt10.zip --out runs/mt10
 
     Args:
-        tasks: MT10, MT50, or names of tasks; if none is given, those of --plans, or else those that the policy was
-            trained on.
         plans: carry out these instead of the policy's own: MT10, MT50, .plan or .json files, or folders; where several
             have a plan for a task, the last one's counts.
-        attribute: say why each failed episode failed: a query, the plan, a skill or time. They are run again a few
-            times.
-        reference: with --attribute, trusted plans for running failed episodes again: MT10, MT50, .plan or .json files,
-            or folders.
     """
     if out is not None:
         options.check_folder("--out", out)
@@ -144,11 +138,11 @@ def _default_tasks(policy: Policy, checkpoint: Path, *, trained: bool) -> tuple[
 
 
 def scripted(
-    names: Positional[Annotated[tuple[str, ...], arg(metavar="[NAMES ...]")]] = ("MT10",),
+    names: Positional[options.Names] = ("MT10",),  # MT10, MT50, or names of tasks
     /,
     episodes: int = 50,  # of each task
     seed: int = 1000,  # fixes initial states and goals
-    select: Literal["first", "random", "mix"] = "first",
+    select: Literal["first", "random", "mix"] = "first",  # of true steps the first, a random one (the paper), or a mix
     noise: float = 0.0,  # standard deviation of the noise on the executed action
     plans: options.PlanSources = ("MT50",),
     skill_file: options.SkillFile = None,
@@ -160,10 +154,6 @@ def scripted(
     """Carry out plans with scripted skills, and say how each step fared: no training, no expert.
 
     Example: lw-torchrl scripted MT50 --episodes 50
-
-    Args:
-        names: MT10, MT50, or names of tasks.
-        select: of several true steps, take the first, a random one, as in the paper, or mix them.
     """
     options.check_folder("--out", out)
     known = options.read_tasks(task_file)

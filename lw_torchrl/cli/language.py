@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def tasks(
-    names: Positional[Annotated[tuple[str, ...], arg(metavar="[NAMES ...]")]] = (),
+    names: Positional[options.Names] = (),  # MT10, MT50, or names of tasks; all there are if none is given
     /,
     task_file: options.TaskFile = None,
     json: options.Json = False,
@@ -24,9 +24,6 @@ def tasks(
     """List tasks: their descriptions, and the objects that queries can name.
 
     Example: lw-torchrl tasks MT10
-
-    Args:
-        names: MT10, MT50, or names of tasks; all there are if none is given.
     """
     import lw_torchrl as lw
 
@@ -104,10 +101,10 @@ def _numbers(values: Iterable[float]) -> str:
 
 
 def plans(
-    names: Positional[Annotated[tuple[str, ...], arg(metavar="[NAMES ...]")]] = (),  # MT10, MT50, or names of tasks
+    names: Positional[options.Names] = (),  # MT10, MT50, or names of tasks
     /,
     plans: options.PlanSources = ("MT50",),
-    skill_set: Literal["own", "MT10"] = "own",
+    skill_set: Literal["own", "MT10"] = "own",  # of shipped plans: with scripted skills of their own, or MT10's words
     roles: bool = False,
     task_file: options.TaskFile = None,
     json: options.Json = False,
@@ -117,7 +114,6 @@ def plans(
     Example: lw-torchrl plans drawer-open --roles
 
     Args:
-        skill_set: of the shipped plans, those with scripted skills of their own, or those worded as MT10's are.
         roles: a table of the steps, what each moves and what it goes to, and what told: "skill", the text is a scripted
             skill's; "words", the text's; "condition", the things that it compares; "nothing".
     """
@@ -166,7 +162,7 @@ def _written(plan: ConditionalPlan) -> dict[str, Any]:
 
 def queries(
     task: Positional[Annotated[str, arg(metavar="TASK")]],  # a task's name
-    text: Positional[Annotated[str | None, arg(metavar="[TEXT]")]] = None,
+    text: Positional[options.Text] = None,  # any words; what the query answering function makes of them is shown
     /,
     by: Literal["edit", "embedding"] = "edit",  # closest in spelling, or in meaning, which wants the extra [text]
     task_file: options.TaskFile = None,
@@ -175,9 +171,6 @@ def queries(
     """List a task's base queries, or find the one closest to a text.
 
     Example: lw-torchrl queries push "the gripper touches the puck"
-
-    Args:
-        text: any words; what the query answering function makes of them is shown.
     """
     import lw_torchrl as lw
     from lw_torchrl.language.nearest import nearest_query
@@ -201,7 +194,7 @@ def queries(
 
 def query(
     task: Positional[Annotated[str, arg(metavar="TASK")]],  # a task's name
-    text: Positional[Annotated[str | None, arg(metavar="[TEXT]")]] = None,
+    text: Positional[options.Text] = None,  # the query; without one, all supported queries that hold are listed
     /,
     step: int = 0,  # how many steps the expert does first, 0 to 500
     seed: int = 0,  # of the episode
@@ -212,9 +205,6 @@ def query(
     """Answer a query on a state of a task: the state after so many steps of the scripted expert.
 
     Example: lw-torchrl query pick-place "Is the gripper open and not above the puck?" --step 40
-
-    Args:
-        text: the query; without one, all supported queries that hold are listed.
     """
     import lw_torchrl as lw
     from lw_torchrl._checks import check_int

@@ -28,11 +28,11 @@ def offline(
     schedule: Scheduled,  # which runs are done, and where
     seeds: tuple[int, ...] = (0, 1, 2),  # of the data, the initial weights and the minibatches
     mixtures: tuple[Mixture, ...] = (),  # only these of the table's, B, W, C
-    methods: tuple[OfflineMethod, ...] = (),
+    methods: tuple[OfflineMethod, ...] = (),  # only these of the table's
     plans: PlanSources = ("MT10",),
     reward: Literal["sparse", "cost", "dense_cost"] | None = None,
     beta: float | None = None,  # how sharply advantages weigh, instead of the recipe's
-    distance: Literal["l1", "l2"] | None = None,
+    distance: Literal["l1", "l2"] | None = None,  # between actions, in methods that imitate, instead of the recipe's
     steps: int | None = None,  # minibatches of each network, instead of the recipe's
     episodes: int = 20,  # evaluated for each task, on seeds that no data has, action noise 0.1
     out: Path = Path("runs/offline"),  # where everything goes; on a cluster, a folder that all its machines share
@@ -53,10 +53,8 @@ def offline(
         table: methods, seven of them on plans, in five tasks; conditioning, plans, descriptions or numbers of tasks,
             for the policy and for its critic; mt10, the best method in all of MT10; quick, two tasks, to try it; or all
             but the last.
-        methods: only these of the table's: advantage, filtered-bc, best-bc, bc, iql, td3-bc, cql.
         reward: what values are of, instead of the recipe's: sparse, the success; cost, of each step; dense_cost, what
             Meta-World's dense reward lacks.
-        distance: between actions, in the methods that imitate, instead of the recipe's.
     """
     schedule.check(out)
     known = read_plans(plans, read_tasks(None))

@@ -31,12 +31,12 @@ def online(
     seeds: tuple[int, ...] = (0, 1, 2),  # of demonstrations, weights, episodes and minibatches
     frames: int = 60_000,  # steps of the environment, the same for every method
     demonstrations: int = 1,  # of each task, without noise
-    start: Path | None = None,
-    condition: Literal["pcbc", "dc", "one-hot"] = "pcbc",
+    start: Path | None = None,  # a policy to begin with, of train; by default one is cloned from the demonstrations
+    condition: Literal["pcbc", "dc", "one-hot"] = "pcbc",  # that one is conditioned on plans, descriptions or numbers
     plans: PlanSources = ("MT50",),
     episodes: int = 40,  # evaluated, on seeds that no training used, action noise 0.1
     step: str | None = None,
-    logger: Literal["none", "csv", "tensorboard", "wandb"] = "none",
+    logger: Literal["none", "csv", "tensorboard", "wandb"] = "none",  # success and losses, to logs/ beside each policy
     out: Path = Path("runs/online"),  # where everything goes; on a cluster, a folder that all its machines share
     json: Json = False,
 ) -> Output:
@@ -52,11 +52,8 @@ def online(
         methods: td3, sac and residual (a small network that corrects the start), half of each minibatch demonstrations;
             ppo; expert-iteration, behavioral cloning of demonstrations and of own successes. The first is compared with
             the others, and with the start.
-        start: a policy to begin with, as train writes it; by default one is cloned from the demonstrations.
-        condition: what that one is conditioned on: plans, the task's description, its number.
         step: of residual, correct the actions in this step of the task's plan alone, by 1 at most, and leave all others
             as they are: its number, from 1, or weakest, the one that failed episodes reached and did not pass.
-        logger: also log success and losses, to a folder logs beside each policy.
     """
     schedule.check(out)
     from lw_torchrl._checks import counted

@@ -30,10 +30,6 @@ _NUMBERS = {int: "an integer", float: "a number"}
 def parse(prog: str, function: Callable[..., Any], args: Sequence[str]) -> partial[Any]:
     """A command's function with its arguments; ``--help`` is printed, and ends the program.
 
-    Raises:
-        ValueError: an option that the command does not have, an argument too many or too few, a word where a number
-            must be, another word than those allowed.
-
     Example:
         >>> def cook(dish: Literal["soup", "stew"], /, minutes: int = 10): ...
         >>> parse("kitchen", cook, ["stew", "--minutes", "30"]).keywords

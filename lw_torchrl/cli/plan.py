@@ -19,15 +19,12 @@ def prompt(
     /,
     format: str = "chain_py",  # how plans are written: basic, chain or goal, then _py, _py_md or _md
     vocabulary: bool = False,  # also say which things the task has, and what can be asked of them
-    plans: options.PlanSources = ("MT10",),
+    plans: options.PlanSources = ("MT10",),  # of the examples
     task_file: options.TaskFile = None,
 ) -> None:
     """Print the text that asks a language model for a plan: plans of three other tasks, then the task.
 
     Example: lw-torchrl plan prompt drawer-open --format chain_py
-
-    Args:
-        plans: where the examples come from: MT10 or MT50 for the shipped plans, .plan files, .json files or folders.
     """
     from lw_torchrl.planners.prompts import plan_prompt
 
@@ -37,7 +34,7 @@ def prompt(
 
 
 def check(
-    file: Positional[Annotated[Path, arg(metavar="FILE")]],
+    file: Positional[options.File],
     /,
     task: str | None = None,  # the task it is for; by default as the file's name says
     format: str | None = None,  # how it is written; by default as the file's folder says, or basic_py for a .plan file
@@ -109,7 +106,7 @@ def compare(
     /,
     episodes: int = 20,  # of each plan, the same initial states for all plans of a task
     seed: int = 1000,  # fixes initial states, goals and what is chosen
-    choose: Literal["random", "first"] = "random",
+    choose: Literal["random", "first"] = "random",  # of true steps a random one, as in the paper, or the first
     noise: float = 0.0,  # standard deviation of the noise on the executed action
     max_steps: int = 500,  # of an episode
     task_file: options.TaskFile = None,
@@ -125,7 +122,6 @@ def compare(
 
     Args:
         source: a folder MODEL/FORMAT/TASK-ATTEMPT.EXT, as plan generate writes it, or a .jsonl file of answers.
-        choose: which of several true steps acts: a random one, as in the paper, or the first.
     """
     options.check_folder("--out", out)
     from lw_torchrl.planners.answer_files import ignored_files, recorded_answers

@@ -28,14 +28,14 @@ def record(
     compare: str | None = None,  # another one, in the same initial states and with the same noise, side by side
     episodes: tuple[int, ...] = (0,),  # their indices, as in an evaluation with this seed
     plans: tuple[str, ...] = (),
-    attribute: bool = False,
+    attribute: bool = False,  # say why failed episodes failed, as evaluate does; for scripted and policies with plans
     reference: tuple[str, ...] = (),  # with --attribute, trusted plans for running failed episodes again
     task_file: options.TaskFile = None,
     text_encoder: options.OwnEncoder = None,
     seed: int = 1000,  # fixes initial states, goals and noise
     noise: float = 0.1,  # standard deviation of the noise on the executed action
     max_steps: int = 500,  # of an episode
-    out: Path | None = None,
+    out: Path | None = None,  # the file; runs/recordings/TASK-POLICY.rrd if none is given; replaced if there
     json: options.Json = False,
 ) -> Output:
     """Record episodes: the robot in 3-D, the plan as it goes, what held when, and how it ended.
@@ -47,9 +47,6 @@ def record(
             wrong, the plan by skills that are right in 60, 30 or 0 of 100 pieces; or a policy's file.
         plans: whose steps and conditions are shown and, by policies that read plans, carried out: MT10, MT50, .plan or
             .json files, or folders. If none is given, a policy's own, or else the shipped ones.
-        attribute: say why each failed episode failed: a query, the plan, a skill or time. It is run again a few times.
-            For scripted and for policies with plans.
-        out: the file; runs/recordings/TASK-POLICY.rrd if none is given. One that is there is replaced.
     """
     if reference and not attribute:
         raise ValueError("--reference is for --attribute, which runs failed episodes again with these plans")
@@ -141,7 +138,7 @@ def view(
     recording: Positional[Annotated[Path, arg(metavar="RUN|FILE")]],  # an .rrd file, or a folder that holds one
     /,
     episode: str | None = None,  # open at this tab, by its title or its episode's name
-    screenshot: Path | None = None,
+    screenshot: Path | None = None,  # write a .png here, no window; wants Debian's mesa-vulkan-drivers and libvulkan1
     step: int | None = None,  # the step to open at; by default the most telling one, of a training the last
     window_size: str = "1400x900",  # of the picture or the window, WIDTHxHEIGHT
     html: Path | None = None,  # write one self-contained page here, some 20 MB, that opens from disk in a browser
@@ -151,9 +148,6 @@ def view(
     """Open a recording in the rerun viewer; or take a picture of it, write it as one page, or serve it as one.
 
     Example: lw-torchrl view runs/demo --episode drawer-open --screenshot picture.png --step 80
-
-    Args:
-        screenshot: write a .png here and open no window; wants Debian's mesa-vulkan-drivers and libvulkan1.
     """
     given = [f"--{name}" for name, value in (("screenshot", screenshot), ("html", html), ("web", web)) if value]
     if len(given) > 1:

@@ -23,11 +23,11 @@ def train(
     data: Positional[Annotated[Path, arg(metavar="DATA")]],  # a dataset's folder, of `lw-torchrl collect`
     /,
     out: Path,  # the policy, one file
-    tasks: tuple[str, ...] = (),
+    tasks: tuple[str, ...] = (),  # MT10, or names of tasks, whose demonstrations alone are used; by default all
     plans: options.PlanSources = ("MT10",),
     task_file: options.TaskFile = None,
     text_encoder: options.EncoderName = None,
-    method: str = "pcbc",
+    method: str = "pcbc",  # pcbc, by plan; or a baseline: dc, by the task's description, one-hot, by its number
     mix: Literal["latents", "actions"] | None = None,
     features: Literal["raw", "differences", "relative", "both"] = "differences",
     width: int = 256,  # of the action decoder's hidden layers
@@ -36,13 +36,13 @@ def train(
     batch_size: int = 500,  # rows of a minibatch, equally many of each task
     learning_rate: float = 1e-3,  # at the start; a cosine brings it to 0
     after_success: int | None = 20,  # leave out steps so long after an episode's first success; None keeps all
-    latent_consistency: float = 0.0,
+    latent_consistency: float = 0.0,  # weight of a term that keeps skills with similar texts similar; with plans
     begin: Path | None = None,  # a trained policy to start from: its weights, plans, options and statistics
     evaluator: str | None = None,
     answers: Literal["logit", "tanh", "hard"] | None = None,
     qaf_anchor: float = 0.0,
     seed: int = 0,  # of the initial weights and the minibatches
-    logger: Literal["csv", "tensorboard", "wandb"] | None = None,
+    logger: Literal["csv", "tensorboard", "wandb"] | None = None,  # write loss and learning rate to logs/ beside OUT
     device: options.Device = "cpu",
     json: options.Json = False,
 ) -> Output:
@@ -53,18 +53,14 @@ def train(
     Example: lw-torchrl train demos/mt10 --out runs/tuned.zip --begin runs/mt10.zip --evaluator runs/eyes/evaluator.zip
 
     Args:
-        tasks: MT10, or names of tasks, to train on only their demonstrations; by default all of the dataset.
-        method: pcbc, conditioned on the plan; or a baseline: dc, on the task's description, one-hot, on its number.
         mix: of a policy with plans, mix the skills' latents, as in the paper and by default, or their actions.
         features: what the policy sees: the raw observation; differences between hand, objects and goal; relative, these
             without the hand's height and the gripper's opening; or both the first and the second.
-        latent_consistency: weight of a term that keeps skills with similar texts similar; of a policy with plans.
         evaluator: a network that answers the conditions inside the policy and is trained with it: a file of
             `lw-torchrl train-evaluator`, or the word new. If it reads pictures, they are drawn beside DATA.
         answers: how its answers enter the attention, see docs/evaluators.md; by default tanh, with --begin hard.
         qaf_anchor: weight of the error of its answers, beside the error of the actions. Without it conditions may drift
             from their words; a new evaluator needs it.
-        logger: also write loss and learning rate, below logs/ beside the policy.
     """
     options.check_file("--out", out)
     if begin is not None and out.resolve() == begin.resolve():

@@ -20,14 +20,14 @@ WHO = ("expert", "scripted", "spoilt-30", "random")
 
 
 def train_evaluator(
-    tasks: Positional[Annotated[tuple[str, ...], arg(metavar="TASKS ...")]],
+    tasks: Positional[Annotated[tuple[str, ...], arg(metavar="TASKS ...")]],  # MT10, MT50, or names, held-out ones too
     /,
-    out: Path,
+    out: Path,  # folder for evaluator.zip, report.json, reliability.png, the episodes, and, with --cameras, wrong.png
     data: tuple[Path, ...] = (),  # datasets of `lw-torchrl collect` to use instead of running episodes
     behaviours: tuple[str, ...] = WHO,  # who acts in the episodes that are run, as for `lw-torchrl collect`
     episodes: int = 5,  # of each task and behaviour
     max_steps: int = 500,  # steps of an episode
-    noise: tuple[float, ...] = (0.0, 0.1, 0.2),
+    noise: tuple[float, ...] = (0.0, 0.1, 0.2),  # standard deviations of the expert's execution noise, used in turn
     cameras: tuple[str, ...] = (),
     picture: int = 64,  # with --cameras, pixels of a picture's height and width
     every: int | None = None,  # use every n-th state of an episode; by default 1, with --cameras 5
@@ -35,11 +35,11 @@ def train_evaluator(
     held_out_pairs: float = 0.1,  # the share of pairs of objects none of whose queries is trained
     held_out_states: float = 0.2,  # the share of episodes that are not trained on
     structure: bool = True,  # read parsed clauses, and objects' positions where the tasks' table says; else only texts
-    text_encoder: str | None = None,
+    text_encoder: str | None = None,  # with --no-structure, your function from texts to vectors, as my_texts:encode
     width: int = 128,  # of the hidden layers
     depth: int = 3,  # number of them
     steps: int | None = None,  # minibatches; by default 6000, with --cameras 4000
-    batch_size: int | None = None,
+    batch_size: int | None = None,  # pairs of state and clause, by default 1024; with --cameras states, 48
     learning_rate: float | None = None,  # at the start; a cosine brings it to 0. By default 0.003, with --cameras 0.002
     states_per_task: int = 2000,  # the most states that are labelled of each task
     seed: int = 0,  # of the episodes, of what is held out, the initial weights and the minibatches
@@ -55,14 +55,8 @@ def train_evaluator(
     Example: lw-torchrl train-evaluator drawer-open --out runs/eyes --cameras corner corner3 --episodes 20
 
     Args:
-        tasks: MT10, MT50, or names of tasks, the held-out ones among them.
-        out: folder for evaluator.zip, report.json, reliability.png, the episodes that were run, and, with --cameras,
-            wrong.png.
-        noise: standard deviations of the execution noise of the expert, used in turn.
         cameras: answer from these cameras' pictures instead of from the observation: corner, corner2, corner3, corner4,
             topview, behindGripper, gripperPOV.
-        text_encoder: with --no-structure, a function of yours that turns texts into vectors, as my_texts:encode.
-        batch_size: pairs of a state and a clause in a minibatch, by default 1024; with --cameras states, 48.
     """
     options.check_folder("--out", out)
     if text_encoder is not None and structure:
