@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
-from lw_torchrl._checks import counted
+from lw_torchrl._checks import counted, nearest
 from lw_torchrl.cli.options import File, Json, SkillFile, TaskFile, read_skills, read_tasks
 from lw_torchrl.cli.output import Output
 
@@ -75,7 +75,6 @@ def check(
 def _check_table(file: Path, known: Mapping[str, Task], hint: str) -> tuple[str, int, list[str]]:
     """What a file is a table of, of how many, and what is noted of them."""
     import lw_torchrl as lw
-    from lw_torchrl._checks import nearest
     from lw_torchrl._files import read_toml
 
     rows = read_toml(file, ValueError)
@@ -83,10 +82,8 @@ def _check_table(file: Path, known: Mapping[str, Task], hint: str) -> tuple[str,
     if any(isinstance(row, dict) and ("description" in row or "objects" in row) for row in rows.values()):
         lw.load_tasks(file)
         for name in sorted(set(rows) - set(lw.TASKS)):
-            close = nearest(name, lw.TASKS, n=1)
-            notes.append(
-                f"task {name!r} is none of the simulator's" + (f"; did you mean {close[0]!r}?" if close else "")
-            )
+            hint = "".join(f"; did you mean {close!r}?" for close in nearest(name, lw.TASKS, n=1))
+            notes.append(f"task {name!r} is none of the simulator's{hint}")
         return "task", len(rows), notes
     table = lw.load_skills(file, tasks=known)
     for text in rows:

@@ -80,18 +80,10 @@ def evaluate(
         raise ValueError("--device is for a policy; the scripted experts work on the CPU")
     if attribute and (policy is None or policy.plans is None):
         raise ValueError(f"--attribute is for a policy with plans, {checkpoint} has none")
-    result = lw.evaluate(
-        policy or lw.ExpertActor(chosen),
-        tasks=chosen,
-        episodes_per_task=episodes,
-        seed=seed,
-        noise_scale=noise,
-        stop_at_success=stop_at_success,
-        num_envs=num_envs,
-        device=there,
-        attribute=attribute,
-        reference=options.read_plans(reference, known) if reference else None,
-    )
+    how: dict[str, Any] = {"tasks": chosen, "episodes_per_task": episodes, "seed": seed, "noise_scale": noise}
+    how |= {"stop_at_success": stop_at_success, "num_envs": num_envs, "device": there, "attribute": attribute}
+    trusted = options.read_plans(reference, known) if reference else None
+    result = lw.evaluate(policy or lw.ExpertActor(chosen), reference=trusted, **how)
     output = Output(json)
     output.result(result)
     if attribute:
@@ -167,16 +159,10 @@ def scripted(
     from lw_torchrl.evaluation.plan_use import PlanUse
 
     use = PlanUse(loaded)
-    result = lw.evaluate(
-        lw.ScriptedSkillActor(loaded, select, skills=skills),
-        tasks=chosen,
-        episodes_per_task=episodes,
-        seed=seed,
-        noise_scale=noise,
-        stop_at_success=not full,
-        also_record=["qaf", "skill_weights"],
-        on_episode=use,
-    )
+    actor = lw.ScriptedSkillActor(loaded, select, skills=skills)
+    how: dict[str, Any] = {"tasks": chosen, "episodes_per_task": episodes, "seed": seed, "noise_scale": noise}
+    how |= {"stop_at_success": not full, "also_record": ["qaf", "skill_weights"], "on_episode": use}
+    result = lw.evaluate(actor, **how)
     seen = use.tasks()
     steps = {
         task: [

@@ -42,13 +42,8 @@ def tasks(
         return ", ".join(one["name"] + (" (ours)" if one["ours"] else "") for one in row["objects"])
 
     output = Output(json)
-    columns: Columns = {
-        "task": "task",
-        "MT10": "mt10",
-        "description": "description",
-        "objects beside the gripper": objects,
-    }
-    output.table("tasks", rows, columns, counted(len(rows), "task"))
+    columns: Columns = {"task": "task", "MT10": "mt10", "description": "description"}
+    output.table("tasks", rows, {**columns, "objects beside the gripper": objects}, counted(len(rows), "task"))
     return output
 
 
@@ -74,8 +69,7 @@ def skills(
     output = Output(json)
     if nearest is not None:
         skill, score = nearest_skill(nearest, definition, table)
-        found = {"skill": skill.text, "similarity": score}
-        output.show("nearest", found, f"{skill.text}   (similarity {score:.2f})")
+        output.show("nearest", {"skill": skill.text, "similarity": score}, f"{skill.text}   (similarity {score:.2f})")
         return output
     rows = []
     for skill in table.values():
@@ -213,11 +207,8 @@ def query(
     known = options.read_tasks(task_file)
     (name,) = options.simulated("task", [check_task(task, known)], known)
     definition = known[name]
-    listed = (
-        [lw.parse_query(text, definition)]
-        if text is not None
-        else [lw.parse_query(q, definition) for q in lw.supported_queries(definition)]
-    )
+    asked = lw.supported_queries(definition) if text is None else [text]
+    listed = [lw.parse_query(one, definition) for one in asked]
     if check_int("step", step, minimum=0) > 500:
         raise ValueError(f"step must be at most 500, got {step}")
     env = lw.LanguageWorldEnv(name, seed=seed)
@@ -233,9 +224,8 @@ def query(
     opening = state["observation"][0, 3].item()
     output.show("opening", opening, f"the gripper's opening       {opening:7.3f}\n")
     answers = [{"query": str(found), "holds": truth} for found, truth in zip(listed, truths, strict=True)]
+    said = [one["query"] for one in answers if one["holds"]]
     if text is not None:
         said = [f"{'yes' if one['holds'] else 'no'}: {one['query']}" for one in answers]
-    else:
-        said = [one["query"] for one in answers if one["holds"]]
     output.show("queries", answers, "\n".join(said))
     return output

@@ -127,11 +127,8 @@ def _told_of_step(config: dict[str, Any]) -> str:
     tuned, elsewhere = config["tuned"], config["elsewhere"]
     lines = [stuck_table([StuckStep(**step) for step in tuned["stuck"]])] if "stuck" in tuned else []
     lines.append(f"tuned: step {tuned['step'] + 1}, {tuned['skill']}; success before {config['before']:.3f}")
-    lines.append(
-        f"{elsewhere['outside']} of {elsewhere['states']} states are outside of it: in {elsewhere['changed']} of them "
-        "the action has changed"
-    )
-    return "\n".join(lines)
+    share = f"{elsewhere['outside']} of {elsewhere['states']} states are outside of it"
+    return "\n".join([*lines, f"{share}: in {elsewhere['changed']} of them the action has changed"])
 
 
 def _summarize(runs: Sequence[OnlineRun], plans: Plans, out: Path) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
@@ -132,16 +132,8 @@ def compare(
     from lw_torchrl.planners.comparison_report import no_plans, write_report
 
     options.use_one_thread()
-    found = compare_plans(
-        source,
-        episodes=episodes,
-        seed=seed,
-        choose=choose,
-        noise_scale=noise,
-        max_steps=max_steps,
-        tasks=known,
-        resume=out / "fared.json",
-    )
+    how: dict[str, Any] = {"episodes": episodes, "seed": seed, "choose": choose, "noise_scale": noise}
+    found = compare_plans(source, max_steps=max_steps, tasks=known, resume=out / "fared.json", **how)
     output = Output(json)
     groups = [
         {"model": model, "format": format, "success": found.mean(model, format)}
@@ -189,11 +181,9 @@ def serve(
     print(f"loading {file}", flush=True)
 
     def ready(name: str, address: str) -> None:
+        asked = f"--model {name} --base-url {address} --constrain --format basic_py"
         print(f"{name} is served at {address}; Ctrl-C ends it. In another terminal:")
-        print(
-            f"lw-torchrl plan generate MT10 --model {name} --base-url {address} --constrain --format basic_py",
-            flush=True,
-        )
+        print(f"lw-torchrl plan generate MT10 {asked}", flush=True)
 
     serve_model(file, host=host, port=port, context=context, threads=threads, ready=ready)
 

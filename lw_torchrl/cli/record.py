@@ -85,9 +85,8 @@ def record(
                 row = {"task": one.task, "episode": one.episode, "policy": who, "first_success": one.first_success}
                 rows.append(row | {"failure": None if failure is None else asdict(failure)})
                 name = None if compare is None else f"{one.task}-{one.episode}-{len(recorded) + 1}"
-                pages.append(
-                    lw.log_rollout(logger, one.steps, shown, seed=seed, policy=who, failure=failure, name=name)
-                )
+                told: dict[str, Any] = {"seed": seed, "policy": who, "failure": failure, "name": name}
+                pages.append(lw.log_rollout(logger, one.steps, shown, **told))
             recorded.append(pages)
         for pair, one in zip(zip(*recorded, strict=True), found, strict=True) if compare is not None else ():
             logger.compare(pair, f"{one.task} · episode {one.episode} · side by side")
@@ -112,9 +111,8 @@ def _cast(
     if who not in options.ACTORS:
         actor = options.load_policy(Path(who), seed, plans, text_encoder)
         if missing := [task for task in tasks if task not in actor.tasks]:
-            raise ValueError(
-                f"the policy of {who!r} does not know {', '.join(missing)}; it knows {', '.join(actor.tasks)}"
-            )
+            knows = f"it knows {', '.join(actor.tasks)}"
+            raise ValueError(f"the policy of {who!r} does not know {', '.join(missing)}; {knows}")
         return actor, actor.plans, Path(who).stem
     shown = options.read_plans(("MT50",), known) if plans is None else plans
     shown.require(tasks)

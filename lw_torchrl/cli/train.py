@@ -105,22 +105,11 @@ def train(
         raise ValueError(f"--latent-consistency is for a method that reads plans, --method {method} does not")
     if reads_plans:
         actor_options["mix"] = mix or "latents"
-    config = lw.BehavioralCloningConfig(
-        steps=steps,
-        batch_size=batch_size,
-        learning_rate=learning_rate,
-        latent_consistency=latent_consistency,
-        normalize=begin is None,
-        qaf_anchor=qaf_anchor,
-        seed=seed,
-    )
-    replay = lw.LanguageWorldExperienceReplay(
-        data,
-        episodes=_all_of(data, chosen) if chosen else None,
-        sampler=lw.TaskBalancedSampler(),
-        after_success=after_success,
-        device=there,
-    )
+    numbers: dict[str, Any] = {"steps": steps, "batch_size": batch_size, "learning_rate": learning_rate, "seed": seed}
+    numbers |= {"latent_consistency": latent_consistency, "qaf_anchor": qaf_anchor}
+    config = lw.BehavioralCloningConfig(normalize=begin is None, **numbers)
+    rows: dict[str, Any] = {"episodes": _all_of(data, chosen) if chosen else None, "after_success": after_success}
+    replay = lw.LanguageWorldExperienceReplay(data, sampler=lw.TaskBalancedSampler(), device=there, **rows)
     torch.manual_seed(seed)
     if begin is not None:
         actor = _begun(begin, encoder)
@@ -139,10 +128,8 @@ def train(
     if isinstance(inside, lw.HeldEvaluator):
         which, mend = "--begin must have", "give the one to train by --evaluator"
         if evaluator is not None:
-            which, mend = (
-                "--evaluator must be",
-                "train with the one inside it, lw.training.save_evaluator(held.evaluator, FILE)",
-            )
+            which = "--evaluator must be"
+            mend = "train with the one inside it, lw.training.save_evaluator(held.evaluator, FILE)"
         raise ValueError(f"{which} no HeldEvaluator, of whose steps a dataset's rows tell nothing: {mend}")
     if isinstance(inside, lw.modules.ImageQueryEvaluator):
         pictures: dict[str, Any] = {"cameras": inside.cameras, "height": inside.height, "width": inside.width}

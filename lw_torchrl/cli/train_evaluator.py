@@ -96,19 +96,14 @@ def train_evaluator(
         seed=seed,
     )
     torch.manual_seed(seed)
-    network: dict[str, Any] = {
-        "structure": structure,
-        "depth": depth,
-        "text_encoder": options.read_encoder(text_encoder),
-        "hidden" if cameras else "width": width,
-    }
+    network: dict[str, Any] = {"structure": structure, "depth": depth, "hidden" if cameras else "width": width}
+    network["text_encoder"] = options.read_encoder(text_encoder)
     pictures: dict[str, Any] = {"cameras": cameras, "height": picture, "width": picture}
     plans = lw.load_plans("MT50")
     evaluator: ClauseEvaluator
     if cameras:
-        evaluator = lw.modules.ImageQueryEvaluator(
-            lw.Plans({task: plans[task] for task in names}), **network, **pictures
-        )
+        own = lw.Plans({task: plans[task] for task in names})
+        evaluator = lw.modules.ImageQueryEvaluator(own, **network, **pictures)
     else:
         evaluator = lw.StateQueryEvaluator(plans, **network)
     run = {"episodes_per_task": episodes, "max_steps": max_steps, "seed": seed, "num_envs": num_envs}
