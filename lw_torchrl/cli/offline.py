@@ -68,10 +68,8 @@ def offline(
     tables: dict[str, list[OfflineRun]] = {}
     for name in [name for name in OFFLINE_TABLES if name != "quick"] if table == "all" else [table]:
         every = offline_runs(OFFLINE_TABLES[name], seeds, recipe, episodes)
-        wanted = [
-            one for one in every if (not mixtures or one.mixture in mixtures) and (not methods or one.method in methods)
-        ]
-        if wanted:
+        every = [one for one in every if not mixtures or one.mixture in mixtures]
+        if wanted := [one for one in every if not methods or one.method in methods]:
             tables[name] = wanted
     if not tables:
         raise ValueError(f"--mixtures and --methods leave nothing of {table}")

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
+from lw_torchrl._checks import counted, shown
 from lw_torchrl.cli.options import Json, PlanSources, check_saved, make_logger, one_or_many, read_plans, simulated
 from lw_torchrl.cli.output import Output
 from lw_torchrl.cli.runs import Job, Scheduled
@@ -56,7 +57,6 @@ def online(
             as they are: its number, from 1, or weakest, the one that failed episodes reached and did not pass.
     """
     schedule.check(out)
-    from lw_torchrl._checks import counted
     from lw_torchrl.language.tasks import TASKS
 
     if start is not None:
@@ -97,20 +97,12 @@ def online(
     command += ["--condition", condition, "--episodes", episodes, "--logger", logger]
     for option, value in (("--start", start), ("--step", step)):
         command += [] if value is None else [option, value]
-    return schedule.execute(
-        Output(json),
-        [],
-        [starts, others],
-        command,
-        lambda: {str(runs[0].group): _summarize(runs, found, out)},
-        lambda result: _told_of_step(result.config),
-    )
+    summarize = partial(_summarize, runs, found, out)
+    return schedule.execute(Output(json), [], [starts, others], command, summarize, _told_of_step)
 
 
 def _read_step(given: str) -> int | str:
     """A step's number, counted from 0, or the word for the weakest."""
-    from lw_torchrl._checks import shown
-
     if given == WEAKEST:
         return given
     if not given.isascii() or not given.isdigit() or not 1 <= len(given) <= 4 or int(given) < 1:
@@ -118,10 +110,11 @@ def _read_step(given: str) -> int | str:
     return int(given) - 1
 
 
-def _told_of_step(config: dict[str, Any]) -> str:
+def _told_of_step(result: EvaluationResult) -> str:
     """Of a run of one step: where failed episodes got stuck, which step was tuned, and what changed elsewhere."""
     from lw_torchrl.evaluation import StuckStep, stuck_table
 
+    config = result.config
     if "tuned" not in config:
         return ""
     tuned, elsewhere = config["tuned"], config["elsewhere"]
@@ -132,7 +125,7 @@ def _told_of_step(config: dict[str, Any]) -> str:
 
 
 def _summarize(runs: Sequence[OnlineRun], plans: Plans, out: Path) -> dict[str, Any]:
-    """A summary, tables and a figure, from the results on disk; returns what summary.json holds."""
+    """A summary, tables and a figure, from the results on disk; returns what summary.json holds, by its group."""
     from lw_torchrl.evaluation import plot_learning_curves
     from lw_torchrl.paper.online import START
     from lw_torchrl.paper.runs import compare, load_result, write_summary
@@ -165,4 +158,4 @@ def _summarize(runs: Sequence[OnlineRun], plans: Plans, out: Path) -> dict[str, 
     write_summary(folder / "summary", text, summary)
     plot_learning_curves(curves, folder / "curves.png", starts=starts)
     print(f"summary.md, summary.json and curves.png are in {folder}")
-    return summary
+    return {str(runs[0].group): summary}

@@ -25,23 +25,19 @@ class Asking:
     model: str  # the model's name at the server.
     base_url: str | None = None  # the server's address; OpenAI's, or what OPENAI_BASE_URL says, if none is given.
     attempts: int = 1  # answers to each question.
-    constrain: bool = False
-    """hold the model to a schema, so that it can only write plans that run; the server must know schemas."""
+    constrain: bool = False  # hold the model to a schema, so that its plans run; the server must know schemas.
     free_skills: bool = False  # with --constrain, skills in any words instead of the scripted ones.
     vocabulary: bool = False  # prompts also say which things the task has, and what can be asked of them.
     temperature: float | None = None  # the server's own if none is given.
     max_tokens: int = 1024  # of an answer, at most; models that think first want more.
     seed: int | None = None  # attempt k is sent SEED + k; without, none is sent.
-    name: str | None = None
-    """of the folder for its answers; by default the model's, with "-constrained" behind it where it is."""
-    plans: tuple[str, ...] = ("MT10",)
-    """where the prompts' examples come from: MT10 or MT50, .plan files, .json files or folders."""
+    name: str | None = None  # of the folder for its answers; by default the model's, with "-constrained" if it is.
+    plans: tuple[str, ...] = ("MT10",)  # of the prompts' examples: MT10 or MT50, .plan files, .json files or folders.
     skill_file: options.SkillFile = None
     task_file: options.TaskFile = None
     concurrency: int = 4  # questions at once.
     retries: int = 6  # how often a question is asked again after a rate limit or a fault, with growing waits.
-    timeout: float = 300.0
-    """seconds that one try may take as a whole, to the answer's last byte; each retry has as long."""
+    timeout: float = 300.0  # seconds for one try as a whole, to the answer's last byte; each retry has as long.
     cache: Path = Path("runs/answers")  # folder where answers are kept, each under a key of all that determines it.
     out: Path = Path("runs/plans")  # folder for the answers as texts, OUT/<name>/<format>/<task>-<attempt>.py or .md.
 

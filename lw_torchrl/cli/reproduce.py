@@ -156,11 +156,9 @@ class _Plans:
         if skills not in self.known:
             found = options.read_plans(self.sources or ["MT50"], self.tasks, skills)
             if missing := [task for task in MT50 if task not in found]:
-                raise ValueError(
-                    f"--plans must have a plan for each of the 50 tasks, they lack {len(missing)}: "
-                    f"{', '.join(missing[:5])}{', ...' if len(missing) > 5 else ''}; --plans MT50 "
-                    f"{' '.join(self.sources)} takes ours for these"
-                )
+                lack = f"{len(missing)}: {', '.join(missing[:5])}{', ...' if len(missing) > 5 else ''}"
+                mend = f"--plans MT50 {' '.join(self.sources)} takes ours for these"
+                raise ValueError(f"--plans must have a plan for each of the 50 tasks, they lack {lack}; {mend}")
             self.known[skills] = found
         return self.known[skills]
 
