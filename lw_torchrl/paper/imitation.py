@@ -20,15 +20,9 @@ from lw_torchrl.modules import ActorEnsemble, ScriptedSkillActor
 from lw_torchrl.modules.policy import METHODS, Policy, make_policy, policy_class
 from lw_torchrl.paper.recipes import DataSetting, Execution, Member, Preset
 from lw_torchrl.paper.runs import Dataset, Run, Work, load_evaluation, own_tasks, plain
-from lw_torchrl.training import (
-    BehavioralCloningConfig,
-    BehavioralCloningTrainer,
-    StackedBehavioralCloning,
-    load_actor,
-    save_actor,
-)
+from lw_torchrl.training import BehavioralCloningConfig, BehavioralCloningTrainer, StackedBehavioralCloning
 from lw_torchrl.training.envelope import check_description
-from lw_torchrl.training.files import describe_data
+from lw_torchrl.training.files import describe_data, load_actor, save_actor
 from lw_torchrl.transforms import RandomYaw
 
 SCRIPTED = "scripted"
@@ -120,20 +114,14 @@ class ImitationRun(Run):
         described: dict[str, Any] = {"method": self.method, "seed": self.seed}
         described["plans"] = plans.fingerprint if self.reads_plans else None
         if self.method != SCRIPTED:
-            described |= {
-                "setting": self.setting.name,
-                "preset": self.preset.name,
-                "datasets": [asdict(dataset) for dataset in self.datasets],
-                "members": [
-                    {"actor": self.actor_options(one), "yaw": one.yaw}
-                    | ({"any_yaw": True} if self.any_yaw(one) else {})
-                    for one in self.preset.members
-                ],
-                "training": self.preset.training.describe(),
-                "label": self.preset.label,
-                "after_success": self.preset.after_success,
-                "passes": self.preset.passes,
-            }
+            described |= {"setting": self.setting.name, "preset": self.preset.name}
+            described["datasets"] = [asdict(dataset) for dataset in self.datasets]
+            described["members"] = [
+                {"actor": self.actor_options(one), "yaw": one.yaw} | ({"any_yaw": True} if self.any_yaw(one) else {})
+                for one in self.preset.members
+            ]
+            described["training"] = self.preset.training.describe()
+            described |= {name: getattr(self.preset, name) for name in ("label", "after_success", "passes")}
             if self.preset.evaluations > 1:
                 described["evaluations"] = self.preset.evaluations
         if not self.reads_plans:
@@ -147,9 +135,7 @@ class ImitationRun(Run):
             return ScriptedSkillActor(work.plans), {}
         targets = None if self.setting.targets is None else resolve_tasks(self.setting.targets)
         folder, described = work.out / self.folder, {"run": self.describe(work.plans)}
-        files = [folder / "policy.zip"]
-        if targets is not None:
-            files = [folder / "models" / f"{target}.zip" for target in targets]
+        files = [folder / "models" / f"{target}.zip" for target in targets or ()] or [folder / "policy.zip"]
         policies = []
         if all(file.is_file() for file in files):
             for file in files:
@@ -223,17 +209,10 @@ def _train_each(run: ImitationRun, work: Work, targets: Sequence[str]) -> Traine
     for number, member in enumerate(run.preset.members):
         config = _config(run, rows, 1_000 * run.seed + len(targets) * number)
         actors = [_make_actor(run, member, work, config.seed + i) for i in range(len(targets))]
-        replays = [
-            _replay(
-                run,
-                work,
-                roots,
-                episodes=[None, {target: 1}],
-                sampler=CoLearningSampler(target),
-                transform=_transform(run, actor, member),
-            )
-            for target, actor in zip(targets, actors, strict=True)
-        ]
+        replays = []
+        for target, actor in zip(targets, actors, strict=True):
+            rows_of = {"episodes": [None, {target: 1}], "transform": _transform(run, actor, member)}
+            replays.append(_replay(run, work, roots, sampler=CoLearningSampler(target), **rows_of))
         members.append(actors)
         trainer = StackedBehavioralCloning(actors, replays, config, **_options(run, number, work))
         _train(trainer, run, dict(zip(targets, actors, strict=True)), work)

@@ -61,14 +61,9 @@ class BehaviourDataset(Dataset):
     @property
     def options(self) -> dict[str, Any]:
         behaviour = self.portion.behaviour
-        return {
-            "tasks": TASK_SETS[self.tasks],
-            "episodes_per_task": self.portion.episodes,
-            "policy": behaviour,
-            "seed": _SEEDS * list(BEHAVIOURS).index(behaviour) + self.seed,
-            "max_steps": self.max_steps,
-            **NOISE[behaviour],
-        }
+        seed = _SEEDS * list(BEHAVIOURS).index(behaviour) + self.seed
+        found = {"tasks": TASK_SETS[self.tasks], "episodes_per_task": self.portion.episodes, "policy": behaviour}
+        return {**found, "seed": seed, "max_steps": self.max_steps, **NOISE[behaviour]}
 
 
 @dataclass(frozen=True)
@@ -106,18 +101,12 @@ class _Learned:
         return plain(asdict(self) | {"plans": own.fingerprint, "data": data} | own_tasks(own))
 
     def _replay(self, plans: Plans, out: Path, n_steps: bool, **options: Any) -> LanguageWorldExperienceReplay:
-        recipe = self.recipe
+        recipe, roots = self.recipe, [out / dataset.folder for dataset in self.datasets]
         if n_steps:
             options |= {"n_steps": recipe.n_steps, "gamma": recipe.gamma if recipe.n_steps > 1 else None}
-        return LanguageWorldExperienceReplay(
-            [out / dataset.folder for dataset in self.datasets],
-            label="executed",
-            terminate_on_success=True,
-            reward=recipe.reward,
-            sampler=TaskBalancedSampler(),
-            transform=QAFTransform(plans),
-            **options,
-        )
+        options |= {"label": "executed", "terminate_on_success": True, "reward": recipe.reward}
+        sampler, transform = TaskBalancedSampler(), QAFTransform(plans)
+        return LanguageWorldExperienceReplay(roots, sampler=sampler, transform=transform, **options)
 
     def _config(self, steps: int) -> OfflineConfig:
         return OfflineConfig(steps=steps, batch_size=self.recipe.batch_size, seed=self.seed)
@@ -166,9 +155,8 @@ class Advantages(_Learned):
         OfflineTrainer(loss, replay, config, checkpoint=checkpoint, progress=progress, title=title).train()
         starts = range(0, len(replay), _CHUNK)
         chunks = [replay[start : min(start + _CHUNK, len(replay))] for start in starts]
-        found = standardize_by_task(
-            torch.cat([loss.advantage(chunk) for chunk in chunks]), torch.cat([chunk["task_id"] for chunk in chunks])
-        )
+        advantages = torch.cat([loss.advantage(chunk) for chunk in chunks])
+        found = standardize_by_task(advantages, torch.cat([chunk["task_id"] for chunk in chunks]))
         write_archive(file, described, {"advantages": {"advantage": found}})
         checkpoint.unlink()
 

@@ -24,15 +24,8 @@ from lw_torchrl.modules.residual_actor import ResidualActor
 from lw_torchrl.paper.imitation import ExpertDataset
 from lw_torchrl.paper.recipes import TARGET
 from lw_torchrl.paper.runs import Run, Work, execute_run, kept_policy, own_tasks, plain
-from lw_torchrl.training import (
-    LEARNERS,
-    BehavioralCloningConfig,
-    BehavioralCloningTrainer,
-    OnlineConfig,
-    OnlineTrainer,
-    load_actor,
-)
-from lw_torchrl.training.files import read_description
+from lw_torchrl.training import LEARNERS, BehavioralCloningConfig, BehavioralCloningTrainer, OnlineConfig, OnlineTrainer
+from lw_torchrl.training.files import load_actor, read_description
 
 START = "start"
 """The policy that is begun with: a run beside those of :data:`~lw_torchrl.training.LEARNERS`."""

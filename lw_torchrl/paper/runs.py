@@ -133,10 +133,9 @@ def load_evaluation(path: Path, run: Run, plans: Plans, tasks: Sequence[str] | N
     if tasks is not None:
         found, ours = found | {"tasks": result.config["tasks"]}, ours | {"tasks": [*tasks]}
     if different := differences(found, ours):
-        raise ValueError(
-            f"out: {str(path)!r} is of another configuration, it differs in {', '.join(different)}; choose another "
-            f"folder, or delete {run.folder} there to do the run again"
-        )
+        mend = f"choose another folder, or delete {run.folder} there to do the run again"
+        how = f"it differs in {', '.join(different)}"
+        raise ValueError(f"out: {str(path)!r} is of another configuration, {how}; {mend}")
     return result
 
 
