@@ -29,12 +29,8 @@ def tasks(
 
     known = options.read_tasks(task_file)
     rows = [
-        {
-            "task": name,
-            "mt10": name in lw.MT10,
-            "description": known[name].description,
-            "objects": [{"name": one.name, "ours": one.ours} for one in known[name].objects[1:]],
-        }
+        {"task": name, "mt10": name in lw.MT10, "description": known[name].description}
+        | {"objects": [{"name": one.name, "ours": one.ours} for one in known[name].objects[1:]]}
         for name in lw.language.tasks.resolve_tasks(options.one_or_many(names) or list(known), tasks=known)
     ]
 
@@ -127,13 +123,8 @@ def plans(
             for name in chosen
             for number, (step, one) in enumerate(zip(loaded[name].steps, plan_roles(loaded[name]), strict=True), 1)
         ]
-        columns: Columns = {
-            "task": "task",
-            "skill": "skill",
-            "moved": lambda row: row["moved"] or "?",
-            "target": lambda row: row["target"] or "?",
-            "told by": "told_by",
-        }
+        objects: Columns = {"moved": lambda row: row["moved"] or "?", "target": lambda row: row["target"] or "?"}
+        columns: Columns = {"task": "task", "skill": "skill", **objects, "told by": "told_by"}
         output.table("steps", told, columns, counted(len(told), "step"))
         return output
     rows = [_written(loaded[name]) for name in chosen]

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
+from lw_torchrl._checks import check_choice
 from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Output
 from lw_torchrl.cli.plan_models import generate, repair
@@ -53,7 +54,6 @@ def check(
             --task and --format.
     """
     import lw_torchrl as lw
-    from lw_torchrl._checks import check_choice
     from lw_torchrl._files import read_text
     from lw_torchrl.language.tasks import check_task
 
@@ -79,15 +79,10 @@ def check(
     output = Output(json)
     steps = [step for step in found.decoded.steps if not step.dropped]
     rows = [
-        {
-            "condition": str(step.condition),
-            "skill": step.written_skill,
-            "scripted": step.scripted,
-            "expert": None if found.expert is None else found.expert.true[k],
-            "own": None if found.own is None else found.own.true[k],
-            "chosen": None if found.own is None else found.own.chosen[k],
-            "never": k in found.never,
-        }
+        {"condition": str(step.condition), "skill": step.written_skill, "scripted": step.scripted}
+        | {"expert": None if found.expert is None else found.expert.true[k]}
+        | {"own": None if found.own is None else found.own.true[k]}
+        | {"chosen": None if found.own is None else found.own.chosen[k], "never": k in found.never}
         for k, step in enumerate(steps)
     ]
     output.show("task", found.task, str(found))

@@ -99,10 +99,9 @@ def train(
     encoder = options.read_encoder(text_encoder)
     actor_options: dict[str, Any] = {"features": features, "width": width, "depth": depth}
     reads_plans = policy_class(modules.METHODS[method].policy).plan_options
-    if mix is not None and not reads_plans:
-        raise ValueError(f"--mix is for a method that reads plans, --method {method} does not")
-    if latent_consistency and not reads_plans:
-        raise ValueError(f"--latent-consistency is for a method that reads plans, --method {method} does not")
+    for option, value in (("--mix", mix), ("--latent-consistency", latent_consistency)):
+        if value and not reads_plans:
+            raise ValueError(f"{option} is for a method that reads plans, --method {method} does not")
     if reads_plans:
         actor_options["mix"] = mix or "latents"
     numbers: dict[str, Any] = {"steps": steps, "batch_size": batch_size, "learning_rate": learning_rate, "seed": seed}
