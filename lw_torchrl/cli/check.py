@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
-from lw_torchrl._checks import counted
-from lw_torchrl.cli.options import Json, SkillFile, TaskFile, read_skills, read_tasks
+from lw_torchrl._checks import counted, nearest
+from lw_torchrl.cli.options import File, Json, SkillFile, TaskFile, read_skills, read_tasks
 from lw_torchrl.cli.output import Output
 
 if TYPE_CHECKING:
@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 
 def check(
-    file: Positional[Annotated[Path, arg(metavar="FILE")]],
+    file: Positional[File],  # a .plan file, a folder of them, or a .toml file of skills or of tasks
     /,
-    task: str | None = None,
+    task: str | None = None,  # the task that a plan must be for
     skill_file: SkillFile = None,
     task_file: TaskFile = None,
     json: Json = False,
@@ -29,10 +29,6 @@ def check(
     """Validate a file of plans, skills or tasks of your own: what is wrong, where, and the nearest allowed text.
 
     Example: lw-torchrl check my-plans/push.plan
-
-    Args:
-        file: a .plan file, a folder of them, or a .toml file of skills or of tasks.
-        task: the task that a plan must be for.
     """
     import lw_torchrl as lw
     from lw_torchrl._files import read_text
@@ -79,7 +75,6 @@ def check(
 def _check_table(file: Path, known: Mapping[str, Task], hint: str) -> tuple[str, int, list[str]]:
     """What a file is a table of, of how many, and what is noted of them."""
     import lw_torchrl as lw
-    from lw_torchrl._checks import nearest
     from lw_torchrl._files import read_toml
 
     rows = read_toml(file, ValueError)
@@ -87,10 +82,8 @@ def _check_table(file: Path, known: Mapping[str, Task], hint: str) -> tuple[str,
     if any(isinstance(row, dict) and ("description" in row or "objects" in row) for row in rows.values()):
         lw.load_tasks(file)
         for name in sorted(set(rows) - set(lw.TASKS)):
-            close = nearest(name, lw.TASKS, n=1)
-            notes.append(
-                f"task {name!r} is none of the simulator's" + (f"; did you mean {close[0]!r}?" if close else "")
-            )
+            hint = "".join(f"; did you mean {close!r}?" for close in nearest(name, lw.TASKS, n=1))
+            notes.append(f"task {name!r} is none of the simulator's{hint}")
         return "task", len(rows), notes
     table = lw.load_skills(file, tasks=known)
     for text in rows:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from statistics import median, quantiles
-from textwrap import fill
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from textwrap import TextWrapper
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from tyro.conf import Positional, arg
 
@@ -21,31 +20,25 @@ if TYPE_CHECKING:
     from lw_torchrl.modules.policy import Policy
 
 
-@dataclass(frozen=True)
-class _Episode:
-    """What is told of an episode: who acted, how it is described, its dense return."""
-
+class _Episode(NamedTuple):
     behaviour: str
     info: EpisodeInfo
-    earned: float
-
-
-_WIDTH = 120
+    earned: float  # the dense return
 
 
 def collect(
-    tasks: Positional[Annotated[tuple[str, ...], arg(metavar="TASKS ...")]],
+    tasks: Positional[Annotated[tuple[str, ...], arg(metavar="TASKS ...")]],  # MT10, MT50, or names of tasks
     /,
-    out: Path,
-    episodes: int = 10,
-    seed: int = 0,
-    noise: tuple[float, ...] = (0.0,),
-    noise_hold: int = 10,
-    gripper_noise: float = 0.2,
-    redraw_failures: bool = False,
+    out: Path,  # the dataset's folder
+    episodes: int = 10,  # kept for each task
+    seed: int = 0,  # evaluate on another one
+    noise: tuple[float, ...] = (0.0,),  # standard deviations of the execution noise, used in turn, one per episode
+    noise_hold: int = 10,  # steps for which each draw of the noise is kept; a longer one leads further from the path
+    gripper_noise: float = 0.2,  # factor of the noise on the gripper, which makes grasps fail
+    redraw_failures: bool = False,  # keep successful episodes only
     policy: str = "expert",
-    behaviour: str | None = None,
-    num_envs: int | None = None,
+    behaviour: str | None = None,  # the label of its episodes; by default the name of who acts, or of the policy's file
+    num_envs: int | None = None,  # environments stepped together; the dataset does not depend on it
     json: options.Json = False,
 ) -> Output:
     """Collect demonstrations of the scripted experts, or of others. If it is stopped, the same command resumes it.
@@ -53,19 +46,9 @@ def collect(
     Example: lw-torchrl collect MT10 --out demos/mt10 --noise 0 0.1 0.2 --redraw-failures
 
     Args:
-        tasks: MT10, MT50, or names of tasks.
-        out: the dataset's folder.
-        episodes: kept for each task.
-        seed: evaluate on another one.
-        noise: standard deviations of the execution noise, used in turn, one per episode.
-        noise_hold: steps for which each draw of the noise is kept; a longer one leads further from the path.
-        gripper_noise: factor of the noise on the gripper, which makes grasps fail.
-        redraw_failures: keep successful episodes only.
         policy: who acts: expert, Meta-World's scripts; scripted, plans with scripted skills; spoilt-60 or spoilt-30,
             the same in so many of 100 pieces of an episode; wrong, any skill of the plan; random; or a policy's file,
             of `lw-torchrl train`.
-        behaviour: the label of its episodes; by default the name of who acts, or of the policy's file.
-        num_envs: environments stepped together; the dataset does not depend on it.
     """
     options.check_folder("--out", out)
     options.check_actor("policy", policy)
@@ -80,23 +63,12 @@ def collect(
 
         options.use_one_thread()
         acts, behaviour = load_actor(policy), behaviour or Path(policy).stem
-    made = collect_demonstrations(
-        chosen,
-        episodes_per_task=episodes,
-        root=out,
-        seed=seed,
-        noise_scale=noise,
-        noise_hold=noise_hold,
-        gripper_noise_factor=gripper_noise,
-        redraw_failures=redraw_failures,
-        policy=acts,
-        behaviour=behaviour,
-        num_envs=num_envs,
-    )
+    how: dict[str, Any] = {"policy": acts, "behaviour": behaviour, "redraw_failures": redraw_failures, "seed": seed}
+    how |= {"noise_scale": noise, "noise_hold": noise_hold, "gripper_noise_factor": gripper_noise}
+    made = collect_demonstrations(chosen, episodes_per_task=episodes, root=out, num_envs=num_envs, **how)
     output = Output(json)
-    rows = [
-        {"task": task, "success": rate, "episodes_run": made.attempts[task]} for task, rate in made.success_rate.items()
-    ]
+    rates, runs = made.success_rate, made.attempts
+    rows = [{"task": task, "success": rate, "episodes_run": runs[task]} for task, rate in rates.items()]
     columns: Columns = {"task": "task", "success": lambda row: f"{row['success']:.2f}", "episodes run": "episodes_run"}
     output.table("tasks", rows, columns)
     output.show("dataset", made.root)
@@ -105,20 +77,15 @@ def collect(
 
 
 def data(
-    action: Positional[Annotated[Literal["show"], arg(metavar="show")]],
-    folders: Positional[Annotated[tuple[Path, ...], arg(metavar="FOLDERS ...")]],
+    action: Positional[Annotated[Literal["show"], arg(metavar="show")]],  # the word show
+    folders: Positional[Annotated[tuple[Path, ...], arg(metavar="FOLDERS ...")]],  # of `lw-torchrl collect`
     /,
-    check: bool = False,
+    check: bool = False,  # also read them through against their checksums
     json: options.Json = False,
 ) -> Output:
     """Show what datasets hold: who acted, in what, how often it succeeded, what it earned. Several are a mixture.
 
     Example: lw-torchrl data show demos/mt10 demos/spoilt --check
-
-    Args:
-        action: the word show.
-        folders: of `lw-torchrl collect`.
-        check: also read them through against their checksums.
     """
     if not folders:
         raise ValueError("folders must name at least one dataset")
@@ -126,20 +93,21 @@ def data(
         options.check_dataset("folders", folder)
     from lw_torchrl.data.dataset import read_metadata
     from lw_torchrl.data.replay_checks import check_behaviours
+    from lw_torchrl.data.selection import returns_of
 
     output = Output(json)
     parts = [read_metadata(folder) for folder in folders]
     check_behaviours(parts)
     told: list[_Episode] = []
     for part in parts:
-        told += _episodes(part)
+        earned = returns_of(part, part, "dense", None)[:, 0].tolist()
+        told += [_Episode(part.config.behaviour, *pair) for pair in zip(part.episodes, earned, strict=True)]
         if not json:
             print("\n".join(_about(part)) + "\n")
     output.show("datasets", [_described(part) for part in parts])
     every = [] if json else [_row("all", told)]
-    mixed = len(parts) > 1
-    _table(output, "task", _by(told, lambda one: one.info.task), [] if mixed else every)
-    if mixed:
+    _table(output, "task", _by(told, lambda one: one.info.task), [] if len(parts) > 1 else every)
+    if len(parts) > 1:
         if not json:
             print()
         _table(output, "behaviour", _by(told, lambda one: one.behaviour), every)
@@ -154,13 +122,6 @@ def _by(told: list[_Episode], key: Callable[[_Episode], str]) -> dict[str, list[
     for one in told:
         found.setdefault(key(one), []).append(one)
     return dict(sorted(found.items()))
-
-
-def _episodes(part: Demonstrations) -> list[_Episode]:
-    from lw_torchrl.data.selection import returns_of
-
-    earned = returns_of(part, part, "dense", None)[:, 0].tolist()
-    return [_Episode(part.config.behaviour, *pair) for pair in zip(part.episodes, earned, strict=True)]
 
 
 def _described(part: Demonstrations) -> dict[str, Any]:
@@ -192,12 +153,8 @@ def _about(part: Demonstrations) -> list[str]:
         "noise": noise,
         "made with": ", ".join(f"{name}\N{NO-BREAK SPACE}{version}" for name, version in part.versions.items()),
     }
-    return [_wrapped(f"{name:10} {line}") for name, line in lines.items()]
-
-
-def _wrapped(line: str) -> str:
-    found = fill(line, _WIDTH, subsequent_indent=" " * 11, break_long_words=False, break_on_hyphens=False)
-    return found.replace("\N{NO-BREAK SPACE}", " ")
+    fit = TextWrapper(120, subsequent_indent=" " * 11, break_long_words=False, break_on_hyphens=False)
+    return [fit.fill(f"{name:10} {line}").replace("\N{NO-BREAK SPACE}", " ") for name, line in lines.items()]
 
 
 def _acted(who: Behaviour) -> str:
@@ -266,9 +223,8 @@ def _check(output: Output, parts: list[Demonstrations]) -> None:
     for part in parts:
         if broken := len(part.episodes) - len(whole_episodes(part, progress=True)):
             damaged.append({"folder": part.root, "episodes": broken})
-            output.fault = output.fault or (
-                f"{str(part.root)!r} is damaged: {broken} of {counted(len(part.episodes), 'episode')} differ from "
-                "their checksums; the same collect_demonstrations runs these again"
-            )
+            share = f"{broken} of {counted(len(part.episodes), 'episode')} differ from their checksums"
+            mend = "the same collect_demonstrations runs these again"
+            output.fault = output.fault or f"{str(part.root)!r} is damaged: {share}; {mend}"
     sound = f"\nchecked: all rows of {counted(len(parts), 'dataset')} are as they were written"
     output.show("damaged", damaged, None if damaged else sound)

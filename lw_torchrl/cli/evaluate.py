@@ -19,21 +19,21 @@ if TYPE_CHECKING:
 
 
 def evaluate(
-    checkpoint: Positional[Annotated[Path, arg(metavar="CHECKPOINT")]],
+    checkpoint: Positional[Annotated[Path, arg(metavar="CHECKPOINT")]],  # of `lw-torchrl train`, or the word expert
     /,
-    tasks: tuple[str, ...] = (),
+    tasks: tuple[str, ...] = (),  # MT10, MT50, or names; if none, those of --plans, or else those it was trained on
     plans: tuple[str, ...] = (),
     task_file: options.TaskFile = None,
     text_encoder: options.OwnEncoder = None,
-    episodes: int = 20,
-    seed: int = 1000,
-    noise: float = 0.1,
-    stop_at_success: bool = False,
-    num_envs: int | None = None,
-    attribute: bool = False,
-    reference: tuple[str, ...] = (),
-    evaluator: Path | None = None,
-    out: Path | None = None,
+    episodes: int = 20,  # of each task
+    seed: int = 1000,  # fixes initial states, goals and noise; not one that the demonstrations used
+    noise: float = 0.1,  # standard deviation of the noise on the executed action
+    stop_at_success: bool = False,  # end an episode at its first success; any-step success stays the same
+    num_envs: int | None = None,  # environments stepped together; the result does not depend on it
+    attribute: bool = False,  # say why failed episodes failed: a query, the plan, a skill or time; they run again
+    reference: tuple[str, ...] = (),  # with --attribute, trusted plans to run failed episodes again, as for --plans
+    evaluator: Path | None = None,  # a network that answers the conditions, of `lw-torchrl train-evaluator`
+    out: Path | None = None,  # folder for results.json, success.png and rollout.rrd; with --attribute also failures.png
     device: options.Device = "cpu",
     json: options.Json = False,
 ) -> Output:
@@ -42,22 +42,8 @@ def evaluate(
     Example: lw-torchrl evaluate runs/mt10.zip --out runs/mt10
 
     Args:
-        checkpoint: of `lw-torchrl train`, or the word expert.
-        tasks: MT10, MT50, or names of tasks; if none is given, those of --plans, or else those that the policy was
-            trained on.
         plans: carry out these instead of the policy's own: MT10, MT50, .plan or .json files, or folders; where several
             have a plan for a task, the last one's counts.
-        episodes: of each task.
-        seed: fixes initial states, goals and noise; not one that the demonstrations used.
-        noise: standard deviation of the noise on the executed action.
-        stop_at_success: end an episode at its first success; any-step success stays the same.
-        num_envs: environments stepped together; the result does not depend on it.
-        attribute: say why each failed episode failed: a query, the plan, a skill or time. They are run again a few
-            times.
-        reference: with --attribute, trusted plans for running failed episodes again: MT10, MT50, .plan or .json files,
-            or folders.
-        evaluator: a network that answers the conditions, of `lw-torchrl train-evaluator`.
-        out: folder for results.json, success.png and rollout.rrd; with --attribute also failures.png.
     """
     if out is not None:
         options.check_folder("--out", out)
@@ -94,18 +80,10 @@ def evaluate(
         raise ValueError("--device is for a policy; the scripted experts work on the CPU")
     if attribute and (policy is None or policy.plans is None):
         raise ValueError(f"--attribute is for a policy with plans, {checkpoint} has none")
-    result = lw.evaluate(
-        policy or lw.ExpertActor(chosen),
-        tasks=chosen,
-        episodes_per_task=episodes,
-        seed=seed,
-        noise_scale=noise,
-        stop_at_success=stop_at_success,
-        num_envs=num_envs,
-        device=there,
-        attribute=attribute,
-        reference=options.read_plans(reference, known) if reference else None,
-    )
+    how: dict[str, Any] = {"tasks": chosen, "episodes_per_task": episodes, "seed": seed, "noise_scale": noise}
+    how |= {"stop_at_success": stop_at_success, "num_envs": num_envs, "device": there, "attribute": attribute}
+    trusted = options.read_plans(reference, known) if reference else None
+    result = lw.evaluate(policy or lw.ExpertActor(chosen), reference=trusted, **how)
     output = Output(json)
     output.result(result)
     if attribute:
@@ -152,31 +130,22 @@ def _default_tasks(policy: Policy, checkpoint: Path, *, trained: bool) -> tuple[
 
 
 def scripted(
-    names: Positional[Annotated[tuple[str, ...], arg(metavar="[NAMES ...]")]] = ("MT10",),
+    names: Positional[options.Names] = ("MT10",),  # MT10, MT50, or names of tasks
     /,
-    episodes: int = 50,
-    seed: int = 1000,
-    select: Literal["first", "random", "mix"] = "first",
-    noise: float = 0.0,
+    episodes: int = 50,  # of each task
+    seed: int = 1000,  # fixes initial states and goals
+    select: Literal["first", "random", "mix"] = "first",  # of true steps the first, a random one (the paper), or a mix
+    noise: float = 0.0,  # standard deviation of the noise on the executed action
     plans: options.PlanSources = ("MT50",),
     skill_file: options.SkillFile = None,
     task_file: options.TaskFile = None,
-    full: bool = False,
-    out: Path = Path("runs/scripted"),
+    full: bool = False,  # run all 500 steps, instead of stopping at the first success
+    out: Path = Path("runs/scripted"),  # folder for results.json, plan_use.json and success.png
     json: options.Json = False,
 ) -> Output:
     """Carry out plans with scripted skills, and say how each step fared: no training, no expert.
 
     Example: lw-torchrl scripted MT50 --episodes 50
-
-    Args:
-        names: MT10, MT50, or names of tasks.
-        episodes: of each task.
-        seed: fixes initial states and goals.
-        select: of several true steps, take the first, a random one, as in the paper, or mix them.
-        noise: standard deviation of the noise on the executed action.
-        full: run all 500 steps, instead of stopping at the first success.
-        out: folder for results.json, plan_use.json and success.png.
     """
     options.check_folder("--out", out)
     known = options.read_tasks(task_file)
@@ -190,16 +159,10 @@ def scripted(
     from lw_torchrl.evaluation.plan_use import PlanUse
 
     use = PlanUse(loaded)
-    result = lw.evaluate(
-        lw.ScriptedSkillActor(loaded, select, skills=skills),
-        tasks=chosen,
-        episodes_per_task=episodes,
-        seed=seed,
-        noise_scale=noise,
-        stop_at_success=not full,
-        also_record=["qaf", "skill_weights"],
-        on_episode=use,
-    )
+    actor = lw.ScriptedSkillActor(loaded, select, skills=skills)
+    how: dict[str, Any] = {"tasks": chosen, "episodes_per_task": episodes, "seed": seed, "noise_scale": noise}
+    how |= {"stop_at_success": not full, "also_record": ["qaf", "skill_weights"], "on_episode": use}
+    result = lw.evaluate(actor, **how)
     seen = use.tasks()
     steps = {
         task: [

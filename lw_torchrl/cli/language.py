@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def tasks(
-    names: Positional[Annotated[tuple[str, ...], arg(metavar="[NAMES ...]")]] = (),
+    names: Positional[options.Names] = (),  # MT10, MT50, or names of tasks; all there are if none is given
     /,
     task_file: options.TaskFile = None,
     json: options.Json = False,
@@ -24,20 +24,13 @@ def tasks(
     """List tasks: their descriptions, and the objects that queries can name.
 
     Example: lw-torchrl tasks MT10
-
-    Args:
-        names: MT10, MT50, or names of tasks; all there are if none is given.
     """
     import lw_torchrl as lw
 
     known = options.read_tasks(task_file)
     rows = [
-        {
-            "task": name,
-            "mt10": name in lw.MT10,
-            "description": known[name].description,
-            "objects": [{"name": one.name, "ours": one.ours} for one in known[name].objects[1:]],
-        }
+        {"task": name, "mt10": name in lw.MT10, "description": known[name].description}
+        | {"objects": [{"name": one.name, "ours": one.ours} for one in known[name].objects[1:]]}
         for name in lw.language.tasks.resolve_tasks(options.one_or_many(names) or list(known), tasks=known)
     ]
 
@@ -45,20 +38,15 @@ def tasks(
         return ", ".join(one["name"] + (" (ours)" if one["ours"] else "") for one in row["objects"])
 
     output = Output(json)
-    columns: Columns = {
-        "task": "task",
-        "MT10": "mt10",
-        "description": "description",
-        "objects beside the gripper": objects,
-    }
-    output.table("tasks", rows, columns, counted(len(rows), "task"))
+    columns: Columns = {"task": "task", "MT10": "mt10", "description": "description"}
+    output.table("tasks", rows, {**columns, "objects beside the gripper": objects}, counted(len(rows), "task"))
     return output
 
 
 def skills(
-    task: Positional[Annotated[str | None, arg(metavar="[TASK]")]] = None,
+    task: Positional[Annotated[str | None, arg(metavar="[TASK]")]] = None,  # only those that this task can use
     /,
-    nearest: str | None = None,
+    nearest: str | None = None,  # a text; the closest skill is shown
     skill_file: options.SkillFile = None,
     task_file: options.TaskFile = None,
     json: options.Json = False,
@@ -66,10 +54,6 @@ def skills(
     """List the scripted skills, or find the one closest to a text.
 
     Example: lw-torchrl skills push --nearest "grab the puck"
-
-    Args:
-        task: only those that this task can use.
-        nearest: a text; the closest skill is shown.
     """
     from lw_torchrl.language.named_objects import GRIPPER
     from lw_torchrl.language.nearest import nearest_skill
@@ -81,8 +65,7 @@ def skills(
     output = Output(json)
     if nearest is not None:
         skill, score = nearest_skill(nearest, definition, table)
-        found = {"skill": skill.text, "similarity": score}
-        output.show("nearest", found, f"{skill.text}   (similarity {score:.2f})")
+        output.show("nearest", {"skill": skill.text, "similarity": score}, f"{skill.text}   (similarity {score:.2f})")
         return output
     rows = []
     for skill in table.values():
@@ -108,10 +91,10 @@ def _numbers(values: Iterable[float]) -> str:
 
 
 def plans(
-    names: Positional[Annotated[tuple[str, ...], arg(metavar="[NAMES ...]")]] = (),
+    names: Positional[options.Names] = (),  # MT10, MT50, or names of tasks
     /,
     plans: options.PlanSources = ("MT50",),
-    skill_set: Literal["own", "MT10"] = "own",
+    skill_set: Literal["own", "MT10"] = "own",  # of shipped plans: with scripted skills of their own, or MT10's words
     roles: bool = False,
     task_file: options.TaskFile = None,
     json: options.Json = False,
@@ -121,8 +104,6 @@ def plans(
     Example: lw-torchrl plans drawer-open --roles
 
     Args:
-        names: MT10, MT50, or names of tasks.
-        skill_set: of the shipped plans, those with scripted skills of their own, or those worded as MT10's are.
         roles: a table of the steps, what each moves and what it goes to, and what told: "skill", the text is a scripted
             skill's; "words", the text's; "condition", the things that it compares; "nothing".
     """
@@ -142,13 +123,8 @@ def plans(
             for name in chosen
             for number, (step, one) in enumerate(zip(loaded[name].steps, plan_roles(loaded[name]), strict=True), 1)
         ]
-        columns: Columns = {
-            "task": "task",
-            "skill": "skill",
-            "moved": lambda row: row["moved"] or "?",
-            "target": lambda row: row["target"] or "?",
-            "told by": "told_by",
-        }
+        objects: Columns = {"moved": lambda row: row["moved"] or "?", "target": lambda row: row["target"] or "?"}
+        columns: Columns = {"task": "task", "skill": "skill", **objects, "told by": "told_by"}
         output.table("steps", told, columns, counted(len(told), "step"))
         return output
     rows = [_written(loaded[name]) for name in chosen]
@@ -170,21 +146,16 @@ def _written(plan: ConditionalPlan) -> dict[str, Any]:
 
 
 def queries(
-    task: Positional[Annotated[str, arg(metavar="TASK")]],
-    text: Positional[Annotated[str | None, arg(metavar="[TEXT]")]] = None,
+    task: Positional[Annotated[str, arg(metavar="TASK")]],  # a task's name
+    text: Positional[options.Text] = None,  # any words; what the query answering function makes of them is shown
     /,
-    by: Literal["edit", "embedding"] = "edit",
+    by: Literal["edit", "embedding"] = "edit",  # closest in spelling, or in meaning, which wants the extra [text]
     task_file: options.TaskFile = None,
     json: options.Json = False,
 ) -> Output:
     """List a task's base queries, or find the one closest to a text.
 
     Example: lw-torchrl queries push "the gripper touches the puck"
-
-    Args:
-        task: a task's name.
-        text: any words; what the query answering function makes of them is shown.
-        by: closest in spelling, or in meaning, which wants the extra [text].
     """
     import lw_torchrl as lw
     from lw_torchrl.language.nearest import nearest_query
@@ -207,25 +178,18 @@ def queries(
 
 
 def query(
-    task: Positional[Annotated[str, arg(metavar="TASK")]],
-    text: Positional[Annotated[str | None, arg(metavar="[TEXT]")]] = None,
+    task: Positional[Annotated[str, arg(metavar="TASK")]],  # a task's name
+    text: Positional[options.Text] = None,  # the query; without one, all supported queries that hold are listed
     /,
-    step: int = 0,
-    seed: int = 0,
-    episode: int = 0,
+    step: int = 0,  # how many steps the expert does first, 0 to 500
+    seed: int = 0,  # of the episode
+    episode: int = 0,  # its index
     task_file: options.TaskFile = None,
     json: options.Json = False,
 ) -> Output:
     """Answer a query on a state of a task: the state after so many steps of the scripted expert.
 
     Example: lw-torchrl query pick-place "Is the gripper open and not above the puck?" --step 40
-
-    Args:
-        task: a task's name.
-        text: the query; without one, all supported queries that hold are listed.
-        step: how many steps the expert does first, 0 to 500.
-        seed: of the episode.
-        episode: its index.
     """
     import lw_torchrl as lw
     from lw_torchrl._checks import check_int
@@ -234,11 +198,8 @@ def query(
     known = options.read_tasks(task_file)
     (name,) = options.simulated("task", [check_task(task, known)], known)
     definition = known[name]
-    listed = (
-        [lw.parse_query(text, definition)]
-        if text is not None
-        else [lw.parse_query(q, definition) for q in lw.supported_queries(definition)]
-    )
+    asked = lw.supported_queries(definition) if text is None else [text]
+    listed = [lw.parse_query(one, definition) for one in asked]
     if check_int("step", step, minimum=0) > 500:
         raise ValueError(f"step must be at most 500, got {step}")
     env = lw.LanguageWorldEnv(name, seed=seed)
@@ -254,9 +215,8 @@ def query(
     opening = state["observation"][0, 3].item()
     output.show("opening", opening, f"the gripper's opening       {opening:7.3f}\n")
     answers = [{"query": str(found), "holds": truth} for found, truth in zip(listed, truths, strict=True)]
+    said = [one["query"] for one in answers if one["holds"]]
     if text is not None:
         said = [f"{'yes' if one['holds'] else 'no'}: {one['query']}" for one in answers]
-    else:
-        said = [one["query"] for one in answers if one["holds"]]
     output.show("queries", answers, "\n".join(said))
     return output

@@ -1,6 +1,7 @@
 """The command line, ``lw-torchrl``: each command is a function, and its docstring the help text.
 
-A command returns what it found, an :class:`~lw_torchrl.cli.output.Output`, where it has ``--json``.
+What an argument is, a comment beside it says, or the docstring if it takes more words. A command returns what it
+found, an :class:`~lw_torchrl.cli.output.Output`, where it has ``--json``.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from lw_torchrl.cli.check import check
 from lw_torchrl.cli.offline import offline
 from lw_torchrl.cli.online import online
 from lw_torchrl.cli.output import Output, check_arguments, complain, nobody_reads, sound_streams
-from lw_torchrl.cli.parsing import in_its_words, parse, unpadded
+from lw_torchrl.cli.parsing import document, in_its_words, parse, unpadded
 from lw_torchrl.cli.train import train
 from lw_torchrl.cli.train_evaluator import train_evaluator
 
@@ -95,6 +96,8 @@ def _run(given: Sequence[str]) -> None:
         if args and (args[0] in ("-h", "--help") or args[0].startswith("--tyro-")):
             about = COMMANDS[group].__doc__ if group else ABOUT
             with unpadded():
+                for command in table.values():
+                    document(command)
                 tyro.extras.subcommand_cli_from_dict(table, prog=prog, description=about, args=args)
         else:
             name = _command(prog, args, table)

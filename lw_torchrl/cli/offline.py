@@ -25,17 +25,17 @@ OfflineMethod = Literal["advantage", "filtered-bc", "best-bc", "bc", "iql", "td3
 def offline(
     table: Positional[Table],
     /,
-    schedule: Scheduled,
-    seeds: tuple[int, ...] = (0, 1, 2),
-    mixtures: tuple[Mixture, ...] = (),
-    methods: tuple[OfflineMethod, ...] = (),
+    schedule: Scheduled,  # which runs are done, and where
+    seeds: tuple[int, ...] = (0, 1, 2),  # of the data, the initial weights and the minibatches
+    mixtures: tuple[Mixture, ...] = (),  # only these of the table's, B, W, C
+    methods: tuple[OfflineMethod, ...] = (),  # only these of the table's
     plans: PlanSources = ("MT10",),
     reward: Literal["sparse", "cost", "dense_cost"] | None = None,
-    beta: float | None = None,
-    distance: Literal["l1", "l2"] | None = None,
-    steps: int | None = None,
-    episodes: int = 20,
-    out: Path = Path("runs/offline"),
+    beta: float | None = None,  # how sharply advantages weigh, instead of the recipe's
+    distance: Literal["l1", "l2"] | None = None,  # between actions, in methods that imitate, instead of the recipe's
+    steps: int | None = None,  # minibatches of each network, instead of the recipe's
+    episodes: int = 20,  # evaluated for each task, on seeds that no data has, action noise 0.1
+    out: Path = Path("runs/offline"),  # where everything goes; on a cluster, a folder that all its machines share
     json: Json = False,
 ) -> Output:
     """Learn policies offline, from scripts that were spoilt, and compare the methods.
@@ -53,17 +53,8 @@ def offline(
         table: methods, seven of them on plans, in five tasks; conditioning, plans, descriptions or numbers of tasks,
             for the policy and for its critic; mt10, the best method in all of MT10; quick, two tasks, to try it; or all
             but the last.
-        schedule: which runs are done, and where.
-        seeds: of the data, the initial weights and the minibatches.
-        mixtures: only these of the table's, B, W, C.
-        methods: only these of the table's: advantage, filtered-bc, best-bc, bc, iql, td3-bc, cql.
         reward: what values are of, instead of the recipe's: sparse, the success; cost, of each step; dense_cost, what
             Meta-World's dense reward lacks.
-        beta: how sharply advantages weigh, instead of the recipe's.
-        distance: between actions, in the methods that imitate, instead of the recipe's.
-        steps: minibatches of each network, instead of the recipe's.
-        episodes: evaluated for each task, on seeds that no data has, action noise 0.1.
-        out: where everything goes; on a cluster, a folder that all its machines share.
     """
     schedule.check(out)
     known = read_plans(plans, read_tasks(None))
@@ -77,10 +68,8 @@ def offline(
     tables: dict[str, list[OfflineRun]] = {}
     for name in [name for name in OFFLINE_TABLES if name != "quick"] if table == "all" else [table]:
         every = offline_runs(OFFLINE_TABLES[name], seeds, recipe, episodes)
-        wanted = [
-            one for one in every if (not mixtures or one.mixture in mixtures) and (not methods or one.method in methods)
-        ]
-        if wanted:
+        every = [one for one in every if not mixtures or one.mixture in mixtures]
+        if wanted := [one for one in every if not methods or one.method in methods]:
             tables[name] = wanted
     if not tables:
         raise ValueError(f"--mixtures and --methods leave nothing of {table}")

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
+from lw_torchrl._checks import counted, shown
 from lw_torchrl.cli.options import Json, PlanSources, check_saved, make_logger, one_or_many, read_plans, simulated
 from lw_torchrl.cli.output import Output
 from lw_torchrl.cli.runs import Job, Scheduled
@@ -24,20 +25,20 @@ WEAKEST = "weakest"
 
 
 def online(
-    tasks: Positional[tuple[str, ...]],
+    tasks: Positional[tuple[str, ...]],  # each gets a policy of its own: names, MT10 or MT50
     /,
-    schedule: Scheduled,
+    schedule: Scheduled,  # which runs are done, and where
     methods: tuple[OnlineMethod, ...] = ("td3", "expert-iteration"),
-    seeds: tuple[int, ...] = (0, 1, 2),
-    frames: int = 60_000,
-    demonstrations: int = 1,
-    start: Path | None = None,
-    condition: Literal["pcbc", "dc", "one-hot"] = "pcbc",
+    seeds: tuple[int, ...] = (0, 1, 2),  # of demonstrations, weights, episodes and minibatches
+    frames: int = 60_000,  # steps of the environment, the same for every method
+    demonstrations: int = 1,  # of each task, without noise
+    start: Path | None = None,  # a policy to begin with, of train; by default one is cloned from the demonstrations
+    condition: Literal["pcbc", "dc", "one-hot"] = "pcbc",  # that one is conditioned on plans, descriptions or numbers
     plans: PlanSources = ("MT50",),
-    episodes: int = 40,
+    episodes: int = 40,  # evaluated, on seeds that no training used, action noise 0.1
     step: str | None = None,
-    logger: Literal["none", "csv", "tensorboard", "wandb"] = "none",
-    out: Path = Path("runs/online"),
+    logger: Literal["none", "csv", "tensorboard", "wandb"] = "none",  # success and losses, to logs/ beside each policy
+    out: Path = Path("runs/online"),  # where everything goes; on a cluster, a folder that all its machines share
     json: Json = False,
 ) -> Output:
     """Train policies in their environment, beside demonstrations. If it is stopped, the same command resumes it.
@@ -49,24 +50,13 @@ def online(
     Example: lw-torchrl online peg-insert-side hammer --methods td3 expert-iteration --seeds 0 1 2
 
     Args:
-        tasks: each gets a policy of its own: names, MT10 or MT50.
-        schedule: which runs are done, and where.
         methods: td3, sac and residual (a small network that corrects the start), half of each minibatch demonstrations;
             ppo; expert-iteration, behavioral cloning of demonstrations and of own successes. The first is compared with
             the others, and with the start.
-        seeds: of demonstrations, weights, episodes and minibatches.
-        frames: steps of the environment, the same for every method.
-        demonstrations: of each task, without noise.
-        start: a policy to begin with, as train writes it; by default one is cloned from the demonstrations.
-        condition: what that one is conditioned on: plans, the task's description, its number.
-        episodes: evaluated, on seeds that no training used, action noise 0.1.
         step: of residual, correct the actions in this step of the task's plan alone, by 1 at most, and leave all others
             as they are: its number, from 1, or weakest, the one that failed episodes reached and did not pass.
-        logger: also log success and losses, to a folder logs beside each policy.
-        out: where everything goes; on a cluster, a folder that all its machines share.
     """
     schedule.check(out)
-    from lw_torchrl._checks import counted
     from lw_torchrl.language.tasks import TASKS
 
     if start is not None:
@@ -107,20 +97,12 @@ def online(
     command += ["--condition", condition, "--episodes", episodes, "--logger", logger]
     for option, value in (("--start", start), ("--step", step)):
         command += [] if value is None else [option, value]
-    return schedule.execute(
-        Output(json),
-        [],
-        [starts, others],
-        command,
-        lambda: {str(runs[0].group): _summarize(runs, found, out)},
-        lambda result: _told_of_step(result.config),
-    )
+    summarize = partial(_summarize, runs, found, out)
+    return schedule.execute(Output(json), [], [starts, others], command, summarize, _told_of_step)
 
 
 def _read_step(given: str) -> int | str:
     """A step's number, counted from 0, or the word for the weakest."""
-    from lw_torchrl._checks import shown
-
     if given == WEAKEST:
         return given
     if not given.isascii() or not given.isdigit() or not 1 <= len(given) <= 4 or int(given) < 1:
@@ -128,24 +110,22 @@ def _read_step(given: str) -> int | str:
     return int(given) - 1
 
 
-def _told_of_step(config: dict[str, Any]) -> str:
+def _told_of_step(result: EvaluationResult) -> str:
     """Of a run of one step: where failed episodes got stuck, which step was tuned, and what changed elsewhere."""
     from lw_torchrl.evaluation import StuckStep, stuck_table
 
+    config = result.config
     if "tuned" not in config:
         return ""
     tuned, elsewhere = config["tuned"], config["elsewhere"]
     lines = [stuck_table([StuckStep(**step) for step in tuned["stuck"]])] if "stuck" in tuned else []
     lines.append(f"tuned: step {tuned['step'] + 1}, {tuned['skill']}; success before {config['before']:.3f}")
-    lines.append(
-        f"{elsewhere['outside']} of {elsewhere['states']} states are outside of it: in {elsewhere['changed']} of them "
-        "the action has changed"
-    )
-    return "\n".join(lines)
+    share = f"{elsewhere['outside']} of {elsewhere['states']} states are outside of it"
+    return "\n".join([*lines, f"{share}: in {elsewhere['changed']} of them the action has changed"])
 
 
 def _summarize(runs: Sequence[OnlineRun], plans: Plans, out: Path) -> dict[str, Any]:
-    """A summary, tables and a figure, from the results on disk; returns what summary.json holds."""
+    """A summary, tables and a figure, from the results on disk; returns what summary.json holds, by its group."""
     from lw_torchrl.evaluation import plot_learning_curves
     from lw_torchrl.paper.online import START
     from lw_torchrl.paper.runs import compare, load_result, write_summary
@@ -178,4 +158,4 @@ def _summarize(runs: Sequence[OnlineRun], plans: Plans, out: Path) -> dict[str, 
     write_summary(folder / "summary", text, summary)
     plot_learning_curves(curves, folder / "curves.png", starts=starts)
     print(f"summary.md, summary.json and curves.png are in {folder}")
-    return summary
+    return {str(runs[0].group): summary}

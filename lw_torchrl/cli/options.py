@@ -35,23 +35,14 @@ Json = Annotated[bool, arg(help="print one JSON document instead, see docs/cli.m
 TaskFile = Annotated[Path | None, arg(help="a file of your tasks, which replace ours of the same name or join them.")]
 SkillFile = Annotated[Path | None, arg(help="a file of your skills, which replace ours of the same text or join them.")]
 EncoderName = Annotated[str | None, arg(help="your function from texts to vectors, as my_texts:encode.")]
-OwnEncoder = Annotated[
-    str | None, arg(help="the function that the policy was trained with, if it was one of yours, as my_texts:encode.")
-]
-Device = Annotated[
-    str,
-    arg(
-        help="where networks work: cpu; cuda, or cuda:1 for the second of several; mps, a Mac's; or auto, the GPU if "
-        "there is one. The simulation is always on the CPU."
-    ),
-]
-PlanSources = Annotated[
-    tuple[str, ...],
-    arg(
-        help="MT10 or MT50 for the shipped plans, .plan files, .json files of pairs, or folders. If several have a "
-        "plan for a task, the last one counts."
-    ),
-]
+OwnEncoder = Annotated[str | None, arg(help="the function of yours, if any, it was trained with, as my_texts:encode.")]
+_DEVICES = "where networks work: cpu; cuda, or cuda:1 for the second of several; mps, a Mac's; or auto, the GPU if "
+Device = Annotated[str, arg(help=f"{_DEVICES}there is one. The simulation is always on the CPU.")]
+_PLANS = "MT10 or MT50 for the shipped plans, .plan files, .json files of pairs, or folders. "
+PlanSources = Annotated[tuple[str, ...], arg(help=f"{_PLANS}If several have a plan for a task, the last one counts.")]
+File = Annotated[Path, arg(metavar="FILE")]
+Names = Annotated[tuple[str, ...], arg(metavar="[NAMES ...]")]
+Text = Annotated[str | None, arg(metavar="[TEXT]")]
 TaskNames = Annotated[tuple[str, ...], arg(metavar="TASKS ...", help="MT10, MT50, or names of tasks.")]
 
 
@@ -61,12 +52,7 @@ def one_or_many(names: tuple[str, ...]) -> str | tuple[str, ...]:
 
 
 def read_tasks(task_file: Path | None) -> Mapping[str, Task]:
-    """The 50 tasks, with those of --task-file, which replace them or join them.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it holds no valid tasks.
-    """
+    """The 50 tasks, with those of --task-file, which replace them or join them."""
     from lw_torchrl.language.tasks import TASKS, load_tasks
 
     if task_file is None:
@@ -76,7 +62,7 @@ def read_tasks(task_file: Path | None) -> Mapping[str, Task]:
 
 
 def read_skills(skill_file: Path | None, tasks: Mapping[str, Task]) -> Mapping[str, ScriptedSkill]:
-    """The scripted skills, with those of --skill-file; errors as of :func:`read_tasks`."""
+    """The scripted skills, with those of --skill-file."""
     from lw_torchrl.language.skills import load_skills
 
     if skill_file is None:
@@ -97,11 +83,7 @@ def _of_option(option: str, file: Path) -> Iterator[None]:
 
 
 def simulated(argument: str, names: str | Sequence[str], known: Mapping[str, Task]) -> tuple[str, ...]:
-    """The tasks behind ``names``, sorted, all of which the simulator has.
-
-    Raises:
-        ValueError: one is not among ``known``, or is a task of the user's that the simulator lacks.
-    """
+    """The tasks behind ``names``, sorted; a task of the user's that the simulator lacks is refused."""
     from lw_torchrl.language.tasks import TASKS, resolve_tasks
 
     given = [names] if isinstance(names, str) else names
@@ -114,14 +96,7 @@ def simulated(argument: str, names: str | Sequence[str], known: Mapping[str, Tas
 
 
 def read_plans(sources: Sequence[str], tasks: Mapping[str, Task], skills: Literal["own", "MT10"] = "own") -> Plans:
-    """The plans of --plans: MT10, MT50, files and folders; where two have a plan for a task, the later one counts.
-
-    A shipped plan is carried over to the task of its name in ``tasks``.
-
-    Raises:
-        PlanError: (a ValueError) a source holds no valid plans, or a shipped one names what a task of the user's lacks.
-        FileNotFoundError: a source is not there.
-    """
+    """The plans of --plans, of which the last for a task counts; shipped ones are carried over to ``tasks``."""
     from lw_torchrl.language.plan_files import load_plans
     from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans
 
@@ -146,11 +121,7 @@ def read_plans(sources: Sequence[str], tasks: Mapping[str, Task], skills: Litera
 
 
 def check_folder(option: str, path: Path) -> Path:
-    """Return ``path`` if it is a folder that can be written to, or one could be made there.
-
-    Raises:
-        ValueError: it is a file, lies below one, or cannot be written to.
-    """
+    """Return ``path`` if it is a folder that can be written to, or one could be made there."""
     here = path
     while not os.path.lexists(here):
         here = here.parent
@@ -166,11 +137,7 @@ def check_folder(option: str, path: Path) -> Path:
 
 
 def check_file(option: str, path: Path, ending: str = "") -> Path:
-    """Return ``path`` if it is a file that can be written to, or one could be made there.
-
-    Raises:
-        ValueError: it is a folder, its folder cannot be written to, or its name ends otherwise.
-    """
+    """Return ``path`` if it is a file that can be written to, or one could be made there."""
     if path.is_dir():
         raise ValueError(f"{option} must be a file, {str(path)!r} is a folder")
     check_folder(f"{option}'s folder", path.parent)
@@ -200,12 +167,7 @@ def check_plan_files(option: str, sources: Sequence[str]) -> None:
 
 
 def check_saved(argument: str, path: Path, what: str = "policy", writer: str = "train") -> None:
-    """Raise for a path where there is no file of a policy, or of what else a command writes.
-
-    Raises:
-        FileNotFoundError: there is nothing.
-        ValueError: it is a folder.
-    """
+    """Refuse a path where there is no file of a policy, or of what else a command writes."""
     if path.is_dir():
         raise ValueError(f"{argument}: {str(path)!r} is a folder; a {what} is one file")
     if not path.exists():
@@ -221,11 +183,7 @@ def check_actor(argument: str, who: str) -> None:
 
 
 def read_encoder(name: str | None) -> TextEncoder | None:
-    """The function that --text-encoder names, "package.module:function"; the working folder is searched first.
-
-    Raises:
-        ValueError: it is no such name, or names nothing that can be called.
-    """
+    """The function that --text-encoder names, "package.module:function"; the working folder is searched first."""
     if name is None:
         return None
     check_encoder(name)
@@ -272,8 +230,7 @@ def load_policy(checkpoint: Path, seed: int, plans: Plans | None, text_encoder: 
 
 
 def use_one_thread() -> None:
-    """One thread for PyTorch, unless OMP_NUM_THREADS says otherwise: networks this small gain little from a second, and
-    lose much where another process wants the core."""
+    """One thread for PyTorch, unless OMP_NUM_THREADS says otherwise: networks this small gain little from a second."""
     if "OMP_NUM_THREADS" not in os.environ:
         import torch
 

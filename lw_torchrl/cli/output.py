@@ -24,13 +24,7 @@ Columns = Mapping[str, str | Callable[[Row], Any]]
 
 
 class Output:
-    """Prints what is found as text, at once, or gathers it for a JSON document.
-
-    Args:
-        as_json: gather.
-
-    Attributes:
-        fault: the error with which the command ends after printing what it found; "" for none.
+    """Prints what is found as text, or gathers it for a JSON document; ``fault``, if any, then ends the command.
 
     Example:
         >>> output = Output(as_json=False)
@@ -56,14 +50,7 @@ class Output:
             print(text)
 
     def table(self, key: str, rows: Sequence[Row], columns: Columns | None = None, title: str = "") -> None:
-        """Print rows as a table, or keep them under the key.
-
-        Args:
-            key: in the document.
-            rows: what is found, by names.
-            columns: of the text; all by their names if none are given.
-            title: of the text.
-        """
+        """Print rows as a table of some columns, by default all by their names, or keep them under the key."""
         if self.as_json:
             self._found[key] = [dict(row) for row in rows]
             return
@@ -182,11 +169,7 @@ def _let_go(stream: TextIO) -> None:
 
 @contextmanager
 def sound_streams() -> Iterator[None]:
-    """Within the block there are streams to print to; a :class:`BrokenPipeError` of theirs ends the program quietly.
-
-    Raises:
-        SystemExit: 141, since nobody reads.
-    """
+    """Within the block there are streams to print to; where nobody reads, the program ends quietly, with 141."""
     _replace_absent()
     try:
         yield

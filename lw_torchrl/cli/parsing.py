@@ -7,10 +7,10 @@ import os
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from dataclasses import MISSING, fields, is_dataclass
 from functools import partial, wraps
-from inspect import Parameter, signature
+from inspect import Parameter, cleandoc, getsource, signature
 from itertools import pairwise
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
@@ -23,15 +23,12 @@ COUNTS = ("attempts", "batch_size", "episodes", "jobs", "max_steps", "num_envs",
 """Arguments that count something, in every command: at least 1."""
 SCALES = ("beta", "gripper_noise", "latent_consistency", "learning_rate", "noise", "qaf_anchor")
 """Arguments that say how much of something: finite and at least 0."""
+_BESIDE = re.compile(r"^    (\w+): .*,  # (.+)$", re.MULTILINE)
 _NUMBERS = {int: "an integer", float: "a number"}
 
 
 def parse(prog: str, function: Callable[..., Any], args: Sequence[str]) -> partial[Any]:
     """A command's function with its arguments; ``--help`` is printed, and ends the program.
-
-    Raises:
-        ValueError: an option that the command does not have, an argument too many or too few, a word where a number
-            must be, another word than those allowed.
 
     Example:
         >>> def cook(dish: Literal["soup", "stew"], /, minutes: int = 10): ...
@@ -43,6 +40,7 @@ def parse(prog: str, function: Callable[..., Any], args: Sequence[str]) -> parti
     """
     known = arguments(function)
     _check_options(prog, known, args)
+    document(function)
 
     @wraps(function)
     def found(*args: Any, **kwargs: Any) -> partial[Any]:
@@ -73,6 +71,15 @@ def parse(prog: str, function: Callable[..., Any], args: Sequence[str]) -> parti
         if name in COUNTS and isinstance(value, int):
             check_int(name, value, minimum=1)
     return call
+
+
+def document(function: Callable[..., Any]) -> None:
+    """Add the comments beside a command's arguments to its docstring, which tyro makes the help text of."""
+    about, _, others = cleandoc(function.__doc__ or "").partition("\n\nArgs:\n")
+    with suppress(OSError):  # typed at a prompt, a function has no source
+        beside = "".join(f"    {name}: {said}.\n" for name, said in _BESIDE.findall(getsource(function)))
+        if not others.startswith(beside):
+            function.__doc__ = f"{about}\n\nArgs:\n{beside}{others}"
 
 
 def arguments(function: Callable[..., Any]) -> dict[str, Parameter]:

@@ -5,32 +5,27 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
+from lw_torchrl._checks import check_choice
 from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Output
 from lw_torchrl.cli.plan_models import generate, repair
 
 
 def prompt(
-    task: Positional[Annotated[str, arg(metavar="TASK")]],
+    task: Positional[Annotated[str, arg(metavar="TASK")]],  # the task that a plan is wanted for
     /,
-    format: str = "chain_py",
-    vocabulary: bool = False,
-    plans: options.PlanSources = ("MT10",),
+    format: str = "chain_py",  # how plans are written: basic, chain or goal, then _py, _py_md or _md
+    vocabulary: bool = False,  # also say which things the task has, and what can be asked of them
+    plans: options.PlanSources = ("MT10",),  # of the examples
     task_file: options.TaskFile = None,
 ) -> None:
     """Print the text that asks a language model for a plan: plans of three other tasks, then the task.
 
     Example: lw-torchrl plan prompt drawer-open --format chain_py
-
-    Args:
-        task: the task that a plan is wanted for.
-        format: how plans are written: basic, chain or goal, then _py, _py_md or _md.
-        vocabulary: also say which things the task has, and what can be asked of them.
-        plans: where the examples come from: MT10 or MT50 for the shipped plans, .plan files, .json files or folders.
     """
     from lw_torchrl.planners.prompts import plan_prompt
 
@@ -40,12 +35,12 @@ def prompt(
 
 
 def check(
-    file: Positional[Annotated[Path, arg(metavar="FILE")]],
+    file: Positional[options.File],
     /,
-    task: str | None = None,
-    format: str | None = None,
-    episodes: int = 5,
-    seed: int = 0,
+    task: str | None = None,  # the task it is for; by default as the file's name says
+    format: str | None = None,  # how it is written; by default as the file's folder says, or basic_py for a .plan file
+    episodes: int = 5,  # of the expert, and of the plan by scripted skills; conditions are answered in their states
+    seed: int = 0,  # of these
     skill_file: options.SkillFile = None,
     task_file: options.TaskFile = None,
     json: options.Json = False,
@@ -57,13 +52,8 @@ def check(
     Args:
         file: an answer FORMAT/TASK-ATTEMPT.EXT, as plan generate writes it, or a .plan file TASK.plan; any text with
             --task and --format.
-        task: the task it is for; by default as the file's name says.
-        format: how it is written; by default as the file's folder says, or basic_py for a .plan file.
-        episodes: of the expert, and of the plan by scripted skills; conditions are answered in their states.
-        seed: of these.
     """
     import lw_torchrl as lw
-    from lw_torchrl._checks import check_choice
     from lw_torchrl._files import read_text
     from lw_torchrl.language.tasks import check_task
 
@@ -89,15 +79,10 @@ def check(
     output = Output(json)
     steps = [step for step in found.decoded.steps if not step.dropped]
     rows = [
-        {
-            "condition": str(step.condition),
-            "skill": step.written_skill,
-            "scripted": step.scripted,
-            "expert": None if found.expert is None else found.expert.true[k],
-            "own": None if found.own is None else found.own.true[k],
-            "chosen": None if found.own is None else found.own.chosen[k],
-            "never": k in found.never,
-        }
+        {"condition": str(step.condition), "skill": step.written_skill, "scripted": step.scripted}
+        | {"expert": None if found.expert is None else found.expert.true[k]}
+        | {"own": None if found.own is None else found.own.true[k]}
+        | {"chosen": None if found.own is None else found.own.chosen[k], "never": k in found.never}
         for k, step in enumerate(steps)
     ]
     output.show("task", found.task, str(found))
@@ -114,13 +99,13 @@ _BEST = ": of each task the plan that did best, be it one that never succeeds"
 def compare(
     source: Positional[Annotated[Path, arg(metavar="DIR|FILE")]],
     /,
-    episodes: int = 20,
-    seed: int = 1000,
-    choose: Literal["random", "first"] = "random",
-    noise: float = 0.0,
-    max_steps: int = 500,
+    episodes: int = 20,  # of each plan, the same initial states for all plans of a task
+    seed: int = 1000,  # fixes initial states, goals and what is chosen
+    choose: Literal["random", "first"] = "random",  # of true steps a random one, as in the paper, or the first
+    noise: float = 0.0,  # standard deviation of the noise on the executed action
+    max_steps: int = 500,  # of an episode
     task_file: options.TaskFile = None,
-    out: Path = Path("runs/compare"),
+    out: Path = Path("runs/compare"),  # folder for results.json, summary.md, models.png, formats.png and best/
     json: options.Json = False,
 ) -> Output:
     """Compare models by the plans they wrote: decode every answer, and carry out all plans by scripted skills.
@@ -132,12 +117,6 @@ def compare(
 
     Args:
         source: a folder MODEL/FORMAT/TASK-ATTEMPT.EXT, as plan generate writes it, or a .jsonl file of answers.
-        episodes: of each plan, the same initial states for all plans of a task.
-        seed: fixes initial states, goals and what is chosen.
-        choose: which of several true steps acts: a random one, as in the paper, or the first.
-        noise: standard deviation of the noise on the executed action.
-        max_steps: of an episode.
-        out: folder for results.json, summary.md, models.png, formats.png and best/.
     """
     options.check_folder("--out", out)
     from lw_torchrl.planners.answer_files import ignored_files, recorded_answers
@@ -148,16 +127,8 @@ def compare(
     from lw_torchrl.planners.comparison_report import no_plans, write_report
 
     options.use_one_thread()
-    found = compare_plans(
-        source,
-        episodes=episodes,
-        seed=seed,
-        choose=choose,
-        noise_scale=noise,
-        max_steps=max_steps,
-        tasks=known,
-        resume=out / "fared.json",
-    )
+    how: dict[str, Any] = {"episodes": episodes, "seed": seed, "choose": choose, "noise_scale": noise}
+    found = compare_plans(source, max_steps=max_steps, tasks=known, resume=out / "fared.json", **how)
     output = Output(json)
     groups = [
         {"model": model, "format": format, "success": found.mean(model, format)}
@@ -184,10 +155,10 @@ def compare(
 def serve(
     model: Positional[Annotated[Path | None, arg(metavar="[MODEL.gguf]")]] = None,
     /,
-    host: str = "127.0.0.1",
-    port: int = 8000,
-    context: int = 8192,
-    threads: int | None = None,
+    host: str = "127.0.0.1",  # the address to listen at; by default only this machine can ask. There is no key
+    port: int = 8000,  # where; 0 takes a free one
+    context: int = 8192,  # tokens of a question and its answer, at most
+    threads: int | None = None,  # of the processor; half of its cores if none is given
 ) -> None:
     """Serve a language model on this machine, as OpenAI's servers do, until Ctrl-C. It wants the extra [serve].
 
@@ -198,10 +169,6 @@ def serve(
 
     Args:
         model: a GGUF file; the small model of the extra if none is given.
-        host: the address to listen at; by default only this machine can ask. There is no key.
-        port: where; 0 takes a free one.
-        context: tokens of a question and its answer, at most.
-        threads: of the processor; half of its cores if none is given.
     """
     from lw_torchrl.planners.model_server import model_file, serve_model
 
@@ -209,11 +176,9 @@ def serve(
     print(f"loading {file}", flush=True)
 
     def ready(name: str, address: str) -> None:
+        asked = f"--model {name} --base-url {address} --constrain --format basic_py"
         print(f"{name} is served at {address}; Ctrl-C ends it. In another terminal:")
-        print(
-            f"lw-torchrl plan generate MT10 --model {name} --base-url {address} --constrain --format basic_py",
-            flush=True,
-        )
+        print(f"lw-torchrl plan generate MT10 {asked}", flush=True)
 
     serve_model(file, host=host, port=port, context=context, threads=threads, ready=ready)
 

@@ -22,40 +22,24 @@ if TYPE_CHECKING:
 class Asking:
     """Which model is asked, and how."""
 
-    model: str
-    """the model's name at the server."""
-    base_url: str | None = None
-    """the server's address; OpenAI's, or what OPENAI_BASE_URL says, if none is given."""
-    attempts: int = 1
-    """answers to each question."""
-    constrain: bool = False
-    """hold the model to a schema, so that it can only write plans that run; the server must know schemas."""
-    free_skills: bool = False
-    """with --constrain, skills in any words instead of the scripted ones."""
-    vocabulary: bool = False
-    """prompts also say which things the task has, and what can be asked of them."""
-    temperature: float | None = None
-    """the server's own if none is given."""
-    max_tokens: int = 1024
-    """of an answer, at most; models that think first want more."""
-    seed: int | None = None
-    """attempt k is sent SEED + k; without, none is sent."""
-    name: str | None = None
-    """of the folder for its answers; by default the model's, with "-constrained" behind it where it is."""
-    plans: tuple[str, ...] = ("MT10",)
-    """where the prompts' examples come from: MT10 or MT50, .plan files, .json files or folders."""
+    model: str  # the model's name at the server.
+    base_url: str | None = None  # the server's address; OpenAI's, or what OPENAI_BASE_URL says, if none is given.
+    attempts: int = 1  # answers to each question.
+    constrain: bool = False  # hold the model to a schema, so that its plans run; the server must know schemas.
+    free_skills: bool = False  # with --constrain, skills in any words instead of the scripted ones.
+    vocabulary: bool = False  # prompts also say which things the task has, and what can be asked of them.
+    temperature: float | None = None  # the server's own if none is given.
+    max_tokens: int = 1024  # of an answer, at most; models that think first want more.
+    seed: int | None = None  # attempt k is sent SEED + k; without, none is sent.
+    name: str | None = None  # of the folder for its answers; by default the model's, with "-constrained" if it is.
+    plans: tuple[str, ...] = ("MT10",)  # of the prompts' examples: MT10 or MT50, .plan files, .json files or folders.
     skill_file: options.SkillFile = None
     task_file: options.TaskFile = None
-    concurrency: int = 4
-    """questions at once."""
-    retries: int = 6
-    """how often a question is asked again after a rate limit or a fault, with growing waits."""
-    timeout: float = 300.0
-    """seconds that one try may take as a whole, to the answer's last byte; each retry has as long."""
-    cache: Path = Path("runs/answers")
-    """folder where answers are kept, each under a key of all that determines it."""
-    out: Path = Path("runs/plans")
-    """folder for the answers as texts, OUT/<name>/<format>/<task>-<attempt>.py or .md."""
+    concurrency: int = 4  # questions at once.
+    retries: int = 6  # how often a question is asked again after a rate limit or a fault, with growing waits.
+    timeout: float = 300.0  # seconds for one try as a whole, to the answer's last byte; each retry has as long.
+    cache: Path = Path("runs/answers")  # folder where answers are kept, each under a key of all that determines it.
+    out: Path = Path("runs/plans")  # folder for the answers as texts, OUT/<name>/<format>/<task>-<attempt>.py or .md.
 
     def begin(self, names: tuple[str, ...]) -> tuple[OpenAIPlanner, dict[str, Task], Mapping[str, Task]]:
         """The model, the tasks that are named, and all tasks."""
@@ -78,8 +62,8 @@ def generate(
     tasks: Positional[options.TaskNames] = ("MT10",),
     /,
     *,
-    asking: Annotated[Asking, OmitArgPrefixes],
-    format: tuple[str, ...] = ("chain_py",),
+    asking: Annotated[Asking, OmitArgPrefixes],  # which model is asked, and how
+    format: tuple[str, ...] = ("chain_py",),  # basic, chain or goal, then _py, _py_md or _md; several, or "all" nine
     json: options.Json = False,
 ) -> Output:
     """Ask a language model for plans, and say what became of them.
@@ -90,10 +74,6 @@ def generate(
     only for what is missing, and the same question costs nothing a second time.
 
     Example: lw-torchrl plan generate MT10 --model llama3.1 --base-url http://127.0.0.1:11434/v1 --attempts 4
-
-    Args:
-        asking: which model is asked, and how.
-        format: how plans are written, one or several: basic, chain or goal, then _py, _py_md or _md; "all" for nine.
     """
     planner, chosen, _ = asking.begin(tasks)
     from lw_torchrl.language.formats import PLAN_FORMATS
@@ -137,12 +117,12 @@ def repair(
     tasks: Positional[options.TaskNames],
     /,
     *,
-    asking: Annotated[Asking, OmitArgPrefixes],
-    format: str = "chain_py",
-    rounds: int = 3,
-    enough: float = 0.8,
-    episodes: int = 10,
-    episode_seed: int = 0,
+    asking: Annotated[Asking, OmitArgPrefixes],  # which model is asked, and how
+    format: str = "chain_py",  # how plans are written: basic, chain or goal, then _py, _py_md or _md
+    rounds: int = 3,  # how often the model is told, at most
+    enough: float = 0.8,  # the success rate from which a plan is left as it is
+    episodes: int = 10,  # of each plan
+    episode_seed: int = 0,  # of these; compare on another one
     json: options.Json = False,
 ) -> Output:
     """Ask a model for plans, carry them out by scripted skills, tell it what became of those that fail, and ask again.
@@ -153,14 +133,6 @@ def repair(
     compare. If it is stopped, the same command resumes it.
 
     Example: lw-torchrl plan repair MT10 --model llama3.1 --base-url http://127.0.0.1:11434/v1 --rounds 3
-
-    Args:
-        asking: which model is asked, and how.
-        format: how plans are written: basic, chain or goal, then _py, _py_md or _md.
-        rounds: how often the model is told, at most.
-        enough: the success rate from which a plan is left as it is.
-        episodes: of each plan.
-        episode_seed: of these; compare on another one.
     """
     planner, chosen, known = asking.begin(tasks)
     from lw_torchrl.language.formats import PLAN_FORMATS

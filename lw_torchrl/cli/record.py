@@ -22,20 +22,20 @@ if TYPE_CHECKING:
 
 
 def record(
-    names: Positional[Annotated[tuple[str, ...], arg(metavar="TASK ...")]],
+    names: Positional[Annotated[tuple[str, ...], arg(metavar="TASK ...")]],  # tasks, or MT10 or MT50
     /,
     policy: str = "expert",
-    compare: str | None = None,
-    episodes: tuple[int, ...] = (0,),
+    compare: str | None = None,  # another one, in the same initial states and with the same noise, side by side
+    episodes: tuple[int, ...] = (0,),  # their indices, as in an evaluation with this seed
     plans: tuple[str, ...] = (),
-    attribute: bool = False,
-    reference: tuple[str, ...] = (),
+    attribute: bool = False,  # say why failed episodes failed, as evaluate does; for scripted and policies with plans
+    reference: tuple[str, ...] = (),  # with --attribute, trusted plans for running failed episodes again
     task_file: options.TaskFile = None,
     text_encoder: options.OwnEncoder = None,
-    seed: int = 1000,
-    noise: float = 0.1,
-    max_steps: int = 500,
-    out: Path | None = None,
+    seed: int = 1000,  # fixes initial states, goals and noise
+    noise: float = 0.1,  # standard deviation of the noise on the executed action
+    max_steps: int = 500,  # of an episode
+    out: Path | None = None,  # the file; runs/recordings/TASK-POLICY.rrd if none is given; replaced if there
     json: options.Json = False,
 ) -> Output:
     """Record episodes: the robot in 3-D, the plan as it goes, what held when, and how it ended.
@@ -43,20 +43,10 @@ def record(
     Example: lw-torchrl record drawer-open --policy runs/mt10.zip --compare scripted --episodes 0 1
 
     Args:
-        names: tasks, or MT10 or MT50.
         policy: expert, Meta-World's script; scripted, the plan by scripted skills; random; spoilt-60, spoilt-30 or
             wrong, the plan by skills that are right in 60, 30 or 0 of 100 pieces; or a policy's file.
-        compare: another one, in the same initial states and with the same noise, side by side.
-        episodes: their indices, as in an evaluation with this seed.
         plans: whose steps and conditions are shown and, by policies that read plans, carried out: MT10, MT50, .plan or
             .json files, or folders. If none is given, a policy's own, or else the shipped ones.
-        attribute: say why each failed episode failed: a query, the plan, a skill or time. It is run again a few times.
-            For scripted and for policies with plans.
-        reference: with --attribute, trusted plans for running failed episodes again.
-        seed: fixes initial states, goals and noise.
-        noise: standard deviation of the noise on the executed action.
-        max_steps: of an episode.
-        out: the file; runs/recordings/TASK-POLICY.rrd if none is given. One that is there is replaced.
     """
     if reference and not attribute:
         raise ValueError("--reference is for --attribute, which runs failed episodes again with these plans")
@@ -95,9 +85,8 @@ def record(
                 row = {"task": one.task, "episode": one.episode, "policy": who, "first_success": one.first_success}
                 rows.append(row | {"failure": None if failure is None else asdict(failure)})
                 name = None if compare is None else f"{one.task}-{one.episode}-{len(recorded) + 1}"
-                pages.append(
-                    lw.log_rollout(logger, one.steps, shown, seed=seed, policy=who, failure=failure, name=name)
-                )
+                told: dict[str, Any] = {"seed": seed, "policy": who, "failure": failure, "name": name}
+                pages.append(lw.log_rollout(logger, one.steps, shown, **told))
             recorded.append(pages)
         for pair, one in zip(zip(*recorded, strict=True), found, strict=True) if compare is not None else ():
             logger.compare(pair, f"{one.task} · episode {one.episode} · side by side")
@@ -122,9 +111,8 @@ def _cast(
     if who not in options.ACTORS:
         actor = options.load_policy(Path(who), seed, plans, text_encoder)
         if missing := [task for task in tasks if task not in actor.tasks]:
-            raise ValueError(
-                f"the policy of {who!r} does not know {', '.join(missing)}; it knows {', '.join(actor.tasks)}"
-            )
+            knows = f"it knows {', '.join(actor.tasks)}"
+            raise ValueError(f"the policy of {who!r} does not know {', '.join(missing)}; {knows}")
         return actor, actor.plans, Path(who).stem
     shown = options.read_plans(("MT50",), known) if plans is None else plans
     shown.require(tasks)
@@ -145,29 +133,19 @@ def _line(episode: FinishedEpisode, who: str, failure: Failure | None) -> str:
 
 
 def view(
-    recording: Positional[Annotated[Path, arg(metavar="RUN|FILE")]],
+    recording: Positional[Annotated[Path, arg(metavar="RUN|FILE")]],  # an .rrd file, or a folder that holds one
     /,
-    episode: str | None = None,
-    screenshot: Path | None = None,
-    step: int | None = None,
-    window_size: str = "1400x900",
-    html: Path | None = None,
-    web: bool = False,
-    port: int = 0,
+    episode: str | None = None,  # open at this tab, by its title or its episode's name
+    screenshot: Path | None = None,  # write a .png here, no window; wants Debian's mesa-vulkan-drivers and libvulkan1
+    step: int | None = None,  # the step to open at; by default the most telling one, of a training the last
+    window_size: str = "1400x900",  # of the picture or the window, WIDTHxHEIGHT
+    html: Path | None = None,  # write one self-contained page here, some 20 MB, that opens from disk in a browser
+    web: bool = False,  # serve a page on this machine and print its address, until Ctrl-C
+    port: int = 0,  # of the page; 0 takes a free one
 ) -> None:
     """Open a recording in the rerun viewer; or take a picture of it, write it as one page, or serve it as one.
 
     Example: lw-torchrl view runs/demo --episode drawer-open --screenshot picture.png --step 80
-
-    Args:
-        recording: an .rrd file, or a folder that holds one.
-        episode: open at this tab, by its title or its episode's name.
-        screenshot: write a .png here and open no window; wants Debian's mesa-vulkan-drivers and libvulkan1.
-        step: the step to open at; by default the most telling one, of a training the last.
-        window_size: of the picture or the window, WIDTHxHEIGHT.
-        html: write one self-contained page here, some 20 MB, that opens from disk in a browser.
-        web: serve a page on this machine and print its address, until Ctrl-C.
-        port: of the page; 0 takes a free one.
     """
     given = [f"--{name}" for name, value in (("screenshot", screenshot), ("html", html), ("web", web)) if value]
     if len(given) > 1:

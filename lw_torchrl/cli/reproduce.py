@@ -47,17 +47,17 @@ def demo(out: Path | None = None, quick: bool = False, json: options.Json = Fals
 def reproduce(
     experiment: Positional[Experiment],
     /,
-    schedule: Scheduled,
-    seeds: tuple[int, ...] = (0, 1, 2),
+    schedule: Scheduled,  # which runs are done, and where
+    seeds: tuple[int, ...] = (0, 1, 2),  # of the demonstrations, the initial weights and the minibatches
     methods: tuple[Method, ...] | None = None,
     preset: Literal["strong", "paper", "evaluator"] = "strong",
-    passes: int | None = None,
+    passes: int | None = None,  # over the rows, fewer than the 500 of the preset paper
     plans: tuple[str, ...] = (),
     task_file: options.TaskFile = None,
     text_encoder: options.EncoderName = None,
-    episodes: int = 20,
+    episodes: int = 20,  # evaluated for each task, on seeds that no training used, action noise 0.1
     device: options.Device = "cpu",
-    out: Path = Path("runs/reproduce"),
+    out: Path = Path("runs/reproduce"),  # where everything goes; on a cluster, a folder that all its machines share
     json: options.Json = False,
 ) -> Output:
     """Run the paper's experiments and compare them with the published results.
@@ -73,17 +73,12 @@ def reproduce(
     Args:
         experiment: zero-shot, 100 demonstrations of each MT10 task; few-shot, 10 of each MT50 task; one-shot, 100 of
             each MT10 task and 1 of the target; scripted, plans with scripted skills; or all of them.
-        schedule: which runs are done, and where.
-        seeds: of the demonstrations, the initial weights and the minibatches.
         methods: conditioned on plans, on the task's description, on the task's number; plans with scripted skills. By
             default all; with --plans, those that are trained.
         preset: strong, ours; paper, the published recipe, which takes hours; or evaluator, in few-shot, ours with
             conditions answered by a network that is trained inside the policy.
-        passes: over the rows, fewer than the 500 of the preset paper.
         plans: of all 50 tasks, instead of ours: .plan files, .json files of pairs, folders, or MT50. If several have a
             plan for a task, the last one counts.
-        episodes: evaluated for each task, on seeds that no training used, action noise 0.1.
-        out: where everything goes; on a cluster, a folder that all its machines share.
     """
     schedule.check(out)
     options.check_encoder(text_encoder)
@@ -161,11 +156,9 @@ class _Plans:
         if skills not in self.known:
             found = options.read_plans(self.sources or ["MT50"], self.tasks, skills)
             if missing := [task for task in MT50 if task not in found]:
-                raise ValueError(
-                    f"--plans must have a plan for each of the 50 tasks, they lack {len(missing)}: "
-                    f"{', '.join(missing[:5])}{', ...' if len(missing) > 5 else ''}; --plans MT50 "
-                    f"{' '.join(self.sources)} takes ours for these"
-                )
+                lack = f"{len(missing)}: {', '.join(missing[:5])}{', ...' if len(missing) > 5 else ''}"
+                mend = f"--plans MT50 {' '.join(self.sources)} takes ours for these"
+                raise ValueError(f"--plans must have a plan for each of the 50 tasks, they lack {lack}; {mend}")
             self.known[skills] = found
         return self.known[skills]
 

@@ -31,14 +31,10 @@ Launcher = Literal["local", "ray"]
 class Schedule:
     """Which runs are done, and where."""
 
-    launcher: Launcher = "local"
-    """local, on this machine; ray, on a Ray cluster, or on all cores of this machine."""
-    jobs: int = 1
-    """runs at a time, by the launcher local."""
-    run: str | None = None
-    """do this run alone, of the names that --list prints."""
-    list: bool = False
-    """print the names of the runs and do nothing."""
+    launcher: Launcher = "local"  # local, on this machine; ray, on a Ray cluster, or on all cores of this machine.
+    jobs: int = 1  # runs at a time, by the launcher local.
+    run: str | None = None  # do this run alone, of the names that --list prints.
+    list: bool = False  # print the names of the runs and do nothing.
 
     def check(self, out: Path) -> None:
         """Raise :class:`ValueError` for options that exclude each other, or where nothing can be written."""
@@ -59,13 +55,8 @@ class Schedule:
     ) -> Output:
         """Do what is asked for; the summary is written when all runs are done.
 
-        Args:
-            output: what is found goes there.
-            shared: stages of jobs that runs share, by their names; a run does what it lacks of them itself.
-            runs: stages of runs, by their names.
-            command: arguments of ``lw-torchrl`` that list the same runs in another process.
-            summarize: write the summary; returns what it holds.
-            told: more lines about a run's result.
+        ``shared`` are stages of jobs, by their names, that runs share; a run does what it lacks of them itself.
+        ``command`` lists the same runs in another process; ``told`` makes more lines of a run's result.
         """
         every = {name: job for stage in (*shared, *runs) for name, job in stage.items()}
         names = [name for stage in runs for name in stage]
@@ -117,18 +108,9 @@ def _report(total: int, lines: Iterator[str]) -> None:
 
 
 def run_command(arguments: Sequence[str]) -> str:
-    """Run ``lw-torchrl`` with these arguments in a process of its own, on one core; return what it printed.
-
-    Raises:
-        RuntimeError: it failed, with the end of what it said.
-    """
-    done = subprocess.run(
-        [sys.executable, "-m", "lw_torchrl", *arguments],
-        env=os.environ | {"OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    """Run ``lw-torchrl`` with these arguments in a process of its own, on one core; return what it printed."""
+    command, env = [sys.executable, "-m", "lw_torchrl", *arguments], os.environ | {"OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
     if done.returncode:
         said = "\n".join(done.stderr.splitlines()[-5:])
         raise RuntimeError(f"lw-torchrl {' '.join(arguments)} failed:\n{said}")
@@ -138,17 +120,9 @@ def run_command(arguments: Sequence[str]) -> str:
 def run_commands(commands: Sequence[Sequence[str]], launcher: Launcher, jobs: int) -> Iterator[tuple[int, str]]:
     """Run commands, several at a time; yield the index and the output of each as it ends.
 
-    A command that fails does not stop the others that run; once they have ended, the first error is raised.
-
-    Args:
-        commands: arguments of ``lw-torchrl`` each.
-        launcher: "local", ``jobs`` processes; "ray", a task of one core each, on the cluster that RAY_ADDRESS names or
-            on this machine. A cluster's machines must see the same files.
-        jobs: of "local".
-
-    Raises:
-        RuntimeError: a command failed.
-        ImportError: "ray" without the extra ``[ray]``.
+    A command that fails does not stop the others that run; once they have ended, the first error is raised. Launcher
+    "local" has ``jobs`` processes; "ray" a task of one core each, on the cluster that RAY_ADDRESS names, whose machines
+    must see the same files, or on this machine.
     """
     failed: Exception | None = None
     for index, outcome in _ray(commands) if launcher == "ray" else _local(commands, jobs):

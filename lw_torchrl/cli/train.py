@@ -20,29 +20,29 @@ if TYPE_CHECKING:
 
 
 def train(
-    data: Positional[Annotated[Path, arg(metavar="DATA")]],
+    data: Positional[Annotated[Path, arg(metavar="DATA")]],  # a dataset's folder, of `lw-torchrl collect`
     /,
-    out: Path,
-    tasks: tuple[str, ...] = (),
+    out: Path,  # the policy, one file
+    tasks: tuple[str, ...] = (),  # MT10, or names of tasks, whose demonstrations alone are used; by default all
     plans: options.PlanSources = ("MT10",),
     task_file: options.TaskFile = None,
     text_encoder: options.EncoderName = None,
-    method: str = "pcbc",
+    method: str = "pcbc",  # pcbc, by plan; or a baseline: dc, by the task's description, one-hot, by its number
     mix: Literal["latents", "actions"] | None = None,
     features: Literal["raw", "differences", "relative", "both"] = "differences",
-    width: int = 256,
-    depth: int = 3,
-    steps: int = 8000,
-    batch_size: int = 500,
-    learning_rate: float = 1e-3,
-    after_success: int | None = 20,
-    latent_consistency: float = 0.0,
-    begin: Path | None = None,
+    width: int = 256,  # of the action decoder's hidden layers
+    depth: int = 3,  # number of them
+    steps: int = 8000,  # minibatches
+    batch_size: int = 500,  # rows of a minibatch, equally many of each task
+    learning_rate: float = 1e-3,  # at the start; a cosine brings it to 0
+    after_success: int | None = 20,  # leave out steps so long after an episode's first success; None keeps all
+    latent_consistency: float = 0.0,  # weight of a term that keeps skills with similar texts similar; with plans
+    begin: Path | None = None,  # a trained policy to start from: its weights, plans, options and statistics
     evaluator: str | None = None,
     answers: Literal["logit", "tanh", "hard"] | None = None,
     qaf_anchor: float = 0.0,
-    seed: int = 0,
-    logger: Literal["csv", "tensorboard", "wandb"] | None = None,
+    seed: int = 0,  # of the initial weights and the minibatches
+    logger: Literal["csv", "tensorboard", "wandb"] | None = None,  # write loss and learning rate to logs/ beside OUT
     device: options.Device = "cpu",
     json: options.Json = False,
 ) -> Output:
@@ -53,28 +53,14 @@ def train(
     Example: lw-torchrl train demos/mt10 --out runs/tuned.zip --begin runs/mt10.zip --evaluator runs/eyes/evaluator.zip
 
     Args:
-        data: a dataset's folder, of `lw-torchrl collect`.
-        out: the policy, one file.
-        tasks: MT10, or names of tasks, to train on only their demonstrations; by default all of the dataset.
-        method: pcbc, conditioned on the plan; or a baseline: dc, on the task's description, one-hot, on its number.
         mix: of a policy with plans, mix the skills' latents, as in the paper and by default, or their actions.
         features: what the policy sees: the raw observation; differences between hand, objects and goal; relative, these
             without the hand's height and the gripper's opening; or both the first and the second.
-        width: of the action decoder's hidden layers.
-        depth: number of them.
-        steps: minibatches.
-        batch_size: rows of a minibatch, equally many of each task.
-        learning_rate: at the start; a cosine brings it to 0.
-        after_success: leave out steps so long after an episode's first success; None keeps all.
-        latent_consistency: weight of a term that keeps skills with similar texts similar; of a policy with plans.
-        begin: a trained policy to start from: its weights, plans, options and statistics.
         evaluator: a network that answers the conditions inside the policy and is trained with it: a file of
             `lw-torchrl train-evaluator`, or the word new. If it reads pictures, they are drawn beside DATA.
         answers: how its answers enter the attention, see docs/evaluators.md; by default tanh, with --begin hard.
         qaf_anchor: weight of the error of its answers, beside the error of the actions. Without it conditions may drift
             from their words; a new evaluator needs it.
-        seed: of the initial weights and the minibatches.
-        logger: also write loss and learning rate, below logs/ beside the policy.
     """
     options.check_file("--out", out)
     if begin is not None and out.resolve() == begin.resolve():
@@ -113,28 +99,16 @@ def train(
     encoder = options.read_encoder(text_encoder)
     actor_options: dict[str, Any] = {"features": features, "width": width, "depth": depth}
     reads_plans = policy_class(modules.METHODS[method].policy).plan_options
-    if mix is not None and not reads_plans:
-        raise ValueError(f"--mix is for a method that reads plans, --method {method} does not")
-    if latent_consistency and not reads_plans:
-        raise ValueError(f"--latent-consistency is for a method that reads plans, --method {method} does not")
+    for option, value in (("--mix", mix), ("--latent-consistency", latent_consistency)):
+        if value and not reads_plans:
+            raise ValueError(f"{option} is for a method that reads plans, --method {method} does not")
     if reads_plans:
         actor_options["mix"] = mix or "latents"
-    config = lw.BehavioralCloningConfig(
-        steps=steps,
-        batch_size=batch_size,
-        learning_rate=learning_rate,
-        latent_consistency=latent_consistency,
-        normalize=begin is None,
-        qaf_anchor=qaf_anchor,
-        seed=seed,
-    )
-    replay = lw.LanguageWorldExperienceReplay(
-        data,
-        episodes=_all_of(data, chosen) if chosen else None,
-        sampler=lw.TaskBalancedSampler(),
-        after_success=after_success,
-        device=there,
-    )
+    numbers: dict[str, Any] = {"steps": steps, "batch_size": batch_size, "learning_rate": learning_rate, "seed": seed}
+    numbers |= {"latent_consistency": latent_consistency, "qaf_anchor": qaf_anchor}
+    config = lw.BehavioralCloningConfig(normalize=begin is None, **numbers)
+    rows: dict[str, Any] = {"episodes": _all_of(data, chosen) if chosen else None, "after_success": after_success}
+    replay = lw.LanguageWorldExperienceReplay(data, sampler=lw.TaskBalancedSampler(), device=there, **rows)
     torch.manual_seed(seed)
     if begin is not None:
         actor = _begun(begin, encoder)
@@ -153,10 +127,8 @@ def train(
     if isinstance(inside, lw.HeldEvaluator):
         which, mend = "--begin must have", "give the one to train by --evaluator"
         if evaluator is not None:
-            which, mend = (
-                "--evaluator must be",
-                "train with the one inside it, lw.training.save_evaluator(held.evaluator, FILE)",
-            )
+            which = "--evaluator must be"
+            mend = "train with the one inside it, lw.training.save_evaluator(held.evaluator, FILE)"
         raise ValueError(f"{which} no HeldEvaluator, of whose steps a dataset's rows tell nothing: {mend}")
     if isinstance(inside, lw.modules.ImageQueryEvaluator):
         pictures: dict[str, Any] = {"cameras": inside.cameras, "height": inside.height, "width": inside.width}

@@ -20,30 +20,30 @@ WHO = ("expert", "scripted", "spoilt-30", "random")
 
 
 def train_evaluator(
-    tasks: Positional[Annotated[tuple[str, ...], arg(metavar="TASKS ...")]],
+    tasks: Positional[Annotated[tuple[str, ...], arg(metavar="TASKS ...")]],  # MT10, MT50, or names, held-out ones too
     /,
-    out: Path,
-    data: tuple[Path, ...] = (),
-    behaviours: tuple[str, ...] = WHO,
-    episodes: int = 5,
-    max_steps: int = 500,
-    noise: tuple[float, ...] = (0.0, 0.1, 0.2),
+    out: Path,  # folder for evaluator.zip, report.json, reliability.png, the episodes, and, with --cameras, wrong.png
+    data: tuple[Path, ...] = (),  # datasets of `lw-torchrl collect` to use instead of running episodes
+    behaviours: tuple[str, ...] = WHO,  # who acts in the episodes that are run, as for `lw-torchrl collect`
+    episodes: int = 5,  # of each task and behaviour
+    max_steps: int = 500,  # steps of an episode
+    noise: tuple[float, ...] = (0.0, 0.1, 0.2),  # standard deviations of the expert's execution noise, used in turn
     cameras: tuple[str, ...] = (),
-    picture: int = 64,
-    every: int | None = None,
-    held_out_tasks: tuple[str, ...] = (),
-    held_out_pairs: float = 0.1,
-    held_out_states: float = 0.2,
-    structure: bool = True,
-    text_encoder: str | None = None,
-    width: int = 128,
-    depth: int = 3,
-    steps: int | None = None,
-    batch_size: int | None = None,
-    learning_rate: float | None = None,
-    states_per_task: int = 2000,
-    seed: int = 0,
-    num_envs: int | None = None,
+    picture: int = 64,  # with --cameras, pixels of a picture's height and width
+    every: int | None = None,  # use every n-th state of an episode; by default 1, with --cameras 5
+    held_out_tasks: tuple[str, ...] = (),  # names, or a number of tasks to draw: none of their queries is trained
+    held_out_pairs: float = 0.1,  # the share of pairs of objects none of whose queries is trained
+    held_out_states: float = 0.2,  # the share of episodes that are not trained on
+    structure: bool = True,  # read parsed clauses, and objects' positions where the tasks' table says; else only texts
+    text_encoder: str | None = None,  # with --no-structure, your function from texts to vectors, as my_texts:encode
+    width: int = 128,  # of the hidden layers
+    depth: int = 3,  # number of them
+    steps: int | None = None,  # minibatches; by default 6000, with --cameras 4000
+    batch_size: int | None = None,  # pairs of state and clause, by default 1024; with --cameras states, 48
+    learning_rate: float | None = None,  # at the start; a cosine brings it to 0. By default 0.003, with --cameras 0.002
+    states_per_task: int = 2000,  # the most states that are labelled of each task
+    seed: int = 0,  # of the episodes, of what is held out, the initial weights and the minibatches
+    num_envs: int | None = None,  # environments stepped together; the result does not depend on it
     json: options.Json = False,
 ) -> Output:
     """Train a network to answer conditions, on all base queries of tasks, and say how well it does.
@@ -55,31 +55,8 @@ def train_evaluator(
     Example: lw-torchrl train-evaluator drawer-open --out runs/eyes --cameras corner corner3 --episodes 20
 
     Args:
-        tasks: MT10, MT50, or names of tasks, the held-out ones among them.
-        out: folder for evaluator.zip, report.json, reliability.png, the episodes that were run, and, with --cameras,
-            wrong.png.
-        data: datasets of `lw-torchrl collect` to use instead of running episodes.
-        behaviours: who acts in the episodes that are run, as for `lw-torchrl collect`.
-        episodes: of each task and behaviour.
-        max_steps: steps of an episode.
-        noise: standard deviations of the execution noise of the expert, used in turn.
         cameras: answer from these cameras' pictures instead of from the observation: corner, corner2, corner3, corner4,
             topview, behindGripper, gripperPOV.
-        picture: with --cameras, pixels of a picture's height and width.
-        every: use every n-th state of an episode; by default 1, with --cameras 5.
-        held_out_tasks: names, or a number of tasks to draw: none of their queries is trained.
-        held_out_pairs: the share of pairs of objects none of whose queries is trained.
-        held_out_states: the share of episodes that are not trained on.
-        structure: read parsed clauses, and objects' positions where the tasks' table says; else only texts.
-        text_encoder: with --no-structure, a function of yours that turns texts into vectors, as my_texts:encode.
-        width: of the hidden layers.
-        depth: number of them.
-        steps: minibatches; by default 6000, with --cameras 4000.
-        batch_size: pairs of a state and a clause in a minibatch, by default 1024; with --cameras states, 48.
-        learning_rate: at the start; a cosine brings it to 0. By default 0.003, with --cameras 0.002.
-        states_per_task: the most states that are labelled of each task.
-        seed: of the episodes, of what is held out, the initial weights and the minibatches.
-        num_envs: environments stepped together; the result does not depend on it.
     """
     options.check_folder("--out", out)
     if text_encoder is not None and structure:
@@ -119,19 +96,14 @@ def train_evaluator(
         seed=seed,
     )
     torch.manual_seed(seed)
-    network: dict[str, Any] = {
-        "structure": structure,
-        "depth": depth,
-        "text_encoder": options.read_encoder(text_encoder),
-        "hidden" if cameras else "width": width,
-    }
+    network: dict[str, Any] = {"structure": structure, "depth": depth, "hidden" if cameras else "width": width}
+    network["text_encoder"] = options.read_encoder(text_encoder)
     pictures: dict[str, Any] = {"cameras": cameras, "height": picture, "width": picture}
     plans = lw.load_plans("MT50")
     evaluator: ClauseEvaluator
     if cameras:
-        evaluator = lw.modules.ImageQueryEvaluator(
-            lw.Plans({task: plans[task] for task in names}), **network, **pictures
-        )
+        own = lw.Plans({task: plans[task] for task in names})
+        evaluator = lw.modules.ImageQueryEvaluator(own, **network, **pictures)
     else:
         evaluator = lw.StateQueryEvaluator(plans, **network)
     run = {"episodes_per_task": episodes, "max_steps": max_steps, "seed": seed, "num_envs": num_envs}

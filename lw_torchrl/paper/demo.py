@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -44,15 +45,9 @@ QUICK = DemoConfig(tasks=RECORDED, demonstrations_per_task=4, training_steps=800
 
 
 def run_demo(out: Path, config: DemoConfig) -> EvaluationResult:
-    """Run the demo, or what is left of it, and print its results.
+    """Run the demo, or what is left of it, and print its results; ``out`` must hold none of another configuration.
 
-    Args:
-        out: gets config.json, demonstrations/, checkpoint.zip, results.json, success.png and rollout.rrd. What is
-            there already is not done again.
-        config: what to do.
-
-    Raises:
-        ValueError: ``out`` holds a demo of another configuration, or another process is at work there.
+    It gets config.json, demonstrations/, checkpoint.zip, results.json, success.png and rollout.rrd.
     """
     stated, path = json.loads(json.dumps(asdict(config))), out / "config.json"
     with held(out, "out", folder=True):
@@ -66,42 +61,23 @@ def run_demo(out: Path, config: DemoConfig) -> EvaluationResult:
 def _run(out: Path, config: DemoConfig) -> EvaluationResult:
     plans = load_plans("MT10")
     print(f"1/4  {config.demonstrations_per_task} demonstrations of each of {counted(len(config.tasks), 'task')}")
-    collect_demonstrations(
-        config.tasks,
-        episodes_per_task=config.demonstrations_per_task,
-        root=out / "demonstrations",
-        seed=config.demonstration_seed,
-        noise_scale=config.demonstration_noise,
-        noise_hold=config.noise_hold,
-        redraw_failures=True,
-    )
+    options: dict[str, Any] = {"noise_scale": config.demonstration_noise, "noise_hold": config.noise_hold}
+    options |= {"episodes_per_task": config.demonstrations_per_task, "seed": config.demonstration_seed}
+    collect_demonstrations(config.tasks, root=out / "demonstrations", redraw_failures=True, **options)
     print(f"2/4  training a plan-conditioned policy for {config.training_steps} steps")
     torch.manual_seed(config.training_seed)
     actor = PlanConditionedActor(plans)
-    replay = LanguageWorldExperienceReplay(
-        out / "demonstrations",
-        sampler=TaskBalancedSampler(),
-        transform=QAFTransform(plans),
-        after_success=config.after_success,
-    )
-    BehavioralCloningTrainer(
-        actor,
-        replay,
-        BehavioralCloningConfig(steps=config.training_steps, batch_size=config.batch_size, seed=config.training_seed),
-        checkpoint=out / "checkpoint.zip",
-    ).train()
+    options = {"after_success": config.after_success, "transform": QAFTransform(plans)}
+    replay = LanguageWorldExperienceReplay(out / "demonstrations", sampler=TaskBalancedSampler(), **options)
+    cloning = BehavioralCloningConfig(config.training_steps, config.batch_size, seed=config.training_seed)
+    BehavioralCloningTrainer(actor, replay, cloning, checkpoint=out / "checkpoint.zip").train()
     print(f"3/4  evaluating {config.episodes_per_task} episodes of each task on seeds no demonstration used")
     results = out / "results.json"
     if results.is_file():
         result = EvaluationResult.load(results)
     else:
-        result = evaluate(
-            actor,
-            tasks=config.tasks,
-            episodes_per_task=config.episodes_per_task,
-            seed=config.evaluation_seed,
-            noise_scale=config.evaluation_noise,
-        )
+        options = {"seed": config.evaluation_seed, "noise_scale": config.evaluation_noise}
+        result = evaluate(actor, tasks=config.tasks, episodes_per_task=config.episodes_per_task, **options)
         result.save(results, checkpoint=out / "checkpoint.zip", plans=plans.fingerprint)
     plot_success(result, out / "success.png", title="Plan-conditioned behavioral cloning")
     print("4/4  recording a rollout")

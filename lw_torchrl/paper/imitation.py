@@ -20,15 +20,9 @@ from lw_torchrl.modules import ActorEnsemble, ScriptedSkillActor
 from lw_torchrl.modules.policy import METHODS, Policy, make_policy, policy_class
 from lw_torchrl.paper.recipes import DataSetting, Execution, Member, Preset
 from lw_torchrl.paper.runs import Dataset, Run, Work, load_evaluation, own_tasks, plain
-from lw_torchrl.training import (
-    BehavioralCloningConfig,
-    BehavioralCloningTrainer,
-    StackedBehavioralCloning,
-    load_actor,
-    save_actor,
-)
+from lw_torchrl.training import BehavioralCloningConfig, BehavioralCloningTrainer, StackedBehavioralCloning
 from lw_torchrl.training.envelope import check_description
-from lw_torchrl.training.files import describe_data
+from lw_torchrl.training.files import describe_data, load_actor, save_actor
 from lw_torchrl.transforms import RandomYaw
 
 SCRIPTED = "scripted"
@@ -37,19 +31,12 @@ SCRIPTED = "scripted"
 
 @dataclass(frozen=True)
 class ExpertDataset(Dataset):
-    """Demonstrations of the scripted experts.
+    """Demonstrations of the scripted experts."""
 
-    Attributes:
-        tasks: "MT10" or another argument of :func:`resolve_tasks`.
-        episodes: demonstrations of each.
-        execution: how the experts are executed.
-        seed: of the initial states and the noise.
-    """
-
-    tasks: str
-    episodes: int
-    execution: Execution
-    seed: int
+    tasks: str  # "MT10" or another argument of :func:`resolve_tasks`
+    episodes: int  # demonstrations of each
+    execution: Execution  # how the experts are executed
+    seed: int  # of the initial states and the noise
 
     @property
     def folder(self) -> Path:
@@ -63,25 +50,15 @@ class ExpertDataset(Dataset):
 
 @dataclass(frozen=True)
 class ImitationRun(Run):
-    """One policy, or one for each target, or plans with scripts.
+    """One policy, or one for each target, or plans with scripts."""
 
-    Attributes:
-        setting: what data it sees; scripts see none, and are the same in every setting.
-        method: one of :data:`~lw_torchrl.modules.policy.METHODS`, or "scripted".
-        seed: of demonstrations, initial weights and minibatches.
-        preset: how to train.
-        episodes: evaluated for each task.
-        plans_name: part of the folder's name, for other plans than ours.
-        encoder_name: that of the text encoder, for another than ours: "my_texts:encode".
-    """
-
-    setting: DataSetting
-    method: str
-    seed: int
-    preset: Preset
-    episodes: int = 20
-    plans_name: str = ""
-    encoder_name: str = ""
+    setting: DataSetting  # what data it sees; scripts see none, and are the same in every setting
+    method: str  # one of :data:`~lw_torchrl.modules.policy.METHODS`, or "scripted"
+    seed: int  # of demonstrations, initial weights and minibatches
+    preset: Preset  # how to train
+    episodes: int = 20  # evaluated for each task
+    plans_name: str = ""  # part of the folder's name, for other plans than ours
+    encoder_name: str = ""  # that of the text encoder, for another than ours: "my_texts:encode"
     any_device = True
 
     def __post_init__(self) -> None:
@@ -105,7 +82,6 @@ class ImitationRun(Run):
 
     @property
     def datasets(self) -> tuple[ExpertDataset, ...]:
-        """The base tasks' demonstrations, and the targets'."""
         if self.method == SCRIPTED:
             return ()
         base = ExpertDataset(self.setting.base, self.setting.episodes, self.preset.base, self.seed)
@@ -120,17 +96,14 @@ class ImitationRun(Run):
 
     @property
     def reads_plans(self) -> bool:
-        """Whether its policy is conditioned on plans."""
         return self.method == SCRIPTED or policy_class(METHODS[self.method].policy).plan_options
 
     @property
     def skills(self) -> Literal["own", "MT10"]:
-        """Whose skills its plans speak of, as for :func:`~lw_torchrl.load_plans`: what is trained on MT10 and never saw
-        another task knows those of MT10 alone."""
+        """Whose skills its plans speak of: what is trained on MT10 and never saw another task knows MT10's alone."""
         return "MT10" if self.setting.name == "zero-shot" and self.method != SCRIPTED else "own"
 
     def actor_options(self, member: Member) -> dict[str, Any]:
-        """Of one of its policy's actors."""
         return {**member.actor, **(member.plan_actor if self.reads_plans else {})}
 
     def any_yaw(self, member: Member) -> bool:
@@ -141,20 +114,14 @@ class ImitationRun(Run):
         described: dict[str, Any] = {"method": self.method, "seed": self.seed}
         described["plans"] = plans.fingerprint if self.reads_plans else None
         if self.method != SCRIPTED:
-            described |= {
-                "setting": self.setting.name,
-                "preset": self.preset.name,
-                "datasets": [asdict(dataset) for dataset in self.datasets],
-                "members": [
-                    {"actor": self.actor_options(one), "yaw": one.yaw}
-                    | ({"any_yaw": True} if self.any_yaw(one) else {})
-                    for one in self.preset.members
-                ],
-                "training": self.preset.training.describe(),
-                "label": self.preset.label,
-                "after_success": self.preset.after_success,
-                "passes": self.preset.passes,
-            }
+            described |= {"setting": self.setting.name, "preset": self.preset.name}
+            described["datasets"] = [asdict(dataset) for dataset in self.datasets]
+            described["members"] = [
+                {"actor": self.actor_options(one), "yaw": one.yaw} | ({"any_yaw": True} if self.any_yaw(one) else {})
+                for one in self.preset.members
+            ]
+            described["training"] = self.preset.training.describe()
+            described |= {name: getattr(self.preset, name) for name in ("label", "after_success", "passes")}
             if self.preset.evaluations > 1:
                 described["evaluations"] = self.preset.evaluations
         if not self.reads_plans:
@@ -168,9 +135,7 @@ class ImitationRun(Run):
             return ScriptedSkillActor(work.plans), {}
         targets = None if self.setting.targets is None else resolve_tasks(self.setting.targets)
         folder, described = work.out / self.folder, {"run": self.describe(work.plans)}
-        files = [folder / "policy.zip"]
-        if targets is not None:
-            files = [folder / "models" / f"{target}.zip" for target in targets]
+        files = [folder / "models" / f"{target}.zip" for target in targets or ()] or [folder / "policy.zip"]
         policies = []
         if all(file.is_file() for file in files):
             for file in files:
@@ -235,10 +200,7 @@ def _train_one(run: ImitationRun, work: Work, targets: Sequence[str]) -> Trained
 
 
 def _train_each(run: ImitationRun, work: Work, targets: Sequence[str]) -> Trained:
-    """A policy for each target, all trained together, member by member.
-
-    The i-th target's seed is the i-th from 1000 times the run's; the next member's follow.
-    """
+    """A policy for each target, all trained together; seeds count from 1000 times the run's, member by member."""
     roots = [work.out / dataset.folder for dataset in run.datasets]
     rows = 0
     if run.preset.passes is not None:  # over the base tasks, which have half of each minibatch
@@ -247,17 +209,10 @@ def _train_each(run: ImitationRun, work: Work, targets: Sequence[str]) -> Traine
     for number, member in enumerate(run.preset.members):
         config = _config(run, rows, 1_000 * run.seed + len(targets) * number)
         actors = [_make_actor(run, member, work, config.seed + i) for i in range(len(targets))]
-        replays = [
-            _replay(
-                run,
-                work,
-                roots,
-                episodes=[None, {target: 1}],
-                sampler=CoLearningSampler(target),
-                transform=_transform(run, actor, member),
-            )
-            for target, actor in zip(targets, actors, strict=True)
-        ]
+        replays = []
+        for target, actor in zip(targets, actors, strict=True):
+            rows_of = {"episodes": [None, {target: 1}], "transform": _transform(run, actor, member)}
+            replays.append(_replay(run, work, roots, sampler=CoLearningSampler(target), **rows_of))
         members.append(actors)
         trainer = StackedBehavioralCloning(actors, replays, config, **_options(run, number, work))
         _train(trainer, run, dict(zip(targets, actors, strict=True)), work)
@@ -288,7 +243,6 @@ def _config(run: ImitationRun, rows: int, seed: int) -> BehavioralCloningConfig:
 
 
 def _options(run: ImitationRun, number: int, work: Work) -> dict[str, Any]:
-    """Of the trainer of a member."""
     checkpoint = work.out / run.folder / f"checkpoint-{number}.zip"
     return {"checkpoint": checkpoint, "progress": work.progress, "device": work.device}
 

@@ -47,19 +47,12 @@ _FORMAT = {"format": "lw_torchrl.advantages", "version": 1}
 
 @dataclass(frozen=True)
 class BehaviourDataset(Dataset):
-    """The episodes of a portion in some tasks, which mixtures share.
+    """The episodes of a portion in some tasks, which mixtures share."""
 
-    Attributes:
-        tasks: a name of :data:`TASK_SETS`.
-        portion: whose, and how many.
-        seed: of the experiment, from 0 to 99.
-        max_steps: of an episode.
-    """
-
-    tasks: str
-    portion: Portion
-    seed: int
-    max_steps: int = 500
+    tasks: str  # a name of :data:`TASK_SETS`
+    portion: Portion  # whose, and how many
+    seed: int  # of the experiment, from 0 to 99
+    max_steps: int = 500  # of an episode
 
     @property
     def folder(self) -> Path:
@@ -68,25 +61,20 @@ class BehaviourDataset(Dataset):
     @property
     def options(self) -> dict[str, Any]:
         behaviour = self.portion.behaviour
-        return {
-            "tasks": TASK_SETS[self.tasks],
-            "episodes_per_task": self.portion.episodes,
-            "policy": behaviour,
-            "seed": _SEEDS * list(BEHAVIOURS).index(behaviour) + self.seed,
-            "max_steps": self.max_steps,
-            **NOISE[behaviour],
-        }
+        seed = _SEEDS * list(BEHAVIOURS).index(behaviour) + self.seed
+        found = {"tasks": TASK_SETS[self.tasks], "episodes_per_task": self.portion.episodes, "policy": behaviour}
+        return {**found, "seed": seed, "max_steps": self.max_steps, **NOISE[behaviour]}
 
 
 @dataclass(frozen=True)
 class _Learned:
     """What an experiment learns from a mixture: its first fields, and what follows from them."""
 
-    tasks: str
-    mixture: str
-    seed: int
-    recipe: OfflineRecipe = field(default_factory=OfflineRecipe)
-    max_steps: int = 500
+    tasks: str  # a name of :data:`TASK_SETS`
+    mixture: str  # a name of :data:`MIXTURES`
+    seed: int  # of the data, the initial weights and the minibatches
+    recipe: OfflineRecipe = field(default_factory=OfflineRecipe)  # the numbers
+    max_steps: int = 500  # of an episode
 
     def __post_init__(self) -> None:
         check_choice("tasks", self.tasks, TASK_SETS)
@@ -101,12 +89,9 @@ class _Learned:
 
     @property
     def datasets(self) -> tuple[BehaviourDataset, ...]:
-        """The mixture's."""
-        portions = MIXTURES[self.mixture]
-        return tuple(BehaviourDataset(self.tasks, portion, self.seed, self.max_steps) for portion in portions)
+        return tuple(BehaviourDataset(self.tasks, one, self.seed, self.max_steps) for one in MIXTURES[self.mixture])
 
     def own_plans(self, plans: Plans) -> Plans:
-        """The plans of its tasks."""
         return Plans([plans[task] for task in TASK_SETS[self.tasks]])
 
     def describe(self, plans: Plans) -> dict[str, Any]:
@@ -116,18 +101,12 @@ class _Learned:
         return plain(asdict(self) | {"plans": own.fingerprint, "data": data} | own_tasks(own))
 
     def _replay(self, plans: Plans, out: Path, n_steps: bool, **options: Any) -> LanguageWorldExperienceReplay:
-        recipe = self.recipe
+        recipe, roots = self.recipe, [out / dataset.folder for dataset in self.datasets]
         if n_steps:
             options |= {"n_steps": recipe.n_steps, "gamma": recipe.gamma if recipe.n_steps > 1 else None}
-        return LanguageWorldExperienceReplay(
-            [out / dataset.folder for dataset in self.datasets],
-            label="executed",
-            terminate_on_success=True,
-            reward=recipe.reward,
-            sampler=TaskBalancedSampler(),
-            transform=QAFTransform(plans),
-            **options,
-        )
+        options |= {"label": "executed", "terminate_on_success": True, "reward": recipe.reward}
+        sampler, transform = TaskBalancedSampler(), QAFTransform(plans)
+        return LanguageWorldExperienceReplay(roots, sampler=sampler, transform=transform, **options)
 
     def _config(self, steps: int) -> OfflineConfig:
         return OfflineConfig(steps=steps, batch_size=self.recipe.batch_size, seed=self.seed)
@@ -145,18 +124,10 @@ class Advantages(_Learned):
 
     @property
     def folder(self) -> Path:
-        """Where its files go, below the experiments' folder."""
         return self.group / "advantages" / CONDITIONS[self.critic] / f"seed{self.seed}"
 
     def make(self, plans: Plans, out: Path, progress: bool) -> dict[str, Tensor]:
-        """The advantages, learned once and kept in ``advantages.zip``.
-
-        Returns:
-            ``advantage``, (R, 1) float32, standardised by task.
-
-        Raises:
-            ValueError: ``out`` holds those of another configuration, or a damaged file.
-        """
+        """``advantage``, (R, 1) float32, standardised by task: learned once and kept in ``advantages.zip``."""
         file = out / self.folder / "advantages.zip"
         described = _FORMAT | {"run": self.describe(plans)}
         with held(file, "out", wait=True):
@@ -184,33 +155,20 @@ class Advantages(_Learned):
         OfflineTrainer(loss, replay, config, checkpoint=checkpoint, progress=progress, title=title).train()
         starts = range(0, len(replay), _CHUNK)
         chunks = [replay[start : min(start + _CHUNK, len(replay))] for start in starts]
-        found = standardize_by_task(
-            torch.cat([loss.advantage(chunk) for chunk in chunks]), torch.cat([chunk["task_id"] for chunk in chunks])
-        )
+        advantages = torch.cat([loss.advantage(chunk) for chunk in chunks])
+        found = standardize_by_task(advantages, torch.cat([chunk["task_id"] for chunk in chunks]))
         write_archive(file, described, {"advantages": {"advantage": found}})
         checkpoint.unlink()
 
 
 @dataclass(frozen=True)
 class OfflineRun(_Learned, Run):
-    """A policy learned from a mixture, and its evaluation.
+    """A policy learned from a mixture, and its evaluation."""
 
-    Attributes:
-        tasks: a name of :data:`TASK_SETS`.
-        mixture: a name of :data:`MIXTURES`.
-        seed: of the data, the initial weights and the minibatches.
-        recipe: the numbers.
-        max_steps: of an episode.
-        method: a name of :data:`OFFLINE_METHODS`.
-        actor: what the policy is conditioned on, a name of :data:`METHODS`.
-        critic: what its critic is conditioned on, where it has one.
-        episodes: evaluated for each task.
-    """
-
-    method: str = "advantage"
-    actor: str = "pcbc"
-    critic: str = "pcbc"
-    episodes: int = 20
+    method: str = "advantage"  # a name of :data:`OFFLINE_METHODS`
+    actor: str = "pcbc"  # what the policy is conditioned on, a name of :data:`METHODS`
+    critic: str = "pcbc"  # what its critic is conditioned on, where it has one
+    episodes: int = 20  # evaluated for each task
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -220,7 +178,6 @@ class OfflineRun(_Learned, Run):
 
     @property
     def how(self) -> OfflineMethod:
-        """Its method."""
         return OFFLINE_METHODS[self.method]
 
     @property
@@ -280,11 +237,8 @@ def _encoder(condition: str, plans: Plans, noise: float = 0.0) -> Encoder:
     return DescriptorEncoder(tuple(plans), feature_noise=noise, **METHODS[condition].options)
 
 
-DISTRIBUTIONS: Mapping[str, str | None] = {
-    "advantage": None,
-    "bc": None,
+DISTRIBUTIONS: Mapping[str, str | None] = dict.fromkeys(("advantage", "bc", "td3-bc")) | {
     "iql": "normal",
-    "td3-bc": None,
     "cql": "tanh_normal",
 }
 """By name: the distribution that the loss wants of its actor."""
@@ -336,12 +290,12 @@ def write_table(
         means = [str(one.summaries[label].mean) if label in one.summaries else "" for one in compared.values()]
         rows.append([label, *means])
     head = markdown_table(["method, conditioned on", *compared], rows)
-    parts = [f"# {name}: {runs[0].tasks} tasks, mean success", head]
-    parts.append("Brackets are 95 % intervals, Student's t over seeds.")
+    about = "Brackets are 95 % intervals, Student's t over seeds."
+    parts = [f"# {name}: {runs[0].tasks} tasks, mean success", head, about]
     for mixture, one in compared.items():
         portions = ", ".join(f"{part.episodes} {part.behaviour}" for part in MIXTURES[mixture])
         parts += [f"## {mixture}: of each task {portions}", one.headline(), one.per_task()]
-    told = {mixture: one.to_json() for mixture, one in compared.items()}
-    write_summary(out / name, "\n\n".join(parts) + "\n", told)
+    numbers = {mixture: one.to_json() for mixture, one in compared.items()}
+    write_summary(out / name, "\n\n".join(parts) + "\n", numbers)
     plot_methods({mixture: one.summaries for mixture, one in compared.items()}, out / f"{name}.png")
     return head

@@ -24,15 +24,10 @@ TASK_SETS: Mapping[str, tuple[str, ...]] = MappingProxyType(
 
 @dataclass(frozen=True)
 class Portion:
-    """Episodes of one behaviour.
+    """Episodes of one behaviour."""
 
-    Attributes:
-        behaviour: a name of :data:`BEHAVIOURS`.
-        episodes: of each task.
-    """
-
-    behaviour: str
-    episodes: int
+    behaviour: str  # a name of :data:`BEHAVIOURS`
+    episodes: int  # of each task
 
 
 _WRONG, _RANDOM = Portion("wrong", 20), Portion("random", 10)
@@ -56,37 +51,23 @@ NOISE: Mapping[str, dict[str, Any]] = dict.fromkeys(BEHAVIOURS, _LED_ASTRAY) | {
 
 @dataclass(frozen=True)
 class OfflineMethod:
-    """How a policy is learned from a mixture.
+    """How a policy is learned from a mixture."""
 
-    Attributes:
-        name: in folders and tables.
-        loss: a name of :data:`lw_torchrl.paper.offline.DISTRIBUTIONS`.
-        keep: which episodes it sees; None for all.
-        critic: whether it has a critic, which may be conditioned otherwise than the actor.
-        version: raised by 1 whenever the method changes, so that earlier results are refused.
-    """
-
-    name: str
-    loss: str
-    keep: EpisodeFilter | None = None
-    critic: bool = False
-    version: int = 1
+    name: str  # in folders and tables
+    loss: str  # a name of :data:`lw_torchrl.paper.offline.DISTRIBUTIONS`
+    keep: EpisodeFilter | None = None  # which episodes it sees; None for all
+    critic: bool = False  # whether it has a critic, which may be conditioned otherwise than the actor
+    version: int = 1  # raised by 1 whenever the method changes, so that earlier results are refused
 
 
-OFFLINE_METHODS: Mapping[str, OfflineMethod] = MappingProxyType(
-    {
-        method.name: method
-        for method in (
-            OfflineMethod("advantage", "advantage", critic=True),
-            OfflineMethod("filtered-bc", "bc", EpisodeFilter(success=True, else_best=0.2)),
-            OfflineMethod("best-bc", "bc", EpisodeFilter(best=0.2)),
-            OfflineMethod("bc", "bc"),
-            OfflineMethod("iql", "iql", critic=True),
-            OfflineMethod("td3-bc", "td3-bc", critic=True),
-            OfflineMethod("cql", "cql", critic=True),
-        )
-    }
+_ALL_METHODS = (
+    OfflineMethod("advantage", "advantage", critic=True),
+    OfflineMethod("filtered-bc", "bc", EpisodeFilter(success=True, else_best=0.2)),
+    OfflineMethod("best-bc", "bc", EpisodeFilter(best=0.2)),
+    OfflineMethod("bc", "bc"),
+    *(OfflineMethod(name, name, critic=True) for name in ("iql", "td3-bc", "cql")),
 )
+OFFLINE_METHODS: Mapping[str, OfflineMethod] = MappingProxyType({method.name: method for method in _ALL_METHODS})
 """By name: imitation weighted by the advantages of a value that was learned before; behavioral cloning of the successes
 (of a task without any, as the next method), of the fifth of each task's episodes with the highest return, and of all
 episodes; and TorchRL's IQL, TD3+BC and CQL."""
@@ -94,41 +75,25 @@ episodes; and TorchRL's IQL, TD3+BC and CQL."""
 
 @dataclass(frozen=True)
 class OfflineRecipe:
-    """The numbers of all methods.
+    """The numbers of all methods."""
 
-    Attributes:
-        reward: what values are of.
-        n_steps, gamma: of their targets.
-        expectile: of the value.
-        beta, max_weight: of the weights by advantage, as for :class:`AdvantageWeightedLoss`.
-        distance: to the action that is imitated. With "l1" a policy learns the median of the actions in a state; the
-            mean ("l2") of opening and closing would half open the gripper.
-        temperature: of IQL's actor.
-        alpha: of TD3+BC, the weight of the value beside the imitation.
-        cql_weight: of CQL's penalty.
-        steps: minibatches of every actor; of the value, ``value_steps``.
-        batch_size: rows of one.
-        width, depth: hidden layers of actors; of critics, ``critic_depth``.
-        feature_noise: of actors while they train.
-    """
-
-    reward: RewardName = "dense_cost"
-    n_steps: int = 10
-    gamma: float = 0.99
-    expectile: float = 0.7
-    beta: float = 2.0
-    max_weight: float = 20.0
-    distance: Literal["l1", "l2"] = "l1"
-    temperature: float = 3.0
-    alpha: float = 2.5
-    cql_weight: float = 1.0
-    steps: int = 4000
+    reward: RewardName = "dense_cost"  # what values are of
+    n_steps: int = 10  # of the values' targets
+    gamma: float = 0.99  # of these
+    expectile: float = 0.7  # of the value
+    beta: float = 2.0  # of the weights by advantage, as for :class:`AdvantageWeightedLoss`
+    max_weight: float = 20.0  # of these
+    distance: Literal["l1", "l2"] = "l1"  # to what is imitated; the mean of open and close would half open the gripper
+    temperature: float = 3.0  # of IQL's actor
+    alpha: float = 2.5  # of TD3+BC, the weight of the value beside the imitation
+    cql_weight: float = 1.0  # of CQL's penalty
+    steps: int = 4000  # minibatches of every actor; of the value, ``value_steps``
     value_steps: int = 4000
-    batch_size: int = 250
-    width: int = 256
-    depth: int = 3
+    batch_size: int = 250  # rows of one
+    width: int = 256  # of hidden layers
+    depth: int = 3  # of actors
     critic_depth: int = 2
-    feature_noise: float = 0.05
+    feature_noise: float = 0.05  # of actors while they train
 
     def __post_init__(self) -> None:
         check_choice("reward", self.reward, REWARDS)
@@ -143,15 +108,10 @@ class OfflineRecipe:
 
 @dataclass(frozen=True)
 class OfflineTable:
-    """Runs that are compared.
+    """Runs that are compared: the first row of a mixture with each of the others."""
 
-    Attributes:
-        tasks: a name of :data:`TASK_SETS`.
-        rows: mixture to its rows, (method, actor, critic) each; the first is compared with each of the others.
-    """
-
-    tasks: str
-    rows: Mapping[str, tuple[tuple[str, str, str], ...]]
+    tasks: str  # a name of :data:`TASK_SETS`
+    rows: Mapping[str, tuple[tuple[str, str, str], ...]]  # mixture to its rows, (method, actor, critic) each
 
 
 _PLAN = "pcbc", "pcbc"

@@ -24,15 +24,8 @@ from lw_torchrl.modules.residual_actor import ResidualActor
 from lw_torchrl.paper.imitation import ExpertDataset
 from lw_torchrl.paper.recipes import TARGET
 from lw_torchrl.paper.runs import Run, Work, execute_run, kept_policy, own_tasks, plain
-from lw_torchrl.training import (
-    LEARNERS,
-    BehavioralCloningConfig,
-    BehavioralCloningTrainer,
-    OnlineConfig,
-    OnlineTrainer,
-    load_actor,
-)
-from lw_torchrl.training.files import read_description
+from lw_torchrl.training import LEARNERS, BehavioralCloningConfig, BehavioralCloningTrainer, OnlineConfig, OnlineTrainer
+from lw_torchrl.training.files import load_actor, read_description
 
 START = "start"
 """The policy that is begun with: a run beside those of :data:`~lw_torchrl.training.LEARNERS`."""
@@ -47,24 +40,14 @@ _DIAGNOSED = 20  # episodes
 
 @dataclass(frozen=True)
 class OnlineRecipe:
-    """How weak policies are made and improved, the same for every task.
+    """How weak policies are made and improved, the same for every task; the configurations get the run's seed."""
 
-    Attributes:
-        demonstrations: of the task, without noise, all successful.
-        feature_noise: of the policy cloned from them.
-        cloning: how it is cloned; its seed is replaced by the run's.
-        reward, n_steps: of the buffer.
-        config: of the training; its seed is replaced by the run's.
-    """
-
-    demonstrations: int = 1
-    feature_noise: float = 0.1
-    cloning: BehavioralCloningConfig = field(
-        default_factory=lambda: BehavioralCloningConfig(steps=1_500, batch_size=200)
-    )
-    reward: RewardName = "dense_cost"
-    n_steps: int = 5
-    config: OnlineConfig = field(default_factory=OnlineConfig)
+    demonstrations: int = 1  # of the task, without noise, all successful
+    feature_noise: float = 0.1  # of the policy cloned from them
+    cloning: BehavioralCloningConfig = field(default_factory=lambda: BehavioralCloningConfig(1_500, 200))
+    reward: RewardName = "dense_cost"  # of the buffer
+    n_steps: int = 5  # of the buffer
+    config: OnlineConfig = field(default_factory=OnlineConfig)  # of the training
 
     def __post_init__(self) -> None:
         check_int("demonstrations", self.demonstrations, minimum=1)
@@ -74,26 +57,18 @@ class OnlineRecipe:
 class OnlineRun(Run):
     """A policy of one task, method and seed, and its evaluation.
 
-    Attributes:
-        task: its name.
-        method: a name of :data:`~lw_torchrl.training.LEARNERS`, or "start".
-        seed: of demonstrations, weights, episodes and minibatches.
-        recipe: the numbers.
-        condition: what the policy is conditioned on, a name of :data:`METHODS`; of a start that is given, its own.
-        start: a policy file to begin with; None to clone one from the demonstrations.
-        episodes: evaluated.
-        step: of method "residual", the step of the task's plan that alone is corrected, counted from 0, or "weakest",
-            the one that the start's failed episodes reached and did not pass; None for all steps.
+    With ``step``, method "residual" corrects that step of the task's plan alone, counted from 0; "weakest" is the one
+    that the start's failed episodes reached and did not pass.
     """
 
-    task: str
-    method: str
-    seed: int
-    recipe: OnlineRecipe = field(default_factory=OnlineRecipe)
-    condition: str = "pcbc"
-    start: Path | None = None
-    episodes: int = 40
-    step: int | str | None = None
+    task: str  # its name
+    method: str  # a name of :data:`~lw_torchrl.training.LEARNERS`, or "start"
+    seed: int  # of demonstrations, weights, episodes and minibatches
+    recipe: OnlineRecipe = field(default_factory=OnlineRecipe)  # the numbers
+    condition: str = "pcbc"  # what the policy is conditioned on, a name of :data:`METHODS`; without ``start``
+    start: Path | None = None  # a policy file to begin with; None to clone one from the demonstrations
+    episodes: int = 40  # evaluated
+    step: int | str | None = None  # None for all steps
 
     def __post_init__(self) -> None:
         check_choice("method", self.method, (*LEARNERS, START))
@@ -130,7 +105,6 @@ class OnlineRun(Run):
 
     @property
     def begin(self) -> OnlineRun:
-        """The run of the policy that it begins with."""
         return replace(self, method=START, step=None)
 
     @cached_property
@@ -141,7 +115,6 @@ class OnlineRun(Run):
             return file_digest(file, "sha256").hexdigest()
 
     def own_plans(self, plans: Plans) -> Plans:
-        """The plan of its task."""
         return Plans([plans[self.task]])
 
     def describe(self, plans: Plans) -> dict[str, Any]:
@@ -199,13 +172,8 @@ class OnlineRun(Run):
             return kept_policy(file, {"run": self.begin.describe(work.plans)}, train)
 
     def _replay(self, work: Work, actor: Policy, **options: Any) -> LanguageWorldExperienceReplay:
-        return LanguageWorldExperienceReplay(
-            work.out / self.datasets[0].folder,
-            label="executed",
-            terminate_on_success=True,
-            transform=actor.transform(),
-            **options,
-        )
+        options |= {"label": "executed", "terminate_on_success": True, "transform": actor.transform()}
+        return LanguageWorldExperienceReplay(work.out / self.datasets[0].folder, **options)
 
     def _make_trainer(self, work: Work, file: Path, checkpoint: Path) -> tuple[OnlineTrainer, dict[str, Any]]:
         """A trainer of the start, and "tuned", the step of a plan if the run is of one."""
@@ -217,15 +185,8 @@ class OnlineRun(Run):
                 torch.manual_seed(config.seed)
                 actor, told = tune_step(actor, self.task, self.step, progress=work.progress, **options)
             tuned = {"tuned": told}
-        replay = self._replay(
-            work,
-            actor,
-            reward=self.recipe.reward,
-            n_steps=self.recipe.n_steps,
-            gamma=config.gamma,
-            grow=config.frames,
-            sampler=CoLearningSampler(GROWN),
-        )
+        rewards = {"reward": self.recipe.reward, "n_steps": self.recipe.n_steps, "gamma": config.gamma}
+        replay = self._replay(work, actor, **rewards, grow=config.frames, sampler=CoLearningSampler(GROWN))
         logger = None if work.make_logger is None else work.make_logger(file)
         options = {"checkpoint": checkpoint, "logger": logger, "progress": work.progress}
         return OnlineTrainer(actor, replay, config, method=self.method, tasks=self.task, **options), tuned
@@ -237,16 +198,10 @@ def tune_step(
     """A residual of one step of a task's plan, and what the result says of it, as JSON.
 
     Args:
-        start: the policy, conditioned on plans.
+        start: the policy, conditioned on plans; else :class:`TypeError`.
         task: one of its tasks.
-        step: of its plan, counted from 0; or "weakest", the one that failed episodes reached and did not pass.
+        step: of its plan, counted from 0; or "weakest", of 20 episodes with ``seed``, some of which must fail.
         scale: how far an action can be corrected.
-        seed: of 20 episodes, in which the weakest step is looked for.
-        progress: show a progress bar of them.
-
-    Raises:
-        ValueError: the plan does not have the step; or, to find the weakest, no episode failed.
-        TypeError: the policy is not conditioned on plans.
     """
     told: dict[str, Any] = {}
     if isinstance(step, str):
@@ -267,12 +222,8 @@ def tune_step(
 class Elsewhere:
     """Compares a residual of some steps with its start in the states of episodes.
 
-    Pass it to ``evaluate`` as ``on_episode``, and the policy's ``in_keys`` as ``also_record``.
-
-    Attributes:
-        states: number of states.
-        outside: how many of them have none of the steps in force.
-        changed: in how many of these the two actions differ in any bit.
+    Pass it to ``evaluate`` as ``on_episode``, and the policy's ``in_keys`` as ``also_record``. Of all ``states`` it
+    counts those ``outside`` of the steps, and of these the ``changed`` ones, where the actions differ in any bit.
     """
 
     def __init__(self, start: Policy, policy: ResidualActor) -> None:

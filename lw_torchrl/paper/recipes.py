@@ -13,32 +13,20 @@ from lw_torchrl.training.behavioral_cloning import BehavioralCloningConfig
 
 @dataclass(frozen=True)
 class DataSetting:
-    """What demonstrations an experiment may see.
+    """What demonstrations an experiment may see; without targets it has one policy of all base tasks."""
 
-    Attributes:
-        name: "zero-shot", "few-shot" or "one-shot".
-        base: the tasks demonstrated, "MT10" or "MT50".
-        episodes: demonstrations of each.
-        targets: tasks that get a policy of their own from one demonstration beside the base tasks; None for one
-            policy of all base tasks.
-    """
-
-    name: str
-    base: str
-    episodes: int
-    targets: str | None = None
+    name: str  # "zero-shot", "few-shot" or "one-shot"
+    base: str  # the tasks demonstrated, "MT10" or "MT50"
+    episodes: int  # demonstrations of each
+    targets: str | None = None  # tasks that each get a policy, from one demonstration beside the base tasks
 
 
-SETTINGS: Mapping[str, DataSetting] = MappingProxyType(
-    {
-        setting.name: setting
-        for setting in (
-            DataSetting("zero-shot", "MT10", 100),
-            DataSetting("few-shot", "MT50", 10),
-            DataSetting("one-shot", "MT10", 100, targets="MT50"),
-        )
-    }
+_SETTINGS = (
+    DataSetting("zero-shot", "MT10", 100),
+    DataSetting("few-shot", "MT50", 10),
+    DataSetting("one-shot", "MT10", 100, targets="MT50"),
 )
+SETTINGS: Mapping[str, DataSetting] = MappingProxyType({setting.name: setting for setting in _SETTINGS})
 """Source: paper, the table of data configurations."""
 
 
@@ -60,19 +48,12 @@ TARGET = Execution("target", (0.0,), redraw_failures=True)
 
 @dataclass(frozen=True)
 class Member:
-    """One of the actors whose actions a policy averages.
+    """One of the actors whose actions a policy averages."""
 
-    Attributes:
-        actor: its options.
-        plan_actor: more options, of :class:`PlanConditionedActor` alone.
-        yaw: scale of :class:`RandomYaw` on its demonstrations, in radians.
-        any_yaw: with plans, turn rows by any angle if their steps in force say no direction.
-    """
-
-    actor: Mapping[str, Any] = field(hash=False)
-    plan_actor: Mapping[str, Any] = field(default_factory=dict, hash=False)
-    yaw: float = 0.0
-    any_yaw: bool = False
+    actor: Mapping[str, Any] = field(hash=False)  # its options
+    plan_actor: Mapping[str, Any] = field(default_factory=dict, hash=False)  # more, of those that read plans
+    yaw: float = 0.0  # scale of :class:`RandomYaw` on its demonstrations, in radians
+    any_yaw: bool = False  # with plans, turn rows by any angle if their steps in force say no direction
 
     def __post_init__(self) -> None:
         for name in ("actor", "plan_actor"):  # a frozen recipe's options are read-only, too
@@ -81,33 +62,17 @@ class Member:
 
 @dataclass(frozen=True)
 class Preset:
-    """How demonstrations are made and policies trained in a setting, the same for every method and task.
+    """How demonstrations are made and policies trained in a setting, the same for every method and task."""
 
-    Attributes:
-        name: "strong", ours; "paper", the published recipe; "evaluator", ours with a query evaluator inside.
-        base: how the base tasks are demonstrated.
-        target: how a target task is demonstrated, once, where the setting has targets.
-        label: which of the expert's actions is imitated, as for :class:`LanguageWorldExperienceReplay`.
-        after_success: drop what comes so many steps after the first success; None keeps all.
-        passes: train for so many passes over the rows instead of ``training.steps`` minibatches.
-        members: the actors of a policy, each trained by itself on the same demonstrations.
-        training: of the optimizer.
-        evaluations: how often the policy is evaluated, a 25th of the training apart, the last time at its end. More
-            than one is for policies of one member.
-
-    Raises:
-        ValueError: more evaluations than one, of more members than one.
-    """
-
-    name: str
-    base: Execution
-    target: Execution | None
-    label: Label
-    after_success: int | None
-    passes: int | None
-    members: tuple[Member, ...]
-    training: BehavioralCloningConfig
-    evaluations: int = 1
+    name: str  # "strong", ours; "paper", the published recipe; "evaluator", ours with a query evaluator inside
+    base: Execution  # how the base tasks are demonstrated
+    target: Execution | None  # how a target task is demonstrated, once, where the setting has targets
+    label: Label  # which of the expert's actions is imitated, as for :class:`LanguageWorldExperienceReplay`
+    after_success: int | None  # drop what comes so many steps after the first success; None keeps all
+    passes: int | None  # train for so many passes over the rows instead of ``training.steps`` minibatches
+    members: tuple[Member, ...]  # the actors of a policy, each trained by itself on the same demonstrations
+    training: BehavioralCloningConfig  # of the optimizer
+    evaluations: int = 1  # of the policy, a 25th of the training apart, the last at its end; of one member, if several
 
     def __post_init__(self) -> None:
         if self.evaluations > 1 and len(self.members) > 1:
@@ -175,6 +140,10 @@ _EVALUATOR = replace(
     ),
     training=replace(_STRONG.training, steps=12_000, qaf_anchor=1.0),
 )
+_PUBLISHED_ACTOR: dict[str, Any] = {"features": "raw", "feature_noise": 0.0, "encoder_width": 64, "encoder_depth": 3}
+_PUBLISHED_ACTOR |= {"width": (128, 128, 128, 64, 32), "squash": False}
+_PUBLISHED_OPTIMIZER: dict[str, Any] = {"optimizer": "sgd", "learning_rate": 1e-5, "momentum": 0.995}
+_PUBLISHED_OPTIMIZER |= {"weight_decay": 0.0, "schedule": "constant", "normalize": False, "max_grad_norm": 1e9}
 _PAPER = Preset(
     "paper",
     base=CLEAN,
@@ -182,29 +151,8 @@ _PAPER = Preset(
     label="unclipped",  # as the authors' code: scripts ask for up to 25, without which so small a learning rate is slow
     after_success=None,
     passes=500,
-    members=(
-        Member(
-            {
-                "features": "raw",
-                "feature_noise": 0.0,
-                "encoder_width": 64,
-                "encoder_depth": 3,
-                "width": (128, 128, 128, 64, 32),
-                "squash": False,
-            }
-        ),
-    ),
-    training=BehavioralCloningConfig(
-        batch_size=200,
-        learning_rate=1e-5,
-        optimizer="sgd",
-        momentum=0.995,
-        weight_decay=0.0,
-        schedule="constant",
-        normalize=False,
-        max_grad_norm=1e9,
-        checkpoint_every=10_000,
-    ),
+    members=(Member(_PUBLISHED_ACTOR),),
+    training=BehavioralCloningConfig(batch_size=200, checkpoint_every=10_000, **_PUBLISHED_OPTIMIZER),
     evaluations=10,
 )
 # Four rows of each task, as few-shot's 200 are; and so five times as many steps in a pass.

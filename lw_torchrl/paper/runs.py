@@ -64,19 +64,12 @@ class Dataset(ABC):
 
 
 class Run(ABC):
-    """Policies of one training seed, and their evaluation: what a scheduler runs.
+    """Policies of one training seed, and their evaluation: what a scheduler runs."""
 
-    Attributes:
-        seed: of data, initial weights and minibatches.
-        episodes: evaluated for each task.
-        encoder_name: that of the text encoder, for another than ours: "my_texts:encode".
-        any_device: whether its networks can be trained and evaluated on a GPU.
-    """
-
-    seed: int
-    episodes: int
-    encoder_name: str = ""
-    any_device = False
+    seed: int  # of data, initial weights and minibatches
+    episodes: int  # evaluated for each task
+    encoder_name: str = ""  # that of the text encoder, for another than ours: "my_texts:encode"
+    any_device = False  # whether its networks can be trained and evaluated on a GPU
 
     @property
     @abstractmethod
@@ -126,11 +119,7 @@ class Run(ABC):
 
 
 def load_result(run: Run, plans: Plans, out: Path, tasks: Sequence[str] | None = None) -> EvaluationResult | None:
-    """The result of a run, if it is there.
-
-    Raises:
-        ValueError: it is of another configuration, or an evaluation of others than ``tasks``, where they are given.
-    """
+    """The result of a run, if it is there; one of another configuration, or of other tasks, is refused."""
     return load_evaluation(out / run.folder / RESULTS, run, plans, tasks)
 
 
@@ -144,10 +133,9 @@ def load_evaluation(path: Path, run: Run, plans: Plans, tasks: Sequence[str] | N
     if tasks is not None:
         found, ours = found | {"tasks": result.config["tasks"]}, ours | {"tasks": [*tasks]}
     if different := differences(found, ours):
-        raise ValueError(
-            f"out: {str(path)!r} is of another configuration, it differs in {', '.join(different)}; choose another "
-            f"folder, or delete {run.folder} there to do the run again"
-        )
+        mend = f"choose another folder, or delete {run.folder} there to do the run again"
+        how = f"it differs in {', '.join(different)}"
+        raise ValueError(f"out: {str(path)!r} is of another configuration, {how}; {mend}")
     return result
 
 
@@ -168,30 +156,23 @@ def execute_run(
         run: what to do.
         plans: a plan for each of its tasks.
         out: the experiments' folder.
-        tasks: to evaluate, of a run of the paper; of one with a policy for each target, the targets among them. None
-            for all of a run's.
-        progress: show progress bars.
-        text_encoder: of a run of the paper, texts to vectors (n, E) float32, which its ``encoder_name`` names; None for
-            the shipped one.
-        device: of a run of the paper, where networks are trained and evaluated. A run that was begun on one device can
-            be finished on another.
+        tasks: to evaluate, of a run of the paper; of one with a policy for each target, the targets among them.
+        text_encoder: of a run of the paper, texts to vectors (n, E) float32, which its ``encoder_name`` names.
+        device: of a run of the paper, where networks work; a run begun on one can be finished on another.
         make_logger: of an online run, a TorchRL logger for a policy's file, for the training.
 
     Returns:
         The evaluation of the last step's policy on seeds that no training used, action noise 0.1. ``config["run"]``
         says what was done, ``config["seconds"]`` how long this call took. More is said by some runs:
 
-        - of the paper, where the preset has more evaluations than one, ``config["best"]``: ``of`` how many ``rates``
-          has each task's best success rate. The earlier ones are in ``evaluations/<steps>.json``;
-        - online, ``config["history"]``: what became of each round. Of a run of one step, ``config["tuned"]`` says
-          which, ``config["before"]`` the start's success in the same episodes, and ``config["elsewhere"]`` in how many
-          "states" of them the step was not in force ("outside"), and in how many of these the action is not the
-          start's.
+        - of the paper, of several evaluations, ``config["best"]``: ``of`` how many ``rates`` has each task's best
+          success rate. The earlier ones are in ``evaluations/<steps>.json``;
+        - online, ``config["history"]``: what became of each round. Of a run of one step, ``config["tuned"]``: which;
+          ``config["before"]``: the start's success in the same episodes; ``config["elsewhere"]``: as of
+          :class:`~lw_torchrl.paper.online.Elsewhere`.
 
     Raises:
-        ValueError: ``out`` holds the same run of another configuration, or evaluated in other tasks; the run has none
-            of the tasks; its text encoder is missing, or one is given that it does not name; its start does not know
-            the task.
+        ValueError: ``out`` holds the same run of another configuration, or evaluated in other tasks.
 
     Source: paper section 'Conditional Plan Experiments'.
     """
@@ -223,15 +204,9 @@ def _execute(run: Run, work: Work) -> EvaluationResult:
 
 
 def kept_policy(file: Path, described: dict[str, Any], train: Callable[[Path], Mapping[str, Any]]) -> Policy:
-    """The policy of a file; if there is none, it is trained and saved first.
+    """The policy of a file, which must say what is ``described``; if there is none, it is trained and saved first.
 
-    Args:
-        file: the policy's.
-        described: what the file must say.
-        train: trains it, with this checkpoint meanwhile; returns arguments of :func:`~lw_torchrl.save_actor`.
-
-    Raises:
-        ValueError: the file says something else.
+    ``train`` is given the checkpoint to use meanwhile; it returns arguments of :func:`~lw_torchrl.save_actor`.
     """
     checkpoint = file.with_name("checkpoint.zip")
     if not file.is_file():
@@ -251,12 +226,7 @@ def joined(results: Sequence[EvaluationResult]) -> EvaluationResult:
 def compare(
     results: Iterable[tuple[Run, EvaluationResult]], published: Mapping[str, Mapping[str, float]] | None = None
 ) -> MethodComparison:
-    """Runs compared by their labels, over seeds; those of several tasks are taken together.
-
-    Args:
-        results: in the order of the table.
-        published: label to (task to success rate), beside them.
-    """
+    """Runs compared by their labels, over seeds, beside published rates; those of several tasks are taken together."""
     found: dict[str, dict[int, list[EvaluationResult]]] = {}
     for run, result in results:
         found.setdefault(run.label, {}).setdefault(run.seed, []).append(result)
