@@ -88,10 +88,7 @@ def place(module: Any, device: str | torch.device | None) -> torch.device:
 
 @contextmanager
 def drawn_on(device: torch.device, state: torch.Tensor) -> Iterator[None]:
-    """Within the block the global generators draw from ``state``, the CPU's; afterwards they are as before.
-
-    A device's generator gets a seed that the CPU's draws, so that one state is enough for any device.
-    """
+    """Within the block the generators draw from ``state``, the CPU's, which also seeds a device's generator."""
     if device.type == "cpu":
         with torch.random.fork_rng(devices=[]):
             torch.set_rng_state(state)

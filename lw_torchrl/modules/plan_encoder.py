@@ -52,10 +52,6 @@ class PlanEncoder(Encoder):
     Attributes:
         skills: the K different skill texts, sorted.
 
-    Raises:
-        ValueError: as for :class:`PlanConditionedActor`; at call time, an evaluator's logits of another shape.
-        TypeError: an evaluator that is none; at call time, logits that are no floats.
-
     Example:
         >>> import lw_torchrl as lw
         >>> from tensordict.nn import TensorDictModule, TensorDictSequential

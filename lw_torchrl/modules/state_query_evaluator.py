@@ -124,7 +124,7 @@ class StateQueryEvaluator(ClauseEvaluator):
             needs the extra ``[text]``: clauses' vectors are not shipped.
 
     Raises:
-        ValueError: a wrong option; a plan asks for a predicate that is not among ``predicates``; at call time, an
+        ValueError: a plan asks for a predicate that is not among ``predicates``; at call time, an
             observation of another shape, or a task_id without a plan.
         ImportError: without ``structure``, the extra ``[text]`` is not installed and there is no ``text_encoder``.
 
