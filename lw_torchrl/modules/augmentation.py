@@ -61,13 +61,7 @@ def swap_unmentioned(observation: Tensor, kept: Tensor, probability: float) -> T
     So a policy cannot rely on it: in one demonstration everything stands in one constellation, and the hand's way to
     the goal can as well be told from an object that has nothing to do with it. Drawn from PyTorch's global generator.
 
-    Args:
-        observation: (..., 39) float32.
-        kept: (..., 3) bool, whether the first object, the second and the goal are mentioned.
-        probability: of each swap.
-
-    Returns:
-        (..., 39) float32, a copy.
+    ``kept`` (..., 3) bool tells whether the first object, the second and the goal are mentioned.
     """
     rows, kept = observation.reshape(-1, observation.shape[-1]), kept.reshape(-1, len(_PLACES))
     swapped, number, device = rows.clone(), len(rows), observation.device

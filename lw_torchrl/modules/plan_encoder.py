@@ -52,6 +52,10 @@ class PlanEncoder(Encoder):
     Attributes:
         skills: the K different skill texts, sorted.
 
+    Raises:
+        ValueError: as for :class:`PlanConditionedActor`; at call time, an evaluator's logits of another shape.
+        TypeError: at call time, logits that are no floats.
+
     Example:
         >>> import lw_torchrl as lw
         >>> from tensordict.nn import TensorDictModule, TensorDictSequential
