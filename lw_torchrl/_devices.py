@@ -88,10 +88,7 @@ def place(module: Any, device: str | torch.device | None) -> torch.device:
 
 @contextmanager
 def drawn_on(device: torch.device, state: torch.Tensor) -> Iterator[None]:
-    """Within the block the global generators draw from ``state``, the CPU's; afterwards they are as before.
-
-    A device's generator gets a seed that the CPU's draws, so that one state is enough for any device.
-    """
+    """Within the block the generators draw from ``state``, the CPU's, which also seeds a device's generator."""
     if device.type == "cpu":
         with torch.random.fork_rng(devices=[]):
             torch.set_rng_state(state)
@@ -107,11 +104,7 @@ def drawn_on(device: torch.device, state: torch.Tensor) -> Iterator[None]:
 
 
 def in_blocks(policy: Callable[[TensorDictBase], TensorDictBase]) -> Callable[[TensorDictBase], TensorDictBase]:
-    """``policy``, run on blocks of 64 rows, or of the least ``rows_at_once`` of its modules; the last block is padded.
-
-    A matrix product of another number of rows rounds differently, and contact amplifies the last bits. With blocks
-    of one size a row's action depends on that row alone, whatever the number of environments.
-    """
+    """``policy`` on blocks of one size: an action then depends on its row alone, bit for bit."""
     modules = policy.modules() if isinstance(policy, torch.nn.Module) else [policy]
     size = min(getattr(module, "rows_at_once", BLOCK) for module in modules)
 

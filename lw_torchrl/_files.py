@@ -98,8 +98,7 @@ def flush(path: Path) -> None:
 
 
 def sweep(target: str | os.PathLike[str]) -> list[Path]:
-    """Remove the temporary files that killed writers of ``target`` left beside it, and return them. Those that are
-    still being written are locked, and stay."""
+    """Remove the temporary files that killed writers of ``target`` left, and return them; locked ones stay."""
     path = Path(target)
     pattern = re.compile(rf"\.+{re.escape(path.stem)}(\.[0-9a-f]{{16}}\.tmp)+{re.escape(path.suffix)}")
     there = os.listdir(path.parent) if path.parent.is_dir() else ()
@@ -196,8 +195,7 @@ def write_json(path: str | os.PathLike[str], value: Any) -> None:
 
 
 def read_bytes(path: Path | Traversable, limit: int) -> bytes:
-    """The content of a file; :class:`ValueError` if it is larger than ``limit`` bytes, or no file but a pipe or a
-    device, which might never end."""
+    """The content of a file; :class:`ValueError` if it is larger than ``limit`` bytes, or a pipe or a device."""
     if isinstance(path, Path) and path.exists() and not path.is_file():
         raise ValueError("it is no file")
     with path.open("rb") as stream:
@@ -247,8 +245,7 @@ def read_json(path: str | os.PathLike[str], what: str, *, limit: int = JSON_LIMI
 
 @contextmanager
 def reading(path: str | os.PathLike[str], what: str) -> Iterator[None]:
-    """Let an error in the block name the argument ``path``, a folder that was to hold ``what``: a FileNotFoundError, or
-    a ValueError for whatever the block cannot use."""
+    """Let an error in the block name the argument ``path``, a folder that was to hold ``what``."""
     try:
         yield
     except FileNotFoundError as error:

@@ -21,15 +21,7 @@ def _duration(seconds: float) -> str:
 
 
 class Progress:
-    """Shows how far work is, on the standard error, while the block lasts.
-
-    Args:
-        what: the work, "training" for example.
-        total: units of work.
-        unit: its name in the singular, "step" for example.
-        initial: units done before.
-        show: False shows nothing.
-    """
+    """Shows on the standard error how far work is; ``initial`` units of ``total`` were done before."""
 
     def __init__(self, what: str, total: int, unit: str, *, initial: int = 0, show: bool = True) -> None:
         self.what, self.total, self.unit, self.initial = what, total, unit, initial

@@ -13,8 +13,7 @@ _STATE = {torch.optim.AdamW: {"step", "exp_avg", "exp_avg_sq"}, torch.optim.SGD:
 
 
 def split(state: Any, tensors: dict[str, Tensor]) -> Any:
-    """JSON for a state of dictionaries, tensordicts, lists, tuples, numbers, strings, None and tensors, which go into
-    ``tensors``; :class:`TypeError` if it holds something else."""
+    """JSON for a nested state, whose tensors go into ``tensors``; :class:`TypeError` for what cannot be saved."""
     if isinstance(state, Tensor):
         name = str(len(tensors))
         tensors[name] = state.detach()
@@ -71,8 +70,7 @@ def check_like(found: Any, live: Any, where: str) -> None:
 
 
 def check_optimizer_state(found: Any, optimizer: torch.optim.Optimizer, step: int) -> None:
-    """Raise :class:`ValueError` unless ``found`` is a state that the optimizer may have after so many steps, with a
-    learning rate from 0 to the initial one."""
+    """Raise :class:`ValueError` unless ``found`` is a state that the optimizer may have after so many steps."""
     live = optimizer.state_dict()
     if not isinstance(found, dict) or set(found) != set(live) or not isinstance(found["state"], dict):
         raise ValueError(f"optimizer must have the keys {sorted(live)}, got {_said(found)}")

@@ -63,12 +63,7 @@ def write_archive(
 
 
 class TensorArchive:
-    """A file that :func:`write_archive` wrote, in memory; :class:`ArchiveError`, a ValueError, for any other.
-
-    Attributes:
-        description: its JSON.
-        groups: the names of the groups of tensors.
-    """
+    """A file that :func:`write_archive` wrote, in memory; :class:`ArchiveError`, a ValueError, for any other."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         try:

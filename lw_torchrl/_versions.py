@@ -17,15 +17,13 @@ LIBRARIES = ("lw_torchrl", "numpy", "tensordict", "torch", "torchrl")
 
 
 def package_versions() -> dict[str, str]:
-    """Package name to version, of what results depend on. Ours is that of the running code, which the metadata of an
-    editable install may not have."""
+    """Package name to version, of what results depend on; ours is that of the running code."""
     others = sorted({*SIMULATORS, *LIBRARIES} - {"lw_torchrl"})
     return {"lw_torchrl": __version__, **{name: version(name) for name in others}}
 
 
 def version_changes(recorded: Any, names: Iterable[str]) -> list[str]:
-    """Which of some packages are installed in another version than was recorded, package name to version in a file:
-    "mujoco 3.2.0, now 3.3.0"."""
+    """The packages installed in another version than was recorded: "mujoco 3.2.0, now 3.3.0"."""
     before, now = recorded if isinstance(recorded, Mapping) else {}, package_versions()
     pairs = [(name, before.get(name), now[name]) for name in names]
     return [f"{name} {shown(was)[1:-1]}, now {is_}" for name, was, is_ in pairs if isinstance(was, str) and was != is_]

@@ -110,12 +110,9 @@ def test_the_package_alone_and_words_load_no_torchrl(python):
 
 
 def test_type_checkers_see_the_names_that_are_there():
-    (block,) = [
-        node
-        for node in ast.parse(Path(lw_torchrl.__file__).read_text("utf-8")).body
-        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
-    ]
-    stated = {alias.asname: line.module for line in block.body for alias in line.names}
+    stub = ast.parse(Path(lw_torchrl.__file__).with_suffix(".pyi").read_text("utf-8"))
+    lines = [node for node in stub.body if isinstance(node, ast.ImportFrom)]
+    stated = {alias.asname: line.module for line in lines for alias in line.names}
     rooms = [name for name, module in stated.items() if module == "lw_torchrl"]
     assert rooms == lw_torchrl._ROOMS.split()
     assert {name: module for name, module in stated.items() if name not in rooms} == lw_torchrl._ROOM_OF

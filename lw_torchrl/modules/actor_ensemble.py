@@ -29,13 +29,7 @@ class ActorEnsemble(Policy):
     Args:
         members: M policies with the same plans, or the same tasks, and the same keys.
 
-    Attributes:
-        members: the policies.
-        plans: their plans, where they have plans.
-        tasks: their tasks.
-
     Raises:
-        TypeError: a member is no :class:`Policy`.
         ValueError: no member, members of different plans, tasks or keys, or one with a :class:`HeldEvaluator`.
 
     Example:
@@ -109,8 +103,7 @@ class ActorEnsemble(Policy):
         return cls([from_description(member, text_encoder) for member in members])
 
     def with_plans(self, plans: Plans | Mapping[str, ConditionalPlan]) -> ActorEnsemble:
-        """An ensemble on the same weights for other plans: training either trains both; :class:`TypeError` if the
-        members are conditioned on descriptions."""
+        """An ensemble on the same weights for other plans; :class:`TypeError` if the members have descriptions."""
         return ActorEnsemble([member.with_plans(plans) for member in self._each]).train(self.training)
 
 

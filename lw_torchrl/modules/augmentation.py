@@ -40,8 +40,7 @@ def _names(step: PlanStep, task: Task) -> set[str]:
 
 
 def mentioned(plans: Plans, tables: PlanTables, roles: PlanRoles | None = None) -> Tensor:
-    """(T, S, 3) bool, a row for each task as in ``tables``: whether a step's condition or skill mentions the
-    first object, the second, the goal, or a point beside it; with ``roles``, also whether it moves it or to it."""
+    """(T, S, 3) bool: whether a step mentions the first object, the second, the goal; with ``roles``, or moves it."""
     table = torch.zeros(len(plans), plans.num_steps, len(_PLACES), dtype=torch.bool)
     for task, plan in plans.items():
         for number, step in enumerate(plan.steps):
@@ -62,13 +61,7 @@ def swap_unmentioned(observation: Tensor, kept: Tensor, probability: float) -> T
     So a policy cannot rely on it: in one demonstration everything stands in one constellation, and the hand's way to
     the goal can as well be told from an object that has nothing to do with it. Drawn from PyTorch's global generator.
 
-    Args:
-        observation: (..., 39) float32.
-        kept: (..., 3) bool, whether the first object, the second and the goal are mentioned.
-        probability: of each swap.
-
-    Returns:
-        (..., 39) float32, a copy.
+    ``kept`` (..., 3) bool tells whether the first object, the second and the goal are mentioned.
     """
     rows, kept = observation.reshape(-1, observation.shape[-1]), kept.reshape(-1, len(_PLACES))
     swapped, number, device = rows.clone(), len(rows), observation.device
@@ -81,8 +74,7 @@ def swap_unmentioned(observation: Tensor, kept: Tensor, probability: float) -> T
 
 
 def hide_opening(observation: Tensor, kept: Tensor, probability: float) -> Tensor:
-    """A copy of observations (..., 39) float32 where the gripper's opening may be that of another row, but where it is
-    ``kept`` (...) bool."""
+    """Observations (..., 39) where the gripper's opening may be another row's, but where it is ``kept`` (...) bool."""
     opening = observation[..., OPENING]
     others = opening.flatten()[torch.randint(opening.numel(), opening.shape, device=opening.device)]
     hidden = torch.rand_like(opening) < probability

@@ -44,8 +44,7 @@ class Clauses(NamedTuple):
 
 
 class PlanClauses(NamedTuple):
-    """The clauses (T, C) of T tasks' plans, each once, and which of them make up each condition; the first eight
-    are those of :class:`Clauses`."""
+    """The :class:`Clauses` (T, C) of T tasks' plans, each once, and which of them make up each condition."""
 
     first: Tensor
     second: Tensor
@@ -100,10 +99,6 @@ class ClauseEvaluator(QueryEvaluator):
         predicates: with ``structure``, the relations and predicates that it can tell; None for all that there are.
         names: with ``structure``, the things that it can tell; empty where they are not told apart by name.
         text_encoder: without ``structure``, texts to vectors (n, E) float32; None for the sentence encoder.
-
-    Raises:
-        ValueError: a wrong option; a plan asks for a predicate or a thing that it cannot tell.
-        ImportError: without ``structure``, the extra ``[text]`` is not installed and there is no ``text_encoder``.
     """
 
     network: nn.Module
@@ -161,9 +156,6 @@ class ClauseEvaluator(QueryEvaluator):
     def code(self, clauses: Sequence[tuple[Task, Clause]]) -> tuple[Clauses, Tensor | None]:
         """Any clauses of tasks, for the network: (G,) of them, and the vectors of their texts, if it reads texts; the
         second half are then the negations of the first.
-
-        Raises:
-            ValueError: one has a predicate or a thing that it cannot tell.
         """
         if self.predicates:
             return _as_tensors(clauses, self.predicates, None, self.names), None
@@ -223,11 +215,7 @@ def _as_tensors(
     texts: Sequence[str] | None,
     names: Sequence[str] = (),
 ) -> Clauses:
-    """Clauses of tasks as tensors, (G,); where a list of what is numbered is empty or None, all are number 0.
-
-    Raises:
-        ValueError: a predicate, or a thing's name, is not in the list.
-    """
+    """Clauses of tasks as tensors, (G,); where a list of what is numbered is empty or None, all are number 0."""
     predicate, text, place = ({name: at for at, name in enumerate(those or ())} for those in (predicates, texts, names))
     for task, clause in clauses:
         if predicates and clause.predicate not in predicate:

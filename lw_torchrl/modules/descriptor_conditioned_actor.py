@@ -34,9 +34,6 @@ class DescriptorEncoder(Encoder):
         feature_noise: standard deviation of the noise on the normalised features while training.
         out_keys: another name for what it writes.
 
-    Raises:
-        ValueError: as for :class:`DescriptorConditionedActor`.
-
     Source: paper section 'Conditional Plan Experiments'.
     """
 

@@ -67,8 +67,7 @@ class Prepared(TensorDictModuleBase):
         raise NotImplementedError(f"{type(self).__name__} must override prepare")
 
     def fit_contacts(self, observation: Tensor, task_id: Tensor) -> None:
-        """Take from demonstrations, (R, 39) float32 and (R,) int64, where the hand touches things, in place; by default
-        there is nothing to take."""
+        """Take contacts from demonstrations, (R, 39) float32 and (R,) int64, in place; by default none."""
 
 
 class Encoder(Prepared):

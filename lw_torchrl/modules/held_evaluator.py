@@ -39,9 +39,6 @@ class HeldEvaluator(QueryEvaluator):
         every: steps of a row's episode between questions, from 1 to 65,536.
         delay: steps until answers are shown, from 0 to 65,536; until then a row is given those of its reset.
 
-    Attributes:
-        evaluator: what is asked.
-
     Raises:
         ValueError: it is a HeldEvaluator, or a number is out of its range; at call time, there are no held answers.
 

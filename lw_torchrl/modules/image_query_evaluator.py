@@ -175,7 +175,7 @@ class ImageQueryEvaluator(ClauseEvaluator):
         text_encoder: without ``structure``, texts to vectors (n, E) float32; None for the sentence encoder.
 
     Raises:
-        ValueError: a wrong option; a plan asks for a predicate or a thing that it cannot tell; at call time, pictures
+        ValueError: a plan asks for a predicate or a thing that it cannot tell; at call time, pictures
             of another size, or a task_id without a plan.
         ImportError: without ``structure``, the extra ``[text]`` is not installed and there is no ``text_encoder``.
 

@@ -30,8 +30,7 @@ def evaluating(network: nn.Module) -> Iterator[None]:
 
 
 def unit_scale(vectors: Tensor) -> Tensor:
-    """Texts' vectors (n, E), rescaled to numbers of size 1: those of vectors of length 1 are so small that a fresh
-    network hardly tells texts apart."""
+    """Texts' vectors (n, E) rescaled to numbers of size 1: a fresh network hardly tells smaller ones apart."""
     vectors = vectors.to(torch.float32)
     return vectors / vectors.square().mean(-1, keepdim=True).sqrt().clamp(min=1e-6)
 

@@ -63,11 +63,10 @@ class PlanConditionedActor(ConditionedActor):
         in_keys, out_keys: other names for what it reads and writes, in the order above; nested ones too.
 
     Attributes:
-        plans: the plans.
         skills: the K different skill texts, sorted.
 
     Raises:
-        ValueError: a wrong option, with the allowed ones; at call time, a task_id without a plan, or ``qaf`` of other
+        ValueError: at call time, a task_id without a plan, or ``qaf`` of other
             plans, as ``qaf_plan`` beside it tells.
         ImportError: a skill's text is not shipped, and the extra ``[text]`` is not installed.
 

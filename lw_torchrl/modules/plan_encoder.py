@@ -54,7 +54,7 @@ class PlanEncoder(Encoder):
 
     Raises:
         ValueError: as for :class:`PlanConditionedActor`; at call time, an evaluator's logits of another shape.
-        TypeError: an evaluator that is none; at call time, logits that are no floats.
+        TypeError: at call time, logits that are no floats.
 
     Example:
         >>> import lw_torchrl as lw

@@ -35,12 +35,7 @@ POLICIES: dict[str, str | type[Policy]] = {
 
 @dataclass(frozen=True)
 class Method:
-    """A way to condition a policy on its task.
-
-    Attributes:
-        policy: a name in :data:`POLICIES`.
-        options: of that class.
-    """
+    """A way to condition a policy on its task: a name in :data:`POLICIES`, and options of that class."""
 
     policy: str
     options: Mapping[str, Any] = field(default_factory=dict)
@@ -127,8 +122,7 @@ class Policy(Prepared):
         return write(tensordict, self, self.act(*self.prepare(tensordict)))
 
     def fit_normalization(self, observation: Tensor, weights: Tensor | None = None) -> None:
-        """Take the statistics of observations (R, 39) float32, each with a weight (R,) float32 of sum 1, in place; by
-        default there is nothing to normalise."""
+        """Take statistics of observations (R, 39) float32 with weights (R,) of sum 1, in place; by default none."""
 
     def describe(self) -> dict[str, Any]:
         """All that :meth:`from_description` needs to make it again, but its weights, as JSON."""
@@ -185,8 +179,7 @@ def make_policy(
 
 
 def from_description(found: Any, text_encoder: TextEncoder | None = None) -> Policy:
-    """Make the policy that :meth:`Policy.describe` described, with fresh weights; :class:`ValueError` if it is no
-    description, or of a kind that :data:`POLICIES` lacks."""
+    """Make the policy that :meth:`Policy.describe` described, with fresh weights; :class:`ValueError` if it is none."""
     if not isinstance(found, Mapping) or not isinstance(found.get("options"), Mapping):
         raise ValueError(f"a policy's description must have kind and options, got {found!r:.80}")
     return policy_class(found.get("kind")).from_description(found, text_encoder)

@@ -93,8 +93,7 @@ class QueryEvaluator(TensorDictModuleBase):
         return write(tensordict, self, [self.answers(*(tensordict.get(key) for key in self.in_keys))])
 
     def with_plans(self, plans: Plans) -> QueryEvaluator:
-        """One on the same weights for other plans' conditions: training either trains both. :class:`RuntimeError` if
-        the weights have other names or shapes there."""
+        """One on the same weights for other plans; :class:`RuntimeError` if the weights differ in names or shapes."""
         other = self.made_for(plans)
         other.load_state_dict(self.state_dict())
         for name, module in other.named_modules():
@@ -118,8 +117,7 @@ class QueryEvaluator(TensorDictModuleBase):
 
 
 def evaluator_from_description(found: Any, plans: Plans, text_encoder: TextEncoder | None = None) -> QueryEvaluator:
-    """Make the evaluator that :meth:`QueryEvaluator.describe` described, with fresh weights; :class:`ValueError` if it
-    is no description, or of a kind that :data:`EVALUATORS` lacks."""
+    """Make the evaluator that was described, with fresh weights; :class:`ValueError` if it is no known one."""
     if not isinstance(found, Mapping) or not isinstance(found.get("options"), Mapping):
         raise ValueError(f"an evaluator's description must have kind and options, got {found!r:.80}")
     kind: str = check_choice("kind of evaluator", found.get("kind"), EVALUATORS)

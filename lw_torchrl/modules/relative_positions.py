@@ -27,8 +27,6 @@ class RelativePositions(nn.Module):
     """The positions of things relative to others, mixed by the attention over the steps.
 
     Args:
-        plans: the plans.
-        tables: theirs.
         pairs: of a plan, for each step up to P pairs: the thing from which, and the thing to which. A step that has
             fewer has 0 there.
         number: P.
@@ -110,8 +108,6 @@ class PlanFocus(RelativePositions):
     for a step without such a clause.
 
     Args:
-        plans: the plans.
-        tables: theirs.
         noise: standard deviation of the noise on each feature while training.
     """
 
@@ -131,8 +127,6 @@ class PlanRoles(RelativePositions):
     that its plan's conditions name.
 
     Args:
-        plans: the plans.
-        tables: theirs.
         noise: standard deviation of the noise on each feature while training.
         jitter: standard deviation, in metres, of the noise on the position's height while training, and half of it to
             the sides, where the gripper pushes or pulls: things are touched at other places in other tasks.

@@ -40,13 +40,7 @@ class ResidualActor(Policy):
         steps: task name to the numbers of its plan's steps, counted from 0, where actions are corrected; None for
             everywhere. All steps are in force where no condition of the plan holds, as for the policy.
 
-    Attributes:
-        base: the policy.
-        steps: where actions are corrected.
-        network: what is trained.
-
     Raises:
-        TypeError: a base that is none of these.
         ValueError: a base with a distribution, or that mixes actions; steps that its plans do not have.
 
     Example:
@@ -147,8 +141,7 @@ class ResidualActor(Policy):
         return cls(from_description(base, text_encoder), **found["options"])
 
     def with_plans(self, plans: Plans | Mapping[str, ConditionalPlan]) -> ResidualActor:
-        """One on the same weights for other plans: training either trains both; :class:`ValueError` if these lack the
-        steps where actions are corrected, with the same skills."""
+        """One on the same weights for other plans; :class:`ValueError` if these lack ``steps`` or their skills."""
         if self.steps is not None:
             assert self.plans is not None
             check_same_skills(self.steps, self.plans, as_plans(plans))

@@ -61,16 +61,7 @@ class ClauseNetwork(nn.Module):
             self.texts = text_to_latent(text_size, self.ends + self.numbers + width + 1, width, 1)
 
     def forward(self, observation: Tensor, clauses: Clauses, text_vectors: Tensor | None = None) -> Tensor:
-        """Answer.
-
-        Args:
-            observation: (B, 39) float32.
-            clauses: (B, C), those that are asked of each row.
-            text_vectors: (U, E) float32, of the texts that ``clauses.text`` numbers, where it reads texts.
-
-        Returns:
-            (B, C) float32, logits of size 30 at most, positive where the clause holds.
-        """
+        """Observations (B, 39), clauses (B, C) and texts' vectors (U, E) to logits (B, C) of size 30 at most."""
         if self.reads_text:
             assert text_vectors is not None
             d, asked = self._from_text(observation, self.texts(text_vectors)[clauses.text])
@@ -124,7 +115,7 @@ class StateQueryEvaluator(ClauseEvaluator):
             needs the extra ``[text]``: clauses' vectors are not shipped.
 
     Raises:
-        ValueError: a wrong option; a plan asks for a predicate that is not among ``predicates``; at call time, an
+        ValueError: a plan asks for a predicate that is not among ``predicates``; at call time, an
             observation of another shape, or a task_id without a plan.
         ImportError: without ``structure``, the extra ``[text]`` is not installed and there is no ``text_encoder``.
 

@@ -45,7 +45,7 @@ class ExpectileValueLoss(LossModule):
         reduction: "mean", "none" or "sum" of the rows' losses.
 
     Raises:
-        ValueError: a wrong option; at call time, keys that the network does not write, or rows that lack one.
+        ValueError: at call time, keys that the network does not write, or rows that lack one.
 
     Noise on the network's features, of which critics have none by default, is on the targets too while the network
     trains. ``train()`` and ``eval()`` reach the network, and :meth:`advantage` is always without noise.
@@ -198,7 +198,7 @@ class AdvantageWeightedLoss(LossModule):
         reduction: "mean", by the weights; "none", each row's distance times its weight; or "sum", the sum of these.
 
     Raises:
-        ValueError: a wrong option; at call time, a missing key, an advantage that is not (B, 1) or not finite.
+        ValueError: at call time, a missing key, an advantage that is not (B, 1) or not finite.
         RuntimeError: the actor's action has another shape than the one to imitate.
         TypeError: "log_prob" for an actor of ours without a distribution.
 

@@ -15,15 +15,7 @@ from lw_torchrl.transforms.environment import KeepsEnvState
 
 
 def kept(before: Tensor | None, now: Tensor, begun: Tensor | None) -> Tensor:
-    """B, a value of each row at a reset; rows that do not begin keep what they had.
-
-    Where some of a worker's rows are reset, TorchRL's batched environments show zeros for the others.
-
-    Args:
-        before: B, at the last reset; None if there was none.
-        now: B.
-        begun: B bool, or with a last dimension of 1, the rows that are reset; None for all.
-    """
+    """B, a value ``now`` of each row that has ``begun``, B bool or None for all; the others keep ``before``."""
     if before is None or begun is None or before.shape != now.shape:
         return now
     return torch.where(begun.reshape(now.shape), now, before)
@@ -32,12 +24,8 @@ def kept(before: Tensor | None, now: Tensor, begun: Tensor | None) -> Tensor:
 class RowAnswers:
     """Counts the steps of each row's episode, and keeps the answers that it is still to be shown.
 
-    In step t of its episode, 0 at the reset, a row is shown the answers of step
-    every · ⌊max(t - delay, 0) / every⌋. Answers are bool, or logits, float32: of one dtype from reset to reset.
-
-    Args:
-        every: steps from one taking of the answers to the next, at least 1.
-        delay: steps until they are shown, at least 0.
+    In step t of its episode, 0 at the reset, a row is shown those of step every · ⌊max(t - delay, 0) / every⌋.
+    Answers are bool, or logits, float32: of one dtype from reset to reset.
     """
 
     def __init__(self, every: int = 1, delay: int = 0) -> None:
@@ -58,15 +46,7 @@ class RowAnswers:
         return self._step
 
     def begin(self, answers: Tensor, rows: Tensor | None) -> Tensor:
-        """Begin the episodes of rows.
-
-        Args:
-            answers: (B, S), in the rows' states; only those of rows that begin are read, or of all at first.
-            rows: B bool, or with a last dimension of 1, those that begin; None for all.
-
-        Returns:
-            (B, S), what each row is shown, of the same dtype.
-        """
+        """Begin the episodes of rows (B bool, None for all) with answers (B, S): what each row is shown."""
         shape = answers.shape[:-1]
         if rows is None or self._step is None or self._taken is None or self._shown is None:
             self._step = torch.zeros(shape, dtype=torch.int64, device=answers.device)
@@ -80,21 +60,12 @@ class RowAnswers:
         return self._shown.clone()
 
     def due(self, rows: Tensor | None) -> Tensor:
-        """B bool, the rows whose answers are taken after the coming step; :meth:`advance` does not read the others'.
-
-        Args:
-            rows: B bool, or with a last dimension of 1, those that make the step; None for all.
-        """
+        """B bool, the rows, of those that make the step, whose answers :meth:`advance` takes after it."""
         taken = (self.step + 1) % self.every == 0
         return taken if rows is None else taken & rows.reshape(taken.shape)
 
     def advance(self, answers: Tensor, rows: Tensor | None, stuck: Callable[[], Tensor] | None = None) -> Tensor:
-        """What rows are shown, (B, S), after a step of theirs.
-
-        Args:
-            answers, rows: as for :meth:`begin`.
-            stuck: gives, once the steps are counted, (B, S) bool, the answers that stay what they were shown before.
-        """
+        """What rows are shown, (B, S), after a step; ``stuck`` gives (B, S) bool, what stays as it was shown before."""
         due = self.due(rows)
         assert self._taken is not None
         assert self._shown is not None
@@ -123,8 +94,6 @@ class HeldAnswers(KeepsEnvState):
         ask: from a TensorDict of n rows with ``in_keys`` to their logits (n, S) float32.
         columns: S.
         every, delay: as for :class:`RowAnswers`.
-        in_keys: what is read.
-        out_key: where the logits go.
     """
 
     def __init__(

@@ -42,8 +42,7 @@ class CorruptQAF(EpisodeTransform):
 
     Args:
         plans: whose conditions ``qaf`` answers.
-        flip: probability, from 0 to 1.
-        stick: probability, from 0 to 1.
+        flip, stick: probabilities, from 0 to 1.
         lag: steps.
         drop: conditions of the plans in any spelling, each dropped in all plans that have it.
         seed: any integer, of what is drawn.

@@ -27,10 +27,7 @@ def base_env(transform: Transform) -> EnvBase | None:
 
 
 def refuse_changed(transform: Transform, key: NestedKey) -> None:
-    """Raise :class:`ValueError` where a transform that runs before this one changes what it is to read.
-
-    It goes by the keys that transforms say they write, and looks into a SerialEnv once that runs, not into processes.
-    """
+    """Raise :class:`ValueError` where a transform before this one says that it writes what this one is to read."""
     for entry, chain in product((key, unravel_key(("next", key))), _before(transform)):
         for earlier in reversed(chain):
             written = [unravel_key(out) for out in earlier.__dict__.get("_out_keys") or ()]
@@ -85,10 +82,7 @@ def _flat(transform: Transform) -> list[Transform]:
 
 
 class EpisodeTransform(Transform):
-    """A transform that keeps something of each row's episode.
-
-    Its clone, for another environment, and one whose state was loaded have seen no episode: a step wants a reset first.
-    """
+    """A transform that keeps something of each row's episode; a clone, or a loaded one, wants a reset first."""
 
     def _forget_episodes(self) -> None:
         """No episode has begun."""
