@@ -83,18 +83,15 @@ def train_evaluator(
     from lw_torchrl.evaluation.evaluator_report import score_evaluator
 
     options.use_one_thread()
-    defaults = {"steps": 4000, "batch_size": 48, "learning_rate": 2e-3, "every": 5}
+    numbers: dict[str, Any] = {"steps": 4000, "batch_size": 48, "learning_rate": 2e-3, "every": 5}
     if not cameras:
-        defaults = {"steps": 6000, "batch_size": 1024, "learning_rate": 3e-3, "every": 1}
-    said = {"steps": steps, "batch_size": batch_size, "learning_rate": learning_rate, "every": every}
-    config = (lw.training.ImageQueryEvaluatorConfig if cameras else lw.training.QueryEvaluatorConfig)(
-        **defaults | {name: value for name, value in said.items() if value is not None},  # type: ignore[arg-type]
-        states_per_task=states_per_task,
-        held_out_states=held_out_states,
-        held_out_pairs=held_out_pairs,
-        held_out_tasks=int(held_out_tasks[0]) if drawn else held_out_tasks,
-        seed=seed,
-    )
+        numbers = {"steps": 6000, "batch_size": 1024, "learning_rate": 3e-3, "every": 1}
+    said = {"steps": steps, "batch_size": batch_size, "learning_rate": learning_rate, "every": every, "seed": seed}
+    numbers |= {name: value for name, value in said.items() if value is not None}
+    numbers |= {"held_out_states": held_out_states, "held_out_pairs": held_out_pairs}
+    numbers |= {"held_out_tasks": int(held_out_tasks[0]) if drawn else held_out_tasks}
+    make_config = lw.training.ImageQueryEvaluatorConfig if cameras else lw.training.QueryEvaluatorConfig
+    config = make_config(states_per_task=states_per_task, **numbers)
     torch.manual_seed(seed)
     network: dict[str, Any] = {"structure": structure, "depth": depth, "hidden" if cameras else "width": width}
     network["text_encoder"] = options.read_encoder(text_encoder)
