@@ -10,9 +10,9 @@ from typing import Any
 from lw_torchrl import __version__
 from lw_torchrl._checks import shown
 
-SIMULATORS = ("metaworld", "mujoco")
+SIMULATORS: tuple[str, ...] = ("metaworld", "mujoco")
 """What an episode's physics depend on."""
-LIBRARIES = ("lw_torchrl", "numpy", "tensordict", "torch", "torchrl")
+LIBRARIES: tuple[str, ...] = ("lw_torchrl", "numpy", "tensordict", "torch", "torchrl")
 """What the last bits of computations depend on."""
 
 

@@ -225,9 +225,13 @@ class Envelope:
             ) from error
 
 
-POLICY = Envelope("lw_torchrl.policy", 3, "actor", "checkpoint", "a policy", "lw-torchrl train")
-EVALUATOR = Envelope("lw_torchrl.evaluator", 1, "evaluator", "evaluator", "an evaluator", "lw-torchrl train-evaluator")
-TRAINING = Envelope("lw_torchrl.training", 1, "loss", "checkpoint", "a loss's training", "lw-torchrl offline", "loss")
+POLICY: Envelope = Envelope("lw_torchrl.policy", 3, "actor", "checkpoint", "a policy", "lw-torchrl train")
+EVALUATOR: Envelope = Envelope(
+    "lw_torchrl.evaluator", 1, "evaluator", "evaluator", "an evaluator", "lw-torchrl train-evaluator"
+)
+TRAINING: Envelope = Envelope(
+    "lw_torchrl.training", 1, "loss", "checkpoint", "a loss's training", "lw-torchrl offline", "loss"
+)
 
 
 def check_description(path: Path, ours: Mapping[str, Any]) -> None:
