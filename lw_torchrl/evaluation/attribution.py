@@ -236,10 +236,6 @@ def decide(mended: Iterable[str], shares: Mapping[str, float]) -> str | None:
     """Of the single exchanges that mend an episode, the one that counts: the smallest, unless a larger one mends more
     of the task's failed episodes by 0.3 of them. More time counts alone; None of none.
 
-    Args:
-        mended: of "query", "skill", a script in one step, "plan", "skills", scripts in all steps, and "time".
-        shares: for each, the share of the task's failed episodes that it mends.
-
     Example:
         >>> decide(["plan", "skill"], {"plan": 0.5, "skill": 0.5})
         'skill'

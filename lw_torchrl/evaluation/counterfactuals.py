@@ -108,12 +108,6 @@ class WithScripts(nn.Module):
     """A policy whose skills are scripted ones: its attention mixes their actions, where it singles any steps out.
 
     Where the step in force has no scripted skill, the action is the expert's.
-
-    Args:
-        actor: the policy; its plan, its answers and its attention stay as they are.
-        plans: its plans.
-        scripts: of their steps.
-        steps: for each episode, the step whose attention the scripts wait for; None to act wherever there is any.
     """
 
     def __init__(self, actor: Acts, plans: Plans, scripts: Scripts, steps: Mapping[EpisodeId, int] | None) -> None:
@@ -158,14 +152,7 @@ class WithScripts(nn.Module):
 
 @dataclass(frozen=True)
 class Rerun:
-    """Runs episodes again as they were run, whatever acts in them.
-
-    Attributes:
-        tasks: their tasks by name.
-        firsts: each episode's first observation, (39,) float32.
-        env: the environment's options: seed, engine, num_threads.
-        noise_scale, max_steps, num_envs, device, progress: as for :func:`evaluate`.
-    """
+    """Runs episodes again as they were run, whatever acts in them."""
 
     tasks: Mapping[str, Task]
     firsts: Mapping[EpisodeId, Tensor]
@@ -252,12 +239,7 @@ class Counterfactuals:
             )
 
     def run(self, seen: Sequence[EpisodeStates], same: Collection[EpisodeId] = ()) -> None:
-        """Run all exchanges that are worth it.
-
-        Args:
-            seen: the episodes.
-            same: those in whose states the reference never asks for anything else, so that it mends nothing.
-        """
+        """Run all exchanges that are worth it."""
         every = [(one.task, one.episode) for one in seen]
         wrong = [w for w, one in zip(every, seen, strict=True) if bool((one.given != one.truth).any())]
         with_reference = [w for w in every if self.reference is not None and w[0] in self.reference]

@@ -57,12 +57,7 @@ class Explanation:
 
 
 class Scripts:
-    """The scripted skills of plans' steps, as far as a table of text to scripted skill has any.
-
-    Attributes:
-        known: task to which of its plan's steps there are scripts for.
-        program: the actions, (..., S, 4); zeros for other steps.
-    """
+    """The scripted skills of plans' steps, as far as a table of text to scripted skill has any."""
 
     def __init__(self, plans: Plans, table: Mapping[str, ScriptedSkill]) -> None:
         self.table = table
@@ -124,10 +119,6 @@ def states_of(task: str, episode: int, steps: TensorDictBase, plans: Plans, give
 def candidates(seen: EpisodeStates, among: Tensor | None = None) -> list[int]:
     """The steps that may be to blame for a failure, the likeliest first: of those in force for a while late in the
     episode the furthest and the most frequent, then the furthest of all, then the others.
-
-    Args:
-        seen: the episode.
-        among: (T,) bool, the states that count; None for all.
     """
     counted = seen.in_force >= 0 if among is None else (seen.in_force >= 0) & among
     if not counted.any():

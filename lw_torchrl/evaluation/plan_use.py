@@ -95,12 +95,7 @@ class PlanUse:
 
 
 def where_stuck(in_charge: Tensor, window: int) -> tuple[int, int]:
-    """Of the last so many states of an episode, the step most often in charge, and the last one in charge for a while.
-
-    Args:
-        in_charge: (T, S) int64, 1 where a step is in charge; several may be.
-        window: how many states.
-    """
+    """Of the last so many states of an episode, the step most often in charge, and the last one in charge for a while."""
     states = in_charge[-window:].sum(0)
     reached = (states >= states.max().clamp(1, _A_WHILE)).nonzero()
     return int(states.argmax()), int(reached[-1]) if len(reached) else 0

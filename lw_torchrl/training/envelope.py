@@ -46,15 +46,7 @@ Module = TypeVar("Module", bound=nn.Module)
 
 @dataclass(frozen=True)
 class Envelope:
-    """How files of a kind are written and read.
-
-    Attributes:
-        format, version: what a file says that it is.
-        part: what it describes: "actor", "evaluator" or "loss".
-        argument, called: how errors begin, and call what is in the file.
-        command: that writes one.
-        group: of the weights.
-    """
+    """How files of a kind are written and read."""
 
     format: str
     version: int
@@ -78,14 +70,7 @@ class Envelope:
         groups: Mapping[str, Mapping[str, Tensor]],
         training: Mapping[str, Any] | None = None,
     ) -> None:
-        """Write a file whole, or leave the earlier one and raise :class:`OSError`.
-
-        Args:
-            path: the file.
-            described: what it says, as JSON, the part among it.
-            groups: the weights, of one module or of many stacked, and its texts' vectors.
-            training: all that training resumes from, the weights aside, if it is trained.
-        """
+        """Write a file whole, or leave the earlier one and raise :class:`OSError`."""
         described = {"format": self.format, "version": self.version, **described}
         if training is not None:
             tensors: dict[str, Tensor] = {}
@@ -101,12 +86,7 @@ class Envelope:
             ) from error
 
     def open(self, path: str | os.PathLike[str]) -> TensorArchive:
-        """The archive of a file whose format, version and part have been checked.
-
-        Raises:
-            FileNotFoundError: there is no such file.
-            ValueError: it is of another kind, or damaged.
-        """
+        """The archive of a file whose format, version and part have been checked."""
         begin = f"{self.argument}: {str(path)!r}"
         if not Path(path).exists():
             raise FileNotFoundError(f"{self.argument}: no file {str(path)!r}; `{self.command}` writes one")
@@ -186,20 +166,8 @@ class Envelope:
     ) -> None:
         """Go on with the training of a file.
 
-        Args:
-            path: the file.
-            described: what it must say.
-            live: the weights, which are replaced in place.
-            load: takes the state that :meth:`write` was given.
-            texts: the vectors that it must hold; None for those of a loss, whose description has their digest.
-            device: where training goes on, if files say where they were trained.
-            packages: on whose versions the bits of the training depend.
-
         Warns:
             UserWarning: the file was written on another kind of device, or under other versions of packages.
-
-        Raises:
-            ValueError: the file is damaged, of another description, or does not fit.
         """
         archive = self.open(path)
         check_same_description(path, archive.description, described)

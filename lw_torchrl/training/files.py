@@ -49,12 +49,7 @@ def save_actor(actor: Policy, path: str | os.PathLike[str], **about: Any) -> Non
 
 
 def check_can_be_saved(actor: Any) -> Policy:
-    """Return the actor if a policy file can hold it: what cannot be loaded again is refused before any training.
-
-    Raises:
-        TypeError: it is no :class:`Policy`.
-        ValueError: its own description does not make it again, or its weights are no finite numbers.
-    """
+    """Return the actor if a policy file can hold it: what cannot be loaded again is refused before any training."""
     if not isinstance(actor, Policy):
         raise TypeError(
             f"actor must be a Policy to be kept in a file, got {type(actor).__name__}: save the policy inside of it, "

@@ -235,12 +235,7 @@ class Training:
         return stat.st_ino, stat.st_size, stat.st_mtime_ns
 
     def save(self) -> None:
-        """Write the checkpoint, if there is to be one; an earlier one is replaced whole.
-
-        Raises:
-            ValueError: the weights are no finite numbers.
-            OSError: it cannot be written; the earlier one stays.
-        """
+        """Write the checkpoint, if there is to be one; an earlier one is replaced whole."""
         check_trained(self.parameters(), self.steps)
         if self.checkpoint is not None:
             kind = self.device.type

@@ -208,12 +208,7 @@ def networks_of(loss: LossModule) -> list[nn.Module]:
 
 
 def check_loss(loss: LossModule, replay: TensorDictReplayBuffer) -> None:
-    """Raise unless a loss can be trained on a buffer; a value estimator that TorchRL would make later is made.
-
-    Raises:
-        TypeError: it is no :class:`LossModule`, but what ``torch.compile`` made of one.
-        ValueError: its sum must not be minimised, or its discount is not that of the buffer's n steps.
-    """
+    """Raise unless a loss can be trained on a buffer; a value estimator that TorchRL would make later is made."""
     if not isinstance(loss, LossModule):
         raise TypeError(
             f"loss must be a LossModule, got {type(loss).__name__}, whose targets and actor cannot be found; compile a "
@@ -243,11 +238,7 @@ def _gamma_of(replay: TensorDictReplayBuffer) -> float | None:
 
 
 def sum_of_losses(found: Mapping[str, Any]) -> Tensor:
-    """What is minimised of what a loss gives: the sum of its ``loss_`` entries, without those that stand for another.
-
-    Raises:
-        ValueError: there is none.
-    """
+    """What is minimised of what a loss gives: the sum of its ``loss_`` entries, without those that stand for another."""
     terms = [value for name, value in found.items() if name.startswith("loss_") and name not in _INSTEAD]
     if not terms:
         raise ValueError(f"loss must give entries that begin with 'loss_', it gives {', '.join(found.keys())}")

@@ -293,17 +293,7 @@ def check_growing_replay(actor: Policy, replay: Any, config: OnlineConfig) -> No
 
 
 def longest_standstill(rows: TensorDictBase) -> int:
-    """The most rows of an episode, one after the other, with the same truth of all conditions; 0 without ``qaf``.
-
-    Args:
-        rows: (R,) in the order of time, with ``("collector", "traj_ids")`` (R,) int64 and ``qaf`` (R, S) bool.
-
-    Example:
-        >>> from tensordict import TensorDict
-        >>> ids, truth = torch.tensor([0, 0, 0, 1, 1]), torch.tensor([[1], [0], [0], [0], [1]]).bool()
-        >>> longest_standstill(TensorDict({"collector": {"traj_ids": ids}, "qaf": truth}, [5]))
-        2
-    """
+    """The most rows of an episode, one after the other, with the same truth of all conditions; 0 without ``qaf``."""
     if (truth := rows.get("qaf", None)) is None:
         return 0
     ids = rows["collector", "traj_ids"]

@@ -182,9 +182,6 @@ class StackedBehavioralCloning(Training):
     def train(self, until: int | None = None) -> Tensor:
         """Train to the last step and give the actors their weights; Ctrl-C as in :class:`BehavioralCloningTrainer`.
 
-        Args:
-            until: end after so many steps in all, as there.
-
         Returns:
             (M,) float32, each actor's mean loss over the last 100 steps made; NaN if there were none left to make.
         """

@@ -38,15 +38,7 @@ class ExpertIterationLearner(Learner):
 
 
 def successful(rows: TensorDictBase) -> TensorDictBase | None:
-    """The rows of a round (N, T), time last, that belong to episodes that ended in success: (R,); None for none.
-
-    Example:
-        >>> from tensordict import TensorDict
-        >>> ids, success = torch.tensor([[0, 0, 2], [1, 1, 1]]), torch.tensor([[0, 1, 0], [0, 0, 0]]).bool()
-        >>> rows = TensorDict({"collector": {"traj_ids": ids}, "next": {"success": success[..., None]}}, [2, 3])
-        >>> successful(rows)["collector", "traj_ids"]
-        tensor([0, 0])
-    """
+    """The rows of a round (N, T), time last, that belong to episodes that ended in success: (R,); None for none."""
     ids = rows["collector", "traj_ids"]
     here = torch.isin(ids, ids[rows["next", "success"].squeeze(-1)])
     return rows[here] if here.any() else None
