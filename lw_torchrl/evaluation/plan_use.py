@@ -95,7 +95,7 @@ class PlanUse:
 
 
 def where_stuck(in_charge: Tensor, window: int) -> tuple[int, int]:
-    """Of the last so many states of an episode, the step most often in charge, and the last one in charge for a while."""
+    """In the last ``window`` states: the step most often in charge, and the last one in charge for a while."""
     states = in_charge[-window:].sum(0)
     reached = (states >= states.max().clamp(1, _A_WHILE)).nonzero()
     return int(states.argmax()), int(reached[-1]) if len(reached) else 0

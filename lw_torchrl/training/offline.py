@@ -238,7 +238,7 @@ def _gamma_of(replay: TensorDictReplayBuffer) -> float | None:
 
 
 def sum_of_losses(found: Mapping[str, Any]) -> Tensor:
-    """What is minimised of what a loss gives: the sum of its ``loss_`` entries, without those that stand for another."""
+    """What is minimised: the sum of the loss's ``loss_`` entries, without those that replace another."""
     terms = [value for name, value in found.items() if name.startswith("loss_") and name not in _INSTEAD]
     if not terms:
         raise ValueError(f"loss must give entries that begin with 'loss_', it gives {', '.join(found.keys())}")
