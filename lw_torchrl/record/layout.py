@@ -33,7 +33,7 @@ class Layout:
     """
 
     def __init__(self) -> None:
-        self.pages: dict[str, Page] = {}
+        self.pages: dict[str, Page] = {}  # iterate over a copy: the writer's thread reads while pages come
         self._compared: list[tuple[str, list[str]]] = []
         self._views: dict[str, list[list[str]]] = {kind: [] for kind in TABS}
         self._entries: list[str] = []
@@ -91,11 +91,9 @@ class Layout:
 
     def blueprint(self, tab: str | None = None) -> rrb.Blueprint:
         """The layout as rerun's; its time panel plays episodes at Meta-World's 80 steps a second."""
-        tabs: list[Any] = [
-            side_by_side([self.pages[name] for name in names], title) for title, names in list(self._compared)
-        ]
+        tabs: list[Any] = [side_by_side([self.pages[name] for name in names], title) for title, names in self._compared]
         tabs += [page.tab() for page in list(self.pages.values())]
-        for kind, views in list(self._views.items()):
+        for kind, views in self._views.items():
             if views:
                 shown = [_view(kind, names) for names in views]
                 tabs.append(shown[0] if kind == "hparams" else rrb.Grid(*shown, name=TABS[kind]))
@@ -110,7 +108,7 @@ class Layout:
         return [
             *(Tab(title, title, names) for title, names in self._compared),
             *(Tab(name, page.title, [name]) for name, page in list(self.pages.items())),
-            *(Tab(TABS[kind], TABS[kind], []) for kind, views in list(self._views.items()) if views),
+            *(Tab(TABS[kind], TABS[kind], []) for kind, views in self._views.items() if views),
         ]
 
     def _find(self, name: str | None) -> int:

@@ -6,7 +6,7 @@ import math
 
 import pytest
 import torch
-from small_training import CONFIG, SMALL, assert_same, collect_demos, everything, make_actor, make_replay, make_trainer
+from small_training import CONFIG, SMALL, assert_same, everything, make_actor, make_replay, make_trainer
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
@@ -16,18 +16,6 @@ from torchrl.record.loggers import Logger
 from lw_torchrl.data import TaskBalancedSampler
 from lw_torchrl.modules import DescriptorConditionedActor
 from lw_torchrl.training import BehavioralCloningConfig, BehavioralCloningTrainer
-
-
-@pytest.fixture(scope="module")
-def demos(tmp_path_factory):
-    return collect_demos(tmp_path_factory.mktemp("trainer") / "demos")
-
-
-@pytest.fixture(scope="module")
-def undisturbed(demos):
-    trainer = make_trainer(demos)
-    trainer.train()
-    return everything(trainer)
 
 
 def test_the_loss_falls(demos):

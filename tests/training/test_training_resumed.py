@@ -9,23 +9,11 @@ import textwrap
 
 import pytest
 import torch
-from small_training import CONFIG, assert_same, collect_demos, everything, flat, make_actor, make_replay, make_trainer
+from small_training import CONFIG, assert_same, everything, flat, make_actor, make_replay, make_trainer
 from torchrl.data import RandomSampler, SamplerWithoutReplacement
 
 from lw_torchrl.training import BehavioralCloningConfig, BehavioralCloningTrainer, StackedBehavioralCloning
 from lw_torchrl.transforms import RandomYaw
-
-
-@pytest.fixture(scope="module")
-def demos(tmp_path_factory):
-    return collect_demos(tmp_path_factory.mktemp("trainer") / "demos")
-
-
-@pytest.fixture(scope="module")
-def undisturbed(demos):
-    trainer = make_trainer(demos)
-    trainer.train()
-    return everything(trainer)
 
 
 @pytest.mark.parametrize("stops", [[5], [7], [11], [6, 6], [3, 8, 11]])
