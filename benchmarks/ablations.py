@@ -22,7 +22,7 @@ from lw_torchrl.language.roles import role_object
 from lw_torchrl.language.tasks import Task
 from lw_torchrl.modules.relative_positions import PlanRoles
 from lw_torchrl.paper.imitation import ImitationRun
-from lw_torchrl.paper.recipes import CLEAN, NOISY, PRESETS, SETTINGS, Member, Preset
+from lw_torchrl.paper.recipes import EXECUTIONS, PRESETS, SETTINGS, Member, Preset
 from lw_torchrl.paper.runs import execute_run
 
 Setting = Literal["few-shot", "zero-shot"]
@@ -62,8 +62,8 @@ ABLATIONS: Mapping[Setting, Mapping[str, Preset]] = MappingProxyType(
     {
         "few-shot": {
             "the recipe": FULL["few-shot"],
-            "clean demonstrations, failures kept": _few_shot("noise", base=CLEAN),
-            "noise drawn anew at every step, failures kept": _few_shot("holding", base=NOISY),
+            "clean demonstrations, failures kept": _few_shot("noise", base=EXECUTIONS["clean"]),
+            "noise drawn anew at every step, failures kept": _few_shot("holding", base=EXECUTIONS["noisy"]),
             "rows long after success kept": _few_shot("cutting", after_success=None),
             "the raw observation": _few_shot("differences", members=_members(features="raw")),
             "no feature noise": _few_shot("feature-noise", members=_members(feature_noise=0.0)),

@@ -13,8 +13,8 @@ from tensordict.nn import TensorDictModuleBase
 import lw_torchrl as lw
 from lw_torchrl.evaluation.explanation import attended
 from lw_torchrl.language.named_objects import GRIPPER
-from lw_torchrl.language.plan_tables import PlanTables
 from lw_torchrl.language.skills import ScriptedSkill
+from lw_torchrl.language.task_index import PlanTables
 
 OFFSET = 0.1  # metres, along x
 

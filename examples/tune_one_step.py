@@ -12,6 +12,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 import lw_torchrl as lw
 from lw_torchrl.evaluation import PlanUse, stuck_steps, stuck_table, weakest_step
+from lw_torchrl.training.algorithms import ResidualConfig
 
 TASK, OTHER = "pick-place", "push"
 CARRY = 3  # the step of pick-place's plan that the policy is not shown
@@ -82,7 +83,7 @@ def main() -> None:
             sampler=lw.CoLearningSampler("grown"),
             transform=actor.transform(),
         )
-        config = lw.OnlineConfig(frames=args.frames, first_frames=min(1_000, args.frames // 2))
+        config = ResidualConfig(frames=args.frames, first_frames=min(1_000, args.frames // 2))
         lw.OnlineTrainer(actor, replay, config, method="residual").train()
 
         after, other_after = look(actor, TASK, args.episodes)[0], look(actor, OTHER, args.episodes)[0]

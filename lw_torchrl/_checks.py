@@ -26,12 +26,7 @@ def nearest(given: str, allowed: Iterable[str], *, n: int = 3) -> list[str]:
 
 
 def unknown_name(argument: str, given: object, allowed: Iterable[str]) -> ValueError:
-    """The error for a name outside a fixed set; the caller raises it.
-
-    Example:
-        >>> str(unknown_name("mix", "latent", ["latents", "actions"]))
-        "mix must be one of 'latents', 'actions', got 'latent'; did you mean 'latents' or 'actions'?"
-    """
+    """The error for a name outside a fixed set, with those close in spelling; the caller raises it."""
     names = list(allowed)
     listed = ", ".join(repr(name) for name in names[:12]) + (", ..." if len(names) > 12 else "")
     message = f"{argument} must be one of {listed}, got {shown(given)}"
@@ -41,22 +36,12 @@ def unknown_name(argument: str, given: object, allowed: Iterable[str]) -> ValueE
 
 
 def counted(number: int, noun: str) -> str:
-    """A number and what it counts.
-
-    Example:
-        >>> counted(1, "task"), counted(50, "task")
-        ('1 task', '50 tasks')
-    """
+    """A number and what it counts: "1 task", "50 tasks"."""
     return f"{number} {noun}" + "s" * (number != 1)
 
 
 def differences(was: Mapping[str, Any], now: Mapping[str, Any], inside: str = "") -> list[str]:
-    """The names under which two nested tables differ, with both values where they are short.
-
-    Example:
-        >>> differences({"steps": 40, "options": {"width": 8}}, {"steps": 30, "options": {"width": 8}, "seed": 1})
-        ['seed (None, now 1)', 'steps (40, now 30)']
-    """
+    """The names under which two nested tables differ, with both values where they are short: "steps (40, now 30)"."""
     found = []
     for key in sorted({**was, **now}):
         before, after = was.get(key), now.get(key)
@@ -158,6 +143,12 @@ def check_probability(argument: str, given: Any) -> float:
     return value
 
 
+Count = int  # Annotations that say more of a number, for a reader and for check_fields: at least 1,
+Natural = int  # at least 0,
+Scale = float  # finite and at least 0,
+Positive = float  # finite and above 0,
+Probability = float  # from 0 to 1.
+
 Check = Callable[[str, Any], object]
 _LITERAL = re.compile(r"Literal\[([^\[\]]*)\]")
 _PLAIN: dict[str, Check] = {
@@ -166,6 +157,11 @@ _PLAIN: dict[str, Check] = {
     "float": _check_real,
     "str": check_text,
     "str | os.PathLike[str]": check_path,
+    "Count": functools.partial(check_int, minimum=1),
+    "Natural": functools.partial(check_int, minimum=0),
+    "Scale": check_scale,
+    "Positive": check_positive,
+    "Probability": check_probability,
 }
 _SEVERAL: dict[Any, tuple[type, str]] = {
     int: (Integral, "an integer"),
@@ -260,20 +256,10 @@ def _check_collection(wanted: Any, check: Check, argument: str, given: Any) -> N
             check(f"{argument}[{shown(place)}]", one)
 
 
-def checked(function: Function) -> Function:
-    """Check a function's arguments by their annotations, see :func:`checked_but`."""
-    return checked_but()(function)
-
-
 def checked_but(*arguments: str) -> Callable[[Function], Function]:
-    """Check a function's arguments by their annotations: flags, numbers, texts, paths, choices, classes, functions, and
-    collections of these. The function itself checks what may be a name or a :class:`Task`, for example.
-
-    Args:
-        *arguments: names of arguments that are not checked, since the function's own error says more.
-
-    Raises:
-        TypeError, ValueError: when the function is called; it names the argument, what was given and what is allowed.
+    """Check a function's arguments, but for those named, by their annotations: flags, numbers, texts, paths, choices,
+    classes, functions, and collections of these. The function itself checks what may be a name or a :class:`Task`, for
+    example; :class:`TypeError` or :class:`ValueError` name the argument, what was given and what is allowed.
 
     Example:
         >>> @checked_but("color")
@@ -313,10 +299,43 @@ def checked_but(*arguments: str) -> Callable[[Function], Function]:
     return decorate
 
 
+checked = checked_but()  # all of a function's arguments
+
+
+def passes_on(*others: Callable[..., Any]) -> Callable[[Function], Function]:
+    """Say which ``**options`` a function takes: the keyword arguments of the functions that it hands them to.
+
+    ``help`` and editors show them, and any other is a :class:`TypeError` that names the nearest.
+    """
+
+    def decorate(function: Function) -> Function:
+        signature = inspect.signature(function)
+        taken = {name: one for name, one in signature.parameters.items() if one.kind is not one.VAR_KEYWORD}
+        for other in others:
+            for name, one in inspect.signature(other).parameters.items():
+                if one.kind is one.KEYWORD_ONLY:
+                    taken.setdefault(name, one)
+
+        @functools.wraps(function)
+        def call(*args: Any, **kwargs: Any) -> Any:
+            for name in kwargs:
+                if name not in taken:
+                    names = [known for known, one in taken.items() if one.kind is one.KEYWORD_ONLY]
+                    of = function.__qualname__.removesuffix(".__init__")
+                    raise TypeError(f"{of}: {unknown_name('argument', name, names)}")
+            return function(*args, **kwargs)
+
+        call.__signature__ = signature.replace(parameters=[*taken.values()])  # type: ignore[attr-defined]
+        return call  # type: ignore[return-value]
+
+    return decorate
+
+
 def check_fields(instance: Any, inside: str = "") -> None:
     """Check the plain fields of a dataclass as :func:`checked` does arguments; errors begin with ``inside``."""
     for field in fields(instance):
-        if (check := _plain_check(str(field.type))) is not None:
+        stated: Any = field.type  # a text, unless its module evaluates annotations
+        if (check := _plain_check(stated) if isinstance(stated, str) else _check_of(stated, {})) is not None:
             check(inside + field.name, getattr(instance, field.name))
 
 
@@ -325,12 +344,7 @@ _SHOWN.maxlevel, _SHOWN.maxstring, _SHOWN.maxother, _SHOWN.maxlist, _SHOWN.maxtu
 
 
 def shown(value: object) -> str:
-    """``repr`` for an error's text: short, and safe of any value, also of one nested deep or of a huge number.
-
-    Example:
-        >>> shown([0.1, "obs[37]", 10**5000])
-        'a list'
-    """
+    """``repr`` for an error's text: short, and safe of any value, also of one nested deep or of a huge number."""
     try:
         return _SHOWN.repr(value)
     except (ValueError, RecursionError):  # a number of more digits than Python writes

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import chain
 from typing import Any
 
 import torch
@@ -13,25 +14,13 @@ from lw_torchrl._checks import shown, unknown_name
 
 _NAMES = ("cpu", "cuda", "cuda:0", "mps", "auto")
 CPU = torch.device("cpu")
-BLOCK = 64
-"""Rows that networks run on at once."""
+BLOCK = 64  # rows that networks run on at once
 
 
 def check_device(argument: str, given: Any) -> torch.device:
-    """The device that is meant, with its number; errors name the ``argument``.
-
-    Args:
-        given: "cpu", "cuda", "cuda:1", "mps" or another kind that PyTorch knows, "auto" for the accelerator of this
-            machine, or the CPU where it has none; or a :class:`torch.device`.
-
-    Raises:
-        ValueError: it is no device, or not in this machine.
-        TypeError: it is neither a name nor a device.
-
-    Example:
-        >>> check_device("device", "cpu")
-        device(type='cpu')
-    """
+    """The device that is meant, with its number: a :class:`torch.device`, a kind that PyTorch knows, such as "cuda",
+    with or without a number, or "auto" for this machine's accelerator, or the CPU where it has none. A name of no
+    device, or of none in this machine, is a :class:`ValueError`, anything else a :class:`TypeError`."""
     if not isinstance(given, (str, torch.device)):
         raise TypeError(f"{argument} must be a device's name, got {shown(given)}")
     there = _there()
@@ -62,18 +51,11 @@ def _there() -> list[str]:
 
 
 def device_of(module: Any) -> torch.device:
-    """The device of a module's first parameter, or else buffer; the CPU for whatever has neither.
-
-    Example:
-        >>> device_of(torch.nn.Linear(1, 1)), device_of(print)
-        (device(type='cpu'), device(type='cpu'))
-    """
+    """The device of a module's first parameter, or else buffer; the CPU for whatever has neither."""
     if not isinstance(module, torch.nn.Module):
         return CPU
-    for tensors in (module.parameters(), module.buffers()):
-        for tensor in tensors:
-            return tensor.device
-    return CPU
+    first = next(chain(module.parameters(), module.buffers()), None)
+    return CPU if first is None else first.device
 
 
 def place(module: Any, device: str | torch.device | None) -> torch.device:

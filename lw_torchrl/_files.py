@@ -22,14 +22,10 @@ try:
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
-PATIENCE = 1.0
-"""Seconds to wait for others that are at work in a place: they may be about to end."""
-JSON_LIMIT = 32 * 2**20
-"""Bytes of a file of JSON or text; read, JSON takes some twenty times as much memory."""
-TOML_LIMIT = 2**18
-"""Bytes of a TOML file, which takes a second to read; the largest of ours has 22 kB."""
-MOST_KEYS = 16
-"""Names joined by dots in a TOML key: Python's reader takes their square in time."""
+PATIENCE = 1.0  # seconds to wait for others that are at work in a place: they may be about to end
+JSON_LIMIT = 32 * 2**20  # bytes of a file of JSON or text; read, JSON takes some twenty times as much memory
+TOML_LIMIT = 2**18  # bytes of a TOML file, which takes a second to read; the largest of ours has 22 kB
+MOST_KEYS = 16  # names joined by dots in a TOML key: Python's reader takes their square in time
 
 _KEY = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
 _DOTTED = re.compile(rf"{_KEY}(?:[ \t]*+\.[ \t]*+{_KEY})*+")
@@ -132,17 +128,9 @@ def held(
     wait: bool = False,
     error: type[ValueError] = ValueError,
 ) -> Iterator[None]:
-    """Keep other threads and processes out of a place while the block writes to it, by a lock in the folder or beside
-    the file. The lock of a killed process is free.
-
-    Args:
-        place: the file or the folder.
-        argument: its name in the error, "out" for example.
-        who: what may be at work there.
-        folder: whether it is one; it is made where there is none.
-        wait: until nothing else is at work there; if False, ``error`` is raised after a second.
-        error: its class.
-    """
+    """Keep other threads and processes out of a place while the block writes to it, by a lock beside the file, or in
+    the ``folder``, which is made where there is none. The lock of a killed process is free. Without ``wait``, an
+    ``error`` that names the ``argument`` and ``who`` may be at work there is raised after a second."""
     path = Path(place)
     lock = path / ".lock" if folder else path.with_name(f".{path.name}.lock")
     lock.parent.mkdir(parents=True, exist_ok=True)
@@ -229,13 +217,8 @@ def read_toml(path: Path | Traversable, error: type[ValueError]) -> dict[str, An
 
 
 def read_json(path: str | os.PathLike[str], what: str, *, limit: int = JSON_LIMIT) -> dict[str, Any]:
-    """The object in a JSON file of at most ``limit`` bytes; errors begin with ``what``, "root: the metadata".
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it is larger, no UTF-8, no JSON (NaN and Infinity are none), nested too deeply, names something
-            twice, holds a number too long to read, or is no object.
-    """
+    """The object in a JSON file of at most ``limit`` bytes, see :func:`parse_json`; a :class:`ValueError` begins with
+    ``what``, "root: the metadata". A file that is not there is a :class:`FileNotFoundError`."""
     file = Path(path)
     try:
         return parse_json(read_bytes(file, limit))
@@ -257,7 +240,8 @@ def reading(path: str | os.PathLike[str], what: str) -> Iterator[None]:
 
 
 def parse_json(content: bytes) -> dict[str, Any]:
-    """The object in JSON in UTF-8; :class:`ValueError` for anything else, as :func:`read_json` raises it."""
+    """The object in JSON in UTF-8; :class:`ValueError` for anything else, NaN and Infinity, what is nested too deeply,
+    a name that comes twice, and a number too long to read."""
     try:
         found = json.loads(
             content.decode("utf-8"), object_pairs_hook=_object, parse_constant=_no_number, parse_float=_number

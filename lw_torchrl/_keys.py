@@ -17,12 +17,7 @@ from lw_torchrl._checks import missing_keys
 
 def as_keys(argument: str, given: Sequence[NestedKey] | None, default: Sequence[str]) -> list[NestedKey]:
     """The keys ``given``, as many as the default ones and in their order; None for the default. :class:`ValueError` for
-    another number of keys, the same twice, or what is no key.
-
-    Example:
-        >>> as_keys("in_keys", [("agent", "observation"), "task"], ("observation", "task_id"))
-        [('agent', 'observation'), 'task']
-    """
+    another number of keys, the same twice, or what is no key."""
     if given is None:
         return list(default)
     error = ValueError(
@@ -57,12 +52,7 @@ def check_apart(in_keys: Sequence[NestedKey], out_keys: Sequence[NestedKey]) -> 
 
 
 def key_beside(key: NestedKey, ending: str) -> NestedKey:
-    """The key beside ``key`` whose name has an ending more.
-
-    Example:
-        >>> key_beside(("agent", "qaf"), "_plan")
-        ('agent', 'qaf_plan')
-    """
+    """The key beside ``key`` whose name has an ending more."""
     return key + ending if isinstance(key, str) else (*key[:-1], key[-1] + ending)
 
 

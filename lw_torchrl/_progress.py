@@ -10,11 +10,6 @@ DELAY, EVERY = 1.0, 30.0  # seconds: before a bar is shown, and between lines
 
 
 def _duration(seconds: float) -> str:
-    """
-    Example:
-        >>> _duration(42.0), _duration(700.0), _duration(9000.0)
-        ('42 s', '12 min', '2.5 h')
-    """
     if seconds < 90:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
@@ -48,8 +43,10 @@ class Progress:
         if self._bar is not None:
             self._bar.update(units)
         elif (now := time.monotonic()) >= self._next:
-            self._next = now + EVERY
-            self._print_line(now - self._started)
+            self._next, spent, left = now + EVERY, now - self._started, ""
+            if self.done > self.initial:
+                left = f", {_duration(spent / (self.done - self.initial) * (self.total - self.done))} left"
+            print(f"{self.what}: {self.done}/{self.total} {self.unit}s{left}{self.notes}", file=sys.stderr, flush=True)
 
     def set_done(self, units: int) -> None:
         """Set how many units are done; fewer than before where some must be done again."""
@@ -62,9 +59,3 @@ class Progress:
         self.notes = "".join(f", {name} {value}" for name, value in notes.items())
         if self._bar is not None:
             self._bar.set_postfix(notes, refresh=False)
-
-    def _print_line(self, seconds: float) -> None:
-        left = ""
-        if self.done > self.initial:
-            left = f", {_duration(seconds / (self.done - self.initial) * (self.total - self.done))} left"
-        print(f"{self.what}: {self.done}/{self.total} {self.unit}s{left}{self.notes}", file=sys.stderr, flush=True)

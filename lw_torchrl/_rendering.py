@@ -12,8 +12,7 @@ RENDER_LIBRARIES = {
     "egl": "libEGL (Debian: apt-get install libegl1)",
     "osmesa": "OSMesa (Debian: apt-get install libosmesa6)",
 }
-CAMERAS = ("corner2", "corner", "corner3", "corner4", "topview", "behindGripper", "gripperPOV")
-"""Meta-World's."""
+CAMERAS = ("corner2", "corner", "corner3", "corner4", "topview", "behindGripper", "gripperPOV")  # Meta-World's
 _LARGEST = 4096  # pixels along a side
 
 

@@ -87,13 +87,13 @@ def check_optimizer_state(found: Any, optimizer: torch.optim.Optimizer, step: in
         if state and set(state) != names:
             raise ValueError(f"optimizer['state'][{number}] must have {sorted(names)}, got {_said(state)}")
         for name, value in state.items():
-            shape = torch.Size() if name == "step" else parameters[number].shape
-            if value is not None and not (
-                isinstance(value, Tensor) and value.dtype == torch.float32 and value.shape == shape
-            ):
-                raise ValueError(f"optimizer['state'][{number}][{name!r}] does not fit, it is {_said(value)}")
-            if value is not None and not _may_be(name, value, step):
-                raise ValueError(f"optimizer['state'][{number}][{name!r}] holds what {step} steps cannot give")
+            if value is None:
+                continue
+            where = f"optimizer['state'][{number}][{name!r}]"
+            shape = () if name == "step" else parameters[number].shape
+            check_like(value, torch.empty(shape, dtype=torch.float32, device="meta"), where)
+            if not _may_be(name, value, step):
+                raise ValueError(f"{where} holds what {step} steps cannot give")
 
 
 def _may_be(name: str, value: Tensor, step: int) -> bool:

@@ -41,12 +41,7 @@ def write_archive(
     path: str | os.PathLike[str], description: Mapping[str, Any], groups: Mapping[str, Mapping[str, Tensor]]
 ) -> None:
     """Write a file whole or not at all: the ``description``, JSON to which ``sha256`` and the ``versions`` of packages
-    are added, and ``groups`` of tensors by name.
-
-    Raises:
-        ValueError: the description is no JSON that can be read again, or the file would be too large to be read.
-        OSError: the disk is full, for example; an earlier file stays as it was.
-    """
+    are added, and ``groups`` of tensors by name. What could not be read again is a :class:`ValueError`."""
     data = {}
     for name, tensors in groups.items():
         own = {key: tensor.detach().cpu().contiguous().clone() for key, tensor in tensors.items()}
@@ -79,7 +74,6 @@ class TensorArchive:
         for name, content in self._data.items():
             if sha256(content).hexdigest() != stated[name]:
                 raise ArchiveError(f"{name} is not what was written: its SHA-256 differs")
-        self.groups = {name.removesuffix(".safetensors") for name in self._data}
 
     def tensors(self, group: str) -> dict[str, Tensor]:
         """The tensors of a group by name; :class:`ArchiveError` if there is none, or it cannot be read."""

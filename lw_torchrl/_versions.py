@@ -10,10 +10,8 @@ from typing import Any
 from lw_torchrl import __version__
 from lw_torchrl._checks import shown
 
-SIMULATORS: tuple[str, ...] = ("metaworld", "mujoco")
-"""What an episode's physics depend on."""
-LIBRARIES: tuple[str, ...] = ("lw_torchrl", "numpy", "tensordict", "torch", "torchrl")
-"""What the last bits of computations depend on."""
+SIMULATORS: tuple[str, ...] = ("metaworld", "mujoco")  # what an episode's physics depend on
+LIBRARIES: tuple[str, ...] = ("lw_torchrl", "numpy", "tensordict", "torch", "torchrl")  # and the last bits of results
 
 
 def package_versions() -> dict[str, str]:

@@ -17,7 +17,7 @@ from benchmarks import __main__ as cli
 from benchmarks import ablations, latents, truth
 from benchmarks.report import Row, Skipped, compare, part_of, times_as_long, under
 from lw_torchrl.evaluation import EpisodeResult, EvaluationResult
-from lw_torchrl.language.plan_tables import PlanTables
+from lw_torchrl.language.task_index import PlanTables
 from lw_torchrl.modules.relative_positions import PlanRoles
 
 ROOT = Path(__file__).parent.parent

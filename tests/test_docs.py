@@ -64,7 +64,7 @@ def test_the_docstrings_have_examples():
 
 
 def test_every_public_class_says_what_it_is():
-    rooms = [importlib.import_module(f"lw_torchrl.{room}") for room in lw_torchrl._ROOMS.split()]
+    rooms = [importlib.import_module(f"lw_torchrl.{room}") for room in lw_torchrl._ROOMS]
     named = [(name, getattr(room, name)) for room in (lw_torchrl, *rooms) for name in getattr(room, "__all__", ())]
     classes = {name: found for name, found in named if inspect.isclass(found)}
     assert len(classes) > 80

@@ -114,8 +114,7 @@ def test_type_checkers_see_the_names_that_are_there():
     lines = [node for node in stub.body if isinstance(node, ast.ImportFrom)]
     stated = {alias.asname: line.module for line in lines for alias in line.names}
     rooms = [name for name, module in stated.items() if module == "lw_torchrl"]
-    assert rooms == lw_torchrl._ROOMS.split()
-    assert {name: module for name, module in stated.items() if name not in rooms} == lw_torchrl._ROOM_OF
+    assert rooms == lw_torchrl._ROOMS
     assert sorted({*stated} - {*rooms}) == lw_torchrl.__all__
 
 
@@ -130,8 +129,8 @@ def test_the_top_level_is_small_and_each_of_its_names_is_shown():
 
 
 def test_a_name_that_left_the_top_level_says_where_it_is():
-    for room, names in lw_torchrl._MOVED.items():
-        for name in names.split():
+    for room, names in lw_torchrl._moved().items():
+        for name in names:
             assert name not in lw_torchrl.__all__
             assert hasattr(importlib.import_module(room), name), f"{room} has no {name}"
             said = rf"lw\.{name} is now lw{room.removeprefix('lw_torchrl')}\.{name} \(from {room} import {name}\)"
@@ -145,4 +144,4 @@ def test_names_rooms_and_what_is_neither():
     with pytest.raises(AttributeError, match="no attribute 'load_plan'"):
         lw_torchrl.load_plan  # noqa: B018
     rooms = {module.name for module in pkgutil.iter_modules(lw_torchrl.__path__) if module.ispkg}
-    assert {*lw_torchrl._ROOMS.split(), "cli"} == rooms
+    assert {*lw_torchrl._ROOMS, "cli"} == rooms

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import ast
+import dataclasses
 import inspect
 import math
 import re
 from importlib import import_module
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -16,15 +17,11 @@ from wrong_values import OF_ONE_NAME, good_calls
 from wrong_values import WRONG as OTHERS
 
 import lw_torchrl as lw
-from lw_torchrl._checks import check_positive, check_probability, check_scale
+from lw_torchrl._checks import check_fields, check_positive, check_probability, check_scale
 from lw_torchrl.evaluation import summarize
 
-PUBLIC = {  # at the top level, or in 0.2.0
-    name: import_module(room)
-    for table in (lw._NAMES, lw._MOVED)
-    for room, names in table.items()
-    for name in names.split()
-}
+PUBLIC = {name: import_module(room) for name, room in lw._ROOM_OF.items()}  # at the top level, or in 0.2.0
+PUBLIC |= {name: import_module(room) for room, names in lw._moved().items() for name in names}
 PUBLIC |= {name: lw.modules for name in ("Value", "QValue", "PlanEncoder")}
 NOT_MADE_BY_USERS = {"DecodedPlan", "DecodedStep", "PlannerError", "PlanError", "QueryError", "Planner", "Policy"}
 WRONG: dict[str, list[Any]] = {
@@ -33,6 +30,11 @@ WRONG: dict[str, list[Any]] = {
     "float": ["0.1", "", True, None, [], math.nan],
     "str": [3, None, [], b"text", 1.5],
     "str | os.PathLike[str]": [3, None, [], 1.5, True],
+    "Count": ["3", 1.5, math.nan, True, None, [], 0, -1],
+    "Natural": ["3", 1.5, math.nan, True, None, [], -1],
+    "Scale": ["0.1", "", True, None, [], math.nan, math.inf, -0.1],
+    "Positive": ["0.1", "", True, None, [], math.nan, math.inf, -0.1, 0.0],
+    "Probability": ["0.1", "", True, None, [], math.nan, -0.1, 1.1],
     "Literal": ["no such choice", 3, None, [], True],
 }
 RIGHT = {"bool": True, "int": 1, "float": 0.5, "str": "reach", "str | os.PathLike[str]": "folder"}
@@ -187,3 +189,34 @@ def test_a_gradient_norm_of_zero_would_train_nothing():
     for config in (lw.BehavioralCloningConfig, lw.OfflineConfig):
         with pytest.raises(ValueError, match="max_grad_norm"):
             config(max_grad_norm=0)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (
+            lambda: lw.PlanConditionedActor(lw.load_plans("MT10"), widht=3),
+            r"PlanConditionedActor: .*'widht'; .*'width'",
+        ),
+        (lambda: lw.DescriptorConditionedActor("MT10", condtion="one-hot"), "did you mean 'condition'"),
+        (lambda: lw.PlanConditionedQValue(lw.load_plans("MT10"), quantile=3), "did you mean 'quantiles'"),
+        (lambda: lw.modules.plan_actor_value(lw.load_plans("MT10"), rolls=True), "did you mean 'roles'"),
+    ],
+)
+def test_a_misspelt_option_is_named_with_the_nearest(call, message):
+    with pytest.raises(TypeError, match=message):
+        call()
+
+
+def test_help_shows_the_options_that_are_handed_on():
+    shown = inspect.signature(lw.PlanConditionedActor).parameters
+    assert {"mix", "width", "distribution", "roles", "evaluator"} <= {*shown}
+    assert not any(one.kind is one.VAR_KEYWORD for one in shown.values())
+
+
+def test_fields_are_checked_however_their_annotations_are_kept():
+    made = dataclasses.make_dataclass("Made", [("steps", int), ("rate", "float"), ("kind", Literal["l1", "l2"])])
+    check_fields(made(3, 0.1, "l1"))
+    for wrong, name in ((made("3", 0.1, "l1"), "steps"), (made(3, "x", "l1"), "rate"), (made(3, 0.1, "l3"), "kind")):
+        with pytest.raises((TypeError, ValueError), match=name):
+            check_fields(wrong)

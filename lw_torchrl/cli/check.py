@@ -32,7 +32,7 @@ def check(
     """
     import lw_torchrl as lw
     from lw_torchrl._files import read_text
-    from lw_torchrl.language.plans import PLAN_LIMIT
+    from lw_torchrl.language.plan_text import PLAN_LIMIT
 
     if not file.exists():
         raise FileNotFoundError(f"file: there is no {str(file)!r}")
@@ -42,8 +42,6 @@ def check(
         try:
             kind, number, notes = _check_table(file, known, "" if task_file else "; tasks of yours come by --task-file")
         except ValueError as error:
-            if not json:
-                raise
             output.show("files", [{"file": file, "steps": 0, "faults": [str(error)], "notes": []}])
             output.fault = str(error)
             return output
@@ -98,7 +96,7 @@ def _check_plan(
 ) -> tuple[list[str], int, list[str]]:
     """Every fault of a plan, the steps it has if there is none, and what the scripted skills make of it."""
     from lw_torchrl.language.nearest import nearest_skill
-    from lw_torchrl.language.plan_files import check_plan
+    from lw_torchrl.language.plans import check_plan
     from lw_torchrl.language.skills import skills_for
 
     plan, faults = check_plan(text, task, source, tasks)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import groupby
 from pathlib import Path
 from statistics import median, quantiles
 from textwrap import TextWrapper
@@ -104,30 +105,22 @@ def data(
         told += [_Episode(part.config.behaviour, *pair) for pair in zip(part.episodes, earned, strict=True)]
         if not json:
             print("\n".join(_about(part)) + "\n")
-    output.show("datasets", [_described(part) for part in parts])
+    described = [
+        {"folder": part.root, "bytes": _size(part), "behaviour": part.config.behaviour, "config": part.config.to_json()}
+        | {"attempts": part.attempts, "versions": part.versions}
+        for part in parts
+    ]
+    output.show("datasets", described)
     every = [] if json else [_row("all", told)]
-    _table(output, "task", _by(told, lambda one: one.info.task), [] if len(parts) > 1 else every)
+    _table(output, "task", told, lambda one: one.info.task, [] if len(parts) > 1 else every)
     if len(parts) > 1:
         if not json:
             print()
-        _table(output, "behaviour", _by(told, lambda one: one.behaviour), every)
+        _table(output, "behaviour", told, lambda one: one.behaviour, every)
     output.show("all", _row("all", told))
     if check:
         _check(output, parts)
     return output
-
-
-def _by(told: list[_Episode], key: Callable[[_Episode], str]) -> dict[str, list[_Episode]]:
-    found: dict[str, list[_Episode]] = {}
-    for one in told:
-        found.setdefault(key(one), []).append(one)
-    return dict(sorted(found.items()))
-
-
-def _described(part: Demonstrations) -> dict[str, Any]:
-    """What a dataset's metadata say of it, for a program."""
-    told = {"folder": part.root, "bytes": _size(part), "behaviour": part.config.behaviour}
-    return told | {"config": part.config.to_json(), "attempts": part.attempts, "versions": part.versions}
 
 
 def _size(part: Demonstrations) -> int:
@@ -178,7 +171,9 @@ def _bytes(size: float) -> str:
     return f"{size:.3g} GB"
 
 
-def _table(output: Output, name: str, found: dict[str, list[_Episode]], ending: list[dict[str, Any]]) -> None:
+def _table(
+    output: Output, name: str, told: list[_Episode], of: Callable[[_Episode], str], ending: list[dict[str, Any]]
+) -> None:
     """A row for each task or behaviour, and a last one; each is called ``label``."""
 
     def first(row: Row) -> str:
@@ -187,7 +182,7 @@ def _table(output: Output, name: str, found: dict[str, list[_Episode]], ending: 
 
     output.table(
         f"{name}s",
-        [_row(label, episodes) for label, episodes in found.items()] + ending,
+        [_row(label, [*episodes]) for label, episodes in groupby(sorted(told, key=of), of)] + ending,
         {
             name: "label",
             "episodes": "episodes",

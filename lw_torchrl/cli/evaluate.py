@@ -11,7 +11,6 @@ from tyro.conf import Positional, arg
 from lw_torchrl._checks import counted
 from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Output
-from lw_torchrl.cli.train_evaluator import with_evaluator
 
 if TYPE_CHECKING:
     from lw_torchrl.language.tasks import Task
@@ -47,24 +46,23 @@ def evaluate(
     """
     if out is not None:
         options.check_folder("--out", out)
-    if reference and not attribute:
-        raise ValueError("--reference is for --attribute, which runs failed episodes again with these plans")
-    if evaluator is not None and str(checkpoint) == "expert":
-        raise ValueError("--evaluator is for a policy with plans, the scripted experts ask no conditions")
+    options.check_reference(reference, attribute)  # which may speak of a policy's own tasks
     if str(checkpoint) != "expert":
         options.check_saved("checkpoint", checkpoint)
+    elif evaluator is not None:
+        raise ValueError("--evaluator is for a policy with plans, the scripted experts ask no conditions")
     if evaluator is not None:
         options.check_saved("evaluator", evaluator, "network", "train-evaluator")
     options.check_encoder(text_encoder)
     known = dict(options.read_tasks(task_file))
     chosen = options.simulated("tasks", options.one_or_many(tasks), known) if tasks else ()
     given = options.read_plans(plans, known) if plans else None
-    options.check_plan_files("--reference", reference)  # which may speak of a policy's own tasks
     import lw_torchrl as lw
     from lw_torchrl._devices import check_device
     from lw_torchrl._files import held
     from lw_torchrl.evaluation import plot_failures
     from lw_torchrl.record.rollouts import run_recorded, write_recording
+    from lw_torchrl.training.files import demonstrated_tasks, load_evaluator
 
     options.use_one_thread()
     there = check_device("device", device)
@@ -72,14 +70,18 @@ def evaluate(
     if str(checkpoint) != "expert":
         policy = options.load_policy(checkpoint, seed, given, text_encoder)
         if evaluator is not None:
-            policy = with_evaluator(policy, evaluator, text_encoder)
+            if policy.plans is None:
+                raise ValueError(f"--evaluator is for a policy with plans, {type(policy).__name__} has none")
+            encoder = options.read_encoder(text_encoder)
+            policy = policy.with_evaluator(load_evaluator(evaluator, policy.plans, text_encoder=encoder))
         known.update({task: found for task in policy.tasks if (found := policy.definition(task)) is not None})
-    if not chosen:
-        chosen = lw.MT10 if policy is None else _default_tasks(policy, checkpoint, trained=not plans)
+    if not chosen and policy is not None:
+        chosen = _default_tasks(policy, set() if plans else demonstrated_tasks(checkpoint))
     if policy is None and there.type != "cpu":
         raise ValueError("--device is for a policy; the scripted experts work on the CPU")
     if attribute and (policy is None or policy.plans is None):
         raise ValueError(f"--attribute is for a policy with plans, {checkpoint} has none")
+    chosen = chosen or lw.MT10
     how: dict[str, Any] = {"tasks": chosen, "episodes_per_task": episodes, "seed": seed, "noise_scale": noise}
     how |= {"stop_at_success": stop_at_success, "num_envs": num_envs, "device": there, "attribute": attribute}
     trusted = options.read_plans(reference, known) if reference else None
@@ -92,10 +94,8 @@ def evaluate(
     if out is not None:
         with held(out, "out", folder=True, wait=True):
             told: dict[str, Any] = {} if policy is None else {"checkpoint": checkpoint}
-            if policy is not None and policy.plans is not None:
-                told["plans"] = policy.plans.fingerprint
-            if evaluator is not None:
-                told["evaluator"] = evaluator
+            told |= {} if policy is None or policy.plans is None else {"plans": policy.plans.fingerprint}
+            told |= {} if evaluator is None else {"evaluator": evaluator}
             result.save(out / "results.json", **told)
             lw.plot_success(result, out / "success.png", title=f"{checkpoint}, {episodes} episodes a task")
             if attribute:
@@ -108,12 +108,10 @@ def evaluate(
     return output
 
 
-def _default_tasks(policy: Policy, checkpoint: Path, *, trained: bool) -> tuple[str, ...]:
-    """The tasks that a policy was trained on, as its file says, that the simulator has; what is left out is printed."""
+def _default_tasks(policy: Policy, shown: set[str]) -> tuple[str, ...]:
+    """The tasks that a policy was ``shown``, or all it has, if the simulator has them; what is left out is printed."""
     from lw_torchrl.language.tasks import TASKS
-    from lw_torchrl.training.files import demonstrated_tasks
 
-    shown = demonstrated_tasks(checkpoint) if trained else set()
     chosen = [task for task in policy.tasks if task in shown] or list(policy.tasks)
     own = [task for task in chosen if task not in TASKS]
     if len(own) == len(chosen):

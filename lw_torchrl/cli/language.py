@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
 from lw_torchrl._checks import counted
 from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Columns, Output, Row
-
-if TYPE_CHECKING:
-    from lw_torchrl.language.plans import ConditionalPlan
 
 
 def tasks(
@@ -127,7 +124,10 @@ def plans(
         columns: Columns = {"task": "task", "skill": "skill", **objects, "told by": "told_by"}
         output.table("steps", told, columns, counted(len(told), "step"))
         return output
-    rows = [_written(loaded[name]) for name in chosen]
+    rows: list[dict[str, Any]] = []
+    for name in chosen:
+        steps = [{"condition": str(step.condition), "skill": step.skill} for step in loaded[name].steps]
+        rows.append({"task": name, "steps": steps, "text": str(loaded[name])})
     if names:
         output.show("plans", rows, "\n".join(row["text"] for row in rows))
         return output
@@ -138,11 +138,6 @@ def plans(
     }
     output.table("plans", rows, columns, counted(len(rows), "plan"))
     return output
-
-
-def _written(plan: ConditionalPlan) -> dict[str, Any]:
-    steps = [{"condition": str(step.condition), "skill": step.skill} for step in plan.steps]
-    return {"task": plan.task, "steps": steps, "text": str(plan)}
 
 
 def queries(

@@ -11,7 +11,6 @@ import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext, redirect_stdout
-from functools import partial
 from types import FrameType
 from typing import Any, NoReturn
 
@@ -24,7 +23,7 @@ from lw_torchrl.cli import plan as cli_plan
 from lw_torchrl.cli.check import check
 from lw_torchrl.cli.offline import offline
 from lw_torchrl.cli.online import online
-from lw_torchrl.cli.output import Output, check_arguments, complain, nobody_reads, sound_streams
+from lw_torchrl.cli.output import Output, complain, nobody_reads, sound_streams
 from lw_torchrl.cli.parsing import document, in_its_words, parse, unpadded
 from lw_torchrl.cli.train import train
 from lw_torchrl.cli.train_evaluator import train_evaluator
@@ -86,7 +85,9 @@ def main(args: Sequence[str] | None = None) -> None:
 
 
 def _run(given: Sequence[str]) -> None:
-    check_arguments(given)
+    for arg in given:  # its name could be written to no file of ours
+        if any("\ud800" <= character <= "\udfff" for character in arg):
+            raise ValueError(f"the argument {arg!a} is no text in the encoding {sys.getfilesystemencoding()}")
     if list(given) == ["--version"]:
         print(f"lw-torchrl {__version__}")
         return
@@ -101,20 +102,17 @@ def _run(given: Sequence[str]) -> None:
                 tyro.extras.subcommand_cli_from_dict(table, prog=prog, description=about, args=args)
         else:
             name = _command(prog, args, table)
-            _call(parse(f"{prog} {name}", table[name], args[1:]))
+            command = parse(f"{prog} {name}", table[name], args[1:])
+            # With --json a command's document is all that goes to the standard output.
+            with redirect_stdout(sys.stderr) if command.keywords.get("json") else nullcontext():
+                output = command()
+            if isinstance(output, Output):
+                if output.as_json:
+                    print(output.document())
+                if output.fault:
+                    raise ValueError(output.fault)
     finally:
         sys.stdout.flush()
-
-
-def _call(command: partial[Any]) -> None:
-    """Run a command; with ``--json`` its document is all that goes to the standard output."""
-    with redirect_stdout(sys.stderr) if command.keywords.get("json") else nullcontext():
-        output = command()
-    if isinstance(output, Output):
-        if output.as_json:
-            print(output.document())
-        if output.fault:
-            raise ValueError(output.fault)
 
 
 def _group(given: Sequence[str]) -> tuple[str, list[str], dict[str, Any]]:

@@ -5,17 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from tyro.conf import Positional
 
 from lw_torchrl.cli.options import Json, PlanSources, read_plans, read_tasks
 from lw_torchrl.cli.output import Output
 from lw_torchrl.cli.runs import Job, Scheduled
-
-if TYPE_CHECKING:
-    from lw_torchrl.language.plans import Plans
-    from lw_torchrl.paper.offline import Advantages
 
 Table = Literal["methods", "conditioning", "mt10", "quick", "all"]
 Mixture = Literal["B", "W", "C"]
@@ -67,21 +63,21 @@ def offline(
     recipe = replace(OfflineRecipe(), **{name: value for name, value in changed.items() if value is not None})  # type: ignore[arg-type]
     tables: dict[str, list[OfflineRun]] = {}
     for name in [name for name in OFFLINE_TABLES if name != "quick"] if table == "all" else [table]:
-        every = offline_runs(OFFLINE_TABLES[name], seeds, recipe, episodes)
-        every = [one for one in every if not mixtures or one.mixture in mixtures]
-        if wanted := [one for one in every if not methods or one.method in methods]:
-            tables[name] = wanted
+        for one in offline_runs(OFFLINE_TABLES[name], seeds, recipe, episodes):
+            if (not mixtures or one.mixture in mixtures) and (not methods or one.method in methods):
+                tables.setdefault(name, []).append(one)
     if not tables:
         raise ValueError(f"--mixtures and --methods leave nothing of {table}")
     runs = [one for wanted in tables.values() for one in wanted]
-    if not schedule.list:
-        for one in runs:
-            known.require(one.scope)
+    for one in () if schedule.list else runs:
+        known.require(one.scope)
     datasets: dict[str, Job] = {
         str(dataset.folder): partial(dataset.collect, out, progress=True) for one in runs for dataset in one.datasets
     }
     advantages: dict[str, Job] = {
-        str(own.folder): partial(_learn, own, known, out) for one in runs if (own := one.advantages) is not None
+        str(own.folder): partial(own.make, known, out, progress=True)
+        for one in runs
+        if (own := one.advantages) is not None
     }
     jobs: dict[str, Job] = {str(one.folder): partial(execute_run, one, known, out) for one in runs}
 
@@ -101,7 +97,3 @@ def offline(
     for option, values in (("--mixtures", mixtures), ("--methods", methods)):
         command += [option, *values] if values else []
     return schedule.execute(Output(json), [datasets, advantages], [jobs], command, summarize)
-
-
-def _learn(one: Advantages, plans: Plans, out: Path) -> None:
-    one.make(plans, out, progress=True)

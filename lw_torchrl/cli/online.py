@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from tyro.conf import Positional
 
@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 
 OnlineMethod = Literal["advantage", "td3", "sac", "residual", "ppo", "expert-iteration", "start"]
 WEAKEST = "weakest"
+_TRAINING: tuple[str, ...] = tuple(method for method in get_args(OnlineMethod) if method != "start")
+_READ_BY = {"frames": _TRAINING, "logger": _TRAINING, "step": ("residual",)}
+"""The methods that read an option; every one reads the others."""
 
 
 def online(
@@ -30,14 +33,14 @@ def online(
     schedule: Scheduled,  # which runs are done, and where
     methods: tuple[OnlineMethod, ...] = ("td3", "expert-iteration"),
     seeds: tuple[int, ...] = (0, 1, 2),  # of demonstrations, weights, episodes and minibatches
-    frames: int = 60_000,  # steps of the environment, the same for every method
+    frames: int | None = None,
     demonstrations: int = 1,  # of each task, without noise
     start: Path | None = None,  # a policy to begin with, of train; by default one is cloned from the demonstrations
     condition: Literal["pcbc", "dc", "one-hot"] = "pcbc",  # that one is conditioned on plans, descriptions or numbers
     plans: PlanSources = ("MT50",),
     episodes: int = 40,  # evaluated, on seeds that no training used, action noise 0.1
     step: str | None = None,
-    logger: Literal["none", "csv", "tensorboard", "wandb"] = "none",  # success and losses, to logs/ beside each policy
+    logger: Literal["none", "csv", "tensorboard", "wandb"] = "none",
     out: Path = Path("runs/online"),  # where everything goes; on a cluster, a folder that all its machines share
     json: Json = False,
 ) -> Output:
@@ -51,19 +54,25 @@ def online(
 
     Args:
         methods: td3, sac and residual (a small network that corrects the start), half of each minibatch demonstrations;
-            ppo; expert-iteration, behavioral cloning of demonstrations and of own successes. The first is compared with
-            the others, and with the start.
+            ppo; expert-iteration, behavioral cloning of demonstrations and of own successes; advantage, which learns
+            online as offline; start, nothing. The first is compared with the others, and with the start.
+        frames: steps of the environment, the same for every method, of which start reads none; 60000 by default.
         step: of residual, correct the actions in this step of the task's plan alone, by 1 at most, and leave all others
-            as they are: its number, from 1, or weakest, the one that failed episodes reached and did not pass.
+            as they are: its number, from 1, or weakest, the one that failed episodes reached and did not pass. No other
+            method reads it.
+        logger: of success and losses, to logs/ beside each policy, of every method but start.
     """
     schedule.check(out)
+    logged = None if logger == "none" else logger
+    for option, given in {"step": step, "frames": frames, "logger": logged}.items():
+        if given is not None and not {*_READ_BY[option]} & {*methods}:
+            of = f"the method{'s' * (len(_READ_BY[option]) > 1)} {', '.join(_READ_BY[option])}"
+            raise ValueError(f"--{option} is of {of}, --methods are {', '.join(methods)}")
     from lw_torchrl.language.tasks import TASKS
 
     if start is not None:
         check_saved("start", start)
     tuned = None if step is None else _read_step(step)
-    if tuned is not None and "residual" not in methods:
-        raise ValueError(f"--step is of the method residual, --methods are {', '.join(methods)}")
     chosen = simulated("tasks", one_or_many(tasks), TASKS)
     found = read_plans(plans, TASKS)
     found.require(chosen)
@@ -75,12 +84,10 @@ def online(
     from lw_torchrl.paper.runs import execute_run
 
     recipe = OnlineRecipe(demonstrations=demonstrations)
-    recipe = replace(recipe, config=replace(recipe.config, frames=frames))
-    whole = replace(recipe, config=replace(recipe.config, residual_scale=1.0))  # of a step: to any action at all
+    if frames is not None:
+        recipe = replace(recipe, config=replace(recipe.config, frames=frames))
     runs = [
-        OnlineRun(task, method, seed, recipe, condition, start, episodes)
-        if tuned is None or method != "residual"
-        else OnlineRun(task, method, seed, whole, condition, start, episodes, step=tuned)
+        OnlineRun(task, method, seed, recipe, condition, start, episodes, tuned if method in _READ_BY["step"] else None)
         for stage in ((START,), tuple(method for method in dict.fromkeys(methods) if method != START))
         for seed in seeds
         for task in chosen
@@ -92,10 +99,10 @@ def online(
     for one in runs:
         stage = starts if one.method == START else others
         stage[str(one.folder)] = partial(execute_run, one, found, out, make_logger=make)
-    command: list[object] = ["online", *tasks, "--frames", frames, "--demonstrations", demonstrations, "--out", out]
+    command: list[object] = ["online", *tasks, "--demonstrations", demonstrations, "--out", out]
     command += ["--seeds", *seeds, "--methods", *methods, "--plans", *plans]
     command += ["--condition", condition, "--episodes", episodes, "--logger", logger]
-    for option, value in (("--start", start), ("--step", step)):
+    for option, value in (("--frames", frames), ("--start", start), ("--step", step)):
         command += [] if value is None else [option, value]
     summarize = partial(_summarize, runs, found, out)
     return schedule.execute(Output(json), [], [starts, others], command, summarize, _told_of_step)

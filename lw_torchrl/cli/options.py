@@ -8,11 +8,11 @@ from __future__ import annotations
 import os
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from tyro.conf import arg
 
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from lw_torchrl.language.text import TextEncoder
     from lw_torchrl.modules.policy import Policy
 
+Loaded = TypeVar("Loaded")
 SETS = ("MT10", "MT50")
 ACTORS = ("expert", "scripted", "spoilt-60", "spoilt-30", "wrong", "random")
 """The names of :data:`lw_torchrl.data.BEHAVIOURS`."""
@@ -55,29 +56,22 @@ def read_tasks(task_file: Path | None) -> Mapping[str, Task]:
     """The 50 tasks, with those of --task-file, which replace them or join them."""
     from lw_torchrl.language.tasks import TASKS, load_tasks
 
-    if task_file is None:
-        return TASKS
-    with _of_option("--task-file", task_file):
-        return load_tasks(task_file)
+    return TASKS if task_file is None else _load("--task-file", task_file, load_tasks)
 
 
 def read_skills(skill_file: Path | None, tasks: Mapping[str, Task]) -> Mapping[str, ScriptedSkill]:
     """The scripted skills, with those of --skill-file."""
     from lw_torchrl.language.skills import load_skills
 
-    if skill_file is None:
-        return load_skills()
-    with _of_option("--skill-file", skill_file):
-        return load_skills(skill_file, tasks=tasks)
+    return load_skills() if skill_file is None else _load("--skill-file", skill_file, partial(load_skills, tasks=tasks))
 
 
-@contextmanager
-def _of_option(option: str, file: Path) -> Iterator[None]:
-    """Errors within the block name the option that the file is of."""
+def _load(option: str, file: Path, load: Callable[[Path], Loaded]) -> Loaded:
+    """What ``load`` reads from a file; errors name the option that it is of."""
     if not file.is_file():
         raise FileNotFoundError(f"{option}: there is no file {str(file)!r}")
     try:
-        yield
+        return load(file)
     except ValueError as error:
         raise ValueError(f"{option} {error}") from error
 
@@ -159,11 +153,14 @@ def check_dataset(argument: str, folder: Path) -> None:
         raise FileNotFoundError(f"{argument}: no dataset folder {str(folder)!r}; make one with `lw-torchrl collect`")
 
 
-def check_plan_files(option: str, sources: Sequence[str]) -> None:
-    """Raise :class:`FileNotFoundError` for a source of plans that is neither a set nor there."""
+def check_reference(sources: Sequence[str], attribute: bool) -> None:
+    """Refuse sources of --reference without --attribute, and one that is neither a set of plans nor there."""
+    if sources and not attribute:
+        raise ValueError("--reference is for --attribute, which runs failed episodes again with these plans")
     for source in sources:
         if source not in SETS and not Path(source).exists():
-            raise FileNotFoundError(f"{option}: no plan file or folder {source!r}; 'MT10' and 'MT50' name the shipped")
+            shipped = "'MT10' and 'MT50' name the shipped"
+            raise FileNotFoundError(f"--reference: no plan file or folder {source!r}; {shipped}")
 
 
 def check_saved(argument: str, path: Path, what: str = "policy", writer: str = "train") -> None:
@@ -201,19 +198,10 @@ def read_encoder(name: str | None) -> TextEncoder | None:
 
 def make_logger(kind: Literal["csv", "tensorboard", "wandb"], out: Path) -> Any:
     """The TorchRL logger of --logger, in a folder beside ``out``."""
-    from torchrl.record import loggers
+    from torchrl.record.loggers import get_logger
 
-    folder = out.parent / "logs"
     try:
-        if kind == "csv":
-            return loggers.CSVLogger(exp_name=out.stem, log_dir=str(folder))
-        if kind == "tensorboard":
-            from torchrl.record.loggers.tensorboard import TensorboardLogger
-
-            return TensorboardLogger(exp_name=out.stem, log_dir=str(folder))
-        from torchrl.record.loggers.wandb import WandbLogger
-
-        return WandbLogger(exp_name=out.stem, save_dir=str(folder))
+        return get_logger(kind, str(out.parent / "logs"), out.stem)
     except ImportError as error:
         raise ImportError(f"--logger {kind} needs the package {kind}: pip install {kind}") from error
 

@@ -10,7 +10,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any
 
 from lw_torchrl._checks import counted
 
@@ -28,7 +28,8 @@ class Output:
 
     Example:
         >>> output = Output(as_json=False)
-        >>> output.table("tasks", [{"task": "push", "episodes": 3}, {"task": "reach", "episodes": None}])
+        >>> columns = {"task": "task", "episodes": "run"}
+        >>> output.table("tasks", [{"task": "push", "run": 3}, {"task": "reach", "run": None}], columns)
         task   episodes
         push   3
         reach
@@ -49,23 +50,19 @@ class Output:
         elif text is not None:
             print(text)
 
-    def table(self, key: str, rows: Sequence[Row], columns: Columns | None = None, title: str = "") -> None:
-        """Print rows as a table of some columns, by default all by their names, or keep them under the key."""
+    def table(self, key: str, rows: Sequence[Row], columns: Columns, title: str = "") -> None:
+        """Print rows as a table of these columns, or keep them under the key."""
         if self.as_json:
             self._found[key] = [dict(row) for row in rows]
             return
-        shown = columns if columns is not None else {name: name for row in rows for name in row}
-        cells = [[_cell(row[of] if isinstance(of, str) else of(row)) for of in shown.values()] for row in rows]
-        (_on_terminal if sys.stdout.isatty() else _in_pipe)(title, [*shown], cells)
+        cells = [[_cell(row[of] if isinstance(of, str) else of(row)) for of in columns.values()] for row in rows]
+        (_on_terminal if sys.stdout.isatty() else _in_pipe)(title, [*columns], cells)
 
     def result(self, found: EvaluationResult, **more: Mapping[str, Any]) -> None:
         """Print an evaluation's table, or keep its numbers under "tasks", with more of each, and its configuration."""
         rates = ("success_once", "success_at_end", "first_success", "mean_return")
-        rows = [
-            {"task": task, **{name: getattr(found, name)[task] for name in rates}}
-            | {name: of[task] for name, of in more.items()}
-            for task in found.config["tasks"]
-        ]
+        columns = {name: getattr(found, name) for name in rates} | more
+        rows = [{"task": task, **{name: of[task] for name, of in columns.items()}} for task in found.config["tasks"]]
         self.show("tasks", rows, found.table())
         self.show("mean_success", found.mean_success)
         self.show("config", found.config)
@@ -126,13 +123,6 @@ def _on_terminal(title: str, headings: Sequence[str], rows: Sequence[Sequence[st
     Printer(highlight=False, markup=False).print(table)
 
 
-def check_arguments(args: Sequence[str]) -> None:
-    """Refuse an argument that is no text in the locale's encoding: its name could be written to no file of ours."""
-    for arg in args:
-        if any("\ud800" <= character <= "\udfff" for character in arg):
-            raise ValueError(f"the argument {arg!a} is no text in the encoding {sys.getfilesystemencoding()}")
-
-
 def complain(message: str) -> None:
     """Print to the standard error, if it can be written to."""
     with suppress(OSError):
@@ -158,15 +148,6 @@ def _replace_absent() -> None:
             stream.reconfigure(errors="replace")  # type: ignore[union-attr]
 
 
-def _let_go(stream: TextIO) -> None:
-    """Drop what cannot be printed, so that the interpreter does not fail at its end."""
-    try:
-        stream.flush()
-    except OSError:
-        with open(os.devnull, "w", encoding="utf-8") as nowhere:
-            os.dup2(nowhere.fileno(), stream.fileno())
-
-
 @contextmanager
 def sound_streams() -> Iterator[None]:
     """Within the block there are streams to print to; where nobody reads, the program ends quietly, with 141."""
@@ -179,4 +160,8 @@ def sound_streams() -> Iterator[None]:
         sys.exit(BROKEN_PIPE)
     finally:
         for stream in (sys.stdout, sys.stderr):
-            _let_go(stream)
+            try:
+                stream.flush()
+            except OSError:  # what cannot be printed is dropped, else the interpreter fails at its end
+                with open(os.devnull, "w", encoding="utf-8") as nowhere:
+                    os.dup2(nowhere.fileno(), stream.fileno())

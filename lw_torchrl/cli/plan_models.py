@@ -50,12 +50,10 @@ class Asking:
 
         known = options.read_tasks(self.task_file)
         chosen = dict(named_tasks(options.one_or_many(names), known=known))
-        asked = {name: value for name, value in vars(self).items() if name not in _NOT_THE_MODELS}
+        ours = ("attempts", "out", "plans", "skill_file", "task_file")
+        asked = {name: value for name, value in vars(self).items() if name not in ours}
         skills = options.read_skills(self.skill_file, known) if self.skill_file else None
         return lw.OpenAIPlanner(skills=skills, plans=options.read_plans(self.plans, known), **asked), chosen, known
-
-
-_NOT_THE_MODELS = ("attempts", "out", "plans", "skill_file", "task_file")
 
 
 def generate(

@@ -15,8 +15,7 @@ from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Output
 
 if TYPE_CHECKING:
-    from lw_torchrl.envs.episodes import FinishedEpisode
-    from lw_torchrl.evaluation.failures import Failure
+    from lw_torchrl.evaluation.failure_records import Failure
     from lw_torchrl.language.plans import Plans
     from lw_torchrl.language.tasks import Task
 
@@ -48,12 +47,10 @@ def record(
         plans: whose steps and conditions are shown and, by policies that read plans, carried out: MT10, MT50, .plan or
             .json files, or folders. If none is given, a policy's own, or else the shipped ones.
     """
-    if reference and not attribute:
-        raise ValueError("--reference is for --attribute, which runs failed episodes again with these plans")
+    options.check_reference(reference, attribute)
     for option, who in (("policy", policy), ("compare", compare or policy)):
         options.check_actor(option, who)
     options.check_encoder(text_encoder)
-    options.check_plan_files("--reference", reference)
     known = dict(options.read_tasks(task_file))
     tasks = options.simulated("names", options.one_or_many(names), known)
     given = options.read_plans(plans, known) if plans else None
@@ -81,8 +78,11 @@ def record(
             pages = []
             for one in found:
                 failure = why.get((one.task, one.episode))
-                print(_line(one, who, failure))
-                row = {"task": one.task, "episode": one.episode, "policy": who, "first_success": one.first_success}
+                first = one.first_success
+                ended = "failed" if first is None else f"success at step {first}"
+                ended += "" if failure is None else f", {failure.cause}: {failure.why}"
+                print(f"{one.task}, episode {one.episode}, {who}: {ended}")
+                row = {"task": one.task, "episode": one.episode, "policy": who, "first_success": first}
                 rows.append(row | {"failure": None if failure is None else asdict(failure)})
                 name = None if compare is None else f"{one.task}-{one.episode}-{len(recorded) + 1}"
                 told: dict[str, Any] = {"seed": seed, "policy": who, "failure": failure, "name": name}
@@ -122,14 +122,6 @@ def _cast(
     if who == "scripted":
         return lw.ScriptedSkillActor(shown), shown, who
     return SegmentActor(behaviour_of(who, tasks), shown, seed, max_steps), shown, who
-
-
-def _line(episode: FinishedEpisode, who: str, failure: Failure | None) -> str:
-    """How an episode went, in a line."""
-    first = episode.first_success
-    ended = "failed" if first is None else f"success at step {first}"
-    why = "" if failure is None else f", {failure.cause}: {failure.why}"
-    return f"{episode.task}, episode {episode.episode}, {who}: {ended}{why}"
 
 
 def view(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
@@ -15,8 +15,8 @@ from lw_torchrl.cli.output import Output
 from lw_torchrl.cli.runs import Job, Scheduled
 
 if TYPE_CHECKING:
-    from lw_torchrl.evaluation import EvaluationResult
     from lw_torchrl.language.plans import Plans
+    from lw_torchrl.language.tasks import Task
     from lw_torchrl.paper.imitation import ImitationRun
 
 Experiment = Literal["zero-shot", "few-shot", "one-shot", "scripted", "all"]
@@ -86,9 +86,10 @@ def reproduce(
         raise ValueError(f"--device {device} is for the launcher local: the tasks of ray have a CPU core each")
     if passes is not None and preset != "paper":
         raise ValueError("--passes is for --preset paper; ours counts minibatches")
-    load = _Plans(plans, task_file)
+    tasks = options.read_tasks(task_file)
+    load = cache(lambda skills: _all_plans(plans or ("MT50",), tasks, skills))
     if plans:
-        load.of("own")
+        load("own")
     from lw_torchrl._devices import check_device
     from lw_torchrl.modules import METHODS
     from lw_torchrl.paper.imitation import SCRIPTED, ImitationRun
@@ -122,7 +123,7 @@ def reproduce(
     datasets: dict[str, Job] = {
         str(dataset.folder): partial(dataset.collect, out, progress=True) for one in runs for dataset in one.datasets
     }
-    jobs: dict[str, Job] = {str(one.folder): partial(execute_run, one, load(one), out, **where) for one in runs}
+    jobs: dict[str, Job] = {str(one.folder): partial(execute_run, one, load(one.skills), out, **where) for one in runs}
     command: list[object] = ["reproduce", experiment, "--preset", preset, "--episodes", episodes, "--out", out]
     command += ["--seeds", *seeds, "--methods", *methods, "--device", device]
     for option, given in (("--passes", passes), ("--text-encoder", text_encoder), ("--task-file", task_file)):
@@ -139,42 +140,19 @@ def _plans_name(source: str) -> str:
     return f"{path.parent.name}-{path.name}" if path.name in PLAN_FORMATS and path.parent.name else path.stem
 
 
-class _Plans:
-    """The plans of a run, each set read once; :class:`ValueError` if a task of the 50 has none."""
+def _all_plans(sources: Sequence[str], tasks: Mapping[str, Task], skills: Literal["own", "MT10"]) -> Plans:
+    """The plans of these sources, shipped ones with these skills; each of the 50 tasks must have one."""
+    from lw_torchrl.language.tasks import MT50
 
-    def __init__(self, sources: Sequence[str], task_file: Path | None) -> None:
-        self.sources, self.tasks = sources, options.read_tasks(task_file)
-        self.known: dict[str, Plans] = {}
-
-    def __call__(self, run: ImitationRun) -> Plans:
-        return self.of(run.skills)
-
-    def of(self, skills: Literal["own", "MT10"]) -> Plans:
-        """Those with these skills, where they are shipped ones."""
-        from lw_torchrl.language.tasks import MT50
-
-        if skills not in self.known:
-            found = options.read_plans(self.sources or ["MT50"], self.tasks, skills)
-            if missing := [task for task in MT50 if task not in found]:
-                lack = f"{len(missing)}: {', '.join(missing[:5])}{', ...' if len(missing) > 5 else ''}"
-                mend = f"--plans MT50 {' '.join(self.sources)} takes ours for these"
-                raise ValueError(f"--plans must have a plan for each of the 50 tasks, they lack {lack}; {mend}")
-            self.known[skills] = found
-        return self.known[skills]
+    found = options.read_plans(sources, tasks, skills)
+    if missing := [task for task in MT50 if task not in found]:
+        lack = f"{len(missing)}: {', '.join(missing[:5])}{', ...' if len(missing) > 5 else ''}"
+        mend = f"--plans MT50 {' '.join(sources)} takes ours for these"
+        raise ValueError(f"--plans must have a plan for each of the 50 tasks, they lack {lack}; {mend}")
+    return found
 
 
-def _best(method: str, results: Mapping[int, EvaluationResult]) -> dict[str, dict[str, list[float]]]:
-    """Task to the best rate of several evaluations, of each seed, where the method's preset has several."""
-    found = [result.config["best"] for result in results.values() if "best" in result.config]
-    if not found:
-        return {}
-    rates = {task: [one["rates"][task] for one in found] for task in found[0]["rates"]}
-    return {f"{method}, best of the last {min(one['of'] for one in found)} evaluations": rates}
-
-
-def _summarize(
-    runs: Sequence[ImitationRun], load: Callable[[ImitationRun], Plans], out: Path
-) -> dict[str, dict[str, Any]]:
+def _summarize(runs: Sequence[ImitationRun], load: Callable[[str], Plans], out: Path) -> dict[str, dict[str, Any]]:
     """A summary, tables and a figure for each setting, from the results on disk; returns what each summary.json has."""
     from lw_torchrl.evaluation import plot_sorted_tasks, published_curves
     from lw_torchrl.paper.runs import compare, load_result, write_summary
@@ -185,10 +163,14 @@ def _summarize(
         groups.setdefault(one.folder.parent if alone else one.group, []).append(one)
     told = {}
     for group, chosen in groups.items():
-        results = [(one, result) for one in chosen if (result := load_result(one, load(one), out)) is not None]
+        results = [(one, result) for one in chosen if (result := load_result(one, load(one.skills), out)) is not None]
+        # Task to the best rate of several evaluations, of each seed, where the method's preset has several.
         best: dict[str, dict[str, list[float]]] = {}
         for method in dict.fromkeys(one.method for one in chosen):
-            best |= _best(method, {one.seed: result for one, result in results if one.method == method})
+            configs = [result.config for one, result in results if one.method == method]
+            if rated := [config["best"] for config in configs if "best" in config]:
+                label = f"{method}, best of the last {min(one['of'] for one in rated)} evaluations"
+                best[label] = {task: [one["rates"][task] for one in rated] for task in rated[0]["rates"]}
         means = {label: {task: sum(of) / len(of) for task, of in rates.items()} for label, rates in best.items()}
         setting = chosen[-1].setting.name
         comparison = compare(results, means | ({} if alone else published_curves(setting, ("PCBC", "DC"))))

@@ -22,8 +22,8 @@ from lw_torchrl.cli.output import Output
 if TYPE_CHECKING:
     from lw_torchrl.evaluation import EvaluationResult
 
-Job = Callable[[], "EvaluationResult | None"]
-"""Does a run, or makes what several runs share, which has no result."""
+Job = Callable[[], Any]
+"""Does a run, whose :class:`EvaluationResult` it returns, or makes what several runs share."""
 Launcher = Literal["local", "ray"]
 
 
@@ -67,7 +67,7 @@ class Schedule:
 
         def line(name: str) -> tuple[EvaluationResult | None, str]:
             result = every[name]()
-            if result is None:
+            if name not in names:
                 return None, name
             said = f"{name}: mean success {result.mean_success:.3f}, {result.config['seconds']:.0f} s"
             return result, "\n".join(filter(None, (said, told(result))))
@@ -83,16 +83,12 @@ class Schedule:
         if self.launcher == "local" and self.jobs == 1:
             _report(len(names), (line(name)[1] for name in names))
         else:
-            given = [str(one) for one in command]
-            for stage in (*shared, *runs):
-                _report(len(stage), self._elsewhere([*stage], given))
+            for stage in map(list, (*shared, *runs)):
+                commands = [[*map(str, command), "--run", name] for name in stage]
+                ended = run_commands(commands, self.launcher, self.jobs)
+                _report(len(stage), (printed.strip() or stage[index] for index, printed in ended))
         output.show("summaries", summarize())
         return output
-
-    def _elsewhere(self, names: Sequence[str], command: Sequence[str]) -> Iterator[str]:
-        """Do runs by ``lw-torchrl COMMAND --run NAME``, several at a time; yields what each printed, as it ends."""
-        for index, printed in run_commands([[*command, "--run", name] for name in names], self.launcher, self.jobs):
-            yield printed.strip() or names[index]
 
 
 Scheduled = Annotated[Schedule, OmitArgPrefixes]
@@ -118,11 +114,10 @@ def run_command(arguments: Sequence[str]) -> str:
 
 
 def run_commands(commands: Sequence[Sequence[str]], launcher: Launcher, jobs: int) -> Iterator[tuple[int, str]]:
-    """Run commands, several at a time; yield the index and the output of each as it ends.
+    """Run commands, several at a time; yield the index and the output of each as it ends, then raise the first error.
 
-    A command that fails does not stop the others that run; once they have ended, the first error is raised. Launcher
-    "local" has ``jobs`` processes; "ray" a task of one core each, on the cluster that RAY_ADDRESS names, whose machines
-    must see the same files, or on this machine.
+    Launcher "local" has ``jobs`` processes; "ray" a task of one core each, on the cluster that RAY_ADDRESS names, whose
+    machines must see the same files, or on this machine.
     """
     failed: Exception | None = None
     for index, outcome in _ray(commands) if launcher == "ray" else _local(commands, jobs):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -15,7 +16,6 @@ from lw_torchrl.cli.output import Output
 if TYPE_CHECKING:
     from lw_torchrl.language.plans import Plans
     from lw_torchrl.language.text import TextEncoder
-    from lw_torchrl.modules.policy import Policy
     from lw_torchrl.modules.query_evaluator import QueryEvaluator
 
 
@@ -83,7 +83,9 @@ def train(
     if begin is not None:
         options.check_saved("--begin", begin)
         given = {"method": method, "mix": mix, "features": features, "width": width, "depth": depth, "plans": plans}
-        _refuse_beside_begin(given)
+        for name, one in given.items():
+            if one != signature(train).parameters[name].default:
+                raise ValueError(f"--{name} is that of the policy that --begin names; leave it out")
     if evaluator not in (None, "new"):
         options.check_saved("evaluator", Path(evaluator), "network", "train-evaluator")
     loaded = options.read_plans(plans, known)
@@ -92,6 +94,7 @@ def train(
     import lw_torchrl as lw
     from lw_torchrl import modules
     from lw_torchrl._devices import check_device
+    from lw_torchrl.data.dataset import read_metadata
     from lw_torchrl.modules.policy import make_policy, policy_class
 
     options.use_one_thread()
@@ -107,14 +110,22 @@ def train(
     numbers: dict[str, Any] = {"steps": steps, "batch_size": batch_size, "learning_rate": learning_rate, "seed": seed}
     numbers |= {"latent_consistency": latent_consistency, "qaf_anchor": qaf_anchor}
     config = lw.BehavioralCloningConfig(normalize=begin is None, **numbers)
-    rows: dict[str, Any] = {"episodes": _all_of(data, chosen) if chosen else None, "after_success": after_success}
+    rows: dict[str, Any] = {"episodes": None, "after_success": after_success}
+    if chosen:
+        held = read_metadata(data).config
+        rows["episodes"] = {check_choice("tasks", task, held.tasks): held.episodes_per_task for task in chosen}
     replay = lw.LanguageWorldExperienceReplay(data, sampler=lw.TaskBalancedSampler(), device=there, **rows)
     torch.manual_seed(seed)
     if begin is not None:
-        actor = _begun(begin, encoder)
+        try:
+            actor = lw.load_actor(begin, text_encoder=encoder)
+        except (OSError, ValueError) as error:  # elsewhere a checkpoint is --out
+            raise ValueError(str(error).replace("checkpoint:", "--begin:", 1)) from error
         loaded = actor.plans if actor.plans is not None else loaded
         if evaluator is not None:
-            actor = _with_evaluator(actor, evaluator, encoder, answers or "hard")
+            if not isinstance(actor, lw.PlanConditionedActor):
+                raise ValueError(f"--evaluator is for one policy with plans, --begin names a {type(actor).__name__}")
+            actor = actor.with_evaluator(_evaluator(evaluator, actor.plans, encoder), answers=answers or "hard")
     else:
         shown = loaded if reads_plans else {task: loaded[task] for task in replay.tasks}
         if evaluator is not None:
@@ -151,46 +162,9 @@ def train(
     return output
 
 
-def _all_of(data: Path, tasks: tuple[str, ...]) -> dict[str, list[int]]:
-    """Every episode of these tasks in a dataset."""
-    from lw_torchrl.data.dataset import read_metadata
-
-    found = read_metadata(data)
-    for task in tasks:
-        check_choice("tasks", task, found.config.tasks)
-    return {task: [one.episode for one in found.episodes if one.task == task] for task in tasks}
-
-
-def _begun(path: Path, encoder: TextEncoder | None) -> Policy:
-    """The policy that ``--begin`` names; a checkpoint is elsewhere ``--out``."""
-    import lw_torchrl as lw
-
-    try:
-        return lw.load_actor(path, text_encoder=encoder)
-    except (OSError, ValueError) as error:
-        raise ValueError(str(error).replace("checkpoint:", "--begin:", 1)) from error
-
-
-def _refuse_beside_begin(given: dict[str, Any]) -> None:
-    defaults = {"method": "pcbc", "mix": None, "features": "differences", "width": 256, "depth": 3, "plans": ("MT10",)}
-    for name, value in given.items():
-        if value != defaults[name]:
-            raise ValueError(f"--{name} is that of the policy that --begin names; leave it out")
-
-
 def _evaluator(named: str, plans: Plans, encoder: TextEncoder | None) -> QueryEvaluator:
     import lw_torchrl as lw
 
     if named == "new":
         return lw.StateQueryEvaluator(plans)
     return lw.training.load_evaluator(named, plans, text_encoder=encoder)
-
-
-def _with_evaluator(
-    actor: Policy, named: str, encoder: TextEncoder | None, answers: Literal["logit", "tanh", "hard"]
-) -> Policy:
-    import lw_torchrl as lw
-
-    if not isinstance(actor, lw.PlanConditionedActor):
-        raise ValueError(f"--evaluator is for one policy with plans, --begin names a {type(actor).__name__}")
-    return actor.with_evaluator(_evaluator(named, actor.plans, encoder), answers=answers)

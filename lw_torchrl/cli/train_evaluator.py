@@ -13,8 +13,6 @@ from lw_torchrl.cli.output import Output
 
 if TYPE_CHECKING:
     from lw_torchrl.modules.clause_evaluator import ClauseEvaluator
-    from lw_torchrl.modules.policy import Policy
-    from lw_torchrl.modules.query_evaluator import QueryEvaluator
 
 WHO = ("expert", "scripted", "spoilt-30", "random")
 
@@ -79,13 +77,12 @@ def train_evaluator(
     import torch
 
     import lw_torchrl as lw
+    from lw_torchrl.data.dataset import read_metadata
     from lw_torchrl.evaluation.evaluator_figures import plot_reliability, plot_wrong_answers
     from lw_torchrl.evaluation.evaluator_report import score_evaluator
 
     options.use_one_thread()
-    numbers: dict[str, Any] = {"steps": 4000, "batch_size": 48, "learning_rate": 2e-3, "every": 5}
-    if not cameras:
-        numbers = {"steps": 6000, "batch_size": 1024, "learning_rate": 3e-3, "every": 1}
+    numbers: dict[str, Any] = {"learning_rate": 2e-3} if cameras else {"steps": 6000}
     said = {"steps": steps, "batch_size": batch_size, "learning_rate": learning_rate, "every": every, "seed": seed}
     numbers |= {name: value for name, value in said.items() if value is not None}
     numbers |= {"held_out_states": held_out_states, "held_out_pairs": held_out_pairs}
@@ -103,9 +100,19 @@ def train_evaluator(
         evaluator = lw.modules.ImageQueryEvaluator(own, **network, **pictures)
     else:
         evaluator = lw.StateQueryEvaluator(plans, **network)
-    run = {"episodes_per_task": episodes, "max_steps": max_steps, "seed": seed, "num_envs": num_envs}
-    roots = list(data) or [_collected(out, who, names, noise, run) for who in behaviours]
-    replay = lw.LanguageWorldExperienceReplay(roots, label="executed", episodes=_of_tasks(roots, names))
+    run: dict[str, Any] = {"episodes_per_task": episodes, "max_steps": max_steps, "seed": seed, "num_envs": num_envs}
+    roots = list(data) or [out / "data" / who for who in behaviours]
+    if not data:
+        for who, root in zip(behaviours, roots, strict=True):
+            noise_scale = noise if who == "expert" else 0.0
+            lw.collect_demonstrations(names, root=root, policy=who, noise_scale=noise_scale, **run)
+    chosen = []  # of each dataset every episode of the tasks
+    for root in roots:
+        held = read_metadata(root).config
+        if not (there := [task for task in names if task in held.tasks]):
+            raise ValueError(f"--data {root} holds none of the tasks; it holds {', '.join(held.tasks)}")
+        chosen.append(dict.fromkeys(there, held.episodes_per_task))
+    replay = lw.LanguageWorldExperienceReplay(roots, label="executed", episodes=chosen)
     if cameras:
         for root in roots:
             lw.data.add_pictures(root, **pictures, every=config.every)
@@ -125,35 +132,3 @@ def train_evaluator(
         plot_wrong_answers(evaluator, labelled, out / "wrong.png")
     print(f"written to {out}")
     return output
-
-
-def _collected(out: Path, who: str, tasks: tuple[str, ...], noise: tuple[float, ...], run: dict[str, Any]) -> Path:
-    from lw_torchrl.data import collect_demonstrations
-
-    root = out / "data" / who
-    collect_demonstrations(tasks, root=root, policy=who, noise_scale=noise if who == "expert" else 0.0, **run)
-    return root
-
-
-def _of_tasks(roots: list[Path], tasks: tuple[str, ...]) -> list[dict[str, list[int]]]:
-    """For each dataset every episode of these tasks."""
-    from lw_torchrl.data.dataset import read_metadata
-
-    chosen = []
-    for root in roots:
-        found = read_metadata(root)
-        there = [task for task in tasks if task in found.config.tasks]
-        if not there:
-            raise ValueError(f"--data {root} holds none of the tasks; it holds {', '.join(found.config.tasks)}")
-        chosen.append({task: [one.episode for one in found.episodes if one.task == task] for task in there})
-    return chosen
-
-
-def with_evaluator(policy: Policy, path: Path, text_encoder: str | None) -> Policy:
-    """A policy whose conditions the evaluator of a file answers."""
-    from lw_torchrl.training.files import load_evaluator
-
-    if policy.plans is None:
-        raise ValueError(f"--evaluator is for a policy with plans, {type(policy).__name__} has none")
-    evaluator: QueryEvaluator = load_evaluator(path, policy.plans, text_encoder=options.read_encoder(text_encoder))
-    return policy.with_evaluator(evaluator)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from hashlib import sha256
 from types import MappingProxyType
 from typing import Any, Literal
@@ -37,8 +37,7 @@ class Behaviour:
     Attributes:
         name: the label of its episodes.
         kind: "expert", Meta-World's script; "segments"; or "policy", a trained one.
-        right, shortest, longest: of "segments", the probability that a piece follows the plan, and the steps of a
-            piece.
+        right, shortest, longest: of "segments", the probability that a piece follows the plan, and a piece's steps.
         otherwise: of "segments", what it does elsewhere: "skill", any one of the plan's, or "action", one in [-1, 1].
         fingerprint: of the plans of "segments", or of a policy's description and weights; None until it is known.
 
@@ -67,8 +66,7 @@ class Behaviour:
                 f"behaviour: longest must be from shortest, {shown(self.shortest)}, to {_MOST_STEPS}, got "
                 f"{shown(self.longest)}"
             )
-        default = {field.name: field.default for field in fields(self)}
-        odd = [name for name in _OF_SEGMENTS if getattr(self, name) != default[name]]
+        odd = [name for name in _OF_SEGMENTS if getattr(self, name) != getattr(Behaviour, name)]
         if self.kind != "segments" and odd:
             raise ValueError(f"behaviour: {', '.join(odd)} is of kind 'segments', got kind {self.kind!r}")
 
@@ -83,15 +81,13 @@ class Behaviour:
     @classmethod
     def from_json(cls, stated: Any) -> Behaviour:
         """The behaviour that :meth:`to_json` gave; :class:`ValueError` or :class:`TypeError` if it is none."""
-        names = [field.name for field in fields(cls)]
-        if not isinstance(stated, Mapping) or set(stated) != set(names):
+        if not isinstance(stated, Mapping) or set(stated) != set(names := cls.__dataclass_fields__):
             raise ValueError(f"policy must be an object of {', '.join(names)}, got {shown(stated)}")
         return cls(**stated)
 
 
 EXPERT = Behaviour("expert", "expert")
-NOISY = "noisy"
-"""The label of the expert's episodes where they are executed with noise."""
+NOISY = "noisy"  # the label of the expert's episodes where they are executed with noise
 _SEGMENTS = (
     Behaviour("scripted"),
     Behaviour("spoilt-60", right=0.6),

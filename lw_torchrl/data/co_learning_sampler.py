@@ -19,8 +19,7 @@ from lw_torchrl.data.samplers import GroupSampler, column, nearest_sizes
 from lw_torchrl.data.storage import JoinedStorage, to_device_of
 from lw_torchrl.language.tasks import MT50, TASKS, task_id
 
-GROWN = "grown"
-"""The target that is what a buffer was extended with."""
+GROWN = "grown"  # the target that is what a buffer was extended with
 
 
 def _check_target(target: Any) -> str | Tensor:
@@ -71,8 +70,7 @@ class CoLearningSampler(GroupSampler):
         target: "grown"; a task's name, for all demonstrations of the task, or in a storage that joins datasets, those
             of the last one that has any; or one bool for each of ``replay.demonstrations.episodes``, in their order.
         target_fraction: the target's share of a minibatch, between 0 and 1, such as 0.5, 1/3 or Fraction(2, 7).
-        task_key, episode_key: the entries of the storage that hold the task, and, for a mask, the episode, in whose
-            order episodes are numbered.
+        task_key, episode_key: the entries of the storage that hold the task, and, for a mask, the episode.
 
     Raises:
         ValueError: a mask that is all true or all false. At sampling: a batch size that cannot be exact, with the
@@ -102,12 +100,10 @@ class CoLearningSampler(GroupSampler):
         task_key: NestedKey = "task_id",
         episode_key: NestedKey = ("collector", "traj_ids"),
     ) -> None:
-        self.target = _check_target(target)
-        self.target_fraction = _check_fraction(target_fraction)
+        self.target, self.target_fraction = _check_target(target), _check_fraction(target_fraction)
         check_key("task_key", task_key)
         check_key("episode_key", episode_key)
-        self.task_key = task_key
-        self.episode_key = episode_key
+        self.task_key, self.episode_key = task_key, episode_key
         super().__init__()
 
     @property
@@ -184,22 +180,21 @@ class CoLearningSampler(GroupSampler):
         mine = batch_size // whole * part
         return torch.tensor([mine] * (not self._grown) + [(batch_size - mine) // base] * base)
 
-    def add(self, index: Any) -> None:
+    def add(self, index: Any, *, storage: Storage | None = None) -> None:
         """Note that rows were written or overwritten; those of a growing buffer are in no group."""
         if not self._grown:
             super().add(index)
 
-    extend = add
+    extend = mark_update = add
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor | tuple[Tensor, ...], dict[str, Any]]:
         self._check_storage(storage)
-        if not isinstance(storage, GrowingStorage):
-            index, info = super().sample(storage, batch_size)
-            info["is_target"] = to_device_of(storage, self._layout(batch_size)[1] == 0)
-            return index, info
-        if not storage.num_grown:
+        if isinstance(storage, GrowingStorage) and not storage.num_grown:
             raise ValueError("target 'grown': nothing has come yet; extend the buffer before the first sample")
         index, info = super().sample(storage, batch_size)
+        if not isinstance(storage, GrowingStorage):
+            info["is_target"] = to_device_of(storage, self._layout(batch_size)[1] == 0)
+            return index, info
         assert isinstance(index, Tensor)  # of one dimension
         mine = batch_size - len(index)
         grown = torch.randint(storage.num_grown, (mine,), generator=self._rng) + storage.num_joined

@@ -32,10 +32,12 @@ def _open_episode_files(
     """The episodes so far, and the versions they were begun with: ``made_with`` for a damaged dataset."""
     folder = root / dataset.PARTIAL
     stated, of_packages = folder / "config.json", folder / "versions.json"
-    begun = stated.is_file()
-    if begun:
-        _check_same(dataset.read_config(stated), config, f"root: {str(root)!r} holds a half-made dataset")
-    recorded = made_with or (dataset.read_versions(of_packages) if begun else {})
+    recorded = made_with or {}
+    if begun := stated.is_file():
+        before = dataset.read_partial(stated, dataset.parse_config)
+        _check_same(before, config, f"root: {str(root)!r} holds a half-made dataset")
+        if not recorded and of_packages.exists():
+            recorded = dataset.read_partial(of_packages, dataset.parse_versions)
     versions = package_versions()
     if recorded and (made_with or any(folder.glob("*.npz"))):
         _check_versions(root, recorded)
@@ -93,7 +95,9 @@ def _read_through(
         memory_map.load_rows(found)
     except DamagedDatasetError as error:
         return None, whole, str(error)
-    return found if len(whole) == len(found.episodes) else None, whole, "rows differ from their checksums"
+    if len(whole) < len(found.episodes):
+        return None, whole, "rows differ from their checksums"
+    return found, whole, ""
 
 
 def _take_apart(root: Path, config: CollectConfig, whole: list[dataset.EpisodeInfo], reason: str) -> None:
@@ -114,14 +118,13 @@ def _assemble(
     infos: list[dataset.EpisodeInfo] = []
 
     def episodes() -> Iterator[TensorDictBase]:
-        start = 0
         for number, (task, episode) in enumerate(listed):
             rows = files.get(task, episode)
             for key in ("task_id", ("next", "task_id")):
                 rows.set(key, torch.full(rows.batch_size, task_id(task)))  # they may have had other numbers then
             rows.set(("collector", "traj_ids"), torch.full(rows.batch_size, number))
+            start = infos[-1].start + infos[-1].length if infos else 0
             infos.append(memory_map.describe_episode(task, episode, start, rows))
-            start += len(rows)
             yield rows
 
     building = files.folder / "rows"
@@ -131,7 +134,9 @@ def _assemble(
         write_rows(building, episodes())
         os.replace(building, root / dataset.DATA)
         flush(root)
-        write_metadata(root, config, versions, infos, {task: max(kept[task]) + 1 for task in config.tasks})
+        attempts = {task: max(kept[task]) + 1 for task in config.tasks}
+        task_ids = {task: task_id(task) for task in config.tasks}
+        write_metadata(Demonstrations(root, config, versions, task_ids, tuple(infos), attempts))
     except OSError as error:
         shutil.rmtree(building, ignore_errors=True)
         raise write_failed(root, len(listed) * config.max_steps * memory_map.ROW_BYTES, error) from error
@@ -141,10 +146,8 @@ def _made(
     root: Path, config: CollectConfig, policy: Policy | None, num_envs: int | None, progress: bool
 ) -> Demonstrations:
     """The dataset, finished or repaired if need be; the folder must be held, and another call may have come first."""
-    found, damaged = None, None
-    if (root / dataset.METADATA).is_file():
-        found, whole, reason = _read_through(root, config, progress)
-        damaged = whole, reason
+    finished = (root / dataset.METADATA).is_file()
+    found, whole, reason = _read_through(root, config, progress) if finished else (None, [], "")
     if found is None:
         for path in (root / dataset.DATA, root / dataset.PARTIAL):
             if path.is_symlink() or (path.exists() and not path.is_dir()):
@@ -152,8 +155,8 @@ def _made(
                     f"root: {str(path)!r} must be a folder for the dataset to be collected or mended, it is a "
                     f"{'link' if path.is_symlink() else 'file'}; put the folder itself there, or choose another root"
                 )
-        if damaged is not None:
-            _take_apart(root, config, *damaged)
+        if finished:
+            _take_apart(root, config, whole, reason)
         files, versions = _open_episode_files(root, config)
         _assemble(root, config, versions, files, run_missing_episodes(config, policy, files, num_envs, progress))
         found = dataset.read_metadata(root)
@@ -181,8 +184,7 @@ def collect_demonstrations(
     """Run Meta-World's scripted experts, or others, and write their episodes to a dataset.
 
     A call that was killed, or ran out of disk, carries on when it is repeated. On a finished dataset of the same
-    configuration it checks all rows, and runs damaged episodes again. The dataset depends neither on ``num_envs`` nor
-    on interruptions or damage.
+    configuration it checks all rows, and runs damaged episodes again. Neither ``num_envs`` nor interruptions matter.
 
     Each row is a step, in TorchRL's TED layout (R rows):
         observation, next/observation: (R, 39) float32, metres.
@@ -203,8 +205,7 @@ def collect_demonstrations(
             random actions; a :class:`Behaviour`; or a trained :class:`Policy`, run as :func:`evaluate` runs it.
         behaviour: the label of its episodes, for :class:`EpisodeFilter`; None for its name. A Policy needs one.
         seed: evaluate on another one.
-        noise_scale: standard deviation of the noise on the executed action; a sequence gives one to each episode in
-            turn.
+        noise_scale: standard deviation of the noise on the executed action; of a sequence, each episode's in turn.
         noise_hold: steps for which each draw of the noise is kept; the longer, the further it leads the expert astray.
         gripper_noise_factor: multiplies the noise on the gripper.
         redraw_failures: keep only successful episodes.
@@ -213,8 +214,7 @@ def collect_demonstrations(
         progress: show a progress bar when it takes longer than a second.
 
     Warns:
-        UserWarning: a finished dataset was damaged; or one that is continued was begun under another version of numpy,
-            torch or this package.
+        UserWarning: a dataset was damaged, or begun under another version of numpy, torch or this package.
 
     Raises:
         DatasetError: (a ValueError) ``root`` holds something else, or episodes of another version of MuJoCo or

@@ -9,20 +9,21 @@ root/.lock            held while collecting
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections import Counter
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from reprlib import repr as short
-from typing import Any
+from typing import Any, TypeVar
 
 from lw_torchrl._checks import check_fields, check_int, check_scale
 from lw_torchrl._files import read_json, write_json
 from lw_torchrl.data.behaviours import EXPERT, NOISY, Behaviour, check_own_label
-from lw_torchrl.language.tasks import MT50, resolve_tasks, task_id
+from lw_torchrl.language.tasks import MT50, resolve_tasks
 
 DATA, METADATA, PARTIAL, LOCK = "data", "metadata.json", ".partial", ".lock"
 _MOST = 2**63 - 1
+Parsed = TypeVar("Parsed")
 
 
 class DatasetError(ValueError):
@@ -87,8 +88,7 @@ class CollectConfig:
 @dataclass(frozen=True)
 class EpisodeInfo:
     """One episode of a dataset: ``episode_seed(task, seed, episode)`` is its seed, ``start`` its first row,
-    ``first_success`` the first successful step, from 1, or None, and ``checksum`` the CRC-32 of its rows, column after
-    column."""
+    ``first_success`` the first successful step, from 1, or None, ``checksum`` the CRC-32 of its rows, by columns."""
 
     task: str
     episode: int
@@ -125,10 +125,9 @@ class Demonstrations:
     @property
     def success_rate(self) -> dict[str, float]:
         """Task name to the fraction of its kept episodes that succeeded."""
-        found: dict[str, list[bool]] = {}
-        for episode in self.episodes:
-            found.setdefault(episode.task, []).append(episode.success)
-        return {task: sum(found[task]) / len(found[task]) for task in self.config.tasks if task in found}
+        kept = Counter(episode.task for episode in self.episodes)
+        succeeded = Counter(episode.task for episode in self.episodes if episode.success)
+        return {task: succeeded[task] / number for task, number in kept.items()}
 
 
 FORMAT = "lw_torchrl.demonstrations"
@@ -136,25 +135,12 @@ FORMAT_VERSION = 2
 _BAD = (ValueError, TypeError, KeyError, OverflowError, RecursionError)
 
 
-def write_metadata(
-    root: Path,
-    config: CollectConfig,
-    versions: dict[str, str],
-    episodes: Sequence[EpisodeInfo],
-    attempts: dict[str, int],
-) -> None:
+def write_metadata(made: Demonstrations) -> None:
     """Write the metadata, which makes the dataset a finished one."""
-    columns = {key: [getattr(episode, key) for episode in episodes] for key in EpisodeInfo.__dataclass_fields__}
-    found = {
-        "format": FORMAT,
-        "version": FORMAT_VERSION,
-        "config": config.to_json(),
-        "versions": versions,
-        "task_ids": {task: task_id(task) for task in config.tasks},
-        "attempts": attempts,
-        "episodes": columns,
-    }
-    write_json(root / METADATA, found)
+    stated: dict[str, Any] = {"format": FORMAT, "version": FORMAT_VERSION, "config": made.config.to_json()}
+    stated |= {key: getattr(made, key) for key in ("versions", "task_ids", "attempts")}
+    columns = {key: [getattr(episode, key) for episode in made.episodes] for key in EpisodeInfo.__dataclass_fields__}
+    write_json(made.root / METADATA, stated | {"episodes": columns})
 
 
 def read_metadata(root: str | os.PathLike[str]) -> Demonstrations:
@@ -185,7 +171,9 @@ def read_metadata(root: str | os.PathLike[str]) -> Demonstrations:
         attempts = _object("attempts", found["attempts"], config.tasks)
         if any(_integer(f"attempts of {task}", attempts[task]) != last[task] + 1 for task in config.tasks):
             raise ValueError("the attempts are not those of the episodes")
-        versions, task_ids = _versions(found["versions"]), _task_ids(found["task_ids"], config)
+        versions, task_ids = parse_versions(found["versions"]), _object("task_ids", found["task_ids"], config.tasks)
+        if len({_integer(f"task_ids of {task}", number) for task, number in task_ids.items()}) != len(task_ids):
+            raise ValueError(f"task_ids must differ, got {short(task_ids)}")
         return Demonstrations(folder, config, versions, task_ids, episodes, attempts)
     except DatasetError:
         raise
@@ -196,28 +184,14 @@ def read_metadata(root: str | os.PathLike[str]) -> Demonstrations:
         ) from error
 
 
-@contextmanager
-def _half_made(path: Path) -> Iterator[None]:
-    """Name the file of a half-made dataset that cannot be read."""
+def read_partial(path: Path, parse: Callable[[Any], Parsed]) -> Parsed:
+    """What ``parse`` makes of a JSON file of a half-made dataset; a damaged file is a :class:`DatasetError`."""
     try:
-        yield
+        return parse(read_json(path, "root: the file"))
     except _BAD as error:
         raise DatasetError(
             f"root: {str(path)!r} is damaged ({str(error)[:500]}); delete {str(path.parent.parent)!r} to start again"
         ) from error
-
-
-def read_config(path: Path) -> CollectConfig:
-    """The configuration of a half-made dataset; a damaged file is a :class:`DatasetError`."""
-    with _half_made(path):
-        return parse_config(read_json(path, "root: the configuration"))
-
-
-def read_versions(path: Path) -> dict[str, str]:
-    """The package versions that a half-made dataset was begun with, {} if it does not say; as :func:`read_config`."""
-    with _half_made(path), suppress(FileNotFoundError):
-        return _versions(read_json(path, "root: the versions"))
-    return {}
 
 
 def parse_config(stated: Any) -> CollectConfig:
@@ -243,24 +217,17 @@ def _object(name: str, stated: Any, keys: Any) -> dict[str, Any]:
     return dict(stated)
 
 
-def _integer(name: str, stated: Any, minimum: int = 0, maximum: int = 2**63 - 1) -> int:
+def _integer(name: str, stated: Any, minimum: int = 0, maximum: int = _MOST) -> int:
     if type(stated) is not int or not minimum <= stated <= maximum:
         raise ValueError(f"{name} must be an integer in [{minimum}, {maximum}], got {short(stated)}")
     return stated
 
 
-def _versions(stated: Any) -> dict[str, str]:
+def parse_versions(stated: Any) -> dict[str, str]:
+    """Package name to version, from its JSON; ValueError if it is none."""
     if not isinstance(stated, dict) or not all(isinstance(v, str) and len(v) <= 100 for v in stated.values()):
         raise ValueError(f"versions must be names and short texts, got {short(stated)}")
     return stated
-
-
-def _task_ids(stated: Any, config: CollectConfig) -> dict[str, int]:
-    found = _object("task_ids", stated, config.tasks)
-    numbers = {task: _integer(f"task_ids of {task}", found[task]) for task in config.tasks}
-    if len({*numbers.values()}) != len(numbers):
-        raise ValueError(f"task_ids must differ, got {short(stated)}")
-    return numbers
 
 
 def _episodes(columns: dict[str, Any], config: CollectConfig) -> tuple[EpisodeInfo, ...]:

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from multiprocessing.context import get_spawning_popen
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -18,7 +18,12 @@ from lw_torchrl._files import reading
 from lw_torchrl._tensor_archive import TensorArchive, write_archive
 from lw_torchrl.data import trajectories
 from lw_torchrl.data.storage import DEMONSTRATION, DONE, REWARD, TRAJECTORY, JoinedStorage, column_name
-from lw_torchrl.data.trajectories import Columns, OpenTrajectories
+from lw_torchrl.data.trajectories import NONE_OPEN, Columns, OpenTrajectories
+
+ONE_PROCESS = (
+    "a buffer that grows is of one process, others would write to a copy: let the collector yield its batches, and "
+    "extend the buffer with them here"
+)
 
 
 class GrowingStorage(JoinedStorage):
@@ -26,14 +31,14 @@ class GrowingStorage(JoinedStorage):
 
     The rows of the parts come first and stay; the i-th row ever written is at ``num_joined + i % grow``. A replay
     buffer over it needs a :class:`GrowingWriter` and ``collate_fn=lambda batch: batch``;
-    ``LanguageWorldExperienceReplay(..., grow=)`` sets both.
+    ``LanguageWorldExperienceReplay(..., grow=)`` sets both. Samples have one column more, ``is_demonstration`` (B,)
+    bool: true of the parts' rows, false of those written.
 
     Batches may have any dimensions, the last of which is time; the columns of the parts are stored, see
     :func:`collected_rows`. ``("collector", "traj_ids")`` gets new numbers, above those of the parts: a trajectory keeps
     its number from batch to batch as long as its newest row is in the ring, and no other trajectory ever gets it. A row
-    follows another if both have the collector's id, the other is not done, and its "next" is bit for bit this row.
-
-    Samples have one column more, ``is_demonstration`` (B,) bool: true of the parts' rows, false of those written.
+    follows another if both have the collector's id, the other is not done, and its "next" is bit for bit this row; else
+    a trajectory begins, since a collector was reset, or another one counts from 0 as well.
 
     Args:
         parts, rows, n_steps, gamma: as for :class:`JoinedStorage`; ("collector", "traj_ids") and ("next", "done") are
@@ -46,8 +51,7 @@ class GrowingStorage(JoinedStorage):
         num_joined, count: rows of the parts, and rows ever written.
 
     Raises:
-        ValueError: as for :class:`JoinedStorage`; at writing, a batch of more rows than the ring has, or what
-            :func:`collected_rows` refuses.
+        ValueError: as for :class:`JoinedStorage`; at writing, too many rows, or what :func:`collected_rows` refuses.
 
     Example:
         >>> from tensordict import TensorDict
@@ -75,27 +79,24 @@ class GrowingStorage(JoinedStorage):
         rows: Sequence[Tensor | None] | None = None,
         *,
         grow: int,
-        n_steps: int = 1,
-        gamma: float | None = None,
         admit: Callable[[Columns], Columns] | None = None,
         check: Callable[[Columns], None] | None = None,
+        **steps: Any,
     ) -> None:
         self.grow, self.count = check_int("grow", grow, minimum=1), 0
         self._admit, self._check = admit, check
-        super().__init__([part.exclude(DEMONSTRATION) for part in parts], rows, n_steps=n_steps, gamma=gamma)
+        super().__init__([part.exclude(DEMONSTRATION) for part in parts], rows, **steps)
         if absent := [column_name(key) for key in (TRAJECTORY, DONE) if key not in self._columns]:
             raise ValueError(f"grow={self.grow} needs the columns {', '.join(absent)}, which parts do not have")
         if not trajectories.shared_keys(self._columns):
             raise ValueError("parts must have a column and its ('next', ...), by which it shows what follows what")
         known = [int(leaf.max()) for leaf in self._columns[TRAJECTORY] if len(leaf)]
-        self._number, self._open = max(known, default=-1) + 1, OpenTrajectories.none()
+        self._number, self._open = max(known, default=-1) + 1, NONE_OPEN
         joined = int(self._ends[-1])
-        self._ring = {
-            key: torch.empty((self.grow, *leaves[0].shape[1:]), dtype=leaves[0].dtype)
-            for key, leaves in self._columns.items()
-        }
-        for key, leaf in self._ring.items():
-            self._columns[key].append(leaf)
+        self._ring: dict[NestedKey, Tensor] = {}
+        for key, leaves in self._columns.items():
+            self._ring[key] = torch.empty((self.grow, *leaves[0].shape[1:]), dtype=leaves[0].dtype)
+            leaves.append(self._ring[key])
         self._ends = torch.cat([self._ends, torch.tensor([joined + self.grow])])
         self._rows = torch.cat([self._rows, torch.arange(joined, joined + self.grow)])
         self.num_parts += 1
@@ -106,6 +107,8 @@ class GrowingStorage(JoinedStorage):
             self._last = torch.cat([self._last, more := torch.arange(self.num_joined, self.max_size)])
             self._earned = torch.cat([self._earned, self._earned.new_zeros(self.grow, 1)])
             self._ahead = torch.cat([self._ahead, torch.ones_like(more)])
+
+    _refusal = "only a GrowingWriter writes rows of a storage that grows, at the end of its ring"
 
     @property
     def num_grown(self) -> int:
@@ -129,10 +132,9 @@ class GrowingStorage(JoinedStorage):
             raise ValueError(f"batch must have 1 to {self.grow} rows, as many as grow says, got {number}")
         if self._admit is not None:
             found = self._admit(found)
-        key, done = found[TRAJECTORY].reshape(-1), found[DONE].reshape(-1)
-        slots, begin = self._open.last % self.grow, {"serial": self.count, "number": self._number}
-        previous, numbers, opened = trajectories.link_rows(key, done, found, self._open, self._ring, slots, **begin)
-        if (cut := len(numbers.unique()) - len(key.unique())) > number // 2:
+        written = self.count, self._number  # rows and trajectories
+        previous, numbers, opened = trajectories.link_rows(found, self._open, self._ring, *written)
+        if (cut := len(numbers.unique()) - len(found[TRAJECTORY].unique())) > number // 2:
             warnings.warn(
                 f"batch: {cut} of {number} rows are not the ('next', ...) of the rows before them, though of the same "
                 "trajectory, which had not ended; each begins a trajectory. Are rows or steps left out?",
@@ -142,12 +144,9 @@ class GrowingStorage(JoinedStorage):
         serial = torch.arange(self.count, self.count + number)
         self._write(serial, found, previous)
         here = opened.last >= self.count - self.grow
-        self._open = OpenTrajectories(opened.key[here], opened.number[here], opened.last[here])
+        self._open = OpenTrajectories(*(part[here] for part in opened))
         self._number = max(self._number, int(numbers.max()) + 1)
         return (self.num_joined + serial % self.grow).view(batch.shape)
-
-    def _read_only(self) -> NoReturn:
-        raise RuntimeError("only a GrowingWriter writes rows of a storage that grows, at the end of its ring")
 
     def _write(self, serial: Tensor, found: Columns, previous: Tensor) -> None:
         slot = serial % self.grow
@@ -176,7 +175,7 @@ class GrowingStorage(JoinedStorage):
 
     def _empty(self) -> None:  # type: ignore[override]
         """Forget the rows of the ring; numbers of trajectories are not reused."""
-        self.count, self._open = 0, OpenTrajectories.none()
+        self.count, self._open = 0, NONE_OPEN
         self._set_last_cursor(None)
         self._bump_mutation_revision()
 
@@ -188,14 +187,14 @@ class GrowingStorage(JoinedStorage):
             "grow": self.grow,
             "count": self.count,
             "number": self._number,
-            "open": {"key": self._open.key, "number": self._open.number, "last": self._open.last},
+            "open": self._open._asdict(),
             "rows": {column_name(key): leaf[slot] for key, leaf in self._ring.items()},
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore a state; :class:`ValueError` if it is of other columns, another ``grow``, or other demonstrations."""
         super().load_state_dict(state_dict)
-        count, number, rows, opened = trajectories.check_grown_state(state_dict, self.grow, self._ring)
+        count, number, rows, opened = trajectories.check_grown_state(state_dict, self._ring)
         if self._check is not None and count:
             self._check(rows)
         self._empty()
@@ -213,7 +212,6 @@ class GrowingStorage(JoinedStorage):
     def dumps(self, path: Any) -> None:
         state = self.state_dict()
         rows, opened = state.pop("rows"), state.pop("open")
-        Path(path).mkdir(parents=True, exist_ok=True)
         write_archive(Path(path) / "grown.zip", state, {"rows": rows, "open": opened})
 
     def loads(self, path: Any) -> None:
@@ -224,10 +222,7 @@ class GrowingStorage(JoinedStorage):
 
     def __getstate__(self) -> dict[str, Any]:
         if get_spawning_popen() is not None:
-            raise RuntimeError(
-                "a buffer that grows is of one process, others would write to a copy: let the collector yield its "
-                "batches, and extend the buffer with them here"
-            )
+            raise RuntimeError(ONE_PROCESS)
         return super().__getstate__()
 
 

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from math import prod
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from zlib import crc32
 
 import numpy as np
@@ -158,17 +158,15 @@ def map_rows(demonstrations: Demonstrations) -> TensorDict:
         raise DatasetError(
             f"root: {', '.join(map(repr, odd[:5]))} in {str(folder)!r} is no part of a dataset; move it elsewhere"
         )
-    rows = TensorDict({}, [number], device="cpu")
     try:
         _check_files(folder, number)
-        for key, (tail, dtype) in COLUMNS.items():
-            rows.set(key, MappedColumn.of(_path(folder, key), (number, *tail), dtype))
+        found = {key: MappedColumn.of(_path(folder, key), (number, *like[0]), like[1]) for key, like in COLUMNS.items()}
     except (OSError, ValueError, RuntimeError) as error:
         raise DamagedDatasetError(
             f"root: the rows in {str(folder)!r} cannot be read ({error}); the same collect_demonstrations keeps the "
             "episodes that are whole and collects the others again"
         ) from error
-    return rows
+    return TensorDict(found, [number], device="cpu")
 
 
 def load_rows(demonstrations: Demonstrations) -> TensorDict:
@@ -183,20 +181,12 @@ def load_rows(demonstrations: Demonstrations) -> TensorDict:
     return rows
 
 
-READ_AT_ONCE = 2 * 2**30
-"""Bytes of rows that are verified when a dataset is opened; of a larger one, so many, spread evenly."""
-
+READ_AT_ONCE = 2 * 2**30  # bytes of rows that are verified when a dataset is opened
 _SETTLED = 3 * 10**9  # ns; a younger file may be written again with the same time
 
 
-class _Verified(NamedTuple):
-    """The episodes of a dataset that this process has verified, and the state of its files then."""
-
-    files: tuple[tuple[int, ...], ...]
-    episodes: set[EpisodeInfo]
-
-
-_VERIFIED: dict[Path, _Verified] = {}
+_VERIFIED: dict[Path, tuple[tuple[tuple[int, ...], ...], set[EpisodeInfo]]] = {}
+"""For each folder, what :func:`_files` gave when this process verified episodes of it, and which."""
 
 
 def _as_written(demonstrations: Demonstrations, info: EpisodeInfo, rows: TensorDictBase) -> bool:
@@ -230,15 +220,14 @@ def verify(demonstrations: Demonstrations, episodes: Sequence[EpisodeInfo], *, e
     DatasetError if they differ. Without ``every``, at most :data:`READ_AT_ONCE` bytes are read, spread evenly."""
     rows, root = map_rows(demonstrations), demonstrations.root.resolve()
     files = _files(root)
-    known = _VERIFIED.get(root, _Verified(files, set()))
-    known = known if known.files == files else _Verified(files, set())
+    before, known = _VERIFIED.get(root, (files, set()))
+    known = known if before == files else set()
     size = sum(info.length for info in episodes) * ROW_BYTES
     asked = episodes if every else episodes[:: -(-size // READ_AT_ONCE)]
     broken = [
         info
         for info in asked
-        if info not in known.episodes
-        and not _as_written(demonstrations, info, rows[info.start : info.start + info.length])
+        if info not in known and not _as_written(demonstrations, info, rows[info.start : info.start + info.length])
     ]
     if broken:
         listed = ", ".join(f"{info.episode} of {info.task!r}" for info in broken[:5]) + ", ..." * (len(broken) > 5)
@@ -248,4 +237,4 @@ def verify(demonstrations: Demonstrations, episodes: Sequence[EpisodeInfo], *, e
             "collect_demonstrations keeps the others and runs these again"
         )
     if max(max(one[3:]) for one in files) < time.time_ns() - _SETTLED:
-        _VERIFIED[root] = _Verified(files, known.episodes | set(asked))
+        _VERIFIED[root] = (files, known | set(asked))

@@ -75,10 +75,7 @@ class EpisodeFiles:
                 raise ValueError(f"{'/'.join(key)} must be {dtype} of shape {(length, *tail)}")
         if not 0 < length <= self.max_steps or (columns["episode",] != episode).any():
             raise ValueError("it is another episode")
-        steps = TensorDict({}, [length])
-        for key, column in columns.items():
-            steps.set(key, column)
-        return steps
+        return TensorDict(columns, [length])
 
     def _content(self, path: Path) -> bytes:
         found = path.lstat()
@@ -113,15 +110,7 @@ def write_failed(folder: Path, size: int, error: OSError) -> OSError:
 
 _Actor = Callable[[TensorDictBase], TensorDictBase]
 
-_RECORDED = [
-    "observation",
-    "task_id",
-    "episode",
-    "action",
-    "expert_action",
-    "unclipped_action",
-    *(("next", key) for key in ("observation", "task_id", "reward", "success", "done", "terminated", "truncated")),
-]
+_RECORDED = [key for key in _STORED if not key[-1].startswith("reward")] + [("next", "reward")]
 _MAX_ATTEMPTS = 20  # episodes run for each one that is kept, before redrawing gives up
 
 

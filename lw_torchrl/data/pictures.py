@@ -9,7 +9,7 @@ import io
 import os
 import zipfile
 from collections.abc import Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,11 +35,17 @@ _LARGEST = 64 * 2**20  # bytes of a file of pictures
 
 
 @dataclass(frozen=True)
-class _Wanted:
+class _Pictures:
+    """The pictures of episodes by some cameras, and their files."""
+
     cameras: tuple[str, ...]
     height: int
     width: int
     every: int
+
+    @classmethod
+    def of(cls, cameras: str | Sequence[str], height: int, width: int, every: int) -> _Pictures:
+        return cls(check_cameras(cameras, height, width), height, width, check_int("every", every, minimum=1))
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -52,9 +58,34 @@ class _Wanted:
     def count(self, episode: EpisodeInfo) -> int:
         return -(-episode.length // self.every)
 
+    def read(self, root: Path, episode: EpisodeInfo) -> Tensor:
+        """Those of an episode, (n, height, width·C, 3) uint8; DatasetError if its file is missing or damaged."""
+        from PIL import Image
 
-def _wanted(cameras: str | Sequence[str], height: int, width: int, every: int) -> _Wanted:
-    return _Wanted(check_cameras(cameras, height, width), height, width, check_int("every", every, minimum=1))
+        path, count = self.file(root, episode), self.count(episode)
+        try:
+            if path.stat().st_size > _LARGEST:
+                raise ValueError("it is larger than an episode's pictures can be")
+            with zipfile.ZipFile(path) as archive:
+                names = [f"{number}.png" for number in range(count)]
+                if archive.namelist() != names or any(one.compress_type for one in archive.infolist()):
+                    raise ValueError(f"it must hold {count} pictures, stored")
+                pictures = np.empty((count, *self.shape), dtype=np.uint8)
+                for number, name in enumerate(names):
+                    with Image.open(io.BytesIO(archive.read(name)), formats=["PNG"]) as picture:
+                        if picture.mode != "RGB" or picture.size != (self.shape[1], self.shape[0]):
+                            raise ValueError(f"{name} is {picture.mode} of {picture.size} pixels")
+                        pictures[number] = np.asarray(picture)
+        except Exception as error:  # a damaged file may raise anything
+            raise DatasetError(f"root: {str(path)!r} is damaged ({error}); add_pictures makes it anew") from error
+        return torch.from_numpy(pictures)
+
+    def missing(self, root: Path, episode: EpisodeInfo) -> bool:
+        """Whether an episode's file is missing, or damaged and so to be written anew."""
+        with suppress(DatasetError):
+            self.read(root, episode)
+            return False
+        return True
 
 
 @checked
@@ -78,8 +109,7 @@ def add_pictures(
         progress: show a progress bar when it takes longer than a second.
 
     Raises:
-        DatasetError: (a ValueError) the folder holds no dataset, or its episodes go otherwise today, by another version
-            of MuJoCo or Meta-World.
+        DatasetError: (a ValueError) there is no dataset, or MuJoCo or Meta-World lets its episodes go otherwise today.
         ImportError: there is no OpenGL; it names what to install.
         OSError: there is no room; nothing is lost.
 
@@ -93,12 +123,11 @@ def add_pictures(
         ...     replay.sample()["pixels"].shape
         torch.Size([8, 64, 64, 3])
     """
-    wanted, found = _wanted(cameras, height, width, every), read_metadata(Path(root))
+    wanted, found = _Pictures.of(cameras, height, width, every), read_metadata(Path(root))
     verify(found, found.episodes)
     rows = load_rows(found)
-    missing = [one for one in found.episodes if not _whole(wanted.file(found.root, one), wanted, wanted.count(one))]
-    bar = Progress("taking pictures", sum(map(wanted.count, missing)), "picture", show=progress)
-    with bar:
+    missing = [one for one in found.episodes if wanted.missing(found.root, one)]
+    with Progress("taking pictures", sum(map(wanted.count, missing)), "picture", show=progress) as bar:
         for task in found.config.tasks:
             own = [one for one in missing if one.task == task]
             for some in (own[first : first + _TOGETHER] for first in range(0, len(own), _TOGETHER)):
@@ -108,7 +137,7 @@ def add_pictures(
 
 
 def _taken(
-    found: Demonstrations, rows: TensorDictBase, episodes: Sequence[EpisodeInfo], wanted: _Wanted
+    found: Demonstrations, rows: TensorDictBase, episodes: Sequence[EpisodeInfo], wanted: _Pictures
 ) -> list[list[np.ndarray[Any, Any]]]:
     base = LanguageWorldEnv(
         episodes[0].task, num_envs=len(episodes), seed=found.config.seed, max_steps=found.config.max_steps
@@ -146,39 +175,6 @@ def _write(path: Path, pictures: Sequence[np.ndarray[Any, Any]]) -> None:
             archive.writestr(zipfile.ZipInfo(f"{number}.png"), stream.getvalue())  # of no date
 
 
-def _whole(path: Path, wanted: _Wanted, count: int) -> bool:
-    """Whether a file has all its pictures; a damaged one is written anew."""
-    if not path.is_file():
-        return False
-    try:
-        _read(path, wanted, count)
-    except DatasetError:
-        return False
-    return True
-
-
-def _read(path: Path, wanted: _Wanted, count: int) -> Tensor:
-    """(count, height, width·C, 3) uint8."""
-    from PIL import Image
-
-    try:
-        if path.stat().st_size > _LARGEST:
-            raise ValueError("it is larger than an episode's pictures can be")
-        with zipfile.ZipFile(path) as archive:
-            names = [f"{number}.png" for number in range(count)]
-            if archive.namelist() != names or any(one.compress_type for one in archive.infolist()):
-                raise ValueError(f"it must hold {count} pictures, stored")
-            pictures = np.empty((count, *wanted.shape), dtype=np.uint8)
-            for number, name in enumerate(names):
-                with Image.open(io.BytesIO(archive.read(name)), formats=["PNG"]) as picture:
-                    if picture.mode != "RGB" or picture.size != (wanted.shape[1], wanted.shape[0]):
-                        raise ValueError(f"{name} is {picture.mode} of {picture.size} pixels")
-                    pictures[number] = np.asarray(picture)
-    except Exception as error:  # a damaged file may raise anything
-        raise DatasetError(f"root: {str(path)!r} is damaged ({error}); add_pictures makes it anew") from error
-    return torch.from_numpy(pictures)
-
-
 @checked
 def load_pictures(
     replay: LanguageWorldExperienceReplay,
@@ -188,27 +184,24 @@ def load_pictures(
     width: int = 64,
     every: int = 1,
 ) -> Tensor:
-    """The pictures of a buffer's rows, for ``replay.add_column("pixels", ...)``: (R, height, width·C, 3) uint8, in
-    memory.
+    """The pictures of a buffer's rows, in memory, for ``replay.add_column("pixels", ...)``: (R, height, width·C, 3)
+    uint8. They are those of ``observation``, in the order of ``replay[:]``; between two of an episode, the earlier one.
 
-    They are those of ``observation``, in the order of ``replay[:]``; between two pictures of an episode, the earlier
-    one. ``cameras``, ``height``, ``width`` and ``every`` are as given to :func:`add_pictures`. Without such pictures,
-    or if they are damaged, a :class:`DatasetError`, which is a ValueError, is raised.
+    ``cameras``, ``height``, ``width`` and ``every`` are as given to :func:`add_pictures`. Without such pictures, or if
+    they are damaged, a :class:`DatasetError`, which is a ValueError, is raised.
     """
-    wanted = _wanted(cameras, height, width, every)
+    wanted = _Pictures.of(cameras, height, width, every)
     _, lengths = torch.unique_consecutive(replay.storage.column(("collector", "traj_ids")), return_counts=True)
     listed = [(part.root, episode) for part in replay.parts for episode in part.episodes]
     found = torch.empty((int(lengths.sum()), *wanted.shape), dtype=torch.uint8)
     row = 0
     for (root, episode), length in zip(listed, lengths.tolist(), strict=True):
-        path = wanted.file(root, episode)
-        if not path.is_file():
+        if not wanted.file(root, episode).is_file():
             raise DatasetError(
                 f"root: {str(root)!r} has no pictures of {episode.task}, episode {episode.episode}, by "
                 f"{', '.join(wanted.cameras)}, {height} times {width} pixels, every {every}; "
                 f"lw.data.add_pictures({str(root)!r}, ...) takes them"
             )
-        taken = _read(path, wanted, wanted.count(episode))
-        found[row : row + length] = taken[torch.arange(length) // every]
+        found[row : row + length] = wanted.read(root, episode)[torch.arange(length) // every]
         row += length
     return found

@@ -23,15 +23,11 @@ from lw_torchrl._devices import CPU, check_device
 from lw_torchrl.data import replay_checks, selection
 from lw_torchrl.data.buffer_state import RestorableReplay, fingerprint
 from lw_torchrl.data.dataset import DATA, read_metadata
-from lw_torchrl.data.growing import GrowingStorage, GrowingWriter
+from lw_torchrl.data.growing import ONE_PROCESS, GrowingStorage, GrowingWriter
 from lw_torchrl.data.memory_map import verify
 from lw_torchrl.data.rewards import RewardName, check_n_steps
 from lw_torchrl.data.selection import EpisodeChoice, EpisodeFilter, JoinedDemonstrations, Label
-from lw_torchrl.data.storage import DeviceStorage, JoinedStorage, WholeStorage
-
-
-def _identity(batch: TensorDictBase) -> TensorDictBase:
-    return batch
+from lw_torchrl.data.storage import DEMONSTRATION, TRAJECTORY, DeviceStorage, JoinedStorage, WholeStorage
 
 
 def _choices(episodes: Any, roots: int, joined: bool) -> list[EpisodeChoice]:
@@ -58,8 +54,7 @@ class LanguageWorldExperienceReplay(RestorableReplay):
     is true of a dataset's rows, and false of those that :meth:`extend` wrote.
 
     Args:
-        root: the dataset's folder, or a list of folders, in the order of the rows. A folder may come twice only if
-            ``episodes`` says what to show of each.
+        root: the dataset's folder, or a list of folders; one may come twice if ``episodes`` says what to show of each.
         episodes: which to show. None: all; a number: the first so many of each task; a mapping: for each task to show,
             the first so many, or a list of indices of episodes. For a list of folders, a list of such choices.
         keep: of these, the successes, the best tenth, those of one behaviour, ...; see :class:`EpisodeFilter`.
@@ -75,10 +70,9 @@ class LanguageWorldExperienceReplay(RestorableReplay):
         after_success: drop the steps that come more than so many after the first success; None keeps all.
         terminate_on_success: end each episode at its first success, with ``("next", "terminated")``, as
             ``LanguageWorldEnv(terminate_on_success=True)`` does; with label="executed".
-        n_steps, gamma: how many steps ``("next", ...)`` is ahead, within the episode that is shown, and from 2 on the
-            discount of the rewards on the way, which the loss must have too; see :class:`JoinedStorage`.
-        grow: rows of a ring that :meth:`extend` writes to, whose oldest are overwritten; see :class:`GrowingStorage`.
-            Samples then leave out the expert's actions and the other reward, which a collector does not give.
+        n_steps, gamma: as for :class:`JoinedStorage`, within the episode that is shown; with label="executed".
+        grow: rows of a ring that :meth:`extend` writes to, see :class:`GrowingStorage`; with label="executed". Samples
+            then leave out the expert's actions and the other reward, which a collector does not give.
         device: where the rows are kept and transforms work: None or "cpu" for the files, memory-mapped; "cuda",
             "cuda:1", "mps" or "auto" for a copy in its memory. Minibatches are the same everywhere.
         check: whether to check the episodes that are shown against their checksums, once in a process while the files
@@ -93,13 +87,11 @@ class LanguageWorldExperienceReplay(RestorableReplay):
         columns: of :meth:`add_column`, the name to a digest of the values.
 
     Warns:
-        UserWarning: the folders were collected with different versions of MuJoCo or Meta-World; or, with ``grow``, with
-            others than the installed ones.
+        UserWarning: the folders, or with ``grow`` the rows to come, are of different versions of MuJoCo or Meta-World.
 
     Raises:
-        ValueError: an episode that the dataset does not hold; ``n_steps`` or ``grow`` without label="executed"; a
-            transform that does nothing to samples, such as ``MultiStepTransform``, which ``n_steps`` replaces. From
-            :meth:`extend`: rows that do not fit the demonstrations, or have another reward.
+        ValueError: an episode that the dataset does not hold; a transform that does nothing to samples, such as
+            ``MultiStepTransform``, which ``n_steps`` replaces. From :meth:`extend`: rows that do not fit.
         RuntimeError: :meth:`extend` without ``grow``; an assignment to rows.
         DatasetError: (a ValueError) the dataset is half-written, damaged, or of another format or version.
 
@@ -175,19 +167,21 @@ class LanguageWorldExperienceReplay(RestorableReplay):
         ]
         for found, chosen in zip(whole, shown, strict=True) if check else ():
             verify(found, chosen.episodes, every=False)
+        after = 0 if terminate_on_success else after_success
         if keep is not None:
-            after = 0 if terminate_on_success else after_success
             pairs = zip(whole, shown, strict=True)
             shown = keep.choose(shown, [selection.returns_of(found, chosen, reward, after) for found, chosen in pairs])
         self.behaviours = tuple(sorted({found.config.behaviour for found in whole}))
         parts: list[TensorDictBase] = []
         kept: list[Tensor | None] = []
         trajectories = 0
-        what: dict[str, Any] = {"label": label, "reward": reward}
-        what |= {"after_success": after_success, "terminate_on_success": terminate_on_success}
         for found, chosen in zip(whole, shown, strict=True):
             who = self.behaviours.index(found.config.behaviour)
-            rows, taken = selection.read_part(found, chosen, first_trajectory=trajectories, behaviour=who, **what)
+            rows, taken = selection.read_part(found, chosen, label, reward, after, terminate_on_success)
+            if trajectories:
+                rows.set(TRAJECTORY, rows.get(TRAJECTORY) + trajectories)
+            rows.set("behaviour", torch.full(rows.batch_size, who))
+            rows.set(DEMONSTRATION, torch.ones(rows.batch_size, dtype=torch.bool))
             parts.append(rows if grow is None else rows.exclude(*_NOT_COLLECTED))
             kept.append(taken)
             trajectories += len(found.episodes)
@@ -195,16 +189,15 @@ class LanguageWorldExperienceReplay(RestorableReplay):
         several = joined or episodes is not None or keep is not None
         self.demonstrations = JoinedDemonstrations(tuple(shown)) if several else shown[0]
         if grow is not None:
-            admit = partial(replay_checks.admit_rows, reward, terminate_on_success)
-            check_rows = partial(replay_checks.check_rows, reward, terminate_on_success)
-            options: dict[str, Any] = {"n_steps": n_steps, "gamma": gamma, "admit": admit, "check": check_rows}
-            storage = GrowingStorage(parts, kept, grow=grow, **options)
+            shown_as = reward, terminate_on_success
+            admit, fits = partial(replay_checks.admit_rows, *shown_as), partial(replay_checks.check_rows, *shown_as)
+            storage = GrowingStorage(parts, kept, grow=grow, n_steps=n_steps, gamma=gamma, admit=admit, check=fits)
         elif several or n_steps > 1 or where != CPU:
             storage = JoinedStorage(parts, kept, n_steps=n_steps, gamma=gamma)
             storage = storage if where == CPU else DeviceStorage(storage, where)
         else:
-            storage = WholeStorage(parts[0] if kept[0] is None else parts[0][kept[0]])  # the second is in memory
-        kwargs.setdefault("collate_fn", _identity)
+            storage = WholeStorage([parts[0] if kept[0] is None else parts[0][kept[0]]])  # the second is in memory
+        kwargs.setdefault("collate_fn", torch.nn.Identity())
         writer: Writer = ImmutableDatasetWriter() if grow is None else GrowingWriter()
         self.root = self.roots[0]
         self._fingerprint = fingerprint(shown, after_success, terminate_on_success)
@@ -241,10 +234,7 @@ class LanguageWorldExperienceReplay(RestorableReplay):
     def share(self, shared: bool = True) -> LanguageWorldExperienceReplay:
         """Let other processes read it; with ``grow``, a RuntimeError."""
         if shared and self._grows:
-            raise RuntimeError(
-                "a buffer that grows is of one process: let the collector yield its batches, and extend the buffer "
-                "with them here"
-            )
+            raise RuntimeError(ONE_PROCESS)
         return super().share(shared)
 
     def add_column(self, name: str, values: Tensor, *, of: LanguageWorldExperienceReplay | None = None) -> None:
@@ -256,8 +246,7 @@ class LanguageWorldExperienceReplay(RestorableReplay):
                 same rows in the same order, and so the same episodes where a filter keeps some by their return.
 
         Raises:
-            ValueError: another number of rows, a name that samples have, or ``of`` shows other rows; or, with ``grow``,
-                since later rows would have no value.
+            ValueError: another number of rows, a name that samples have, ``of`` shows other rows, or rows may ``grow``.
         """
         if self._grows:
             raise ValueError(f"add_column: {name!r} would be of no row that comes later, and this buffer grows")

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import NestedKey
 from torch import Tensor
 from torchrl.data.replay_buffers.samplers import SliceSampler
 from torchrl.envs import Compose, MultiStepTransform, Transform
@@ -17,11 +16,12 @@ from torchrl.envs import Compose, MultiStepTransform, Transform
 from lw_torchrl._versions import SIMULATORS, package_versions
 from lw_torchrl.data.dataset import Demonstrations
 from lw_torchrl.data.rewards import REWARDS, RewardName, check_reward
+from lw_torchrl.data.trajectories import Columns
 from lw_torchrl.language.value_checks import finite
 
 _OF_SAMPLERS = ("index", "is_target")  # keys of samples that are no columns
+# What a transform overrides that acts on rows as they are written, or in an environment.
 _ELSEWHERE = ("inv", "_inv_call", "_inv_apply_transform", "_call", "_step", "_reset")
-"""What a transform overrides that acts on rows as they are written, or in an environment."""
 
 
 class _Accessed(Exception):
@@ -130,7 +130,7 @@ def check_growing(sampler: Any, options: Mapping[str, Any]) -> None:
         )
 
 
-def check_rows(reward: RewardName, terminate_on_success: bool, rows: Mapping[NestedKey, Tensor]) -> None:
+def check_rows(reward: RewardName, terminate_on_success: bool, rows: Columns) -> None:
     """Raise if rows have another reward, or other ends, than the demonstrations."""
     success = rows["next", "success"]
     check_reward(reward, rows["next", "reward"], success)
@@ -142,9 +142,7 @@ def check_rows(reward: RewardName, terminate_on_success: bool, rows: Mapping[Nes
         )
 
 
-def admit_rows(
-    reward: RewardName, terminate_on_success: bool, rows: Mapping[NestedKey, Tensor]
-) -> dict[NestedKey, Tensor]:
+def admit_rows(reward: RewardName, terminate_on_success: bool, rows: Columns) -> Columns:
     """A collector's rows with the demonstrations' reward; raises as :func:`check_rows`."""
     made = REWARDS[reward]
     check_rows(made.source, terminate_on_success, rows)

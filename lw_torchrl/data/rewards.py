@@ -76,8 +76,7 @@ def check_reward(name: RewardName, reward: Tensor, success: Tensor) -> None:
         raise ValueError(f"batch: the reward of a success must be {stated.at_success} for {name!r}")
 
 
-STEPS = "steps_to_next_obs"
-"""The column that says how many steps lie between ``observation`` and ``("next", "observation")``; TorchRL's name."""
+STEPS = "steps_to_next_obs"  # TorchRL's name of the column with the steps from an observation to its "next"
 
 
 def check_n_steps(n_steps: Any, gamma: Any) -> tuple[int, float]:
@@ -92,20 +91,3 @@ def check_n_steps(n_steps: Any, gamma: Any) -> tuple[int, float]:
     if not (discount := check_probability("gamma", gamma)):
         raise ValueError("gamma must be above 0, got 0")
     return number, discount
-
-
-def last_rows(end: Tensor, n_steps: int) -> Tensor:
-    """The row in which ``n_steps`` steps from each row end: (R,) int64, at most the next ``end``, (R,) bool."""
-    rows = torch.arange(len(end))
-    ends = torch.where(end, rows, max(len(end) - 1, 0))
-    return torch.minimum(rows + n_steps - 1, ends.flip(0).cummin(0).values.flip(0))
-
-
-def sum_rewards(reward: Tensor, last: Tensor, gamma: float, n_steps: int) -> Tensor:
-    """The discounted reward from each row to ``last``: (R, 1), summed in the order of time."""
-    total = reward.clone()
-    rows = torch.arange(len(reward))
-    for ahead in range(1, n_steps):
-        inside = (rows + ahead <= last).nonzero().flatten()
-        total[inside] += gamma**ahead * reward[inside + ahead]
-    return total

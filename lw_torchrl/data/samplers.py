@@ -52,12 +52,10 @@ class GroupSampler(Sampler):
 
     Rows may be written and overwritten. If the subclass tells a row's group by a column (:meth:`_keys`), groups and
     passes are updated: a new row takes a random place in what is left of its group's pass, and the work is that of the
-    new rows. Otherwise, and when a group comes or goes or the storage has several dimensions, all rows are grouped
-    again and all passes begin.
+    new rows. Otherwise, when a group comes or goes, and with several dimensions, all are grouped and all passes begin.
     """
 
-    ran_out = False
-    """Whether the last batch ended an epoch: a pass over the group that takes the most batches."""
+    ran_out = False  # whether the last batch ended an epoch: a pass over the group that takes the most batches
 
     def __init__(self) -> None:
         self._process = os.getpid()
@@ -164,29 +162,26 @@ class GroupSampler(Sampler):
         index = to_device_of(storage, index)
         return (index if storage.ndim == 1 else torch.unravel_index(index, storage.shape)), {}
 
-    def add(self, index: Any) -> None:
+    def add(self, index: Any, *, storage: Storage | None = None) -> None:
+        """Note that rows were written, perhaps by another buffer of the same storage."""
         rows = torch.as_tensor(index, device="cpu").reshape(-1)
         self._written.append(rows)
         if sum(map(len, self._written)) > 2 * self._length:
             self._length, self._written = 0, []  # it is as much work to group all rows again
 
-    extend = add
-
-    def mark_update(self, index: Any, *, storage: Storage | None = None) -> None:
-        """Note that rows were written, perhaps by another buffer of the same storage."""
-        self.add(index)
+    extend = mark_update = add
 
     def state_dict(self) -> dict[str, Any]:
         """The shuffled order, how far each group's pass has come, and the rows written since the last batch."""
         none = torch.empty(0, dtype=torch.int64)
         begun = self._length > 0 and not (self._written and self._known is None)  # otherwise all is grouped again
-        size = self._passes.size if begun else none
+        passes = self._passes if begun else Passes(none, none)
         return {
             "length": torch.tensor(self._length if begun else 0),
-            "order": self._passes.compact() if begun else none,
-            "start": size.cumsum(0) - size,
-            "size": size.clone(),
-            "cursor": self._passes.cursor.clone() if begun else none,
+            "order": passes.compact(),
+            "start": passes.size.cumsum(0) - passes.size,
+            "size": passes.size.clone(),
+            "cursor": passes.cursor.clone(),
             "known": self._known.clone() if begun and self._known is not None else none,
             "written": torch.cat(self._written) if begun and self._written else none,
             "ran_out": torch.tensor(self.ran_out),
@@ -237,8 +232,7 @@ class TaskBalancedSampler(GroupSampler):
     The buffer may grow: new rows take random places in the present passes, and overwritten ones leave them; when a task
     comes or goes, all passes begin anew. A batch costs no more than the rows written since the last one. It draws from
     the replay buffer's generator, so ``ReplayBuffer(..., generator=...)`` fixes the batches; its state is saved with
-    the buffer's. An epoch is a pass over the largest task. ``task_key`` is the entry of the storage that holds the
-    task.
+    the buffer's. An epoch is a pass over the largest task. The storage's entry ``task_key`` holds the task.
 
     Raises:
         ValueError: at sampling, a batch size that the number of tasks does not divide (with the nearest that it does).

@@ -4,20 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from lw_torchrl._checks import check_fields, check_int, check_probability, check_text, unknown_name
+from lw_torchrl._checks import check_fields, check_int, check_probability, check_text, shown, unknown_name
 from lw_torchrl.data.dataset import CollectConfig, DamagedDatasetError, Demonstrations, EpisodeInfo
 from lw_torchrl.data.memory_map import load_rows
+from lw_torchrl.data.passes import spans
 from lw_torchrl.data.rewards import REWARDS, RewardName
-from lw_torchrl.data.storage import DEMONSTRATION, TRAJECTORY
 from lw_torchrl.language.value_checks import finite
-
-_Listed = tuple[int, int, str, float, int]  # part, number in it, task, return, rows
 
 
 @dataclass(frozen=True)
@@ -67,50 +65,46 @@ class EpisodeFilter:
             if label not in labels:
                 raise unknown_name("keep: behaviours", label, sorted(labels))
         listed = [
-            (part, number, episode.task, float(earned), int(rows))
-            for part, (described, found) in enumerate(zip(parts, returns, strict=True))
-            for number, (episode, (earned, rows)) in enumerate(zip(described.episodes, found.tolist(), strict=True))
+            (place, episode, earned, rows)
+            for place, (part, found) in enumerate(zip(parts, returns, strict=True))
+            for episode, (earned, rows) in zip(part.episodes, found.tolist(), strict=True)
         ]
-        chosen = []
-        for task in sorted({row[2] for row in listed}):
-            ours = [row for row in listed if row[2] == task]
-            left = [row for row in ours if self._keeps(parts[row[0]], row[1], row[3])]
+        chosen: set[tuple[int, EpisodeInfo]] = set()
+        lost = []
+        for task in sorted({episode.task for _, episode, *_ in listed}):
+            ours = [row for row in listed if row[1].task == task]
+            left, share = [row for row in ours if self._keeps(parts[row[0]], row[1], row[2])], self.best
             if not left and self.else_best is not None:
-                chosen += _best(ours, self.else_best)
-            else:
-                chosen += left if self.best is None else _best(left, self.best)
-        kept = {(part, number) for part, number, *_ in chosen}
-        if lost := sorted({row[2] for row in listed} - {row[2] for row in chosen}):
+                left, share = ours, self.else_best
+            if share is not None:  # the highest returns, and the shorter at a tie
+                left = sorted(left, key=lambda row: (-row[2], row[3]))[: max(1, round(share * len(left)))]
+            chosen |= {row[:2] for row in left}
+            if not left:
+                lost.append(task)
+        if lost:
             raise ValueError(f"keep: {self} leaves no episode of {', '.join(lost)}")
         return [
-            replace(part, episodes=tuple(e for number, e in enumerate(part.episodes) if (place, number) in kept))
+            replace(part, episodes=tuple(episode for episode in part.episodes if (place, episode) in chosen))
             for place, part in enumerate(parts)
         ]
 
-    def _keeps(self, part: Demonstrations, number: int, earned: float) -> bool:
+    def _keeps(self, part: Demonstrations, episode: EpisodeInfo, earned: float) -> bool:
         return (
-            (self.success is None or part.episodes[number].success == self.success)
+            (self.success is None or episode.success == self.success)
             and (self.least_return is None or earned >= self.least_return)
             and (self.behaviours is None or part.config.behaviour in self.behaviours)
         )
 
 
-def _best(listed: list[_Listed], part: float) -> list[_Listed]:
-    """This fraction of a task's episodes, by return and then length; at least one."""
-    ours = sorted(listed, key=lambda row: (-row[3], row[4], row[0], row[1]))
-    return ours[: max(1, round(part * len(ours)))]
-
-
-def episode_returns(reward: Tensor, lengths: Sequence[int]) -> Tensor:
+def episode_returns(reward: Tensor, lengths: Sequence[int] | Tensor) -> Tensor:
     """The return and the number of rows of consecutive episodes: (E, 2) float64, of rewards (R, 1) float32."""
-    rows = torch.tensor(lengths, dtype=torch.int64)
+    rows = torch.as_tensor(lengths, dtype=torch.int64)
     total = torch.zeros(len(rows), dtype=torch.float64)
     total.index_add_(0, torch.repeat_interleave(rows), reward.reshape(-1).double())
     return torch.stack((total, rows.double()), -1)
 
 
 Label = Literal["expert", "unclipped", "executed"]
-LABELS = get_args(Label)
 EpisodeChoice = int | Mapping[str, int | Sequence[int]] | None
 """All episodes; the first so many of each task; or, for each task to take, the first so many or these."""
 
@@ -122,13 +116,9 @@ def choose_episodes(found: Demonstrations, chosen: EpisodeChoice, argument: str 
     there: dict[str, list[int]] = {}
     for episode in found.episodes:
         there.setdefault(episode.task, []).append(episode.episode)
-    wanted: dict[str, int | Sequence[int]]
-    if isinstance(chosen, Mapping):
-        wanted = dict(chosen)
-    elif hasattr(chosen, "__index__"):
-        wanted = dict.fromkeys(there, chosen)
-    else:
+    if not isinstance(chosen, Mapping) and not hasattr(chosen, "__index__"):
         raise TypeError(f"{argument} must be None, a number, or a mapping of task names, got {chosen!r}")
+    wanted = chosen if isinstance(chosen, Mapping) else dict.fromkeys(there, chosen)
     if not wanted:
         raise ValueError(f"{argument} must name at least one task, got an empty mapping")
     keep: set[tuple[str, int]] = set()
@@ -145,55 +135,37 @@ def choose_episodes(found: Demonstrations, chosen: EpisodeChoice, argument: str 
         else:
             raise TypeError(f"{place} must be a number or a list of episodes, got {some!r}")
         if odd := sorted(set(numbers) - set(there[task])):
-            raise ValueError(f"{place}: the dataset holds the episodes {_listed(there[task])}, got {_listed(odd)}")
+            held, asked = shown(there[task])[1:-1], shown(odd)[1:-1]
+            raise ValueError(f"{place}: the dataset holds the episodes {held}, got {asked}")
         if not numbers or len(set(numbers)) != len(numbers):
             raise ValueError(f"{place} must name at least one episode, each once, got {list(numbers)}")
         keep |= {(task, number) for number in numbers}
     return replace(found, episodes=tuple(e for e in found.episodes if (e.task, e.episode) in keep))
 
 
-def _listed(numbers: list[int]) -> str:
-    return ", ".join(map(str, numbers[:20])) + (", ..." if len(numbers) > 20 else "")
-
-
-def _lengths(episodes: Sequence[EpisodeInfo], after: int | None) -> list[int]:
-    """The rows of each episode up to ``after`` steps past its first success."""
-    return [
+def _kept(episodes: Sequence[EpisodeInfo], after: int | None) -> tuple[Tensor, Tensor]:
+    """The rows up to ``after`` steps past each episode's first success, and how many these are of each episode."""
+    shown = [
         e.length if after is None or e.first_success is None else min(e.length, e.first_success + after)
         for e in episodes
     ]
-
-
-def _kept(episodes: Sequence[EpisodeInfo], after: int | None) -> tuple[Tensor, Tensor]:
-    """The rows up to ``after`` steps past each episode's first success, and the last of them of each episode."""
-    starts = torch.tensor([episode.start for episode in episodes], dtype=torch.int64)
-    lengths = torch.tensor(_lengths(episodes, after), dtype=torch.int64)
-    before = lengths.cumsum(0) - lengths
-    rows = torch.repeat_interleave(starts - before, lengths) + torch.arange(int(lengths.sum()))
-    return rows, starts + lengths - 1
+    starts, lengths = (torch.tensor(some, dtype=torch.int64) for some in ([e.start for e in episodes], shown))
+    return spans(starts, lengths), lengths
 
 
 def returns_of(whole: Demonstrations, chosen: Demonstrations, reward: RewardName, after: int | None) -> Tensor:
     """The return and the number of rows, (E, 2) float64, of the chosen episodes up to ``after`` steps past success."""
-    rows, (kept, _) = load_rows(whole), _kept(chosen.episodes, after)
+    rows, (kept, lengths) = load_rows(whole), _kept(chosen.episodes, after)
     made = REWARDS[reward]
     source, success = (rows.get(("next", key))[kept] for key in (f"reward_{made.source}", "success"))
-    return episode_returns(made.of(source, success), _lengths(chosen.episodes, after))
+    return episode_returns(made.of(source, success), lengths)
 
 
 def read_part(
-    whole: Demonstrations,
-    chosen: Demonstrations,
-    *,
-    label: Label,
-    reward: RewardName,
-    after_success: int | None,
-    terminate_on_success: bool = False,
-    first_trajectory: int = 0,
-    behaviour: int = 0,
+    whole: Demonstrations, chosen: Demonstrations, label: Label, reward: RewardName, after: int | None, terminate: bool
 ) -> tuple[TensorDictBase, Tensor | None]:
     """All rows of a dataset, memory-mapped, and which of them to show: (n,) int64, None for all. Columns that differ
-    from the files are in memory: ends of episodes that are cut short, rewards, ids, ``behaviour``."""
+    from the files are in memory: rewards, and ends of episodes that are cut short."""
     rows = load_rows(whole)
     if label == "executed":
         rows = rows.clone(recurse=False)
@@ -208,17 +180,13 @@ def read_part(
             f"root: an action in {str(whole.root)!r} is no finite number, for label={label!r}; the same "
             "collect_demonstrations keeps the episodes that are whole and collects the others again"
         )
-    if first_trajectory:
-        rows.set(TRAJECTORY, rows.get(TRAJECTORY) + first_trajectory)
-    rows.set("behaviour", torch.full(rows.batch_size, behaviour))
-    rows.set(DEMONSTRATION, torch.ones(rows.batch_size, dtype=torch.bool))
-    after = 0 if terminate_on_success else after_success
     if chosen.episodes == whole.episodes and after is None:
         return rows, None
-    kept, last = _kept(chosen.episodes, after)
+    kept, lengths = _kept(chosen.episodes, after)
     if label == "executed" and after is not None:
+        last = kept[lengths.cumsum(0) - 1]
         ends = {"done": last, "truncated": last}
-        if terminate_on_success:
+        if terminate:
             succeeds = rows.get(("next", "success"))[last].reshape(-1)
             ends |= {"truncated": last[~succeeds], "terminated": last[succeeds]}
         for key, where in ends.items():

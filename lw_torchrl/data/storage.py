@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 from reprlib import repr as short
@@ -15,11 +15,10 @@ from torchrl.data.replay_buffers.storages import Storage
 
 from lw_torchrl._devices import CPU
 from lw_torchrl._files import read_json, reading, write_json
-from lw_torchrl.data.rewards import STEPS, check_n_steps, last_rows, sum_rewards
+from lw_torchrl.data.rewards import STEPS, check_n_steps
 
 TRAJECTORY, REWARD, DONE = ("collector", "traj_ids"), ("next", "reward"), ("next", "done")
-DEMONSTRATION = "is_demonstration"
-"""The column that is true of a dataset's rows, and false of those that a buffer was extended with."""
+DEMONSTRATION = "is_demonstration"  # true of a dataset's rows, false of those that a buffer was extended with
 _MAX_RUNS = 4  # runs of one part in a batch, for each part, up to which they are read one after another
 
 
@@ -50,17 +49,6 @@ def _columns(parts: Sequence[TensorDictBase]) -> dict[NestedKey, list[Tensor]]:
             if number:
                 columns[key].append(leaf)
     return columns
-
-
-def _nested(columns: Mapping[NestedKey, Tensor], shape: Sequence[int], device: torch.device | None) -> TensorDict:
-    nested: dict[str, Any] = {}
-    for key, leaf in columns.items():
-        *path, last = (key,) if isinstance(key, str) else key
-        node = nested
-        for name in path:
-            node = node.setdefault(name, {})
-        node[last] = leaf
-    return TensorDict(nested, shape, device=device)
 
 
 class JoinedStorage(Storage):
@@ -112,18 +100,14 @@ class JoinedStorage(Storage):
             raise ValueError(f"rows must be one for each of the {len(parts)} parts, got {len(chosen)}")
         self._columns = _columns(parts)
         self._ends = torch.tensor([len(part) for part in parts]).cumsum(0)  # of the parts, all rows counted
-        starts = [0, *self._ends.tolist()]
         taken = []
-        for number, (start, end) in enumerate(pairwise(starts)):
-            one = chosen[number]
-            if one is None:
-                taken.append(torch.arange(start, end))
-                continue
-            if len(one) and not 0 <= int(one.min()) <= int(one.max()) < end - start:
+        for number, (one, (start, end)) in enumerate(zip(chosen, pairwise(self._bounds()), strict=True)):
+            local = torch.arange(end - start) if one is None else one.to(torch.int64)
+            if len(local) and not 0 <= int(local.min()) <= int(local.max()) < end - start:
                 raise IndexError(
-                    f"rows[{number}] must be in [0, {end - start}), got {int(one.min())}..{int(one.max())}"
+                    f"rows[{number}] must be in [0, {end - start}), got {int(local.min())}..{int(local.max())}"
                 )
-            taken.append(one.to(torch.int64) + start)
+            taken.append(local + start)
         self._rows = torch.cat(taken)
         self.num_joined, self.num_parts = len(self._rows), len(parts)
         self._batch_device = parts[0].device
@@ -131,6 +115,10 @@ class JoinedStorage(Storage):
         super().__init__(max_size=len(self._rows))
         if self.n_steps > 1:
             self._look_ahead()
+
+    def _bounds(self) -> list[int]:
+        """Where each part begins and the last ends, all rows counted."""
+        return [0, *self._ends.tolist()]
 
     def _look_ahead(self) -> None:
         """Note where each row's n steps end, and their discounted reward."""
@@ -141,10 +129,14 @@ class JoinedStorage(Storage):
         part = torch.bucketize(self._rows, self._ends, right=True)
         end = found[DONE].reshape(-1).clone()
         end[:-1] |= (trajectory[1:] != trajectory[:-1]) | (part[1:] != part[:-1]) | (self._rows.diff() != 1)
-        self._places = torch.arange(len(end))
-        self._last = last_rows(end, self.n_steps)
-        self._earned = sum_rewards(reward, self._last, self.gamma, self.n_steps)
-        self._ahead = self._last - self._places + 1
+        rows = self._places = torch.arange(len(end))
+        next_end = torch.where(end, rows, max(len(end) - 1, 0)).flip(0).cummin(0).values.flip(0)
+        self._last = torch.minimum(rows + self.n_steps - 1, next_end)
+        self._ahead = self._last - rows + 1
+        self._earned = reward.clone()
+        for ahead in range(1, self.n_steps):  # summed in the order of time
+            inside = (rows + ahead <= self._last).nonzero().flatten()
+            self._earned[inside] += self.gamma**ahead * reward[inside + ahead]
 
     def __len__(self) -> int:
         return self.num_joined
@@ -178,8 +170,7 @@ class JoinedStorage(Storage):
         values = values.to(self._rows.device)
         whole = values.new_zeros((int(self._ends[-1]), *values.shape[1:]))
         whole[self._rows] = values
-        starts = [0, *self._ends.tolist()]
-        self._columns[key] = [whole[start:end] for start, end in pairwise(starts)]
+        self._columns[key] = [whole[start:end] for start, end in pairwise(self._bounds())]
 
     def _gather(self, rows: Tensor, keys: Sequence[NestedKey]) -> dict[NestedKey, Tensor]:
         """The columns of rows counted over all parts, a fresh tensor each."""
@@ -195,7 +186,7 @@ class JoinedStorage(Storage):
             rows = rows[order]
             cuts = (part[1:] != part[:-1]).nonzero().flatten().tolist()
         bounds = [0, *(cut + 1 for cut in cuts), len(rows)]
-        firsts = [0, *self._ends.tolist()]
+        firsts = self._bounds()
         runs = []
         for start, stop in pairwise(bounds):
             number = int(part[start]) if stop > start else 0
@@ -217,7 +208,7 @@ class JoinedStorage(Storage):
         found = self._gather(flat, list(self._columns)) if plain else self._read(flat, self.keys())
         if rows.dim() != 1:
             found = {key: leaf.reshape(rows.shape + leaf.shape[1:]) for key, leaf in found.items()}
-        return _nested(found, rows.shape, self._batch_device)
+        return TensorDict(found, rows.shape, device=self._batch_device)
 
     def contains(self, item: Any) -> Any:
         """Whether an index, or each of a tensor of indices, is one of a row."""
@@ -225,14 +216,12 @@ class JoinedStorage(Storage):
             return (item >= -len(self)) & (item < len(self))
         return -len(self) <= item < len(self)
 
-    def _read_only(self) -> NoReturn:
-        raise RuntimeError("this storage is read-only: it shows datasets as they are on disk")
+    _refusal = "this storage is read-only: it shows datasets as they are on disk"
 
-    def set(self, cursor: Any, data: Any, *, set_cursor: bool = True) -> NoReturn:
-        self._read_only()
+    def set(self, *args: Any, **kwargs: Any) -> NoReturn:
+        raise RuntimeError(self._refusal)
 
-    def _empty(self) -> NoReturn:
-        self._read_only()
+    _empty = set
 
     def state_dict(self) -> dict[str, Any]:
         """The number of rows; the rows themselves stay in their datasets."""
@@ -258,15 +247,12 @@ class JoinedStorage(Storage):
 class WholeStorage(JoinedStorage):
     """A :class:`JoinedStorage` of one tensordict, whose slices are views: a write to one changes later batches."""
 
-    def __init__(self, rows: TensorDictBase) -> None:
-        super().__init__([rows])
-
     def get(self, index: Any) -> TensorDict:
         """The rows at an index, as for :class:`JoinedStorage`; of a slice, views."""
         if not isinstance(index, slice):
             return super().get(index)
         found = {key: leaf[index] for key, (leaf,) in self._columns.items()}
-        return _nested(found, self._rows[index].shape, self._batch_device)
+        return TensorDict(found, self._rows[index].shape, device=self._batch_device)
 
 
 def device_of_rows(storage: Storage) -> torch.device:

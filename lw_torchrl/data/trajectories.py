@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
+from lw_torchrl._state_tree import check_like
 from lw_torchrl.data.rewards import STEPS
-from lw_torchrl.data.storage import TRAJECTORY, column_name
+from lw_torchrl.data.storage import DONE, TRAJECTORY, column_name
 from lw_torchrl.language.value_checks import finite
 
 EXECUTED = ("next", "executed_action")
@@ -22,8 +22,7 @@ def collected_rows(batch: TensorDictBase, columns: Mapping[NestedKey, Tensor]) -
     """The ``columns`` of a collector's batch (n, ...), flattened to one dimension.
 
     ``action`` is ``("next", "executed_action")`` where the batch has that; a policy's own may be outside [-1, 1], which
-    is refused, as are other columns, dtypes or shapes, NaN, and rows of n steps or of padding, by ``("collector",
-    "mask")``.
+    is refused, as are other columns, dtypes or shapes, NaN, and rows of n steps or, by :data:`MASK`, of padding.
     """
     names = set(batch.keys(True, True))
     if STEPS in names:
@@ -62,18 +61,15 @@ def collected_rows(batch: TensorDictBase, columns: Mapping[NestedKey, Tensor]) -
 Columns = Mapping[NestedKey, Tensor]
 
 
-@dataclass(frozen=True)
-class OpenTrajectories:
-    """Trajectories that have not ended: the collector's ids, ours, and their last rows' serial numbers, sorted, (K,)
-    int64."""
+class OpenTrajectories(NamedTuple):
+    """Of trajectories that have not ended, the collector's id, our number, and the last row's serial, (K,) int64."""
 
     key: Tensor
     number: Tensor
     last: Tensor
 
-    @classmethod
-    def none(cls) -> OpenTrajectories:
-        return cls(*(torch.empty(0, dtype=torch.int64) for _ in range(3)))
+
+NONE_OPEN = OpenTrajectories(*torch.empty(3, 0, dtype=torch.int64))
 
 
 def shared_keys(columns: Iterable[NestedKey]) -> dict[NestedKey, NestedKey]:
@@ -102,24 +98,16 @@ def _match(start: Tensor, candidate: Tensor, starts: int, candidates: int) -> Te
 
 
 def link_rows(
-    key: Tensor,
-    done: Tensor,
-    batch: Columns,
-    opened: OpenTrajectories,
-    ring: Columns,
-    slots: Tensor,
-    *,
-    serial: int,
-    number: int,
+    batch: Columns, opened: OpenTrajectories, ring: Columns, serial: int, number: int
 ) -> tuple[Tensor, Tensor, OpenTrajectories]:
     """The serial number of the row before each, (n,) int64, -1 where a trajectory begins; each trajectory's number,
     (n,) int64; and the trajectories that may continue.
 
-    A row follows another if both have the same ``key``, (n,) int64, the collector's id, the other is not ``done``, and
-    its "next" is bit for bit this row. Otherwise a trajectory begins: a collector was reset, or another one counts from
-    0 as well. Rows of a key are in the order of time. ``opened`` trajectories may continue, whose last rows are in
-    ``ring`` at ``slots``, (K,) int64. ``serial`` and ``number`` are those of the first row, and of the next trajectory.
+    Rows of one collector's id are in the order of time; :class:`GrowingStorage` says which row follows another, the
+    last rows of ``opened`` are in ``ring``, and ``serial`` and ``number`` are of the first row and the next trajectory.
     """
+    key, done = batch[TRAJECTORY].reshape(-1), batch[DONE].reshape(-1)
+    slots = opened.last % len(ring[TRAJECTORY])
     order = key.argsort(stable=True)
     one, next_one = order[:-1], order[1:]
     first = torch.ones(len(key), dtype=torch.bool)
@@ -142,47 +130,37 @@ def link_rows(
     ends = ends[~done[ends]].sort().values
     stay = torch.ones(len(opened.key), dtype=torch.bool)
     stay[match[~new]] = False
-    kept = (opened.key[stay], opened.number[stay], opened.last[stay])
-    added = (key[ends], numbers[ends], serial + ends)
+    kept, added = (part[stay] for part in opened), (key[ends], numbers[ends], serial + ends)
     return previous, numbers, OpenTrajectories(*(torch.cat(pair) for pair in zip(kept, added, strict=True)))
 
 
-def check_grown_state(
-    state: Mapping[str, Any], grow: int, ring: Mapping[NestedKey, Tensor]
-) -> tuple[int, int, dict[NestedKey, Tensor], OpenTrajectories]:
+def check_grown_state(state: Mapping[str, Any], ring: Columns) -> tuple[int, int, Columns, OpenTrajectories]:
     """Count, next number, rows and open trajectories of a growing storage's state, if they fit the ring."""
 
     def require(holds: bool, name: str, wanted: str) -> None:
         if not holds:
             raise ValueError(f"state_dict: {name} must be {wanted}")
 
+    grow = len(ring[TRAJECTORY])
     require(state.get("grow") == grow, "grow", f"{grow}, as this buffer's")
-    count, number = state.get("count"), state.get("number")
-    require(type(count) is int and 0 <= count < 2**62, "count", "a number of rows")
-    require(type(number) is int and 0 <= number < 2**62, "number", "a trajectory's number")
-    assert isinstance(count, int)
-    assert isinstance(number, int)
+    for name, wanted in (("count", "a number of rows"), ("number", "a trajectory's number")):
+        require(type(state.get(name)) is int and 0 <= state[name] < 2**62, name, wanted)
+    count, number, names = state["count"], state["number"], {column_name(key): key for key in ring}
     there = min(count, grow)
     given = state.get("rows")
-    names = {column_name(key): key for key in ring}
     require(isinstance(given, Mapping) and set(given) == set(names), "rows", f"the columns {', '.join(names)}")
-    rows = {}
-    for name, key in names.items():
-        leaf, like = given[name], ring[key]  # type: ignore[index]
-        fits = isinstance(leaf, Tensor) and leaf.dtype == like.dtype and leaf.shape == (there, *like.shape[1:])
-        require(fits, f"rows[{name!r}]", f"{like.dtype} of shape {(there, *like.shape[1:])}")
-        if leaf.dtype.is_floating_point:
-            require(finite(leaf), f"rows[{name!r}]", "finite numbers")
-        rows[key] = leaf
+    check_like(given, {name: ring[key][:there] for name, key in names.items()}, "state_dict: rows")
+    rows = {key: state["rows"][name] for name, key in names.items()}
+    for key, leaf in rows.items():
+        require(finite(leaf), f"rows[{column_name(key)!r}]", "finite numbers")
     if "action" in rows:
         require(bool((rows["action"].abs() <= 1).all()), "rows['action']", "in [-1, 1]")
     require(bool((rows[TRAJECTORY] < number).all()), f"rows[{column_name(TRAJECTORY)!r}]", f"below {number}")
-    given = state.get("open")
-    require(isinstance(given, Mapping) and set(given) == {"key", "number", "last"}, "open", "key, number and last")
-    parts = [given[name] for name in ("key", "number", "last")]  # type: ignore[index]
-    for part in parts:
-        fits = isinstance(part, Tensor) and part.dtype == torch.int64 and part.shape == parts[0].shape[:1]
-        require(fits, "open", "(K,) int64 each")
+    given, fields = state.get("open"), OpenTrajectories._fields
+    require(isinstance(given, Mapping) and set(given) == set(fields), "open", "key, number and last")
+    parts = [state["open"][name] for name in fields]
+    fits = (isinstance(part, Tensor) and part.dtype == torch.int64 and part.dim() == 1 for part in parts)
+    require(all(fits) and len({len(part) for part in parts}) == 1, "open", "(K,) int64 each")
     opened = OpenTrajectories(*(part.clone() for part in parts))
     inside = (opened.last >= count - there) & (opened.last < count)
     require(bool(inside.all()) and len(opened.last.unique()) == len(opened.last), "open", "of rows that are there")

@@ -1,10 +1,11 @@
-"""Cameras: pictures of MuJoCo states by Meta-World's cameras, one OpenGL context for all models."""
+"""Pictures of MuJoCo states by Meta-World's cameras, one OpenGL context for all models; and where their bodies are."""
 
 from __future__ import annotations
 
 import atexit
 import os
 import sys
+from collections.abc import Sequence
 from typing import Any
 from weakref import WeakSet
 
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lw_torchrl._rendering import RENDER_LIBRARIES
+from lw_torchrl.envs.engine import BodyPoses, RowModel
 
 _ROLLED = ("corner", "corner2", "corner3", "corner4")  # Meta-World hangs them upside down
 _MOST_GEOMS = 2000
@@ -71,25 +73,26 @@ class Cameras:
         _processes.add(os.getpid())
         self._loaded: dict[str, tuple[Any, Any]] = {}
 
-    def picture(self, scene: str, model: Any, data: Any, *, camera: str, height: int, width: int) -> NDArray[np.uint8]:
-        """One picture of a state, (height, width, 3) uint8; models with the same meshes share a ``scene``'s name."""
+    def picture(self, shown: RowModel, data: Any, *, camera: str, height: int, width: int) -> NDArray[np.uint8]:
+        """One picture of a state, (height, width, 3) uint8."""
         self._gl.make_current()
         try:
-            return self._picture(scene, model, data, camera, height, width)
+            return self._picture(shown, data, camera, height, width)
         finally:
             if type(self._gl).__module__ == "mujoco.egl":  # another thread may take the context
                 from OpenGL import EGL  # type: ignore[import-untyped]
 
                 EGL.eglReleaseThread()
 
-    def _picture(self, scene: str, model: Any, data: Any, camera: str, height: int, width: int) -> NDArray[np.uint8]:
-        if scene not in self._loaded:
+    def _picture(self, shown: RowModel, data: Any, camera: str, height: int, width: int) -> NDArray[np.uint8]:
+        path, model = shown
+        if path not in self._loaded:
             try:
                 context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
             except mujoco.FatalError as error:
                 raise _no_open_gl(error) from error
-            self._loaded[scene] = mujoco.MjvScene(model=model, maxgeom=_MOST_GEOMS), context
-        view, context = self._loaded[scene]
+            self._loaded[path] = mujoco.MjvScene(model=model, maxgeom=_MOST_GEOMS), context
+        view, context = self._loaded[path]
         if (context.offWidth, context.offHeight) != (width, height):
             mujoco.mjr_resizeOffscreen(width, height, context)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, context)
@@ -115,3 +118,31 @@ class Cameras:
             context.free()
         self._loaded = {}
         self._gl.free()
+
+
+class SeenRows:
+    """What an engine has whose rows can be seen."""
+
+    _cameras: Cameras | None = None
+
+    def _seen(self, row: int) -> tuple[RowModel, Any]:
+        """A row's model, with the row's own places in it, and MuJoCo's data."""
+        raise NotImplementedError
+
+    def render(self, rows: Sequence[int], *, camera: str, height: int, width: int) -> NDArray[np.uint8]:
+        """Pictures of the rows as they are now: (len(rows), height, width, 3) uint8, the first line on top."""
+        cameras = self._cameras = self._cameras or Cameras()
+        return np.stack([cameras.picture(*self._seen(row), camera=camera, height=height, width=width) for row in rows])
+
+    def model(self, row: int) -> RowModel:
+        """The model of a row."""
+        return self._seen(row)[0]
+
+    def poses(self, row: int) -> BodyPoses:
+        """Where all bodies of a row are now."""
+        data = self._seen(row)[1]
+        return BodyPoses(data.xpos.copy(), data.xquat.copy())
+
+    def close(self) -> None:
+        if self._cameras is not None:
+            self._cameras.close()

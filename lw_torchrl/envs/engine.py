@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from lw_torchrl.language.observation import ACTION_SIZE, OBSERVATION_SIZE
 
-__all__ = ["ACTION_SIZE", "OBSERVATION_SIZE", "BodyPoses", "Engine", "EngineStep", "Pictured", "Posed", "RowModel"]
+__all__ = ["ACTION_SIZE", "OBSERVATION_SIZE", "BodyPoses", "Engine", "EngineStep", "RowModel"]
 
 
 class EngineStep(NamedTuple):
@@ -36,28 +36,18 @@ class EngineStep(NamedTuple):
 
 
 class Engine(Protocol):
-    """Simulates N rows of Meta-World tasks."""
+    """Simulates N rows of Meta-World tasks. With the ``render`` of :class:`~lw_torchrl.envs.cameras.SeenRows` it also
+    gives pictures, with its ``model`` and ``poses`` recordings of the scene."""
 
     def reset(self, rows: Sequence[int], seeds: Sequence[int]) -> NDArray[np.float64]:
         """Start an episode in each of ``rows``, as Meta-World's own ``env.seed(seed); env.reset()`` does, whatever the
         row did before; returns the first observations, (len(rows), 39) float64."""
-        ...
 
     def step(self, action: NDArray[np.float32], active: NDArray[np.bool_]) -> EngineStep:
         """Step the rows where ``active`` (N, bool) with ``action`` (N, 4) in [-1, 1], in the action's own precision."""
-        ...
 
     def close(self) -> None:
         """Free the simulators."""
-        ...
-
-
-class Pictured(Engine, Protocol):
-    """An engine that also takes pictures, for ``LanguageWorldEnv.render``."""
-
-    def render(self, rows: Sequence[int], *, camera: str, height: int, width: int) -> NDArray[np.uint8]:
-        """Pictures of the rows as they are now: (len(rows), height, width, 3) uint8, the first line on top."""
-        ...
 
 
 class RowModel(NamedTuple):
@@ -73,15 +63,3 @@ class BodyPoses(NamedTuple):
 
     position: NDArray[np.float64]
     quaternion: NDArray[np.float64]
-
-
-class Posed(Engine, Protocol):
-    """An engine whose bodies can be read, for recordings of the scene."""
-
-    def model(self, row: int) -> RowModel:
-        """The model of a row."""
-        ...
-
-    def poses(self, row: int) -> BodyPoses:
-        """Where all bodies of a row are now."""
-        ...

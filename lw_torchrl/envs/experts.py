@@ -12,10 +12,10 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 
-from lw_torchrl._checks import missing_keys
-from lw_torchrl._keys import as_keys, dispatched, write
+from lw_torchrl._keys import as_keys, dispatched, read, write
 from lw_torchrl.envs.engine import ACTION_SIZE, OBSERVATION_SIZE
 from lw_torchrl.envs.engines.metaworld import import_metaworld
+from lw_torchrl.envs.row_states import row_mask
 from lw_torchrl.language.tasks import resolve_tasks, task_id
 
 _quiet = Lock()  # Python's filters of warnings are the process's: two threads would leave ours behind
@@ -60,9 +60,7 @@ class ExpertActor(TensorDictModuleBase):
 
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        observation, given = (tensordict.get(key, None) for key in self.in_keys)
-        if observation is None or given is None:
-            raise missing_keys(tensordict.keys(True, True), *self.in_keys)
+        observation, given = read(tensordict, self.in_keys)
         if observation.shape[-1:] != (OBSERVATION_SIZE,):
             raise ValueError(f"observation must have 39 numbers, got shape {tuple(observation.shape)}")
         if given.shape != observation.shape[:-1]:
@@ -72,17 +70,13 @@ class ExpertActor(TensorDictModuleBase):
             )
         states = observation.reshape(-1, OBSERVATION_SIZE).cpu().numpy().astype(np.float64)
         task_ids = given.reshape(-1).tolist()
-        mask = tensordict.get("_step", None)
-        wanted = [True] * len(task_ids) if mask is None else mask.reshape(-1).tolist()
         action = np.zeros((len(task_ids), ACTION_SIZE), dtype=np.float32)
         with _quiet, warnings.catch_warnings():
             # The scripts warn nearly every step that they ask for more than [-1, 1].
             warnings.filterwarnings("ignore", message="Constant\\(s\\) may be too high")
-            for row, (state, task) in enumerate(zip(states, task_ids, strict=True)):
-                if not wanted[row]:
-                    continue
-                if task not in self._policies:
+            for row in np.flatnonzero(row_mask(tensordict, "_step", len(task_ids))):
+                if (task := task_ids[row]) not in self._policies:
                     raise ValueError(f"task_id {task} is none of this expert's tasks: {', '.join(self.tasks)}")
-                action[row] = self._policies[task].get_action(state)
+                action[row] = self._policies[task].get_action(states[row])
         asked = torch.from_numpy(action).to(observation.device).reshape(*observation.shape[:-1], ACTION_SIZE)
         return write(tensordict, self, [asked.clamp(-1.0, 1.0), asked])

@@ -254,8 +254,7 @@ class LanguageWorldEnv(EnvBase):
     def _simulate(self, action: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """One step of the simulation of some rows, and their reward, (N,) float64."""
         result = self._engine.step(action, rows)
-        if (unstable := result.fault & rows).any():
-            self._report(unstable, "its simulation became unstable")
+        self._report(result.fault & rows, "its simulation became unstable")
         np.copyto(self._rows.observation, result.observation, casting="same_kind", where=rows[:, None])
         success = result.success & rows
         self._rows.success |= success
@@ -313,7 +312,9 @@ class LanguageWorldEnv(EnvBase):
         if (self._rows.episode[list(asked)] < 0).any():
             raise RuntimeError("there is nothing to see before a reset: call env.reset()")
         if not hasattr(self._engine, "render"):
-            raise NotImplementedError(f"engine {type(self._engine).__name__} has no render; see lw_torchrl.envs.engine")
+            raise NotImplementedError(
+                f"engine {type(self._engine).__name__} has no render; see lw_torchrl.envs.cameras"
+            )
         if not asked:
             return torch.zeros(0, height, width, 3, dtype=torch.uint8)
         pictures = torch.from_numpy(self._engine.render(asked, camera=camera, height=height, width=width))

@@ -16,6 +16,17 @@ from lw_torchrl.envs.engine import ACTION_SIZE, OBSERVATION_SIZE
 from lw_torchrl.language.tasks import MT50, task_id
 
 
+def _moving(method: Callable[..., Any], move: Callable[..., Tensor]) -> Any:
+    """A method of Categorical that makes another spec, whose ids are moved alike."""
+
+    def make(self: TaskIds, *args: Any, **kwargs: Any) -> TaskIds:
+        made = method(self, *args, **kwargs)
+        made.ids = None if self.ids is None else move(self.ids, *args, **kwargs)
+        return made
+
+    return make
+
+
 class TaskIds(Categorical):
     """Each row's task: a Categorical whose zero is the row's own id, (N,) int64, so that policies can act on
     ``fake_tensordict()``, which is of zeros: they may not know the task of id 0."""
@@ -32,34 +43,14 @@ class TaskIds(Categorical):
             return super().zero(shape)
         return self.ids.expand((*(shape or ()), *self.shape)).clone()
 
-    def _with(self, made: TaskIds, ids: Callable[[Tensor], Tensor]) -> TaskIds:
-        made.ids = None if self.ids is None else ids(self.ids)
-        return made
-
-    def expand(self, *shape: Any) -> TaskIds:
-        made = super().expand(*shape)
-        return self._with(made, lambda ids: ids.expand(made.shape))
-
-    def _reshape(self, shape: Any) -> TaskIds:
-        return self._with(super()._reshape(shape), lambda ids: ids.reshape(shape))
-
-    def _unflatten(self, dim: int, sizes: Any) -> TaskIds:
-        return self._with(super()._unflatten(dim, sizes), lambda ids: ids.unflatten(dim, sizes))
-
-    def squeeze(self, dim: int | None = None) -> TaskIds:
-        return self._with(super().squeeze(dim), lambda ids: ids.squeeze() if dim is None else ids.squeeze(dim))
-
-    def unsqueeze(self, dim: int) -> TaskIds:
-        return self._with(super().unsqueeze(dim), lambda ids: ids.unsqueeze(dim))
-
-    def to(self, dest: Any) -> TaskIds:
-        return self._with(super().to(dest), lambda ids: ids if isinstance(dest, torch.dtype) else ids.to(dest))
-
-    def clone(self) -> TaskIds:
-        return self._with(super().clone(), Tensor.clone)
-
-    def __getitem__(self, index: Any) -> TaskIds:
-        return self._with(super().__getitem__(index), lambda ids: ids[index])
+    expand = _moving(Categorical.expand, Tensor.expand)
+    _reshape = _moving(Categorical._reshape, Tensor.reshape)
+    _unflatten = _moving(Categorical._unflatten, Tensor.unflatten)
+    squeeze = _moving(Categorical.squeeze, lambda ids, dim=None: ids.squeeze() if dim is None else ids.squeeze(dim))
+    unsqueeze = _moving(Categorical.unsqueeze, Tensor.unsqueeze)
+    to = _moving(Categorical.to, lambda ids, dest: ids if isinstance(dest, torch.dtype) else ids.to(dest))
+    clone = _moving(Categorical.clone, Tensor.clone)
+    __getitem__ = _moving(Categorical.__getitem__, Tensor.__getitem__)
 
 
 def observation_spec(task_id: Tensor) -> Composite:
@@ -109,7 +100,6 @@ def clipped_action(tensordict: TensorDictBase, batch_size: torch.Size) -> Tensor
 
 
 Rows = NDArray[np.intp]
-Mask = NDArray[np.bool_]
 
 
 class RowStates:

@@ -66,8 +66,7 @@ def stated_episode(tensordict: TensorDictBase | None, episode: int | Tensor | No
 
 
 class EpisodeCounter:
-    """The m-th reset of the r-th of a task's R rows in the w-th of W workers is episode (m·W + w)·R + r, so that W
-    environments of R rows run the episodes of one with W·R rows; ``worker`` is (w, W)."""
+    """Which episodes the rows of :class:`LanguageWorldEnv` run, as it says there; ``worker`` is (w, W)."""
 
     def __init__(self, tasks: Sequence[Task], seed: int, worker: tuple[int, int]) -> None:
         self.tasks = tuple(tasks)
@@ -91,18 +90,13 @@ class EpisodeCounter:
     def asked(self, episode: int | Tensor, rows: Rows) -> Episodes:
         """The requested episodes of ``rows``, from one integer for all, or an int64 tensor (N,) with one for each."""
         n = len(self.names)
-        if isinstance(episode, Tensor) and (
-            episode.shape not in ((), (n,)) or episode.dtype not in (torch.int64, torch.int32)
-        ):
-            raise ValueError(
-                f"episode must be an integer, or int64 of shape ({n},), one for each row, got {episode.dtype} of "
-                f"shape {tuple(episode.shape)}"
-            )
-        if not isinstance(episode, Tensor):
-            if check_int("episode", episode, minimum=0) >= 2**63:
-                raise ValueError(f"episode must be below 2**63, got {shown(episode)}")
-            episode = torch.tensor(episode)
-        found = episode.expand(n).cpu().numpy().astype(np.int64)[rows]
+        if isinstance(episode, Tensor):
+            if episode.shape not in ((), (n,)) or episode.dtype not in (torch.int64, torch.int32):
+                given = f"{episode.dtype} of shape {tuple(episode.shape)}"
+                raise ValueError(f"episode must be an integer, or int64 of shape ({n},), one for each row, got {given}")
+        elif check_int("episode", episode, minimum=0) >= 2**63:
+            raise ValueError(f"episode must be below 2**63, got {shown(episode)}")
+        found = torch.as_tensor(episode).expand(n).cpu().numpy().astype(np.int64)[rows]
         if (found < 0).any():
             raise ValueError(f"episode must be at least 0, got {found.min()}")
         return found

@@ -32,21 +32,19 @@ def _remote(found: Locals) -> tuple[int, int]:
     return (0, 1) if index is None or parent_process() is not None else (index, MANY)
 
 
+_BATCHED = "torchrl.envs.batched_envs"
 # Where TorchRL (0.14), which tells a factory nothing of its worker, calls one: module and function to its (rank, of),
 # from the function's local variables. A factory must not give each worker the same episodes.
 _WORKERS: dict[tuple[str, str], Callable[[Locals], tuple[int, int]]] = {
-    ("torchrl.envs.batched_envs", "SerialEnv._start_workers"): lambda found: (found["idx"], found["_num_workers"]),
+    (_BATCHED, "SerialEnv._start_workers"): lambda found: (found["idx"], found["_num_workers"]),
     # An environment of environments, which starts its own at its first reset.
-    ("torchrl.envs.batched_envs", "SerialEnv._reset"): lambda found: (found["i"], found["self"].num_workers),
+    (_BATCHED, "SerialEnv._reset"): lambda found: (found["i"], found["self"].num_workers),
     ("torchrl.envs.async_envs", "ThreadingAsyncEnvPool._setup"): _threads,
     ("torchrl.collectors._single", "Collector.__init__"): _remote,
 }
 _WORKER_PROCESSES: dict[tuple[str, str], Callable[[Locals], tuple[int, int]]] = {
-    ("torchrl.envs.batched_envs", "_run_worker_pipe_shared_mem"): lambda found: (
-        found["worker_idx"],
-        len(found["shm_done_flags"]),
-    ),
-    ("torchrl.envs.batched_envs", "_run_worker_pipe_direct"): lambda found: _by_process(-1),
+    (_BATCHED, "_run_worker_pipe_shared_mem"): lambda found: (found["worker_idx"], len(found["shm_done_flags"])),
+    (_BATCHED, "_run_worker_pipe_direct"): lambda found: _by_process(-1),
     ("torchrl.envs.async_envs", "ProcessorAsyncEnvPool._env_exec"): lambda found: (found["i"], MANY),
     ("torchrl.collectors._runner", "_main_async_collector_impl"): lambda found: (found["idx"], MANY),
 }

@@ -4,7 +4,7 @@ import lw_torchrl._torchrl  # noqa: F401
 from lw_torchrl.evaluation.attribution import attribute_failures
 from lw_torchrl.evaluation.evaluator_figures import WrongAnswer, plot_reliability, plot_wrong_answers, wrong_answers
 from lw_torchrl.evaluation.evaluator_report import Drift, EvaluatorReport, condition_drift, drift_table, score_evaluator
-from lw_torchrl.evaluation.failures import CAUSES, Failure
+from lw_torchrl.evaluation.failure_records import CAUSES, Failure
 from lw_torchrl.evaluation.figures import (
     plot_failures,
     plot_learning_curves,

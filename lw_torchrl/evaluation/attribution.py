@@ -24,7 +24,7 @@ from lw_torchrl.evaluation.explanation import (
     settled,
     states_of,
 )
-from lw_torchrl.evaluation.failures import Cause, Failure
+from lw_torchrl.evaluation.failure_records import Cause, Failure
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.skills import ScriptedSkill, load_skills
 from lw_torchrl.language.tasks import TASKS, task_id
@@ -70,43 +70,41 @@ def attribute_failures(
 
     **A rule explains.** *Query*, if the policy acted on other answers than the query answering function gives in the
     same states; else *plan*, if late in the episode the plan's true step asks for something else than the reference
-    plan's; else *skill*. Without ``actor`` that is all. Without a reference the rule is weak: it tells wrong answers, a
-    plan of which no condition holds, and a skill that stays far from where it goes; the rest is undecided. Even with a
-    reference it is no proof, since another plan that succeeds may ask for other things.
+    plan's, which is no proof: another plan that succeeds may; else *skill*. Without a reference the rule is weak: it
+    tells wrong answers, a plan of which no condition holds, and a skill that stays far from where it goes; the rest is
+    undecided. Without ``actor`` that is all.
 
     **A counterfactual decides**, with ``actor``: the very same episode, its noise too, is run again with true answers,
     where they were wrong; with scripted skills in one step of the plan, or, if that mends nothing, in all (where a text
     is no scripted skill, with the expert's actions); with the reference plan; with twice the time. What alone mends the
     episode is its cause. Where several do, the smallest exchange counts: answers, a skill in one step, the plan,
-    skills in all steps, unless a larger one mends clearly more of the task's failed episodes. Time counts where
-    nothing else mends. Where no single exchange mends, pairs are tried, which give ``cause`` and ``also``. One mended
-    episode may be luck: ``evidence`` holds how much of the task's failed episodes each exchange mended.
+    skills in all steps, unless a larger one mends clearly more of the task's failed episodes; time counts last. Where
+    none mends, pairs are tried, which give ``cause`` and ``also``. One mended episode may be luck: ``evidence`` holds
+    how much of the task's failed episodes each exchange mended.
 
     Args:
         rollouts: episodes as :func:`evaluate` gives them to ``on_episode``, or TensorDicts of batch (T,), each one
             episode from its first state on; those with success are left out. Keys: ``observation`` (T, 39) float32,
             ``task_id`` (T,) int64, ``("next", "success")`` (T, 1) bool; of a TensorDict ``episode`` (T,) int64.
-            Optional: ``qaf`` (T, S) bool, the answers that the policy acted on, or ``qaf_logits`` (T, S) float32, which
-            count before ``qaf``; ``skill_weights`` (T, S) float32, for the step in force.
+            Optional: the answers that the policy acted on, ``qaf_logits`` (T, S) float32, else ``qaf`` (T, S) bool;
+            ``skill_weights`` (T, S) float32, for the step in force.
         plans: the plans that were carried out.
-        actor: what acted: anything with ``plans`` and ``with_plans`` that writes ``action`` and ``skill_weights``. None
-            for the rule alone. One that draws its actions cannot be run again alike; its exchanges tell less.
-        reference: other plans for the same tasks, which are trusted. Tasks that they lack have no reference.
-        evaluator: what answered in the query answering function's place, between it and the actor: a module or
-            function that writes ``qaf`` into the tensordict (read with ``observation`` and ``task_id``), a
-            :class:`QueryEvaluator`, or a :class:`torchrl.envs.Transform` that writes ``qaf``. An evaluator inside the
-            policy is found there.
-        skills: the scripted skills by text that are trusted, as from :func:`load_skills`; None for the shipped ones.
+        actor: what acted: anything with ``plans`` and ``with_plans`` that writes ``action`` and ``skill_weights``. One
+            that draws its actions cannot be run again alike; its exchanges tell less.
+        reference: other plans, for some of the tasks, which are trusted.
+        evaluator: what answered in the query answering function's place, between it and the actor: a
+            :class:`QueryEvaluator`, or a module, function or :class:`torchrl.envs.Transform` that writes ``qaf``. An
+            evaluator inside the policy is found there.
+        skills: the scripted skills by text that are trusted; None for the shipped ones, :func:`load_skills`.
         seed, noise_scale, max_steps, engine: with which the episodes were run.
-        num_envs, num_threads, device: as for :func:`evaluate`; the result depends on none of them.
-        progress: show a bar for each exchange.
+        num_envs, num_threads, device, progress: as for :func:`evaluate`.
 
     Returns:
         A :class:`Failure` for each failed episode, in the order of the rollouts.
 
     Raises:
-        ValueError: a rollout without a key that is needed, twice the same episode, a task without a plan, plans that
-            are not the actor's, or an episode that does not begin as (task, seed, episode) does.
+        ValueError: a rollout lacks a key, the same episode twice, a task without a plan, plans that are not the
+            actor's, or an episode that does not begin as (task, seed, episode) does.
 
     Warns:
         UserWarning: the policy cannot carry out the reference; no plan is exchanged.
@@ -119,16 +117,10 @@ def attribute_failures(
         >>> plans = lw.Plans({"reach": lw.load_plans("MT10")["reach"]})
         >>> spoilt = {text: replace(skill, offset=(0.1, 0.0, 0.0)) for text, skill in lw.load_skills().items()}
         >>> actor, episodes = lw.ScriptedSkillActor(plans, skills=spoilt), []
-        >>> result = lw.evaluate(
-        ...     actor,
-        ...     tasks="reach",
-        ...     episodes_per_task=1,
-        ...     seed=1_000,
-        ...     max_steps=100,
-        ...     also_record=["observation", "task_id", "qaf", "skill_weights"],
-        ...     on_episode=episodes.append,
-        ... )
-        >>> [failure] = attribute_failures(episodes, plans, actor=actor, seed=1_000, max_steps=100)
+        >>> run, keys = {"seed": 1_000, "max_steps": 100}, ["observation", "task_id", "qaf", "skill_weights"]
+        >>> told = {"also_record": keys, "on_episode": episodes.append}
+        >>> _ = lw.evaluate(actor, tasks="reach", episodes_per_task=1, **run, **told)
+        >>> [failure] = attribute_failures(episodes, plans, actor=actor, **run)
         >>> failure.cause, failure.swaps
         ('skill', {'skill': True})
 
@@ -137,8 +129,7 @@ def attribute_failures(
     answered = as_plans(plans)
     check_scale("noise_scale", noise_scale)
     check_int("max_steps", max_steps, minimum=1)
-    if num_envs is not None:
-        check_int("num_envs", num_envs, minimum=1)
+    check_int("num_envs", 1 if num_envs is None else num_envs, minimum=1)
     if actor is not None and (own := plans_of(actor)) is not None and (other := answered.differences(own)):
         raise ValueError(f"plans differ from the actor's own for {', '.join(other)}; pass the actor's plans")
     table = load_skills() if skills is None else skills
@@ -148,8 +139,8 @@ def attribute_failures(
     if not failed:
         return []
     names = sorted({task for task, _, _ in failed})
-    others = {} if reference is None else as_plans(reference, "reference")
-    others = {task: plan for task, plan in others.items() if task in names}
+    given = {} if reference is None else as_plans(reference, "reference")
+    others = {task: plan for task, plan in given.items() if task in names}
     trusted = Plans(others) if others else None
     seen = [states_of(task, k, steps, answered, _answers(steps, actor)) for task, k, steps in failed]
     scripts = Scripts(answered, table)
@@ -177,32 +168,25 @@ def _failed(
     found: list[tuple[str, int, TensorDictBase]] = []
     seen: set[EpisodeId] = set()
     for place, rollout in enumerate(rollouts):
-        steps = rollout.steps if isinstance(rollout, FinishedEpisode) else rollout
+        steps, number = (rollout.steps, rollout.episode) if isinstance(rollout, FinishedEpisode) else (rollout, None)
         if not isinstance(steps, TensorDictBase) or steps.batch_dims != 1 or not len(steps):
-            raise ValueError(
-                f"rollouts[{place}] must be a finished episode, or a TensorDict of batch (T,), got "
-                f"{type(steps).__name__}"
-            )
-        needed = ["observation", "task_id", ("next", "success")]
-        needed += [] if isinstance(rollout, FinishedEpisode) else ["episode"]
+            what = type(steps).__name__
+            raise ValueError(f"rollouts[{place}] must be a finished episode, or a TensorDict of batch (T,), got {what}")
+        needed = ["observation", "task_id", ("next", "success"), *(["episode"] if number is None else [])]
         if missing := [key for key in needed if steps.get(key, None) is None]:
             raise missing_keys(steps.keys(True, True), *(str(key) for key in missing))
-        given = steps.get("task_id").unique().tolist()
-        if len(given) != 1 or given[0] not in by_id:
-            raise ValueError(f"rollouts[{place}] must be of one task that plans has, {', '.join(plans)}; got {given}")
-        task = by_id[given[0]]
-        if isinstance(rollout, FinishedEpisode):
-            episode = rollout.episode
-        else:
-            episodes = steps.get("episode").unique().tolist()
-            if len(episodes) != 1:
-                raise ValueError(f"rollouts[{place}] must be one episode, got {len(episodes)}: split them")
-            episode = episodes[0]
-        if (task, episode) in seen:
-            raise ValueError(f"rollouts[{place}] is episode {episode} of {task!r} again")
-        seen.add((task, episode))
+        tasks = steps.get("task_id").unique().tolist()
+        if len(tasks) != 1 or tasks[0] not in by_id:
+            raise ValueError(f"rollouts[{place}] must be of one task that plans has, {', '.join(plans)}; got {tasks}")
+        episodes = steps.get("episode").unique().tolist() if number is None else [number]
+        if len(episodes) != 1:
+            raise ValueError(f"rollouts[{place}] must be one episode, got {len(episodes)}: split them")
+        which = by_id[tasks[0]], episodes[0]
+        if which in seen:
+            raise ValueError(f"rollouts[{place}] is episode {which[1]} of {which[0]!r} again")
+        seen.add(which)
         if not steps.get(("next", "success")).any():
-            found.append((task, episode, steps))
+            found.append((*which, steps))
     return found
 
 
@@ -234,14 +218,7 @@ def keys_to_attribute(actor: Any, env: EnvBase) -> list[NestedKey]:
 
 def decide(mended: Iterable[str], shares: Mapping[str, float]) -> str | None:
     """Of the single exchanges that mend an episode, the one that counts: the smallest, unless a larger one mends more
-    of the task's failed episodes by 0.3 of them. More time counts alone; None of none.
-
-    Example:
-        >>> decide(["plan", "skill"], {"plan": 0.5, "skill": 0.5})
-        'skill'
-        >>> decide(["plan", "skill"], {"plan": 0.9, "skill": 0.1})
-        'plan'
-    """
+    of the task's failed episodes by 0.3 of them. More time counts alone; None of none."""
     given = set(mended)
     best = None
     for name in _EXCHANGES:
@@ -263,10 +240,8 @@ def decide_pair(mended: Iterable[str], shares: Mapping[str, float]) -> tuple[Cau
 
 
 def _by_rule(one: EpisodeStates, told: Explanation, seed: int) -> Failure:
-    """What the states alone tell."""
     cause = told.cause
-    words = ["The states alone do not tell"] if cause == "undecided" else []
-    why = _text(*words, told.why[cause])
+    why = _text(*(["The states alone do not tell"] if cause == "undecided" else []), told.why[cause])
     return Failure(one.task, seed, one.episode, cause, None, told.steps[cause], told.at[cause], why, told.evidence)
 
 

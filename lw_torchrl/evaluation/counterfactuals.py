@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import closing, nullcontext
 from copy import deepcopy
 from dataclasses import dataclass
+from itertools import groupby
+from operator import itemgetter
 from typing import Any
 
 import torch
@@ -20,8 +22,8 @@ from lw_torchrl.envs.episodes import policy_of, run_episodes
 from lw_torchrl.envs.experts import ExpertActor
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.evaluation.explanation import EpisodeStates, Scripts, attended, candidates, unlike_scripts
-from lw_torchrl.language.plan_tables import PlanTables
 from lw_torchrl.language.plans import Plans
+from lw_torchrl.language.task_index import PlanTables
 from lw_torchrl.language.tasks import TASKS, Task, task_id
 from lw_torchrl.modules.networks import evaluating
 from lw_torchrl.modules.plan_encoder import IN_FORCE
@@ -105,10 +107,8 @@ def answered_by(actor: Any, evaluator: Any) -> Any:
 
 
 class WithScripts(nn.Module):
-    """A policy whose skills are scripted ones: its attention mixes their actions, where it singles any steps out.
-
-    Where the step in force has no scripted skill, the action is the expert's.
-    """
+    """A policy whose attention mixes scripted skills' actions, where it singles any steps out; where the step in force
+    has no scripted skill, the action is the expert's."""
 
     def __init__(self, actor: Acts, plans: Plans, scripts: Scripts, steps: Mapping[EpisodeId, int] | None) -> None:
         super().__init__()
@@ -166,73 +166,60 @@ class Rerun:
     def __call__(
         self, what: str, which: Sequence[EpisodeId], actor: Any, plans: Plans, evaluator: Any = None, longer: int = 1
     ) -> dict[EpisodeId, int | None]:
-        """Each episode's first successful step, counted from 0, or None; :class:`ValueError` if one does not begin as
-        it was recorded. Episodes may be ``longer`` by this factor."""
-        wanted: dict[str, list[int]] = {}
-        for task, episode in sorted(which):
-            wanted.setdefault(task, []).append(episode)
+        """Each episode's first successful step, from 0, or None; episodes may be ``longer`` by this factor."""
+        wanted = {task: [k for _, k in listed] for task, listed in groupby(sorted(which), itemgetter(0))}
         rows = len(wanted) * max(1, min(max(map(len, wanted.values())), _ROWS // len(wanted)))
-        if self.num_envs is not None:
-            rows = max(len(wanted), min(rows, self.num_envs))
+        rows = max(len(wanted), min(rows, self.num_envs or rows))
         max_steps, scale = self.max_steps * longer, self.noise_scale
         tasks = [self.tasks[task] for task in wanted]
         base = LanguageWorldEnv(tasks, num_envs=rows, max_steps=max_steps, strict=True, **self.env)
         env = make_env(actor.actor if isinstance(actor, WithScripts) else actor, plans, base, evaluator)
         actor = answered_by(actor, evaluator)
         found: dict[EpisodeId, int | None] = {}
-        try:
-            mode = evaluating(actor) if isinstance(actor, nn.Module) else nullcontext()
-            bar = Progress(f"again with {what}", len(which) * max_steps, "step", show=self.progress)
-            with mode, bar, torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-                for one in run_episodes(
-                    env,
-                    policy_of(actor, self.device),
-                    wanted,
-                    keys=["observation", ("next", "success")],
-                    noise=(lambda _: (scale,) * 4) if scale else None,
-                    after_success=0,
-                    on_progress=bar.update,
-                ):
-                    if not torch.equal(one.steps.get("observation")[0], self.firsts[one.task, one.episode]):
-                        raise ValueError(
-                            f"rollouts: episode {one.episode} of {one.task!r} does not begin as episode {one.episode} "
-                            f"of seed={self.env['seed']} does; give the seed and the engine that it was run with, and "
-                            "the episode from its first state on"
-                        )
-                    first = one.first_success
-                    found[one.task, one.episode] = None if first is None else first - 1
-        finally:
-            env.close()
+        mode = evaluating(actor) if isinstance(actor, nn.Module) else nullcontext()
+        deterministic = set_exploration_type(ExplorationType.DETERMINISTIC)
+        bar = Progress(f"again with {what}", len(which) * max_steps, "step", show=self.progress)
+        with closing(env), mode, bar, torch.no_grad(), deterministic:
+            for one in run_episodes(
+                env,
+                policy_of(actor, self.device),
+                wanted,
+                keys=["observation", ("next", "success")],
+                noise=(lambda _: (scale,) * 4) if scale else None,
+                after_success=0,
+                on_progress=bar.update,
+            ):
+                if not torch.equal(one.steps.get("observation")[0], self.firsts[one.task, one.episode]):
+                    raise ValueError(
+                        f"rollouts: episode {one.episode} of {one.task!r} does not begin as episode {one.episode} of "
+                        f"seed={self.env['seed']} does; give the seed and the engine that it was run with, and the "
+                        "episode from its first state on"
+                    )
+                first = one.first_success
+                found[one.task, one.episode] = None if first is None else first - 1
         return found
 
 
 class Counterfactuals:
-    """Runs the exchanges that are worth it, and keeps what each gave.
-
-    Attributes:
-        found: an exchange's name to the episodes that it was tried in, and their first successful step.
-        step: of episodes that a script in one step mends, that step.
-    """
+    """Runs the exchanges that are worth it, and keeps what each gave."""
 
     def __init__(
         self, actor: Any, plans: Plans, evaluator: Any, reference: Plans | None, scripts: Scripts, rerun: Rerun
     ) -> None:
         self.actor, self.plans, self.evaluator, self.scripts, self.rerun = actor, plans, evaluator, scripts, rerun
-        self.found: dict[str, dict[EpisodeId, int | None]] = {}
-        self.step: dict[EpisodeId, int] = {}
+        self.found: dict[str, dict[EpisodeId, int | None]] = {}  # exchange to episodes and their first success
+        self.step: dict[EpisodeId, int] = {}  # in which a script mends the episode
         self.reference: Plans | None = None
-        self.other, self.other_evaluator = None, evaluator  # that carry out the reference
+        self.other = self.other_evaluator = None  # that carry out the reference
         different = [] if reference is None else [reference[task] for task in reference.differences(plans)]
         if not different:
             return
         reference = Plans(different)
         try:
-            self.other = actor.with_plans(reference)
-            if hasattr(evaluator, "with_plans"):
-                self.other_evaluator = evaluator.with_plans(reference)
-            self.reference = reference
+            other = actor.with_plans(reference)
+            theirs = evaluator.with_plans(reference) if hasattr(evaluator, "with_plans") else evaluator
+            self.other, self.other_evaluator, self.reference = other, theirs, reference
         except (AttributeError, ImportError, RuntimeError, TypeError, ValueError) as error:
-            self.other = None
             warnings.warn(
                 f"reference: the policy cannot carry it out, so no plan is exchanged ({type(error).__name__}: {error})",
                 stacklevel=4,
@@ -256,15 +243,12 @@ class Counterfactuals:
         if can_answer:
             pair = [one for one in left if one in wrong]
             self._run("query + skill", "true answers and scripts", pair, self._scripted(true, self.plans), self.plans)
-            if self.other is not None and self.reference is not None:
-                both = [one for one in pair if one in with_reference]
-                other = with_true_answers(self.other)
-                self._run("query + plan", "true answers and the reference plan", both, other, self.reference)
-        if self.other is not None and self.reference is not None:
-            left = [one for one in self._unmended(left, "query + skill", "query + plan") if one in with_reference]
-            other = self._scripted(self.other, self.reference)
-            what = "the reference plan and scripts"
-            self._run("plan + skill", what, left, other, self.reference, self.other_evaluator)
+            both, other = [one for one in pair if one in with_reference], with_true_answers(self.other)
+            self._run("query + plan", "true answers and the reference plan", both, other, self.reference)
+        left = [one for one in self._unmended(left, "query + skill", "query + plan") if one in with_reference]
+        other = self._scripted(self.other, self.reference)
+        what = "the reference plan and scripts"
+        self._run("plan + skill", what, left, other, self.reference, self.other_evaluator)
 
     def _mends(self, name: str, which: EpisodeId) -> bool:
         return self.found.get(name, {}).get(which) is not None
@@ -276,7 +260,9 @@ class Counterfactuals:
         if which and actor is not None and plans is not None:
             self.found.setdefault(name, {}).update(self.rerun(what, which, actor, plans, *options))
 
-    def _scripted(self, actor: Any, plans: Plans, steps: Mapping[EpisodeId, int] | None = None) -> WithScripts:
+    def _scripted(self, actor: Any, plans: Plans | None, steps: Mapping[EpisodeId, int] | None = None) -> Any:
+        if actor is None or plans is None:
+            return None
         scripts = self.scripts if plans is self.plans else Scripts(plans, self.scripts.table)
         return WithScripts(actor, plans, scripts, steps)
 

@@ -19,7 +19,6 @@ from lw_torchrl.modules.networks import evaluating
 from lw_torchrl.training.labelled_queries import Asked, LabelledQueries
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
@@ -30,7 +29,7 @@ def plot_reliability(report: EvaluatorReport, path: str | os.PathLike[str] | Non
 
     Args:
         report: of :func:`score_evaluator`.
-        path: an image file, .png, .svg, .pdf or .jpg, replaced whole; None for none.
+        path: as for :func:`plot_success`.
 
     Example:
         >>> import torch
@@ -63,16 +62,9 @@ def plot_reliability(report: EvaluatorReport, path: str | os.PathLike[str] | Non
 
 @dataclass(frozen=True)
 class WrongAnswer:
-    """A state in which a clause was answered wrongly.
-
-    Attributes:
-        clause: what was asked.
-        holds: whether it holds.
-        believed: the probability that it was given.
-        pixels: (H, W·C, 3) uint8, what was seen.
-        off: for the subject and the object, where they are told by name, how far they were taken to be from where they
-            are, metres.
-    """
+    """A state in which a clause was answered wrongly: whether it holds, the probability that was believed, the
+    ``pixels`` (H, W·C, 3) uint8 that were seen, and for the subject and the object, where they are told by name, how
+    far ``off`` they were taken to be, metres."""
 
     clause: Clause
     holds: bool
@@ -83,37 +75,23 @@ class WrongAnswer:
 
 @checked
 def wrong_answers(evaluator: ImageQueryEvaluator, data: LabelledQueries, most: int = 12) -> list[WrongAnswer]:
-    """The surest wrong answers in held-out states, at most one of each clause.
+    """The surest wrong answers in held-out states, at most one of each clause and ``most`` in all.
 
     Args:
-        evaluator: of pictures.
-        data: with pictures, and states that are held out.
-        most: so many at most.
+        evaluator, data: of pictures.
     """
-    found: list[WrongAnswer] = []
-    for asked in data.parts["states"]:
-        found += _worst(evaluator, asked)
+    found = []
+    with torch.no_grad(), evaluating(evaluator):
+        for asked in data.parts["states"]:
+            logits, truth = clause_logits(evaluator, asked)[0]
+            believed = logits.sigmoid()
+            surest = (believed - truth.float()).abs().argmax(0).tolist()  # of each clause
+            for column, (row, clause) in enumerate(zip(surest, asked.clauses, strict=True)):
+                told, holds = float(believed[row, column]), bool(truth[row, column])
+                if (told > 0.5) != holds:
+                    off = _off(evaluator, asked, row, clause)
+                    found.append(WrongAnswer(clause, holds, told, asked.seen("pixels")[row], off))
     return sorted(found, key=lambda one: -abs(one.believed - one.holds))[:most]
-
-
-@torch.no_grad()
-def _worst(evaluator: ImageQueryEvaluator, asked: Asked) -> list[WrongAnswer]:
-    """Of each clause that was ever answered wrongly, the surest wrong answer."""
-    with evaluating(evaluator):
-        logits, truth = clause_logits(evaluator, asked)[0]
-        believed = logits.sigmoid()
-        off = (believed - truth.float()).abs()
-        return [
-            WrongAnswer(
-                asked.clauses[column],
-                bool(truth[row, column]),
-                float(believed[row, column]),
-                asked.seen("pixels")[row],
-                _off(evaluator, asked, row, asked.clauses[column]),
-            )
-            for column, row in enumerate(off.argmax(0).tolist())
-            if (believed[row, column] > 0.5) != truth[row, column]
-        ]
 
 
 def _off(evaluator: ImageQueryEvaluator, asked: Asked, row: int, clause: Clause) -> dict[str, float]:
@@ -133,11 +111,8 @@ def plot_wrong_answers(
     the things were taken to be.
 
     Args:
-        evaluator, data, most: as for :func:`wrong_answers`.
-        path: an image file, .png, .svg, .pdf or .jpg, replaced whole; None for none.
-
-    Raises:
-        ValueError: another format; no state is held out.
+        evaluator, data, most: as for :func:`wrong_answers`; data that hold out no state raise :class:`ValueError`.
+        path: as for :func:`plot_success`.
     """
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
@@ -153,15 +128,11 @@ def plot_wrong_answers(
     for axes in panels:
         axes.axis("off")
     for axes, one in zip(panels, found, strict=False):
-        _draw(axes, one)
+        axes.imshow(one.pixels.numpy())
+        said = f"{one.clause}: {'holds' if one.holds else 'does not hold'}, believed with {one.believed:.2f}"
+        axes.set_title(fill(said, 44), fontsize=8)
+        off = ", ".join(f"{name} {100 * far:.1f} cm off" for name, far in one.off.items())
+        axes.text(0.5, -0.03, off, transform=axes.transAxes, ha="center", va="top", fontsize=8, color="#b04a3a")
     if not found:
         panels[0].text(0.5, 0.5, "no answer was wrong", ha="center")
     return saved(figure, path)
-
-
-def _draw(axes: Axes, one: WrongAnswer) -> None:
-    axes.imshow(one.pixels.numpy())
-    said = f"{one.clause}: {'holds' if one.holds else 'does not hold'}, believed with {one.believed:.2f}"
-    axes.set_title(fill(said, 44), fontsize=8)
-    off = ", ".join(f"{name} {100 * far:.1f} cm off" for name, far in one.off.items())
-    axes.text(0.5, -0.03, off, transform=axes.transAxes, ha="center", va="top", fontsize=8, color="#b04a3a")

@@ -31,14 +31,10 @@ _ROWS = 256
 
 @dataclass(frozen=True)
 class PartScore:
-    """How an evaluator answers one part of :class:`LabelledQueries`.
-
-    Attributes:
-        right, asked: by predicate, how often it was right and asked where the predicate does not hold, and where it
-            holds. A negation counts with what it negates.
-        reliability: (15, 3) float64, of the answers by their probability that the predicate holds, in bins of equal
-            width: how many there are, the sum of their probabilities, and how often the predicate holds.
-    """
+    """How an evaluator answers one part of :class:`LabelledQueries`: by predicate, how often it was ``right`` and
+    ``asked`` where the predicate does not hold, and where it holds; a negation counts with what it negates. The
+    ``reliability``, (15, 3) float64, is of the answers by their probability that the predicate holds, in bins of equal
+    width: how many there are, the sum of their probabilities, and how often the predicate holds."""
 
     right: dict[str, tuple[int, int]]
     asked: dict[str, tuple[int, int]]
@@ -95,12 +91,8 @@ class PartScore:
 
 @dataclass(frozen=True)
 class EvaluatorReport:
-    """How an evaluator answers what was held out.
-
-    Attributes:
-        parts: by name, "states", "queries" and "tasks", as far as there are any.
-        about: what was trained and held out, as JSON.
-    """
+    """How an evaluator answers what was held out: ``parts`` "states", "queries" and "tasks", as far as there are any;
+    ``about`` says as JSON what was trained and held out."""
 
     parts: dict[str, PartScore]
     about: dict[str, Any]
@@ -125,14 +117,7 @@ class EvaluatorReport:
 
 @checked
 def score_evaluator(evaluator: ClauseEvaluator, data: LabelledQueries) -> EvaluatorReport:
-    """Ask an evaluator what was held out.
-
-    Args:
-        evaluator: any, of whatever plans.
-        data: with the answers.
-
-    Raises:
-        ValueError: nothing was held out.
+    """Ask an evaluator, of whatever plans, what the data hold out; :class:`ValueError` if that is nothing.
 
     Example:
         >>> import lw_torchrl as lw, tempfile
@@ -158,11 +143,11 @@ def _score(evaluator: ClauseEvaluator, data: LabelledQueries, part: str) -> Part
     with evaluating(evaluator):
         for one in data.parts[part]:
             for logits, truth in clause_logits(evaluator, one):
-                correct = (logits > 0) == truth
-                for column, clause in enumerate(one.clauses):
-                    found = [(truth[:, column] == bool(value)) for value in (0, 1)]
-                    _add(asked, clause.predicate, [int(rows.sum()) for rows in found])
-                    _add(right, clause.predicate, [int(correct[rows, column].sum()) for rows in found])
+                for table, counted in ((asked, torch.ones_like(truth)), (right, (logits > 0) == truth)):
+                    numbers = zip((counted & ~truth).sum(0).tolist(), (counted & truth).sum(0).tolist(), strict=True)
+                    for clause, (false, true) in zip(one.clauses, numbers, strict=True):
+                        before = table.get(clause.predicate, (0, 0))
+                        table[clause.predicate] = before[0] + false, before[1] + true
                 told = logits.double().sigmoid().reshape(-1)
                 place = (told * BINS).long().clamp(max=BINS - 1)
                 entries = torch.stack((torch.ones_like(told), told, truth.reshape(-1).double()), -1)
@@ -181,23 +166,10 @@ def clause_logits(evaluator: ClauseEvaluator, asked: Asked) -> list[tuple[Tensor
     return [(logits if number == 0 else -logits, asked.truth) for number, logits in enumerate(found)]
 
 
-def _add(table: dict[str, tuple[int, int]], name: str, more: list[int]) -> None:
-    false, true = table.get(name, (0, 0))
-    table[name] = (false + more[0], true + more[1])
-
-
 @dataclass(frozen=True)
 class Drift:
-    """What a condition has come to mean.
-
-    Attributes:
-        task: its plan's.
-        step: its number, from 0.
-        condition: its words.
-        states: how many were looked at.
-        exact, believed: the share of them in which it holds by its words, and by the evaluator.
-        agreement: the share in which both say the same.
-    """
+    """What the condition of a step, counted from 0, has come to mean: of the ``states`` looked at, the share in which
+    it holds by its words, ``exact``, and by the evaluator, ``believed``, and the ``agreement`` of both."""
 
     task: str
     step: int
@@ -213,12 +185,9 @@ def condition_drift(policy: Any, states: TensorDictBase) -> list[Drift]:
     """Compare the answers of a policy's evaluator with the query answering function's, the least agreement first.
 
     Args:
-        policy: one with an evaluator, or an evaluator.
+        policy: an evaluator, or a policy with one, else :class:`ValueError`.
         states: (R,) rows with ``observation`` (R, 39) float32, ``task_id`` (R,) int64 and what the evaluator reads, of
             a replay buffer, ``replay[:]``, or a rollout; conditions of other tasks are left out.
-
-    Raises:
-        ValueError: the policy has no evaluator.
 
     Example:
         >>> import lw_torchrl as lw

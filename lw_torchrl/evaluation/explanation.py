@@ -4,7 +4,7 @@ step it ended in."""
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn.functional import one_hot
 
 from lw_torchrl._devices import device_of
-from lw_torchrl.evaluation.failures import Cause
+from lw_torchrl.evaluation.failure_records import Cause
 from lw_torchrl.evaluation.plan_use import where_stuck
 from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.language.observation import HAND
@@ -45,8 +45,7 @@ class EpisodeStates(NamedTuple):
     in_force: Tensor  # (T,) int64, the step with most of it; -1 where all have the same, so that none is in force
 
 
-@dataclass(frozen=True)
-class Explanation:
+class Explanation(NamedTuple):
     """What the states say by themselves."""
 
     cause: Cause  # "undecided" where they do not tell
@@ -61,12 +60,13 @@ class Scripts:
 
     def __init__(self, plans: Plans, table: Mapping[str, ScriptedSkill]) -> None:
         self.table = table
-        found = {plan.definition: [_script(plan, step.skill, table) for step in plan.steps] for plan in plans.values()}
-        self.known = {task.name: [skill is not None for skill in listed] for task, listed in found.items()}
-        self.program = SkillProgram({task: [skill or _REST for skill in listed] for task, listed in found.items()})
-        self._ruler = SkillProgram(
-            {task: [_ruler(skill or _REST) for skill in listed] for task, listed in found.items()}
-        )
+        found: dict[Any, list[ScriptedSkill]] = {
+            plan.definition: [_script(plan, step.skill, table) or _REST for step in plan.steps]
+            for plan in plans.values()
+        }
+        self.known = {task.name: [skill is not _REST for skill in listed] for task, listed in found.items()}
+        self.program = SkillProgram(found)
+        self._ruler = SkillProgram({task: [_ruler(skill) for skill in listed] for task, listed in found.items()})
 
     def distance(self, observation: Tensor, task_id: Tensor, step: int) -> Tensor:
         """(T,) metres, how far what a step's skill moves is from where it goes."""
@@ -90,10 +90,8 @@ def chosen(truth: Tensor, steps: int) -> Tensor:
 
 
 def attended(weights: Tensor, steps: Tensor) -> Tensor:
-    """The step in force, (...) int64: the first of those with most attention, ``weights`` (..., S) float32.
-
-    -1 where all ``steps`` (..., S) bool that there are have the same, since no condition holds or every one does.
-    """
+    """The step in force, (...) int64: the first of those with most attention, ``weights`` (..., S) float32; -1 where
+    all ``steps``, (..., S) bool, have the same, since no condition holds or every one does."""
     most = weights.masked_fill(~steps, -1.0).amax(-1, keepdim=True)
     least = weights.masked_fill(~steps, 2.0).amin(-1, keepdim=True)
     first = (steps & (weights >= most - 1e-6)).int().argmax(-1)
@@ -118,8 +116,7 @@ def states_of(task: str, episode: int, steps: TensorDictBase, plans: Plans, give
 
 def candidates(seen: EpisodeStates, among: Tensor | None = None) -> list[int]:
     """The steps that may be to blame for a failure, the likeliest first: of those in force for a while late in the
-    episode the furthest and the most frequent, then the furthest of all, then the others.
-    """
+    episode the furthest and the most frequent, then the furthest of all, then the others."""
     counted = seen.in_force >= 0 if among is None else (seen.in_force >= 0) & among
     if not counted.any():
         return []
@@ -135,15 +132,11 @@ def candidates(seen: EpisodeStates, among: Tensor | None = None) -> list[int]:
 
 def stay(states: Tensor) -> int:
     """(T,) bool to where the last stay in them begins; interruptions of up to 25 states do not end it."""
-    found = states.nonzero().flatten().tolist()
-    if not found:
+    found = states.nonzero().flatten()
+    if not len(found):
         return len(states) - 1
-    begin = found[-1]
-    for state in reversed(found):
-        if begin - state > _AWAY + 1:
-            break
-        begin = state
-    return begin
+    gaps = (found.diff() > _AWAY + 1).nonzero()
+    return int(found[gaps[-1] + 1] if len(gaps) else found[0])
 
 
 def settled(seen: EpisodeStates, step: int) -> int:
@@ -166,10 +159,8 @@ def in_charge(seen: EpisodeStates, plan: ConditionalPlan, step: int) -> str:
 def explain(
     seen: EpisodeStates, plans: Plans, scripts: Scripts, reference: Plans | None, reference_scripts: Scripts | None
 ) -> Explanation:
-    """The rule: wrong answers, else a plan that asks for something else than the reference, else a skill.
-
-    Without a reference, a plan is to blame where no condition holds, and a skill that stays in force far from its goal.
-    """
+    """The rule of :func:`attribute_failures`; without a reference, a plan is to blame where no condition holds, and a
+    skill that stays in force far from its goal."""
     plan, length = plans[seen.task], len(seen.in_force)
     observation, task_id = seen.steps.get("observation"), seen.steps.get("task_id")
     late = min(_LATE, length)
@@ -259,14 +250,10 @@ def _departs(
 
 
 def unlike_scripts(actor: Any, seen: EpisodeStates, scripts: Scripts) -> Tensor | None:
-    """(T,) bool, the states in which the policy does something else than the scripted skills of the steps it is in.
-
-    None where it cannot be asked, since it reads what was not recorded or draws its actions.
-    """
-    if getattr(actor, "draws", True):
-        return None
-    keys = [key for key in actor.in_keys if key != "qaf"]
-    if any(seen.steps.get(key, None) is None for key in keys):
+    """(T,) bool, the states in which the policy does something else than the scripted skills of the steps it is in;
+    None where it cannot be asked, since it draws its actions or reads what was not recorded."""
+    keys = [key for key in getattr(actor, "in_keys", ()) if key != "qaf"]
+    if getattr(actor, "draws", True) or any(seen.steps.get(key, None) is None for key in keys):
         return None
     states = seen.steps.select(*keys).clone()
     if "qaf" in actor.in_keys:

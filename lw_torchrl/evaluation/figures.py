@@ -9,15 +9,14 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from lw_torchrl._checks import check_choice, checked, counted
+from lw_torchrl._checks import checked, counted
 from lw_torchrl._files import replacing
-from lw_torchrl.evaluation.failures import CAUSES, count_causes
+from lw_torchrl.evaluation.failure_records import CAUSES, count_causes
 from lw_torchrl.evaluation.result import EvaluationResult, attributed
 from lw_torchrl.evaluation.statistics import Array, check_rates, wilson_interval
 from lw_torchrl.evaluation.summary import Summary
 
 if TYPE_CHECKING:
-    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -63,7 +62,7 @@ def plot_success(result: EvaluationResult, path: str | os.PathLike[str] | None =
 
     Args:
         result: of :func:`evaluate`.
-        path: an image file, .png, .svg, .pdf or .jpg, replaced whole; None for none.
+        path: an image file, .png, .svg, .pdf or .jpg, replaced whole; another format raises :class:`ValueError`.
         title: above the figure.
 
     Example:
@@ -78,17 +77,15 @@ def plot_success(result: EvaluationResult, path: str | os.PathLike[str] | None =
     tasks = sorted(rates, key=lambda task: (rates[task], task))
     figure = new_figure(8.0, 1.6 + 0.27 * len(tasks))
     axes = figure.subplots()
-    values = [rates[task] for task in tasks]
-    intervals = [wilson_interval(round(rate * trials), trials) for rate in values]
-    ends = [(max(0.0, rate - low), max(0.0, high - rate)) for rate, (low, high) in zip(values, intervals, strict=True)]
-    bars = {"ecolor": "#333333", "elinewidth": 1, "capsize": 2}
-    axes.barh(tasks, values, xerr=list(zip(*ends, strict=True)), color="#4c78a8", error_kw=bars)
+    values = np.array([rates[task] for task in tasks])
+    low, high = np.array([wilson_interval(round(rate * trials), trials) for rate in values.tolist()]).T
+    ends, bars = (values - low, high - values), {"ecolor": "#333333", "elinewidth": 1, "capsize": 2}
+    axes.barh(tasks, values, xerr=np.maximum(ends, 0.0), color="#4c78a8", error_kw=bars)
     axes.axvline(result.mean_success, color="#e45756", linestyle="--")
     axes.set_xlim(0, 1.02)
     axes.margins(y=0.5 / len(tasks))
-    axes.set_xlabel(
-        f"episodes with success at any step (of {trials}; action noise {result.config['noise_scale']}; bars: 95 %)"
-    )
+    noise = result.config["noise_scale"]
+    axes.set_xlabel(f"episodes with success at any step (of {trials}; action noise {noise}; bars: 95 %)")
     axes.set_title(f"{title}\nmean over {counted(len(tasks), 'task')}: {result.mean_success:.3f}".strip())
     trim(axes)
     return saved(figure, path)
@@ -99,12 +96,8 @@ def plot_failures(result: EvaluationResult, path: str | os.PathLike[str] | None 
     """Draw how many episodes of each task failed, and of what; the task with most failures at the top.
 
     Args:
-        result: of ``evaluate(..., attribute=True)``.
-        path: an image file, .png, .svg, .pdf or .jpg, replaced whole; None for none.
-        title: above the figure.
-
-    Raises:
-        ValueError: another format, or a result whose failures were not attributed.
+        result: of ``evaluate(..., attribute=True)``; one without failures raises :class:`ValueError`.
+        path, title: as for :func:`plot_success`.
 
     Example:
         >>> from lw_torchrl.evaluation import EpisodeResult, Failure
@@ -122,14 +115,13 @@ def plot_failures(result: EvaluationResult, path: str | os.PathLike[str] | None 
     tasks = sorted((task for task in counts if sum(counts[task].values())), key=lambda t: (sum(counts[t].values()), t))
     figure = new_figure(8.0, 1.9 + 0.27 * len(tasks))
     axes = figure.subplots()
-    left = dict.fromkeys(tasks, 0)
+    left = np.zeros(len(tasks))
     for cause, meaning in CAUSES.items():
         numbers = [counts[task][cause] for task in tasks]
         label = f"{cause}: {meaning} ({sum(numbers)})"
-        bars = axes.barh(tasks, numbers, left=list(left.values()), color=_CAUSE_COLORS[cause], label=label, height=0.7)
+        bars = axes.barh(tasks, numbers, left=left, color=_CAUSE_COLORS[cause], label=label, height=0.7)
         axes.bar_label(bars, [str(n) if n else "" for n in numbers], label_type="center", color="white", fontsize=8)
-        for task, number in zip(tasks, numbers, strict=True):
-            left[task] += number
+        left = left + numbers
     axes.set_xlim(0, trials * 1.02)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.margins(y=0.5 / max(1, len(tasks)))
@@ -159,15 +151,11 @@ def plot_sorted_tasks(
     Args:
         curves: a method's name to its :class:`Summary`, or to (task to its rates, one per seed), in [0, 1]. All have
             the same tasks.
-        path: an image file, .png, .svg, .pdf or .jpg, replaced whole; None for none.
+        path, title: as for :func:`plot_success`.
         published: label to (task to rate), of the same tasks at least; :func:`published_curves` gives them.
         order: "shared" sorts the tasks by the first method, so that each place on x is one named task; "own" sorts
             every curve for itself, as the paper does: x is then a rank.
         of: what a rate is of, for the legend: "seed", "plan".
-        title: above the figure.
-
-    Raises:
-        ValueError: no curves, methods with different tasks, or rates outside [0, 1].
 
     Example:
         >>> figure = plot_sorted_tasks({"PCBC": {"push": [0.5, 0.7], "reach": [1.0, 0.9]}})
@@ -177,7 +165,6 @@ def plot_sorted_tasks(
     Source: paper, figures of section 'Conditional Plan Experiments'.
     """
     check_image(path)
-    check_choice("order", order, ("shared", "own"))
     if not curves:
         raise ValueError("curves must hold at least one method, got none")
     named = {method: _as_rates(f"curves[{method!r}]", given) for method, given in curves.items()}
@@ -237,8 +224,7 @@ def _draw_method(axes: Axes, method: str, rates: Array, color: str, order: str, 
 
 def _draw_published(axes: Axes, label: str, rates: Array, k: int, order: str) -> None:
     rates = np.sort(rates) if order == "own" else rates
-    color = ("#666666", "#aaaaaa")[k % 2]
-    style = _DASHES[k // 2 % len(_DASHES)]
+    color, style = ("#666666", "#aaaaaa")[k % 2], _DASHES[k // 2 % len(_DASHES)]
     axes.plot(rates, color=color, linewidth=1, linestyle=style, zorder=1.5, label=f"{label}: mean {rates.mean():.2f}")
     axes.axhline(float(rates.mean()), color=color, linewidth=0.9, linestyle=style, zorder=1.5)
 
@@ -262,18 +248,14 @@ def plot_learning_curves(
     starts: Mapping[str, float] | None = None,
     title: str = "",
 ) -> Figure:
-    """Draw success by steps of the environment: a panel for each task, a line for each method.
-
-    A line is the mean over seeds, its band spans the least and the greatest seed.
+    """Draw success by steps of the environment: a panel for each task, a line for each method's mean over seeds, in a
+    band from the least to the greatest.
 
     Args:
-        curves: task to method to the curve of each seed; those of a method in a task have the same steps.
-        path: an image file, .png, .svg, .pdf or .jpg, replaced whole; None for none.
+        curves: task to method to the curve of each seed; those of a method in a task have the same steps, else
+            :class:`ValueError`.
+        path, title: as for :func:`plot_success`.
         starts: task to the success rate before, as a dotted line.
-        title: above the figure.
-
-    Raises:
-        ValueError: no curves, seeds of different steps, or another format.
 
     Example:
         >>> figure = plot_learning_curves({"push": {"td3": [[(0, 0.2), (5000, 0.9)], [(0, 0.3), (5000, 0.7)]]}})
@@ -307,10 +289,7 @@ def plot_learning_curves(
     for axes in panels[len(curves) :]:
         axes.set_visible(False)
     figure.supylabel("success in training", fontsize=10)
-    named: dict[str, Artist] = {}
-    for axes in panels[: len(curves)]:
-        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
-            named.setdefault(label, handle)
+    named = {label: line for axes in panels for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
     figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=4, frameon=False, fontsize=9)
     figure.suptitle(title)
     return saved(figure, path)
@@ -325,8 +304,7 @@ def plot_methods(
 
     Args:
         groups: a column's name to its methods' summaries by name.
-        path: an image file, .png, .svg, .pdf or .jpg, replaced whole; None for none.
-        title: above the figure.
+        path, title: as for :func:`plot_success`.
 
     Example:
         >>> from lw_torchrl.evaluation import summarize_rates
@@ -334,7 +312,6 @@ def plot_methods(
         >>> figure.axes[0].get_title()
         'B'
     """
-
     check_image(path)
     if not groups:
         raise ValueError("groups must hold at least one, got none")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from typing import Any, Literal
 
 import numpy as np
@@ -10,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import Tensor, nn
+from torch.nn.utils.rnn import pad_sequence
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from lw_torchrl._checks import check_int, check_scale, checked
@@ -42,31 +44,21 @@ def evaluate_plans(
     progress: bool = True,
     on_plan: Callable[[int, tuple[bool, ...]], object] | None = None,
 ) -> list[tuple[bool, ...]]:
-    """Carry out many plans, several of a task too, by scripted skills: the success of each in episodes 0 to k - 1.
+    """Carry out many plans, several of a task too, by scripted skills: of each whether it succeeded in each episode.
 
-    All run in one environment, whose rows take the next episode of any plan of their task. Every plan meets the same
-    initial states. The result depends neither on ``num_envs`` nor on the plans beside. Where no condition holds, the
-    last step's skill acts.
+    Every plan meets the same initial states. The result depends neither on ``num_envs`` nor on the plans beside. Where
+    no condition holds, the last step's skill acts.
 
     Args:
         plans: every step's skill is the text of a scripted one, as ``DecodedPlan.scripted`` has them.
-        episodes: k, of each plan; each ends at its first success.
-        seed: of the environment, and of the choice.
+        episodes, seed: of each plan, which end at their first success; of the environment and the choice.
         choose: of several true steps, a "random" one in every state, the paper's rule, or the "first".
-        skills: the scripted skills by text, as from :func:`~lw_torchrl.load_skills`; None for the shipped ones.
-        noise_scale: standard deviation of the noise on the executed action.
-        max_steps: of an episode.
-        num_envs: rows of the environment.
-        num_threads: of the simulation, which changes no result.
-        progress: show a progress bar.
+        skills: the scripted skills by text; None for the shipped ones, :func:`~lw_torchrl.load_skills`.
+        noise_scale, max_steps, num_envs, num_threads, progress: as for :func:`evaluate`.
         on_plan: told the index of a plan, and how it fared, once all its episodes are done.
 
-    Returns:
-        For each plan whether it succeeded in each episode.
-
     Raises:
-        ValueError: there is no plan, a wrong option, a skill that is no scripted one, or two plans that mean different
-            tasks by one name.
+        ValueError: a wrong argument, a skill that is no scripted one, or plans that mean different tasks by one name.
 
     Example:
         >>> import lw_torchrl as lw
@@ -99,30 +91,27 @@ def evaluate_plans(
     listed = {task: list(range(episodes)) * len(found) for task, found in different.items()}
     total = sum(map(len, listed.values()))
     bar = Progress("carrying out plans", total * max_steps, "step", show=progress)
-    won: dict[int, dict[int, bool]] = {}
-    try:
-        with bar, torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-            for one in run_episodes(
-                env,
-                policy_of(policy),
-                listed,
-                keys=[_PLACE, ("next", "success")],
-                noise=(lambda _: (noise_scale,) * 4) if noise_scale else None,
-                after_success=0,
-                place=_PLACE,
-                on_progress=bar.update,
-            ):
-                for index in equal[one.task][int(one.steps.get(_PLACE)[0]) // episodes]:
-                    won.setdefault(index, {})[one.episode] = one.first_success is not None
-                    if len(won[index]) == episodes and on_plan is not None:
-                        on_plan(index, _in_order(won[index]))
-    finally:
-        env.close()
-    return [_in_order(won[index]) for index in range(len(plans))]
+    won: dict[int, dict[int, bool]] = {index: {} for index in range(len(plans))}
 
+    def in_order(index: int) -> tuple[bool, ...]:
+        return tuple(won[index][episode] for episode in range(episodes))
 
-def _in_order(found: Mapping[int, bool]) -> tuple[bool, ...]:
-    return tuple(found[episode] for episode in sorted(found))
+    with closing(env), bar, torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        for one in run_episodes(
+            env,
+            policy_of(policy),
+            listed,
+            keys=[_PLACE, ("next", "success")],
+            noise=(lambda _: (noise_scale,) * 4) if noise_scale else None,
+            after_success=0,
+            place=_PLACE,
+            on_progress=bar.update,
+        ):
+            for index in equal[one.task][int(one.steps.get(_PLACE)[0]) // episodes]:
+                won[index][one.episode] = one.first_success is not None
+                if len(won[index]) == episodes and on_plan is not None:
+                    on_plan(index, in_order(index))
+    return [in_order(index) for index in range(len(plans))]
 
 
 class _PlanOfRow(nn.Module):
@@ -143,9 +132,8 @@ class _PlanOfRow(nn.Module):
         self._index = TaskIndex(plans)
         conditions: dict[Any, list[Any]] = {}
         texts: dict[Any, list[str]] = {}
-        width = max(len(plan.steps) for listed in plans.values() for plan in listed)
         first: dict[str, int] = {}
-        rows: list[list[tuple[int, int, bool]]] = []
+        rows: list[Tensor] = []
         for task, listed in plans.items():
             definition, first[task] = listed[0].definition, len(rows)
             if any(plan.definition != definition for plan in listed):
@@ -154,11 +142,10 @@ class _PlanOfRow(nn.Module):
             done = list(dict.fromkeys(step.skill for plan in listed for step in plan.steps))
             conditions[definition], texts[definition] = asked, done
             for plan in listed:
-                steps = [(asked.index(step.condition), done.index(step.skill), True) for step in plan.steps]
-                rows.append(steps + [(0, 0, False)] * (width - len(steps)))
-        table = torch.tensor(rows)
-        self._condition, self._skill, self._step = table[..., 0], table[..., 1], table[..., 2].bool()
-        self._last = self._step.sum(-1) - 1
+                steps = [(asked.index(step.condition), done.index(step.skill), 1) for step in plan.steps]
+                rows.append(torch.tensor(steps))
+        self._condition, self._skill, there = pad_sequence(rows, batch_first=True).unbind(-1)
+        self._step, self._last = there.bool(), there.sum(-1) - 1
         self._first = torch.tensor([first[task] for task in self._index.tasks])
         numbers = [Plans([plan]).numbers[task] for task, listed in plans.items() for plan in listed]
         self._number = np.array(numbers, dtype=np.uint64)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from statistics import median
 from typing import Any, NamedTuple
 
@@ -28,29 +28,17 @@ _LATE = 50  # the last steps of a failed episode, in which it got nowhere
 
 @dataclass
 class TaskUse:
-    """How one task's plan was used, over all its episodes.
+    """How one task's plan was used, over all its episodes, to 20 steps after their first success."""
 
-    Attributes:
-        states: how many states were seen, to 20 steps after the first success.
-        true: per step of the plan, the share of states in which its condition held.
-        chosen: per step, the share of states in which it had the greatest weight; empty if no policy chose.
-        covered: the share of the states before the first success in which some condition held.
-        gaps: the others, as stretches: episode, first and last step, of each.
-        num_true: the median number of conditions that held, before the first success.
-        stuck: per step, in how many failed episodes it was the one chosen (or true) most in the last 50 steps.
-        furthest: per step, in how many failed episodes it was the plan's last that was chosen (or true) in 5 states.
-        failed: how many episodes failed.
-    """
-
-    states: int = 0
-    true: list[float] = field(default_factory=list)
-    chosen: list[float] = field(default_factory=list)
-    covered: float = 0.0
-    gaps: list[tuple[int, int, int]] = field(default_factory=list)
-    num_true: float = 0.0
-    stuck: list[int] = field(default_factory=list)
-    furthest: list[int] = field(default_factory=list)
-    failed: int = 0
+    states: int  # how many were seen
+    true: list[float]  # per step of the plan, the share of states in which its condition held
+    chosen: list[float]  # per step, the share of states in which it had the greatest weight; empty if no policy chose
+    covered: float  # the share of the states before the first success in which some condition held
+    gaps: list[tuple[int, int, int]]  # the others, as stretches: episode, first and last step of each
+    num_true: float  # the median number of conditions that held, before the first success
+    stuck: list[int]  # per step, in how many failed episodes it was chosen (or true) most in the last 50 steps
+    furthest: list[int]  # per step, in how many failed episodes it was the last chosen (or true) in 5 states
+    failed: int  # how many episodes failed
 
     def to_json(self) -> dict[str, Any]:
         """As plain numbers and lists."""
@@ -111,15 +99,12 @@ def _summed(seen: list[_Episode]) -> TaskUse:
             in_charge = one.qaf.long() if one.chosen is None else one_hot(one.chosen, steps)
             stuck[where_stuck(in_charge, _LATE)[0]] += 1
             furthest[where_stuck(in_charge, len(in_charge))[1]] += 1
-    shares: list[float] = []
     chosen = [one.chosen for one in seen if one.chosen is not None]
-    if len(chosen) == len(seen):
-        counts = torch.bincount(torch.cat(chosen), minlength=steps)
-        shares = (counts / len(qaf)).tolist()
+    counts = torch.bincount(torch.cat(chosen), minlength=steps) if len(chosen) == len(seen) else torch.zeros(0)
     return TaskUse(
         states=len(qaf),
         true=qaf.float().mean(0).tolist(),
-        chosen=shares,
+        chosen=(counts / len(qaf)).tolist(),
         covered=float(before.any(-1).float().mean()),
         gaps=sorted(gap for one in seen for gap in one.gaps()),
         num_true=float(median(before.sum(-1).tolist())),
@@ -136,27 +121,18 @@ def expert_use(
     episodes_per_task: int = 10,
     seed: int = 0,
 ) -> dict[str, TaskUse]:
-    """Which conditions of the plans hold in the states that Meta-World's experts visit.
-
-    Args:
-        plans: the plans.
-        tasks: some of their tasks; None for all.
-        episodes_per_task: episodes of each, without action noise.
-        seed: of the episodes.
-
-    Returns:
-        Task name to :class:`TaskUse`. An episode ends 20 steps after its first success: what follows does not count.
+    """Which conditions of the plans hold in the states that Meta-World's experts visit, without action noise, in some
+    of the plans' tasks or all. An episode ends 20 steps after its first success.
 
     Example:
         >>> import lw_torchrl as lw
         >>> expert_use(lw.load_plans("MT10"), "reach", episodes_per_task=1)["reach"].covered
         1.0
     """
-    answered = as_plans(plans)
-    names = resolve_tasks(list(answered) if tasks is None else tasks)
-    use = PlanUse(answered)
+    use = PlanUse(plans)
+    names = resolve_tasks(list(use.plans) if tasks is None else tasks)
     rows = len(names) * min(episodes_per_task, -(-_ROWS // len(names)))
-    env = TransformedEnv(LanguageWorldEnv(names, num_envs=rows, seed=seed, strict=True), QAFTransform(answered))
+    env = TransformedEnv(LanguageWorldEnv(names, num_envs=rows, seed=seed, strict=True), QAFTransform(use.plans))
     episodes = {task: range(episodes_per_task) for task in names}
     keys = ["qaf", ("next", "success")]
     for finished in run_episodes(env, ExpertActor(names), episodes, keys=keys, after_success=_AFTER):
@@ -167,16 +143,8 @@ def expert_use(
 
 @dataclass(frozen=True)
 class StuckStep:
-    """A step of a plan, and how many failed episodes ended in it, or came no further.
-
-    Attributes:
-        task: the plan's.
-        step: its number, counted from 0.
-        condition, skill: its words.
-        stuck: in how many failed episodes it was the one in charge in the last 50 steps.
-        furthest: in how many failed episodes it was the last of the plan's steps that was in charge for a while.
-        failed: episodes of the task that failed.
-    """
+    """A step of a plan, counted from 0: of the task's ``failed`` episodes, in how many it was the one in charge in the
+    last 50 steps, ``stuck``, and the last of the plan's steps that was in charge for a while, ``furthest``."""
 
     task: str
     step: int
@@ -215,11 +183,8 @@ def weakest_step(use: PlanUse, task: str | None = None) -> StuckStep:
     the first step, which is sound. Plans are written in the order in which their steps come.
 
     Args:
-        use: what evaluated episodes told.
-        task: whose step; None for any.
-
-    Raises:
-        ValueError: a task that was not seen; no episode failed.
+        use: what evaluated episodes told; :class:`ValueError` if none failed.
+        task: whose step, of those that were seen; None for any.
     """
     found = stuck_steps(use)
     if task is not None:
@@ -242,8 +207,8 @@ def stuck_table(steps: Sequence[StuckStep]) -> str:
     """
     rows = [("task", "step", "ended here", "no further", "skill", "while")]
     for s in steps:
-        ended, reached = (f"{count} of {s.failed}" for count in (s.stuck, s.furthest))
-        rows.append((s.task, str(s.step + 1), ended, reached, s.skill, s.condition))
+        counts = f"{s.stuck} of {s.failed}", f"{s.furthest} of {s.failed}"
+        rows.append((s.task, str(s.step + 1), *counts, s.skill, s.condition))
     task, skill = (max(len(row[column]) for row in rows) for column in (0, 4))
     return "\n".join(
         f"{row[0]:{task}}  {row[1]:>4}  {row[2]:>10}  {row[3]:>10}  {row[4]:{skill}}  {row[5]}" for row in rows

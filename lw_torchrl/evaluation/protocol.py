@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import closing, nullcontext
 from typing import Any, Literal
 
 import torch
@@ -19,7 +19,7 @@ from lw_torchrl._progress import Progress
 from lw_torchrl.envs.episodes import FinishedEpisode, policy_of, read_action, run_episodes
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.evaluation.attribution import attribute_failures, keys_to_attribute
-from lw_torchrl.evaluation.counterfactuals import answered_by, make_env
+from lw_torchrl.evaluation.counterfactuals import Acts, answered_by, make_env
 from lw_torchrl.evaluation.result import EpisodeResult, EvaluationResult
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.tasks import TASKS, Task, named_tasks
@@ -58,9 +58,7 @@ def _result(finished: FinishedEpisode, stopped_early: bool, keep_actions: bool) 
     return EpisodeResult(task, episode, first is not None, first, at_end, total, actions)
 
 
-def _checked(
-    policy: Callable[[TensorDictBase], TensorDictBase], env: EnvBase, also_record: Sequence[NestedKey]
-) -> Callable[[TensorDictBase], TensorDictBase]:
+def _checked(policy: Acts, env: EnvBase, also_record: Iterable[NestedKey]) -> Acts:
     """``policy``, whose action is checked, and at its first call whether it and ``env`` write ``also_record``."""
     unseen = [unravel_key(key) for key in also_record]
     specs = env.full_observation_spec, env.full_reward_spec, env.full_done_spec
@@ -105,9 +103,8 @@ def evaluate(
     """Run episodes 0 to k - 1 of each task and report how they went.
 
     The actor runs in eval mode with deterministic exploration. The executed action is its action plus
-    N(0, noise_scale²) on all four numbers, clipped. The result depends neither on ``num_envs`` nor on the tasks
-    evaluated beside: the actor is run on blocks of a fixed number of rows, and all randomness comes from
-    (task, seed, episode).
+    N(0, noise_scale²) on all four numbers, clipped. The result depends neither on ``num_envs`` nor on the tasks beside:
+    the actor is run on blocks of a fixed number of rows, and all randomness comes from (task, seed, episode).
 
     Args:
         actor: reads ``observation``, ``task_id`` and, if it has plans, ``qaf``; writes ``action`` (N, 4) float32.
@@ -117,36 +114,28 @@ def evaluate(
         seed: one that no demonstration was collected with.
         noise_scale: standard deviation of the action noise.
         num_envs: environments stepped together, at least the number of tasks; by default about 256.
-        stop_at_success: end an episode at its first success; any-step success is the same, success at the end and
-            return are None.
+        stop_at_success: end an episode at its first success; success at the end and return are then None.
         record_actions: keep each episode's executed actions, (T, 4) float32.
         reward: "sparse" or "dense", summed in the return.
-        max_steps: steps of an episode.
-        engine, num_threads: as for :class:`LanguageWorldEnv`.
+        max_steps, engine, num_threads: as for :class:`LanguageWorldEnv`.
         progress: show a progress bar when it takes longer than a second.
         also_record: more keys for ``on_episode`` to see: "qaf", "skill_weights".
-        on_episode: called with each finished episode, a named tuple of ``task``, ``episode``, its index, and ``steps``,
-            a TensorDict of batch (T,) with ``action``, ``("next", "success")``, ``("next", "reward")`` and the keys of
-            ``also_record``.
+        on_episode: called with each finished episode, a named tuple of ``task``, ``episode`` (its index) and ``steps``,
+            a TensorDict of batch (T,): ``action``, ``("next", "success")``, ``("next", "reward")``, ``also_record``.
         device: where the actor works: "cpu", "cuda", "cuda:1", "mps", or "auto"; it is moved there, and stays. None for
             where it is. The environment and its queries are always on the CPU.
         evaluator: answers the conditions in the query answering function's place, as for :func:`attribute_failures`: a
             :class:`~lw_torchrl.CorruptQAF`, or ``QAFTransform(plans, every=5)``; None for exact truth at every step.
-        attribute: run failed episodes again to say why each failed, see :func:`attribute_failures`.
+        attribute: say why episodes failed, see :func:`attribute_failures`: ``.failures`` of the result.
         reference: trusted plans for the same tasks, with which failed episodes are run again.
 
     Warns:
         UserWarning: a simulation became unstable; its episode ends there, a failure unless it had succeeded. The actor
             cannot carry out the reference.
 
-    Returns:
-        The result; ``.success_once`` maps each task to its success rate. With ``attribute``, ``.failures`` says why
-        episodes failed, ``.failure_table()`` counts.
-
     Raises:
         ValueError: a wrong argument, plans that differ from the actor's, a task without a plan or not among the
-            actor's, a key in ``also_record`` that nobody writes, an actor that gives NaN, or ``attribute`` without
-            plans.
+            actor's, a key in ``also_record`` that nobody writes, an actor that gives NaN.
 
     Example:
         >>> import lw_torchrl as lw
@@ -162,10 +151,8 @@ def evaluate(
     if answered is not None:
         answered.require(names)
     known = getattr(actor, "tasks", names) if isinstance(actor, Policy) else names
-    if other := [task for task in names if task not in known]:
-        raise ValueError(
-            f"tasks must be among the actor's, {', '.join(known)}; it was not made for: {', '.join(other)}"
-        )
+    if other := ", ".join(task for task in names if task not in known):
+        raise ValueError(f"tasks must be among the actor's, {', '.join(known)}; it was not made for: {other}")
     if attribute and answered is None:
         raise ValueError("attribute must be False for an actor without plans, unless plans are given")
     if reference is not None and not attribute:
@@ -176,10 +163,9 @@ def evaluate(
         check_key("also_record", key)
     check_int("episodes_per_task", episodes_per_task, minimum=1)
     check_scale("noise_scale", noise_scale)
-    most = len(names) * episodes_per_task  # a row more would have nothing to do
     if num_envs is None:
-        num_envs = len(names) * max(1, min(episodes_per_task, _ROWS // len(names)))
-    num_envs = min(check_int("num_envs", num_envs), most)
+        num_envs = len(names) * max(1, _ROWS // len(names))
+    num_envs = min(check_int("num_envs", num_envs), len(names) * episodes_per_task)  # a row more would have no work
     shared: dict[str, Any] = {"seed": seed, "engine": engine, "num_threads": num_threads, "max_steps": max_steps}
     base = LanguageWorldEnv(list(chosen.values()), num_envs=num_envs, reward=reward, strict=True, **shared)
     env = make_env(actor, answered, base, evaluator)
@@ -190,30 +176,26 @@ def evaluate(
     found: list[EpisodeResult] = []
     failed: list[FinishedEpisode] = []
     bar = Progress("evaluating", len(names) * episodes_per_task * max_steps, "step", show=progress)
-    try:
-        mode = evaluating(actor) if isinstance(actor, torch.nn.Module) else nullcontext()
-        with mode, bar, torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-            for finished in run_episodes(
-                env,
-                _checked(policy, env, list(seen)),
-                {task: range(episodes_per_task) for task in names},
-                keys=["action", ("next", "success"), ("next", "reward"), *seen],
-                noise=(lambda _: (noise_scale,) * 4) if noise_scale else None,
-                after_success=0 if stop_at_success else None,
-                on_progress=bar.update,
-            ):
-                found.append(_result(finished, stop_at_success, record_actions))
-                if attribute and not found[-1].success:
-                    failed.append(finished)
-                if on_episode is not None:
-                    on_episode(finished)
-    finally:
-        env.close()
+    mode = evaluating(actor) if isinstance(actor, torch.nn.Module) else nullcontext()
+    with closing(env), mode, bar, torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        for finished in run_episodes(
+            env,
+            _checked(policy, env, seen),
+            {task: range(episodes_per_task) for task in names},
+            keys=["action", ("next", "success"), ("next", "reward"), *seen],
+            noise=(lambda _: (noise_scale,) * 4) if noise_scale else None,
+            after_success=0 if stop_at_success else None,
+            on_progress=bar.update,
+        ):
+            found.append(_result(finished, stop_at_success, record_actions))
+            if attribute and not found[-1].success:
+                failed.append(finished)
+            if on_episode is not None:
+                on_episode(finished)
     config = {"tasks": list(names), "episodes_per_task": episodes_per_task, "seed": seed, "noise_scale": noise_scale}
     config |= {"stop_at_success": stop_at_success, "reward": reward, "max_steps": max_steps}
     failures = None
-    if attribute:
-        assert answered is not None
+    if attribute and answered is not None:
         failed.sort(key=lambda episode: (episode.task, episode.episode))
         shared |= {"noise_scale": noise_scale, "num_envs": num_envs, "device": device, "progress": progress}
         options = {"actor": actor, "reference": reference, "evaluator": evaluator, **shared}

@@ -21,7 +21,7 @@ def _table(name: str = "published") -> dict[str, Any]:
 
 @checked
 def published(setting: str, method: str = "PCBC", which: Literal["last", "best"] = "last") -> dict[str, float]:
-    """The published success rate of each of the 50 tasks, a mean over 4 seeds of 20 episodes each.
+    """Task, sorted by name, to its published success rate in [0, 1], a mean over 4 seeds of 20 episodes each.
 
     The rates of single seeds were not published. The published "last" and "best" of DC one-shot are the same numbers.
 
@@ -30,9 +30,6 @@ def published(setting: str, method: str = "PCBC", which: Literal["last", "best"]
         method: "PCBC" or "DC" (descriptor conditioning).
         which: "last", the last evaluation of each run, to compare with; or "best", per task and seed the best of the
             last ten evaluations, which the paper's figures show.
-
-    Returns:
-        Task to success rate, in [0, 1], sorted by name.
 
     Example:
         >>> rates = published("few-shot")
@@ -49,14 +46,11 @@ def published(setting: str, method: str = "PCBC", which: Literal["last", "best"]
 
 @checked
 def published_curves(setting: str, methods: str | Iterable[str] = ("PCBC",)) -> dict[str, dict[str, float]]:
-    """Both published curves of each method, by the label that a figure or a table gives them.
+    """Both published curves of each method, label to (task to success rate): for :func:`plot_sorted_tasks` and
+    :meth:`Summary.table`.
 
     Args:
-        setting: "zero-shot", "few-shot" or "one-shot".
-        methods: "PCBC", "DC" or several of them; a method that the paper has no rates of raises.
-
-    Returns:
-        Label to (task to success rate): for :func:`plot_sorted_tasks` and :meth:`Summary.table`.
+        setting, methods: as for :func:`published`; a method, or several.
 
     Example:
         >>> list(published_curves("zero-shot"))
@@ -72,14 +66,11 @@ def published_curves(setting: str, methods: str | Iterable[str] = ("PCBC",)) -> 
 
 @checked
 def published_plans(model: str = "PaLM 2", format: str = "chain_py") -> dict[str, tuple[float, ...]]:
-    """The published success rate of each of a model's 5 generated plans per task, run with scripted skills.
+    """Task, sorted by name, to the published success rates in [0, 1] of a model's 5 plans, run with scripted skills.
 
     Args:
         model: "PaLM 2", "GPT-3.5" or "GPT-3".
         format: of the plans, a name in :data:`~lw_torchrl.PLAN_FORMATS`.
-
-    Returns:
-        Task to the rates of its 5 plans, in [0, 1], sorted by name.
 
     Example:
         >>> published_plans()["window-open"]

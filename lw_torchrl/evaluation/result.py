@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Container
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from functools import cached_property
@@ -15,7 +15,8 @@ from torch import Tensor
 
 from lw_torchrl._files import read_json, write_json
 from lw_torchrl._versions import package_versions
-from lw_torchrl.evaluation.failures import Failure, failure_table, is_number, read_failures
+from lw_torchrl.evaluation.failure_records import Failure, failure_table, read_failures
+from lw_torchrl.evaluation.records import Rules, check_rules, is_integer, is_number, read_records
 
 FORMAT = "lw_torchrl.evaluation"
 FORMAT_VERSION = 1
@@ -26,8 +27,7 @@ class EpisodeResult:
     """One evaluated episode.
 
     Attributes:
-        task: the task's name.
-        episode: its index; ``episode_seed(task, seed, episode)`` is its seed.
+        task, episode: the task's name and the episode's index; ``episode_seed(task, seed, episode)`` is its seed.
         success: at some step.
         first_success: the first successful step, from 1; None without success.
         success_at_end: at the last step; None where the episode was stopped at its success.
@@ -107,9 +107,9 @@ class EvaluationResult:
 
         Args:
             path: the file.
-            checkpoint: the file that the actor was made of; its path and SHA-256 are noted.
+            checkpoint, evaluator: the files that the actor and what answered the conditions were made of; their paths
+                and SHA-256 are noted.
             plans: the fingerprint of the plans.
-            evaluator: the file of what answered the conditions; noted likewise.
 
         Raises:
             FileNotFoundError: there is no such checkpoint or evaluator.
@@ -123,24 +123,15 @@ class EvaluationResult:
                     origin[name] = {"path": str(given), "sha256": file_digest(file, "sha256").hexdigest()}
         if plans is not None:
             origin["plans"] = plans
-        episodes = [{k: v for k, v in asdict(e).items() if k != "actions"} for e in self.episodes]
-        failures = {} if self.failures is None else {"failures": [asdict(failure) for failure in self.failures]}
-        write_json(
-            path,
-            {
-                "format": FORMAT,
-                "version": FORMAT_VERSION,
-                "origin": origin,
-                "config": self.config,
-                "mean_success_once": self.mean_success,
-                "success_once": self.success_once,
-                "success_at_end": self.success_at_end,
-                "first_success": self.first_success,
-                "mean_return": self.mean_return,
-                "episodes": episodes,
-                **failures,
-            },
-        )
+        told: dict[str, Any] = {"format": FORMAT, "version": FORMAT_VERSION, "origin": origin, "config": self.config}
+        told["mean_success_once"] = self.mean_success
+        told |= {
+            name: getattr(self, name) for name in ("success_once", "success_at_end", "first_success", "mean_return")
+        }
+        told["episodes"] = [{k: v for k, v in asdict(e).items() if k != "actions"} for e in self.episodes]
+        if self.failures is not None:
+            told["failures"] = [asdict(failure) for failure in self.failures]
+        write_json(path, told)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> EvaluationResult:
@@ -157,11 +148,12 @@ class EvaluationResult:
             config, origin = found["config"], found.get("origin", {})
             if not isinstance(config, dict) or not isinstance(origin, dict):
                 raise ValueError("its config and its origin must be objects")
-            _check_config(config)
+            check_rules("config", config, _config_rules(config))
             episodes = _read_episodes(found["episodes"], config)
             if not isinstance(found["success_once"], dict) or set(found["success_once"]) != set(config["tasks"]):
                 raise ValueError("the tasks of its success_once are not those of its config")
-            failures = read_failures(found["failures"], config, episodes) if "failures" in found else None
+            failed = [(episode.task, episode.episode) for episode in episodes if not episode.success]
+            failures = read_failures(found["failures"], config, failed) if "failures" in found else None
             return cls(config, episodes, origin, failures)
         except FileNotFoundError:
             raise FileNotFoundError(
@@ -176,26 +168,16 @@ class EvaluationResult:
     def table(self) -> str:
         """The rates per task as text in columns."""
         lines = [f"{'task':28} {'any step':>8} {'at end':>8} {'first step':>10}"]
-
-        def row(name: str, once: float | None, end: float | None, first: float | None) -> str:
-            cells = [
-                "-" if once is None else f"{once:.2f}",
-                "-" if end is None else f"{end:.2f}",
-                "-" if first is None else f"{first:.0f}",
-            ]
-            return f"{name:28} {cells[0]:>8} {cells[1]:>8} {cells[2]:>10}"
-
-        for task, rate in self.success_once.items():
-            lines.append(row(task, rate, self.success_at_end[task], self.first_success[task]))
-        lines.append(row("mean", self.mean_success, _mean(list(self.success_at_end.values())), None))
+        ends, firsts = self.success_at_end, self.first_success
+        rows = [(task, once, ends[task], firsts[task]) for task, once in self.success_once.items()]
+        for name, *rates, first in [*rows, ("mean", self.mean_success, _mean(self.success_at_end.values()), None)]:
+            once, end = ("-" if rate is None else f"{rate:.2f}" for rate in rates)
+            lines.append(f"{name:28} {once:>8} {end:>8} {'-' if first is None else f'{first:.0f}':>10}")
         return "\n".join(lines)
 
     def failure_table(self) -> str:
-        """Numbers of failed episodes, as text in columns: a row for each task, a column for each cause.
-
-        Raises:
-            ValueError: the failures were not attributed.
-        """
+        """Numbers of failed episodes, as text: a row for each task, a column for each cause. :class:`ValueError` if the
+        failures were not attributed."""
         return failure_table(self.config["tasks"], self.config["episodes_per_task"], attributed(self))
 
 
@@ -206,63 +188,41 @@ def attributed(result: EvaluationResult) -> tuple[Failure, ...]:
     return result.failures
 
 
-def _mean(values: list[Any]) -> float | None:
-    if not values or any(value is None for value in values):
-        return None
-    return sum(values) / len(values)
+def _mean(values: Collection[Any]) -> float | None:
+    return None if not values or None in values else sum(values) / len(values)
 
 
-def _is_integer(value: Any, minimum: int, maximum: int = 2**63 - 1) -> bool:
-    return type(value) is int and minimum <= value <= maximum
-
-
-def _check(holds: bool, name: str, wanted: str, given: Any) -> None:
-    if not holds:
-        raise ValueError(f"{name} must be {wanted}, got {short(given)}")
-
-
-def _check_config(config: dict[str, Any]) -> None:
-    tasks = config["tasks"]
+def _config_rules(config: dict[str, Any]) -> Rules:
+    tasks, noise = config["tasks"], config["noise_scale"]
     named = isinstance(tasks, list) and bool(tasks) and all(isinstance(task, str) for task in tasks)
-    _check(named and len(set(tasks)) == len(tasks), "config: tasks", "different names", tasks)
+    yield "tasks", named and len(set(tasks)) == len(tasks), "different names"
     for name in ("episodes_per_task", "max_steps"):
-        _check(_is_integer(config[name], 1), f"config: {name}", "an integer of at least 1", config[name])
-    _check(_is_integer(config["seed"], -(2**63)), "config: seed", "an integer", config["seed"])
-    noise = config["noise_scale"]
-    _check(is_number(noise) and noise >= 0, "config: noise_scale", "a number of at least 0", noise)
-    stops = config["stop_at_success"]
-    _check(isinstance(stops, bool), "config: stop_at_success", "true or false", stops)
+        yield name, is_integer(config[name], 1), "an integer of at least 1"
+    yield "seed", is_integer(config["seed"], -(2**63)), "an integer"
+    yield "noise_scale", is_number(noise) and noise >= 0, "a number of at least 0"
+    yield "stop_at_success", isinstance(config["stop_at_success"], bool), "true or false"
+
+
+def _episode_rules(episode: EpisodeResult, tasks: Container[str], max_steps: int) -> Rules:
+    success, first, end = episode.success, episode.first_success, episode.success_at_end
+    yield "task", isinstance(episode.task, str) and episode.task in tasks, "in config"
+    yield "episode", is_integer(episode.episode, 0), "an integer of at least 0"
+    yield "success", isinstance(success, bool), "true or false"
+    if success:
+        yield "first_success", is_integer(first, 1, max_steps), f"a step from 1 to {max_steps}"
+    else:
+        yield "first_success", first is None, "null without success"
+    yield "success_at_end", end is None or isinstance(end, bool), "true, false or null"
+    yield "success_at_end", success or not end, "false without success"
+    yield "episode_return", episode.episode_return is None or is_number(episode.episode_return), "a number or null"
 
 
 def _read_episodes(stated: Any, config: dict[str, Any]) -> tuple[EpisodeResult, ...]:
-    """The episodes of a file, as many of each task as its configuration says."""
-    _check(isinstance(stated, list), "episodes", "a list", stated)
-    names = {name for name in EpisodeResult.__dataclass_fields__ if name != "actions"}
-    count = dict.fromkeys(config["tasks"], 0)
-    seen: set[tuple[str, int]] = set()
-    found = []
-    for number, entry in enumerate(stated):
-        at = f"episodes[{number}]"
-        _check(isinstance(entry, dict) and set(entry) == names, at, f"an object of {', '.join(sorted(names))}", entry)
-        episode = EpisodeResult(**entry)
-        _check(isinstance(episode.task, str) and episode.task in count, f"{at}: task", "in config", episode.task)
-        _check(_is_integer(episode.episode, 0), f"{at}: episode", "an integer of at least 0", episode.episode)
-        which = episode.task, episode.episode
-        _check(which not in seen, at, "an episode of its own", which)
-        _check(isinstance(episode.success, bool), f"{at}: success", "true or false", episode.success)
-        first, end, total = episode.first_success, episode.success_at_end, episode.episode_return
-        if episode.success:
-            wanted = f"a step from 1 to {config['max_steps']}"
-            _check(_is_integer(first, 1, config["max_steps"]), f"{at}: first_success", wanted, first)
-        else:
-            _check(first is None, f"{at}: first_success", "null without success", first)
-        _check(end is None or isinstance(end, bool), f"{at}: success_at_end", "true, false or null", end)
-        _check(not end or episode.success, f"{at}: success_at_end", "false without success", end)
-        _check(total is None or is_number(total), f"{at}: episode_return", "a number or null", total)
-        seen.add(which)
-        count[episode.task] += 1
-        found.append(episode)
-    for task, number in count.items():
-        wanted = f"{config['episodes_per_task']}, as config: episodes_per_task says"
-        _check(number == config["episodes_per_task"], f"the number of episodes of {task!r}", wanted, number)
-    return tuple(found)
+    """The episodes of a file, as many of each task as its configuration says, all different."""
+    count, wanted = dict.fromkeys(config["tasks"], 0), config["episodes_per_task"]
+    found = read_records("episodes", stated, EpisodeResult, lambda one: _episode_rules(one, count, config["max_steps"]))
+    for task, _ in {(one.task, one.episode) for one in found}:
+        count[task] += 1
+    if len(found) != sum(count.values()) or set(count.values()) != {wanted}:
+        raise ValueError(f"episodes must be {wanted} different ones of each task, as config: episodes_per_task says")
+    return found

@@ -3,24 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from lw_torchrl._checks import checked, shown
+from lw_torchrl._checks import checked, counted, shown
+from lw_torchrl.evaluation import statistics
 from lw_torchrl.evaluation.result import EvaluationResult
-from lw_torchrl.evaluation.statistics import (
-    Array,
-    Estimate,
-    check_rates,
-    count_solved,
-    interquartile_mean,
-    mean_difference,
-    mean_rate,
-    probability_of_improvement,
-)
+from lw_torchrl.evaluation.statistics import Array, Estimate
 from lw_torchrl.language.tasks import MT10
 
 _SETTINGS = ("episodes_per_task", "noise_scale", "max_steps")  # what rates must share to be averaged
@@ -40,11 +32,9 @@ class Summary:
     """The success rates of one method over seeds and tasks, from :func:`summarize` or :func:`summarize_rates`.
 
     Attributes:
-        tasks: their names, T of them.
-        seeds: the training seeds' names, n of them.
+        tasks, seeds: their names, T and n of them.
         rates: n rows of T success rates at any step.
-        mean: over seeds and tasks, with its 95 % interval, Student's t over the seeds.
-        iqm: the interquartile mean, likewise.
+        mean, iqm: the mean and the interquartile mean over seeds and tasks, with 95 % intervals over the seeds.
         solved: how many tasks' mean over seeds is at least ``threshold``.
         threshold: 0.8.
     """
@@ -84,7 +74,7 @@ class Summary:
             "threshold": self.threshold,
             "by_seed": self.by_seed,
             "tasks": {
-                task: {"mean": found.mean, "min": found.min, "max": found.max, "rates": rates}
+                task: {**asdict(found), "rates": rates}
                 for (task, found), rates in zip(self.per_task.items(), self.array.T.tolist(), strict=True)
             },
         }
@@ -96,23 +86,21 @@ class Summary:
             beside: more columns, name to (task to rate), such as :func:`published_curves` gives; "-" where a task is
                 missing. Their names stand in full below the table.
         """
-        columns = list((beside or {}).items())
+        columns = dict(beside or {})
         head = "".join(f" {f'({k + 1})':>6}" for k in range(len(columns)))
-        count = f"{len(self.seeds)} seed" + "s" * (len(self.seeds) > 1)
         solved = f"{self.solved} of {len(self.tasks)} tasks >= {self.threshold:g}"
         lines = [
-            f"mean {self.mean}, IQM {self.iqm}; {solved}; {count}",
+            f"mean {self.mean}, IQM {self.iqm}; {solved}; {counted(len(self.seeds), 'seed')}",
             f"{'task':28} {'mean':>6} {'min':>6} {'max':>6}{head}",
         ]
-        for task, found in self.per_task.items():
-            cells = "".join(f" {rates[task]:6.2f}" if task in rates else f" {'-':>6}" for _, rates in columns)
-            lines.append(f"{task:28} {found.mean:6.2f} {found.min:6.2f} {found.max:6.2f}{cells}")
-        seeds, cells = self.by_seed.values(), ""
-        for _, rates in columns:
-            shared = [rates[task] for task in self.tasks if task in rates]
-            cells += f" {sum(shared) / len(shared):6.2f}" if len(shared) == len(self.tasks) else f" {'-':>6}"
-        lines.append(f"{'mean':28} {self.mean.value:6.2f} {min(seeds):6.2f} {max(seeds):6.2f}{cells}")
-        return "\n".join([*lines, *(f"({k + 1}) {name}" for k, (name, _) in enumerate(columns))])
+        seeds = self.by_seed.values()
+        total = TaskSummary(self.mean.value, min(seeds), max(seeds))
+        for name, found in [*self.per_task.items(), ("mean", total)]:
+            tasks = self.tasks if found is total else (name,)
+            there = [None if set(tasks) - set(rates) else _mean(rates, tasks) for rates in columns.values()]
+            cells = "".join(f" {'-':>6}" if rate is None else f" {rate:6.2f}" for rate in there)
+            lines.append(f"{name:28} {found.mean:6.2f} {found.min:6.2f} {found.max:6.2f}{cells}")
+        return "\n".join([*lines, *(f"({k + 1}) {name}" for k, name in enumerate(columns))])
 
 
 @checked
@@ -131,9 +119,6 @@ def summarize_rates(
         threshold: a task counts as solved from here.
         confidence: of the intervals, in (0, 1).
 
-    Raises:
-        ValueError: no tasks, tasks with different numbers of seeds, or another wrong argument.
-
     Example:
         >>> summary = summarize_rates({"push": [0.5, 0.7], "reach": [1.0, 0.9]})
         >>> print(summary.mean, summary.solved)
@@ -146,7 +131,7 @@ def summarize_rates(
         raise ValueError(f"rates must hold at least one task, each with at least one rate, got {dict(rates)!r}")
     if len(set(counts.values())) > 1:
         raise ValueError(f"rates must hold a rate per seed for each task, got different numbers: {counts}")
-    array = check_rates("rates", list(rates.values())).T
+    array = statistics.check_rates("rates", list(rates.values())).T
     names = tuple(str(seed) for seed in (range(len(array)) if seeds is None else seeds))
     if len(names) != len(array) or len(set(names)) != len(names):
         raise ValueError(f"seeds must be {len(array)} different names, got {names}")
@@ -154,9 +139,9 @@ def summarize_rates(
         tasks=tuple(rates),
         seeds=names,
         rates=tuple(tuple(row) for row in array.tolist()),
-        mean=mean_rate(array, confidence=confidence),
-        iqm=interquartile_mean(array, confidence=confidence),
-        solved=count_solved(array, threshold),
+        mean=statistics.mean_rate(array, confidence=confidence),
+        iqm=statistics.interquartile_mean(array, confidence=confidence),
+        solved=statistics.count_solved(array, threshold),
         threshold=threshold,
     )
 
@@ -170,8 +155,8 @@ def summarize(results: Mapping[Any, EvaluationResult] | Sequence[EvaluationResul
         options: ``threshold`` (0.8) and ``confidence`` (0.95), as for :func:`summarize_rates`.
 
     Raises:
-        ValueError: no results, one evaluation given twice, other tasks or plans in one than in another, or evaluations
-            that cannot be averaged because their episodes_per_task, noise_scale or max_steps differ.
+        ValueError: no results, one evaluation given twice, or evaluations that differ in tasks, plans,
+            episodes_per_task, noise_scale or max_steps.
         TypeError: one is no :class:`EvaluationResult`.
 
     Example:
@@ -192,32 +177,23 @@ def summarize(results: Mapping[Any, EvaluationResult] | Sequence[EvaluationResul
     first_seed, first = next(iter(named.items()))
     tasks = tuple(first.success_once)
     for seed, result in named.items():
-        if different := set(tasks) ^ set(result.success_once):
-            raise ValueError(
-                f"results must be of the same tasks; seeds {first_seed!r} and {seed!r} do not share "
-                + ", ".join(sorted(different))
-            )
+        both = f"seeds {first_seed!r} and {seed!r}"
+        if different := ", ".join(sorted(set(tasks) ^ set(result.success_once))):
+            raise ValueError(f"results must be of the same tasks; {both} do not share {different}")
         if len({one.origin.get("plans") for one in (first, result)} - {None}) > 1:
-            raise ValueError(f"results must be of the same plans; those of seeds {first_seed!r} and {seed!r} differ")
+            raise ValueError(f"results must be of the same plans; those of {both} differ")
         for key in _SETTINGS:
-            if first.config.get(key) != result.config.get(key):
-                raise ValueError(
-                    f"results must share {key}, got {first.config.get(key)!r} for seed {first_seed!r} and "
-                    f"{result.config.get(key)!r} for seed {seed!r}"
-                )
+            if (was := first.config.get(key)) != (now := result.config.get(key)):
+                got = f"{was!r} for seed {first_seed!r} and {now!r} for seed {seed!r}"
+                raise ValueError(f"results must share {key}, got {got}")
     rates: dict[str, Any] = {task: [result.success_once[task] for result in named.values()] for task in tasks}
     return summarize_rates(rates, seeds=list(named), **options)
 
 
 @dataclass(frozen=True)
 class Pair:
-    """How much better the first method is than the second, on the same tasks.
-
-    Attributes:
-        methods: their names.
-        difference: of the mean success rates.
-        improvement: the probability that a seed of the first beats one of the second on a task; a tie counts half.
-    """
+    """How much better the first of two methods is on the same tasks: the difference of the mean success rates, and the
+    probability that a seed of the first beats one of the second on a task, where a tie counts half."""
 
     methods: tuple[str, str]
     difference: Estimate
@@ -225,15 +201,12 @@ class Pair:
 
 
 class MethodComparison:
-    """Several methods' summaries, which have the same tasks.
+    """Several methods' summaries.
 
     Args:
-        summaries: method to :class:`Summary`; the first is compared with each of the others.
+        summaries: method to :class:`Summary`, of the same tasks; the first is compared with each of the others.
         published: label to (task to success rate), such as :func:`published_curves` gives.
         confidence: of the intervals of differences, in (0, 1).
-
-    Raises:
-        ValueError: no summaries, or summaries of different tasks.
 
     Example:
         >>> from lw_torchrl.evaluation import summarize_rates
@@ -262,48 +235,39 @@ class MethodComparison:
         for other in others:
             order = [self.summaries[other].tasks.index(task) for task in self.tasks]
             rates = self.summaries[first].array, self.summaries[other].array[:, order]
-            difference = mean_difference(*rates, confidence=confidence)
-            improvement = probability_of_improvement(*rates, confidence=confidence)
+            difference = statistics.mean_difference(*rates, confidence=confidence)
+            improvement = statistics.probability_of_improvement(*rates, confidence=confidence)
             self.pairs.append(Pair((first, other), difference, improvement))
 
     def to_json(self) -> dict[str, Any]:
         """As plain numbers, lists and mappings."""
         return {
             "methods": {method: summary.to_json() for method, summary in self.summaries.items()},
-            "pairs": [
-                {"methods": [*p.methods], "difference": p.difference.to_json(), "improvement": p.improvement.to_json()}
-                for p in self.pairs
-            ],
-            "published_means": {label: self._mean(rates) for label, rates in self.published.items()},
+            "pairs": [{**asdict(pair), "methods": list(pair.methods)} for pair in self.pairs],
+            "published_means": {label: _mean(rates, self.tasks) for label, rates in self.published.items()},
         }
 
     def headline(self) -> str:
         """A Markdown table with a row per method, then a line per pair."""
         outside = [task for task in self.tasks if task not in MT10]
+        outside = [] if len(outside) == len(self.tasks) else outside
         head = ["method", "mean", "IQM", f"tasks >= {self.threshold:g}, of {len(self.tasks)}", "seeds"]
-        head += [f"mean of the {len(outside)} outside MT10"] if 0 < len(outside) < len(self.tasks) else []
+        head += [f"mean of the {len(outside)} outside MT10"] if outside else []
         rows = []
         for method, summary in self.summaries.items():
             each = ", ".join(f"{mean:.3f}" for mean in summary.by_seed.values())
-            row = [method, str(summary.mean), str(summary.iqm), str(summary.solved), each]
             means = {task: found.mean for task, found in summary.per_task.items()}
-            rows.append([*row, *self._outside(means, outside)])
+            last = [f"{_mean(means, outside):.3f}"] if outside else []
+            rows.append([method, str(summary.mean), str(summary.iqm), str(summary.solved), each, *last])
         for label, rates in self.published.items():
             solved = sum(rates[task] >= self.threshold - 1e-9 for task in self.tasks)
-            rows.append([label, f"{self._mean(rates):.3f}", "", str(solved), "", *self._outside(rates, outside)])
+            last = [f"{_mean(rates, outside):.3f}"] if outside else []
+            rows.append([label, f"{_mean(rates, self.tasks):.3f}", "", str(solved), "", *last])
         lines = [
             f"{pair.methods[0]} - {pair.methods[1]}: {pair.difference}; probability of improvement {pair.improvement}"
             for pair in self.pairs
         ]
         return "\n\n".join(filter(None, [markdown_table(head, rows), "  \n".join(lines)]))
-
-    def _mean(self, rates: Mapping[str, float]) -> float:
-        return sum(rates[task] for task in self.tasks) / len(self.tasks)
-
-    def _outside(self, rates: Mapping[str, float], outside: list[str]) -> list[str]:
-        if not 0 < len(outside) < len(self.tasks):
-            return []
-        return [f"{sum(rates[task] for task in outside) / len(outside):.3f}"]
 
     def per_task(self) -> str:
         """A Markdown table with a row per task: each method's mean, its least and greatest seed, and the published."""
@@ -316,6 +280,10 @@ class MethodComparison:
                 cells.append(f"{each[task].mean:.2f}{spread}")
             rows.append([task, *cells, *(f"{rates[task]:.2f}" for rates in self.published.values())])
         return markdown_table(["task", *found, *self.published], rows)
+
+
+def _mean(rates: Mapping[str, float], tasks: Sequence[str]) -> float:
+    return sum(rates[task] for task in tasks) / len(tasks)
 
 
 def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

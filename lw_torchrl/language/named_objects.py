@@ -24,6 +24,10 @@ def is_number(value: object) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e9
 
 
+def is_triple(value: object) -> bool:
+    return isinstance(value, (list, tuple)) and len(value) == 3 and all(map(is_number, value))
+
+
 def typed(position: Sequence[Coordinate]) -> TypedPosition:
     """A position that tells index 1 from metre 1.0, which are equal numbers."""
     return tuple((isinstance(coordinate, int), coordinate) for coordinate in position)
@@ -59,14 +63,12 @@ class NamedObject:
             raise ValueError(f"name must be lower-case words like 'drawer handle', got {shown(self.name)}")
         if {"and", "is", "not", "the"} & set(self.name.split()):
             raise ValueError(f"name may not contain 'and', 'is', 'not' or 'the', got {shown(self.name)}")
-        if len(self.position) != 3:
-            raise ValueError(f"position of {self.name!r} must have 3 coordinates, got {shown(self.position)}")
-        if not all(map(is_number, self.position)):
-            raise ValueError(f"position of {self.name!r} must hold ints and finite floats, got {shown(self.position)}")
+        if not is_triple(self.position):
+            raise ValueError(f"position of {self.name!r} must hold 3 ints or finite floats, got {shown(self.position)}")
         for coordinate in self.position:
             if isinstance(coordinate, int) and not 0 <= coordinate < OBSERVATION_SIZE:
                 raise ValueError(f"position of {self.name!r}: obs[{coordinate}] is outside the 39 numbers, 0 to 38")
-        if len(self.offset) != 3 or not all(map(is_number, self.offset)):
+        if not is_triple(self.offset):
             raise ValueError(f"offset of {self.name!r} must be three numbers in metres, got {shown(self.offset)}")
 
 
@@ -85,7 +87,6 @@ def read_position(name: str, at: Any) -> tuple[Coordinate, Coordinate, Coordinat
 
 
 def write_position(position: tuple[Coordinate, Coordinate, Coordinate]) -> str | list[str | float]:
-    """What :func:`read_position` reads back."""
     first = position[0]
     if isinstance(first, int) and position == (first, first + 1, first + 2):
         return f"obs[{first}:{first + 3}]"
@@ -101,10 +102,9 @@ def read_point(name: str, at: Any, objects: Mapping[str, NamedObject]) -> NamedO
     if len(at) != 2:
         raise ValueError(f"point {name!r} must have object and offset, got {', '.join(at) or 'neither'}")
     check_choice(f"object of point {name!r}", at["object"], objects)
-    offset = at["offset"]
-    if not isinstance(offset, list) or len(offset) != 3 or not all(map(is_number, offset)):
-        raise ValueError(f"offset of {name!r} must be three numbers in metres, got {shown(offset)}")
-    return NamedObject(name, objects[at["object"]].position, (offset[0], offset[1], offset[2]), ours=True)
+    if not is_triple(at["offset"]):
+        raise ValueError(f"offset of {name!r} must be three numbers in metres, got {shown(at['offset'])}")
+    return NamedObject(name, objects[at["object"]].position, tuple(at["offset"]), ours=True)
 
 
 def read_objects(row: Mapping[str, Any]) -> tuple[NamedObject, ...]:

@@ -6,16 +6,14 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
-from importlib.resources import files
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from rapidfuzz import fuzz, process
 
 from lw_torchrl._checks import check_choice, checked, shown
-from lw_torchrl._files import read_toml
 from lw_torchrl.language.queries import Clause, Query, QueryError, base_clauses, check_length, parse_query, read_query
 from lw_torchrl.language.relations import PUBLISHED, RELATIONS, UNARY
-from lw_torchrl.language.skills import ScriptedSkill, SkillError, load_skills, skills_for
+from lw_torchrl.language.skills import WORDS, ScriptedSkill, SkillError, Skills, load_skills, skills_for
 from lw_torchrl.language.tasks import Task, get_task
 
 if TYPE_CHECKING:
@@ -134,7 +132,6 @@ def _content(words: list[str]) -> str:
 
 @lru_cache(maxsize=256)
 def _choices(task: Task, relations: tuple[str, ...]) -> tuple[tuple[Clause, ...], tuple[str, ...]]:
-    """The base clauses without negations, and the words of each that count."""
     affirmed = tuple(clause for clause in base_clauses(task, relations) if not clause.negated)
     return affirmed, tuple(_content(str(clause).split()) for clause in affirmed)
 
@@ -155,7 +152,7 @@ def _vectors(texts: tuple[str, ...], encode: Callable[[list[str]], Tensor]) -> T
 def nearest_skill(
     text: str,
     task: str | Task | None = None,
-    skills: Mapping[str, ScriptedSkill] | Iterable[str] | None = None,
+    skills: Skills | Iterable[str] | None = None,
     by: Literal["edit", "embedding"] = "edit",
 ) -> tuple[ScriptedSkill, float]:
     """The scripted skill whose text is closest, and how close it is, in [0, 1].
@@ -201,12 +198,7 @@ class StepMapper:
     """
 
     def __init__(
-        self,
-        task: Task,
-        skills: Mapping[str, ScriptedSkill] | None,
-        by: Literal["edit", "embedding"],
-        limit: float,
-        skill_limit: float,
+        self, task: Task, skills: Skills | None, by: Literal["edit", "embedding"], limit: float, skill_limit: float
     ) -> None:
         self.task, self.by, self.limit, self.skill_limit = task, by, limit, skill_limit
         self.skills = skills_for(task, skills)
@@ -230,14 +222,14 @@ class StepMapper:
             return None, 1.0
         words = _with_target(text, self.task)
         if found := _phrases("skills").match(words):
-            words = _synonyms("skills")[found[0]] + words[found.end() :]
+            words = WORDS["skills"][found[0]] + words[found.end() :]
         skill, score = nearest_skill(words, None, self.skills, by=self.by)
         return (skill.text if 1.0 - score <= self.skill_limit else None), 1.0 - score
 
 
 @lru_cache(maxsize=4096)
 def _nearest_condition(text: str, task: Task, by: Literal["edit", "embedding"]) -> tuple[Query | None, float]:
-    words = _phrases("conditions").sub(lambda found: _synonyms("conditions")[found[0]], _with_target(text, task))
+    words = _phrases("conditions").sub(lambda found: WORDS["conditions"][found[0]], _with_target(text, task))
     try:
         match = nearest_query(words, task, by=by)
     except QueryError:
@@ -257,13 +249,7 @@ def _with_target(text: str, task: Task) -> str:
 
 
 @cache
-def _synonyms(kind: str) -> Mapping[str, str]:
-    table: Mapping[str, str] = read_toml(files("lw_torchrl.language") / "data" / "words.toml", ValueError)[kind]
-    return table
-
-
-@cache
 def _phrases(kind: str) -> re.Pattern[str]:
     """Any phrase of the table, the longest first; one that our own words begin with is left alone."""
-    longest = sorted(_synonyms(kind), key=len, reverse=True)
+    longest = sorted(WORDS[kind], key=len, reverse=True)
     return re.compile(rf"\b(?:{'|'.join(map(re.escape, longest))})\b")

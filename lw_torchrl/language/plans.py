@@ -3,37 +3,22 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, lru_cache
 from hashlib import sha256
-from typing import Any
+from typing import Any, NoReturn
 
 from lw_torchrl._checks import check_fields, checked, shown
+from lw_torchrl.language.plan_text import MOST_STEPS, function_head, one_line, quote, read_plan_text, too_many_steps
 from lw_torchrl.language.queries import Query, check_query, read_query
 from lw_torchrl.language.relations import PREDICATES
-from lw_torchrl.language.skill_words import canonical_skill
-from lw_torchrl.language.skills import load_skills
-from lw_torchrl.language.tasks import TASKS, Task, check_task, get_task
-
-MOST_STEPS = 1_000
-"""Steps of a plan, at most; the longest of ours has 6."""
-PLAN_LIMIT = 2**18
-"""Characters of a plan's text, and bytes of a file of plans, which takes a second to read."""
+from lw_torchrl.language.skills import canonical_skill, load_skills
+from lw_torchrl.language.tasks import TASKS, Task, Tasks, check_task, get_task
 
 
 class PlanError(ValueError):
     """A text or a list of steps that is no conditional plan."""
-
-
-def one_line(text: str) -> str:
-    """A description or a reason with its line ends as spaces."""
-    return " ".join(text.split())
-
-
-def too_many_steps(what: str, number: int) -> PlanError:
-    """The error for a plan of more than :data:`MOST_STEPS`; the caller raises it."""
-    return PlanError(f"{what} must have at most {MOST_STEPS} steps, got {number}")
 
 
 @lru_cache(maxsize=1024)
@@ -85,7 +70,7 @@ class ConditionalPlan:
             raise TypeError(f"definition must be a Task, got {shown(self.definition)}")
         listed = tuple(self.steps)
         if len(listed) > MOST_STEPS:
-            raise too_many_steps(f"plan of task {self.task!r}", len(listed))
+            raise PlanError(too_many_steps(f"plan of task {self.task!r}", len(listed)))
         definition = TASKS[check_task(self.task)] if self.definition is None else self.definition
         if definition.name != self.task:
             raise PlanError(f"definition of plan {self.task!r} is of another task, {definition.name!r}")
@@ -111,7 +96,7 @@ class ConditionalPlan:
         """A plan from (condition, skill) pairs, the conditions in any accepted spelling."""
         definition, listed = get_task(task), list(pairs)
         if len(listed) > MOST_STEPS:
-            raise too_many_steps(f"plan of task {definition.name!r}", len(listed))
+            raise PlanError(too_many_steps(f"plan of task {definition.name!r}", len(listed)))
         steps = tuple(PlanStep(check_query(query, definition), skill) for query, skill in listed)
         return cls(definition.name, steps, definition)
 
@@ -121,31 +106,64 @@ class ConditionalPlan:
         return tuple(step.goal or usual_goal(step.skill, self.definition) for step in self.steps)
 
     def __str__(self) -> str:
-        return format_plan(self)
+        """The plan as text in the chain_py format; :func:`parse_plan` reads it back."""
+        lines = []
+        for step in self.steps:
+            if reason := one_line(step.reason).lstrip("# "):
+                lines.append(f"    # {reason}")
+            verb, _, details = step.skill.partition(" ")
+            said = [quote(details)]
+            if step.goal is not None:
+                said.append(f"goal={quote(str(step.goal))}")
+            lines += [f"    if check({quote(str(step.condition))}):", f"        robot.{verb}({', '.join(said)})"]
+        return function_head(self.definition) + "".join(f"{line}\n" for line in lines)
 
 
-def quote(text: str) -> str:
-    """A text in quotes, as plans and Python have it."""
-    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
+def check_plan(
+    text: str, task: str | None = None, source: str = "plan", tasks: Tasks = TASKS
+) -> tuple[ConditionalPlan | None, list[str]]:
+    """As :func:`parse_plan`, but the plan, None if it has faults, and all its faults in the order of the lines."""
+    faults: list[str] = []
+    return _read(text, task, source, tasks, faults.append), faults
 
 
-def format_plan(plan: ConditionalPlan) -> str:
-    """The plan as text in the chain_py format; :func:`~lw_torchrl.language.plan_files.parse_plan` reads it back."""
-    lines = []
-    for step in plan.steps:
-        if reason := one_line(step.reason).lstrip("# "):
-            lines.append(f"    # {reason}")
-        verb, _, details = step.skill.partition(" ")
-        said = [quote(details)]
-        if step.goal is not None:
-            said.append(f"goal={quote(str(step.goal))}")
-        lines += [f"    if check({quote(str(step.condition))}):", f"        robot.{verb}({', '.join(said)})"]
-    return function_head(plan.definition) + "".join(f"{line}\n" for line in lines)
+def parse_plan(text: str, task: str | None = None, source: str = "plan", tasks: Tasks = TASKS) -> ConditionalPlan:
+    """Read one plan in the chain_py format. It is not executed: every line is matched against a few forms::
+
+        def drawer_open(robot):
+            # The gripper has to come from above.
+            if check("the robot's gripper is not vertically aligned with the drawer handle"):
+                robot.place("the gripper above the drawer handle")
+
+    A goal that is not the skill's usual one stands behind it: ``robot.place("...", goal="the gripper is open")``.
+
+    Args:
+        text: the plan; its first fault is a :class:`PlanError` with the line.
+        task: the task it must be for; None takes the one its ``def`` line names.
+        source: what to call the text in errors, a file's name.
+        tasks: whose objects the conditions name, by task name, as from :func:`~lw_torchrl.load_tasks`.
+
+    Source: paper section 'Conditional Plan Generation' and its figure of a chain_py plan.
+    """
+
+    def refuse(fault: str) -> NoReturn:
+        raise PlanError(fault)
+
+    plan = _read(text, task, source, tasks, refuse)
+    assert plan is not None  # or a fault was refused
+    return plan
 
 
-def function_head(task: Task) -> str:
-    """The lines with which the function of a task begins."""
-    return f"# {task.name}: {one_line(task.description)}\ndef {task.name.replace('-', '_')}(robot):\n"
+def _read(
+    text: str, task: str | None, source: str, tasks: Tasks, report: Callable[[str], Any]
+) -> ConditionalPlan | None:
+    if (found := read_plan_text(text, task, source, tasks, report)) is None:
+        return None
+    name, steps = found
+    try:
+        return ConditionalPlan(name, tuple(PlanStep(*step) for step in steps), tasks[name])
+    except PlanError as error:
+        return report(str(error))
 
 
 class Plans(Mapping[str, ConditionalPlan]):
@@ -242,8 +260,6 @@ class Plans(Mapping[str, ConditionalPlan]):
     @classmethod
     def from_json(cls, found: Any) -> Plans:
         """The plans of :meth:`to_json`; any other value is a :class:`PlanError`."""
-        from lw_torchrl.language.plan_files import parse_plan
-
         if not isinstance(found, dict):
             raise PlanError(f"plans must be an object of task names and plans, got {shown(found)}")
         plans = []

@@ -6,6 +6,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import permutations
 
 from rapidfuzz import fuzz, process
 
@@ -63,19 +64,14 @@ def check_length(text: str, parts: Sequence[str]) -> None:
 def base_clauses(task: Task, relations: tuple[str, ...]) -> tuple[Clause, ...]:
     """The clauses that :func:`supported_queries` lists as texts."""
     clauses = []
-    for first in task.object_names:
-        for second in task.object_names:
-            if first == second:
-                continue
-            for relation in relations:
-                if relation == "around" and first != GRIPPER:
-                    continue
+    for first, second in permutations(task.object_names, 2):
+        for relation in relations:
+            if relation != "around" or first == GRIPPER:
                 clauses += [Clause(first, relation, second, negated) for negated in (False, True)]
     for thing in task.objects:
         if not thing.ours and thing.position in (places(FIRST), places(SECOND)):
             clauses += [Clause(thing.name, TOUCHING), Clause(thing.name, TOUCHING, negated=True)]
-    clauses += [Clause(GRIPPER, "open"), Clause(GRIPPER, "closed")]
-    return tuple(clauses)
+    return (*clauses, Clause(GRIPPER, "open"), Clause(GRIPPER, "closed"))
 
 
 @lru_cache(maxsize=256)
@@ -145,7 +141,7 @@ class _ClauseParser:
 
     def name(self) -> str | None:
         start = self.at
-        if self.at < len(self.words) and self.words[self.at] in ARTICLES:
+        if self.at_article():
             self.at += 1
         for name in sorted(self.names, key=len, reverse=True):
             if self.take(name):
@@ -153,13 +149,13 @@ class _ClauseParser:
         self.at = start
         return None
 
-    def name_error(self, expected: str) -> QueryError:
-        if self.at < len(self.words) and self.words[self.at] in ARTICLES:
+    def name_error(self, expected: str = "") -> QueryError:
+        if self.at_article():
             self.at += 1  # the noun is wrong, not its article
-        return self.error(expected)
+        return self.error(expected or "one of " + ", ".join(repr(f"the {name}") for name in self.task.object_names))
 
-    def names_allowed(self) -> str:
-        return "one of " + ", ".join(repr(f"the {name}") for name in self.task.object_names)
+    def at_article(self) -> bool:
+        return self.at < len(self.words) and self.words[self.at] in ARTICLES
 
     def parse(self, previous: str | None) -> Clause:
         if not self.words:
@@ -169,8 +165,8 @@ class _ClauseParser:
             self.take("is")
         subject = self.name()
         if subject is None:
-            if previous is None or (self.words[self.at : self.at + 1] and self.words[self.at] in ARTICLES):
-                raise self.name_error(self.names_allowed())
+            if previous is None or self.at_article():
+                raise self.name_error()
             subject = previous
             self.inferred = f"the {subject} is "
         if not negated:
@@ -181,15 +177,12 @@ class _ClauseParser:
         if predicate in ("open", "closed") and subject != GRIPPER:
             self.at -= 1
             raise self.error(f"a predicate of the {subject}; only the gripper is open or closed")
-        other = None
-        if predicate not in UNARY:
-            start = self.at
-            other = self.name()
-            if other is None:
-                raise self.name_error(self.names_allowed())
-            if other == subject:
-                self.at = start
-                raise self.name_error(f"an object other than {subject!r}")
+        start, other = self.at, None if predicate in UNARY else self.name()
+        if other is None and predicate not in UNARY:
+            raise self.name_error()
+        if other == subject:
+            self.at = start
+            raise self.name_error(f"an object other than {subject!r}")
         if self.at < len(self.words):
             raise self.error("the end of the clause, or 'and'")
         return Clause(subject, predicate, other, negated)

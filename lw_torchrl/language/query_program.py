@@ -10,12 +10,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from lw_torchrl._checks import check_choice, checked, shown
+from lw_torchrl._checks import check_choice, shown
 from lw_torchrl.language.observation import OBSERVATION_SIZE
 from lw_torchrl.language.queries import Query, check_query
 from lw_torchrl.language.query_tables import QueryTables, compile_facts, compile_queries
 from lw_torchrl.language.task_index import TaskIndex, TaskTables
-from lw_torchrl.language.tasks import TASKS, Task, get_task
+from lw_torchrl.language.tasks import TASKS, Task
 from lw_torchrl.language.value_checks import check_finite
 
 _LEAST, _MOST = 1e-6, 1e4  # of the size of a logit, and of metres where a length has a gradient
@@ -57,19 +57,17 @@ class QueryProgram(nn.Module):
     Source: paper section 'Query Answering Function'.
     """
 
-    @checked
     def __init__(self, queries: Mapping[str | Task, Sequence[str | Query]]) -> None:
+        what = "queries must map task names to lists of queries, got"
         if not isinstance(queries, Mapping):
-            raise TypeError(f"queries must map task names to lists of queries, got {type(queries).__name__}")
+            raise TypeError(f"{what} {type(queries).__name__}")
         if not queries:
             raise ValueError("queries must name at least one task, got an empty mapping")
         compiled: dict[Task, tuple[Query, ...]] = {}
         for key, listed in queries.items():
             if not isinstance(key, (str, Task)):
-                raise TypeError(f"queries must map task names to lists of queries, got {shown(key)} for a name")
-            if isinstance(key, str):
-                check_choice("queries", key, TASKS)
-            task = get_task(key)
+                raise TypeError(f"{what} {shown(key)} for a name")
+            task = key if isinstance(key, Task) else TASKS[check_choice("queries", key, TASKS)]
             if any(task.name == other.name for other in compiled):
                 raise ValueError(f"queries must name each task once, got {task.name!r} twice")
             if isinstance(listed, (str, Query)) or not isinstance(listed, Iterable) or not listed:
@@ -151,11 +149,9 @@ class QueryProgram(nn.Module):
         return soft - soft.detach() + torch.where(holds, size, -size)
 
     def _kernel(self, observation: Tensor, task_id: Tensor) -> Callable[..., bool] | None:
-        """The kernel, if it can answer this batch."""
         here = observation.dtype in self._facts and observation.is_cpu and task_id.is_cpu
-        if here and self._tables.plain(observation, task_id) and not observation.is_neg():
-            return find_kernel()
-        return None
+        right = here and self._tables.plain(observation, task_id) and not observation.is_neg()
+        return find_kernel() if right else None
 
     def _answer(self, kernel: Callable[..., bool], observation: Tensor, task_id: Tensor) -> Tensor:
         """Few operations of PyTorch: after the physics, which empties the processor's caches, each is slow."""

@@ -155,7 +155,6 @@ class QueryFacts(NamedTuple):
     constants: NDArray[np.floating[Any]]  # (C,), read as if they followed the observation
 
     def of(self, dtype: Any) -> QueryFacts:
-        """The same for observations of another precision."""
         return self._replace(metres=self.metres.astype(dtype), constants=self.constants.astype(dtype))
 
 

@@ -1,18 +1,17 @@
-"""What the relations mean: comparisons of d = first position - second position, in metres."""
+"""What the relations mean: comparisons of d = first position - second position, in metres, of data/relations.toml."""
 
 from __future__ import annotations
 
 import re
 from collections import ChainMap, UserDict
 from dataclasses import dataclass
+from importlib.resources import files
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from lw_torchrl._checks import check_choice, shown
+from lw_torchrl._files import read_toml
 from lw_torchrl.language.named_objects import is_number
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 
 @dataclass(frozen=True)
@@ -47,33 +46,16 @@ class Comparison:
         if self.temperature <= 0:
             raise ValueError(f"temperature must be above 0, got {self.temperature}")
 
-    def holds(self, d: Tensor) -> Tensor:
-        """Whether the comparison holds of d: (..., 3) metres to (...) bool."""
-        import torch
 
-        counted = [d[..., "xyz".index(axis)] + (self.raise_z if axis == "z" else 0.0) for axis in self.axes]
-        value = torch.stack([x.square() for x in counted]).sum(0).sqrt() if self.length else counted[0]
-        if self.sense == "<":
-            return value < self.threshold
-        return value > self.threshold if self.sense == ">" else value <= self.threshold
+_TABLE = read_toml(files("lw_torchrl.language") / "data" / "relations.toml", ValueError)
 
 
-def _within(axes: str, radius: float, raise_z: float = 0.0) -> Comparison:
-    return Comparison(axes, "<", radius, raise_z=raise_z)
-
-
-def _along(axis: str, sense: Literal["<", ">", "<="], threshold: float, temperature: float = 0.01) -> Comparison:
-    return Comparison(axis, sense, threshold, length=False, temperature=temperature)
+def _predicates(kind: str) -> dict[str, tuple[Comparison, ...]]:
+    return {name: tuple(Comparison(**part) for part in parts) for name, parts in _TABLE[kind].items()}
 
 
 TOUCHING = "touching the table"
-UNARY = MappingProxyType(
-    {
-        TOUCHING: (_along("z", "<=", 0.02),),
-        "open": (_along("z", ">", 0.75, temperature=0.05),),
-        "closed": (_along("z", "<=", 0.75, temperature=0.05),),
-    }
-)
+UNARY = MappingProxyType(_predicates("unary"))
 """The predicates of one object, with the origin as second position: "touching the table" compares the object's z,
 "open" and "closed" the gripper's opening in place of z."""
 
@@ -92,46 +74,13 @@ class Relations(UserDict[str, tuple[Comparison, ...]]):
         super().__setitem__(name, tuple(parts))
 
 
-RELATIONS = Relations(
-    {
-        "near": (_within("xyz", 0.04),),
-        "around": (_within("xyz", 0.03, raise_z=0.02),),
-        "left of": (_along("x", ">", 0.04),),
-        "right of": (_along("x", "<", -0.04),),
-        "behind": (_along("y", ">", 0.04), _within("xz", 0.04)),
-        "in front of": (_along("y", "<", -0.04), _within("xz", 0.04)),
-        "above": (_within("xy", 0.02), _along("z", ">", 0.0)),
-        "below": (_within("xy", 0.02), _along("z", "<", 0.0)),
-        "vertically aligned with": (_within("xy", 0.06),),
-        "almost vertically aligned with": (_within("xy", 0.12),),
-        "mostly below": (_along("z", "<", 0.23),),
-        "horizontally aligned with": (_within("yz", 0.03),),
-        "forward aligned with": (_within("xz", 0.03),),
-    }
-)
+RELATIONS = Relations(_predicates("relations"))
 """The relations between two objects: the 13 published ones, and those that you add (docs/queries.md shows how).
 
 Source: paper section 'Query Answering Function'; the thresholds are the published ones.
 """
-PUBLISHED = (
-    "near", "around", "left of", "right of", "behind", "in front of", "above", "below", "vertically aligned with",
-    "almost vertically aligned with", "mostly below", "horizontally aligned with", "forward aligned with",
-)  # fmt: skip
+PUBLISHED: tuple[str, ...] = tuple(_TABLE["published"])
 """The names of the paper's 13, whatever else :data:`RELATIONS` holds."""
 
 PREDICATES = ChainMap[str, tuple[Comparison, ...]](UNARY, RELATIONS)  # type: ignore[arg-type]
 """All that a clause can say: the relations, also those that are added, then the predicates of one object."""
-
-
-def relation_holds(relation: str, first: Tensor, second: Tensor) -> Tensor:
-    """Whether one of :data:`RELATIONS` holds between two positions: (..., 3) float, metres, to (...) bool.
-
-    Example:
-        >>> import torch
-        >>> relation_holds("above", torch.tensor([0.0, 0.6, 0.2]), torch.tensor([0.0, 0.61, 0.02]))
-        tensor(True)
-    """
-    import torch
-
-    check_choice("relation", relation, RELATIONS)
-    return torch.stack([part.holds(first - second) for part in RELATIONS[relation]]).all(0)

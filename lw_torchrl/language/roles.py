@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
 from lw_torchrl.language.named_objects import GRIPPER, NamedObject, typed
 from lw_torchrl.language.observation import FIRST, GOAL, HAND, SECOND, places
 from lw_torchrl.language.plans import ConditionalPlan, PlanStep
-from lw_torchrl.language.skills import ScriptedSkill, skills_for
+from lw_torchrl.language.skills import Skills, skills_for
 from lw_torchrl.language.tasks import Task
 
 Source = Literal["skill", "words", "condition", "nothing"]
@@ -38,7 +37,7 @@ def role_object(task: Task, name: str) -> NamedObject:
     return _GOAL if name == _TARGET and name not in task.object_names else task.object(name)
 
 
-def plan_roles(plan: ConditionalPlan, skills: Mapping[str, ScriptedSkill] | None = None) -> tuple[Roles, ...]:
+def plan_roles(plan: ConditionalPlan, skills: Skills | None = None) -> tuple[Roles, ...]:
     """The roles of each step of a plan.
 
     If the text is that of a scripted skill for the task, the skill's ``target`` and ``moved`` count, and nothing else
@@ -64,7 +63,7 @@ def plan_roles(plan: ConditionalPlan, skills: Mapping[str, ScriptedSkill] | None
     return tuple(found)
 
 
-def _of_skill(step: PlanStep, task: Task, skills: Mapping[str, ScriptedSkill]) -> Roles | None:
+def _of_skill(step: PlanStep, task: Task, skills: Skills) -> Roles | None:
     if step.skill not in skills:
         return None
     skill = skills[step.skill].for_task(task)
@@ -139,7 +138,6 @@ def _carried(roles: Roles, step: PlanStep, task: Task) -> Roles:
 
 
 def _holds(step: PlanStep, relation: str, name: str) -> bool:
-    """Whether the condition says so of the gripper and a thing, or of the gripper."""
     said = [clause for clause in step.condition.clauses if clause.predicate == relation and not clause.negated]
     return any(name in (clause.subject, clause.object) for clause in said)
 
@@ -149,7 +147,6 @@ def _same_thing(first: str, second: str, task: Task) -> bool:
 
 
 def _can_move(name: str, task: Task) -> bool:
-    """Whether it is the gripper or an object: no wall, no hole, no goal."""
     position = typed(role_object(task, name).position)
     return any(position == typed(places(thing)) for thing in (HAND, FIRST, SECOND))
 

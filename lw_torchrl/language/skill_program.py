@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from lw_torchrl._checks import check_choice
 from lw_torchrl.language.named_objects import coordinate_index
 from lw_torchrl.language.observation import OBSERVATION_SIZE
-from lw_torchrl.language.skills import ScriptedSkill, load_skills
+from lw_torchrl.language.skills import ScriptedSkill, Skills, load_skills
 from lw_torchrl.language.task_index import TaskIndex, TaskTables
 from lw_torchrl.language.tasks import Task, get_task
 
@@ -47,11 +47,7 @@ class SkillProgram(nn.Module):
     Source: paper section 'Scripted Skills'.
     """
 
-    def __init__(
-        self,
-        skills: Mapping[str | Task, Sequence[str | ScriptedSkill]],
-        table: Mapping[str, ScriptedSkill] | None = None,
-    ) -> None:
+    def __init__(self, skills: Mapping[str | Task, Sequence[str | ScriptedSkill]], table: Skills | None = None) -> None:
         known = load_skills() if table is None else table
         if not skills:
             raise ValueError("skills must name at least one task, got an empty mapping")

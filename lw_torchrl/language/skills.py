@@ -1,9 +1,10 @@
-"""Scripted skills: stateless linear controllers with a name in plain English. Their table is data/skills.toml."""
+"""Scripted skills, stateless linear controllers of data/skills.toml, and what the words of any skill say."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Mapping
+import re
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from functools import cache, lru_cache
 from importlib.resources import files
@@ -12,10 +13,10 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from lw_torchrl._checks import checked, nearest, shown
+from lw_torchrl._checks import check_choice, checked, nearest, shown
 from lw_torchrl._files import read_toml
-from lw_torchrl.language.named_objects import GRIPPER, is_number
-from lw_torchrl.language.tasks import TASKS, Task, check_task, get_task
+from lw_torchrl.language.named_objects import GRIPPER, is_number, is_triple
+from lw_torchrl.language.tasks import TASKS, Task, Tasks, check_task, get_task
 
 Triple = tuple[float, float, float]
 
@@ -63,7 +64,7 @@ class ScriptedSkill:
         for name in ("target", "moved"):
             check(name, "be the name of an object", lambda given: isinstance(given, str))
         for name in ("offset", "gain"):
-            check(name, "be three numbers", _is_triple)
+            check(name, "be three numbers", is_triple)
         check("gain", "not be negative", lambda given: min(given) >= 0)
         check("goal", "be a query in words", lambda given: isinstance(given, str))
         check("gripper", "lie in [-1, 1]", lambda given: is_number(given) and -1 <= given <= 1)
@@ -75,7 +76,8 @@ class ScriptedSkill:
         for name in (skill.target, skill.moved):
             if name not in found.object_names:
                 lacks = f"needs {name!r}, which task {found.name!r} lacks; it has {', '.join(found.object_names)}"
-                raise SkillError(f"skill {self.text!r} {lacks}{_did_you_mean(name, found.object_names)}")
+                near = "".join(f"; did you mean {other!r}?" for other in nearest(name, found.object_names, n=1))
+                raise SkillError(f"skill {self.text!r} {lacks}{near}")
         return skill
 
     def suits(self, task: str | Task) -> bool:
@@ -85,61 +87,50 @@ class ScriptedSkill:
         return {skill.target, skill.moved} <= set(found.object_names)
 
 
+Skills = Mapping[str, ScriptedSkill]
 _KEYS = tuple(f.name for f in fields(ScriptedSkill) if f.name not in ("text", "variants"))
 
 
-def _is_triple(given: Any) -> bool:
-    return isinstance(given, (list, tuple)) and len(given) == 3 and all(map(is_number, given))
-
-
-def _did_you_mean(name: str, allowed: Iterable[str]) -> str:
-    close = nearest(name, allowed, n=1)
-    return f"; did you mean {close[0]!r}?" if close else ""
-
-
-def _skill(text: str, row: Any, source: str, tasks: Mapping[str, Task]) -> ScriptedSkill:
+def _skill(text: str, row: Any, tasks: Tasks) -> ScriptedSkill:
     if not isinstance(row, Mapping):
-        raise SkillError(f"{source}: skill {text!r} must be a table, got {shown(row)}")
+        raise SkillError(f"skill {text!r} must be a table, got {shown(row)}")
     given = dict(row)
     listed = given.pop("for", {})
     if not isinstance(listed, Mapping) or not all(isinstance(change, Mapping) for change in listed.values()):
-        raise SkillError(f"{source}: for of skill {text!r} must map task names to tables, got {shown(listed)}")
+        raise SkillError(f"for of skill {text!r} must map task names to tables, got {shown(listed)}")
     variants = {}
     for task, change in listed.items():
         try:
-            check_task(task, tasks)
+            variants[check_task(task, tasks)] = _skill(text, {**given, **change}, tasks)
         except ValueError as error:
-            raise SkillError(f"{source}: skill {text!r}: {error}") from error
-        variants[task] = _skill(text, {**given, **change}, f"{source}, for {task}", tasks)
+            raise SkillError(f"for {task}: {error}") from error
     for key in given:
-        if key not in _KEYS:
-            allowed = f"may have {', '.join(_KEYS)} and for, got {key!r}{_did_you_mean(key, _KEYS)}"
-            raise SkillError(f"{source}: skill {text!r} {allowed}")
+        check_choice(f"key of skill {text!r}", key, _KEYS)
     if "target" not in given:
-        raise SkillError(f"{source}: skill {text!r} must name a target")
+        raise SkillError(f"skill {text!r} must name a target")
     gain = given.get("gain", 10.0)
     given["gain"] = (gain,) * 3 if isinstance(gain, (int, float)) else gain
     given |= {key: tuple(given[key]) for key in ("gain", "offset") if isinstance(given.get(key), list)}
-    try:
-        return ScriptedSkill(text, **given, variants=MappingProxyType(variants))
-    except SkillError as error:
-        raise SkillError(f"{source}: {error}") from error
+    return ScriptedSkill(text, **given, variants=MappingProxyType(variants))
 
 
 @cache
-def _shipped() -> Mapping[str, ScriptedSkill]:
+def _shipped() -> Skills:
     return MappingProxyType(_read(files("lw_torchrl.language") / "data" / "skills.toml", TASKS))
 
 
-def _read(file: Path | Traversable, tasks: Mapping[str, Task]) -> dict[str, ScriptedSkill]:
-    table = read_toml(file, SkillError)
-    return {name: _skill(name, row, str(file), tasks) for name, row in sorted(table.items())}
+def _read(file: Path | Traversable, tasks: Tasks) -> dict[str, ScriptedSkill]:
+    found = {}
+    for text, row in sorted(read_toml(file, SkillError).items()):
+        try:
+            found[text] = _skill(text, row, tasks)
+        except ValueError as error:
+            raise SkillError(f"{file}: {error}") from error
+    return found
 
 
 @checked
-def load_skills(
-    path: str | os.PathLike[str] | None = None, *, tasks: Mapping[str, Task] = TASKS
-) -> Mapping[str, ScriptedSkill]:
+def load_skills(path: str | os.PathLike[str] | None = None, *, tasks: Tasks = TASKS) -> Skills:
     """The scripted skills by their text.
 
     Args:
@@ -163,7 +154,7 @@ def _foreign_words(task: Task) -> frozenset[str]:
     return frozenset(thing.name.split()[-1] for one in TASKS.values() for thing in one.published.objects) - own
 
 
-def skills_for(task: Task, skills: Mapping[str, ScriptedSkill] | None = None) -> Mapping[str, ScriptedSkill]:
+def skills_for(task: Task, skills: Skills | None = None) -> Skills:
     """The skills that a task may use, of the shipped ones if none are given: it has the objects that they name, and
     their texts name nothing that only other tasks have, or they have a variant for it."""
     if skills is None:
@@ -177,5 +168,60 @@ def skills_for(task: Task, skills: Mapping[str, ScriptedSkill] | None = None) ->
 
 
 @lru_cache(maxsize=256)
-def _shipped_for(task: Task) -> Mapping[str, ScriptedSkill]:
+def _shipped_for(task: Task) -> Skills:
     return MappingProxyType(dict(skills_for(task, _shipped())))
+
+
+WORDS: Mapping[str, Any] = read_toml(files("lw_torchrl.language") / "data" / "words.toml", ValueError)
+"""The tables of data/words.toml."""
+_BEFORE_NOUN, _PUSHES, _CLOSES, _DIRECTIONS = (
+    frozenset(WORDS["in_skills"][name]) for name in ("before_noun", "pushes", "closes", "directions")
+)
+_LONGEST_BEFORE = max(map(len, _BEFORE_NOUN))
+
+
+def canonical_skill(skill: str, task: Task) -> str:
+    """The skill in plain English: articles go before the nouns that lack one, as in the paper.
+
+    A noun lacks one at the beginning and after a word like "above"; else ("the coffee mug") it is left alone.
+    """
+    first, _, details = " ".join(skill.split()).partition(" ")
+    verb, *rest = first.replace("_", " ").split() or [""]
+    if not re.fullmatch(r"[A-Za-z]\w*", verb):
+        raise ValueError(f"skill must begin with a plain word like 'place', got {skill!r}")
+    details = " ".join([*rest, _with_articles(details, task)]).strip()
+    return f"{verb} {_with_articles(details, task)}".strip()
+
+
+def _with_articles(details: str, task: Task) -> str:
+    def article(match: re.Match[str]) -> str:
+        end = match.start() - (details[match.start() - 1 : match.start()] == " ")
+        start = max(0, end - _LONGEST_BEFORE - 1)  # no further: a text may be all nouns
+        before = details[start:end].rpartition(" ")[2]
+        return f"the {match[0]}" if not before or before in _BEFORE_NOUN else match[0]
+
+    nouns = sorted({*task.object_names, "gripper"}, key=len, reverse=True)
+    pattern = "|".join(re.escape(noun) for noun in nouns)
+    return re.sub(rf"(?<![\w'-])(?:{pattern})(?![\w'-])", article, details)
+
+
+def pushes(skill: str) -> bool:
+    """Whether a skill pushes or pulls: "turn the dial to the right" does, "place the gripper above the dial" not."""
+    return skill.split()[0] in _PUSHES
+
+
+def presses(skill: str) -> bool:
+    """Whether a skill pushes straight down: "push the button down"."""
+    return pushes(skill) and "down" in skill.split()
+
+
+def closes(skill: str) -> bool:
+    """Whether a skill closes the gripper: "close the gripper around the puck"."""
+    return not _CLOSES.isdisjoint(skill.split())
+
+
+def has_direction(skill: str) -> bool:
+    """Whether a skill says a direction in the plane, as seen by the robot or by the thing: "to the left", "toward the
+    robot", "in front of the drawer handle", "into the hole"; "toward the reach target" and "above the puck" say none.
+    """
+    return not _DIRECTIONS.isdisjoint(skill.split())

@@ -1,4 +1,4 @@
-"""From task ids to rows of tables that have a row for each task."""
+"""From task ids to rows of tables that have a row for each task, and the table of plans."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from typing import Any, Generic, TypeVar
 import torch
 from torch import Tensor, nn
 
+from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.tasks import MT50, task_id
-from lw_torchrl.language.value_checks import asserted, plain, waits
+from lw_torchrl.language.value_checks import asserted, plain, readable, waits
 
 _Kind = tuple[torch.device, torch.dtype, bool]
 _KEPT_ROWS = 4096  # of the last batch, the most to keep the tables of
@@ -41,7 +42,6 @@ class TaskIndex:
         self._ids = torch.tensor([*sorted(names), -1])  # -1 is no task's, for ids beyond the last
 
     def row(self, task: str) -> int:
-        """The row of a task's name."""
         return self.tasks.index(task)
 
     def rows(self, task_id: Tensor, problem: str) -> Tensor:
@@ -66,16 +66,66 @@ class TaskIndex:
         found = ids.index_select(0, rows.reshape(-1)).reshape(rows.shape)
         if kept and not waits(task_id):
             if not torch.equal(found, given):
-                raise ValueError(f"task_id names {problem}: {self._name(given[found != given])}")
+                wrong = given[found != given].unique().tolist()[:5]
+                names = (MT50[i] if 0 <= i < len(MT50) else f"{i} (none of the 50)" for i in wrong)
+                raise ValueError(f"task_id names {problem}: {', '.join(names)}")
             return rows
         if asserted(task_id):
             torch._assert_async((found == given).all(), f"task_id names {problem}")
         return torch.where(found == given, rows, len(self.tasks))
 
-    @staticmethod
-    def _name(wrong: Tensor) -> str:
-        listed = wrong.unique().tolist()[:5]
-        return ", ".join(MT50[i] if 0 <= i < len(MT50) else f"{i} (none of the 50)" for i in listed)
+
+class PlanTables:
+    """What transforms, attention and actors read of plans.
+
+    Attributes:
+        index: from task ids to rows, T of them.
+        mask: (T, S) bool, the steps that there are.
+        skill_index: (T, S) int64, the number of each step's skill in ``plans.skills``; 0 beyond the last step.
+        number: (T,) int64, the number of each plan, as in :attr:`Plans.numbers`.
+    """
+
+    def __init__(self, plans: Plans) -> None:
+        self.index = TaskIndex(plans)
+        self._problem = f"tasks without a plan in {plans!r}"
+        self.mask = torch.zeros(len(plans), plans.num_steps, dtype=torch.bool)
+        self.skill_index = torch.zeros(len(plans), plans.num_steps, dtype=torch.int64)
+        skill = {text: number for number, text in enumerate(plans.skills)}
+        for row, task in enumerate(self.index.tasks):
+            steps = plans[task].steps
+            self.mask[row, : len(steps)] = True
+            self.skill_index[row, : len(steps)] = torch.tensor([skill[step.skill] for step in steps])
+        numbers = plans.numbers
+        self.number = torch.tensor([numbers[task] for task in self.index.tasks])
+
+    def rows(self, task_id: Tensor) -> Tensor:
+        """The row of each task, (...) int64 to (...) int64; a task without a plan is a :class:`ValueError`."""
+        return self.index.rows(task_id, self._problem)
+
+    def refuse_others(self, number: Tensor | None, rows: Tensor) -> None:
+        """Raise :class:`ValueError` where queries were answered of other plans than those of ``rows``, (...) int64.
+
+        ``number``, (...) int64, is that of the plan whose queries were answered; 0 where unknown, None for all.
+        """
+        if number is None:
+            return
+        numbers = self.number
+        if number.device != numbers.device:
+            numbers = numbers.to(number.device)
+            if plain(number, rows):
+                self.number = numbers
+        if asserted(number, rows):
+            own = numbers[rows]
+            torch._assert_async(((own == number) | (number == 0)).all(), "qaf answers other plans than the actor's")
+        if not readable(number, rows):
+            return
+        own = numbers[rows]
+        if not torch.equal(own, number) and (wrong := (own != number) & (number != 0)).any():
+            tasks = ", ".join(self.index.tasks[row] for row in rows[wrong].unique().tolist()[:5])
+            raise ValueError(
+                f"qaf answers other plans than the actor's, for {tasks}: give QAFTransform the actor's plans, "
+                "QAFTransform(actor.plans), or the actor those of QAFTransform, actor.with_plans(plans)"
+            )
 
 
 class TaskTables(nn.Module, Generic[Tables]):
@@ -93,11 +143,6 @@ class TaskTables(nn.Module, Generic[Tables]):
             self.register_buffer(name, table, persistent=False)
         self._moved: dict[_Kind, Tables] = {}
         self._last: tuple[Tensor, _Kind, Tables] | None = None
-
-    @property
-    def tables(self) -> Tables:
-        """The tables, each (T, ...)."""
-        return self._make(self.buffers(recurse=False))
 
     def plain(self, *tensors: Tensor) -> bool:
         """Whether the tensors are plain, and the tables: a loss may give each member of an ensemble its own tables."""
@@ -122,14 +167,12 @@ class TaskTables(nn.Module, Generic[Tables]):
         return selected
 
     def _to(self, device: torch.device, dtype: torch.dtype) -> Tables:
-        return self._make(table.to(device, dtype if table.is_floating_point() else None) for table in self.tables)
+        tables = self.buffers(recurse=False)
+        return self._kind(*(table.to(device, dtype if table.is_floating_point() else None) for table in tables))
 
     def _pick(self, tables: Tables, task_id: Tensor) -> Tables:
         rows = self.index.rows(task_id, self.problem)
-        return self._make(table.index_select(0, rows) for table in tables)
-
-    def _make(self, tables: Iterable[Tensor]) -> Tables:
-        return self._kind(*tables)
+        return self._kind(*(table.index_select(0, rows) for table in tables))
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> TaskTables[Tables]:
         device = fn(torch.empty(0, dtype=torch.int64)).device  # which a cast of floats leaves alone

@@ -123,19 +123,18 @@ def _check_name(name: str) -> str:
     return name
 
 
-def _load() -> tuple[Mapping[str, Task], tuple[str, ...]]:
-    table = read_toml(files("lw_torchrl.language") / "data" / "tasks.toml", TaskError)
-    tasks = {name: Task.from_json(name, row) for name, row in sorted(table.items())}
-    return MappingProxyType(tasks), tuple(sorted(name for name, row in table.items() if row.get("mt10")))
-
-
-TASKS, MT10 = _load()
+_TABLE = dict(sorted(read_toml(files("lw_torchrl.language") / "data" / "tasks.toml", TaskError).items()))
+Tasks = Mapping[str, Task]
+TaskList = str | Task | Iterable[str | Task]
+TASKS: Tasks = MappingProxyType({name: Task.from_json(name, row) for name, row in _TABLE.items()})
+MT10: tuple[str, ...] = tuple(name for name, row in _TABLE.items() if row.get("mt10"))
 """TASKS maps the 50 names, sorted, to their :class:`Task`; MT10 names the ten of the MT10 set."""
 MT50: tuple[str, ...] = tuple(TASKS)
+_SETS = {"MT10": MT10, "MT50": MT50}
 _RANK = {name: rank for rank, name in enumerate(MT50)}
 
 
-def check_task(name: object, tasks: Mapping[str, Task] = TASKS) -> str:
+def check_task(name: object, tasks: Tasks = TASKS) -> str:
     """Return ``name`` if it names one of ``tasks``, else raise :class:`ValueError` with the nearest name."""
     if not isinstance(name, str):
         raise TypeError(f"task must be a task's name, got {shown(name)} ({type(name).__name__})")
@@ -144,9 +143,9 @@ def check_task(name: object, tasks: Mapping[str, Task] = TASKS) -> str:
     return name
 
 
-def _unknown_task(argument: str, name: str, tasks: Mapping[str, Task]) -> ValueError:
+def _unknown_task(argument: str, name: str, tasks: Tasks) -> ValueError:
     """The error for a name that is none of ``tasks``; where these are the 50, it says how other tasks are given."""
-    error = unknown_name(argument, name, tasks if argument == "task" else ("MT10", "MT50", *tasks))
+    error = unknown_name(argument, name, tasks if argument == "task" else (*_SETS, *tasks))
     if tasks is not TASKS:
         return error
     said = str(error) if str(error).endswith("?") else f"{error}."
@@ -168,7 +167,7 @@ def task_id(name: str) -> int:
     return len(MT50) + int.from_bytes(digest, "big") % _OWN_IDS
 
 
-def resolve_tasks(names: str | Iterable[str], *, tasks: Mapping[str, Task] = TASKS) -> tuple[str, ...]:
+def resolve_tasks(names: str | Iterable[str], *, tasks: Tasks = TASKS) -> tuple[str, ...]:
     """The names behind a set, a task, or a list of tasks, sorted by name.
 
     Args:
@@ -182,8 +181,8 @@ def resolve_tasks(names: str | Iterable[str], *, tasks: Mapping[str, Task] = TAS
     if not isinstance(tasks, Mapping):
         raise TypeError(f"tasks must map names to Task, got {shown(tasks)} ({type(tasks).__name__})")
     if isinstance(names, str):
-        if names in ("MT10", "MT50"):
-            return resolve_tasks(MT10 if names == "MT10" else MT50, tasks=tasks)
+        if names in _SETS:
+            return resolve_tasks(_SETS[names], tasks=tasks)
         if names not in tasks:
             raise _unknown_task("tasks", names, tasks)
         return (names,)
@@ -198,16 +197,12 @@ def resolve_tasks(names: str | Iterable[str], *, tasks: Mapping[str, Task] = TAS
     return tuple(sorted(found))
 
 
-def named_tasks(tasks: str | Task | Iterable[str | Task], *, known: Mapping[str, Task] = TASKS) -> dict[str, Task]:
+def named_tasks(tasks: TaskList, *, known: Tasks = TASKS) -> dict[str, Task]:
     """Task names, sorted, to the tasks of a set, a name, a Task, or a list of names and Tasks.
 
     Args:
         tasks: as for :func:`resolve_tasks`; a :class:`Task` counts for itself, whatever else has its name.
         known: the tasks that names stand for, as from :func:`~lw_torchrl.load_tasks`.
-
-    Example:
-        >>> list(named_tasks(["push", TASKS["door-open"]]))
-        ['door-open', 'push']
     """
     if isinstance(tasks, str) or not isinstance(tasks, (Task, Iterable)):
         return {name: known[name] for name in resolve_tasks(tasks, tasks=known)}
@@ -218,13 +213,13 @@ def named_tasks(tasks: str | Task | Iterable[str | Task], *, known: Mapping[str,
     return {name: there[name] for name in resolve_tasks(names, tasks=there)}
 
 
-def get_task(task: str | Task) -> Task:
-    """The :class:`Task` of a name of the 50; a Task is returned as it is."""
-    return task if isinstance(task, Task) else TASKS[check_task(task)]
+def get_task(task: str | Task, tasks: Tasks = TASKS) -> Task:
+    """The :class:`Task` of a name among ``tasks``; a Task is returned as it is."""
+    return task if isinstance(task, Task) else tasks[check_task(task, tasks)]
 
 
 @checked
-def load_tasks(path: str | os.PathLike[str]) -> Mapping[str, Task]:
+def load_tasks(path: str | os.PathLike[str]) -> Tasks:
     """All 50 tasks and those of your own file: some of the 50 with other objects, points or words, or new tasks.
 
     Args:
@@ -236,15 +231,10 @@ def load_tasks(path: str | os.PathLike[str]) -> Mapping[str, Task]:
         :func:`~lw_torchrl.load_plans` and :func:`~lw_torchrl.resolve_tasks`.
 
     Example:
-        >>> import os, tempfile
-        >>> folder = tempfile.TemporaryDirectory()
-        >>> path = os.path.join(folder.name, "mine.toml")
-        >>> lines = ["[push]", "description = 'Push the disc.'", "objects.disc = 'obs[4:7]'"]
-        >>> with open(path, "w") as file:
-        ...     print(*lines, sep=os.linesep, file=file)
-        >>> load_tasks(path)["push"].object_names
+        >>> row = "[push]\\ndescription = 'Push the disc.'\\nobjects.disc = 'obs[4:7]'"
+        >>> _ = Path("mine.toml").write_text(row)
+        >>> load_tasks("mine.toml")["push"].object_names
         ("robot's gripper", 'disc')
-        >>> folder.cleanup()
     """
     file = Path(path)
     found = dict(TASKS)

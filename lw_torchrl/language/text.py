@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 from importlib.resources import as_file, files
-from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
-
-from lw_torchrl._files import replacing
 
 TEXT_DIMENSION = 384
 TABLE = "embeddings.npz"
@@ -65,11 +62,6 @@ def encode_texts(texts: Sequence[str]) -> Tensor:
     """The default encoder: n texts to (n, 384) float32, each of length 1.
 
     The shipped texts have shipped vectors; for all others the extra ``[text]`` is needed, an ImportError without it.
-
-    Example:
-        >>> from lw_torchrl.language.tasks import TASKS
-        >>> encode_texts([TASKS["reach"].description]).shape
-        torch.Size([1, 384])
     """
     shipped = _shipped()
     new = sorted({text for text in texts if text not in shipped})
@@ -90,19 +82,3 @@ def encoded(texts: Sequence[str], encoder: TextEncoder | None) -> Tensor:
         wrong = texts[int((~found.isfinite()).any(-1).nonzero()[0])]
         raise ValueError(f"text_encoder must give finite numbers, it gives NaN or infinity for {wrong!r}")
     return found.detach().to(torch.float32)
-
-
-def write_table(path: Path, texts: Iterable[str]) -> None:
-    """Encode ``texts`` and write them with their vectors, half precision, as an .npz without pickles."""
-    listed = list(texts)
-    vectors = sentence_encoder(listed).numpy().astype(np.float16)
-    with replacing(path) as temporary:
-        np.savez_compressed(temporary, texts=np.array(listed), vectors=vectors)
-
-
-if __name__ == "__main__":
-    from lw_torchrl.language.plan_files import shipped_texts
-
-    target = Path(__file__).parent / "data" / TABLE
-    write_table(target, shipped_texts())
-    print(f"{len(shipped_texts())} texts written to {target.name}")

@@ -2,6 +2,7 @@
 
 import lw_torchrl._torchrl  # noqa: F401
 from lw_torchrl.modules.actor_ensemble import ActorEnsemble
+from lw_torchrl.modules.conditioned_actor import ConditionedActor
 from lw_torchrl.modules.critics import PlanConditionedQValue, PlanConditionedValue, QValue, Value, plan_actor_value
 from lw_torchrl.modules.descriptor_conditioned_actor import DescriptorConditionedActor, DescriptorEncoder
 from lw_torchrl.modules.encoder import Encoder
@@ -24,6 +25,7 @@ __all__ = [
     "METHODS",
     "POLICIES",
     "ActorEnsemble",
+    "ConditionedActor",
     "DescriptorConditionedActor",
     "DescriptorEncoder",
     "Encoder",

@@ -65,7 +65,6 @@ class ActorEnsemble(Policy):
         self._own_evaluators = any(getattr(member, "evaluator", None) is not None for member in members)
 
     def transform(self) -> Transform | None:
-        """As a member's."""
         return self._each[0].transform()
 
     @property
@@ -74,7 +73,6 @@ class ActorEnsemble(Policy):
 
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``out_keys``."""
         done = [member.act(*member.prepare(tensordict)) for member in self._each]
         written = [torch.stack([action for action, *_ in done]).mean(0)]
         if self.plans is not None:  # exact truth gives every member the same weights
@@ -83,12 +81,10 @@ class ActorEnsemble(Policy):
         return write(tensordict, self, written)
 
     def fit_normalization(self, observation: Tensor, weights: Tensor | None = None) -> None:
-        """As :meth:`Policy.fit_normalization`, of each member."""
         for member in self._each:
             member.fit_normalization(observation, weights)
 
     def fit_contacts(self, observation: Tensor, task_id: Tensor) -> None:
-        """As :meth:`Policy.fit_contacts`, of each member."""
         for member in self._each:
             member.fit_contacts(observation, task_id)
 
@@ -103,7 +99,6 @@ class ActorEnsemble(Policy):
         return cls([from_description(member, text_encoder) for member in members])
 
     def with_plans(self, plans: Plans | Mapping[str, ConditionalPlan]) -> ActorEnsemble:
-        """An ensemble on the same weights for other plans; :class:`TypeError` if the members have descriptions."""
         return ActorEnsemble([member.with_plans(plans) for member in self._each]).train(self.training)
 
 

@@ -17,8 +17,8 @@ from lw_torchrl.language.observation import (
     a_step_before,
     places,
 )
-from lw_torchrl.language.plan_tables import PlanTables
 from lw_torchrl.language.plans import Plans, PlanStep
+from lw_torchrl.language.task_index import PlanTables
 from lw_torchrl.language.tasks import Task
 from lw_torchrl.modules.relative_positions import PlanRoles
 

@@ -63,23 +63,12 @@ class PlanClauses(NamedTuple):
 
 
 def conjunction(logits: Tensor, mask: Tensor) -> Tensor:
-    """The logit of all of some statements, whose errors are taken to be independent of one another.
+    """The logit (...) of all of some statements, of logits (..., K) of size 30 at most, where ``mask`` (..., K) bool is
+    true; of none it is 30. Their errors are taken to be independent of one another.
 
     Each statement has the probability sigmoid(l), all of them their product p, whose logit log(p / (1 - p)) is
     -log(expm1(sum(softplus(-l)))). Of one statement that is its own logit; of several sure ones nearly the least. Two
     of 0.6 each make 0.36: where all are barely true, the conjunction is not.
-
-    Args:
-        logits: (..., K) float32, of size 30 at most.
-        mask: (..., K) bool, the statements that there are; of none at all the logit is 30.
-
-    Returns:
-        (...) float32.
-
-    Example:
-        >>> import torch
-        >>> conjunction(torch.tensor([8.0, -3.0]), torch.tensor([True, True])).round(decimals=2)
-        tensor(-3.)
     """
     doubt = torch.where(mask, nn.functional.softplus(-logits), 0.0).sum(-1).clamp(min=1e-13)
     return -(doubt + torch.log(-torch.expm1(-doubt)))
@@ -88,17 +77,28 @@ def conjunction(logits: Tensor, mask: Tensor) -> Tensor:
 class ClauseEvaluator(QueryEvaluator):
     """Answers conditions by a network that was trained on the query answering function's answers, and never asks it.
 
-    A condition's clauses are answered one by one, each once in a task, and put together as :func:`conjunction` says,
-    so that new conjunctions need no training. The logits are -1e4 beyond a plan's last step. A subclass gives
-    ``network``, whose call takes what is seen of B states, their clauses (B, C) and the texts' vectors, to logits
-    (B, C), and says in ``seen_dims`` how many dimensions a state has.
+    Reads what is seen of a state and ``task_id`` (B,) int64; writes ``qaf_logits`` (B, S) float32, positive where a
+    condition of the row's plan holds, -1e4 beyond its last step. A condition's clauses are answered one by one, each
+    once in a task, and put together as :func:`conjunction` says, so that new conjunctions need no training.
+
+    A subclass gives ``network``, whose call takes what is seen of B states, their clauses (B, C) and the texts'
+    vectors, to logits (B, C), and says in ``seen_dims`` how many dimensions a state has.
 
     Args:
         plans: whose conditions it answers.
-        structure: a clause is read as the query language parses it; False: only its text's vector is known.
+        structure: a clause is read as the query language parses it: its predicate and its things by number, "not" as
+            the opposite. False: only its text's vector is known.
         predicates: with ``structure``, the relations and predicates that it can tell; None for all that there are.
         names: with ``structure``, the things that it can tell; empty where they are not told apart by name.
-        text_encoder: without ``structure``, texts to vectors (n, E) float32; None for the sentence encoder.
+        text_encoder: without ``structure``, texts to vectors (n, E) float32; None for the sentence encoder, which
+            needs the extra ``[text]``: clauses' vectors are not shipped.
+
+    Raises:
+        ValueError: a plan asks for a predicate or a thing that it cannot tell; at call time, what is seen is of
+            another shape, or a task_id has no plan.
+        ImportError: without ``structure``, the extra ``[text]`` is not installed and there is no ``text_encoder``.
+
+    Source: paper section 'Differentiability and Optimization', which names a visual question answering model.
     """
 
     network: nn.Module
@@ -119,6 +119,9 @@ class ClauseEvaluator(QueryEvaluator):
             raise ValueError("predicates is for structure=True; without, an evaluator reads texts alone")
         self.predicates = _checked("predicates", sorted(PREDICATES) if predicates is None else predicates, structure)
         self.names = _checked("names", names, structure and bool(names))
+        self.config = {"structure": structure}
+        if structure:
+            self.config["predicates"] = list(self.predicates)
         self.text_encoder = text_encoder
         index = TaskIndex(plans)
         asked = [(plan.definition, clause) for plan in plans.values() for clause in _of(plan)]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import torch
 from tensordict import TensorDictBase
@@ -19,6 +19,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 from torchrl.envs import Transform
 
+from lw_torchrl._checks import checked
 from lw_torchrl._keys import as_keys, check_apart, dispatched, key_beside, read, write
 from lw_torchrl.language.tasks import Task
 from lw_torchrl.modules.encoder import Encoder, Encoding
@@ -28,51 +29,71 @@ from lw_torchrl.modules.policy import Policy
 _ALTERING = ("jitter", "swap_unmentioned", "hide_opening")
 
 
-def noise_of_features(asked: float | None, distribution: str | None) -> float:
-    """The noise asked for; by default none with a distribution, whose likelihoods it would change from call to call."""
-    if asked is not None:
-        return asked
-    return 0.05 if distribution is None else 0.0
-
-
 class ConditionedActor(Policy):
-    """What all our actors share, whatever they are conditioned on; a subclass makes the encoder.
+    """What all our actors share, whatever they are conditioned on; a subclass names its encoder.
 
-    Reads what the encoder reads; writes ``action`` (B, 4) float32 and what the encoder gives. With a distribution it
-    writes ``loc`` and ``scale`` (B, 4) float32 and ``action_log_prob`` (B,) float32 too, and ``action`` is drawn from
-    it under ``set_exploration_type(ExplorationType.RANDOM)``, as collectors do, and its mode otherwise.
+    Reads what the encoder reads; writes ``action`` (B, 4) float32 and, of an encoder with plans, ``skill_weights``
+    (B, S) and ``skill_latent`` (B, D) float32. With a distribution also ``loc`` and ``scale`` (B, 4) float32, those of
+    the Normal, and ``action_log_prob`` (B,) float32; ``action`` is then drawn from it under
+    ``set_exploration_type(ExplorationType.RANDOM)``, as collectors do, and its mode otherwise.
 
     Args:
-        encoder: what it is conditioned on.
-        extras: the keys of what the encoder gives beside the action, of ("skill_weights", "skill_latent").
+        about: what its encoder is conditioned on.
+        feature_noise: standard deviation of the noise on the normalised features while training; None for 0.05, or 0
+            with a distribution, whose likelihoods must not change from call to call.
+        width, depth: hidden layers of the action decoder; a tuple of widths says both.
+        squash: keep each number of the action in (-1, 1) by tanh; without, as in the paper, the environment clips.
+        distribution: None for a deterministic actor; for RL "tanh_normal", a Normal through tanh, or "normal", about
+            the action, clipped by the environment.
+        init_std: the Normal's initial standard deviation, in every state: before tanh for "tanh_normal".
         out_keys: other names for what it writes, in the order above; nested ones too.
-        **head: of :class:`ActionHead`.
+        **options: of the encoder.
+
+    Attributes:
+        dist_params_keys, log_prob_keys, dist_sample_keys: where it writes ``loc`` and ``scale``, the action's
+            log-probability, and the action that is drawn; empty without a distribution.
 
     Source: ``torchrl.modules.ProbabilisticActor``, without its wrapping.
     """
+
+    encoder_class: ClassVar[type[Encoder]]
 
     # What V-trace asks of an actor, as of TorchRL's own.
     default_interaction_type = InteractionType.DETERMINISTIC
     num_samples = None
     _dist_sample = ProbabilisticTensorDictModule._dist_sample
 
+    @checked
     def __init__(
-        self, encoder: Encoder, extras: Sequence[str], *, out_keys: Sequence[NestedKey] | None, **head: Any
+        self,
+        about: Any,
+        *,
+        feature_noise: float | None = None,
+        width: int | tuple[int, ...] = 256,
+        depth: int = 3,
+        squash: bool = True,
+        distribution: DistributionName | None = None,
+        init_std: float = 0.3,
+        out_keys: Sequence[NestedKey] | None = None,
+        **options: Any,
     ) -> None:
         super().__init__()
-        distribution = head["distribution"]
-        if distribution is not None and any(encoder.config.get(name) for name in _ALTERING):
+        if feature_noise is None:
+            feature_noise = 0.05 if distribution is None else 0.0
+        self.encoder = self.encoder_class(about, feature_noise=feature_noise, **options)
+        if distribution is not None and any(self.encoder.config.get(name) for name in _ALTERING):
             raise ValueError(
                 f"{', '.join(_ALTERING[:-1])} and {_ALTERING[-1]} must be 0 with a distribution: in training mode they "
                 "would change its likelihoods from call to call; train an actor without one, and take "
                 "actor.stochastic()"
             )
-        self.encoder = encoder
-        self.head = ActionHead(encoder.width, **head)
-        self.plans, self.tasks, self.in_keys = encoder.plans, encoder.tasks, encoder.in_keys
+        head: Any = dict(width=width, depth=depth, squash=squash, distribution=distribution, init_std=init_std)
+        self.head = ActionHead(self.encoder.width, **head)
+        self.plans, self.tasks, self.in_keys = self.encoder.plans, self.encoder.tasks, self.encoder.in_keys
+        extras = () if self.plans is None else ("skill_weights", "skill_latent")
         drawn = () if distribution is None else ("loc", "scale", "action_log_prob")
         self._written = ("action", *extras, *drawn)
-        self.config = {**encoder.config, **head}
+        self.config = {**self.encoder.config, **head}
         self.out_keys = as_keys("out_keys", out_keys, self._written)
 
     @property
@@ -85,8 +106,13 @@ class ConditionedActor(Policy):
         named = as_keys("out_keys", keys, self._written)
         check_apart(self.in_keys, named)
         self._out_keys = self._out_keys_apparent = self.config["out_keys"] = named
-        if self.head.distribution is not None:  # where KLPENPPOLoss looks for it
+        self.dist_params_keys: list[NestedKey] = []
+        self.log_prob_keys: list[NestedKey] = []
+        self.dist_sample_keys: list[NestedKey] = []
+        if self.head.distribution is not None:
             action, *_, loc, scale, log_prob = named
+            self.dist_params_keys, self.log_prob_keys, self.dist_sample_keys = [loc, scale], [log_prob], [action]
+            # KLPENPPOLoss looks for it here.
             self.sampler = ProbabilisticTensorDictModule(
                 in_keys={"loc": loc, "scale": scale},
                 out_keys=[action],
@@ -103,15 +129,13 @@ class ConditionedActor(Policy):
         return self.encoder.transform()
 
     def prepare(self, tensordict: TensorDictBase) -> tuple[Tensor, ...]:
-        """What no trained parameter touches, see the encoder's."""
         return self.encoder.prepare(tensordict)
 
     def extras(self, encoding: Encoding) -> tuple[Tensor, ...]:
-        """What is written of an encoding beside the action."""
-        return ()
+        """What is written of an encoding beside the action: with plans attention (B, S) and the mixed latent (B, D)."""
+        return () if encoding.weights is None else (encoding.weights, encoding.latent)
 
     def act(self, *prepared: Tensor) -> tuple[Tensor, ...]:
-        """From what :meth:`prepare` gives to a tensor for each of ``out_keys``."""
         if self.head.distribution is None:
             encoding = self.encoder.encode(*prepared)
             return self.head(encoding.joined), *self.extras(encoding)
@@ -171,25 +195,6 @@ class ConditionedActor(Policy):
     def _loc_scale(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         self._require_distribution()
         return self.head.loc_scale(self.encoder.encode(*self.prepare(tensordict)).joined)
-
-    @property
-    def _sampling_keys(self) -> list[NestedKey]:
-        return [] if self.head.distribution is None else self.out_keys_source[-3:]
-
-    @property
-    def dist_params_keys(self) -> list[NestedKey]:
-        """Where ``loc`` and ``scale`` are written; none without a distribution."""
-        return self._sampling_keys[:2]
-
-    @property
-    def log_prob_keys(self) -> list[NestedKey]:
-        """Where the action's log-probability is written; none without a distribution."""
-        return self._sampling_keys[2:]
-
-    @property
-    def dist_sample_keys(self) -> list[NestedKey]:
-        """Where the action is written, if it is drawn."""
-        return self.out_keys_source[:1] if self._sampling_keys else []
 
     def stochastic(self, distribution: DistributionName = "tanh_normal", init_std: float = 0.3) -> Self:
         """A copy with a distribution, whose mode is what this actor does, to be trained by RL.

@@ -12,7 +12,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.envs import Transform
 
-from lw_torchrl._checks import check_int, checked
+from lw_torchrl._checks import check_int, checked, passes_on
 from lw_torchrl._keys import as_keys, check_apart, check_key, dispatched, read, write
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.modules.encoder import Encoder
@@ -74,11 +74,10 @@ class Value(TensorDictModuleBase):
         )
 
     def transform(self) -> Transform | None:
-        """As :meth:`Policy.transform`."""
         return self.encoder.transform()
 
     def fit_normalization(self, observation: Tensor, weights: Tensor | None = None) -> None:
-        """As for :meth:`Policy.fit_normalization`."""
+        """As :meth:`Policy.fit_normalization`."""
         self.encoder.features.fit(observation, weights)
 
     def _input(self, tensordict: TensorDictBase) -> Tensor:
@@ -86,7 +85,6 @@ class Value(TensorDictModuleBase):
 
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the values."""
         seen = self._input(tensordict)
         values = torch.cat([each(seen) for each in self.heads], -1)
         if self._numbers > 1:
@@ -113,6 +111,7 @@ class QValue(Value):
     _written = ("state_action_value", "state_action_values")
     _more = ACTION_SIZE
 
+    @passes_on(Value.__init__)
     @checked
     def __init__(
         self,
@@ -153,10 +152,9 @@ class PlanConditionedValue(Value):
         >>> import lw_torchrl as lw
         >>> lw.PlanConditionedValue(lw.load_plans("MT10")).out_keys
         ['state_value']
-
-    Source: ``torchrl.modules.ValueOperator``.
     """
 
+    @passes_on(Value.__init__, PlanEncoder.__init__)
     def __init__(self, plans: Plans | Mapping[str, ConditionalPlan], **options: Any) -> None:
         own = {name: options.pop(name) for name in _OWN if name in options}
         super().__init__(PlanEncoder(plans, **options), **own)
@@ -177,15 +175,15 @@ class PlanConditionedQValue(QValue):
         >>> from torchrl.objectives import TD3BCLoss
         >>> plans = lw.load_plans("MT10")
         >>> loss = TD3BCLoss(lw.PlanConditionedActor(plans), lw.PlanConditionedQValue(plans), bounds=(-1.0, 1.0))
-
-    Source: ``torchrl.modules.ValueOperator``.
     """
 
+    @passes_on(QValue.__init__, PlanEncoder.__init__)
     def __init__(self, plans: Plans | Mapping[str, ConditionalPlan], **options: Any) -> None:
         own = {name: options.pop(name) for name in (*_OWN, "action_key", "quantiles") if name in options}
         super().__init__(PlanEncoder(plans, **options), **own)
 
 
+@passes_on(PlanConditionedActor.__init__)
 @checked
 def plan_actor_value(
     plans: Plans | Mapping[str, ConditionalPlan],

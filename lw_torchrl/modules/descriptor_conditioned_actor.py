@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from lw_torchrl._checks import checked
+from lw_torchrl._checks import checked, passes_on
 from lw_torchrl._keys import as_keys, check_apart
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.task_index import TaskIndex
 from lw_torchrl.language.tasks import MT50, TASKS, Task, named_tasks
 from lw_torchrl.language.text import TextEncoder, encoded
-from lw_torchrl.modules.conditioned_actor import ConditionedActor, noise_of_features
+from lw_torchrl.modules.conditioned_actor import ConditionedActor
 from lw_torchrl.modules.encoder import Encoder, Encoding
-from lw_torchrl.modules.networks import DistributionName, text_to_latent, unit_scale
+from lw_torchrl.modules.networks import text_to_latent, unit_scale
 from lw_torchrl.modules.observation_features import Features, ObservationFeatures
 
 
@@ -28,11 +28,11 @@ class DescriptorEncoder(Encoder):
     Reads ``observation`` (B, 39) float32 and ``task_id`` (B,) int64; writes ``encoding`` (B, D + F) float32.
 
     Args:
-        tasks, condition: as for :class:`DescriptorConditionedActor`.
-        features, latent_size, encoder_width, encoder_depth, text_encoder, in_keys: as for
-            :class:`PlanConditionedActor`.
-        feature_noise: standard deviation of the noise on the normalised features while training.
-        out_keys: another name for what it writes.
+        tasks: the tasks that it knows, as for :func:`resolve_tasks`; a :class:`Task` in a list brings its own
+            description.
+        condition: "description", the text's vector; "one-hot", one number for each task, which knows no words.
+        features, feature_noise, latent_size, encoder_width, encoder_depth, text_encoder, in_keys, out_keys: as for
+            :class:`PlanEncoder`; ``features`` other than "opening".
 
     Source: paper section 'Conditional Plan Experiments'.
     """
@@ -94,7 +94,6 @@ class DescriptorEncoder(Encoder):
         return rows, self.features(observation)
 
     def encode(self, *prepared: Tensor) -> Encoding:
-        """From what :meth:`prepare` gives."""
         rows, seen = prepared
         return Encoding(self.texts(self.text_vectors)[: len(self.tasks)][rows], seen)
 
@@ -110,11 +109,11 @@ class DescriptorConditionedActor(ConditionedActor):
     with a distribution also ``loc`` and ``scale`` (B, 4) float32 and ``action_log_prob`` (B,) float32.
 
     Args:
-        tasks: the tasks it is to act in, as for :func:`resolve_tasks`; a :class:`Task` in a list brings its own
-            description.
-        condition: "description", the text's vector; "one-hot", one number for each task, which knows no words.
-        features, feature_noise, latent_size, width, depth, encoder_width, encoder_depth, squash, distribution,
-            init_std, text_encoder, in_keys, out_keys: as for :class:`PlanConditionedActor`, with the same networks.
+        tasks: the tasks it is to act in, see :class:`DescriptorEncoder`.
+        feature_noise, width, depth, squash, distribution, init_std, out_keys: as for
+            :class:`~lw_torchrl.modules.ConditionedActor`.
+        **options: condition, features, latent_size, encoder_width, encoder_depth, text_encoder and in_keys, as for
+            :class:`DescriptorEncoder`.
 
     Raises:
         ValueError: an unknown task; at call time, a task_id outside ``tasks``.
@@ -129,60 +128,19 @@ class DescriptorConditionedActor(ConditionedActor):
     Source: paper section 'Conditional Plan Experiments'.
     """
 
+    encoder_class = DescriptorEncoder
     encoder: DescriptorEncoder
 
-    @checked
-    def __init__(
-        self,
-        tasks: str | Iterable[str | Task],
-        *,
-        condition: Literal["description", "one-hot"] = "description",
-        features: Features = "differences",
-        feature_noise: float | None = None,
-        latent_size: int = 64,
-        width: int | tuple[int, ...] = 256,
-        depth: int = 3,
-        encoder_width: int = 128,
-        encoder_depth: int = 1,
-        squash: bool = True,
-        distribution: DistributionName | None = None,
-        init_std: float = 0.3,
-        text_encoder: TextEncoder | None = None,
-        in_keys: Sequence[NestedKey] | None = None,
-        out_keys: Sequence[NestedKey] | None = None,
-    ) -> None:
-        encoder = DescriptorEncoder(
-            tasks,
-            condition=condition,
-            features=features,
-            feature_noise=noise_of_features(feature_noise, distribution),
-            latent_size=latent_size,
-            encoder_width=encoder_width,
-            encoder_depth=encoder_depth,
-            text_encoder=text_encoder,
-            in_keys=in_keys,
-        )
-        super().__init__(
-            encoder,
-            (),
-            width=width,
-            depth=depth,
-            squash=squash,
-            distribution=distribution,
-            init_std=init_std,
-            out_keys=out_keys,
-        )
+    @passes_on(ConditionedActor.__init__, DescriptorEncoder.__init__)
+    def __init__(self, tasks: str | Iterable[str | Task], **options: Any) -> None:
+        super().__init__(tasks, **options)
 
     @classmethod
-    def for_plans(
-        cls, plans: Plans, *, text_encoder: TextEncoder | None = None, **options: Any
-    ) -> DescriptorConditionedActor:
+    def for_plans(cls, plans: Plans, *, text_encoder: TextEncoder | None = None, **options: Any) -> Self:
         return cls([plan.definition for plan in plans.values()], text_encoder=text_encoder, **options)
 
     @classmethod
-    def from_description(
-        cls, found: Mapping[str, Any], text_encoder: TextEncoder | None = None
-    ) -> DescriptorConditionedActor:
+    def from_description(cls, found: Mapping[str, Any], text_encoder: TextEncoder | None = None) -> Self:
         own = {name: Task.from_json(name, row) for name, row in found["own_tasks"].items()}
         tasks = [own.get(name, name) for name in found["tasks"]]
         return cls(tasks, text_encoder=text_encoder, **found["options"])

@@ -19,17 +19,11 @@ from lw_torchrl.modules.observation_features import ObservationFeatures
 
 
 class Encoding(NamedTuple):
-    """What an encoder makes of a batch.
+    """What an encoder makes of a batch."""
 
-    Attributes:
-        latent: (B, D) float32, what is to be done.
-        features: (B, F) float32, where things are.
-        weights: (B, S) float32, the attention over the plan's steps; None without plans.
-    """
-
-    latent: Tensor
-    features: Tensor
-    weights: Tensor | None = None
+    latent: Tensor  # (B, D) float32, what is to be done
+    features: Tensor  # (B, F) float32, where things are
+    weights: Tensor | None = None  # (B, S) float32, the attention over the plan's steps; None without plans
 
     @property
     def joined(self) -> Tensor:
@@ -66,6 +60,10 @@ class Prepared(TensorDictModuleBase):
         """What no trained parameter touches, and all checks of values, outside of vmap."""
         raise NotImplementedError(f"{type(self).__name__} must override prepare")
 
+    def describe(self) -> dict[str, Any]:
+        """What a policy's description needs beside the options, as JSON."""
+        return {}
+
     def fit_contacts(self, observation: Tensor, task_id: Tensor) -> None:
         """Take contacts from demonstrations, (R, 39) float32 and (R,) int64, in place; by default none."""
 
@@ -78,7 +76,6 @@ class Encoder(Prepared):
     for networks of yours.
 
     Attributes:
-        config, plans, tasks: as for :class:`Prepared`.
         features: what it sees of the observation.
         latent_size: D.
 
@@ -100,12 +97,7 @@ class Encoder(Prepared):
 
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``encoding``."""
         return write(tensordict, self, [self.encode(*self.prepare(tensordict)).joined])
-
-    def describe(self) -> dict[str, Any]:
-        """What a description of its actor needs beside the options, as JSON."""
-        return {}
 
     def with_plans(self, plans: Plans | Mapping[str, ConditionalPlan]) -> Encoder:
         """The same weights for other plans: training either trains both."""

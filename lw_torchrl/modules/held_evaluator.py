@@ -16,8 +16,8 @@ from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.networks import evaluating
 from lw_torchrl.modules.query_evaluator import QueryEvaluator, evaluator_from_description
-from lw_torchrl.transforms.answers import HeldAnswers
 from lw_torchrl.transforms.camera import CameraTransform
+from lw_torchrl.transforms.late_answers import HeldAnswers
 
 _MOST = 2**16  # steps; a policy file with more would be refused
 
@@ -73,7 +73,6 @@ class HeldEvaluator(QueryEvaluator):
 
     @property
     def text_vectors(self) -> Tensor | None:
-        """As :attr:`text_encoder`."""
         return getattr(self.evaluator, "text_vectors", None)
 
     def logits(self, *read: Tensor) -> Tensor:
@@ -116,7 +115,6 @@ class HeldEvaluator(QueryEvaluator):
         return HeldEvaluator(self.evaluator.made_for(plans), **self.config)
 
     def with_plans(self, plans: Plans) -> HeldEvaluator:
-        """As :meth:`QueryEvaluator.with_plans`."""
         return HeldEvaluator(self.evaluator.with_plans(plans), **self.config).train(self.training)
 
     def describe(self) -> dict[str, Any]:

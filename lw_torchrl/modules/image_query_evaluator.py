@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from math import sqrt
-from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torchrl.modules import MLP
 
 from lw_torchrl._checks import check_choice, check_int, checked
 from lw_torchrl._rendering import check_cameras
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.clause_evaluator import ClauseEvaluator, Clauses
+from lw_torchrl.modules.networks import head
 from lw_torchrl.modules.state_query_evaluator import ClauseNetwork
 from lw_torchrl.transforms.camera import CameraTransform
 
@@ -60,37 +59,21 @@ class PointingNetwork(ClauseNetwork):
         features: F, the size of a place's features.
         cameras: C, side by side in a row's pictures.
         names: N, how many things there are; 0 for a network that reads texts.
-        width, depth, predicates, text_size: as for :class:`ClauseNetwork`.
+        **trunk: of :class:`ClauseNetwork`.
     """
 
     numbers = 4
     ends = 2 * KEYS + 2
 
-    def __init__(
-        self,
-        encoder: nn.Module,
-        features: int,
-        *,
-        cameras: int,
-        names: int,
-        width: int,
-        depth: int,
-        predicates: int,
-        text_size: int,
-    ) -> None:
-        super().__init__(width, depth, predicates=predicates, text_size=text_size)
+    def __init__(self, encoder: nn.Module, features: int, *, cameras: int, names: int, **trunk: int) -> None:
+        super().__init__(**trunk)
         self.encoder, self.cameras = encoder, cameras
         self.key = nn.Conv2d(features, KEYS, 1)
         self.seen = nn.Conv2d(features, _KEPT, 1)
         self.landmarks = nn.Conv2d(features, _LANDMARKS, 1)
         if names:
             self.names = nn.Embedding(names, KEYS)
-        self.place = MLP(
-            in_features=cameras * (2 + _KEPT + 2 * _LANDMARKS) + KEYS,
-            out_features=self.numbers,
-            num_cells=[width, width],
-            activation_class=nn.ReLU,
-        )
+        self.place = head(cameras * (2 + _KEPT + 2 * _LANDMARKS) + KEYS, self.numbers, self.width, 2)
 
     def forward(self, seen: Tensor, clauses: Clauses, text_vectors: Tensor | None = None) -> Tensor:
         """As :class:`ClauseNetwork`, of pictures (B, H, W·C, 3) uint8 side by side."""
@@ -115,15 +98,8 @@ class PointingNetwork(ClauseNetwork):
         return self.judge(first - second, self.predicates.weight[clauses.predicate], clauses.negated)
 
     def places(self, seen: Tensor, things: Tensor) -> tuple[Tensor, Tensor]:
-        """Where things are.
-
-        Args:
-            seen: (B, H, W·C, 3) uint8.
-            things: (N, 32) float32, their vectors.
-
-        Returns:
-            (B, N, 4) float32, positions in metres and how far they are open; and where they are seen,
-            (B, C, N, h, w) float32, which sums to 1 over each picture.
+        """Of pictures (B, H, W·C, 3) uint8 and things' vectors (N, 32) float32: positions in metres and how far they
+        are open, (B, N, 4) float32; where they are seen, (B, C, N, h, w) float32, which sums to 1 over each picture.
         """
         rows = len(seen)
         pictures = seen.unflatten(-2, (self.cameras, -1)).permute(0, 2, 4, 1, 3).flatten(0, 1)
@@ -158,26 +134,18 @@ class ImageQueryEvaluator(ClauseEvaluator):
     """Answers conditions from pictures, by a network that was trained on the query answering function's answers.
 
     Reads ``pixels`` (B, height, width·C, 3) uint8, of C cameras side by side, and ``task_id`` (B,) int64; writes
-    ``qaf_logits`` (B, S) float32, positive where a condition of the row's plan holds, -1e4 beyond its last step. A
-    condition's clauses are answered one by one, by pointing at the things that they name, see
-    :class:`PointingNetwork`. ``transform()`` is the :class:`CameraTransform` that takes its pictures.
+    ``qaf_logits`` (B, S) float32, positive where a condition of the row's plan holds, -1e4 beyond its last step. It
+    points at the things that a clause names, see :class:`PointingNetwork`. ``transform()`` is the
+    :class:`CameraTransform` that takes its pictures.
 
     Args:
-        plans: whose conditions it answers.
+        plans, structure, predicates, text_encoder: as for
+            :class:`~lw_torchrl.modules.clause_evaluator.ClauseEvaluator`, whose errors and source it has.
         cameras, height, width: as for :class:`CameraTransform`; at most 512 pixels.
         every: steps from one picture to the next when it acts; in between its answers stay.
         encoder: a name in :data:`IMAGE_ENCODERS`.
-        structure: a clause is read as the query language parses it, its things by name. False: only its text's vector
-            is known.
         hidden, depth: hidden layers of what judges differences.
-        predicates: with ``structure``, the relations and predicates that it can tell; None for all that there are.
         names: with ``structure``, the things that it can tell; None for those of the plans' tasks.
-        text_encoder: without ``structure``, texts to vectors (n, E) float32; None for the sentence encoder.
-
-    Raises:
-        ValueError: a plan asks for a predicate or a thing that it cannot tell; at call time, pictures
-            of another size, or a task_id without a plan.
-        ImportError: without ``structure``, the extra ``[text]`` is not installed and there is no ``text_encoder``.
 
     Example:
         >>> import lw_torchrl as lw
@@ -187,8 +155,6 @@ class ImageQueryEvaluator(ClauseEvaluator):
         ['observation', 'task_id', 'pixels']
         >>> actor.transform().shape
         (64, 128, 3)
-
-    Source: paper section 'Differentiability and Optimization', which names a visual question answering model.
     """
 
     network: PointingNetwork
@@ -237,18 +203,17 @@ class ImageQueryEvaluator(ClauseEvaluator):
             predicates=len(self.predicates),
             text_size=self.text_size,
         )
-        self.config: dict[str, Any] = {
+        self.config |= {
             "cameras": list(self.cameras),
             "height": height,
             "width": width,
             "every": self.every,
             "encoder": encoder,
-            "structure": structure,
             "hidden": hidden,
             "depth": depth,
         }
         if structure:
-            self.config |= {"predicates": list(self.predicates), "names": list(self.names)}
+            self.config["names"] = list(self.names)
 
     def transform(self) -> CameraTransform:
         """A new transform that takes its pictures."""

@@ -38,13 +38,7 @@ def unit_scale(vectors: Tensor) -> Tensor:
 def text_to_latent(text_size: int, latent_size: int, width: int, depth: int) -> MLP:
     """An MLP from a text's vector to a skill latent, with ``depth`` hidden layers of ``width``."""
     check_int("latent_size", latent_size, minimum=1)
-    check_int("encoder_width", width, minimum=1)
-    return MLP(
-        in_features=text_size,
-        out_features=latent_size,
-        num_cells=[width] * check_int("encoder_depth", depth, minimum=0),
-        activation_class=nn.ReLU,
-    )
+    return head(text_size, latent_size, width, depth, named="encoder_")
 
 
 def check_width(argument: str, width: int | Sequence[int]) -> None:
@@ -53,10 +47,12 @@ def check_width(argument: str, width: int | Sequence[int]) -> None:
         check_int(argument, cells, minimum=1)
 
 
-def head(size: int, out: int, width: int | Sequence[int], depth: int, *, layer_norm: bool = False) -> MLP:
-    """An MLP from an encoding (..., size) to (..., out); a tuple of widths says both width and depth."""
-    check_width("width", width)
-    widths = [width] * check_int("depth", depth, minimum=0) if isinstance(width, int) else list(width)
+def head(
+    size: int, out: int, width: int | Sequence[int], depth: int, *, layer_norm: bool = False, named: str = ""
+) -> MLP:
+    """An MLP from (..., size) to (..., out); a tuple of widths says both. Errors name ``named`` width and depth."""
+    check_width(f"{named}width", width)
+    widths = [width] * check_int(f"{named}depth", depth, minimum=0) if isinstance(width, int) else list(width)
     return MLP(
         in_features=size,
         out_features=out,
@@ -81,10 +77,7 @@ class ActionHead(nn.Module):
 
     Args:
         size: of the encoding.
-        width, depth: hidden layers; a tuple of widths says both.
-        squash: keep each number of the action in (-1, 1) by tanh; a "tanh_normal" does so itself.
-        distribution: None, "tanh_normal" or "normal".
-        init_std: the initial standard deviation of the Normal: before tanh for "tanh_normal".
+        width, depth, squash, distribution, init_std: as for :class:`ConditionedActor`.
     """
 
     def __init__(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import combinations
 from typing import Literal
 
@@ -15,7 +16,6 @@ from lw_torchrl.language.value_checks import check_finite
 
 Features = Literal["raw", "differences", "relative", "opening", "both"]
 _FINE, _COARSE = 0.02, 0.1  # metres: where the two squashed copies of each difference bend
-_WIDTH = {"raw": OBSERVATION_SIZE, "differences": 56, "relative": 54, "opening": 1, "both": OBSERVATION_SIZE + 56}
 
 
 def relative(observation: Tensor) -> Tensor:
@@ -44,6 +44,24 @@ def squash(difference: Tensor) -> tuple[Tensor, Tensor]:
     return torch.tanh(difference / _FINE), torch.tanh(difference / _COARSE)
 
 
+_KINDS: dict[str, tuple[int, Callable[[Tensor], Tensor]]] = {
+    "raw": (OBSERVATION_SIZE, lambda observation: observation),
+    "differences": (56, differences),
+    "relative": (54, relative),
+    "opening": (1, lambda observation: observation[..., OPENING : OPENING + 1]),
+    "both": (OBSERVATION_SIZE + 56, lambda observation: torch.cat((observation, differences(observation)), -1)),
+}
+
+
+def check_observation(observation: Tensor) -> None:
+    """Raise :class:`ValueError` unless it is (..., 39) float32."""
+    if observation.shape[-1:] != (OBSERVATION_SIZE,) or observation.dtype != torch.float32:
+        raise ValueError(
+            f"observation must be float32 of shape (..., {OBSERVATION_SIZE}), got {observation.dtype} of shape "
+            f"{tuple(observation.shape)}"
+        )
+
+
 class ObservationFeatures(nn.Module):
     """Observation to normalised features.
 
@@ -65,26 +83,15 @@ class ObservationFeatures(nn.Module):
     def __init__(self, kind: Features = "differences", noise: float = 0.0) -> None:
         super().__init__()
         self.noise = check_scale("feature_noise", noise)
-        self.kind = check_choice("features", kind, _WIDTH)
-        self.width = _WIDTH[kind]
+        self.kind = check_choice("features", kind, _KINDS)
+        self.width, _ = _KINDS[kind]
         self.register_buffer("mean", torch.zeros(self.width))
         self.register_buffer("std", torch.ones(self.width))
 
     def _select(self, observation: Tensor) -> Tensor:
-        if observation.shape[-1:] != (OBSERVATION_SIZE,) or observation.dtype != torch.float32:
-            raise ValueError(
-                f"observation must be float32 of shape (..., 39), got {observation.dtype} of shape "
-                f"{tuple(observation.shape)}"
-            )
+        check_observation(observation)
         check_finite("observation", observation)
-        if self.kind == "raw":
-            return observation
-        if self.kind == "relative":
-            return relative(observation)
-        if self.kind == "opening":
-            return observation[..., OPENING : OPENING + 1]
-        made = differences(observation)
-        return made if self.kind == "differences" else torch.cat((observation, made), -1)
+        return _KINDS[self.kind][1](observation)
 
     @torch.no_grad()
     def fit(self, observation: Tensor, weights: Tensor | None = None) -> None:

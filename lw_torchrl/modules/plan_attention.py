@@ -13,8 +13,8 @@ from torch import Tensor
 
 from lw_torchrl._checks import checked
 from lw_torchrl._keys import as_keys, check_apart, dispatched, read, write
-from lw_torchrl.language.plan_tables import PlanTables
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
+from lw_torchrl.language.task_index import PlanTables
 from lw_torchrl.language.value_checks import check_values
 from lw_torchrl.transforms.qaf import plan_number_key
 
@@ -31,10 +31,6 @@ def attention_logits(logits: Tensor, answers: Answers, scale: float) -> Tensor:
 
     "logit": what they are. "tanh": 5·tanh(scale·logit), which at 0.5 is the paper's 10·p - 5 of the probability p.
     "hard": 5 above 0 and else -5; its gradient is that of "tanh", straight through.
-
-    Example:
-        >>> attention_logits(torch.tensor([0.4, -8.0]), "hard", 0.5)
-        tensor([ 5., -5.])
     """
     if answers == "logit":
         return logits
@@ -108,7 +104,6 @@ class PlanAttention(TensorDictModuleBase):
 
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``skill_weights``."""
         qaf, task_id = read(tensordict, self.in_keys)
         rows = self.tables.rows(task_id)
         self.tables.refuse_others(tensordict.get(plan_number_key(self.in_keys[0]), None), rows)

@@ -9,25 +9,17 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.envs import Transform
 
 from lw_torchrl._checks import check_probability, check_scale, checked
-from lw_torchrl._keys import as_keys, check_apart
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
-from lw_torchrl.language.skill_words import closes
+from lw_torchrl.language.skills import closes
 from lw_torchrl.language.text import TextEncoder, encoded
 from lw_torchrl.modules.augmentation import hide_opening, mentioned, swap_unmentioned
 from lw_torchrl.modules.encoder import Encoder, Encoding
 from lw_torchrl.modules.networks import text_to_latent, unit_scale
 from lw_torchrl.modules.observation_features import Features, ObservationFeatures
 from lw_torchrl.modules.plan_attention import Answers, PlanAttention, attend, attention_logits
-from lw_torchrl.modules.query_evaluator import (
-    QueryEvaluator,
-    check_evaluator,
-    condition_keys,
-    condition_transform,
-    describe_plans,
-)
+from lw_torchrl.modules.query_evaluator import QueryEvaluator, ReadsPlans
 from lw_torchrl.modules.relative_positions import PlanFocus, PlanRoles, RelativePositions
 from lw_torchrl.transforms.qaf import plan_number_key, plan_program
 from lw_torchrl.transforms.random_yaw import yaw_key
@@ -35,7 +27,7 @@ from lw_torchrl.transforms.random_yaw import yaw_key
 IN_FORCE = 0.01  # a step whose condition does not hold beside one that does has a weight of 1e-4
 
 
-class PlanEncoder(Encoder):
+class PlanEncoder(ReadsPlans, Encoder):
     """Each skill's text is encoded to a latent, and the conditions' truth gives attention over the steps: the mixed
     latent, beside the observation's features, is what a plan says is to be done now.
 
@@ -44,10 +36,27 @@ class PlanEncoder(Encoder):
 
     Args:
         plans: a plan for each task that will be seen.
-        features, focus, roles, jitter, swap_unmentioned, hide_opening, latent_size, encoder_width, encoder_depth,
-            evaluator, answers, answer_scale, text_encoder, in_keys: as for :class:`PlanConditionedActor`.
+        features: what is seen of the observation: "raw", the 39 numbers; "differences", the pairwise differences
+            between hand, objects and goal, the hand's height and the gripper's opening; "relative", the differences
+            alone; "opening", the gripper's opening alone, for ``roles``; "both", raw and differences.
         feature_noise: standard deviation of the noise on the normalised features while training.
-        out_keys: another name for what it writes.
+        focus: also see the relative positions of what the steps in force compare, see :class:`PlanFocus`.
+        roles: also see the target's position relative to what the step in force moves, see
+            :class:`~lw_torchrl.modules.relative_positions.PlanRoles`: for tasks that were not demonstrated.
+        jitter: standard deviation, in metres, of noise on that position while training, where the gripper pushes.
+        swap_unmentioned: the probability, in training, that an object or the goal is put where it is in another row,
+            if no step in force mentions it, or with ``roles`` moves it or to it.
+        hide_opening: the probability, in training, that the gripper's opening is another row's, if no step in force
+            closes it: it often tells which task this is.
+        latent_size: D.
+        encoder_width, encoder_depth: hidden layers of the skill encoder.
+        evaluator: answers the conditions in the place of ``qaf``, which is then not read; see :class:`QueryEvaluator`.
+        answers: what an evaluator's logit counts in the attention's softmax, where exact truth counts 5 and -5:
+            "logit", what it is; "tanh", 5·tanh(answer_scale·logit); "hard", 5 or -5 by its sign, with the gradient of
+            "tanh".
+        answer_scale: the scale in "tanh" and "hard"; 0.5 makes "tanh" the paper's 10·p - 5 of the probability p.
+        text_encoder: texts to vectors (n, E) float32; None for the shipped sentence encoder.
+        in_keys, out_keys: other names for what it reads and writes, in the order above; nested ones too.
 
     Attributes:
         skills: the K different skill texts, sorted.
@@ -72,7 +81,6 @@ class PlanEncoder(Encoder):
     skill_index: Tensor
     mentioned: Tensor
     closing: Tensor
-    plans: Plans
 
     @checked
     def __init__(
@@ -97,8 +105,7 @@ class PlanEncoder(Encoder):
         out_keys: Sequence[NestedKey] | None = None,
     ) -> None:
         super().__init__()
-        self.plans = as_plans(plans)
-        self.evaluator = check_evaluator(evaluator, self.plans)
+        self.read_plans(plans, evaluator, in_keys, out_keys, ("encoding",))
         if evaluator is not None and (focus or roles or swap_unmentioned or hide_opening):
             raise ValueError(
                 "focus, roles, swap_unmentioned and hide_opening read the queries' exact truth, which an evaluator "
@@ -112,11 +119,6 @@ class PlanEncoder(Encoder):
             raise ValueError(f"jitter moves the way of the roles, and roles is False; got jitter={jitter}")
         if evaluator is None and (answers, answer_scale) != ("logit", 0.5):
             raise ValueError("answers and answer_scale are of an evaluator's logits, and evaluator is None")
-        self.tasks = tuple(self.plans)
-        own, self.in_keys = condition_keys(in_keys, evaluator)
-        self.out_keys = as_keys("out_keys", out_keys, ("encoding",))
-        check_apart(self.in_keys, self.out_keys)
-        self._answered = plan_number_key(own[-1])
         self.config: dict[str, Any] = {
             "features": features,
             "feature_noise": feature_noise,
@@ -128,7 +130,7 @@ class PlanEncoder(Encoder):
             "latent_size": latent_size,
             "encoder_width": encoder_width,
             "encoder_depth": encoder_depth,
-            "in_keys": own,
+            "in_keys": self.own_keys,
         }
         if evaluator is not None:
             self.config |= {"answers": answers, "answer_scale": check_scale("answer_scale", answer_scale)}
@@ -157,10 +159,6 @@ class PlanEncoder(Encoder):
     def _relative(self) -> list[RelativePositions]:
         return [part for part in (self.focus, self.roles) if part is not None]
 
-    def transform(self) -> Transform | None:
-        """Query answers, or what the evaluator reads."""
-        return condition_transform(self.plans, self.in_keys, self.evaluator)
-
     def prepare(self, tensordict: TensorDictBase) -> tuple[Tensor, ...]:
         """What no trained parameter touches: attention (B, S), the index of each step's skill (B, S) int64, and the
         observation's features (B, F). With an evaluator, the mask of real steps (B, S) bool in the attention's place,
@@ -170,7 +168,7 @@ class PlanEncoder(Encoder):
         if self.evaluator is not None:
             asked = [tensordict.get(key) for key in self.evaluator.in_keys]
             return self.attention.mask[rows], self.skill_index[rows], self.features(observation), *asked
-        self.attention.tables.refuse_others(tensordict.get(self._answered, None), rows)
+        self.attention.tables.refuse_others(tensordict.get(plan_number_key(self.in_keys[2]), None), rows)
         weights = self.attention.over_steps(rest[0], rows)
         if self.training:
             observation = self._augmented(observation, weights, rows)
@@ -211,7 +209,6 @@ class PlanEncoder(Encoder):
         return attend(attention_logits(logits, self.config["answers"], self.config["answer_scale"]), steps)
 
     def encode(self, *prepared: Tensor) -> Encoding:
-        """From what :meth:`prepare` gives."""
         weights = self.weights(*prepared)
         # A product with (B, K) is faster than picking (B, S, D) latents, forwards and backwards.
         over_skills = weights.new_zeros((*weights.shape[:-1], len(self.skills))).scatter_add(-1, prepared[1], weights)
@@ -221,9 +218,6 @@ class PlanEncoder(Encoder):
     def latents(self) -> Tensor:
         """(K, D), the latent of each skill."""
         return self.texts(self.text_vectors)
-
-    def describe(self) -> dict[str, Any]:
-        return describe_plans(self.plans, self.evaluator)
 
     def with_plans(self, plans: Plans | Mapping[str, ConditionalPlan]) -> PlanEncoder:
         evaluator = None if self.evaluator is None else self.evaluator.with_plans(as_plans(plans))

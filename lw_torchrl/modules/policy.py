@@ -58,8 +58,7 @@ class Policy(Prepared):
     Attributes:
         config: the options that make it again, as JSON; :meth:`describe` adds what else it needs, its tasks for
             example, and :meth:`from_description` reads that.
-        plans: what it carries out; None where it is not conditioned on plans.
-        tasks: the names of the tasks that it can act in.
+        plans, tasks: as for :class:`~lw_torchrl.modules.encoder.Prepared`.
         plan_options: whether its class has options about a plan's steps, like ``focus``.
         row_by_row: whether a row's action is the same to the last bit whatever the other rows are; networks' are not,
             and run on blocks of one size.
@@ -118,7 +117,6 @@ class Policy(Prepared):
 
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``out_keys``."""
         return write(tensordict, self, self.act(*self.prepare(tensordict)))
 
     def fit_normalization(self, observation: Tensor, weights: Tensor | None = None) -> None:

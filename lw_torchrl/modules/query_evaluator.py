@@ -14,9 +14,10 @@ from torch import Tensor
 from torchrl.envs import Transform
 
 from lw_torchrl._checks import check_choice, checked
-from lw_torchrl._keys import as_keys, dispatched, write
-from lw_torchrl.language.plans import Plans
+from lw_torchrl._keys import as_keys, check_apart, dispatched, write
+from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.text import TextEncoder
+from lw_torchrl.modules.encoder import Prepared
 from lw_torchrl.transforms.qaf import QAFTransform
 
 EVALUATORS: dict[str, str | type[QueryEvaluator]] = {
@@ -89,7 +90,6 @@ class QueryEvaluator(TensorDictModuleBase):
 
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``qaf_logits``."""
         return write(tensordict, self, [self.answers(*(tensordict.get(key) for key in self.in_keys))])
 
     def with_plans(self, plans: Plans) -> QueryEvaluator:
@@ -126,45 +126,47 @@ def evaluator_from_description(found: Any, plans: Plans, text_encoder: TextEncod
     return made.from_options(plans, found["options"], text_encoder)
 
 
-def check_evaluator(evaluator: Any, plans: Plans) -> QueryEvaluator | None:
-    """Return what is given as an actor's evaluator, if it is one of the actor's plans, or None."""
-    if evaluator is None:
-        return None
-    if not isinstance(evaluator, QueryEvaluator):
-        given = f"the class {evaluator.__name__}" if isinstance(evaluator, type) else type(evaluator).__name__
-        raise TypeError(f"evaluator must be a QueryEvaluator, made for the plans: MyEvaluator(plans); got {given}")
-    if evaluator.plans.fingerprint != plans.fingerprint:
-        raise ValueError("evaluator must be of the actor's plans, it answers the conditions of others")
-    return evaluator
+class ReadsPlans(Prepared):
+    """What plan encoders and scripts share: an evaluator, or ``qaf``, tells which of a plan's steps is in force."""
 
+    plans: Plans
+    evaluator: QueryEvaluator | None
 
-def describe_plans(plans: Plans, evaluator: QueryEvaluator | None) -> dict[str, Any]:
-    """What a policy's description says of its plans and of what answers their conditions, as JSON."""
-    found: dict[str, Any] = {"plans": plans.to_json()}
-    return found if evaluator is None else found | {"evaluator": evaluator.describe()}
+    def read_plans(
+        self,
+        plans: Plans | Mapping[str, ConditionalPlan],
+        evaluator: QueryEvaluator | None,
+        in_keys: Sequence[NestedKey] | None,
+        out_keys: Sequence[NestedKey] | None,
+        written: Sequence[str],
+    ) -> None:
+        """Take the arguments that they share; ``own_keys`` are ``in_keys`` without those that the evaluator adds."""
+        self.plans = as_plans(plans)
+        self.tasks = tuple(self.plans)
+        if evaluator is not None and evaluator.plans.fingerprint != self.plans.fingerprint:
+            raise ValueError("evaluator must be of the actor's plans, it answers the conditions of others")
+        self.evaluator = evaluator
+        read = ["observation", "task_id"] + ["qaf"] * (evaluator is None)
+        self.own_keys = as_keys("in_keys", in_keys, read)
+        asked = [] if evaluator is None else evaluator.in_keys
+        self.in_keys: list[NestedKey] = list(dict.fromkeys([*self.own_keys, *asked]))
+        self.out_keys = as_keys("out_keys", out_keys, written)
+        check_apart(self.in_keys, self.out_keys)
+
+    def transform(self) -> Transform | None:
+        """Query answers, or what the evaluator reads."""
+        if self.evaluator is not None:
+            return self.evaluator.transform()
+        return QAFTransform(self.plans, in_keys=self.in_keys[:2], out_keys=self.in_keys[2:])
+
+    def describe(self) -> dict[str, Any]:
+        asked = {} if self.evaluator is None else {"evaluator": self.evaluator.describe()}
+        return {**super().describe(), "plans": self.plans.to_json(), **asked}
 
 
 def plans_and_evaluator(
     found: Mapping[str, Any], text_encoder: TextEncoder | None
 ) -> tuple[Plans, QueryEvaluator | None]:
-    """What :func:`describe_plans` described."""
+    """What :meth:`ReadsPlans.describe` described."""
     plans, asked = Plans.from_json(found["plans"]), found.get("evaluator")
     return plans, None if asked is None else evaluator_from_description(asked, plans, text_encoder)
-
-
-def condition_keys(
-    given: Sequence[NestedKey] | None, evaluator: QueryEvaluator | None
-) -> tuple[list[NestedKey], list[NestedKey]]:
-    """A policy's own ``in_keys``, and these with those of what answers its conditions."""
-    if evaluator is None:
-        own = as_keys("in_keys", given, ("observation", "task_id", "qaf"))
-        return own, own
-    own = as_keys("in_keys", given, ("observation", "task_id"))
-    return own, list(dict.fromkeys([*own, *evaluator.in_keys]))
-
-
-def condition_transform(plans: Plans, in_keys: list[NestedKey], evaluator: QueryEvaluator | None) -> Transform | None:
-    """A new transform that writes the query answers, or what the evaluator reads."""
-    if evaluator is not None:
-        return evaluator.transform()
-    return QAFTransform(plans, in_keys=in_keys[:2], out_keys=in_keys[2:])

@@ -12,10 +12,10 @@ from torch import Tensor, nn
 from lw_torchrl._checks import check_scale
 from lw_torchrl.language.named_objects import GRIPPER, NamedObject, coordinate_index
 from lw_torchrl.language.observation import FIRST, HAND, OBSERVATION_SIZE, places
-from lw_torchrl.language.plan_tables import PlanTables
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.language.roles import plan_roles, role_object
-from lw_torchrl.language.skill_words import closes, presses, pushes
+from lw_torchrl.language.skills import closes, presses, pushes
+from lw_torchrl.language.task_index import PlanTables
 from lw_torchrl.modules.observation_features import squash
 from lw_torchrl.transforms.random_yaw import turn_observation, turn_vectors
 
@@ -71,11 +71,8 @@ class RelativePositions(nn.Module):
 
     def positions(self, observation: Tensor, weights: Tensor, rows: Tensor, yaw: Tensor | None = None) -> Tensor:
         """(..., 39) float32, attention (..., S) float32 and rows (...) int64, as from :meth:`PlanTables.rows`, to
-        (..., P, 3) float32 metres.
-
-        Args:
-            yaw: (...) float32, the angle by which :class:`RandomYaw` turned the observation: fixed places and offsets
-                are turned with it.
+        (..., P, 3) float32 metres. Fixed places and offsets are turned by ``yaw`` (...) float32, the angle by which
+        :class:`RandomYaw` turned the observation.
         """
         if yaw is not None:
             observation = turn_observation(observation, -yaw)
@@ -106,9 +103,6 @@ class PlanFocus(RelativePositions):
     position of the handle relative to the gripper stands in the same place as that of the puck in another task, and
     what was learned there is of use here. Of each step the first and the last clause with two things: 18 features, 0
     for a step without such a clause.
-
-    Args:
-        noise: standard deviation of the noise on each feature while training.
     """
 
     def __init__(self, plans: Plans, tables: PlanTables, noise: float = 0.0) -> None:
@@ -127,7 +121,6 @@ class PlanRoles(RelativePositions):
     that its plan's conditions name.
 
     Args:
-        noise: standard deviation of the noise on each feature while training.
         jitter: standard deviation, in metres, of the noise on the position's height while training, and half of it to
             the sides, where the gripper pushes or pulls: things are touched at other places in other tasks.
 
@@ -186,14 +179,9 @@ class PlanRoles(RelativePositions):
 
     @torch.no_grad()
     def fit(self, observation: Tensor, weights: Tensor, rows: Tensor) -> None:
-        """Take the contacts from demonstrations, in place: the median of hand minus object while a step is in force
-        that closes the gripper around the first object, pushes or pulls it, or moves it. What is pressed from above
-        has none, since the gripper goes through it.
-
-        Args:
-            observation: (R, 39) float32.
-            weights: (R, S) float32, the attention.
-            rows: (R,) int64, as from :meth:`PlanTables.rows`.
+        """Take the contacts from demonstrations, observations (R, 39) and attention (R, S) float32 with their rows (R,)
+        int64, in place: the median of hand minus object while a step is in force that closes the gripper around the
+        first object, pushes or pulls it, or moves it. What is pressed from above has none: the gripper goes through it.
         """
         held = (weights * self.acts[rows]).sum(-1) > 0.5
         away = observation[:, HAND] - observation[:, FIRST]

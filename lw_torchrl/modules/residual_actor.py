@@ -12,7 +12,6 @@ from torchrl.envs import Transform
 
 from lw_torchrl._checks import check_choice, check_int, check_scale, checked, shown
 from lw_torchrl._keys import key_beside, read
-from lw_torchrl.language.plan_tables import PlanTables
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.tasks import Task
 from lw_torchrl.language.text import TextEncoder
@@ -94,8 +93,11 @@ class ResidualActor(Policy):
             self.steps = self.config["steps"] = check_steps(steps, base.encoder.plans)
             action, weights, *_ = base.out_keys_source
             self.out_keys = [action, weights, key_beside(action, "_corrected")]
-            table = step_table(self.steps, base.encoder.attention.tables)
-            self.register_buffer("chosen", table, persistent=False)
+            tables = base.encoder.attention.tables
+            chosen = torch.zeros_like(tables.mask)  # (T, S)
+            for task, numbers in self.steps.items():
+                chosen[tables.index.row(task), numbers] = True
+            self.register_buffer("chosen", chosen, persistent=False)
 
     def train(self, mode: bool = True) -> ResidualActor:
         """As a module's, but the base stays in eval mode: its features have no noise."""
@@ -119,7 +121,6 @@ class ResidualActor(Policy):
         return *prepared, self.chosen[self.base.encoder.attention.tables.rows(task)]
 
     def act(self, *prepared: Tensor) -> tuple[Tensor, ...]:
-        """From what :meth:`prepare` gives to a tensor for each of ``out_keys``."""
         encoding = self.base.encoder.encode(*(prepared if self.steps is None else prepared[:-1]))
         action = self.base.head(encoding.joined)
         more = self.config["scale"] * torch.tanh(self.network(torch.cat((encoding.joined, action), -1)))
@@ -144,7 +145,12 @@ class ResidualActor(Policy):
         """One on the same weights for other plans; :class:`ValueError` if these lack ``steps`` or their skills."""
         if self.steps is not None:
             assert self.plans is not None
-            check_same_skills(self.steps, self.plans, as_plans(plans))
+            others = as_plans(plans)
+            checked_steps = check_steps(self.steps, others).items()
+            for task, number in [(task, number) for task, numbers in checked_steps for number in numbers]:
+                was, now = (of[task].steps[number].skill for of in (self.plans, others))
+                if was != now:
+                    raise ValueError(f"steps of {task!r}: step {number} must have the skill {was!r}, got {now!r}")
         base = self.base.with_plans(plans)
         assert isinstance(base, ConditionedActor)
         other = ResidualActor(base, **self.config)
@@ -153,13 +159,7 @@ class ResidualActor(Policy):
 
 
 def check_steps(steps: Any, plans: Plans) -> dict[str, list[int]]:
-    """Steps of plans as JSON, with tasks and steps sorted, if the plans have them.
-
-    Example:
-        >>> import lw_torchrl as lw
-        >>> check_steps({"pick-place": (3, 1)}, lw.load_plans("MT10"))
-        {'pick-place': [1, 3]}
-    """
+    """Steps of plans as JSON, with tasks and steps sorted, if the plans have them."""
     if not isinstance(steps, Mapping):
         raise TypeError(f"steps must map names of tasks to steps of their plans, got {shown(steps)}")
     if not steps:
@@ -180,30 +180,7 @@ def check_steps(steps: Any, plans: Plans) -> dict[str, list[int]]:
     return dict(sorted(found.items()))
 
 
-def check_same_skills(steps: Mapping[str, Sequence[int]], plans: Plans, others: Plans) -> None:
-    """Raise :class:`ValueError` unless the steps are in other plans too, with the same skills."""
-    for task, numbers in check_steps(steps, others).items():
-        for number in numbers:
-            ours, theirs = plans[task].steps[number].skill, others[task].steps[number].skill
-            if ours != theirs:
-                raise ValueError(f"steps of {task!r}: step {number} must have the skill {ours!r}, got {theirs!r}")
-
-
-def step_table(steps: Mapping[str, Sequence[int]], tables: PlanTables) -> Tensor:
-    """(T, S) bool, a row for each task as in ``tables``: true of the steps."""
-    found = torch.zeros_like(tables.mask)
-    for task, numbers in steps.items():
-        found[tables.index.tasks.index(task), list(numbers)] = True
-    return found
-
-
 def weight_in_force(weights: Tensor, chosen: Tensor) -> Tensor:
-    """How much of the attention (B, S) float32 is on chosen steps (B, S) bool: (B, 1) float32 from 0 to 1, and exactly
-    0 where none of them is in force.
-
-    Example:
-        >>> weights = torch.tensor([[1e-4, 0.9999], [0.5, 0.5]])
-        >>> weight_in_force(weights, torch.tensor([True, False]).expand(2, 2)).flatten().tolist()
-        [0.0, 0.5]
-    """
+    """How much of the attention (B, S) float32 is on chosen steps (B, S) bool: (B, 1) float32, exactly 0 where none of
+    them is in force."""
     return weights.masked_fill(~chosen | (weights <= IN_FORCE), 0.0).sum(-1, keepdim=True)

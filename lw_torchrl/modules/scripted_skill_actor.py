@@ -9,29 +9,20 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.envs import Transform
 
 from lw_torchrl._checks import checked, shown
-from lw_torchrl._keys import as_keys, check_apart
-from lw_torchrl.language.plan_tables import PlanTables
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.skill_program import SkillProgram
 from lw_torchrl.language.skills import ScriptedSkill
+from lw_torchrl.language.task_index import PlanTables
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.plan_attention import check_truth
 from lw_torchrl.modules.policy import Policy
-from lw_torchrl.modules.query_evaluator import (
-    QueryEvaluator,
-    check_evaluator,
-    condition_keys,
-    condition_transform,
-    describe_plans,
-    plans_and_evaluator,
-)
+from lw_torchrl.modules.query_evaluator import QueryEvaluator, ReadsPlans, plans_and_evaluator
 from lw_torchrl.transforms.qaf import plan_number_key
 
 
-class ScriptedSkillActor(Policy):
+class ScriptedSkillActor(ReadsPlans, Policy):
     """Runs the skill of a true step of the plan; where none is true, that of the last step.
 
     Reads ``observation`` (B, 39) float32, ``task_id`` (B,) int64 and ``qaf`` (B, S) bool, or float in [0, 1] for soft
@@ -76,13 +67,8 @@ class ScriptedSkillActor(Policy):
         out_keys: Sequence[NestedKey] | None = None,
     ) -> None:
         super().__init__()
-        self.plans: Plans = as_plans(plans)
-        self.tasks = tuple(self.plans)
-        self.evaluator = check_evaluator(evaluator, self.plans)
-        own, self.in_keys = condition_keys(in_keys, evaluator)
-        self.out_keys = as_keys("out_keys", out_keys, ("action", "skill_weights"))
-        check_apart(self.in_keys, self.out_keys)
-        self.config = {"select": select, "seed": seed, "in_keys": own, "out_keys": self.out_keys}
+        self.read_plans(plans, evaluator, in_keys, out_keys, ("action", "skill_weights"))
+        self.config = {"select": select, "seed": seed, "in_keys": self.own_keys, "out_keys": self.out_keys}
         if not -(2**63) <= seed < 2**64:
             raise ValueError(f"seed must be from -2**63 to 2**64 - 1, got {shown(seed)}")
         self.select = select
@@ -99,10 +85,6 @@ class ScriptedSkillActor(Policy):
     def for_plans(cls, plans: Plans, *, text_encoder: TextEncoder | None = None, **options: Any) -> ScriptedSkillActor:
         return cls(plans, **options)
 
-    def transform(self) -> Transform | None:
-        """Query answers, or what the evaluator reads."""
-        return condition_transform(self.plans, self.in_keys, self.evaluator)
-
     def with_plans(self, plans: Plans | Mapping[str, ConditionalPlan]) -> ScriptedSkillActor:
         """The same skills under other plans."""
         evaluator = None if self.evaluator is None else self.evaluator.with_plans(as_plans(plans))
@@ -117,7 +99,7 @@ class ScriptedSkillActor(Policy):
         """As :meth:`Policy.describe`; :class:`TypeError` with skills of one's own, which no policy file holds."""
         if self._skills is not None:
             raise TypeError("a ScriptedSkillActor with skills of your own cannot be saved: keep their file instead")
-        return super().describe() | describe_plans(self.plans, self.evaluator)
+        return super().describe()
 
     @classmethod
     def from_description(cls, found: Mapping[str, Any], text_encoder: TextEncoder | None = None) -> ScriptedSkillActor:

@@ -10,11 +10,12 @@ from torch import Tensor, nn
 from torchrl.modules import MLP
 
 from lw_torchrl._checks import check_int, checked
-from lw_torchrl.language.observation import OBSERVATION_SIZE, OPENING, POSITIONS
+from lw_torchrl.language.observation import OPENING, POSITIONS
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.clause_evaluator import ClauseEvaluator, Clauses
 from lw_torchrl.modules.networks import text_to_latent
+from lw_torchrl.modules.observation_features import check_observation
 
 MOST = 30.0
 """The size of the largest logit of a clause: a probability of 1e-13."""
@@ -98,26 +99,16 @@ def _difference(observation: Tensor, clauses: Clauses) -> Tensor:
 
 
 class StateQueryEvaluator(ClauseEvaluator):
-    """Answers conditions by a network that was trained on the query answering function's answers, and never asks it.
+    """Answers conditions from the observation, by a network that was trained on the query answering function's answers.
 
     Reads ``observation`` (B, 39) float32 and ``task_id`` (B,) int64; writes ``qaf_logits`` (B, S) float32, positive
-    where a condition of the row's plan holds, -1e4 beyond its last step. A condition's clauses are answered one by one,
-    see :class:`~lw_torchrl.modules.clause_evaluator.ClauseEvaluator`, so that new conjunctions need no training.
+    where a condition of the row's plan holds, -1e4 beyond its last step. With ``structure``, objects' positions are
+    read where the tasks' table says that they stand in the observation: only what the predicates mean is learned.
 
     Args:
-        plans: whose conditions it answers.
-        structure: a clause is read as the query language parses it: its predicate by number, its objects' positions
-            where the tasks' table says that they stand in the observation, "not" as the opposite. Only what the
-            predicates mean is learned. False: only a clause's text vector is known.
+        plans, structure, predicates, text_encoder: as for
+            :class:`~lw_torchrl.modules.clause_evaluator.ClauseEvaluator`, whose errors and source it has.
         width, depth: hidden layers.
-        predicates: with ``structure``, the relations and predicates that it can tell; None for all that there are.
-        text_encoder: without ``structure``, texts to vectors (n, E) float32; None for the sentence encoder, which
-            needs the extra ``[text]``: clauses' vectors are not shipped.
-
-    Raises:
-        ValueError: a plan asks for a predicate that is not among ``predicates``; at call time, an
-            observation of another shape, or a task_id without a plan.
-        ImportError: without ``structure``, the extra ``[text]`` is not installed and there is no ``text_encoder``.
 
     Example:
         >>> import lw_torchrl as lw
@@ -127,8 +118,6 @@ class StateQueryEvaluator(ClauseEvaluator):
         >>> actor(env.reset())["action"].shape
         torch.Size([1, 4])
         >>> env.close()
-
-    Source: paper section 'Differentiability and Optimization'.
     """
 
     network: ClauseNetwork
@@ -146,13 +135,7 @@ class StateQueryEvaluator(ClauseEvaluator):
     ) -> None:
         super().__init__(plans, structure=structure, predicates=predicates, text_encoder=text_encoder)
         self.network = ClauseNetwork(width, depth, predicates=len(self.predicates), text_size=self.text_size)
-        self.config = {"structure": structure, "width": width, "depth": depth}
-        if structure:
-            self.config["predicates"] = list(self.predicates)
+        self.config |= {"width": width, "depth": depth}
 
     def check_seen(self, seen: Tensor) -> None:
-        if seen.shape[-1:] != (OBSERVATION_SIZE,) or seen.dtype != torch.float32:
-            raise ValueError(
-                f"observation must be float32 of shape (..., {OBSERVATION_SIZE}), got {seen.dtype} of shape "
-                f"{tuple(seen.shape)}"
-            )
+        check_observation(seen)

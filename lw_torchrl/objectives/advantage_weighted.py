@@ -1,5 +1,4 @@
-"""Learning without an environment: ExpectileValueLoss, the value of a state; AdvantageWeightedLoss, imitation of the
-rows that did better than others."""
+"""Learning without an environment: the value of a state, and imitation of the rows that did better than others."""
 
 from __future__ import annotations
 
@@ -46,9 +45,6 @@ class ExpectileValueLoss(LossModule):
 
     Raises:
         ValueError: at call time, keys that the network does not write, or rows that lack one.
-
-    Noise on the network's features, of which critics have none by default, is on the targets too while the network
-    trains. ``train()`` and ``eval()`` reach the network, and :meth:`advantage` is always without noise.
 
     Example:
         >>> import lw_torchrl as lw, torch
@@ -115,11 +111,9 @@ class ExpectileValueLoss(LossModule):
         """Set how targets are estimated, and return the loss.
 
         Args:
-            value_type: ``ValueEstimators.TD0``, or None for it; or any estimator as an object or a class.
+            value_type: an estimator as an object or a class, or ``ValueEstimators.TD0``, or None for it; others, which
+                need rows in the order of time, are a :class:`NotImplementedError`.
             **hyperparams: ``gamma``, the discount of a step, 0.99 by default.
-
-        Raises:
-            NotImplementedError: another one by name, which needs rows in the order of time.
         """
         value_type = self.default_value_estimator if value_type is None else value_type
         if not isinstance(value_type, (str, ValueEstimators)):
@@ -131,7 +125,7 @@ class ExpectileValueLoss(LossModule):
         return self
 
     def train(self, mode: bool = True) -> ExpectileValueLoss:
-        """Reach the network too, which is none of the loss's submodules."""
+        """Reach the network too, whose noise is on targets as well."""
         self.value_network.train(mode)
         return super().train(mode)
 
@@ -152,7 +146,7 @@ class ExpectileValueLoss(LossModule):
     @torch.no_grad()
     def advantage(self, tensordict: TensorDictBase) -> Tensor:
         """How much more a row's steps gave than its state is worth, (B, 1) float32: the target less the mean value,
-        both of the target network, without noise on its features. The rows given stay as they are."""
+        both of the target network, without noise on its features."""
         with evaluating(self.value_network):
             value = self._values(tensordict, self.target_value_network_params).mean(-1, keepdim=True)
             return self._target(tensordict) - value
@@ -165,7 +159,7 @@ class ExpectileValueLoss(LossModule):
         )  # a copy, since one that averages rewards writes them
 
     def _values(self, tensordict: TensorDictBase, params: TensorDictParams) -> Tensor:
-        """(B, E), each member's; E is 1 for a network that writes ``state_value`` alone."""
+        """(B, E), each member's."""
         network, keys = self.value_network, self.tensor_keys
         key = keys.values if unravel_key(keys.values) in network.out_keys else keys.value
         several = isinstance(network, Value) and len(network.heads) > 1
@@ -313,8 +307,7 @@ def standardize_by_task(advantage: Tensor, task_id: Tensor) -> Tensor:
             f"task_id must be ({len(advantage)},) int64, a task for each row of advantage, got "
             f"{tuple(task_id.shape)} {task_id.dtype}"
         )
-    if not advantage.isfinite().all():
-        raise ValueError("advantage must hold finite numbers, got NaN or infinity")
+    check_finite("advantage", advantage)
     found = torch.zeros_like(advantage)
     for task in task_id.unique():
         rows = task_id == task

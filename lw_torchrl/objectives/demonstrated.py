@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any
 
 import torch
 from tensordict import TensorDictBase
@@ -15,19 +15,13 @@ from torchrl.data import Composite
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import SACLoss, TD3BCLoss
 
-from lw_torchrl._checks import check_choice, check_scale, checked, shown
+from lw_torchrl._checks import check_scale, checked, shown
 from lw_torchrl.objectives.reduction import Reduction, let_go, priority_weight
 
 
 def imitation(action: Tensor, demonstrated: Tensor, is_demonstration: Tensor) -> Tensor:
-    """The squared distance to the demonstrated action, of each row: (B,) float32.
-
-    It is 0 in rows that are no demonstrations, and scaled so that its mean over all rows is the mean over
-    demonstrations; 0 where there are none.
-
-    Args:
-        action, demonstrated: (B, A) float32.
-        is_demonstration: (B,) or (B, 1) bool.
+    """The squared distance of (B, A) float32 actions to the demonstrated ones, (B,) float32: 0 in rows that are no
+    demonstrations, and scaled so that its mean over all rows is the mean over demonstrations.
 
     Example:
         >>> import torch
@@ -47,8 +41,6 @@ else:
 
 
 class _ImitatesDemonstrations(_Loss):
-    """What both losses share: the imitation of those rows of which ``is_demonstration`` is true."""
-
     _fixed: Mapping[str, Any] = {}  # options that are not the user's
     in_keys: list[NestedKey]
 
@@ -59,12 +51,11 @@ class _ImitatesDemonstrations(_Loss):
         qvalue_network: TensorDictModuleBase | list[TensorDictModuleBase],
         *,
         bc_weight: float = 2.0,
+        reduction: Reduction | None = None,
         **options: Any,
     ) -> None:
         if "alpha" in self._fixed and "alpha" in options:
             raise ValueError("alpha is 1 here: give bc_weight, the weight of the imitation")
-        if options.get("reduction") is not None:
-            check_choice("reduction", options["reduction"], get_args(Reduction))
         spec = options.get("action_spec")
         if spec is not None and not isinstance(spec, Composite) and len(spec.shape) > 1:  # actions of as many rows
             raise ValueError(
@@ -75,20 +66,19 @@ class _ImitatesDemonstrations(_Loss):
             raise TypeError(
                 f"qvalue_network must be a TensorDictModule, or a list of these, got {shown(qvalue_network)}"
             )
-        super().__init__(actor_network, qvalue_network, **self._fixed, **options)
+        super().__init__(actor_network, qvalue_network, reduction=reduction, **self._fixed, **options)
         self.bc_weight = check_scale("bc_weight", bc_weight)
         self.in_keys = [*self.in_keys, self.tensor_keys.is_demonstration]
 
     def set_keys(self, **keys: NestedKey) -> None:
-        """Read and write under other names; see :class:`torchrl.objectives.LossModule`."""
+        """See :class:`torchrl.objectives.LossModule`."""
         super().set_keys(**keys)
         self.in_keys = [*self.in_keys, self.tensor_keys.is_demonstration]
 
     def _imitation(self, tensordict: TensorDictBase, action: Tensor) -> Tensor:
-        """The imitation by an action (B, A) of each row, (B,), without its weight."""
+        """As :func:`imitation`, of a minibatch."""
         key = self.tensor_keys.is_demonstration
-        found = tensordict.get(key, None)
-        if found is None:
+        if (found := tensordict.get(key, None)) is None:
             raise ValueError(
                 f"the batch lacks {key!r}, which says which rows to imitate: a LanguageWorldExperienceReplay writes "
                 f"it, as does a buffer on a GrowingStorage; in a buffer of your own, set it, (B,) bool, or name it by "
@@ -103,9 +93,8 @@ class DemonstratedTD3Loss(_ImitatesDemonstrations, TD3BCLoss):
     """TD3 on a collector's rows and demonstrations alike, whose actor also imitates the demonstrations.
 
     The actor's loss is -Q / mean(abs(Q)) over all rows, where Q is the mean of the critics, plus ``bc_weight`` times
-    the mean squared distance to ``action`` over the rows that are demonstrations, of which ``is_demonstration`` is
-    true. A :class:`~lw_torchrl.LanguageWorldExperienceReplay` says so of its datasets' rows, and not of what it was
-    extended with. The critics' loss is TD3's.
+    the mean squared distance to ``action`` over the rows of which ``is_demonstration`` is true: those of the datasets
+    of a :class:`~lw_torchrl.LanguageWorldExperienceReplay`, not what it was extended with. The critics' loss is TD3's.
 
     Reads what TD3 reads, and ``is_demonstration`` (B,) bool; writes what :class:`torchrl.objectives.TD3BCLoss` does:
     ``loss_actor`` and ``loss_qvalue``, () float32 each, and, detached, ``bc_loss`` (), without its weight, ``lmbd`` (),
@@ -125,12 +114,10 @@ class DemonstratedTD3Loss(_ImitatesDemonstrations, TD3BCLoss):
 
     Example:
         >>> import lw_torchrl as lw
-        >>> from torchrl.objectives import SoftUpdate
         >>> plans = lw.load_plans("MT10")
         >>> actor, critic = lw.PlanConditionedActor(plans), lw.PlanConditionedQValue(plans)
         >>> loss = lw.objectives.DemonstratedTD3Loss(actor, critic, bounds=(-1.0, 1.0))
         >>> loss.make_value_estimator(gamma=0.99)
-        >>> targets = SoftUpdate(loss, eps=0.995)
         >>> "is_demonstration" in loss.in_keys
         True
 
@@ -147,7 +134,7 @@ class DemonstratedTD3Loss(_ImitatesDemonstrations, TD3BCLoss):
     _fixed = {"alpha": 1.0}
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict]:
-        """The actor's loss, () float32, and ``bc_loss``, ``lmbd`` and ``state_action_value_actor``, detached."""
+        """The actor's loss, () float32, and what is told of it, detached."""
         seen = tensordict.select(*self.actor_network.in_keys, strict=False)
         with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
             seen = self.actor_network(seen)
@@ -176,10 +163,9 @@ class DemonstratedTD3Loss(_ImitatesDemonstrations, TD3BCLoss):
 class DemonstratedSACLoss(_ImitatesDemonstrations, SACLoss):
     """SAC on a collector's rows and demonstrations alike, whose actor also imitates the demonstrations.
 
-    The actor's loss is SAC's over all rows, plus ``bc_weight`` times the mean squared distance of the distribution's
-    mode to ``action`` over the rows of which ``is_demonstration`` is true, as for
-    :class:`DemonstratedTD3Loss`. It is a distance and no likelihood, since half of the demonstrated actions have a
-    component at ±1, where that of a TanhNormal explodes.
+    The actor's loss is SAC's over all rows, plus ``bc_weight`` times the imitation of :class:`DemonstratedTD3Loss`, by
+    the distribution's mode. It is a distance and no likelihood, since half of the demonstrated actions have a component
+    at ±1, where that of a TanhNormal explodes. Errors are as there.
 
     Reads what SAC reads, and ``is_demonstration`` (B,) bool; writes what :class:`torchrl.objectives.SACLoss` does:
     ``loss_actor``, ``loss_qvalue``, ``loss_alpha``, ``alpha`` and ``entropy``, () float32 each.
@@ -187,21 +173,15 @@ class DemonstratedSACLoss(_ImitatesDemonstrations, SACLoss):
     Args:
         actor_network: with a distribution, ``actor.stochastic()`` say.
         qvalue_network: of which ``num_qvalue_nets`` copies are made.
-        bc_weight: of the imitation. Values are not divided by their size, as those of :class:`DemonstratedTD3Loss` are.
+        bc_weight: of the imitation; values are not divided by their size.
         **options: of :class:`torchrl.objectives.SACLoss`.
-
-    Raises:
-        ValueError: ``bc_weight`` is negative or no number; another ``reduction``; ``action_spec`` is of several rows;
-            at call time, rows without ``is_demonstration``.
 
     Example:
         >>> import lw_torchrl as lw
-        >>> from torchrl.objectives import SoftUpdate
         >>> plans = lw.load_plans("MT10")
         >>> actor = lw.PlanConditionedActor(plans).stochastic("tanh_normal", init_std=0.2)
         >>> loss = lw.objectives.DemonstratedSACLoss(actor, lw.PlanConditionedQValue(plans), bc_weight=2.0)
         >>> loss.make_value_estimator(gamma=0.99)
-        >>> targets = SoftUpdate(loss, eps=0.995)
 
     Source: Haarnoja et al., 'Soft Actor-Critic Algorithms and Applications', with the term of
     :class:`DemonstratedTD3Loss`.
@@ -215,7 +195,7 @@ class DemonstratedSACLoss(_ImitatesDemonstrations, SACLoss):
     default_keys = _AcceptedKeys
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """The actor's loss, () float32, and ``log_prob`` and ``bc_loss``, detached."""
+        """As :meth:`DemonstratedTD3Loss.actor_loss`."""
         loss, metadata = super().actor_loss(tensordict)
         with (
             set_exploration_type(ExplorationType.DETERMINISTIC),

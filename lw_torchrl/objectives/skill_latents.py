@@ -15,7 +15,6 @@ from lw_torchrl.modules.plan_encoder import PlanEncoder
 from lw_torchrl.objectives.reduction import Reduction, let_go, set_reduction
 
 Kind = Literal["consistency", "contrastive"]
-KINDS = ("consistency", "contrastive")
 _TEMPERATURE = 0.1
 
 
@@ -67,7 +66,7 @@ class SkillLatentLoss(LossModule):
         self.convert_to_functional(skill_encoder("network", network), "encoder")
 
     def forward(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
-        """The term; what is given is not read."""
+        """The term."""
         with self.encoder_params.to_module(self.encoder, preserve_module_state=False):
             found = TensorDict(loss_latents=latent_term(self.encoder, self.kind, self.reduction))
         let_go(found, self.encoder_params)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from lw_torchrl.evaluation import EvaluationResult, evaluate, plot_success
 from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.tasks import MT10
 from lw_torchrl.modules import PlanConditionedActor
+from lw_torchrl.paper.runs import plain
 from lw_torchrl.record.rollouts import active_skills, run_recorded, write_recording
 from lw_torchrl.training import BehavioralCloningConfig, BehavioralCloningTrainer
 from lw_torchrl.transforms import QAFTransform
@@ -49,7 +49,7 @@ def run_demo(out: Path, config: DemoConfig) -> EvaluationResult:
 
     It gets config.json, demonstrations/, checkpoint.zip, results.json, success.png and rollout.rrd.
     """
-    stated, path = json.loads(json.dumps(asdict(config))), out / "config.json"
+    stated, path = plain(asdict(config)), out / "config.json"
     with held(out, "out", folder=True):
         if not path.is_file():
             write_json(path, stated)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from torchrl.envs import Compose, Transform
+from torchrl.envs import Compose
 
 from lw_torchrl._checks import check_choice
 from lw_torchrl._progress import Progress
@@ -19,8 +19,8 @@ from lw_torchrl.language.tasks import resolve_tasks
 from lw_torchrl.modules import ActorEnsemble, ScriptedSkillActor
 from lw_torchrl.modules.policy import METHODS, Policy, make_policy, policy_class
 from lw_torchrl.paper.recipes import DataSetting, Execution, Member, Preset
-from lw_torchrl.paper.runs import Dataset, Run, Work, load_evaluation, own_tasks, plain
-from lw_torchrl.training import BehavioralCloningConfig, BehavioralCloningTrainer, StackedBehavioralCloning
+from lw_torchrl.paper.runs import Dataset, Run, Work, joined, load_result, own_tasks, plain
+from lw_torchrl.training import BehavioralCloningTrainer, StackedBehavioralCloning
 from lw_torchrl.training.envelope import check_description
 from lw_torchrl.training.files import describe_data, load_actor, save_actor
 from lw_torchrl.transforms import RandomYaw
@@ -63,10 +63,6 @@ class ImitationRun(Run):
 
     def __post_init__(self) -> None:
         check_choice("method", self.method, (*METHODS, SCRIPTED))
-
-    @property
-    def label(self) -> str:
-        return self.method
 
     @property
     def group(self) -> Path:
@@ -142,8 +138,7 @@ class ImitationRun(Run):
                 check_description(file, described)
                 policies.append(load_actor(file, text_encoder=work.text_encoder))
         else:
-            train = _train_one if targets is None else _train_each
-            members, replays = train(self, work, targets or ())
+            members, replays = self._train(work, targets or ())
             for file, replay, *actors in zip(files, replays, *members, strict=True):
                 policies.append(actors[0] if len(actors) == 1 else ActorEnsemble(actors))
                 save_actor(policies[-1], file, data=describe_data(replay), **described)
@@ -155,18 +150,11 @@ class ImitationRun(Run):
         result = self._rollouts(policy, work)
         if self.preset.evaluations == 1 or self.method == SCRIPTED:
             return result, {}
-        files = sorted((work.out / self.folder / "evaluations").glob("*.json"))
-        earlier = [load_evaluation(file, self, work.plans, work.tasks) for file in files]
+        files = sorted(file.name for file in (work.out / self.folder / "evaluations").glob("*.json"))
+        earlier = [load_result(self, work.plans, work.out, work.tasks, f"evaluations/{file}") for file in files]
         every = [result, *filter(None, earlier)]
         rates = {task: max(one.success_once[task] or 0.0 for one in every) for task in result.success_once}
         return result, {"best": {"of": len(every), "rates": rates}}
-
-    def watch(self, policy: Any, step: int, work: Work) -> None:
-        """Evaluate what is trained in the midst of training, unless it was done."""
-        file = work.out / self.folder / "evaluations" / f"{step}.json"
-        if load_evaluation(file, self, work.plans, work.tasks) is None:
-            result = self._rollouts(policy, work)
-            replace(result, config=result.config | {"run": self.describe(work.plans)}).save(file)
 
     def _rollouts(self, policy: Any, work: Work) -> EvaluationResult:
         options = {} if self.method == SCRIPTED else {"device": work.device}
@@ -177,81 +165,57 @@ class ImitationRun(Run):
             for task in work.tasks:
                 each.append(self.rollouts(policy[task], work, tasks=task, progress=False, **options))
                 bar.update()
-        episodes = tuple(episode for one in each for episode in one.episodes)
-        return EvaluationResult(each[0].config | {"tasks": [*work.tasks]}, episodes)
+        return joined(each)
 
+    def _train(
+        self, work: Work, targets: Sequence[str]
+    ) -> tuple[list[list[Policy]], list[LanguageWorldExperienceReplay]]:
+        """The policies, one of all tasks or one of each target, member by member. Seeds count from the run's by
+        thousands; with targets, from 1000 times the run's, target by target."""
+        preset, roots = self.preset, [work.out / dataset.folder for dataset in self.datasets]
+        steps = preset.training.steps
+        if preset.passes is not None:  # over the base tasks, which have half of each minibatch of a target
+            rows = len(LanguageWorldExperienceReplay(roots[0], after_success=preset.after_success))
+            steps = max(1, preset.passes * (2 if targets else 1) * rows // preset.training.batch_size)
+        members: list[list[Policy]] = []
+        for number, member in enumerate(preset.members):
+            first = 1_000 * self.seed + len(targets) * number if targets else self.seed + 1_000 * number
+            config = replace(preset.training, steps=steps, seed=first)
+            actors = [self._make_actor(member, work, first + i) for i in range(len(targets) or 1)]
+            checkpoint = work.out / self.folder / f"checkpoint-{number}.zip"
+            options: dict[str, Any] = {"checkpoint": checkpoint, "progress": work.progress, "device": work.device}
+            trainer: BehavioralCloningTrainer | StackedBehavioralCloning
+            if targets:
+                replays = [
+                    self._replay(member, work, actor, roots, CoLearningSampler(target), episodes=[None, {target: 1}])
+                    for target, actor in zip(targets, actors, strict=True)
+                ]
+                trainer = StackedBehavioralCloning(actors, replays, config, **options)
+            else:
+                replays = [self._replay(member, work, actors[0], roots[0], TaskBalancedSampler())]
+                trainer = BehavioralCloningTrainer(actors[0], replays[0], config, **options)
+            policy = dict(zip(targets, actors, strict=True)) if targets else actors[0]
+            for step in preset.evaluated_before(steps):
+                if trainer.steps > step:
+                    continue
+                trainer.train(until=step)
+                if load_result(self, work.plans, work.out, work.tasks, f"evaluations/{step}.json") is None:
+                    result = self._rollouts(policy, work)
+                    result = replace(result, config=result.config | {"run": self.describe(work.plans)})
+                    result.save(work.out / self.folder / "evaluations" / f"{step}.json")
+            trainer.train()
+            members.append(actors)
+        return members, replays
 
-Trained = tuple[list[list[Policy]], list[LanguageWorldExperienceReplay]]
-"""The members, each a list of one actor for each policy; and the last member's demonstrations of each policy."""
+    def _make_actor(self, member: Member, work: Work, seed: int) -> Policy:
+        torch.manual_seed(seed)
+        return make_policy(self.method, work.plans, text_encoder=work.text_encoder, **self.actor_options(member))
 
-
-def _train_one(run: ImitationRun, work: Work, targets: Sequence[str]) -> Trained:
-    """One policy for all tasks."""
-    members: list[list[Policy]] = []
-    for number, member in enumerate(run.preset.members):
-        replay = _replay(run, work, work.out / run.datasets[0].folder, sampler=TaskBalancedSampler())
-        config = _config(run, len(replay), run.seed + 1_000 * number)
-        actor = _make_actor(run, member, work, config.seed)
-        members.append([actor])
-        replay.append_transform(_transform(run, actor, member))
-        trainer = BehavioralCloningTrainer(actor, replay, config, **_options(run, number, work))
-        _train(trainer, run, actor, work)
-    return members, [replay]
-
-
-def _train_each(run: ImitationRun, work: Work, targets: Sequence[str]) -> Trained:
-    """A policy for each target, all trained together; seeds count from 1000 times the run's, member by member."""
-    roots = [work.out / dataset.folder for dataset in run.datasets]
-    rows = 0
-    if run.preset.passes is not None:  # over the base tasks, which have half of each minibatch
-        rows = 2 * len(LanguageWorldExperienceReplay(roots[0], after_success=run.preset.after_success))
-    members: list[list[Policy]] = []
-    for number, member in enumerate(run.preset.members):
-        config = _config(run, rows, 1_000 * run.seed + len(targets) * number)
-        actors = [_make_actor(run, member, work, config.seed + i) for i in range(len(targets))]
-        replays = []
-        for target, actor in zip(targets, actors, strict=True):
-            rows_of = {"episodes": [None, {target: 1}], "transform": _transform(run, actor, member)}
-            replays.append(_replay(run, work, roots, sampler=CoLearningSampler(target), **rows_of))
-        members.append(actors)
-        trainer = StackedBehavioralCloning(actors, replays, config, **_options(run, number, work))
-        _train(trainer, run, dict(zip(targets, actors, strict=True)), work)
-    return members, replays
-
-
-def _make_actor(run: ImitationRun, member: Member, work: Work, seed: int) -> Policy:
-    torch.manual_seed(seed)
-    return make_policy(run.method, work.plans, text_encoder=work.text_encoder, **run.actor_options(member))
-
-
-def _replay(run: ImitationRun, work: Work, root: Any, **options: Any) -> LanguageWorldExperienceReplay:
-    label, after_success = run.preset.label, run.preset.after_success
-    return LanguageWorldExperienceReplay(root, label=label, after_success=after_success, device=work.device, **options)
-
-
-def _transform(run: ImitationRun, actor: Policy, member: Member) -> Transform:
-    queries = actor.transform()
-    turned = RandomYaw(member.yaw, plans=actor.plans if run.any_yaw(member) else None)
-    return Compose(*([] if queries is None else [queries]), *([turned] if member.yaw else []))
-
-
-def _config(run: ImitationRun, rows: int, seed: int) -> BehavioralCloningConfig:
-    """The preset's; where it counts passes, with as many steps as these take over so many rows."""
-    config, passes = run.preset.training, run.preset.passes
-    steps = config.steps if passes is None else max(1, passes * rows // config.batch_size)
-    return replace(config, steps=steps, seed=seed)
-
-
-def _options(run: ImitationRun, number: int, work: Work) -> dict[str, Any]:
-    checkpoint = work.out / run.folder / f"checkpoint-{number}.zip"
-    return {"checkpoint": checkpoint, "progress": work.progress, "device": work.device}
-
-
-def _train(
-    trainer: BehavioralCloningTrainer | StackedBehavioralCloning, run: ImitationRun, policy: Any, work: Work
-) -> None:
-    for step in run.preset.evaluated_before(trainer.config.steps):
-        if trainer.steps <= step:
-            trainer.train(until=step)
-            run.watch(policy, step, work)
-    trainer.train()
+    def _replay(
+        self, member: Member, work: Work, actor: Policy, roots: Any, sampler: Any, **options: Any
+    ) -> LanguageWorldExperienceReplay:
+        queries = actor.transform()
+        turned = RandomYaw(member.yaw, plans=actor.plans if self.any_yaw(member) else None)
+        transform = Compose(*([] if queries is None else [queries]), *([turned] if member.yaw else []))
+        options |= {"label": self.preset.label, "after_success": self.preset.after_success, "device": work.device}
+        return LanguageWorldExperienceReplay(roots, sampler=sampler, transform=transform, **options)

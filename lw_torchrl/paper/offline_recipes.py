@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib.resources import files
+from itertools import product
 from types import MappingProxyType
 from typing import Any, Literal
 
 from lw_torchrl._checks import check_choice, check_int, check_probability, check_scale
+from lw_torchrl._files import read_toml
 from lw_torchrl.data import BEHAVIOURS, EpisodeFilter
 from lw_torchrl.data.rewards import REWARDS, RewardName
 from lw_torchrl.language.tasks import MT10
-
-TASK_SETS: Mapping[str, tuple[str, ...]] = MappingProxyType(
-    {
-        "five": ("door-open", "drawer-open", "peg-insert-side", "pick-place", "push"),
-        "MT10": MT10,
-        "two": ("door-open", "drawer-open"),
-    }
-)
-"""By name: five tasks of MT10, without those that chance solves; MT10; and two, to try an experiment."""
 
 
 @dataclass(frozen=True)
@@ -28,25 +22,6 @@ class Portion:
 
     behaviour: str  # a name of :data:`BEHAVIOURS`
     episodes: int  # of each task
-
-
-_WRONG, _RANDOM = Portion("wrong", 20), Portion("random", 10)
-MIXTURES: Mapping[str, tuple[Portion, ...]] = MappingProxyType(
-    {
-        "B": (Portion("spoilt-30", 20), Portion("spoilt-60", 20), _WRONG, _RANDOM),
-        "W": (Portion("spoilt-30", 20), _WRONG, _RANDOM),
-        "C": (Portion("expert", 5), _WRONG, _RANDOM),
-    }
-)
-"""What a policy learns from, by name: B, plans spoilt a little and much, wrong skills, chance, no expert; W, B without
-the plans spoilt a little; C, the hard case: five expert demonstrations among wrong skills and chance."""
-
-_LED_ASTRAY: dict[str, Any] = {"noise_scale": 0.3, "noise_hold": 10, "gripper_noise_factor": 0.5}
-NOISE: Mapping[str, dict[str, Any]] = dict.fromkeys(BEHAVIOURS, _LED_ASTRAY) | {
-    "expert": {"noise_scale": 0.0},
-    "random": {"noise_scale": 0.1, "noise_hold": 10, "gripper_noise_factor": 1.0},
-}
-"""How each behaviour is executed: the expert without noise, chance with a little, scripts with much."""
 
 
 @dataclass(frozen=True)
@@ -58,19 +33,6 @@ class OfflineMethod:
     keep: EpisodeFilter | None = None  # which episodes it sees; None for all
     critic: bool = False  # whether it has a critic, which may be conditioned otherwise than the actor
     version: int = 1  # raised by 1 whenever the method changes, so that earlier results are refused
-
-
-_ALL_METHODS = (
-    OfflineMethod("advantage", "advantage", critic=True),
-    OfflineMethod("filtered-bc", "bc", EpisodeFilter(success=True, else_best=0.2)),
-    OfflineMethod("best-bc", "bc", EpisodeFilter(best=0.2)),
-    OfflineMethod("bc", "bc"),
-    *(OfflineMethod(name, name, critic=True) for name in ("iql", "td3-bc", "cql")),
-)
-OFFLINE_METHODS: Mapping[str, OfflineMethod] = MappingProxyType({method.name: method for method in _ALL_METHODS})
-"""By name: imitation weighted by the advantages of a value that was learned before; behavioral cloning of the successes
-(of a task without any, as the next method), of the fifth of each task's episodes with the highest return, and of all
-episodes; and TorchRL's IQL, TD3+BC and CQL."""
 
 
 @dataclass(frozen=True)
@@ -114,20 +76,29 @@ class OfflineTable:
     rows: Mapping[str, tuple[tuple[str, str, str], ...]]  # mixture to its rows, (method, actor, critic) each
 
 
-_PLAN = "pcbc", "pcbc"
-_CONDITIONS = ("pcbc", "dc", "one-hot")
-_METHODS = tuple((name, *_PLAN) for name in OFFLINE_METHODS)
-_SHORT = tuple((name, *_PLAN) for name in ("advantage", "filtered-bc", "best-bc", "bc"))
-_CONDITIONING = (
-    *(("advantage", actor, critic) for actor in _CONDITIONS for critic in _CONDITIONS),
-    *(("filtered-bc", actor, "pcbc") for actor in _CONDITIONS),
+def _method(name: str, keep: Mapping[str, Any] | None = None, **given: Any) -> OfflineMethod:
+    return OfflineMethod(name, keep=None if keep is None else EpisodeFilter(**keep), **given)
+
+
+def _table(tasks: str, runs: Sequence[Mapping[str, Any]]) -> OfflineTable:
+    rows: dict[str, tuple[tuple[str, str, str], ...]] = {}
+    for block in runs:
+        own = tuple(product(block["methods"], block.get("actors", ["pcbc"]), block.get("critics", ["pcbc"])))
+        rows |= {mixture: rows.get(mixture, ()) + own for mixture in block["mixtures"]}
+    return OfflineTable(tasks, rows)
+
+
+_TABLES = read_toml(files("lw_torchrl.paper") / "data" / "offline.toml", ValueError)
+TASK_SETS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {"MT10": MT10, **{name: tuple(tasks) for name, tasks in _TABLES["task_sets"].items()}}
+)
+MIXTURES: Mapping[str, tuple[Portion, ...]] = MappingProxyType(
+    {name: tuple(Portion(*portion) for portion in mixture.items()) for name, mixture in _TABLES["mixtures"].items()}
+)
+NOISE: Mapping[str, dict[str, Any]] = {one: _TABLES["noise"].get(one, _TABLES["noise"]["others"]) for one in BEHAVIOURS}
+OFFLINE_METHODS: Mapping[str, OfflineMethod] = MappingProxyType(
+    {name: _method(name, **given) for name, given in _TABLES["methods"].items()}
 )
 OFFLINE_TABLES: Mapping[str, OfflineTable] = MappingProxyType(
-    {
-        "methods": OfflineTable("five", {"B": _METHODS, "W": _METHODS, "C": _SHORT}),
-        "conditioning": OfflineTable("five", {"B": _CONDITIONING, "W": _CONDITIONING}),
-        "mt10": OfflineTable("MT10", {"B": _SHORT[:2]}),
-        "quick": OfflineTable("two", {"W": _SHORT[:2]}),
-    }
+    {name: _table(**given) for name, given in _TABLES["tables"].items()}
 )
-"""By name: seven methods on plans; what actors and critics are conditioned on; all of MT10; two tasks, to try it."""

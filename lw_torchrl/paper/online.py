@@ -25,6 +25,7 @@ from lw_torchrl.paper.imitation import ExpertDataset
 from lw_torchrl.paper.recipes import TARGET
 from lw_torchrl.paper.runs import Run, Work, execute_run, kept_policy, own_tasks, plain
 from lw_torchrl.training import LEARNERS, BehavioralCloningConfig, BehavioralCloningTrainer, OnlineConfig, OnlineTrainer
+from lw_torchrl.training.algorithms import ResidualConfig, method_config
 from lw_torchrl.training.files import load_actor, read_description
 
 START = "start"
@@ -47,7 +48,7 @@ class OnlineRecipe:
     cloning: BehavioralCloningConfig = field(default_factory=lambda: BehavioralCloningConfig(1_500, 200))
     reward: RewardName = "dense_cost"  # of the buffer
     n_steps: int = 5  # of the buffer
-    config: OnlineConfig = field(default_factory=OnlineConfig)  # of the training
+    config: OnlineConfig = field(default_factory=OnlineConfig)  # of the training: of all methods, or the run's own
 
     def __post_init__(self) -> None:
         check_int("demonstrations", self.demonstrations, minimum=1)
@@ -57,8 +58,8 @@ class OnlineRecipe:
 class OnlineRun(Run):
     """A policy of one task, method and seed, and its evaluation.
 
-    With ``step``, method "residual" corrects that step of the task's plan alone, counted from 0; "weakest" is the one
-    that the start's failed episodes reached and did not pass.
+    With ``step``, method "residual" corrects that step of the task's plan alone, counted from 0, to any action at all
+    where the recipe says no scale; "weakest" is the one that the start's failed episodes reached and did not pass.
     """
 
     task: str  # its name
@@ -79,6 +80,16 @@ class OnlineRun(Run):
         elif self.step is not None:
             check_int("step", self.step, minimum=0)
         check_choice("condition", self.condition, METHODS)
+        if self.method != START:
+            method_config(self.method, self.recipe.config)
+
+    @property
+    def config(self) -> OnlineConfig:
+        """Of the method."""
+        given = self.recipe.config
+        if self.step is not None and type(given) is OnlineConfig:
+            given = ResidualConfig(**vars(given), residual_scale=1.0)
+        return method_config(self.method, given)
 
     @property
     def group(self) -> Path:
@@ -121,6 +132,8 @@ class OnlineRun(Run):
         recipe = asdict(self.recipe)
         if self.method == START:
             del recipe["config"], recipe["reward"], recipe["n_steps"]
+        else:
+            recipe["config"] = asdict(self.config)
         found = {"task": self.task, "method": self.method, "seed": self.seed, "recipe": recipe}
         if self.step is not None:
             found["step"] = self.step
@@ -178,8 +191,9 @@ class OnlineRun(Run):
     def _make_trainer(self, work: Work, file: Path, checkpoint: Path) -> tuple[OnlineTrainer, dict[str, Any]]:
         """A trainer of the start, and "tuned", the step of a plan if the run is of one."""
         actor: Policy = self.load_start(work)
-        config, tuned = replace(self.recipe.config, seed=ONLINE_SEED + self.seed), {}
+        config, tuned = replace(self.config, seed=ONLINE_SEED + self.seed), {}
         if self.step is not None:
+            assert isinstance(config, ResidualConfig)
             options: dict[str, Any] = {"scale": config.residual_scale, "seed": DIAGNOSIS_SEED + self.seed}
             with torch.random.fork_rng(devices=[]):
                 torch.manual_seed(config.seed)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -66,6 +67,7 @@ class Dataset(ABC):
 class Run(ABC):
     """Policies of one training seed, and their evaluation: what a scheduler runs."""
 
+    method: str
     seed: int  # of data, initial weights and minibatches
     episodes: int  # evaluated for each task
     encoder_name: str = ""  # that of the text encoder, for another than ours: "my_texts:encode"
@@ -77,9 +79,9 @@ class Run(ABC):
         """Where its files go, below the experiments' folder."""
 
     @property
-    @abstractmethod
     def label(self) -> str:
         """Its name in tables."""
+        return self.method
 
     @property
     @abstractmethod
@@ -118,13 +120,11 @@ class Run(ABC):
         return evaluate(policy, **given | options)
 
 
-def load_result(run: Run, plans: Plans, out: Path, tasks: Sequence[str] | None = None) -> EvaluationResult | None:
+def load_result(
+    run: Run, plans: Plans, out: Path, tasks: Sequence[str] | None = None, file: str = RESULTS
+) -> EvaluationResult | None:
     """The result of a run, if it is there; one of another configuration, or of other tasks, is refused."""
-    return load_evaluation(out / run.folder / RESULTS, run, plans, tasks)
-
-
-def load_evaluation(path: Path, run: Run, plans: Plans, tasks: Sequence[str] | None) -> EvaluationResult | None:
-    """As :func:`load_result`, of any file."""
+    path = out / run.folder / file
     if not path.is_file():
         return None
     result = EvaluationResult.load(path)
@@ -187,20 +187,18 @@ def execute_run(
     if (done := load_result(run, plans, out, work.tasks)) is not None:
         return done
     with held(out / run.folder, "out", folder=True, wait=True):
-        return load_result(run, plans, out, work.tasks) or _execute(run, work)
-
-
-def _execute(run: Run, work: Work) -> EvaluationResult:
-    started = time.perf_counter()
-    for dataset in run.datasets:
-        dataset.collect(work.out, work.progress)
-    policy, trained = run.learn(work)
-    result, evaluated = run.evaluate(policy, work)
-    seconds = round(time.perf_counter() - started, 1)
-    described = {"run": run.describe(work.plans), **trained, **evaluated, "seconds": seconds}
-    result = replace(result, config=result.config | described)
-    result.save(work.out / run.folder / RESULTS)
-    return result
+        if (done := load_result(run, plans, out, work.tasks)) is not None:
+            return done
+        started = time.perf_counter()
+        for dataset in run.datasets:
+            dataset.collect(out, progress)
+        policy, trained = run.learn(work)
+        result, evaluated = run.evaluate(policy, work)
+        seconds = round(time.perf_counter() - started, 1)
+        described = {"run": run.describe(plans), **trained, **evaluated, "seconds": seconds}
+        result = replace(result, config=result.config | described)
+        result.save(out / run.folder / RESULTS)
+        return result
 
 
 def kept_policy(file: Path, described: dict[str, Any], train: Callable[[Path], Mapping[str, Any]]) -> Policy:
@@ -250,6 +248,4 @@ def own_tasks(plans: Plans) -> dict[str, Any]:
 
 def plain(value: Any) -> Any:
     """As JSON gives it back: lists for tuples."""
-    if isinstance(value, dict):
-        return {key: plain(one) for key, one in value.items()}
-    return [plain(one) for one in value] if isinstance(value, (list, tuple)) else value
+    return json.loads(json.dumps(value))

@@ -6,9 +6,8 @@ How answers fare needs the simulator: :mod:`~lw_torchrl.planners.checking`, :mod
 from lw_torchrl.planners.answer_files import answer_path, folder_name, write_answer
 from lw_torchrl.planners.answers import Answer, Answers, PlannerError, Tokens
 from lw_torchrl.planners.openai_planner import OpenAIPlanner
-from lw_torchrl.planners.plan_schema import plan_schema
 from lw_torchrl.planners.planner import FilePlanner, Planner
-from lw_torchrl.planners.prompts import plan_prompt, prompt_examples
+from lw_torchrl.planners.prompts import plan_prompt, plan_schema, prompt_examples
 
 __all__ = [
     "Answer", "Answers", "FilePlanner", "OpenAIPlanner", "Planner", "PlannerError", "Tokens", "answer_path",

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from lw_torchrl._checks import check_choice, checked, differences, shown
-from lw_torchrl._files import JSON_LIMIT, parse_json, read_json, read_text, write_json, write_text
+from lw_torchrl._files import JSON_LIMIT, parse_json, read_bytes, read_json, read_text, write_json, write_text
 from lw_torchrl.language.formats import PLAN_FORMATS
-from lw_torchrl.language.skills import ScriptedSkill
+from lw_torchrl.language.skills import Skills
 from lw_torchrl.planners.answers import Answer, Reply, Tokens, is_count, read_reply, storable
 from lw_torchrl.planners.prompts import Question
 
@@ -66,12 +66,7 @@ def settle_folder(folder: Path, settings: Mapping[str, Any], *, reading: bool = 
 
 
 def recorded_answer(
-    out: str | os.PathLike[str],
-    model: str,
-    question: Question,
-    format: str,
-    kept: Reply | None,
-    skills: Mapping[str, ScriptedSkill] | None = None,
+    out: str | os.PathLike[str], model: str, question: Question, format: str, kept: Reply | None, skills: Skills | None
 ) -> Answer | None:
     """The answer recorded in ``out/<model>``, if any; ``kept`` is the reply in the cache, which knows more of it."""
     path = answer_path(out, model, format, question.task.name, question.attempt)
@@ -102,8 +97,6 @@ def recorded_answers(source: str | os.PathLike[str]) -> dict[str, dict[_Place, s
 def ignored_files(source: str | os.PathLike[str]) -> list[Path]:
     """Files that look like answers and lie where answers do, but have another name or ending."""
     root = Path(source)
-    if not root.is_dir():
-        return []
     read = {path for answers in _of_folder(root).values() for path in answers.values()}
     endings = {f".{known.extension}" for known in PLAN_FORMATS.values()} | {".txt"}
     return sorted(
@@ -120,7 +113,6 @@ def answer_text(found: str | Path) -> str:
 
 
 def _of_folder(root: Path) -> dict[str, dict[_Place, str | Path]]:
-    """Models to the files of their answers; whatever else is in the folder is left alone."""
     found: dict[str, dict[_Place, str | Path]] = {}
     for format, known in PLAN_FORMATS.items():
         for path in root.glob(f"*/{format}/*.{known.extension}"):
@@ -166,7 +158,6 @@ class AnswerCache:
         self.folder = Path(folder)
 
     def path(self, request: dict[str, Any]) -> Path:
-        """The file of the answer to a request."""
         key = answer_key(request)
         return self.folder / key[:2] / f"{key}.json"
 
@@ -174,11 +165,9 @@ class AnswerCache:
         """The answer to a request, None if there is none yet; a file without it is a :class:`ValueError`."""
         path = self.path(request)
         try:
-            found = read_json(path, "the kept answer")
+            return _reply(parse_json(read_bytes(path, JSON_LIMIT)), request)
         except FileNotFoundError:
             return None
-        try:
-            return _reply(found, request)
         except ValueError as error:
             raise ValueError(f"the kept answer {str(path)!r} cannot be read: {error}") from error
 
@@ -196,18 +185,15 @@ class AnswerCache:
 
 
 def _reply(found: dict[str, Any], request: dict[str, Any]) -> Reply:
-    """The reply in what a file holds; :class:`ValueError` if it is none to this request."""
     try:
         if answer_key(found["request"]) != answer_key(request):
             raise ValueError("it answers another request")
         said = found["answer"]
         reply = Reply(said["text"], said["finish"], said["refusal"], Tokens(**said["tokens"]), tuple(said["notes"]))
+        texts = "".join((reply.text, reply.finish, reply.refusal, *reply.notes))
     except (KeyError, TypeError, RecursionError) as error:
         raise ValueError(repr(error)) from error
-    texts = (reply.text, reply.finish, reply.refusal, *reply.notes)
-    if not all(isinstance(text, str) for text in texts):
-        raise ValueError("its texts must be strings")
-    "".join(texts).encode()  # a lone surrogate goes into no file of an answer
+    texts.encode()  # a lone surrogate goes into no file of an answer
     if not (is_count(reply.tokens.prompt) and is_count(reply.tokens.completion)):
         raise ValueError("its tokens must be integers from 0 to 2**53")
     return reply

@@ -6,16 +6,16 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeGuard, overload
+from typing import Any, TypeGuard
 
 from lw_torchrl._checks import counted, shown
-from lw_torchrl.language.decoding import LIMIT, SKILL_LIMIT, DecodedPlan, decode_as
 from lw_torchrl.language.formats import PLAN_FORMATS, encode_plan
 from lw_torchrl.language.formats.structured import read_structured
 from lw_torchrl.language.nearest import StepMapper
-from lw_torchrl.language.skills import ScriptedSkill
+from lw_torchrl.language.plan_decoding import LIMIT, SKILL_LIMIT, DecodedPlan, decode_as
+from lw_torchrl.language.skills import Skills
 from lw_torchrl.language.tasks import Task
-from lw_torchrl.planners.plan_schema import passes
+from lw_torchrl.planners.prompts import passes
 
 CUT_OFF = "it was cut off at max_tokens"
 
@@ -57,9 +57,6 @@ class Tokens:
         return Tokens(self.prompt + other.prompt, self.completion + other.completion)
 
 
-NO_TOKENS = Tokens()
-
-
 def is_count(value: object) -> TypeGuard[int]:
     """Whether it can be a number of tokens."""
     return type(value) is int and 0 <= value < 2**53
@@ -78,7 +75,7 @@ class Reply:
     text: str  # the answer; "" if there is none
     finish: str = ""  # why it ends, in the server's words: "stop", "length", "content_filter", ""
     refusal: str = ""  # what the model said instead of an answer
-    tokens: Tokens = NO_TOKENS
+    tokens: Tokens = Tokens()
     notes: tuple[str, ...] = ()  # what was different from what was asked
 
 
@@ -92,33 +89,21 @@ class Answer:
     text: str  # the answer in the format, for :func:`~lw_torchrl.decode_plan`
     raw: str  # as it came; JSON if the model was held to a schema, else the same as ``text``
     decoded: DecodedPlan  # what was made of it
-    tokens: Tokens = NO_TOKENS  # what it cost when it was asked for
+    tokens: Tokens = Tokens()  # what it cost when it was asked for
     cached: bool = False  # it had been asked for before
     notes: tuple[str, ...] = ()  # further remarks: it was cut off, the server did not keep to the schema
 
 
-class Answers(Sequence[Answer]):
+class Answers(tuple[Answer, ...]):
     """Answers in the order of formats, tasks and attempts."""
 
-    def __init__(self, answers: Iterable[Answer]) -> None:
-        self._answers = tuple(sorted(answers, key=lambda answer: (answer.format, answer.task, answer.attempt)))
-
-    @overload
-    def __getitem__(self, index: int) -> Answer: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[Answer]: ...
-
-    def __getitem__(self, index: int | slice) -> Answer | Sequence[Answer]:
-        return self._answers[index]
-
-    def __len__(self) -> int:
-        return len(self._answers)
+    def __new__(cls, answers: Iterable[Answer]) -> Answers:
+        return super().__new__(cls, sorted(answers, key=lambda answer: (answer.format, answer.task, answer.attempt)))
 
     @property
     def tokens(self) -> Tokens:
         """Of all answers, cached ones included."""
-        return sum((answer.tokens for answer in self), NO_TOKENS)
+        return sum((answer.tokens for answer in self), Tokens())
 
     def __repr__(self) -> str:
         plans = sum(answer.decoded.plan is not None for answer in self)
@@ -130,7 +115,7 @@ def read_reply(
     task: Task,
     format: str,
     attempt: int = 0,
-    skills: Mapping[str, ScriptedSkill] | None = None,
+    skills: Skills | None = None,
     schema: Mapping[str, Any] | None = None,
 ) -> Answer:
     """The answer in a reply to a question for a plan; whatever the server claims, it is read as any text is.
@@ -141,11 +126,8 @@ def read_reply(
     raw = storable(reply.text)
     decoded = decode_as(raw, read, StepMapper(task, skills, "edit", LIMIT, SKILL_LIMIT))
     text = encode_plan(decoded.plan, format) if schema and decoded.plan is not None else raw
-    notes = []
-    if reply.finish == "length":
-        notes.append(CUT_OFF)
-    elif reply.finish == "content_filter":
-        notes.append("a filter of the server cut it off")
+    ended = {"length": CUT_OFF, "content_filter": "a filter of the server cut it off"}
+    notes = [ended[reply.finish]] if reply.finish in ended else []
     if reply.refusal:
         notes.append(f"the model refused: {shown(reply.refusal)}")
     elif not raw.strip():

@@ -11,8 +11,7 @@ from typing import Any
 from lw_torchrl._files import parse_json
 from lw_torchrl.planners.answers import Reply, Tokens, is_count, storable
 
-REPLY_LIMIT = 4 * 2**20
-"""Bytes of a reply; one byte more is kept, which tells a larger one from one that fits."""
+REPLY_LIMIT = 4 * 2**20  # bytes of a reply; one byte more is kept, which tells a larger one from one that fits
 KEY_SENT_BACK = "the server sent the key back; it is hidden"
 _HEADERS = ("location", "retry-after", "retry-after-ms", "x-should-retry")
 _LONGEST, _SEARCHED = 300, 20_000  # characters of a server's text: in an error, and searched for secrets

@@ -6,10 +6,9 @@ import asyncio
 import os
 import re
 import threading
-from collections import deque
 from collections.abc import Callable, Coroutine, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from queue import SimpleQueue
+from multiprocessing.pool import ThreadPool
 from typing import Any, TypeVar
 from urllib.parse import parse_qsl, unquote, urlsplit
 
@@ -48,7 +47,6 @@ class Dialect:
     refused: str = ""  # what the server said when it did not know "json_schema"
 
     def after(self, status: int, said: str) -> Dialect:
-        """The dialect to go on with after an error, or the same."""
         if self.limit == "max_tokens" and status == 400 and "max_completion_tokens" in said:
             return replace(self, limit="max_completion_tokens")
         named = "response_format" in said or "json_schema" in said
@@ -176,7 +174,6 @@ class ChatServer:
         return PlannerError(self._hidden(told), fatal=fatal)
 
     def _explained(self, fault: Exception, question: str) -> PlannerError:
-        """The error: what came, and what to try."""
         said, tried = self._said(fault), f", asked {counted(self.retries + 1, 'time')}"
         status, fatal = getattr(fault, "status_code", 0), False
         if isinstance(fault, self._openai.APITimeoutError):
@@ -230,33 +227,22 @@ def ask_at_once(
 
     After an error that is no :class:`PlannerError`, or a fatal one, only those under way are waited for.
     """
-    waiting, ended = deque(items), SimpleQueue[tuple[Item, Result | Exception] | None]()
-    stop = threading.Event()
+    stop, listed = threading.Event(), list(items)
 
-    def worker() -> None:
-        while not stop.is_set():
-            try:
-                item = waiting.popleft()
-            except IndexError:
-                break
-            try:
-                ended.put((item, work(item)))
-            except Exception as error:
-                if not isinstance(error, PlannerError) or error.fatal:
-                    stop.set()
-                ended.put((item, error))
-        ended.put(None)
+    def attempt(item: Item) -> tuple[Item, Result | Exception | None]:
+        if stop.is_set():
+            return item, None
+        try:
+            return item, work(item)
+        except Exception as error:
+            if not isinstance(error, PlannerError) or error.fatal:
+                stop.set()
+            return item, error
 
-    threads = [threading.Thread(target=worker, daemon=True) for _ in range(min(concurrency, len(waiting)))]
-    try:
-        for thread in threads:
-            thread.start()
-        left = len(threads)
-        while left:
-            found = ended.get()
-            if found is None:
-                left -= 1
-            else:
-                yield found
-    finally:
-        stop.set()
+    with ThreadPool(max(1, min(concurrency, len(listed)))) as pool:  # of daemons: none outlives the program
+        try:
+            for item, found in pool.imap_unordered(attempt, listed):
+                if found is not None:
+                    yield item, found
+        finally:
+            stop.set()

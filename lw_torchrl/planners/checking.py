@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -10,9 +9,9 @@ from torch import Tensor
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.evaluation.plan_use import PlanUse, TaskUse, expert_use
 from lw_torchrl.evaluation.protocol import evaluate
-from lw_torchrl.language.decoding import DecodedPlan, decode_plan
-from lw_torchrl.language.skills import ScriptedSkill
-from lw_torchrl.language.tasks import TASKS, Task, check_task
+from lw_torchrl.language.plan_decoding import DecodedPlan, decode_plan
+from lw_torchrl.language.skills import Skills
+from lw_torchrl.language.tasks import TASKS, Task, Tasks, get_task
 from lw_torchrl.modules.scripted_skill_actor import ScriptedSkillActor
 
 _GAPS = 3  # the longest are told of
@@ -44,10 +43,11 @@ class PlanCheck:
         lines = [f"{self.task}, {len(self.decoded.plan.steps)} steps"]
         kept = [step for step in self.decoded.steps if not step.dropped]
         for k, step in enumerate(kept):
+            own = "" if self.own is None else f", {self.own.true[k]:.0%} of its own; acts in {self.own.chosen[k]:.0%}"
             lines += [
                 f"{k + 1}  when {step.condition}{_said(step.written_condition, step.condition_distance)}",
                 f"   {step.scripted or 'no scripted skill'}{_said(step.written_skill, step.skill_distance)}",
-                f"   holds in {self.expert.true[k]:.0%} of the expert's states{self._in_force(k)}",
+                f"   holds in {self.expert.true[k]:.0%} of the expert's states{own}",
             ]
         lines += [f"left out, {note}" for note in self.decoded.notes]
         lines.append(f"Some condition holds in {self.expert.covered:.0%} of the states up to the expert's success.")
@@ -62,10 +62,6 @@ class PlanCheck:
             lines.append(f"Carried out by scripted skills it succeeds in {self.success:.0%} of episodes.")
         return "\n".join(lines)
 
-    def _in_force(self, step: int) -> str:
-        own = self.own
-        return "" if own is None else f", {own.true[step]:.0%} of its own; acts in {own.chosen[step]:.0%}"
-
 
 def _said(written: str, distance: float) -> str:
     return f"   <- {written!r} ({distance:.2f})" if distance else ""
@@ -78,8 +74,8 @@ def check_plan(
     *,
     episodes: int = 5,
     seed: int = 0,
-    skills: Mapping[str, ScriptedSkill] | None = None,
-    tasks: Mapping[str, Task] = TASKS,
+    skills: Skills | None = None,
+    tasks: Tasks = TASKS,
 ) -> PlanCheck:
     """Decode a text, as :func:`~lw_torchrl.decode_plan`, and look where its plan's conditions hold.
 
@@ -91,18 +87,13 @@ def check_plan(
         >>> found.never, found.expert.covered, found.success
         ((), 1.0, 1.0)
     """
-    owner = task if isinstance(task, Task) else tasks[check_task(task, tasks)]
+    owner = get_task(task, tasks)
     decoded = decode_plan(text, owner, format, skills=skills, tasks=tasks)
     return check_decoded(decoded, owner, episodes=episodes, seed=seed, skills=skills)
 
 
 def check_decoded(
-    decoded: DecodedPlan,
-    owner: Task,
-    *,
-    episodes: int = 5,
-    seed: int = 0,
-    skills: Mapping[str, ScriptedSkill] | None = None,
+    decoded: DecodedPlan, owner: Task, *, episodes: int = 5, seed: int = 0, skills: Skills | None = None
 ) -> PlanCheck:
     """As :func:`check_plan`, of what was made of a text; the task is ``owner``."""
     if decoded.plan is None:

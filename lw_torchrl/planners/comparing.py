@@ -15,9 +15,9 @@ from lw_torchrl._progress import Progress
 from lw_torchrl.evaluation.many_plans import evaluate_plans
 from lw_torchrl.evaluation.statistics import mean_rate
 from lw_torchrl.evaluation.summary import markdown_table
-from lw_torchrl.language.decoding import decode_plan
+from lw_torchrl.language.plan_decoding import decode_plan
 from lw_torchrl.language.plans import ConditionalPlan, Plans
-from lw_torchrl.language.tasks import TASKS, Task
+from lw_torchrl.language.tasks import TASKS, Tasks
 from lw_torchrl.planners.answer_files import answer_text, recorded_answers
 
 _SAVE_SECONDS = 5.0
@@ -58,17 +58,18 @@ class PlanComparison:
 
     @property
     def models(self) -> tuple[str, ...]:
-        return tuple(dict.fromkeys(one.model for one in self.answers))
+        return tuple(dict.fromkeys(model for model, _ in self.groups))
 
     def rates(self, model: str, format: str) -> dict[str, list[float]]:
         """Task to the success rate of each of its answers."""
-        found: dict[str, list[float]] = {}
-        for one in self._of(model, format):
-            found.setdefault(one.task, []).append(one.rate)
-        return found
+        return {task: [one.rate for one in found] for task, found in self._by_task(model, format).items()}
 
-    def _of(self, model: str, format: str) -> list[ComparedAnswer]:
-        return [one for one in self.answers if (one.model, one.format) == (model, format)]
+    def _by_task(self, model: str, format: str) -> dict[str, list[ComparedAnswer]]:
+        found: dict[str, list[ComparedAnswer]] = {}
+        for one in self.answers:
+            if (one.model, one.format) == (model, format):
+                found.setdefault(one.task, []).append(one)
+        return found
 
     def mean(self, model: str, format: str) -> float:
         """The mean success rate, of each task over its answers, then over tasks."""
@@ -80,29 +81,24 @@ class PlanComparison:
 
     def best_of(self, model: str, format: str) -> float:
         """The mean over tasks of the odd episodes' success of the answer best in the even ones; NaN of one episode."""
-        chosen: dict[str, tuple[float, float]] = {}
-        for one in self._of(model, format):
-            tried, fresh = _mean(one.success[::2]), _mean(one.success[1::2])
-            if one.task not in chosen or tried > chosen[one.task][0]:
-                chosen[one.task] = tried, fresh
-        return _mean([fresh for _, fresh in chosen.values()])
+        listed = self._by_task(model, format).values()
+        chosen = [max(found, key=lambda one: _mean(one.success[::2])) for found in listed]
+        return _mean([_mean(one.success[1::2]) for one in chosen])
 
     def best_plans(self, model: str, format: str) -> dict[str, ConditionalPlan]:
         """The plan of each task that succeeded most often, of equals the first."""
-        best: dict[str, tuple[float, ConditionalPlan]] = {}
-        for one in self._of(model, format):
-            if one.plan is not None and (one.task not in best or one.rate > best[one.task][0]):
-                best[one.task] = one.rate, one.plan
-        return {task: plan for task, (_, plan) in best.items()}
+        listed = self._by_task(model, format).values()
+        best = [max(found, key=lambda one: (one.plan is not None, one.rate)) for found in listed]
+        return {one.task: one.plan for one in best if one.plan is not None}
 
     def table(self) -> str:
         """Markdown: a line for each model and format."""
         rows = []
         for model, format in self.groups:
-            found, rates = self._of(model, format), self.rates(model, format)
-            runs = sum(bool(one.steps) for one in found)
+            rates = self.rates(model, format)
+            found = [one for listed in self._by_task(model, format).values() for one in listed]
             success = str(mean_rate([[_mean(one)] for one in rates.values()]))
-            counts = map(str, (len(rates), len(found), runs))
+            counts = map(str, (len(rates), len(found), sum(bool(one.steps) for one in found)))
             rows.append([model, format, *counts, success, f"{self.best_of(model, format):.3f}"])
         head = ["model", "format", "tasks", "answers", "with a plan that runs", "success", "best answer of a task"]
         return markdown_table(head, rows)
@@ -135,7 +131,7 @@ def compare_plans(
     max_steps: int = 500,
     num_envs: int = 256,
     num_threads: int | None = None,
-    tasks: Mapping[str, Task] = TASKS,
+    tasks: Tasks = TASKS,
     resume: str | os.PathLike[str] | None = None,
     progress: bool = True,
 ) -> PlanComparison:
@@ -150,12 +146,11 @@ def compare_plans(
         progress: show progress bars.
 
     Example:
-        >>> import tempfile, lw_torchrl as lw
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     path = lw.planners.answer_path(folder, "by hand", "chain_py", "reach", 0)
-        ...     path.parent.mkdir(parents=True)
-        ...     _ = path.write_text(lw.encode_plan(lw.load_plans("MT10")["reach"], "chain_py"))
-        ...     compare_plans(folder, episodes=2).mean("by hand", "chain_py")
+        >>> import lw_torchrl as lw
+        >>> path = lw.planners.answer_path("answers", "by hand", "chain_py", "reach", 0)
+        >>> path.parent.mkdir(parents=True)
+        >>> _ = path.write_text(lw.encode_plan(lw.load_plans("MT10")["reach"], "chain_py"))
+        >>> compare_plans("answers", episodes=2).mean("by hand", "chain_py")
         1.0
 
     Source: paper section 'LLM Experiments'.

@@ -85,17 +85,10 @@ def _draw(
     curves = {name: {task: found[task] for task in sorted(common)} for name, found in rates.items()}
     least = min(len(one) for found in curves.values() for one in found.values())
     even = {name: {task: one[:least] for task, one in found.items()} for name, found in curves.items()}
-    plot_sorted_tasks(even, file, published=_published(groups, common), order="own", of="answer", title=title)
-
-
-def _published(groups: Sequence[Group], tasks: set[str]) -> dict[str, dict[str, float]]:
-    """Of those groups that the paper has."""
-    found = {}
+    published = {}
     for model, format in groups:
-        try:
-            rates = published_plans(model, format)
-        except ValueError:
-            continue
-        if tasks <= set(rates):
-            found[f"{model}, {format}, published"] = {task: sum(rates[task]) / len(rates[task]) for task in tasks}
-    return found
+        with suppress(ValueError):  # the paper has no such group
+            means = {task: sum(one) / len(one) for task, one in published_plans(model, format).items()}
+            if common <= set(means):
+                published[f"{model}, {format}, published"] = {task: means[task] for task in common}
+    plot_sorted_tasks(even, file, published=published, order="own", of="answer", title=title)

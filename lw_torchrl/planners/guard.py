@@ -10,7 +10,7 @@ from urllib.parse import urlsplit
 
 from lw_torchrl._checks import nearest, shown
 from lw_torchrl._files import parse_json
-from lw_torchrl.planners.plan_schema import PATTERNS
+from lw_torchrl.planners.prompts import PATTERNS
 
 MESSAGES, STOPS = 100, 8
 _SCHEMA_DEPTH, _CHOICES, _ITEMS = 12, 1000, 64
@@ -139,12 +139,10 @@ _FIELDS: dict[str, _Check] = {
     "repeat_penalty": _number(0, 10),
 }
 
-BODY_LIMIT = 2**20
-"""Bytes of a request; the longest prompt with its schema has some 25,000."""
+BODY_LIMIT = 2**20  # bytes of a request; the longest prompt with its schema has some 25,000
 
 HEAD_SECONDS, BODY_SECONDS = 10.0, 30.0
-WAITING = 32
-"""Questions that wait for their turn; more are told to come again."""
+WAITING = 32  # questions that wait for their turn; more are told to come again
 
 
 class Guard:

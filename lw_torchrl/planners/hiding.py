@@ -10,11 +10,9 @@ from html import unescape
 from unicodedata import combining, normalize
 
 HIDDEN = "(the key)"
-_SHORTEST = 8
-"""Letters and digits of a secret that is looked for in every form. A shorter one may be a word, as "none"."""
+_SHORTEST = 8  # letters and digits of a secret that is looked for in every form; a shorter one may be a word, "none"
 _SHORTEST_WORD = 4
-_LONGEST = 200_000
-"""Characters of a text that is searched for the places of a secret; a longer one that has it is hidden whole."""
+_LONGEST = 200_000  # characters of a text that is searched for the places of a secret; a longer one is hidden whole
 _ESCAPE = re.compile(r"\\(?:u[0-9a-f]{4}|x[0-9a-f]{2}|.)|%[0-9a-f]{2}|&#?\w{1,30};|<[^<>]*>", re.IGNORECASE | re.DOTALL)
 _LOGGERS = [f"httpcore{version}.{part}" for version in ("", "2") for part in ("connection", "http11", "http2", "proxy")]
 _LOGGERS += ["httpx", "httpx2", "openai._base_client"]
@@ -26,13 +24,6 @@ class Hider(logging.Filter):
     A secret is found whole or broken by white space, punctuation, invisible characters or tags, in either case, with
     its characters escaped (JSON, URL, HTML; up to twice), in base64 and as hex digits. One of fewer than eight letters
     and digits is found only as it is, as a word; one of fewer than four characters is no secret.
-
-    Example:
-        >>> hide = Hider(["sk-2f9c41d07a"])
-        >>> hide("your key SK-2F9C 41D0-7A is wrong"), hide("sk%2D2f9c41d0%37a")
-        ('your key (the key) is wrong', '(the key)')
-        >>> hide("c2stMmY5YzQxZDA3YQ==")
-        '(the key)Q=='
     """
 
     def __init__(self, secrets: Iterable[str]) -> None:
@@ -61,7 +52,6 @@ class Hider(logging.Filter):
         return "".join([*found, text[end:]])
 
     def _places(self, text: str) -> Iterator[tuple[int, int]]:
-        """Where secrets begin and end in a text, in each of its views."""
         view = [(sign, place, place + 1) for place, sign in enumerate(text)]
         for _ in _views(text):
             letters = [(letter, start, stop) for sign, start, stop in view for letter in _letters(sign)]

@@ -19,14 +19,6 @@ SMALL_MODEL = "smollm2-135m"
 LOCAL = "127.0.0.1"
 
 
-def small_model() -> Path:
-    """The file of the model that the extra ``[serve]`` brings, SmolLM2 of 135 million weights, 98 MB."""
-    files = sorted(folder.glob("*.gguf")) if (folder := _small_folder()) else []
-    if not files:
-        raise ImportError(INSTALL)
-    return files[0]
-
-
 def model_name(file: Path) -> str:
     """What a model is called at its server: the small one by its short name, others by their file's."""
     return SMALL_MODEL if file.resolve().parent == _small_folder() else file.stem
@@ -101,8 +93,11 @@ def local_names(host: str) -> set[str] | None:
 
 def model_file(model: str | os.PathLike[str] | None) -> Path:
     """The GGUF file of a model, the small one's for None; errors as of :func:`serve_model`."""
-    if model is None:
-        return small_model()
+    if model is None:  # SmolLM2 of 135 million weights, 98 MB
+        files = sorted(folder.glob("*.gguf")) if (folder := _small_folder()) else []
+        if not files:
+            raise ImportError(INSTALL)
+        return files[0]
     file = Path(model)
     if not file.is_file():
         beside = [path.name for path in file.parent.glob("*.gguf")] if file.parent.is_dir() else []

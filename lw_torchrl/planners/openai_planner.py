@@ -14,8 +14,8 @@ from lw_torchrl._checks import check_choice, check_int, check_positive, check_sc
 from lw_torchrl._progress import Progress
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
-from lw_torchrl.language.skills import ScriptedSkill
-from lw_torchrl.language.tasks import TASKS, Task, check_task, named_tasks
+from lw_torchrl.language.skills import Skills
+from lw_torchrl.language.tasks import TASKS, Task, TaskList, Tasks, get_task, named_tasks
 from lw_torchrl.planners.answer_files import (
     AnswerCache,
     answer_path,
@@ -26,16 +26,16 @@ from lw_torchrl.planners.answer_files import (
 )
 from lw_torchrl.planners.answers import Answer, Answers, Reply, read_reply, storable, unanswered
 from lw_torchrl.planners.chat_server import ChatServer, Dialect, ask_at_once, server_address
-from lw_torchrl.planners.plan_schema import plan_schema
-from lw_torchrl.planners.prompts import Question, chat_messages, example_plans, request_options
+from lw_torchrl.planners.prompts import Question, chat_messages, example_plans, plan_schema, request_options
+
+_SETTINGS = ("model", "constrain", "free_skills", "vocabulary", "temperature", "max_tokens", "seed", "options")
 
 
 class OpenAIPlanner:
     """Asks a model behind an OpenAI-compatible server: OpenAI's own, vLLM, Ollama, llama.cpp's.
 
     The key comes from the environment variable OPENAI_API_KEY alone; a server of your own needs none. Every answer is
-    kept in ``cache``, under a key of all that determines it: the server, the model, the messages, the schema,
-    ``max_tokens``, ``temperature``, ``seed``, ``options`` and the attempt. What is there is not asked for again.
+    kept in ``cache`` under all that determines it (:meth:`request`). What is there is not asked for again.
 
     Args:
         model: the model's name at the server.
@@ -75,7 +75,7 @@ class OpenAIPlanner:
         base_url: str | None = None,
         constrain: bool = False,
         free_skills: bool = False,
-        skills: Mapping[str, ScriptedSkill] | None = None,
+        skills: Skills | None = None,
         plans: Plans | Mapping[str, ConditionalPlan] | None = None,
         vocabulary: bool = False,
         temperature: float | None = None,
@@ -130,23 +130,12 @@ class OpenAIPlanner:
     def settings(self) -> dict[str, Any]:
         """What determines all its answers beside the question, as JSON has it."""
         skills = None if self.skills is None else sha256("\n".join(sorted(self.skills)).encode()).hexdigest()[:32]
-        return {
-            "model": self.model,
-            "server": self.address,
-            "constrain": self.constrain,
-            "free_skills": self.free_skills,
-            "skills": skills,
-            "plans": example_plans(self.examples).fingerprint,
-            "vocabulary": self.vocabulary,
-            "temperature": self.temperature,
-            "max_tokens": self.max_tokens,
-            "seed": self.seed,
-            "options": self.options,
-        }
+        found = {"server": self.address, "skills": skills, "plans": example_plans(self.examples).fingerprint}
+        return found | {name: getattr(self, name) for name in _SETTINGS}
 
     def plans(
         self,
-        tasks: str | Task | Iterable[str | Task],
+        tasks: TaskList,
         *,
         format: str = "chain_py",
         attempts: int = 1,
@@ -183,7 +172,7 @@ class OpenAIPlanner:
         facts: Iterable[str],
         *,
         round: int = 1,
-        tasks: Mapping[str, Task] = TASKS,
+        tasks: Tasks = TASKS,
         out: str | os.PathLike[str] | None = None,
         progress: bool = True,
     ) -> Answers:
@@ -205,7 +194,7 @@ class OpenAIPlanner:
         (format,) = formats
         questions = []
         for answer, fact in zip(before, told, strict=True):
-            task = tasks[check_task(answer.task, tasks)]
+            task = get_task(answer.task, tasks)
             request = self.request(task, format, answer.attempt)
             talk = {"assistant": answer.raw, "user": fact}
             request["messages"] += [{"role": role, "content": content} for role, content in talk.items()]

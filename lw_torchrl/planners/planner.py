@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
 from typing import Protocol, runtime_checkable
 
 from lw_torchrl._checks import check_choice, check_int, checked, counted, unknown_name
-from lw_torchrl.language.decoding import decode_plan
 from lw_torchrl.language.formats import PLAN_FORMATS
-from lw_torchrl.language.tasks import Task, named_tasks
+from lw_torchrl.language.plan_decoding import decode_plan
+from lw_torchrl.language.tasks import TaskList, named_tasks
 from lw_torchrl.planners.answer_files import answer_text, folder_name, recorded_answers, write_answer
 from lw_torchrl.planners.answers import Answer, Answers, PlannerError
 
@@ -24,12 +23,7 @@ class Planner(Protocol):
         ...
 
     def plans(
-        self,
-        tasks: str | Task | Iterable[str | Task],
-        *,
-        format: str = "chain_py",
-        attempts: int = 1,
-        out: str | os.PathLike[str] | None = None,
+        self, tasks: TaskList, *, format: str = "chain_py", attempts: int = 1, out: str | os.PathLike[str] | None = None
     ) -> Answers:
         """Plans of tasks, an answer for each task and attempt.
 
@@ -84,12 +78,7 @@ class FilePlanner:
         return f"FilePlanner({self.name!r}, {counted(len(self.recorded), 'answer')})"
 
     def plans(
-        self,
-        tasks: str | Task | Iterable[str | Task],
-        *,
-        format: str = "chain_py",
-        attempts: int = 1,
-        out: str | os.PathLike[str] | None = None,
+        self, tasks: TaskList, *, format: str = "chain_py", attempts: int = 1, out: str | os.PathLike[str] | None = None
     ) -> Answers:
         """The recorded answers, see :meth:`Planner.plans`; one that is not recorded is a :class:`PlannerError`."""
         check_choice("format", format, PLAN_FORMATS)

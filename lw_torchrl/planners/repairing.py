@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +13,7 @@ from torch import Tensor
 from lw_torchrl._checks import check_int
 from lw_torchrl._progress import Progress
 from lw_torchrl.language.named_objects import GRIPPER
-from lw_torchrl.language.tasks import TASKS, Task, check_task
+from lw_torchrl.language.tasks import TASKS, Task, Tasks, get_task
 from lw_torchrl.planners.answers import CUT_OFF, Answer
 from lw_torchrl.planners.checking import PlanCheck, check_decoded
 from lw_torchrl.planners.openai_planner import OpenAIPlanner
@@ -92,7 +92,7 @@ def repair_plans(
     enough: float = 0.8,
     episodes: int = 10,
     seed: int = 0,
-    tasks: Mapping[str, Task] = TASKS,
+    tasks: Tasks = TASKS,
     out: str | os.PathLike[str] | None = None,
     progress: bool = True,
 ) -> list[Repair]:
@@ -119,11 +119,10 @@ def repair_plans(
     options: dict[str, Any] = {"episodes": episodes, "seed": seed, "skills": planner.skills}
 
     def check(answers: Sequence[Answer]) -> list[PlanCheck]:
+        checks = []
         with Progress("carrying out", len(answers), "plan", show=progress) as bar:
-            checks = []
             for answer in answers:
-                owner = tasks[check_task(answer.task, tasks)]
-                checks.append(check_decoded(answer.decoded, owner, **options))
+                checks.append(check_decoded(answer.decoded, get_task(answer.task, tasks), **options))
                 bar.update()
         return checks
 
@@ -133,10 +132,8 @@ def repair_plans(
         if not open_:
             break
         before = [found[k].answers[-1] for k in open_]
-        facts = [
-            plan_facts(found[k].checks[-1], tasks[answer.task], answer.notes)
-            for k, answer in zip(open_, before, strict=True)
-        ]
+        told = zip(open_, before, strict=True)
+        facts = [plan_facts(found[k].checks[-1], tasks[answer.task], answer.notes) for k, answer in told]
         came = planner.revise(before, facts, round=number, tasks=tasks, out=out, progress=progress)
         of = {(answer.task, answer.attempt): answer for answer in came}
         others = [of[answer.task, answer.attempt] for answer in before]

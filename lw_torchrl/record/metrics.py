@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lw_torchrl.record.conventions import METRIC_TIMELINE, Stream, rr, time_columns
+from lw_torchrl.record.conventions import Stream, rr
 
 MOST_CURVES = 64
 JPEG_QUALITY = 90
@@ -43,47 +43,24 @@ def numbers(name: str, value: Any) -> list[float]:
     return found
 
 
-def histogram(name: str, data: Any, bins: Any) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """The counts of ``data`` and the edges of the bins, whose number or edges ``bins`` are."""
+def histogram(name: str, data: Any, bins: Any) -> Any:
+    """The counts of ``data`` as a bar chart in columns; ``bins`` is the number or the edges of the bins."""
     values = np.asarray(torch.as_tensor(data).detach().cpu().to(torch.float64)).ravel()
     if not values.size or not np.isfinite(values).all():
         raise ValueError(f"data of histogram {name!r} must be finite and not empty, got {values.tolist()[:8]}")
     counts, edges = np.histogram(values, bins=bins)
-    return counts.astype(np.int64), edges
-
-
-def send_histogram(stream: Stream, path: str, step: int, counts: NDArray[np.int64], edges: NDArray[np.float64]) -> None:
-    """Add counts as a bar chart."""
-    index = [rr.TimeColumn(METRIC_TIMELINE, sequence=[step])]
     centers, widths = (edges[1:] + edges[:-1]) / 2, np.diff(edges)
-    chart = rr.BarChart.columns(values=[counts], abscissa=[centers], widths=[widths], color=[BARS])
-    stream.send_columns(path, index, chart)
+    return rr.BarChart.columns(values=[counts.astype(np.int64)], abscissa=[centers], widths=[widths], color=[BARS])
 
 
-def check_video(name: str, video: Tensor) -> None:
-    """Raise :class:`ValueError` unless ``video`` is uint8 of shape T×C×H×W, C = 1 or 3, and not empty."""
+def check_video(name: str, video: Tensor) -> NDArray[np.uint8]:
+    """The frames T×H×W×C of a video T×C×H×W uint8, C = 1 or 3, that is not empty; else :class:`ValueError`."""
     if video.ndim != 4 or video.shape[1] not in (1, 3) or not video.numel() or video.dtype != torch.uint8:
         raise ValueError(
             f"video {name!r} must be uint8 of shape T×C×H×W with C = 1 or 3, "
             f"got {str(video.dtype).removeprefix('torch.')} of shape {'×'.join(map(str, video.shape))}"
         )
-
-
-def send_video(stream: Stream, path: str, video: Tensor, fps: float) -> None:
-    """Add the frames T×C×H×W of a video, each a JPEG."""
-    pixels = video.permute(0, 2, 3, 1).contiguous().numpy()
-    stream.log(path, rr.EncodedImage.from_fields(media_type="image/jpeg"), static=True)
-    times = time_columns(np.arange(len(pixels)), 1 / fps)
-    stream.send_columns(path, times, rr.EncodedImage.columns(blob=[jpeg(frame) for frame in pixels]))
-
-
-def jpeg(pixels: NDArray[np.uint8]) -> bytes:
-    """Pixels H×W×C as a JPEG, C = 1 or 3."""
-    from PIL import Image
-
-    buffer = io.BytesIO()
-    Image.fromarray(pixels[..., 0] if pixels.shape[-1] == 1 else pixels).save(buffer, "JPEG", quality=JPEG_QUALITY)
-    return buffer.getvalue()
+    return video.permute(0, 2, 3, 1).contiguous().numpy()
 
 
 def check_image(name: str, image: Any) -> NDArray[np.uint8]:
@@ -104,17 +81,23 @@ def check_image(name: str, image: Any) -> NDArray[np.uint8]:
     return pixels.contiguous().numpy()
 
 
-def send_image(stream: Stream, path: str, step: int, pixels: NDArray[np.uint8]) -> None:
-    """Add an image H×W×C as a JPEG."""
+def send_images(stream: Stream, path: str, times: Any, images: Iterable[NDArray[np.uint8]]) -> None:
+    """Add images H×W×C, each a JPEG at its time."""
+    from PIL import Image
+
+    jpegs = []
+    for pixels in images:
+        buffer = io.BytesIO()
+        Image.fromarray(pixels[..., 0] if pixels.shape[-1] == 1 else pixels).save(buffer, "JPEG", quality=JPEG_QUALITY)
+        jpegs.append(buffer.getvalue())
     stream.log(path, rr.EncodedImage.from_fields(media_type="image/jpeg"), static=True)
-    index = [rr.TimeColumn(METRIC_TIMELINE, sequence=[step])]
-    stream.send_columns(path, index, rr.EncodedImage.columns(blob=[jpeg(pixels)]))
+    stream.send_columns(path, times, rr.EncodedImage.columns(blob=jpegs))
 
 
 def send_hparams(stream: Stream, hparams: Mapping[str, str]) -> None:
     """Show hyperparameters as a table, sorted by name."""
-    rows = [f"| {_cell(key)} | {_cell(value)} |" for key, value in sorted(hparams.items())]
-    text = "\n".join(["| key | value |", "|---|---|", *rows])
+    cells = [[text.replace("|", "\\|").replace("\n", " ") for text in pair] for pair in sorted(hparams.items())]
+    text = "\n".join(["| key | value |", "|---|---|", *(f"| {key} | {value} |" for key, value in cells)])
     stream.log("hparams", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
 
 
@@ -127,7 +110,3 @@ def flatten(cfg: Mapping[Any, Any], prefix: str = "") -> dict[str, str]:
         else:
             flat[f"{prefix}{key}"] = str(value)
     return flat
-
-
-def _cell(text: str) -> str:
-    return text.replace("|", "\\|").replace("\n", " ")

@@ -6,7 +6,7 @@ Meta-World's cameras show the same geoms, but planes are left out, and a texture
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -85,38 +85,32 @@ def _prepare(model: Any) -> ModelGeometry:
             continue
         body = int(model.geom_bodyid[geom])
         name = bodies.setdefault(body, model.body(body).name or f"body-{body}")
-        parts.append((name, f"geom-{geom}", (shape, _pose(model, geom))))
+        turn = rr.Quaternion(xyzw=model.geom_quat[geom][[1, 2, 3, 0]])
+        pose = rr.Transform3D(translation=model.geom_pos[geom], quaternion=turn)
+        parts.append((name, f"geom-{geom}", (shape, pose)))
     return ModelGeometry(bodies, tuple(parts))
-
-
-def _pose(model: Any, geom: int) -> Any:
-    turn = rr.Quaternion(xyzw=model.geom_quat[geom][[1, 2, 3, 0]])
-    return rr.Transform3D(translation=model.geom_pos[geom], quaternion=turn)
 
 
 def _shape(model: Any, geom: int, color: NDArray[np.uint8]) -> Any:
     """The geom as rerun draws it, None for a plane."""
-    kinds = mujoco.mjtGeom
-    kind, size = model.geom_type[geom], model.geom_size[geom]
-    look: dict[str, Any] = {"colors": [color], "fill_mode": rr.components.FillMode.Solid}
-    if kind == kinds.mjGEOM_PLANE:
+    kind, size = mujoco.mjtGeom(int(model.geom_type[geom])).name, model.geom_size[geom]
+    if kind == "mjGEOM_PLANE":
         return None
-    if kind == kinds.mjGEOM_MESH:
-        mesh = _clustered(*_corners(model, model.geom_dataid[geom]))
-        geometry = {"vertex_positions": mesh.vertices, "vertex_normals": mesh.normals}
-        return rr.Mesh3D(**geometry, triangle_indices=mesh.triangles, albedo_factor=color)
-    if kind == kinds.mjGEOM_BOX:
-        return rr.Boxes3D(half_sizes=[size], **look)
-    if kind == kinds.mjGEOM_SPHERE:
-        return rr.Ellipsoids3D(half_sizes=[[size[0]] * 3], **look)
-    if kind == kinds.mjGEOM_ELLIPSOID:
-        return rr.Ellipsoids3D(half_sizes=[size], **look)
-    if kind == kinds.mjGEOM_CYLINDER:
-        return rr.Cylinders3D(lengths=[2 * size[1]], radii=[size[0]], **look)
-    if kind == kinds.mjGEOM_CAPSULE:
+    if kind == "mjGEOM_MESH":
+        return rr.Mesh3D(**_clustered(*_corners(model, model.geom_dataid[geom])), albedo_factor=color)
+    round_ = {"lengths": [2 * size[1]], "radii": [size[0]]}
+    drawn = {
+        "mjGEOM_BOX": (rr.Boxes3D, {"half_sizes": [size]}),
+        "mjGEOM_SPHERE": (rr.Ellipsoids3D, {"half_sizes": [[size[0]] * 3]}),
+        "mjGEOM_ELLIPSOID": (rr.Ellipsoids3D, {"half_sizes": [size]}),
+        "mjGEOM_CYLINDER": (rr.Cylinders3D, round_),
         # MuJoCo's stands around its middle, rerun's begins at its origin.
-        return rr.Capsules3D(lengths=[2 * size[1]], radii=[size[0]], translations=[[0, 0, -size[1]]], **look)
-    raise NotImplementedError(f"geom {geom} is of type {kinds(int(kind)).name}, which no model of Meta-World has")
+        "mjGEOM_CAPSULE": (rr.Capsules3D, round_ | {"translations": [[0, 0, -size[1]]]}),
+    }
+    if kind not in drawn:
+        raise NotImplementedError(f"geom {geom} is of type {kind}, which no model of Meta-World has")
+    shape, sizes = drawn[kind]
+    return shape(**sizes, colors=[color], fill_mode=rr.components.FillMode.Solid)
 
 
 def _corners(model: Any, mesh: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -141,27 +135,14 @@ def _color(model: Any, geom: int) -> NDArray[np.uint8]:
             rgba = np.array(model.mat_rgba[material], np.float64)
         textures = model.mat_texid[material]
         for texture in textures[textures >= 0][:1]:
-            rgba[:3] *= _mean_color(model, texture)
+            channels, start = model.tex_nchannel[texture], model.tex_adr[texture]
+            end = start + model.tex_height[texture] * model.tex_width[texture] * channels
+            rgba[:3] *= model.tex_data[start:end].reshape(-1, channels)[:, :3].mean(axis=0) / 255.0
     return np.rint(np.clip(rgba, 0, 1) * 255).astype(np.uint8)
 
 
-def _mean_color(model: Any, texture: int) -> NDArray[np.float64]:
-    height, width, channels = model.tex_height[texture], model.tex_width[texture], model.tex_nchannel[texture]
-    start = model.tex_adr[texture]
-    pixels = model.tex_data[start : start + height * width * channels].reshape(-1, channels)
-    return pixels[:, :3].mean(axis=0) / 255.0
-
-
-class _Mesh(NamedTuple):
-    """V vertices (metres) with unit normals, and F triangles of indices."""
-
-    vertices: NDArray[np.float32]
-    normals: NDArray[np.float32]
-    triangles: NDArray[np.uint32]
-
-
-def _clustered(corners: NDArray[np.float64], normals: NDArray[np.float64]) -> _Mesh:
-    """A coarse mesh of triangles' corners (F×3×3, metres) and their normals (F×3×3).
+def _clustered(corners: NDArray[np.float64], normals: NDArray[np.float64]) -> dict[str, Any]:
+    """A coarse mesh, as rerun takes it, of triangles' corners (F×3×3, metres) and their unit normals (F×3×3).
 
     The corners in a cube move to their mean, so no gap opens; those whose normals differ stay apart: edges stay sharp.
     """
@@ -179,11 +160,11 @@ def _clustered(corners: NDArray[np.float64], normals: NDArray[np.float64]) -> _M
     triangles = vertex.reshape(-1, 3)[(a != b) & (b != c) & (a != c)]
     _, once = np.unique(_packed(triangles), return_index=True)
     used, renumbered = np.unique(triangles[once], return_inverse=True)
-    return _Mesh(
-        places[cube[first]][used].astype(np.float32),
-        mean_normals[used].astype(np.float32),
-        renumbered.reshape(-1, 3).astype(np.uint32),
-    )
+    return {
+        "vertex_positions": places[cube[first]][used].astype(np.float32),
+        "vertex_normals": mean_normals[used].astype(np.float32),
+        "triangle_indices": renumbered.reshape(-1, 3).astype(np.uint32),
+    }
 
 
 def _packed(indices: NDArray[np.int64], base: int = 1 << 20) -> NDArray[np.int64]:

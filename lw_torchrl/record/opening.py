@@ -11,9 +11,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from lw_torchrl._checks import check_int
-from lw_torchrl.record.conventions import rr
-from lw_torchrl.record.layout import Layout
+from lw_torchrl.record.conventions import EPISODE_TIMELINE, METRIC_TIMELINE, rr
 from lw_torchrl.record.rerun_binary import binary, plain
+from lw_torchrl.record.tabs import Layout
 
 FLUSH_SECONDS = 60.0
 
@@ -109,19 +109,22 @@ def copy_recording(source: Path, target: Path, tab: str | None = None) -> None:
 def opening_step(path: str | os.PathLike[str], tab: str | None = None, step: int | None = None) -> int | None:
     """The step for a viewer's cursor in a tab (None: the first); None for a tab of no episode.
 
-    It is ``step``, if the recording goes so far, else a ValueError. Without one it is the decisive step of the episode:
-    where its failure is seen, its first success, or its end; of episodes side by side the earliest.
+    It is ``step``, or a ValueError if the recording does not go so far; without one :meth:`Layout.opening_step`.
     """
     from rerun.chunk import RrdReader
 
     reader = RrdReader(os.fspath(path))
-    layout = Layout.read(reader) or Layout()
+    layout = Layout.read(reader)
     if step is None:
-        return layout.opening_step(tab)
-    timeline, end = layout.timeline(tab), -1
-    for chunk in reader.stream().filter(has_timeline=timeline):
-        times = chunk.to_record_batch().column(timeline)
-        end = max(end, times[-1].cast("int64").as_py()) if len(times) else end
+        return (layout or Layout()).opening_step(tab)
+    end = -1
+    # A recording of an earlier version does not say its tabs; if it has episodes, it opens at one.
+    for timeline in [layout.tab(tab).timeline] if layout else [EPISODE_TIMELINE, METRIC_TIMELINE]:
+        for chunk in reader.stream().filter(has_timeline=timeline):
+            times = chunk.to_record_batch().column(timeline)
+            end = max(end, times[-1].cast("int64").as_py()) if len(times) else end
+        if end >= 0:
+            break
     if end < 0:
         raise ValueError(f"step {step} was given, but the recording holds no steps")
     if check_int("step", step, minimum=0) > end:

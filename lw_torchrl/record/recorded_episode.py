@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 
 from lw_torchrl.language.named_objects import GRIPPER
-from lw_torchrl.language.skills import SkillError, load_skills
+from lw_torchrl.language.skills import load_skills
 from lw_torchrl.language.tasks import Task
 
 NOBODY = -1
@@ -45,58 +45,21 @@ class TargetPose(NamedTuple):
         return np.full_like(gap, np.nan) if self.relative else gap
 
 
-def target_pose(skill: str, task: Task, observation: NDArray[np.float32]) -> TargetPose | None:
-    """The target pose of a skill's text in a task (T×39 observations); None where no scripted skill has this text."""
-    known = load_skills().get(skill)
-    if known is None:
-        return None
-    try:
-        found = known.for_task(task)
-    except SkillError:
-        return None
-    positions = task.positions(torch.from_numpy(observation))
-    moved = positions[found.moved].numpy()
-    towards = positions[found.target].numpy() + np.asarray(found.offset, np.float32)
-    position = np.where(np.asarray(found.gain) > 0, towards, moved).astype(np.float32)
-    return TargetPose(position, moved, found.target == GRIPPER)
-
-
 @dataclass(frozen=True)
 class RecordedEpisode:
-    """T rows of one episode, checked, on the CPU; S is the number of steps of its plan.
+    """T rows of one episode, checked, on the CPU; S is the number of steps of its plan."""
 
-    Attributes:
-        observation: T×39 float32; metres, gripper opening in [0,1] at index 3, goal at 36:39.
-        action: T×4 float32, displacement xyz and gripper effort in [-1,1].
-        objects: name -> T×3 float32 position in metres; the gripper is among them.
-        qaf: T×S bool, truth of each condition, or None.
-        believed: T×S bool, what a learned evaluator takes for it, or None.
-        skill_weights: T×S float32, attention over the steps, or None.
-        success: T bool, of the state that the row's action led to, or None.
-        reward: T float32, likewise, or None.
-        corrected: T float32, how much of a correction counts, or None.
-        steps: the S (condition, skill) texts; empty where there is no plan.
-        target_poses: of each step; None where its skill is no scripted one.
-    """
-
-    observation: NDArray[np.float32]
-    action: NDArray[np.float32]
-    objects: dict[str, NDArray[np.float32]]
-    qaf: NDArray[np.bool_] | None
-    believed: NDArray[np.bool_] | None
-    skill_weights: NDArray[np.float32] | None
-    success: NDArray[np.bool_] | None
-    reward: NDArray[np.float32] | None
-    corrected: NDArray[np.float32] | None
-    steps: tuple[tuple[str, str], ...]
-    target_poses: tuple[TargetPose | None, ...] = ()
-
-    @property
-    def skills(self) -> list[str]:
-        """A text for each column of skill_weights: "1 grasp the handle", or "1" where there is no plan."""
-        count = 0 if self.skill_weights is None else self.skill_weights.shape[1]
-        texts = [f" {skill}" for _, skill in self.steps] or [""] * count
-        return [f"{i}{text}" for i, text in enumerate(texts, 1)]
+    observation: NDArray[np.float32]  # T×39; metres, gripper opening in [0,1] at index 3, goal at 36:39
+    action: NDArray[np.float32]  # T×4, displacement xyz and gripper effort in [-1,1]
+    objects: dict[str, NDArray[np.float32]]  # name -> T×3 position in metres; the gripper is among them
+    qaf: NDArray[np.bool_] | None  # T×S, truth of each condition
+    believed: NDArray[np.bool_] | None  # T×S, what a learned evaluator takes for it
+    skill_weights: NDArray[np.float32] | None  # T×S, attention over the steps
+    success: NDArray[np.bool_] | None  # T, of the state that the row's action led to
+    reward: NDArray[np.float32] | None  # T, likewise
+    corrected: NDArray[np.float32] | None  # T, how much of a correction counts
+    steps: tuple[tuple[str, str], ...]  # the S (condition, skill) texts; empty where there is no plan
+    target_poses: tuple[TargetPose | None, ...] = ()  # of each step; None where its skill is no scripted one
 
     @property
     def answers(self) -> NDArray[np.bool_] | None:
@@ -115,12 +78,6 @@ class RecordedEpisode:
         if (answers := self.answers) is not None:
             return np.where(answers.any(axis=1), answers.argmax(axis=1), NOBODY)
         return None
-
-    @property
-    def attends_softly(self) -> bool:
-        """Whether weights ever lie between 0 and 1."""
-        weights = self.skill_weights
-        return weights is not None and bool(((weights > 1e-3) & (weights < 1 - 1e-3)).any())
 
     @property
     def first_success(self) -> int | None:
@@ -142,8 +99,16 @@ class RecordedEpisode:
 
     def with_target_poses(self, task: Task) -> RecordedEpisode:
         """The episode with the target poses of its plan's skills in ``task``."""
-        poses = tuple(target_pose(skill, task, self.observation) for _, skill in self.steps)
-        return replace(self, target_poses=poses)
+        scripted, positions = load_skills(), task.positions(torch.from_numpy(self.observation))
+        poses: list[TargetPose | None] = [None] * len(self.steps)
+        for step, (_, text) in enumerate(self.steps):
+            if text in scripted and scripted[text].suits(task):
+                skill = scripted[text].for_task(task)
+                moved = positions[skill.moved].numpy()
+                towards = positions[skill.target].numpy() + np.asarray(skill.offset, np.float32)
+                position = np.where(np.asarray(skill.gain) > 0, towards, moved).astype(np.float32)
+                poses[step] = TargetPose(position, moved, skill.target == GRIPPER)
+        return replace(self, target_poses=tuple(poses))
 
     def __len__(self) -> int:
         return len(self.observation)
@@ -160,19 +125,39 @@ class RecordedEpisode:
             raise ValueError(f"rollout must have batch size (T,) with T >= 1, got {tuple(rollout.batch_size)}{hint}")
         steps = tuple((str(step.condition), step.skill) for step in plan.steps) if plan is not None else ()
         length = rollout.batch_size[0]
+
+        def column(key: Any, size: int | None) -> NDArray[Any]:
+            value = rollout.get(key, None)
+            if value is None:
+                found = ", ".join(sorted(map(str, rollout.keys())))
+                raise ValueError(f"rollout must have the key {key!r} ({length}×{size}), got {found or 'no keys'}")
+            return _array(value, f"rollout[{key!r}]", (length, size))
+
+        def optional(key: Any, *, flat: bool = False, truth: bool = False) -> NDArray[Any] | None:
+            """A column for each step of the plan, or a flat one; what is beyond them is padding and dropped."""
+            if rollout.get(key, None) is None:
+                return None
+            array, needed = column(key, None), 1 if flat else len(steps)
+            if array.shape[1] < max(needed, 1):
+                columns = f"a column for each of {needed} plan steps, got {array.shape[1]}"
+                raise ValueError(f"rollout[{key!r}] must have {columns}")
+            if truth and array.dtype != np.bool_:
+                raise ValueError(f"rollout[{key!r}] must be bool, got {rollout.get(key).dtype}")
+            return array[:, 0] if flat else array[:, : needed or None]
+
+        logits = optional("qaf_logits")
+        observation = column("observation", 39)
         executed = ("next", "executed_action")
-        action = "action" if rollout.get(executed, None) is None else executed
-        logits = _of_steps(rollout, "qaf_logits", length, len(steps))
         return cls(
-            observation=_column(rollout, "observation", length, 39),
-            action=_column(rollout, action, length, 4),
-            objects=_positions(objects, rollout, length),
-            qaf=_truth(rollout, "qaf", length, len(steps)),
+            observation=observation,
+            action=column("action" if rollout.get(executed, None) is None else executed, 4),
+            objects=_positions(objects, observation),
+            qaf=optional("qaf", truth=True),
             believed=None if logits is None else logits > 0,
-            skill_weights=_of_steps(rollout, "skill_weights", length, len(steps)),
-            success=_flat(_truth(rollout, ("next", "success"), length, 1)),
-            reward=_flat(_of_steps(rollout, ("next", "reward"), length, 1)),
-            corrected=_flat(_of_steps(rollout, "action_corrected", length, 1)),
+            skill_weights=optional("skill_weights"),
+            success=optional(("next", "success"), flat=True, truth=True),
+            reward=optional(("next", "reward"), flat=True),
+            corrected=optional("action_corrected", flat=True),
             steps=steps,
         )
 
@@ -192,42 +177,11 @@ def _array(value: Any, label: str, shape: tuple[int | None, ...]) -> NDArray[Any
     return array
 
 
-def _column(rollout: TensorDictBase, key: Any, length: int, size: int | None) -> NDArray[Any]:
-    value = rollout.get(key, None)
-    if value is None:
-        found = ", ".join(sorted(map(str, rollout.keys())))
-        raise ValueError(f"rollout must have the key {key!r} ({length}×{size}), got {found or 'no keys'}")
-    return _array(value, f"rollout[{key!r}]", (length, size))
-
-
-def _of_steps(rollout: TensorDictBase, key: Any, length: int, steps: int) -> NDArray[Any] | None:
-    """An optional column with at least ``steps`` columns; those beyond are padding and dropped."""
-    if rollout.get(key, None) is None:
-        return None
-    array = _column(rollout, key, length, None)
-    if array.shape[1] < max(steps, 1):
-        raise ValueError(f"rollout[{key!r}] must have a column for each of {steps} plan steps, got {array.shape[1]}")
-    return array[:, :steps] if steps else array
-
-
-def _truth(rollout: TensorDictBase, key: Any, length: int, steps: int) -> NDArray[np.bool_] | None:
-    array = _of_steps(rollout, key, length, steps)
-    if array is not None and array.dtype != np.bool_:
-        raise ValueError(f"rollout[{key!r}] must be bool, got {rollout.get(key).dtype}")
-    return array
-
-
-def _flat(array: NDArray[Any] | None) -> NDArray[Any] | None:
-    return None if array is None else array[:, 0]
-
-
-def _positions(objects: Any, rollout: TensorDictBase, length: int) -> dict[str, NDArray[np.float32]]:
+def _positions(objects: Any, observation: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:
     if not isinstance(objects, Mapping):
         raise TypeError(f"objects must map names to T×3 positions, got {type(objects).__name__}")
     for name in objects:
         if not isinstance(name, str) or not name:
             raise TypeError(f"objects must be named by non-empty strings, got {name!r}")
-    checked = {name: _array(value, f"objects[{name!r}]", (length, 3)) for name, value in objects.items()}
-    if GRIPPER not in checked:
-        checked[GRIPPER] = _column(rollout, "observation", length, 39)[:, :3]
-    return checked
+    checked = {name: _array(value, f"objects[{name!r}]", (len(observation), 3)) for name, value in objects.items()}
+    return checked if GRIPPER in checked else checked | {GRIPPER: observation[:, :3]}

@@ -17,23 +17,14 @@ from typing import IO
 LOCAL = "127.0.0.1"
 
 # What the viewer prints when it dies, and what to do about it.
-REASONS = (
-    (
-        r"render context|[Nn]o (graphics|wgpu) adapter|libvulkan",
-        "no graphics driver was found. Without a GPU, install Vulkan's loader and Mesa's software driver "
-        "(Debian: apt-get install libvulkan1 mesa-vulkan-drivers)",
-    ),
-    (
-        r"DISPLAY is set|EventLoopError|failed to open display",
-        "there is no screen here. Take a picture, --screenshot; or look at it from another machine: "
-        "--web serves a page, --html writes one",
-    ),
-    (
-        "No glyph for",
-        "a text in the recording has a character outside the one font that pictures are drawn with. "
-        "Without --screenshot the viewer uses the system's fonts too",
-    ),
-)
+REASONS = {
+    r"render context|[Nn]o (graphics|wgpu) adapter|libvulkan": "no graphics driver was found. Without a GPU, install "
+    "Vulkan's loader and Mesa's software driver (Debian: apt-get install libvulkan1 mesa-vulkan-drivers)",
+    r"DISPLAY is set|EventLoopError|failed to open display": "there is no screen here. Take a picture, --screenshot; "
+    "or look at it from another machine: --web serves a page, --html writes one",
+    "No glyph for": "a text in the recording has a character outside the one font that pictures are drawn with. "
+    "Without --screenshot the viewer uses the system's fonts too",
+}
 
 
 def binary() -> str:
@@ -82,7 +73,7 @@ def failure(output: IO[bytes]) -> RuntimeError:
     """The error that says why the program ended, by what it printed."""
     output.seek(0)
     text = plain(output.read().decode("utf-8", "replace"))
-    for pattern, reason in REASONS:
+    for pattern, reason in REASONS.items():
         if re.search(pattern, text):
             return RuntimeError(f"rerun's viewer stopped: {reason}.")
     # Neither the stack nor the lines of routine.

@@ -11,9 +11,9 @@ import uuid
 import warnings
 from collections.abc import Mapping, Sequence
 from itertools import count
-from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
@@ -22,12 +22,12 @@ from torchrl.record.loggers import Logger
 
 from lw_torchrl._checks import check_choice, checked
 from lw_torchrl.record import metrics
-from lw_torchrl.record.conventions import CONTROL_PERIOD, METRIC_TIMELINE, entity_path, rr
-from lw_torchrl.record.layout import TABS, Layout
+from lw_torchrl.record.conventions import CONTROL_PERIOD, METRIC_TIMELINE, entity_path, rr, time_columns
+from lw_torchrl.record.episode_page import send_page
 from lw_torchrl.record.metrics import check_name
 from lw_torchrl.record.mujoco_scene import Motion
-from lw_torchrl.record.page import send_page
 from lw_torchrl.record.recorded_episode import PlanLike, RecordedEpisode
+from lw_torchrl.record.tabs import TABS, Layout
 from lw_torchrl.record.verdict import Heading
 from lw_torchrl.record.writer import RecordingWriter, check_address, check_path
 
@@ -97,14 +97,11 @@ class RerunLogger(Logger):
         stream = self._writer.stream
         # In another process (service_backend="process") torchrl ends the experiment, not the logger.
         stream.finish = self.shutdown
+        self.previous = self._writer.previous
         self._layout.send(stream)
         atexit.register(self.shutdown)
         self._tell()
         return stream
-
-    @property
-    def previous(self) -> Path | None:
-        return self._writer.previous
 
     def __repr__(self) -> str:
         state = "closed" if self._service_shutdown else "open"
@@ -158,10 +155,8 @@ class RerunLogger(Logger):
             image: H×W, H×W×C or C×H×W, C = 1 or 3; uint8, or floats in [0, 1].
             step: the training step; None counts the calls with this name from 0.
         """
-        stream, parts, pixels = self._open(), check_name(name).split("/"), metrics.check_image(name, image)
-        path = entity_path("images", *parts)
-        metrics.send_image(stream, path, self._count(path, step), pixels)
-        self._layout.add_view("images", *parts)
+        stream, pixels = self._open(), metrics.check_image(name, image)
+        metrics.send_images(stream, *self._place("images", name, step), [pixels])
 
     def log_video(self, name: str, video: Tensor, step: int | None = None, **kwargs: Any) -> None:
         """Add a video as JPEG images "videos/<name>", frame i at step i of the episodes' timelines.
@@ -176,12 +171,12 @@ class RerunLogger(Logger):
             for i, one in enumerate(video):
                 self.log_video(f"{name}/{i}", one, step, **kwargs)
             return
-        video = video[0] if video.ndim == 5 else video
-        metrics.check_video(name, video)
+        frames = metrics.check_video(name, video[0] if video.ndim == 5 else video)
         stream, parts = self._open(), check_name(name).split("/")
         if step is not None:
             parts.append(f"step {int(step)}")
-        metrics.send_video(stream, entity_path("videos", *parts), video, float(kwargs.get("fps", 1 / CONTROL_PERIOD)))
+        times = time_columns(np.arange(len(frames)), 1 / float(kwargs.get("fps", 1 / CONTROL_PERIOD)))
+        metrics.send_images(stream, entity_path("videos", *parts), times, frames)
         self._layout.add_view("videos", *parts)
 
     def log_hparams(self, cfg: Any) -> None:
@@ -202,11 +197,15 @@ class RerunLogger(Logger):
             data: numbers of any shape, all finite.
             **kwargs: ``step``, the training step (None counts the calls), and ``bins``, their number or edges (30).
         """
-        counts, edges = metrics.histogram(name, data, kwargs.get("bins", 30))
+        chart = metrics.histogram(name, data, kwargs.get("bins", 30))
+        self._open().send_columns(*self._place("histograms", name, kwargs.get("step")), chart)
+
+    def _place(self, kind: str, name: str, step: int | None) -> tuple[str, list[Any]]:
+        """The entity and the time of what is logged at a training step; it is shown from now on."""
         parts = check_name(name).split("/")
-        path = entity_path("histograms", *parts)
-        metrics.send_histogram(self._open(), path, self._count(path, kwargs.get("step")), counts, edges)
-        self._layout.add_view("histograms", *parts)
+        path = entity_path(kind, *parts)
+        self._layout.add_view(kind, *parts)
+        return path, [rr.TimeColumn(METRIC_TIMELINE, sequence=[self._count(path, step)])]
 
     def flush(self, timeout: float | None = None) -> None:
         """Write what waits to the file, within ``timeout`` seconds; by itself that is done each half second."""
@@ -229,7 +228,7 @@ class RerunLogger(Logger):
         if not self._service_shutdown:
             self._service_shutdown = True
             atexit.unregister(self.shutdown)
-            self._writer.discard()
+            self._writer.close(discard=True)
 
     def _checkpoint_state(self) -> dict[str, Any]:
         return {"counters": dict(self._counters)}
@@ -280,10 +279,9 @@ class RerunLogger(Logger):
         t · 0.0125 seconds; success and reward, its action's outcome, at t + 1.
 
         Args:
-            rollout: batch size (T,). "observation" T×39 (metres), "action" T×4 in [-1,1], or in its place
-                ("next", "executed_action"); optional are "qaf" T×S bool, "qaf_logits" T×S, "skill_weights" T×S,
-                "action_corrected" T×1, ("next", "success") T×1 bool, ("next", "reward") T×1. Columns beyond the
-                plan's steps are padding and left out.
+            rollout: batch size (T,). "observation" T×39 float32 (metres) and "action" T×4 float32 in [-1, 1]; optional
+                are what :func:`lw_torchrl.log_rollout` lists and ("next", "success") T×1 bool. Columns beyond the
+                plan's S steps are padding and left out.
             task: the task's name.
             objects: name -> T×3 positions in metres; without "robot's gripper" it is observation 0:3.
             plan: its ``steps`` each have a ``condition`` and a ``skill``; None shows numbered columns.

@@ -19,14 +19,12 @@ from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.record.mujoco_scene import Motion, model_geometry
 from lw_torchrl.record.rerun_logger import RerunLogger
-from lw_torchrl.record.rollout_pages import read_rollout
+from lw_torchrl.record.rollouts import read_rollout
 from lw_torchrl.transforms.environment import base_env, refuse_changed
 
-_ROOM = 512  # steps, at first
-_FIXED = ("task_id", "episode", "qaf_plan")
-_BEFORE = ("observation", "qaf", "qaf_logits", "skill_weights", "action_corrected")
+_BEFORE = ("task_id", "episode", "qaf_plan", "observation", "qaf", "qaf_logits", "skill_weights", "action_corrected")
 _AFTER = ("executed_action", "success", "reward")
-"""Keys of a step: those that an episode keeps, those of the state and the policy, those of what it led to."""
+"""Keys of a step: those of the state and the policy, those of what it led to."""
 
 
 class RolloutRecorder(Transform):
@@ -149,9 +147,8 @@ class _Row:
         self._model = None if self._engine is None else self._engine.model(row)
         if self._model is not None:
             model_geometry(self._model)
-        self._fixed: dict[str, NDArray[Any]] = {}
-        self._read: tuple[list[str], list[str]] = [], []
-        self._steps, self._poses = _Rows(), _Rows()
+        self._steps: list[dict[NestedKey, NDArray[Any]]] = []
+        self._poses: list[list[NDArray[Any]]] = []
         self._recorded = self._stepped = False
 
     def begin(self, *, recorded: bool) -> None:
@@ -162,61 +159,34 @@ class _Row:
     def take(self, before: Mapping[str, Tensor], after: Mapping[str, Tensor]) -> None:
         """Note a step: what it was decided on and what it led to."""
         self._stepped = True
-        if not self._recorded:
-            return
-        if not self._steps.length:
-            self._read = [key for key in _BEFORE if key in before], [key for key in _AFTER if key in after]
-            self._fixed = {key: np.array(self._of(before[key])) for key in _FIXED if key in before}
-        now, then = self._read
-        self._steps.add([self._of(before[key]) for key in now] + [self._of(after[key]) for key in then])
-        self._look()
+        if self._recorded:
+            step: dict[NestedKey, NDArray[Any]] = {key: self._of(before[key]) for key in _BEFORE if key in before}
+            self._steps.append(step | {("next", key): self._of(after[key]) for key in _AFTER if key in after})
+            self._look()
 
     def finish(self) -> tuple[TensorDict | None, Motion | None]:
         """The episode so far, (T,), and its motion; afterwards none runs. None where no step was noted."""
         self.ended += self._stepped
         steps, poses = self._steps, self._poses
-        self._steps, self._poses = _Rows(), _Rows()
+        self._steps, self._poses = [], []
         self._recorded = self._stepped = False
-        length, (now, then) = steps.length, self._read
-        if not length:
+        if not steps:
             return None, None
-        names: list[NestedKey] = [*now, *(("next", key) for key in then)]
-        columns: dict[NestedKey, Any] = dict(zip(names, map(torch.from_numpy, steps.columns()), strict=True))
-        columns |= {key: torch.from_numpy(value).reshape(-1).expand(length) for key, value in self._fixed.items()}
-        rollout = TensorDict(columns, [length])
+        columns: Any = {key: torch.from_numpy(np.stack([step[key] for step in steps])) for key in steps[0]}
+        rollout = TensorDict(columns, [len(steps)])
         if self._model is None:
             return rollout, None
-        positions, quaternions = (column.astype(np.float32) for column in poses.columns())
+        positions, quaternions = (np.stack(rows).astype(np.float32) for rows in zip(*poses, strict=True))
         return rollout, Motion(self._model, positions, quaternions)
 
     def _of(self, values: Tensor) -> NDArray[Any]:
-        """This row's part of a tensor of all rows."""
+        """A copy of this row's part of a tensor of all rows: some environments write into theirs again."""
         array = _array(values)
-        return array[self._row] if self._batched else array
+        return np.array(array[self._row] if self._batched else array)
 
     def _look(self) -> None:
         if self._recorded and self._engine is not None:
-            self._poses.add(self._engine.poses(self._row))
-
-
-class _Rows:
-    """Rows of some arrays each, as copies: some environments write into theirs again."""
-
-    def __init__(self) -> None:
-        self.length = 0
-        self._columns: list[NDArray[Any]] = []
-
-    def add(self, values: Sequence[NDArray[Any]]) -> None:
-        if not self.length:
-            self._columns = [np.empty((_ROOM, *value.shape), value.dtype) for value in values]
-        elif self.length == len(self._columns[0]):
-            self._columns = [np.concatenate((column, np.empty_like(column))) for column in self._columns]
-        for column, value in zip(self._columns, values, strict=True):
-            column[self.length] = value
-        self.length += 1
-
-    def columns(self) -> list[NDArray[Any]]:
-        return [column[: self.length] for column in self._columns]
+            self._poses.append([np.array(values) for values in self._engine.poses(self._row)])
 
 
 def _array(values: Tensor) -> NDArray[Any]:

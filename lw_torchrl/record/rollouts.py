@@ -1,29 +1,213 @@
-"""Recording what a plan-conditioned policy does: one episode of each task, as a rerun file."""
+"""Rollouts as pages of a recording, with the robot as it moved, simulated again for it; and episodes run for them."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
+from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
+from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from lw_torchrl._checks import checked, missing_keys, shown
 from lw_torchrl._files import replacing
 from lw_torchrl._progress import Progress
+from lw_torchrl.envs.engines.vectorized.engine import VectorizedEngine
 from lw_torchrl.envs.episodes import FinishedEpisode, policy_of, run_episodes
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
+from lw_torchrl.envs.seeding import episode_seed
+from lw_torchrl.evaluation.failure_records import Failure
 from lw_torchrl.evaluation.protocol import actor_plans, make_env, tasks_of
-from lw_torchrl.language.plans import ConditionalPlan, Plans
-from lw_torchrl.language.tasks import Task
+from lw_torchrl.language.named_objects import GRIPPER
+from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
+from lw_torchrl.language.tasks import MT50, TASKS, Task, task_id
+from lw_torchrl.record.mujoco_scene import Motion
+from lw_torchrl.record.recorded_episode import RecordedEpisode
 from lw_torchrl.record.rerun_logger import RerunLogger
-from lw_torchrl.record.rollout_pages import log_rollout
+from lw_torchrl.record.verdict import Heading
 
 _KEYS: list[NestedKey] = ["observation", "task_id", "episode", "action", ("next", "success"), ("next", "reward")]
 _PLAN_KEYS = {"qaf", "skill_weights", "action_corrected"}
+
+
+@checked
+def log_rollout(
+    logger: RerunLogger,
+    rollout: TensorDictBase,
+    plans: Plans | Mapping[str, ConditionalPlan] | None = None,
+    *,
+    seed: int | None = None,
+    name: str | None = None,
+    policy: str | None = None,
+    failure: Failure | Sequence[Failure | None] | None = None,
+    tasks: Iterable[Task] = (),
+) -> Any:
+    """Add a rollout to a recording: the robot in 3-D, a verdict, the plan at the cursor, the timeline and curves.
+
+    Where the environment's seed is given, the episode is simulated again, from its task, ``seed``, ``episode`` and
+    actions, and the robot is shown as it moved. The observations must come out the same, bit for bit; where they do
+    not, a warning says so, and a hand over a table stands for the robot, as it does without a seed.
+
+    Args:
+        logger: the recording.
+        rollout: batch size (T,), one episode from its first state on: "observation" T×39 float32 (metres), "task_id" T
+            int64, "action" T×4 float32 in [-1, 1], as executed, and ("next", "success") T×1 bool. Optional are
+            ("next", "executed_action") T×4, which is taken in the place of the action, "episode" T int64, "qaf" T×S
+            bool, "qaf_plan" T int64, "qaf_logits" T×S float32 (positive: true), "skill_weights" T×S float32,
+            "action_corrected" T×1 and ("next", "reward") T×1 float32. Or batch size (N, T), an episode in each row.
+        plans: what ``qaf`` answers; None for no plan.
+        seed: of the environment; with ``episode`` it says how the episode began.
+        name: of the episode in the recording; None takes "push-7", of task and episode, or else "push".
+        policy: who acted, in a word, for the tab.
+        failure: why it failed, for the verdict; of N rows one for each, None where there is none.
+        tasks: of your own, where the plans do not say what they are.
+
+    Returns:
+        The name; of N rows a list of names.
+
+    Raises:
+        ValueError: the rows are of several episodes; ``qaf`` answers other plans; the failure is another episode's.
+        PlanError: (a ValueError) there is no plan for the task.
+
+    Example:
+        >>> import tempfile
+        >>> import lw_torchrl as lw
+        >>> env = lw.LanguageWorldEnv("reach", seed=7)
+        >>> rollout = env.rollout(20, lw.ExpertActor("reach"))[0]
+        >>> with lw.RerunLogger(tempfile.mkdtemp() + "/reach.rrd") as logger:
+        ...     lw.log_rollout(logger, rollout, seed=7, policy="expert")
+        'reach-0'
+        >>> env.close()
+    """
+    if len(rollout.batch_size) == 2:
+        if name is not None:
+            raise ValueError(f"name is of one episode, but rollout holds {len(rollout)}; got {name!r}")
+        failures = failure if isinstance(failure, Sequence) else [failure] * len(rollout)
+        if len(failures) != len(rollout):
+            raise ValueError(f"failure must be one for each of {len(rollout)} rows, got {len(failures)}")
+        rows, tasks = zip(rollout, failures, strict=True), list(tasks)
+        return [
+            log_rollout(logger, row, plans, seed=seed, policy=policy, failure=why, tasks=tasks) for row, why in rows
+        ]
+    if isinstance(failure, Sequence):
+        raise ValueError(f"failure must be one Failure for one episode, got {len(failure)}")
+    heading, episode = read_rollout(rollout, plans, seed=seed, policy=policy, failure=failure, tasks=tasks)
+    motion = _motion(heading, episode) if seed is not None and heading.task in TASKS else None
+    return logger.add_page(heading, episode, motion=motion, name=name)
+
+
+def read_rollout(
+    rollout: TensorDictBase,
+    plans: Plans | Mapping[str, ConditionalPlan] | None = None,
+    *,
+    seed: int | None = None,
+    policy: str | None = None,
+    failure: Failure | None = None,
+    tasks: Iterable[Task] = (),
+) -> tuple[Heading, RecordedEpisode]:
+    """What a page shows of a rollout (T,), checked, as :func:`log_rollout` has it."""
+    plans = None if plans is None else as_plans(plans)
+    number = _single(rollout, "task_id", required=True)
+    index = _single(rollout, "episode", required=seed is not None)
+    assert number is not None
+    own = [*tasks, *(plan.definition for plan in (plans or {}).values())]
+    task = next((one for one in own if task_id(one.name) == number), None)
+    if task is None and 0 <= number < len(MT50):
+        task = TASKS[MT50[number]]
+    label = f"task-{number}" if task is None else task.name
+    plan = None
+    if plans is not None:
+        plans.require([label])
+        plan = plans[label]
+        answered = rollout.get("qaf_plan", None)
+        if answered is not None and not bool((answered == Plans([plan]).numbers[label]).all()):
+            raise ValueError(f"rollout['qaf'] answers another plan of {label!r} than was given, as 'qaf_plan' tells")
+    if not isinstance(failure, Failure | None):
+        raise TypeError(f"failure must be a Failure, got {shown(failure)} ({type(failure).__name__})")
+    if failure is not None and (failure.task, failure.episode) != (label, failure.episode if index is None else index):
+        raise ValueError(
+            f"failure must be of the rollout's episode, {label} {index}, got that of {failure.task} {failure.episode}"
+        )
+    observation = rollout.get("observation", None)
+    objects: dict[str, Tensor] = {}
+    if task is not None and observation is not None and observation.shape[1:] == (39,):
+        told_of = [] if plan is None else [f"{step.condition} {step.skill}" for step in plan.steps]
+        for name, position in task.positions(observation).items():
+            if plan is None or name == GRIPPER or any(name in words for words in told_of):
+                objects[name] = position
+    episode = RecordedEpisode.from_rollout(rollout, objects, plan)
+    if task is not None and plan is not None:
+        episode = episode.with_target_poses(task)
+    return Heading(label, index, seed, policy, failure), episode
+
+
+class DiffersError(ValueError):
+    """An episode that is simulated again comes out as another; the text says where they first differ, and how much."""
+
+
+def simulate_again(
+    task: str, seed: int, episode: int, action: NDArray[np.float32], observation: NDArray[np.float32]
+) -> Motion:
+    """The motion of all bodies in an episode, of T + 1 rows; a :class:`DiffersError` where it is another episode.
+
+    The simulation depends on the seed and the actions alone, so equal observations, bit for bit, mean equal motion.
+    Actions are T×4 float32 in [-1, 1], as executed; observations T×39 float32, those from which they were taken.
+    """
+    engine = VectorizedEngine([task], num_threads=1)
+    try:
+        seen = engine.reset([0], [episode_seed(task, seed, episode)])[0].astype(np.float32)
+        shape, active = (len(action) + 1, engine.model(0).model.nbody), np.ones(1, bool)
+        positions, quaternions = np.empty((*shape, 3), np.float32), np.empty((*shape, 4), np.float32)
+        positions[0], quaternions[0] = engine.poses(0)
+        for step in range(len(action)):
+            if not np.array_equal(seen, observation[step]):
+                off = np.abs(seen.astype(np.float64) - observation[step])
+                raise DiffersError(f"step {step}: number {off.argmax()} is {off.max():.3g} off")
+            seen = engine.step(action[step : step + 1], active).observation[0].astype(np.float32)
+            positions[step + 1], quaternions[step + 1] = engine.poses(0)
+        return Motion(engine.model(0), positions, quaternions)
+    finally:
+        engine.close()
+
+
+def _motion(heading: Heading, episode: RecordedEpisode) -> Motion | None:
+    assert heading.seed is not None
+    assert heading.episode is not None
+    try:
+        return simulate_again(heading.task, heading.seed, heading.episode, episode.action, episode.observation)
+    except DiffersError as error:
+        warnings.warn(
+            f"simulating {heading.task}, episode {heading.episode} of seed {heading.seed}, again gives other numbers "
+            f"at {error}. Was it the seed, and are these the executed actions? A hand over a table is drawn in the "
+            "place of the robot",
+            stacklevel=3,
+        )
+        return None
+
+
+def _single(rollout: TensorDictBase, key: str, *, required: bool) -> int | None:
+    """The one number that a column of integers holds."""
+    column = rollout.get(key, None)
+    if column is None:
+        if required:
+            raise missing_keys(rollout.keys(True, True), key)
+        return None
+    length = tuple(rollout.batch_size)
+    if column.is_floating_point() or tuple(column.shape) not in (length, (*length, 1)):
+        given = f"{column.dtype} {tuple(column.shape)}"
+        raise ValueError(f"rollout[{key!r}] must be integers of shape {length}, got {given}")
+    found = torch.unique(column).tolist()
+    if len(found) != 1:
+        raise ValueError(f"rollout must be one episode of one task, got {key!r} {found[:5]}; split it")
+    return int(found[0])
 
 
 def run_recorded(

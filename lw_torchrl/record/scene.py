@@ -5,7 +5,8 @@ Meta-World's frame: metres, x to the robot's right, y away from the robot, z up,
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from itertools import cycle
 from typing import Any
 
 import numpy as np
@@ -59,19 +60,23 @@ def log_scene(stream: Stream, root: str, episode: RecordedEpisode, motion: Motio
     goal = np.ascontiguousarray(episode.observation[:, 36:39])
     # Objects that stand for the goal, like "target location", have its colour, and their own label.
     goals = [name for name, position in episode.objects.items() if np.allclose(goal, position, atol=1e-3)]
+    others = [name for name in episode.objects if name != GRIPPER]
+    colors = {GRIPPER: GOLD} | dict(zip(others, cycle(OBJECT_COLORS), strict=False))
     trails = []
-    for name, color in _colors(episode.objects, goals).items():
+    for name, color in (colors | {name: GREEN for name in goals if name != GRIPPER}).items():
         part, position = entity_path(name), episode.objects[name]
         label, size = (None, 0.005) if name == GRIPPER else (name, 0.016 if motion is None else 0.008)
         point(f"objects{part}", position, label, size, color)
-        if motion is None:
-            lines(f"heights{part}", _to_table(position), 0.0012, (*color, 150))
+        if motion is None:  # from each row straight down, or up, to the table's top
+            onto = position * np.array([1, 1, 0], np.float32)
+            lines(f"heights{part}", np.stack([position, onto], axis=1), 0.0012, (*color, 150))
         if motion is None or name == GRIPPER:
             # The whole way, faint, and the way so far.
             whole = rr.LineStrips3D([position], colors=[(*color, 70)], radii=[0.0012])
             stream.log(f"{scene}/paths{part}", whole, static=True)
             trails.append(f"{scene}/trails{part}")
-            lines(f"trails{part}", _from_row_before(position), 0.003 if motion is None else 0.002, color)
+            before = np.concatenate([position[:1], position[:-1]])
+            lines(f"trails{part}", np.stack([before, position], axis=1), 0.003 if motion is None else 0.002, color)
 
     if goal.any():
         point("goal", goal, None if goals else "goal", 0.018, GREEN)
@@ -96,29 +101,20 @@ def _log_simple_robot(stream: Stream, scene: str, episode: RecordedEpisode) -> N
     box("gripper/wrist", [(0.0, 0.0, WRIST_RISE)], [WRIST_HALF], STEEL, [GRIPPER])
     box("gripper/fingers", None, [FINGER_HALF] * 2, GOLD)
     stream.send_columns(f"{scene}/gripper", times, rr.Transform3D.columns(translation=episode.objects[GRIPPER]))
-    fingers = rr.Boxes3D.columns(centers=_finger_centers(episode.observation[:, 3]))
+    half = episode.observation[:, 3] * FINGER_TRAVEL / 2 + FINGER_HALF[1]
+    zero, drop = np.zeros_like(half), np.full_like(half, -FINGER_DROP)
+    centers = np.stack([zero, half, drop, zero, -half, drop], axis=1).reshape(-1, 3)  # of two fingers, row by row
+    fingers = rr.Boxes3D.columns(centers=centers.astype(np.float32))
     stream.send_columns(f"{scene}/gripper/fingers", times, fingers.partition([2] * len(episode)))
 
 
-def _to_table(position: NDArray[np.float32]) -> NDArray[np.float32]:
-    """T×2×3 lines: from each row straight down (or up) to the table's top."""
-    return np.stack([position, position * np.array([1, 1, 0], np.float32)], axis=1)
-
-
-def _grid(spacing: float = 0.1) -> list[list[tuple[float, float, float]]]:
-    """Lines on the table, ``spacing`` metres apart."""
+def _grid() -> list[list[tuple[float, float, float]]]:
+    """Lines on the table, 10 cm apart."""
     middle, half = np.array(TABLE_CENTER[:2]), np.array(TABLE_HALF[:2])
     (left, near), (right, far), z = (middle - half).tolist(), (middle + half).tolist(), 0.0005
-    across = [[(left, y, z), (right, y, z)] for y in np.arange(near, far + 1e-6, spacing).tolist()]
-    along = [[(x, near, z), (x, far, z)] for x in np.arange(left, right + 1e-6, spacing).tolist()]
+    across = [[(left, y, z), (right, y, z)] for y in np.arange(near, far + 1e-6, 0.1).tolist()]
+    along = [[(x, near, z), (x, far, z)] for x in np.arange(left, right + 1e-6, 0.1).tolist()]
     return across + along
-
-
-def _finger_centers(opening: NDArray[np.float32]) -> NDArray[np.float32]:
-    """2T×3 centres of the fingers of T rows, metres in the gripper's frame; ``opening`` T in [0,1]."""
-    half = opening * FINGER_TRAVEL / 2 + FINGER_HALF[1]
-    zero, drop = np.zeros_like(half), np.full_like(half, -FINGER_DROP)
-    return np.stack([zero, half, drop, zero, -half, drop], axis=1).reshape(-1, 3).astype(np.float32)
 
 
 def _log_target(stream: Stream, scene: str, episode: RecordedEpisode, times: Sequence[Any]) -> None:
@@ -140,14 +136,3 @@ def _log_target(stream: Stream, scene: str, episode: RecordedEpisode, times: Seq
     stream.log(f"{scene}/target/position", style, static=True)
     points = rr.Points3D.columns(positions=end[shown], colors=colors[shown])
     stream.send_columns(f"{scene}/target/position", times, points.partition(shown.astype(int)))
-
-
-def _colors(objects: Mapping[str, Any], goals: Sequence[str]) -> dict[str, Color]:
-    others = [name for name in objects if name != GRIPPER]
-    palette = {name: OBJECT_COLORS[i % len(OBJECT_COLORS)] for i, name in enumerate(others)}
-    return {GRIPPER: GOLD} | palette | dict.fromkeys([name for name in goals if name != GRIPPER], GREEN)
-
-
-def _from_row_before(position: NDArray[np.float32]) -> NDArray[np.float32]:
-    """T×2×3 lines: from the row before (the first: from itself) to each row."""
-    return np.stack([np.concatenate([position[:1], position[:-1]]), position], axis=1)

@@ -104,7 +104,12 @@ def log_curves(stream: Stream, root: str, episode: RecordedEpisode) -> list[str]
     sent = ["action"]
     _send(stream, f"{root}/action", rows, episode.action, ACTION_NAMES)
     if (distance := episode.distance()) is not None:
-        _send_distance(stream, f"{root}/distance", distance, episode)
+        # One line in centimetres, in the colour of the step in force.
+        assert episode.in_force is not None
+        colors = [FALSE if step == NOBODY else step_color(step) for step in episode.in_force.tolist()]
+        stream.log(f"{root}/distance", rr.SeriesLines(names=["distance [cm]"], widths=[2.0]), static=True)
+        columns = [*rr.Scalars.columns(scalars=distance * 100), *rr.SeriesLines.columns(colors=colors)]
+        stream.send_columns(f"{root}/distance", time_columns(rows), columns)
         sent.append("distance")
     # A sparse reward is the success, which has a row in the timeline.
     if episode.reward is not None and not (
@@ -112,8 +117,10 @@ def log_curves(stream: Stream, root: str, episode: RecordedEpisode) -> list[str]
     ):
         _send(stream, f"{root}/reward", rows + 1, episode.reward[:, None], ["reward"], STEEL)
         sent.append("reward")
-    if episode.skill_weights is not None and episode.attends_softly:
-        _send(stream, f"{root}/skill_weights", rows, episode.skill_weights, episode.skills)
+    weights = episode.skill_weights
+    if weights is not None and bool(((weights > 1e-3) & (weights < 1 - 1e-3)).any()):  # else the timeline has them
+        texts = [f" {skill}" for _, skill in episode.steps] or [""] * weights.shape[1]
+        _send(stream, f"{root}/skill_weights", rows, weights, [f"{i}{text}" for i, text in enumerate(texts, 1)])
         sent.append("skill_weights")
     if episode.corrected is not None:
         _send(stream, f"{root}/corrected", rows, episode.corrected[:, None], ["of the correction"])
@@ -126,12 +133,3 @@ def _send(stream: Stream, path: str, steps: Any, values: Any, names: Sequence[st
     stream.log(path, rr.SeriesLines(names=names, colors=colors, widths=[1.5] * len(names)), static=True)
     columns = rr.Scalars.columns(scalars=values.ravel()).partition([values.shape[1]] * len(values))
     stream.send_columns(path, time_columns(steps), columns)
-
-
-def _send_distance(stream: Stream, path: str, distance: NDArray[np.float32], episode: RecordedEpisode) -> None:
-    """One line in centimetres, in the colour of the step in force."""
-    assert episode.in_force is not None
-    stream.log(path, rr.SeriesLines(names=["distance [cm]"], widths=[2.0]), static=True)
-    colors = [FALSE if step == NOBODY else step_color(step) for step in episode.in_force.tolist()]
-    columns = [*rr.Scalars.columns(scalars=distance * 100), *rr.SeriesLines.columns(colors=colors)]
-    stream.send_columns(path, time_columns(np.arange(len(distance))), columns)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lw_torchrl.evaluation.failures import CAUSES, Failure
+from lw_torchrl.evaluation.failure_records import CAUSES, Failure
 from lw_torchrl.record.recorded_episode import NOBODY, RecordedEpisode
 
 AFTER_SUCCESS, AROUND_FAILURE = 20, 60
@@ -34,18 +34,14 @@ class Heading:
         known = [f"{name} {number}" for name, number in numbers.items() if number is not None]
         return [self.task, *known, *([] if self.policy is None else [self.policy])]
 
-    def outcome(self, episode: RecordedEpisode) -> str:
-        """How it ended: "success at 87", "failed: skill", "failed"; nothing where the rollout does not say."""
-        if episode.first_success is not None:
-            return f"success at {episode.first_success}"
-        if self.failure is not None:
-            return f"failed: {self.failure.cause}"
-        return "" if episode.success is None else "failed"
-
     def title(self, episode: RecordedEpisode, name: str | None) -> str:
-        """The tab's: the name that a user gave or the task's, what else is known, and how it ended."""
-        told = [name or self.task, *self.parts()[1:], self.outcome(episode)]
-        return " · ".join(filter(None, told))
+        """The tab's: the name that a user gave or the task's, what else is known, and how it ended, if that is."""
+        ended = "" if episode.success is None else "failed"
+        if episode.first_success is not None:
+            ended = f"success at {episode.first_success}"
+        elif self.failure is not None:
+            ended = f"failed: {self.failure.cause}"
+        return " · ".join(filter(None, [name or self.task, *self.parts()[1:], ended]))
 
 
 def decisive_step(heading: Heading, episode: RecordedEpisode) -> int:

@@ -28,22 +28,9 @@ from lw_torchrl.record.rerun_binary import LOCAL, failure, free_port, running
 LARGE = 30 * 10**6
 START_SECONDS = 60.0
 
-_INSIDE = """const load = (name) => {
-  const text = atob(document.getElementById(name).textContent);
-  const bytes = new Uint8Array(text.length);
-  for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
-  return unpack(new Blob([bytes]).stream());
-};"""
-
 ASKING_SECONDS, STALLED_SECONDS = 30.0, 30.0
 """How long a request may take to come as a whole, and each piece of an answer to be taken."""
 _PIECE = 65_536
-
-_FETCHED = """const load = async (name) => {
-  const answer = await fetch(name + ".gz");
-  if (!answer.ok) throw new Error(name + ": " + answer.status);
-  return unpack(answer.body);
-};"""
 
 
 @checked
@@ -52,20 +39,14 @@ def write_html(
 ) -> Path:
     """Write a recording as one page to send to somebody: it opens from disk, without a network.
 
-    The page is some 20 MB of viewer and the recording, compressed. It wants WebGL 2 or WebGPU.
+    The page is some 20 MB of viewer and the recording, compressed. It wants WebGL 2 or WebGPU. The other arguments and
+    the errors are those of :func:`open_viewer`.
 
     Args:
-        path: the .rrd file, or a folder that holds one.
         page: the .html file; it is replaced whole or not at all.
-        episode: the tab to open at, by its title or its episode's name; None takes the layout's.
-        step: where the time cursor stands; None takes the step that tells most of an episode.
 
     Returns:
         The page's path.
-
-    Raises:
-        FileNotFoundError: there is no such recording, or rerun is not installed.
-        ValueError: the recording is damaged or has no such tab or step.
 
     Example:
         >>> write_html("runs/demo/rollout.rrd", "rollout.html")  # doctest: +SKIP
@@ -78,10 +59,9 @@ def write_html(
         data = {"recording": gzip.compress(file.read_bytes(), 6)}
     script, data["wasm"] = _viewer_files()
     script = script.replace("</script", "<\\/script")
-    inline = [f"<script>{script}</script>"]
-    for name, content in data.items():
-        inline.append(f'<script type="text/plain" id="{name}">{base64.b64encode(content).decode()}</script>')
-    text = _page(recording.stem, "\n".join(inline), _INSIDE, at)
+    texts = {name: base64.b64encode(content).decode() for name, content in data.items()}
+    parts = [f'<script type="text/plain" id="{name}">{content}</script>' for name, content in texts.items()]
+    text = _page(recording.stem, "\n".join([f"<script>{script}</script>", *parts]), at)
     with replacing(target) as file:
         file.write_text(text, encoding="utf-8")
     if len(text) > LARGE:
@@ -92,18 +72,14 @@ def write_html(
 class WebPage(AbstractContextManager["WebPage"]):
     """A recording as a page at ``address``, served until :meth:`close`.
 
-    The recording is read once, when the page is made; where it still grows, make another.
+    The recording is read once, when the page is made; where it still grows, make another. The other arguments and
+    errors are those of :func:`open_viewer`.
 
     Args:
-        path: the .rrd file, or a folder that holds one.
-        episode: the tab to open at, by its title or its episode's name; None takes the layout's.
-        step: where the time cursor stands; None takes the step that tells most of an episode.
         port: of this machine, 127.0.0.1; 0 takes a free one. Another machine reaches it through a tunnel,
             ``ssh -L 8000:127.0.0.1:PORT``.
 
     Raises:
-        FileNotFoundError: there is no such recording, or rerun is not installed.
-        ValueError: the recording is damaged, or has no such tab or step.
         OSError: the port is taken.
 
     Example:
@@ -121,7 +97,7 @@ class WebPage(AbstractContextManager["WebPage"]):
             at = opening_step(file, episode, step)
             data = gzip.compress(file.read_bytes(), 1)
         script, wasm = _viewer_files()
-        page = _page(recording.stem, '<script src="viewer.js"></script>', _FETCHED, at)
+        page = _page(recording.stem, '<script src="viewer.js"></script>', at)
         files = {
             "/": ("text/html; charset=utf-8", page.encode()),
             "/viewer.js": ("text/javascript; charset=utf-8", script.encode()),
@@ -184,12 +160,12 @@ def _handler(files: dict[str, tuple[str, bytes]]) -> type[BaseHTTPRequestHandler
     return Handler
 
 
-def _page(title: str, data: str, load: str, step: int | None) -> str:
-    """The page of the viewer, which gets its parts by the JavaScript function ``load`` and opens at ``step``."""
-    template = Template((Path(__file__).with_name("viewer_page.html")).read_text(encoding="utf-8"))
+def _page(title: str, data: str, step: int | None) -> str:
+    """The page of the viewer, which opens at ``step``."""
+    template = Template(Path(__file__).with_name("viewer_page.html").read_text(encoding="utf-8"))
     quoted = json.dumps(title).replace("<", "\\u003c")
     cursor = json.dumps(None if step is None else {"request": list(request(step)), "sign": list(sign(step))})
-    return template.substitute(title=html.escape(title), title_json=quoted, data=data, load=load, cursor=cursor)
+    return template.substitute(title=html.escape(title), title_json=quoted, data=data, cursor=cursor)
 
 
 @cache

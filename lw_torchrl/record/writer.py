@@ -42,11 +42,7 @@ _URL = re.compile(
 class RecordingWriter:
     """A rerun stream and where it goes: to memory first, so that no file and no viewer holds up rerun.
 
-    Args:
-        path: the file, or None. An older one of that name is set aside, and ``previous`` is its new name.
-        connect: the address of a viewer, or None.
-        application_id, name: of the recording.
-        prepare: called before each write, in whatever thread it is; sends what its owner holds back.
+    ``prepare`` is called before each write, in whatever thread it is; it sends what the writer's owner holds back.
     """
 
     def __init__(
@@ -94,37 +90,26 @@ class RecordingWriter:
             if piece and self._viewer is not None:
                 self._viewer.send(piece)
 
-    def close(self, timeout: float | None = None) -> None:
-        """Write the rest and end the file."""
+    def close(self, timeout: float | None = None, *, discard: bool = False) -> None:
+        """Write the rest and end the file; or drop all, and an older file of that name gets it back."""
         with self._lock:
             if self._closed:
                 return
-            self.write(timeout)
-            self._end()
-            if self._file is not None:
+            if not discard:
+                self.write(timeout)
+            self._closed = True
+            self._stop.set()
+            self.stream.disconnect()
+            self._pieces.read(flush=False)  # else rerun complains of what is dropped
+            if self._file is not None and discard:
+                self._file.discard()
+            elif self._file is not None:
                 try:
                     self._file.close(compact=not self._file_lost)
                 except (OSError, ValueError) as error:
                     self.troubles.append(f"recording {str(self._file.path)!r} got no index: {error}")
         if self._viewer is not None:
             self._viewer.close(timeout)
-
-    def discard(self) -> None:
-        """End without a file; an older one of that name gets it back."""
-        with self._lock:
-            if self._closed:
-                return
-            self._end()
-            if self._file is not None:
-                self._file.discard()
-        if self._viewer is not None:
-            self._viewer.close()
-
-    def _end(self) -> None:
-        self._closed = True
-        self._stop.set()
-        self.stream.disconnect()
-        self._pieces.read(flush=False)  # else rerun complains of what is dropped
 
     def take_troubles(self) -> list[str]:
         """What went wrong since the last call."""

@@ -6,7 +6,7 @@ import os
 import warnings
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
@@ -17,9 +17,9 @@ from torchrl.data import TensorDictReplayBuffer
 from torchrl.objectives import BCLoss
 from torchrl.record.loggers import Logger
 
-from lw_torchrl._checks import check_choice, check_fields, check_int, check_positive, check_scale, checked
+from lw_torchrl._checks import Count, Positive, Scale, check_fields, checked
 from lw_torchrl._devices import place
-from lw_torchrl.language.plan_tables import PlanTables
+from lw_torchrl.language.task_index import PlanTables
 from lw_torchrl.modules.policy import Policy
 from lw_torchrl.modules.query_evaluator import QueryEvaluator
 from lw_torchrl.objectives.skill_latents import Kind, latent_term, skill_encoder
@@ -30,7 +30,6 @@ from lw_torchrl.training.loop import ReplayState, Training, make_schedule
 from lw_torchrl.training.normalization import check_contacts, fit_normalization
 from lw_torchrl.transforms.qaf import plan_program
 
-LOSSES = ("l1", "l2", "smooth_l1")
 _LATER = {"latent_consistency", "latent_contrast", "qaf_anchor"}
 """Options that files did not say at first: at 0, training is what it was before them."""
 
@@ -41,7 +40,7 @@ class BehavioralCloningConfig:
 
     Attributes:
         steps: minibatches.
-        batch_size: rows of a minibatch; the number of tasks must divide it.
+        batch_size: rows of a minibatch; with a :class:`TaskBalancedSampler` the number of tasks must divide it.
         learning_rate: at the start.
         optimizer: "adamw" or "sgd".
         weight_decay: the optimizer's.
@@ -59,33 +58,24 @@ class BehavioralCloningConfig:
             policy with an evaluator: its conditions keep to their words.
     """
 
-    steps: int = 8000
-    batch_size: int = 500
-    learning_rate: float = 1e-3
-    optimizer: str = "adamw"
-    weight_decay: float = 1e-4
-    momentum: float = 0.9
-    schedule: str = "cosine"
+    steps: Count = 8000
+    batch_size: Count = 500
+    learning_rate: Scale = 1e-3
+    optimizer: Literal["adamw", "sgd"] = "adamw"
+    weight_decay: Scale = 1e-4
+    momentum: Scale = 0.9
+    schedule: Literal["cosine", "constant"] = "cosine"
     normalize: bool = True
-    loss_function: str = "l2"
-    max_grad_norm: float = 1.0
+    loss_function: Literal["l1", "l2", "smooth_l1"] = "l2"
+    max_grad_norm: Positive = 1.0
     seed: int = 0
-    checkpoint_every: int = 500
-    latent_consistency: float = 0.0
-    latent_contrast: float = 0.0
-    qaf_anchor: float = 0.0
+    checkpoint_every: Count = 500
+    latent_consistency: Scale = 0.0
+    latent_contrast: Scale = 0.0
+    qaf_anchor: Scale = 0.0
 
     def __post_init__(self) -> None:
         check_fields(self)
-        for name in ("steps", "batch_size", "checkpoint_every"):
-            check_int(name, getattr(self, name), minimum=1)
-        for name in ("learning_rate", "weight_decay", "momentum", *sorted(_LATER)):
-            check_scale(name, getattr(self, name))
-        check_positive("max_grad_norm", self.max_grad_norm)
-        check_int("seed", self.seed)
-        check_choice("loss_function", self.loss_function, LOSSES)
-        check_choice("optimizer", self.optimizer, ("adamw", "sgd"))
-        check_choice("schedule", self.schedule, ("cosine", "constant"))
 
     def describe(self) -> dict[str, Any]:
         """What files say of it, as JSON: files from before an option hold what those with its default hold."""
@@ -94,11 +84,10 @@ class BehavioralCloningConfig:
 
 def make_optimizer(parameters: Iterable[Tensor], config: BehavioralCloningConfig) -> torch.optim.Optimizer:
     """The optimizer of a configuration."""
-    rate = float(config.learning_rate)  # as it is in a checkpoint
-    decay, momentum = config.weight_decay, config.momentum
+    rate, decay = float(config.learning_rate), config.weight_decay  # a float, as it is in a checkpoint
     if config.optimizer == "adamw":
         return torch.optim.AdamW(parameters, lr=rate, weight_decay=decay, fused=True)
-    return torch.optim.SGD(parameters, lr=rate, momentum=momentum, weight_decay=decay, fused=True)
+    return torch.optim.SGD(parameters, lr=rate, momentum=config.momentum, weight_decay=decay, fused=True)
 
 
 def bc_loss(actor: nn.Module, distance: str) -> BCLoss:
@@ -109,17 +98,16 @@ def bc_loss(actor: nn.Module, distance: str) -> BCLoss:
 
 
 class LatentTerms(nn.Module):
-    """The weighted sum of a configuration's terms on the latents of an actor's skills; a module, for
-    ``functional_call``. With no ``weights`` it must not be called; an actor without plans has no terms."""
+    """The weighted sum of a configuration's terms on the latents of an actor's skills, of which there must be some; a
+    module, for ``functional_call``."""
 
     def __init__(self, actor: Any, config: BehavioralCloningConfig) -> None:
         super().__init__()
-        asked: list[tuple[str, Kind]] = [("latent_consistency", "consistency"), ("latent_contrast", "contrastive")]
-        self.weights: dict[Kind, float] = {}
-        for name, kind in asked:
-            if weight := getattr(config, name):
-                skill_encoder(name, actor)
-                self.weights[kind] = weight
+        kinds: dict[str, Kind] = {"latent_consistency": "consistency", "latent_contrast": "contrastive"}
+        asked = {name: weight for name in kinds if (weight := getattr(config, name))}
+        for name in asked:
+            skill_encoder(name, actor)
+        self.weights = {kinds[name]: weight for name, weight in asked.items()}
         self.actor = actor
 
     def forward(self) -> Tensor:
@@ -129,8 +117,8 @@ class LatentTerms(nn.Module):
 
 
 class EvaluatorAnchor:
-    """The mean cross entropy of the answers of an actor's evaluator to its plans' conditions with the query answering
-    function's. It holds the evaluator to the words while the loss of imitation trains it."""
+    """The mean cross entropy of the answers of an actor's evaluator with the query answering function's: it holds the
+    evaluator to the words while the loss of imitation trains it."""
 
     def __init__(self, actor: Any) -> None:
         evaluator = getattr(actor, "evaluator", None)
@@ -140,8 +128,7 @@ class EvaluatorAnchor:
         self.program, self.tables = plan_program(evaluator.plans), PlanTables(evaluator.plans)
 
     def __call__(self, batch: TensorDictBase) -> Tensor:
-        """() float32, of a minibatch with ``observation`` (B, 39) float32, ``task_id`` (B,) int64 and what the
-        evaluator reads."""
+        """() float32, of a minibatch with ``observation``, ``task_id`` and what the evaluator reads."""
         task = batch.get("task_id")
         logits = self.evaluator.answers(*(batch.get(key) for key in self.evaluator.in_keys))
         truth = self.program(batch.get("observation"), task).to(logits.dtype)
@@ -157,26 +144,16 @@ class BehavioralCloningTrainer(Training):
 
     Args:
         actor: it is trained in place.
-        replay: samples with what the actor reads and ``action`` (B, 4) float32. Its generator is set to the
-            configuration's seed.
-        config: how to train.
-        checkpoint: a file to write checkpoints to. If it is there already, training carries on from it.
-        logger: a TorchRL logger for the loss and the learning rate.
-        progress: show a progress bar.
+        replay: samples with what the actor reads and ``action`` (B, 4) float32.
+        config, checkpoint, logger, progress: as of :class:`~lw_torchrl.training.loop.Training`, with its errors.
         device: where to train: "cpu", "cuda", "cuda:1", "mps", or "auto" for the fastest that there is. The actor is
             moved there, and stays; None for where it is. On a GPU no step waits for another: losses are read every 100
             steps. Make the buffer with the same ``device``, or each minibatch has to go over.
 
-    Warns:
-        UserWarning: the checkpoint was written on another kind of device, or under other versions of torch, say:
-            training goes on with the same minibatches, but not bit for bit.
-
     Raises:
-        ValueError: the checkpoint is damaged, of another architecture, configuration or data; the actor writes no
-            ``action``, has no plans for the configuration's terms on skills' latents, or no evaluator for its anchor;
-            or, in :meth:`train`, the loss or the weights are no numbers.
+        ValueError: the actor writes no ``action``, has no plans for the configuration's terms on skills' latents, or no
+            evaluator for its anchor.
         TypeError: a checkpoint for an actor that is no :class:`Policy`.
-        OSError: the checkpoint cannot be written; the earlier one stays.
 
     Example:
         >>> import lw_torchrl as lw, tempfile

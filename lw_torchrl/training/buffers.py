@@ -14,23 +14,25 @@ from lw_torchrl.modules.critics import Value
 from lw_torchrl.modules.policy import plans_of
 
 
-def _check_plans(network: Any, replay: TensorDictReplayBuffer) -> None:
-    """Raise :class:`ValueError` unless the buffer answers the queries of a network's plans, where it has plans."""
-    if (own := plans_of(network)) is None:
-        return
-    for transform in replay.transform:
-        answered = plans_of(transform)
-        if answered is not None and (different := answered.differences(own)):
-            name = "critic" if isinstance(network, Value) else "actor"
-            raise ValueError(
-                f"replay's QAFTransform must have the {name}'s plans, they differ for {', '.join(different)}; use "
-                f"{name}.transform()"
-            )
-
-
-def _check_draws(replay: TensorDictReplayBuffer) -> None:
-    """Raise :class:`ValueError` if the sampler would draw on a device, where the trainers' generators are not, or by
-    priorities, which no trainer changes."""
+def check_minibatches(networks: Iterable[Any], replay: TensorDictReplayBuffer, size: int) -> None:
+    """Raise :class:`ValueError` unless networks can be trained on a buffer's minibatches, and training be resumed: the
+    buffer answers the queries of their plans, and draws neither ahead, nor on a device, where the trainers' generators
+    are not, nor by priorities, which no trainer changes."""
+    for network in networks:
+        own = plans_of(network)
+        for answered in map(plans_of, replay.transform):
+            if own is not None and answered is not None and (different := answered.differences(own)):
+                name = "critic" if isinstance(network, Value) else "actor"
+                raise ValueError(
+                    f"replay's QAFTransform must have the {name}'s plans, they differ for {', '.join(different)}; use "
+                    f"{name}.transform()"
+                )
+    if replay._prefetch:
+        raise ValueError("replay must not prefetch: batches drawn ahead would be lost when training is resumed")
+    if replay.batch_size not in (None, size):
+        raise ValueError(
+            f"batch_size of the replay buffer must be None or the configuration's, {size}, got {replay.batch_size}"
+        )
     rows, sampler = replay.storage, replay.sampler
     if isinstance(sampler, PrioritizedSampler):
         raise ValueError("replay: nothing here gives rows new priorities, so a PrioritizedSampler draws them all alike")
@@ -40,19 +42,6 @@ def _check_draws(replay: TensorDictReplayBuffer) -> None:
             f"replay: a {type(sampler).__name__} draws on {device}, where its rows are, with a generator of its own; "
             "take a TaskBalancedSampler or a CoLearningSampler, or leave the rows on the CPU: minibatches then go over"
         )
-
-
-def check_minibatches(networks: Iterable[Any], replay: TensorDictReplayBuffer, size: int) -> None:
-    """Raise :class:`ValueError` unless networks can be trained on a buffer's minibatches, and training be resumed."""
-    for network in networks:
-        _check_plans(network, replay)
-    if replay._prefetch:
-        raise ValueError("replay must not prefetch: batches drawn ahead would be lost when training is resumed")
-    if replay.batch_size not in (None, size):
-        raise ValueError(
-            f"batch_size of the replay buffer must be None or the configuration's, {size}, got {replay.batch_size}"
-        )
-    _check_draws(replay)
 
 
 def check_replay(actor: Any, replay: TensorDictReplayBuffer, size: int) -> None:

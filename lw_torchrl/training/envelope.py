@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 import os
 import warnings
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -22,13 +22,13 @@ import torch
 from torch import Tensor, nn
 
 from lw_torchrl._checks import differences, shown
-from lw_torchrl._state_tree import join, split
+from lw_torchrl._state_tree import check_like, join, split
 from lw_torchrl._tensor_archive import ArchiveError, TensorArchive, write_archive
 from lw_torchrl._versions import LIBRARIES, warn_of_other_versions
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.training.file_checks import (
-    check_options,
-    check_remade,
+    check_finite,
+    check_integers,
     check_size,
     check_texts,
     copy_weights,
@@ -37,9 +37,6 @@ from lw_torchrl.training.file_checks import (
 
 _ADDED = {"actors", "replay"}
 """What older descriptions do not say: a training that was begun without it goes on."""
-
-MISFITS = (ValueError, KeyError, TypeError, RuntimeError, AttributeError)
-"""What a training state of another structure raises where it is loaded."""
 
 Module = TypeVar("Module", bound=nn.Module)
 
@@ -56,12 +53,14 @@ class Envelope:
     command: str
     group: str = "weights"
 
-    def check_about(self, about: Collection[str]) -> None:
-        """Raise :class:`ValueError` for a name that a file gives itself."""
+    def save(self, path: str | os.PathLike[str], module: Any, texts: Mapping[str, Tensor], about: dict) -> None:
+        """Write a module that a file can hold, and ``about``; :class:`ValueError` if it names what a file says."""
         if reserved := {"format", "version", "versions", self.part, "state", "sha256"} & set(about):
             raise ValueError(
                 f"about must not be named {', '.join(sorted(reserved))}, which {self.called} file says itself"
             )
+        groups = {"weights": module.state_dict(), "texts": texts}
+        self.write(path, {self.part: module.describe(), **about}, groups)
 
     def write(
         self,
@@ -120,7 +119,10 @@ class Envelope:
         described = module.describe()
         try:
             with torch.random.fork_rng(devices=[]):
-                check_remade(module, make(json.loads(json.dumps(described))))
+                again = make(json.loads(json.dumps(described)))
+            weights = module.state_dict(keep_vars=True)
+            check_like(weights, again.state_dict(), "weights")
+            check_finite(weights, weights)
         except Exception as error:
             raise ValueError(
                 f"{self.part} cannot be kept in a file, which would not make it again from its description "
@@ -134,13 +136,13 @@ class Envelope:
         encoder: TextEncoder | None,
         texts_of: Callable[[Module], dict[str, Tensor]],
     ) -> Module:
-        """The module of a file, in eval mode; ``make`` makes it of its description and a text encoder, and ``texts_of``
-        gives the vectors of its texts. :class:`ValueError` if its weights, sizes or texts are not those it says."""
+        """The module of a file, in eval mode, that ``make`` makes of its description and a text encoder;
+        :class:`ValueError` if its weights, sizes or texts, which ``texts_of`` gives, are not those it says."""
         archive = self.open(path)
         described = archive.description[self.part]
         try:
             weights, texts = archive.tensors(self.group), archive.tensors("texts")
-            check_options(described, weights)
+            check_integers(described, sum(tensor.numel() for tensor in weights.values()), len(weights))
             check_size(lambda stand_in: make(described, stand_in), weights, texts)
             module = make(described, encoder)
             check_texts(texts, texts_of(module))
@@ -164,11 +166,8 @@ class Envelope:
         device: torch.device | None = None,
         packages: Sequence[str] = LIBRARIES,
     ) -> None:
-        """Go on with the training of a file.
-
-        Warns:
-            UserWarning: the file was written on another kind of device, or under other versions of packages.
-        """
+        """Go on with the training of a file; warn if it was written on another kind of device, or under other
+        versions of packages."""
         archive = self.open(path)
         check_same_description(path, archive.description, described)
         if device is not None and (before := archive.description.get("device", "cpu")) != device.type:
@@ -186,7 +185,7 @@ class Envelope:
                 check_texts(archive.tensors("texts"), texts)
             copy_weights(archive.tensors(self.group), live)
             load(state)
-        except (*MISFITS, RecursionError) as error:
+        except (ValueError, KeyError, TypeError, RuntimeError, AttributeError) as error:  # RecursionError among them
             raise ValueError(
                 f"checkpoint: {str(path)!r} does not fit, it is of another architecture or damaged "
                 f"({first_line(error)})"
@@ -210,9 +209,11 @@ def check_description(path: Path, ours: Mapping[str, Any]) -> None:
 def check_same_description(path: Path, found: Mapping[str, Any], ours: Mapping[str, Any]) -> None:
     """Raise :class:`ValueError` unless a file's description ``found`` is ``ours``."""
     for part, wanted in json.loads(json.dumps(ours)).items():  # JSON has lists, but no tuples
-        if found.get(part) == wanted or (part in _ADDED and part not in found):
-            continue
         before = found.get(part)
+        if part == "online" and isinstance(before, dict):  # older files list the options of all methods
+            before = {name: value for name, value in before.items() if name in wanted}
+        if before == wanted or (part in _ADDED and part not in found):
+            continue
         different = differences(before if isinstance(before, dict) else {}, wanted or {})
         kind = "architecture" if part in ("actor", "actors", "evaluator", "loss") else "configuration"
         raise ValueError(

@@ -12,8 +12,8 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from lw_torchrl._checks import check_scale, checked_but
-from lw_torchrl._state_tree import check_optimizer_state
+from lw_torchrl._checks import Count, Scale, checked_but
+from lw_torchrl._state_tree import check_like, check_optimizer_state
 from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.language.observation import OPENING
 from lw_torchrl.modules.clause_evaluator import ClauseEvaluator
@@ -37,15 +37,10 @@ class ImageQueryEvaluatorConfig(QueryEvaluatorConfig):
             the loss, of an evaluator with ``structure``: the simulator knows them. 0 to learn from answers alone.
     """
 
-    steps: int = 4000
-    batch_size: int = 48
-    learning_rate: float = 1e-3
-    every: int = 5
-    position_weight: float = 1.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_scale("position_weight", self.position_weight)
+    batch_size: Count = 48
+    learning_rate: Scale = 1e-3
+    every: Count = 5
+    position_weight: Scale = 1.0
 
 
 class _StateMinibatches:
@@ -57,25 +52,21 @@ class _StateMinibatches:
         self.clauses, self.vectors = evaluator.code([(one.task, clause) for one in asked for clause in one.clauses])
         self.negatable = len(self.clauses.predicate) // 2 if self.vectors is not None else 0
         names = [clause.predicate for one in asked for clause in one.clauses]
-        number = {name: place for place, name in enumerate(sorted({*names}))}
-        kind = torch.tensor([number[name] for name in names])
-        groups: list[list[Tensor]] = [[] for _ in range(2 * len(number))]
+        kinds = sorted({*names})
+        kind = torch.tensor([2 * kinds.index(name) for name in names], dtype=torch.uint8)
+        groups: list[list[Tensor]] = [[] for _ in range(2 * len(kinds))]
         row = first = 0
         for one in asked:
-            of = kind[first : first + len(one.clauses)]
-            for place in of.unique().tolist():
-                columns = (of == place).nonzero()[:, 0]
-                for truth in (0, 1):
-                    at = (one.truth[:, columns] == bool(truth)).nonzero()
-                    pairs = torch.stack((at[:, 0] + row, columns[at[:, 1]] + first), -1)
-                    groups[2 * place + truth].append(pairs.int())
-            row, first = row + len(one.observation), first + len(one.clauses)
-        parts = [(torch.cat(found), place % 2) for place, found in enumerate(groups) if found]
-        parts = [(found, truth) for found, truth in parts if len(found)]
-        self.pairs = torch.cat([found for found, _ in parts])
-        self.sizes = torch.tensor([len(found) for found, _ in parts])
+            rows, clauses = one.truth.shape
+            begin, code = torch.tensor([row, first], dtype=torch.int32), kind[first : first + clauses] + one.truth
+            for number, group in enumerate(groups):
+                group.append((code == number).nonzero().int().add_(begin))
+            row, first = row + rows, first + clauses
+        parts = [torch.cat(group) for group in groups]
+        self.pairs = torch.cat(parts)
+        self.sizes = torch.tensor([len(part) for part in parts if len(part)])
         self.starts = self.sizes.cumsum(0) - self.sizes
-        self.truths = torch.tensor([bool(truth) for _, truth in parts])
+        self.truths = torch.tensor([number % 2 == 1 for number, part in enumerate(parts) if len(part)])
         self.labels = _digest((self.observation, self.pairs, self.sizes))
 
     def draw(self, step: int, generator: torch.Generator) -> tuple[Tensor, Any, Tensor]:
@@ -110,7 +101,7 @@ class _PictureMinibatches:
         self.labels = _digest(tensor for one in asked for tensor in (one.observation, one.truth, one.seen("pixels")))
 
     def _known_positions(self, asked: Asked) -> tuple[Tensor, Tensor, Tensor]:
-        """The things of a task, (n,) int64; where they are, (R, n, 4) float32; and what of that counts, (n, 4)."""
+        """A task's things, (n,); where they are, and how far the gripper is open, (R, n, 4); what counts, (n, 4)."""
         names = [name for name in asked.task.object_names if name in self.evaluator.names]
         positions, number = asked.task.positions(asked.observation), self.evaluator.names.index
         known = torch.zeros(len(asked.observation), len(names), 4)
@@ -126,7 +117,6 @@ class _PictureMinibatches:
         return torch.stack([self._task_loss(task, each, generator) for task in range(len(self.asked))]).mean()
 
     def _task_loss(self, task: int, size: int, generator: torch.Generator) -> Tensor:
-        """Of so many states of a task."""
         asked, network = self.asked[task], self.evaluator.network
         coded, vectors = self.coded[task]
         rows = torch.randint(len(asked.observation), (size,), generator=generator)
@@ -148,8 +138,7 @@ class _PictureMinibatches:
 
 
 def _answer_weights(asked: Asked) -> Tensor:
-    """(2, Q) float32, the weight of a clause's false and true answers, by which each predicate and truth weighs
-    alike."""
+    """(2, Q) float32, of a clause's false and true answers: each predicate and truth weighs alike."""
     true = asked.truth.double().mean(0)
     names = [clause.predicate for clause in asked.clauses]
     weights = torch.zeros(2, len(names))
@@ -170,26 +159,18 @@ def _digest(tensors: Iterable[Tensor]) -> str:
 class QueryEvaluatorTrainer(Training):
     """Trains an evaluator on the answers of the query answering function to all base queries of tasks.
 
-    A minibatch has equally many of each predicate and truth, as far as there are any; within these, pairs of a state
-    and a clause are drawn alike. An evaluator that reads texts is asked half of the clauses negated. A step's minibatch
-    hangs on the seed and the step alone.
+    A minibatch has equally many pairs of a state and a clause of each predicate and truth, as far as there are any. An
+    evaluator that reads texts is asked half of the clauses negated. A minibatch hangs on the seed and the step alone.
 
     Args:
         evaluator: it is trained in place; its plans do not matter.
         data: what is asked, and what of it is held out.
         config: how to train, the one that the data were made with.
-        checkpoint: a file to write checkpoints to, which :func:`load_evaluator` reads. If it is there already, training
-            carries on from it, bit for bit.
-        progress: show a progress bar.
-
-    Warns:
-        UserWarning: the checkpoint was written under another version of torch or another package that bits hang on: it
-            goes on, but not bit for bit.
+        checkpoint, progress: as of :class:`~lw_torchrl.training.loop.Training`, with its errors;
+            :func:`load_evaluator` reads the file.
 
     Raises:
         TypeError: the evaluator is no :class:`StateQueryEvaluator`.
-        ValueError: the checkpoint is damaged, or of another evaluator, configuration or data; or, in :meth:`train`, the
-            loss is no number.
 
     Example:
         >>> import lw_torchrl as lw, tempfile
@@ -225,10 +206,9 @@ class QueryEvaluatorTrainer(Training):
         if not data.parts["training"]:
             raise ValueError("data must have states and queries to train on, all are held out")
         self._minibatches = type(self).minibatches(evaluator, data.parts["training"], config)
-        trained = (weight for weight in evaluator.parameters() if weight.requires_grad)
-        self.optimizer = torch.optim.AdamW(trained, lr=float(config.learning_rate), weight_decay=config.weight_decay)
-        for group in self.optimizer.param_groups:
-            group["initial_lr"] = group["lr"]
+        trained, rate = [one for one in evaluator.parameters() if one.requires_grad], float(config.learning_rate)
+        groups = [{"params": trained, "initial_lr": rate}]
+        self.optimizer = torch.optim.AdamW(groups, lr=rate, weight_decay=config.weight_decay)
         if self.checkpoint is not None:
             check_evaluator_can_be_saved(evaluator)
             described = data.describe() | {"labels": self._minibatches.labels}
@@ -242,9 +222,8 @@ class QueryEvaluatorTrainer(Training):
         return {"step": self.steps, "optimizer": self.optimizer.state_dict()}
 
     def load_state_dict(self, found: dict[str, Any]) -> None:
-        if set(found) != {"step", "optimizer"}:
-            raise ValueError("a training state has step and optimizer")
-        if type(found["step"]) is not int or not 0 <= found["step"] <= self.config.steps:
+        check_like({**found, "optimizer": None}, {"step": 0, "optimizer": None}, "state")
+        if not 0 <= found["step"] <= self.config.steps:
             raise ValueError(f"step must be from 0 to {self.config.steps}")
         check_optimizer_state(found["optimizer"], self.optimizer, found["step"])
         self.optimizer.load_state_dict(found["optimizer"])
@@ -268,10 +247,10 @@ class QueryEvaluatorTrainer(Training):
 
 
 class ImageQueryEvaluatorTrainer(QueryEvaluatorTrainer):
-    """Trains an evaluator of pictures on the answers of the query answering function to all base queries of tasks.
+    """Trains an evaluator of pictures, as :class:`QueryEvaluatorTrainer` does one of states.
 
     A minibatch has equally many states of each task; of each state all clauses are asked, and each predicate and truth
-    weighs alike. Arguments, errors and files are as for :class:`QueryEvaluatorTrainer`.
+    weighs alike.
 
     Raises:
         TypeError: the evaluator is no :class:`ImageQueryEvaluator`, or the configuration is of another class.

@@ -15,13 +15,6 @@ from lw_torchrl.language.text import TEXT_DIMENSION, TextEncoder
 _TEXT_TOLERANCE = 0.01  # of numbers of size 1: more than machines differ, far less than encoders do
 
 
-def check_remade(module: nn.Module, again: nn.Module) -> None:
-    """Raise :class:`ValueError` unless what was made again of a description can hold the weights, all finite."""
-    weights = module.state_dict(keep_vars=True)
-    check_like(weights, again.state_dict(), "weights")
-    check_finite(weights, weights)
-
-
 def check_finite(weights: Mapping[str, Tensor], live: Mapping[str, Tensor]) -> None:
     """Raise :class:`ValueError` unless the weights of what is a parameter in ``live`` are finite, and the statistics of
     features too, with a standard deviation above 0."""
@@ -31,14 +24,6 @@ def check_finite(weights: Mapping[str, Tensor], live: Mapping[str, Tensor]) -> N
             raise ValueError(f"weights: {name} must be finite, it holds NaN or infinity")
         if name.endswith("features.std") and not (weights[name] > 0).all():
             raise ValueError(f"weights: {name} must be above 0, it holds {weights[name].min().item()}")
-
-
-def check_trained(weights: Mapping[str, Tensor], step: int) -> None:
-    """Raise :class:`ValueError` if training has made parameters that are no numbers."""
-    try:
-        check_finite(weights, weights)
-    except ValueError as error:
-        raise ValueError(f"{error} after step {step}: the learning rate is too high") from error
 
 
 def text_vectors(actor: nn.Module) -> dict[str, Tensor]:
@@ -52,18 +37,15 @@ def tensors_of(module: nn.Module) -> dict[str, Tensor]:
     return {**dict(module.named_parameters()), **dict(module.named_buffers())}
 
 
-def check_options(found: Any, weights: Mapping[str, Tensor]) -> None:
-    """Refuse integers that no network of these weights can have, before lists of that length are made."""
-    _check_integers(found, sum(tensor.numel() for tensor in weights.values()), len(weights))
-
-
-def _check_integers(found: Any, numbers: int, tensors: int, name: str = "") -> None:
+def check_integers(found: Any, numbers: int, tensors: int, name: str = "") -> None:
+    """Refuse integers in a description that no network of so many numbers and tensors can have, before lists of that
+    length are made."""
     if isinstance(found, dict):
         for key, one in found.items():
-            _check_integers(one, numbers, tensors, key)
+            check_integers(one, numbers, tensors, key)
     elif isinstance(found, list):
         for one in found:
-            _check_integers(one, numbers, tensors, name)
+            check_integers(one, numbers, tensors, name)
     elif isinstance(found, int) and abs(found) > max(numbers, 2**16):
         raise ValueError(f"it says {found:.3g}, but holds only {numbers} numbers")
     elif isinstance(found, int) and name.endswith("depth") and found > max(tensors, 64):

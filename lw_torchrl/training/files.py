@@ -42,10 +42,7 @@ def save_actor(actor: Policy, path: str | os.PathLike[str], **about: Any) -> Non
         >>> lw.load_actor(path).config["width"]
         8
     """
-    POLICY.check_about(about)
-    policy = check_can_be_saved(actor)
-    groups = {"weights": policy.state_dict(), "texts": text_vectors(policy)}
-    POLICY.write(path, {"actor": policy.describe(), **about}, groups)
+    POLICY.save(path, check_can_be_saved(actor), text_vectors(actor), about)
 
 
 def check_can_be_saved(actor: Any) -> Policy:
@@ -89,15 +86,8 @@ def save_evaluator(evaluator: QueryEvaluator, path: str | os.PathLike[str], **ab
     whatever the plans whose conditions it answers.
 
     Args:
-        evaluator: what to write, of a class in :data:`~lw_torchrl.modules.EVALUATORS`.
-        path: the file.
-        **about: what else the file is to say, as JSON.
-
-    Raises:
-        TypeError: it is no :class:`QueryEvaluator`.
-        ValueError: its own description does not make it again, or its weights are no finite numbers; or ``about`` names
-            what a file says itself.
-        OSError: it cannot be written; an earlier file stays.
+        evaluator: what to write, of a class in :data:`~lw_torchrl.modules.EVALUATORS`; else :class:`TypeError`.
+        path, **about: as of :func:`save_actor`, with its errors.
 
     Example:
         >>> import lw_torchrl as lw, os, tempfile
@@ -106,18 +96,16 @@ def save_evaluator(evaluator: QueryEvaluator, path: str | os.PathLike[str], **ab
         >>> lw.training.load_evaluator(path, lw.load_plans("MT50")).config["width"]
         8
     """
-    EVALUATOR.check_about(about)
-    check_evaluator_can_be_saved(evaluator)
-    groups = {"weights": evaluator.state_dict(), "texts": evaluator_texts(evaluator)}
-    EVALUATOR.write(path, {"evaluator": evaluator.describe(), **about}, groups)
+    EVALUATOR.save(path, check_evaluator_can_be_saved(evaluator), evaluator_texts(evaluator), about)
 
 
-def check_evaluator_can_be_saved(evaluator: Any) -> None:
-    """Raise unless a file can hold the evaluator, as :func:`save_evaluator` does."""
+def check_evaluator_can_be_saved(evaluator: Any) -> QueryEvaluator:
+    """As :func:`check_can_be_saved`, of an evaluator."""
     if not isinstance(evaluator, QueryEvaluator):
         raise TypeError(f"evaluator must be a QueryEvaluator to be kept in a file, got {type(evaluator).__name__}")
     encoder = getattr(evaluator, "text_encoder", None)
     EVALUATOR.check_can_be_saved(evaluator, lambda found: evaluator_from_description(found, evaluator.plans, encoder))
+    return evaluator
 
 
 def evaluator_texts(evaluator: QueryEvaluator) -> dict[str, Tensor]:
@@ -137,15 +125,9 @@ def load_evaluator(
     """Make the evaluator of a file, for the conditions of some plans, in eval mode.
 
     Args:
-        path: the file.
-        plans: whose conditions it is to answer; they need not be those that it was trained beside.
-        text_encoder: the one that it was made with, if it reads texts and it was not the shipped one.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it is damaged or no evaluator's, or its weights, sizes or texts are not those that it says; the
-            plans ask for what it cannot answer; or the text encoder is another than it was trained with.
-        ImportError: it reads texts, and the extra ``[text]`` is not installed.
+        path, text_encoder: as of :func:`load_actor`, with its errors.
+        plans: whose conditions it is to answer; they need not be those that it was trained beside. :class:`ValueError`
+            if they ask for what it cannot answer.
     """
 
     def make(described: Any, encoder: TextEncoder | None) -> QueryEvaluator:
@@ -155,12 +137,7 @@ def load_evaluator(
 
 
 def read_description(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """The description that a policy file was saved with.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it is no policy file, or damaged.
-    """
+    """The description that a policy file was saved with; errors as of :func:`load_actor`."""
     return POLICY.open(path).description
 
 
@@ -187,7 +164,7 @@ def describe_data(replay: Any) -> dict[str, Any] | None:
 
 
 def describe_replay(replay: Any) -> dict[str, Any]:
-    """How a replay buffer shows its rows, as JSON: what else than :func:`describe_data` its batches hang on."""
+    """How a replay buffer shows its rows, as JSON: what its batches depend on besides :func:`describe_data`."""
     parts = [part for part in replay.transform.modules() if isinstance(part, Transform)]
     return {
         "label": getattr(replay, "label", None),

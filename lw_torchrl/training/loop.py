@@ -26,7 +26,7 @@ from lw_torchrl._state_tree import check_like, check_optimizer_state, check_same
 from lw_torchrl._versions import LIBRARIES
 from lw_torchrl.data.replay import LanguageWorldExperienceReplay
 from lw_torchrl.training.envelope import Envelope
-from lw_torchrl.training.file_checks import check_trained, text_vectors
+from lw_torchrl.training.file_checks import check_finite, text_vectors
 
 READ_EVERY = 100
 """Steps between readings of the losses: to read one is to wait for its device."""
@@ -76,8 +76,16 @@ class ReplayState:
 
 
 class Training:
-    """What all trainers share. A subclass makes ``optimizer`` and ``module``, and fills in :meth:`step`. Its ``config``
-    has ``steps``, ``checkpoint_every`` and ``learning_rate``.
+    """What all trainers share. A subclass makes ``optimizer`` and ``module``, and fills in :meth:`step`.
+
+    Args:
+        config: how to train, with ``steps``, ``checkpoint_every`` and ``learning_rate``; of trainers, None for the
+            defaults.
+        replays: the buffers. Their generators are set to the configuration's seed.
+        checkpoint: a file to write checkpoints to. If it is there already, training carries on from it.
+        logger: a TorchRL logger for what :meth:`means` gives, every 100 steps.
+        progress: show a progress bar.
+        title: of the progress bar.
 
     Attributes:
         module: holds all that is trained.
@@ -88,6 +96,15 @@ class Training:
         described: what a checkpoint says, as JSON: training resumes only from one that says the same.
         envelope: of the checkpoint.
         says_device: whether a checkpoint says on which kind of device it was trained.
+
+    Warns:
+        UserWarning: the checkpoint was written on another kind of device, or under other versions of torch, say:
+            training goes on with the same minibatches, but not bit for bit.
+
+    Raises:
+        ValueError: the checkpoint is damaged, or of another architecture, configuration or data; or, while it trains, a
+            loss or weights are no numbers.
+        OSError: the checkpoint cannot be written; the earlier one stays.
     """
 
     envelope: ClassVar[Envelope]
@@ -120,7 +137,7 @@ class Training:
         self._file_known = self._file_now()  # it was read or written by this training
 
     def step(self) -> Any:
-        """Train on one minibatch: find its loss and give it to :meth:`descend`."""
+        """Find a minibatch's loss and give it to :meth:`descend`."""
         raise NotImplementedError
 
     def parameters(self) -> dict[str, Tensor]:
@@ -135,16 +152,13 @@ class Training:
         """Change the gradients before the optimizer's step."""
 
     def means(self, losses: Tensor) -> dict[str, float]:
-        """What is logged every 100 steps and at the end, by name, of the losses of the last 100 steps, (n,) or (n, M)
-        float32 on the CPU; what has "loss" in its name is shown."""
+        """What is logged, by name, of the losses of the last 100 steps, (n,) or (n, M) float32 on the CPU; what has
+        "loss" in its name is shown."""
         return {"loss": losses.mean().item()}
 
     def descend(self, losses: Tensor) -> Tensor:
         """Take an optimizer's step on the loss, () float32, or on those of M models, (M,) float32; return it, detached.
-
-        A loss that is no finite number is a :class:`ValueError`, at once on the CPU. Another device is not waited for:
-        there :meth:`run` says so later.
-        """
+        Other devices than the CPU are not waited for: there :meth:`run` says later that a loss is no number."""
         if self.device == CPU:
             self._check_loss(losses, self.steps)
         self.optimizer.zero_grad()
@@ -158,8 +172,8 @@ class Training:
         return losses.detach()
 
     def run(self, until: int | None = None) -> Tensor:
-        """Train to the last step, or until so many in all, from wherever training stands; return the losses of the last
-        100 steps made, (n,) or (n, M) float32 on the CPU. Ctrl-C ends it between two steps, with a checkpoint."""
+        """Train to the last step, or until so many in all; return the losses of the last 100 steps made, (n,) or (n, M)
+        float32 on the CPU. Ctrl-C ends it between two steps, with a checkpoint."""
         every, total = self.config.checkpoint_every, self.config.steps
         if until is not None and check_int("until", until, minimum=1) > total:
             raise ValueError(f"until must be at most the configuration's steps, {total}, got {until}")
@@ -187,7 +201,6 @@ class Training:
         return self._read_losses()
 
     def log(self, found: Mapping[str, float], step: int) -> None:
-        """Give the logger numbers by name, where there is one."""
         if self.logger is not None:
             for name, value in found.items():
                 self.logger.log_scalar(f"train/{name}", value, step=step)
@@ -214,8 +227,8 @@ class Training:
 
     @contextmanager
     def at_work(self, total: int, done: int) -> Iterator[tuple[Progress, Interrupt]]:
-        """Keep other trainings from the checkpoint, show progress and take Ctrl-C between steps while the block lasts;
-        :class:`ValueError` if another training is at work, or has written the checkpoint meanwhile."""
+        """Keep other trainings from the checkpoint, show progress and take Ctrl-C between steps; :class:`ValueError` if
+        another training is at work, or has written the checkpoint meanwhile."""
         bar = Progress(self.title, total, "step", initial=done, show=self.progress)
         alone = nullcontext() if self.checkpoint is None else held(self.checkpoint, "checkpoint", "training")
         with alone:
@@ -236,7 +249,10 @@ class Training:
 
     def save(self) -> None:
         """Write the checkpoint, if there is to be one; an earlier one is replaced whole."""
-        check_trained(self.parameters(), self.steps)
+        try:
+            check_finite(self.parameters(), self.parameters())
+        except ValueError as error:
+            raise ValueError(f"{error} after step {self.steps}: the learning rate is too high") from error
         if self.checkpoint is not None:
             kind = self.device.type
             said = {"device": kind} if self.says_device and kind != "cpu" else {}
@@ -244,7 +260,7 @@ class Training:
             self._file_known = self._file_now()  # it was read or written by this training
 
     def resume(self, packages: Sequence[str] = LIBRARIES) -> bool:
-        """Go on from the checkpoint, and say whether it is there; errors and arguments of :meth:`Envelope.resume`."""
+        """Go on from the checkpoint, and say whether it is there."""
         if self.checkpoint is None or not self.checkpoint.exists():
             return False
         for replay in self.replays:
@@ -266,7 +282,6 @@ class Training:
         }
 
     def load_state_dict(self, found: dict[str, Any]) -> None:
-        """Go on from what :meth:`state_dict` gave; an error as of a file's parts that do not fit."""
         assert self.schedule is not None
         if set(found) != {"optimizer", "schedule", "states"}:
             raise ValueError(f"a training state has optimizer, schedule and states, got {', '.join(map(str, found))}")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from functools import partial
 from typing import Any
 
 import torch
@@ -23,9 +22,8 @@ from lw_torchrl.modules.relative_positions import PlanRoles
 def fit_normalization(target: nn.Module, replay: TensorDictReplayBuffer) -> None:
     """Give a policy, a critic, or all that a loss holds, the statistics of a buffer's rows.
 
-    A TorchRL loss copies the networks it is given, buffers included. Its copies and targets get the statistics too.
-    Each row counts as often as :class:`CoLearningSampler` draws it: a target's few rows would not count otherwise, and
-    its features lie far outside the base tasks' range.
+    A loss's copies and targets get them too. Each row counts as often as :class:`CoLearningSampler` draws it: a
+    target's few rows would not count otherwise, and its features lie far outside the base tasks' range.
 
     Args:
         target: a :class:`Policy`, a critic, a module with :class:`ObservationFeatures` in it, or a loss of such.
@@ -39,15 +37,14 @@ def fit_normalization(target: nn.Module, replay: TensorDictReplayBuffer) -> None
         >>> import lw_torchrl as lw, torch
         >>> from tensordict import TensorDict
         >>> from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-        >>> from torchrl.objectives import SoftUpdate, TD3Loss
+        >>> from torchrl.objectives import TD3Loss
         >>> from lw_torchrl.training import fit_normalization
         >>> replay = TensorDictReplayBuffer(storage=LazyTensorStorage(64), batch_size=8)
         >>> _ = replay.extend(TensorDict(observation=torch.rand(64, 39)).auto_batch_size_(1))
         >>> plans = lw.load_plans("MT10")
         >>> loss = TD3Loss(lw.PlanConditionedActor(plans), lw.PlanConditionedQValue(plans), bounds=(-1.0, 1.0))
-        >>> targets = SoftUpdate(loss, eps=0.995)
         >>> fit_normalization(loss, replay)
-        >>> loss.target_qvalue_network_params["encoder", "features", "mean"].shape  # of two critics
+        >>> loss.qvalue_network_params["encoder", "features", "mean"].shape  # of two critics
         torch.Size([2, 56])
 
     Source: :meth:`Policy.fit_normalization`.
@@ -131,8 +128,4 @@ def _held(target: nn.Module, kind: type[nn.Module]) -> Iterator[tuple[Any, Calla
                 for copy in (f"{name}_params", f"target_{name}_params"):
                     params: Any = held.get(copy)
                     if isinstance(params, TensorDictBase):
-                        yield module, partial(_buffer, params, path)
-
-
-def _buffer(params: TensorDictBase, path: str, name: str) -> Tensor:
-    return params.get((*path.split("."), name)).data
+                        yield module, params.get(tuple(path.split("."))).data.get

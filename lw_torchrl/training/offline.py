@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from hashlib import sha256
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
@@ -18,15 +18,7 @@ from torchrl.envs import MultiStepTransform
 from torchrl.objectives import LossModule, SoftUpdate
 from torchrl.record.loggers import Logger
 
-from lw_torchrl._checks import (
-    check_choice,
-    check_fields,
-    check_int,
-    check_positive,
-    check_probability,
-    check_scale,
-    checked_but,
-)
+from lw_torchrl._checks import Count, Positive, Probability, Scale, check_fields, checked_but
 from lw_torchrl.objectives.reduction import with_n_steps
 from lw_torchrl.training.buffers import check_minibatches
 from lw_torchrl.training.envelope import TRAINING
@@ -40,45 +32,31 @@ _INSTEAD = {"loss_actor_bc"}  # minimised in place of another entry: in CQL's fi
 
 @dataclass(frozen=True)
 class OfflineConfig:
-    """How a loss is trained over a buffer.
+    """How a loss is trained over a buffer, by AdamW. What is not said here is as of :class:`BehavioralCloningConfig`.
 
     Attributes:
-        steps: minibatches.
-        batch_size: rows of a minibatch; with a :class:`TaskBalancedSampler` the number of tasks must divide it.
-        learning_rate: of the loss's actor, at the start; the schedule is a cosine to 0.
+        learning_rate: of the loss's actor, at the start.
         critic_learning_rate: of everything else that it trains.
-        weight_decay: AdamW's.
         target_eps: how much of target networks stays at a step, where the loss has any.
-        schedule: "cosine" to 0 or "constant".
         normalize: first take the statistics of the observation's features from the buffer, for all networks; False
             for those that were trained before on others.
         max_grad_norm: the actor's gradients, and those of all else, are clipped to it.
-        seed: of the minibatches, and of what networks and transforms draw while training.
-        checkpoint_every: steps between checkpoints.
     """
 
-    steps: int = 5000
-    batch_size: int = 250
-    learning_rate: float = 1e-3
-    critic_learning_rate: float = 5e-4
-    weight_decay: float = 1e-4
-    target_eps: float = 0.995
-    schedule: str = "cosine"
+    steps: Count = 5000
+    batch_size: Count = 250
+    learning_rate: Scale = 1e-3
+    critic_learning_rate: Scale = 5e-4
+    weight_decay: Scale = 1e-4
+    target_eps: Probability = 0.995
+    schedule: Literal["cosine", "constant"] = "cosine"
     normalize: bool = True
-    max_grad_norm: float = 1.0
+    max_grad_norm: Positive = 1.0
     seed: int = 0
-    checkpoint_every: int = 1000
+    checkpoint_every: Count = 1000
 
     def __post_init__(self) -> None:
         check_fields(self)
-        for name in ("steps", "batch_size", "checkpoint_every"):
-            check_int(name, getattr(self, name), minimum=1)
-        for name in ("learning_rate", "critic_learning_rate", "weight_decay"):
-            check_scale(name, getattr(self, name))
-        check_positive("max_grad_norm", self.max_grad_norm)
-        check_probability("target_eps", self.target_eps)
-        check_choice("schedule", self.schedule, ("cosine", "constant"))
-        check_int("seed", self.seed)
 
 
 class OfflineTrainer(Training):
@@ -89,26 +67,17 @@ class OfflineTrainer(Training):
     Args:
         loss: of ``torchrl.objectives`` or ``lw_torchrl.objectives``, with its value estimator; networks are trained in
             place, on the device where they are, in train mode, and are in eval mode afterwards.
-        replay: samples with what the loss reads. Its generator is set to the configuration's seed.
-        config: how to train.
-        checkpoint: a file to write checkpoints to. If it is there already, training carries on from it.
-        logger: a TorchRL logger for what the loss gives.
-        progress: show a progress bar.
-        title: of the progress bar.
+        replay: samples with what the loss reads.
+        config, checkpoint, logger, progress, title: as of :class:`~lw_torchrl.training.loop.Training`, with its errors.
 
     Attributes:
         last: the means over the last 100 steps of what the loss gives, by name.
 
-    Warns:
-        UserWarning: the checkpoint was written under other versions of torch, say: training does not go on bit for bit.
-
     Raises:
-        ValueError: the checkpoint is damaged, or of another loss, configuration or data; a buffer that answers the
-            queries of other plans, or draws by priorities; a loss whose value estimator has another gamma than the
-            buffer's n steps, that gives no mean, or CQL's with a Lagrange multiplier; networks that were trained with
-            other statistics, where ``normalize``; or, in :meth:`train`, the loss or the weights are no numbers.
+        ValueError: a buffer that answers the queries of other plans, or draws by priorities; a loss whose value
+            estimator has another gamma than the buffer's n steps, that gives no mean, or CQL's with a Lagrange
+            multiplier; networks that were trained with other statistics, where ``normalize``.
         TypeError: the loss is none of TorchRL's kind.
-        OSError: the checkpoint cannot be written; the earlier one stays.
 
     Example:
         >>> import lw_torchrl as lw, tempfile
@@ -221,7 +190,9 @@ def check_loss(loss: LossModule, replay: TensorDictReplayBuffer) -> None:
             "loss: with_lagrange=True gives a loss_alpha_prime that reaches the critics, and takes from them what "
             "loss_cql adds; give with_lagrange=False"
         )
-    if (shown := _gamma_of(replay)) is None or loss.default_value_estimator is None:
+    summed = [part.gamma for part in replay.transform if isinstance(part, MultiStepTransform)]
+    shown = next(iter(summed), getattr(replay, "gamma", None))  # None where ``next`` is one step ahead
+    if shown is None or loss.default_value_estimator is None:
         return
     own = getattr(loss.value_estimator, "gamma", None)
     if own is not None and abs(float(own) - shown) > 1e-6:
@@ -229,12 +200,6 @@ def check_loss(loss: LossModule, replay: TensorDictReplayBuffer) -> None:
             f"loss: its value estimator's gamma must be that of the replay buffer's n steps, {shown}, got "
             f"{float(own):.6g}; call loss.make_value_estimator(gamma={shown})"
         )
-
-
-def _gamma_of(replay: TensorDictReplayBuffer) -> float | None:
-    """The discount of the rewards that a buffer sums; None where ``next`` is one step ahead."""
-    summed = [part.gamma for part in replay.transform if isinstance(part, MultiStepTransform)]
-    return next(iter(summed), getattr(replay, "gamma", None))
 
 
 def sum_of_losses(found: Mapping[str, Any]) -> Tensor:

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.record.loggers import Logger
 
-from lw_torchrl._checks import check_choice, checked_but
+from lw_torchrl._checks import checked_but
 from lw_torchrl._devices import CPU, drawn_on
 from lw_torchrl._progress import Progress
 from lw_torchrl._state_tree import check_like
@@ -28,7 +28,8 @@ from lw_torchrl.language.tasks import Task, named_tasks
 from lw_torchrl.modules.critics import QValue
 from lw_torchrl.modules.networks import ACTION_SIZE
 from lw_torchrl.modules.policy import Policy
-from lw_torchrl.training.algorithms import LEARNERS, OnlineConfig
+from lw_torchrl.training.algorithms import LEARNERS, OnlineConfig, method_config
+from lw_torchrl.training.algorithms.learner import NoiseConfig
 from lw_torchrl.training.buffers import check_minibatches, check_replay
 from lw_torchrl.training.envelope import POLICY
 from lw_torchrl.training.files import check_can_be_saved, describe_data, describe_learning
@@ -42,45 +43,37 @@ class OnlineTrainer(Training):
 
     In a round, each row of the environment runs episodes, which end at their first success or after ``max_steps``;
     their steps go into the buffer, and the learner makes its gradient steps. At its end all rows are reset, since an
-    episode's physics cannot be restored, and a checkpoint is written: training that was stopped goes on from the last
-    round's end with the same bits.
+    episode's physics cannot be restored, and a checkpoint is written, from which training goes on with the same bits.
 
     Args:
-        actor: the policy to begin with, one that was cloned, say. Methods "td3" and "expert-iteration" train it in
-            place, and so does "residual" a :class:`ResidualActor`, of some steps of a plan say; the others train one
-            that is made of it, ``policy``.
+        actor: the policy to begin with, one that was cloned, say. "advantage", "td3" and "expert-iteration" train it in
+            place, and so does "residual" a :class:`ResidualActor`; the others train one that is made of it.
         replay: demonstrations that grow: ``LanguageWorldExperienceReplay(..., grow=, label="executed",
             terminate_on_success=True, sampler=CoLearningSampler("grown"))`` with the actor's transform. Its reward is
-            what is learned from. Its generator is set to the configuration's seed.
-        config: how to train.
-        method: "td3", "sac" or "residual", from demonstrations and what came, half of a minibatch each; "ppo"; or
-            "expert-iteration", behavioral cloning of demonstrations and own successes. See :data:`LEARNERS`.
+            what is learned from.
+        config: how to train: the method's own configuration, of :mod:`lw_torchrl.training.algorithms`, or an
+            :class:`OnlineConfig` for the method's defaults of all else; None for its defaults.
+        method: a name of :data:`LEARNERS`, whose classes say what they do.
         tasks: to run, as for :class:`LanguageWorldEnv`; None for those of the demonstrations.
-        critic: whose copies are trained by "td3", "sac" and "residual", with its normalisation as it is
+        critic: whose copies are trained, where the method has one, with its normalisation as it is
             (``critic.fit_normalization``); None for one that sees what the actor sees, by the actor's.
-        checkpoint: a file to write checkpoints to, the buffer's rows among it. If it is there already, training
-            carries on from it.
-        logger: a TorchRL logger, for what ``history`` holds, by steps of the environment.
-        progress: show a progress bar.
+        checkpoint, logger, progress: as of :class:`~lw_torchrl.training.loop.Training`, with its errors; the checkpoint
+            holds the buffer's rows too, and what ``history`` holds is logged, by steps of the environment.
         num_threads: of the simulation, which changes no result.
 
     Attributes:
         policy: what is trained.
-        frames: steps of the environment done, up to the last round's end.
+        frames: steps of the environment done.
         history: of each round, "frames", "episodes" (those that ended), the means of losses and values, and "success",
             that of the first episode of each row, which has the time to end; not of a round shorter than an episode.
 
-    Warns:
-        UserWarning: the checkpoint was written under other versions of mujoco, say: it does not go on bit for bit.
-
     Raises:
-        ValueError: a wrong method; a buffer that does not grow, or is not of these plans; the checkpoint is damaged, or
-            of another architecture, start, configuration or data; or, in :meth:`train`, a loss is no number.
-        TypeError: the actor is no :class:`Policy`, or none that the method can train.
-        OSError: the checkpoint cannot be written; the earlier one stays.
+        ValueError: a wrong method; a buffer that does not grow, or is not of these plans.
+        TypeError: the actor is no :class:`Policy`, or none that the method can train; another method's configuration.
 
     Example:
         >>> import lw_torchrl as lw, tempfile
+        >>> from lw_torchrl.training.algorithms import TD3Config
         >>> plans = lw.load_plans("MT10")
         >>> with tempfile.TemporaryDirectory() as root:
         ...     _ = lw.collect_demonstrations("reach", episodes_per_task=1, root=root + "/demos", max_steps=80)
@@ -95,7 +88,7 @@ class OnlineTrainer(Training):
         ...         sampler=lw.CoLearningSampler("grown"),
         ...         transform=lw.QAFTransform(plans),
         ...     )
-        ...     config = lw.OnlineConfig(frames=40, rows=4, round_steps=5, max_steps=5, first_frames=20, batch_size=8)
+        ...     config = TD3Config(frames=40, rows=4, round_steps=5, max_steps=5, first_frames=20, batch_size=8)
         ...     trainer = lw.OnlineTrainer(lw.PlanConditionedActor(plans), replay, config, progress=False)
         ...     trainer.train()
         >>> [one["frames"] for one in trainer.history]
@@ -122,9 +115,8 @@ class OnlineTrainer(Training):
         progress: bool = True,
         num_threads: int | None = None,
     ) -> None:
-        config = config or OnlineConfig()
-        title = f"training {check_choice('method', method, LEARNERS)}"
-        super().__init__(config, [replay], checkpoint, logger=logger, progress=progress, title=title)
+        config = method_config(method, config)
+        super().__init__(config, [replay], checkpoint, logger=logger, progress=progress, title=f"training {method}")
         check_can_be_saved(actor)
         check_growing_replay(actor, replay, config)
         if critic is not None:
@@ -177,7 +169,10 @@ class OnlineTrainer(Training):
         self.learner.load_state_dict(found["learner"])
         self.replay.load_state_dict(found["replay"])
         self._episodes, self._drawn = found["episodes"].clone(), found["drawn"].clone()
-        self.history = [{str(name): _number(value) for name, value in one.items()} for one in found["history"]]
+        self.history = [
+            {str(name): value if type(value) is int else float(value) for name, value in one.items()}
+            for one in found["history"]
+        ]
         self.round, self.steps = found["round"], self.learner.made
 
     def train(self) -> None:
@@ -224,7 +219,7 @@ class OnlineTrainer(Training):
         config, learner = self.config, self.learner
         state, done_before = env.reset(), self.frames
         first = FirstEpisodes(config.rows)
-        exploration = Exploration(config, self._patience) if learner.noisy else None
+        exploration = Exploration(config, self._patience) if isinstance(config, NoiseConfig) else None
         came = []
         steps = min(config.round_steps, config.steps - self.round * config.round_steps)
         due = 0
@@ -251,21 +246,12 @@ class OnlineTrainer(Training):
             if learner.wants_round:
                 came.append(rows)
             frames = done_before + (begin + len(chunk)) * config.rows
-            steps_due = self._due(frames) - self._due(frames - rows.numel())
+            steps_due = config.due(frames) - config.due(frames - rows.numel())
             learner.learn(steps_due)
             due += steps_due
             bar.update(rows.numel())
         learner.end_round(torch.cat(came, 1) if came else None, due)
         return {"frames": done_before + steps * config.rows, **first.result(), **learner.told()}
-
-    def _due(self, frames: int) -> int:
-        """The gradient steps that are to be made in the first so many steps of the environment."""
-        return int(max(0, frames - self.config.first_frames) * self.config.utd)
-
-
-def _number(value: Any) -> int | float:
-    """A number as it was written: an integer stays one."""
-    return value if type(value) is int else float(value)
 
 
 def _fingerprint(module: torch.nn.Module) -> str:
@@ -306,11 +292,11 @@ class Exploration:
     """The noise of a round.
 
     A row is stuck if no condition's truth has changed for more states than ``patience``, the longest time in the
-    demonstrations; 0 for never. There the noise on the hand grows, until half as long again, from ``exploration`` to
-    ``stuck_exploration``; that on the gripper does not, since it opens grasps.
+    demonstrations (0: never). There the hand's noise grows, until half as long again, from ``exploration`` to
+    ``stuck_exploration``; the gripper's would open grasps.
     """
 
-    def __init__(self, config: OnlineConfig, patience: int) -> None:
+    def __init__(self, config: NoiseConfig, patience: int) -> None:
         self.patience = patience
         self._scale = torch.tensor([1.0, 1.0, 1.0, config.gripper_exploration]) * config.exploration
         self._stuck_scale = torch.tensor([*[config.stuck_exploration] * 3, float(self._scale[3])])
@@ -323,8 +309,8 @@ class Exploration:
         self._drawn = torch.randn_like(self._drawn)
 
     def noise(self, state: TensorDictBase) -> Tensor:
-        """(N, 4) float32, to be added to the actions in these states, each one step after those of the last call or
-        the first of a new episode; ``qaf`` (N, S) bool, if it is there."""
+        """(N, 4) float32, for the actions in these states, each one step after those of the last call or the first of
+        an episode; ``qaf`` (N, S) bool, if it is there."""
         truth = state.get("qaf", None)
         if not self.patience or truth is None:
             return self._drawn * self._scale

@@ -37,11 +37,6 @@ class _Act(nn.Module):
         return self.actor.act(*prepared)[0]
 
 
-def _fingerprint(actor: Policy) -> str:
-    """16 characters that differ for actors of other plans, tasks or options."""
-    return sha256(json.dumps(actor.describe(), sort_keys=True).encode()).hexdigest()[:16]
-
-
 def _check_actors(actors: Sequence[Policy]) -> None:
     """Raise :class:`ValueError` unless the actors differ in their weights, plans and tasks alone."""
     described = [actor.describe() for actor in actors]
@@ -65,18 +60,11 @@ class StackedBehavioralCloning(Training):
             place.
         replays: M buffers, each with its sampler; the i-th actor's batches come from the i-th.
         config: how to train each; the i-th has the seed ``config.seed + i``.
-        checkpoint: a file to write checkpoints to. If it is there already, training carries on from it.
-        progress: show a progress bar.
+        checkpoint, progress: as of :class:`~lw_torchrl.training.loop.Training`, with its errors.
         device: where to train, as for :class:`BehavioralCloningTrainer`; None for where the first actor is.
 
-    Warns:
-        UserWarning: the checkpoint was written on another kind of device, or under other versions of torch, say:
-            training does not go on bit for bit.
-
     Raises:
-        ValueError: not as many buffers as actors, one twice, or actors of different options; a checkpoint that is
-            damaged, or of other actors, data or another configuration; in :meth:`train`, a loss or weights that are no
-            numbers.
+        ValueError: not as many buffers as actors, one twice, or actors of different options.
 
     Example:
         >>> import lw_torchrl as lw, tempfile
@@ -122,9 +110,10 @@ class StackedBehavioralCloning(Training):
             raise ValueError("qaf_anchor is for BehavioralCloningTrainer, which trains one policy at a time")
         self.device = place(actors[0], device)
         if self.checkpoint is not None:
+            described = [json.dumps(actor.describe(), sort_keys=True).encode() for actor in actors]
             self.described = {
                 "actor": check_can_be_saved(actors[0]).describe() | {"number": len(actors)},
-                "actors": {str(number): _fingerprint(actor) for number, actor in enumerate(actors)},
+                "actors": {str(number): sha256(one).hexdigest()[:16] for number, one in enumerate(described)},
                 "training": config.describe(),
                 "data": {str(number): describe_data(replay) for number, replay in enumerate(replays)},
                 "replay": {str(number): describe_replay(replay) for number, replay in enumerate(replays)},

@@ -17,25 +17,24 @@ from lw_torchrl._checks import check_int, checked
 from lw_torchrl._keys import as_keys
 from lw_torchrl._rendering import check_cameras
 from lw_torchrl.transforms.environment import KeepsEnvState, base_env
+from lw_torchrl.transforms.late_answers import kept
 
 
 class CameraTransform(KeepsEnvState):
     """Writes ``pixels`` (B, height, width·C, 3) uint8, pictures by C cameras side by side, the first on the left.
 
     A picture of a row is taken at its reset and then every so many steps of its episode, and held in between; rows that
-    a ``_step`` or ``_reset`` mask leaves out are not drawn. It shows the row's state, as ``observation`` does, and
-    changes nothing in the simulation. Its ``state_dict`` holds the environment's, as :class:`EnvState` does; after
-    ``load_state_dict`` the environment must be reset. With SerialEnv and ParallelEnv put it into each worker. A replay
-    buffer has no simulation to draw: :func:`add_pictures` draws a dataset's rows.
+    a ``_step`` or ``_reset`` mask leaves out are not drawn. The simulation does not change. Its ``state_dict`` holds
+    the environment's, as :class:`EnvState` does; after ``load_state_dict`` the environment must be reset. With
+    SerialEnv and ParallelEnv put it into each worker. :func:`add_pictures` draws a dataset's rows.
 
     Args:
         cameras: "corner2", "corner", "corner3", "corner4", "topview", "behindGripper" or "gripperPOV", or several.
-        height, width: pixels of each picture.
-        every: steps of a row's episode from one picture to the next.
+        height, width, every: pixels of each picture; steps of a row's episode from one picture to the next.
         out_keys: where the pictures go.
 
     Raises:
-        ValueError: an unknown camera or size, ``every`` under 1; or on a replay buffer.
+        ValueError: a wrong argument, or on a replay buffer.
         TypeError: there is no LanguageWorldEnv right under it.
         RuntimeError: a step of an environment that was never reset, or not since ``load_state_dict``.
         ImportError: there is no OpenGL; it names what to install.
@@ -64,19 +63,14 @@ class CameraTransform(KeepsEnvState):
         self.cameras = check_cameras(cameras, height, width)
         self.height, self.width, self.every = height, width, check_int("every", every, minimum=1)
         super().__init__(in_keys=[], out_keys=as_keys("out_keys", out_keys, ("pixels",)))
+        self.shape = self.height, self.width * len(self.cameras), 3  # of a row's pictures
         self._forget_episodes()
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """Of a row's pictures."""
-        return self.height, self.width * len(self.cameras), 3
 
     def _forget_episodes(self) -> None:
         self._taken: Tensor | None = None  # (N, height, width·C, 3) uint8
         self._steps: Tensor | None = None  # (N,) int64, of each row's episode
 
     def set_container(self, container: Transform | EnvBase) -> None:
-        """Join an environment."""
         super().set_container(container)
         env = base_env(self)
         if isinstance(env, BatchedEnvBase):
@@ -92,7 +86,7 @@ class CameraTransform(KeepsEnvState):
         env: Any = base_env(self)
         rows = which.nonzero().flatten()
         if self._taken is None:
-            self._taken = torch.zeros(len(env.row_tasks), *self.shape, dtype=torch.uint8)
+            self._taken = torch.zeros(len(which), *self.shape, dtype=torch.uint8)
         if len(rows):
             size = {"height": self.height, "width": self.width, "rows": rows.tolist()}
             drawn = [env.render(camera=camera, **size) for camera in self.cameras]
@@ -106,8 +100,7 @@ class CameraTransform(KeepsEnvState):
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         begun = self._rows(tensordict.get("_reset", None))
-        steps = torch.zeros(len(begun), dtype=torch.int64) if self._steps is None else self._steps
-        self._steps = torch.where(begun, 0, steps)
+        self._steps = kept(self._steps, torch.zeros(len(begun), dtype=torch.int64), begun)
         return self._draw(begun, tensordict_reset)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
@@ -121,14 +114,12 @@ class CameraTransform(KeepsEnvState):
         return self._draw(moved & (self._steps % self.every == 0), next_tensordict)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Raise: rows of a replay buffer are in no simulation."""
         raise ValueError(
             "CameraTransform draws an environment's rows; a dataset's are drawn by lw.data.add_pictures(root, ...), "
             "and replay.add_column('pixels', lw.data.load_pictures(replay, ...)) shows them"
         )
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        """Add ``pixels`` to the specs."""
         assert isinstance(observation_spec, Composite)
         shape = (*observation_spec.shape, *self.shape)
         observation_spec[self.out_keys[0]] = UnboundedDiscrete(shape, dtype=torch.uint8, device=observation_spec.device)

@@ -13,11 +13,11 @@ from torchrl.data import Composite, TensorSpec
 from lw_torchrl._checks import check_int, check_probability, checked, missing_keys, shown, unknown_name
 from lw_torchrl._keys import as_keys, read
 from lw_torchrl._seeding import episode_generator
-from lw_torchrl.language.plan_tables import PlanTables
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.queries import Query, read_query
-from lw_torchrl.transforms.answers import RowAnswers, kept
+from lw_torchrl.language.task_index import PlanTables
 from lw_torchrl.transforms.environment import EpisodeTransform
+from lw_torchrl.transforms.late_answers import RowAnswers, kept
 from lw_torchrl.transforms.qaf import plan_number_key
 
 _BLOCK = 64  # steps of an episode whose draws are made at once
@@ -35,23 +35,20 @@ class CorruptQAF(EpisodeTransform):
       what sticks is the answer itself, not its opposite;
     - **drop**: the answers to these queries are always false.
 
-    Padding stays false. What is drawn for an answer depends only on (task, seed, episode, step) and the answer's place
-    in its plan, not on the number of environments nor on the tasks beside. Of two probabilities the greater one spoils
-    what the smaller one spoils, and more. In :func:`lw_torchrl.evaluate` it is an ``evaluator``. A policy with a
-    :class:`QueryEvaluator` of its own does not read ``qaf``, and feels nothing.
+    What is drawn for an answer depends only on (task, seed, episode, step) and the answer's place in its plan. Of two
+    probabilities the greater one spoils what the smaller one spoils, and more. In :func:`lw_torchrl.evaluate` it is an
+    ``evaluator``. A policy with a :class:`QueryEvaluator` of its own does not read ``qaf``, and feels nothing.
 
     Args:
         plans: whose conditions ``qaf`` answers.
-        flip, stick: probabilities, from 0 to 1.
-        lag: steps.
+        flip, stick, lag: probabilities, from 0 to 1, and steps.
         drop: conditions of the plans in any spelling, each dropped in all plans that have it.
         seed: any integer, of what is drawn.
         in_keys: where qaf, task_id and episode are, in this order; qaf is written where it was.
 
     Raises:
-        ValueError: a probability or number out of range, a query that no plan has (with the nearest); in use, ``qaf``
-            that is absent, of another shape or dtype, or of other plans, or a replay buffer, whose rows do not tell the
-            steps of their episodes.
+        ValueError: a wrong argument, a query that no plan has (with the nearest), ``qaf`` that is absent, of another
+            shape or dtype, or of other plans, or a replay buffer, whose rows do not tell the steps of their episodes.
         RuntimeError: a step of an environment that was never reset, or not since ``load_state_dict``.
 
     Example:
@@ -92,7 +89,7 @@ class CorruptQAF(EpisodeTransform):
             self._answered &= ~dropped
         self._task: Tensor | None = None  # B int64, of the rows' episodes
         self._episode: Tensor | None = None
-        self._plan: Tensor | None = None  # B int64, where their plans are in the tables
+        self._plan = torch.empty(0, dtype=torch.int64)  # B int64, where their plans are in the tables
         self._forget_episodes()
 
     def _forget_episodes(self) -> None:
@@ -129,7 +126,6 @@ class CorruptQAF(EpisodeTransform):
         return next_tensordict.set(self.in_keys[0], self._spoilt(now))
 
     def _drawn(self, purpose: str) -> Tensor:
-        assert self._plan is not None
         assert self._episode is not None
         return self._draws[purpose](self._plan, self._episode, self._rows.step)
 
@@ -139,14 +135,12 @@ class CorruptQAF(EpisodeTransform):
         return answers & self._answered[self._plan]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Refused: rows of a buffer do not tell the steps of their episodes."""
         raise ValueError(
             "CorruptQAF counts the steps of an environment's episodes, which rows of a replay buffer do not tell: put "
             "it into the environment, behind QAFTransform, or give it to evaluate(evaluator=...)"
         )
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        """Leaves the specs as they are, which must have what is read."""
         assert isinstance(observation_spec, Composite)
         found = list(observation_spec.keys(True, True))
         if any(key not in found for key in self.in_keys):
@@ -188,10 +182,10 @@ class _Draws:
 def _as_texts(drop: Iterable[str | Query]) -> tuple[str, ...]:
     if isinstance(drop, (str, Query)) or not isinstance(drop, Iterable):
         raise TypeError(f"drop must be a list of queries, got {shown(drop)}")
-    texts = tuple(str(one) if isinstance(one, (str, Query)) else one for one in drop)
-    if wrong := [text for text in texts if not isinstance(text, str)]:
-        raise TypeError(f"drop must be a list of queries, got {shown(wrong[0])} in it")
-    return texts
+    for one in (listed := tuple(drop)):
+        if not isinstance(one, (str, Query)):
+            raise TypeError(f"drop must be a list of queries, got {shown(one)} in it")
+    return tuple(map(str, listed))
 
 
 def _steps_with(text: str, tables: PlanTables, plans: Plans) -> Tensor:

@@ -103,13 +103,11 @@ class KeepsEnvState(EpisodeTransform):
     def get_extra_state(self) -> Tensor:
         """The environment's ``state_dict``, as bytes (n,) uint8; empty on a replay buffer."""
         env = base_env(self)
-        if env is None:
-            return torch.zeros(0, dtype=torch.uint8)
-        if isinstance(env, BatchedEnvBase) and env.is_closed:
-            warnings.warn(
-                f"this {type(env).__name__} is not running, so the state_dict says nothing of its episodes",
-                stacklevel=2,
-            )
+        closed = isinstance(env, BatchedEnvBase) and env.is_closed
+        if closed:
+            told = f"this {type(env).__name__} is not running, so the state_dict says nothing of its episodes"
+            warnings.warn(told, stacklevel=2)
+        if env is None or closed:
             return torch.zeros(0, dtype=torch.uint8)
         buffer = io.BytesIO()
         torch.save(env.state_dict(), buffer)
@@ -131,11 +129,10 @@ class KeepsEnvState(EpisodeTransform):
 class EnvState(KeepsEnvState):
     """Keeps the environment's seed and episode counters in a TransformedEnv's ``state_dict``, and so in a Collector's.
 
-    A TransformedEnv's ``state_dict`` is that of its transforms alone. Without this one, or a :class:`QAFTransform`,
-    which does the same, a collector that is resumed would run the same episodes again. It changes no entry. After
-    ``load_state_dict`` the environment must be reset (``collector.reset()``). Put it around a ParallelEnv too: the
-    ``load_state_dict`` of a ParallelEnv alone leaves TorchRL 0.14.1 one answer behind, unless it has
-    ``use_buffers=False``; this one mends that.
+    Without this one, or a :class:`QAFTransform`, which does the same, a collector that is resumed would run the same
+    episodes again: a TransformedEnv's ``state_dict`` is that of its transforms alone. It changes no entry. After
+    ``load_state_dict`` the environment must be reset (``collector.reset()``). Put it around a ParallelEnv too, whose
+    own ``load_state_dict`` leaves TorchRL 0.14.1 one answer behind, unless it has ``use_buffers=False``.
 
     Raises:
         ValueError: at loading, a state of other tasks or rows, or of no environment.

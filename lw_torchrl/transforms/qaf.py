@@ -15,12 +15,11 @@ from torchrl.envs.batched_envs import BatchedEnvBase
 
 from lw_torchrl._checks import check_int, checked, missing_keys
 from lw_torchrl._keys import as_keys, check_apart, key_beside
-from lw_torchrl.language.plan_tables import PlanTables
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.query_program import QueryProgram
-from lw_torchrl.language.task_index import TaskTables
-from lw_torchrl.transforms.answers import RowAnswers, kept
+from lw_torchrl.language.task_index import PlanTables, TaskTables
 from lw_torchrl.transforms.environment import KeepsEnvState, base_env, refuse_changed, transforms_beside
+from lw_torchrl.transforms.late_answers import RowAnswers, kept
 
 _HALF = (torch.float16, torch.bfloat16)  # in which metres are not told apart as conditions do
 
@@ -49,27 +48,25 @@ class QAFTransform(KeepsEnvState):
     the environment's, as :class:`EnvState` does.
 
     Conditions speak of metres, so it comes before whatever changes the observation: a normaliser, :class:`RandomYaw`.
-    A transform that comes first and names the observation in its ``out_keys`` is refused, also in the workers of a
-    SerialEnv. What it cannot see it answers wrongly: a transform that changes the observation without naming it, and
-    one in the processes of a ParallelEnv. Put it into each worker, before them.
+    A transform that comes first and names the observation in its ``out_keys`` is refused, also in a SerialEnv's
+    workers. It cannot see, and answers wrongly behind, one that does not name it or is in a ParallelEnv's processes:
+    put it into each worker, before them.
 
-    Answers may be slow. With ``every`` a row's answers are taken at its reset and then every so many steps of its
-    episode, and held in between. With ``delay`` they come so many steps late: in step t, 0 at the reset, a row is shown
-    those of step every · ⌊max(t - delay, 0) / every⌋. A ``_step`` or ``_reset`` mask counts for its rows alone. After
+    Answers may be slow: with ``every`` and ``delay``, in step t of its episode, 0 at the reset, a row is shown those of
+    step every · ⌊max(t - delay, 0) / every⌋. A ``_step`` or ``_reset`` mask counts for its rows alone. After
     ``load_state_dict`` the environment must be reset: episodes under way are no part of it. Rows of a replay buffer
     have no such steps, so a ``QAFTransform`` with either is refused there.
 
     Args:
         plans: a plan for each task that will be seen.
-        every: steps of a row's episode from one taking of its answers to the next.
-        delay: steps until answers are shown; until then a row is shown those of its reset.
-        in_keys: where observation and task_id are, in this order; a key may be nested.
+        every, delay: steps from one taking of a row's answers to the next, and until they are shown.
+        in_keys: where observation and task_id are, in this order.
         out_keys: where the truth goes; the plan's number goes beside it, under that name and ``_plan``.
 
     Raises:
         PlanError: (a ValueError) the environment has a task without a plan.
-        ValueError: a task_id without a plan, a malformed observation, one of half precision, or a transform before it
-            that changes it; ``every`` under 1 or ``delay`` under 0, or either on a replay buffer.
+        ValueError: a wrong argument, a task_id without a plan, a malformed observation, one of half precision, or a
+            transform before it that changes it; ``every`` or ``delay`` on a replay buffer.
         RuntimeError: with ``every`` or ``delay``, a step of an environment that was never reset, or not since
             ``load_state_dict``.
 
@@ -96,10 +93,8 @@ class QAFTransform(KeepsEnvState):
     ) -> None:
         self.every, self.delay = check_int("every", every, minimum=1), check_int("delay", delay, minimum=0)
         truth = as_keys("out_keys", out_keys, ("qaf",))
-        super().__init__(
-            in_keys=as_keys("in_keys", in_keys, ("observation", "task_id")),
-            out_keys=[*truth, plan_number_key(truth[0])],
-        )
+        read = as_keys("in_keys", in_keys, ("observation", "task_id"))
+        super().__init__(in_keys=read, out_keys=[*truth, plan_number_key(truth[0])])
         check_apart(self.in_keys, self.out_keys)
         self.plans = as_plans(plans)
         self.program = plan_program(self.plans)
@@ -154,7 +149,6 @@ class QAFTransform(KeepsEnvState):
         return next_tensordict
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write both keys, and those of ``next`` where there is a next observation."""
         if self._rows is not None:
             raise ValueError(
                 f"QAFTransform(every={self.every}, delay={self.delay}) counts the steps of an environment's episodes, "
@@ -173,7 +167,6 @@ class QAFTransform(KeepsEnvState):
         return tensordict
 
     def set_container(self, container: Transform | EnvBase) -> None:
-        """Join an environment, every task of which must have a plan."""
         super().set_container(container)
         self._saw_workers = False
         refuse_changed(self, self.in_keys[0])
@@ -182,7 +175,6 @@ class QAFTransform(KeepsEnvState):
             self.plans.require(getattr(env, "tasks", ()))
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        """Add ``qaf`` and ``qaf_plan`` to the specs."""
         assert isinstance(observation_spec, Composite)
         refuse_changed(self, self.in_keys[0])  # it may have been put there later
         steps, shape, device = self.program.num_queries, observation_spec.shape, observation_spec.device

@@ -13,9 +13,9 @@ from torchrl.envs import EnvBase, Transform
 from lw_torchrl._checks import check_scale, checked, missing_keys
 from lw_torchrl._keys import as_keys, check_apart, key_beside, read
 from lw_torchrl.language.observation import FIRST, HAND, POSITIONS, SECOND, a_step_before
-from lw_torchrl.language.plan_tables import PlanTables
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
-from lw_torchrl.language.skill_words import has_direction
+from lw_torchrl.language.skills import has_direction
+from lw_torchrl.language.task_index import PlanTables
 from lw_torchrl.transforms.qaf import plan_number_key
 
 _STARTS = tuple(part.start for part in (*POSITIONS, *map(a_step_before, (HAND, FIRST, SECOND))))
@@ -47,17 +47,11 @@ def yaw_key(observation: NestedKey) -> NestedKey:
     return key_beside(observation, "_yaw")
 
 
-def _reach(action: Tensor) -> Tensor:
-    """The larger of the two numbers in the plane, (..., 1)."""
-    return action[..., :2].abs().amax(-1, keepdim=True)
-
-
 class RandomYaw(Transform):
     """Turns each sampled row, its positions and its action alike, by a random angle about the vertical.
 
     A policy then learns to move towards the goal rather than in the direction that the demonstrations happened to have.
-    For replay buffers; where a :class:`QAFTransform` is used, put it first, since conditions speak of the scene as it
-    was.
+    For replay buffers; a :class:`QAFTransform` comes first, since conditions speak of the scene as it was.
 
     Changes ``observation`` (B, 39) float32 and ``action`` (B, 4) float32, and, where they are, ``expert_action`` and
     ``unclipped_action`` (B, 4) float32 and ``("next", "observation")``; writes ``observation_yaw`` (B,) float32, the
@@ -71,13 +65,12 @@ class RandomYaw(Transform):
         plans: the actor's plans: rows whose steps in force say no direction ("move the puck to the target location")
             are then turned by any angle. It reads ``qaf`` (B, S) bool and ``task_id`` (B,) int64; None turns all rows
             alike.
-        in_keys: where observation, action, the expert's action and the unclipped one are, in this order; a key may be
-            nested.
+        in_keys: where observation, action, the expert's action and the unclipped one are, in this order.
         out_keys: where they go, turned; None for the same places.
 
     Raises:
-        ValueError: a negative or infinite scale; a sample without observation or action, or, with plans, without
-            qaf and task_id, or with those of other plans.
+        ValueError: a wrong argument; a sample without observation or action, or, with plans, without qaf and task_id,
+            or with those of other plans.
         TypeError: it is given to an environment.
 
     Example:
@@ -129,7 +122,6 @@ class RandomYaw(Transform):
         return torch.where(free, any_angle, angle)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Turn each row of a sample."""
         tensordict = tensordict.copy()  # of a buffer's whole range it may be the storage itself
         seen, *actions = zip(self.in_keys, self.out_keys, strict=True)
         observation = tensordict.get(seen[0], None)
@@ -145,7 +137,8 @@ class RandomYaw(Transform):
             if (action := tensordict.get(key, None)) is None:
                 continue
             turned = _turned(action, (0,), cos, sin)
-            turned[..., :2] /= torch.where(_reach(action) <= 1.0, _reach(turned).clamp(min=1.0), 1.0)
+            before, now = (one[..., :2].abs().amax(-1, keepdim=True) for one in (action, turned))
+            turned[..., :2] /= torch.where(before <= 1.0, now.clamp(min=1.0), 1.0)
             tensordict.set(turned_key, turned)
         return tensordict
 
@@ -153,7 +146,6 @@ class RandomYaw(Transform):
         raise TypeError(_NOT_FOR_ENVIRONMENTS)
 
     def set_container(self, container: Transform | EnvBase) -> None:
-        """Join a buffer's transforms; an environment's actions cannot be turned after the fact."""
         if isinstance(container, EnvBase):
             raise TypeError(_NOT_FOR_ENVIRONMENTS)
         super().set_container(container)

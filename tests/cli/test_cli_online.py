@@ -13,10 +13,15 @@ TINY = """
 from functools import partial
 import lw_torchrl as lw
 from lw_torchrl.paper import online, runs
+from lw_torchrl.training import algorithms
 
 cloning = lw.BehavioralCloningConfig(steps=30, batch_size=20, checkpoint_every=10)
-config = lw.OnlineConfig(rows=4, round_steps=15, max_steps=12, batch_size=8, first_frames=20, warm_up=3, epochs=2)
+config = lw.OnlineConfig(rows=4, round_steps=15, max_steps=12, batch_size=8)
 online.OnlineRecipe = partial(online.OnlineRecipe, cloning=cloning, config=config)
+def method_config(method, given):
+    found, few = algorithms.method_config(method, given), dict(first_frames=20, warm_up=3, epochs=2)
+    return online.replace(found, **{name: number for name, number in few.items() if hasattr(found, name)})
+online.method_config = method_config
 online.evaluate = runs.evaluate = partial(lw.evaluate, max_steps=20)
 runs.collect_demonstrations = partial(lw.collect_demonstrations, max_steps=100)
 """
@@ -27,6 +32,7 @@ def tiny(monkeypatch):
     """Few steps of everything."""
     for module, name in (
         (online, "OnlineRecipe"),
+        (online, "method_config"),
         (online, "evaluate"),
         (runs, "evaluate"),
         (runs, "collect_demonstrations"),
@@ -117,6 +123,10 @@ def test_what_it_refuses(capsys, tmp_path, tiny):
     assert "--frames must be a multiple of rows, 4, got 181" in fails(capsys, *arguments(tmp_path, "--frames", 181))
     assert "--start: no file " in fails(capsys, *arguments(tmp_path, "--start", tmp_path / "nope.zip"))
     assert "TASKS must be" in fails(capsys, "online", "raech", "--out", tmp_path)
+    for given in (("--frames", 200), ("--logger", "csv")):
+        message = fails(capsys, "online", "reach", "--methods", "start", *given, "--out", tmp_path)
+        assert f"{given[0]} is of the methods advantage, td3, sac, residual, ppo, expert-iteration, " in message
+        assert "--methods are start" in message
     (tmp_path / "push.plan").write_text(str(lw.load_plans("MT10")["push"]))
     message = fails(capsys, *arguments(tmp_path, "--plans", tmp_path / "push.plan"))
     assert "plans lack reach; they cover push" in message

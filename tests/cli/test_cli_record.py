@@ -5,7 +5,7 @@ from commands import fails, run
 from rerun.chunk import RrdReader
 
 import lw_torchrl as lw
-from lw_torchrl.record.layout import Layout
+from lw_torchrl.record.tabs import Layout
 
 SHORT = ("--max-steps", 120, "--seed", 1000)
 

@@ -13,7 +13,7 @@ from lw_torchrl.envs.seeding import action_noise, episode_seed
 
 TRIPLES = st.tuples(st.sampled_from(lw.MT50), st.integers(-(2**70), 2**70), st.integers(0, 10**6))
 
-# Published results hang on these numbers: they may never change.
+# Published results depend on these numbers: they may never change.
 KNOWN = {
     ("reach", 0, 0): 3159217241594054643,
     ("pick-place", 1, 11): 4428370476197786331,

@@ -4,12 +4,12 @@ import dataclasses
 
 import pytest
 import torch
+from relation_truth import relation_holds
 
 import lw_torchrl as lw
 from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.language.plans import ConditionalPlan, PlanError, PlanStep, usual_goal
 from lw_torchrl.language.queries import parse_query
-from lw_torchrl.language.relations import relation_holds
 
 SKILLS = lw.load_skills()
 WITH_GOAL = sorted(text for text, skill in SKILLS.items() if skill.goal)
@@ -74,7 +74,7 @@ def test_a_goal_is_checked():
     with pytest.raises(PlanError, match=r"step 1 of plan 'push'.*drawer"):
         ConditionalPlan("push", (PlanStep(condition, "x", goal="the gripper is near the drawer handle"),))
     text = 'def push(robot):\n    if check("gripper open"):\n        robot.place("x", goal="the gripper is wet")\n'
-    from lw_torchrl.language.plan_files import check_plan
+    from lw_torchrl.language.plans import check_plan
 
     plan, faults = check_plan(text)
     assert plan is None

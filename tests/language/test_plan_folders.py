@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from plan_texts import DRAWER, HEAD, conditional_plans, plan
 
-from lw_torchrl.language.plan_files import load_plans, parse_plan, save_plans
-from lw_torchrl.language.plans import PlanError, Plans
+from lw_torchrl.language.plan_files import load_plans, save_plans
+from lw_torchrl.language.plans import PlanError, Plans, parse_plan
 from lw_torchrl.language.tasks import MT50
 
 

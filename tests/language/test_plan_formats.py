@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 from plan_texts import conditional_plans, queries
 
 import lw_torchrl as lw
-from lw_torchrl.language.plan_files import format_plan, parse_plan
-from lw_torchrl.language.plans import ConditionalPlan, PlanStep
+from lw_torchrl.language.plans import ConditionalPlan, PlanStep, parse_plan
 from lw_torchrl.language.queries import parse_query
 
 NINE = [f"{style}_{container}" for style in ("basic", "chain", "goal") for container in ("py", "py_md", "md")]
@@ -76,11 +75,11 @@ def test_goals_are_read_back_where_they_have_a_place(plan, format):
 @settings(max_examples=40, deadline=None)
 @given(plans_with_goals())
 def test_plan_files_hold_goals(plan):
-    assert parse_plan(format_plan(plan)) == plan
+    assert parse_plan(str(plan)) == plan
     assert lw.Plans.from_json(lw.Plans([plan]).to_json()) == {plan.task: plan}
     without = ConditionalPlan(plan.task, tuple(PlanStep(s.condition, s.skill, s.reason) for s in plan.steps))
     assert lw.Plans([plan]).fingerprint == lw.Plans([without]).fingerprint
-    assert (format_plan(plan) == format_plan(without)) == (plan == without)
+    assert (str(plan) == str(without)) == (plan == without)
 
 
 def test_plans_without_goals_of_their_own_write_none():

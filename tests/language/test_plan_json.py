@@ -152,5 +152,5 @@ def test_json_of_no_plan_says_what_is_wrong(found, says):
 
 
 def test_the_types_can_be_imported_first(python):
-    for module in ("plans", "formats", "plan_files", "decoding"):
+    for module in ("plans", "formats", "plan_files", "plan_decoding"):
         assert python(f"import lw_torchrl.language.{module}").returncode == 0

@@ -7,9 +7,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from plan_texts import DRAWER, HEAD, plan
 
-from lw_torchrl.language import plan_files
-from lw_torchrl.language.plan_files import check_plan, format_plan, load_plans, parse_plan
-from lw_torchrl.language.plans import MOST_STEPS, PLAN_LIMIT, ConditionalPlan, PlanError
+from lw_torchrl.language import plan_text
+from lw_torchrl.language.plan_files import load_plans
+from lw_torchrl.language.plan_text import MOST_STEPS, PLAN_LIMIT
+from lw_torchrl.language.plans import ConditionalPlan, PlanError, check_plan, parse_plan
 from lw_torchrl.language.queries import check_query, parse_query
 
 
@@ -155,7 +156,7 @@ def test_a_text_is_never_executed(tmp_path):
             load_plans(tmp_path)
     # In quotes it is a skill like any other, and stays words.
     quoted = plan("push", ("gripper open", f"push {attack}"))
-    assert parse_plan(format_plan(quoted)) == quoted
+    assert parse_plan(str(quoted)) == quoted
     assert not mark.exists()
 
 
@@ -186,12 +187,12 @@ def test_any_text_is_a_plan_or_a_plan_error(text):
         found = parse_plan(text)
     except PlanError:
         return
-    assert parse_plan(format_plan(found)) == found
+    assert parse_plan(str(found)) == found
 
 
 def test_all_faults_come_in_one_pass(monkeypatch):
     asked = []
-    monkeypatch.setattr(plan_files, "check_query", lambda text, task: asked.append(text) or check_query(text, task))
+    monkeypatch.setattr(plan_text, "check_query", lambda text, task: asked.append(text) or check_query(text, task))
     step = "    if check('the gripper is {} the pluck'):\n        robot.wait()\n"
     found, faults = check_plan("def push(robot):\n" + "".join(step.format("near") for _ in range(50)), source="my.plan")
     assert found is None

@@ -3,8 +3,7 @@
 from hypothesis import given, settings
 from plan_texts import conditional_plans, plan
 
-from lw_torchrl.language.plan_files import format_plan, parse_plan
-from lw_torchrl.language.plans import ConditionalPlan, PlanStep
+from lw_torchrl.language.plans import ConditionalPlan, PlanStep, parse_plan
 from lw_torchrl.language.queries import parse_query
 from lw_torchrl.language.tasks import TASKS, Task
 
@@ -12,24 +11,24 @@ from lw_torchrl.language.tasks import TASKS, Task
 @settings(max_examples=120, deadline=None)
 @given(conditional_plans())
 def test_the_text_of_a_plan_reads_back_as_the_same_plan(given):
-    text = format_plan(given)
+    text = str(given)
     found = parse_plan(text, given.task)
     assert found == given
     assert [step.skill for step in found.steps] == [step.skill for step in given.steps]
-    assert format_plan(found) == text
+    assert str(found) == text
     assert str(given) == text
 
 
 def test_reasons_are_kept_and_cannot_add_lines():
     reason = "because\n    if check('gripper closed'):\n        robot.fling('the puck')\u2028x"
     given = ConditionalPlan("push", (PlanStep(parse_query("gripper open", "push"), "push the puck", reason),))
-    found = parse_plan(format_plan(given))
+    found = parse_plan(str(given))
     assert found == given
     assert found.steps[0].reason == " ".join(reason.split())
 
 
 def test_the_text_names_the_task_and_its_description():
-    assert format_plan(plan()) == (
+    assert str(plan()) == (
         f"# push: {TASKS['push'].description}\n"
         "def push(robot):\n"
         '    if check("the robot\'s gripper is open"):\n'
@@ -39,7 +38,7 @@ def test_the_text_names_the_task_and_its_description():
 
 def test_the_text_of_a_plan_is_python_too():
     # People's editors colour and indent it as Python.
-    compile(format_plan(plan("push", ("gripper open", "say \"a\" \\ 'b' 手"))), "push.plan", "exec")
+    compile(str(plan("push", ("gripper open", "say \"a\" \\ 'b' 手"))), "push.plan", "exec")
 
 
 def test_a_description_of_several_lines_writes_no_second_plan():

@@ -7,8 +7,7 @@ from hypothesis import given, settings
 from plan_texts import DRAWER, conditional_plans, plan
 
 from lw_torchrl.language.named_objects import GRIPPER
-from lw_torchrl.language.plan_files import format_plan, parse_plan
-from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans, PlanStep, as_plans
+from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans, PlanStep, as_plans, parse_plan
 from lw_torchrl.language.queries import Clause, Query, QueryError, parse_query
 
 
@@ -48,7 +47,7 @@ def test_a_skill_is_kept_in_canonical_spelling_or_refused(given, skill):
     else:
         kept = plan("push", ("gripper open", given))
         assert kept.steps[0].skill == skill
-        assert parse_plan(format_plan(kept)) == kept
+        assert parse_plan(str(kept)) == kept
 
 
 def test_a_condition_is_kept_in_canonical_spelling():

@@ -5,12 +5,13 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from relation_truth import relation_holds
 from states import random_states
 
 from lw_torchrl.language.named_objects import GRIPPER, NamedObject
 from lw_torchrl.language.queries import QueryError, parse_query, supported_queries
 from lw_torchrl.language.query_program import QueryProgram
-from lw_torchrl.language.relations import RELATIONS, relation_holds
+from lw_torchrl.language.relations import RELATIONS
 from lw_torchrl.language.tasks import MT50, TASKS, Task, task_id
 
 metres = st.floats(-0.2, 0.2)

@@ -7,7 +7,7 @@ import pytest
 import lw_torchrl as lw
 from lw_torchrl.evaluation.plan_use import expert_use
 from lw_torchrl.language import text
-from lw_torchrl.language.plan_files import format_plan, parse_plan
+from lw_torchrl.language.plans import parse_plan
 
 EPISODES = 30
 
@@ -44,7 +44,7 @@ def test_every_step_is_needed_and_none_is_always_on(use, task):
 
 @pytest.mark.parametrize("task", lw.MT50)
 def test_file_is_canonical(task):
-    assert format_plan(parse_plan(plan_text(task), task)) == plan_text(task)
+    assert str(parse_plan(plan_text(task), task)) == plan_text(task)
 
 
 @pytest.mark.parametrize("task", lw.MT50)
@@ -72,7 +72,7 @@ def test_the_second_set_speaks_of_nothing_that_mt10_has_not():
         if task in lw.MT10:
             assert plans[task] == lw.load_plans("MT10")[task]
         else:
-            assert format_plan(plans[task]) == plan_text(task, "plans_mt10_skills")
+            assert str(plans[task]) == plan_text(task, "plans_mt10_skills")
 
 
 def test_every_text_comes_with_its_embedding(monkeypatch):

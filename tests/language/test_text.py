@@ -7,11 +7,11 @@ import sys
 
 import pytest
 import torch
+from embedding_table import shipped_texts, write_table
 
 from lw_torchrl.language import text
-from lw_torchrl.language.plan_files import load_plans, shipped_texts
+from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.tasks import TASKS
-from lw_torchrl.language.text import write_table
 
 NEW = "juggle three drawers while whistling"
 DESCRIPTIONS = [task.description for task in TASKS.values()]

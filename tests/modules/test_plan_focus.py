@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 
 import lw_torchrl as lw
-from lw_torchrl.language.plan_tables import PlanTables
 from lw_torchrl.language.plans import ConditionalPlan, Plans
+from lw_torchrl.language.task_index import PlanTables
 from lw_torchrl.modules.relative_positions import PlanFocus
 
 HAND, OBJECT, SECOND, GOAL = slice(0, 3), slice(4, 7), slice(11, 14), slice(36, 39)

@@ -13,7 +13,8 @@ from torch.nn.functional import normalize
 
 import lw_torchrl as lw
 from lw_torchrl.modules import PlanEncoder
-from lw_torchrl.objectives.skill_latents import KINDS
+
+KINDS = ("consistency", "contrastive")
 
 PLANS = lw.load_plans("MT10")
 SMALL = dict(width=16, depth=1, latent_size=5, encoder_width=8)

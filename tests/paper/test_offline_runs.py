@@ -1,4 +1,4 @@
-"""Offline experiments: what runs are called and hang on, the data they share, and that they carry on."""
+"""Offline experiments: what runs are called and depend on, the data they share, and that they carry on."""
 
 from __future__ import annotations
 

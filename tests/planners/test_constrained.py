@@ -13,7 +13,7 @@ from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.formats.structured import read_structured, write_structured
 from lw_torchrl.planners import plan_schema
 from lw_torchrl.planners.answers import Reply, read_reply
-from lw_torchrl.planners.plan_schema import passes
+from lw_torchrl.planners.prompts import passes
 
 OTHER_WORDS = lw.load_plans("MT50", skills="MT10")
 PUSH = plan_schema("push")

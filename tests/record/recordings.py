@@ -13,8 +13,8 @@ from torchrl.envs import TransformedEnv
 
 import lw_torchrl as lw
 from lw_torchrl.record import RerunLogger
-from lw_torchrl.record.layout import Layout
 from lw_torchrl.record.recorded_episode import GRIPPER
+from lw_torchrl.record.tabs import Layout
 
 STEPS = (
     ("the robot's gripper is not near the puck", "place the gripper above the puck"),

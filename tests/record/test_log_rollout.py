@@ -15,7 +15,7 @@ from recordings import Recording, run
 import lw_torchrl as lw
 from lw_torchrl.envs.engines import MetaWorldEngine
 from lw_torchrl.envs.seeding import episode_seed
-from lw_torchrl.evaluation.failures import Failure
+from lw_torchrl.evaluation.failure_records import Failure
 from lw_torchrl.record.opening import opening_step
 from lw_torchrl.record.viewer import open_viewer
 

@@ -17,7 +17,7 @@ from torchrl.record import VideoRecorder
 from torchrl.record.loggers import Logger
 
 from lw_torchrl.record import RerunLogger
-from lw_torchrl.record.layout import Layout
+from lw_torchrl.record.tabs import Layout
 
 
 def test_it_is_a_torchrl_logger(tmp_path):

@@ -10,7 +10,7 @@ from torchrl.envs import Compose, SerialEnv, TransformedEnv
 from torchrl.envs.transforms import ObservationNorm
 
 import lw_torchrl as lw
-from lw_torchrl.record import RolloutRecorder, rollout_recorder
+from lw_torchrl.record import RolloutRecorder
 
 PLANS = lw.load_plans("MT10")
 
@@ -31,9 +31,7 @@ def content(path):
     }
 
 
-@pytest.mark.parametrize("room", [512, 3])
-def test_live_is_what_is_logged_afterwards(tmp_path, monkeypatch, room):
-    monkeypatch.setattr(rollout_recorder, "_ROOM", room)
+def test_live_is_what_is_logged_afterwards(tmp_path):
     live = lw.RerunLogger(tmp_path / "live.rrd")
     env = make(live, num_envs=3, rows=(1, 2), policy="scripted")
     rollout = env.rollout(8, lw.ScriptedSkillActor(PLANS))

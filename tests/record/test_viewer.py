@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from types import SimpleNamespace
 
 import pytest
+import rerun
 import torch
 from recordings import Recording
 from rerun.chunk import RrdReader
@@ -196,6 +197,21 @@ def test_a_picture_of_an_episode_is_of_the_step_that_tells_most(tmp_path):
     assert opening_step(tmp_path / "a.rrd", names[1], 7) == 7
     with pytest.raises(ValueError, match="step must be at most 0, the recording's last, got 1"):
         opening_step(tmp_path / "a.rrd", "Metrics", 1)
+
+
+@pytest.mark.parametrize("timeline", ["step", "global_step"])
+def test_a_recording_that_does_not_say_its_tabs_opens_at_a_step_too(tmp_path, timeline):
+    """Those of earlier versions do not."""
+    stream = rerun.RecordingStream("lw_torchrl")
+    stream.save(tmp_path / "a.rrd")
+    for step in range(4):
+        stream.set_time(timeline, sequence=step)
+        stream.log("curve", rerun.Scalars(step))
+    stream.disconnect()
+    assert opening_step(tmp_path / "a.rrd") is None
+    assert opening_step(tmp_path / "a.rrd", step=2) == 2
+    with pytest.raises(ValueError, match="step must be at most 3"):
+        opening_step(tmp_path / "a.rrd", step=4)
 
 
 def test_a_window_opens_at_the_step_that_tells_most(tmp_path, monkeypatch):

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 
 import lw_torchrl as lw
 from lw_torchrl.modules import make_policy
+from lw_torchrl.training.algorithms import method_config
 
 TASKS = ["push", "reach"]
 PLANS = lw.load_plans("MT10")
 SMALL = dict(latent_size=4, width=16, depth=1, encoder_width=8)
-CONFIG = lw.OnlineConfig(
+NUMBERS = dict(
     frames=240,
     rows=4,
     round_steps=15,
@@ -23,6 +26,15 @@ CONFIG = lw.OnlineConfig(
     actor_learning_rate=1e-2,
     cloning_learning_rate=1e-2,
 )
+
+
+def configure(method="td3", **numbers):
+    """Small numbers of all that a method reads, but those given."""
+    config = method_config(method)
+    return replace(config, **{name: value for name, value in NUMBERS.items() if hasattr(config, name)} | numbers)
+
+
+CONFIG = configure()
 
 
 def collect_demos(root):
@@ -49,7 +61,8 @@ def make_replay(root, actor, **options):
     return lw.LanguageWorldExperienceReplay(root, **{**given, **options})
 
 
-def make_online(root, method="td3", checkpoint=None, *, actor=None, config=CONFIG, replay=None, **options):
+def make_online(root, method="td3", checkpoint=None, *, actor=None, config=None, replay=None, **options):
+    config = configure(method) if config is None else config
     actor = make_actor() if actor is None else actor
     replay = make_replay(root, actor) if replay is None else replay
     return lw.OnlineTrainer(

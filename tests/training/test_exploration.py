@@ -8,11 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
-from lw_torchrl.training.algorithms import OnlineConfig
+from lw_torchrl.training.algorithms import TD3Config
 from lw_torchrl.training.online import Exploration, longest_standstill
 
 ROWS, PATIENCE = 3, 4
-CONFIG = OnlineConfig(frames=60, rows=ROWS, exploration=0.1, stuck_exploration=0.5, gripper_exploration=0.5)
+CONFIG = TD3Config(frames=60, rows=ROWS, exploration=0.1, stuck_exploration=0.5, gripper_exploration=0.5)
 
 
 def state(*truth):

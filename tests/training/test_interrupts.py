@@ -136,12 +136,13 @@ def interrupted(forks, tmp_path, arguments, runs, owner, method):
     return found
 
 
-def test_twenty_times_at_random_moments(forks, demos, tmp_path):
+@pytest.mark.parametrize("times", [5, pytest.param(20, marks=pytest.mark.slow)])
+def test_at_random_moments(forks, demos, tmp_path, times):
     """Each run carries on from the one before; none loses a step that it made."""
     file = tmp_path / "policy.zip"
     arguments = ["train", demos, "--out", file, "--steps", 10**6, "--batch-size", 20, "--width", 16, "--depth", 1]
-    found = interrupted(forks, tmp_path, arguments, 20, "BehavioralCloningTrainer", "step")
-    assert [status for status, _ in found] == [130] * 20
+    found = interrupted(forks, tmp_path, arguments, times, "BehavioralCloningTrainer", "step")
+    assert [status for status, _ in found] == [130] * times
     steps = [step for _, step in found]
     assert steps[0] == 0
     assert all(before < after for before, after in pairwise(steps)), steps

@@ -42,8 +42,7 @@ def evaluator(demos, path):
 
 
 def online(demos, path):
-    config = lw.OnlineConfig(**{**vars(small_online.CONFIG), "frames": 60})
-    return small_online.make_online(demos, "td3", path, config=config)
+    return small_online.make_online(demos, "td3", path, config=small_online.configure(frames=60))
 
 
 TRAINERS = {"cloning": make_trainer, "stacked": stacked, "offline": offline, "evaluator": evaluator, "online": online}

@@ -7,12 +7,12 @@ import signal
 import subprocess
 import sys
 import textwrap
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
 import torch
-from small_online import CONFIG, PLANS, collect_demos, everything, make_actor, make_online, make_replay
+from small_online import CONFIG, PLANS, collect_demos, configure, everything, make_actor, make_online, make_replay
 from small_training import assert_same, flat
 from tensordict import TensorDict
 from torchrl.record.loggers import CSVLogger
@@ -20,8 +20,9 @@ from torchrl.record.loggers import CSVLogger
 import lw_torchrl as lw
 from lw_torchrl.modules import DescriptorEncoder, QValue
 from lw_torchrl.training import LEARNERS
-from lw_torchrl.training.algorithms import expert_iteration
+from lw_torchrl.training.algorithms import Learner, PPOConfig, TD3Config, expert_iteration
 from lw_torchrl.training.algorithms.expert_iteration import successful
+from lw_torchrl.training.algorithms.learner import ReplayConfig
 from lw_torchrl.training.envelope import POLICY
 
 
@@ -133,7 +134,7 @@ KILLER = """
     import os, random, signal, sys, time
     import torch
     sys.path.insert(0, sys.argv[3])
-    from small_online import CONFIG, everything, make_online
+    from small_online import everything, make_online
     from small_training import flat
     import lw_torchrl as lw
 
@@ -201,7 +202,7 @@ def test_the_critic_is_trained_alone_at_first(demos):
 def test_sacs_actor_learns_from_the_critics_that_judged_it(demos):
     actors = []
     for rate in (0.0, 1.0):
-        config = replace(CONFIG, frames=60, utd=0.05, warm_up=0, critic_learning_rate=rate)
+        config = configure("sac", frames=60, utd=0.05, warm_up=0, critic_learning_rate=rate)
         trainer = make_online(demos, "sac", config=config)
         trainer.train()
         assert trainer.learner.made == 1
@@ -262,7 +263,7 @@ def test_it_is_logged_by_steps_of_the_environment(demos, tmp_path):
 @pytest.mark.parametrize("how", ["td3", "residual", "ppo"])
 @pytest.mark.slow
 def test_other_conditions_learn_too(demos, method, how):
-    trainer = make_online(demos, how, actor=make_actor(method), config=replace(CONFIG, frames=120))
+    trainer = make_online(demos, how, actor=make_actor(method), config=configure(how, frames=120))
     trainer.train()
     assert len(trainer.history) == 2
 
@@ -301,7 +302,7 @@ def test_what_cannot_be_trained_on_is_refused(demos):
     actor, push = make_actor(), PLANS["push"]
     other = lw.Plans([*(PLANS[task] for task in PLANS if task != "push"), replace(push, steps=push.steps[:1])])
     with pytest.raises(ValueError, match=r"method must be one of 'advantage', 'td3', .* did you mean 'td3'"):
-        make_online(demos, "td4")
+        make_online(demos, "td4", config=CONFIG)
     plain = lw.LanguageWorldExperienceReplay(demos, transform=actor.transform())
     with pytest.raises(ValueError, match=r"replay must be .* that grows: give it grow="):
         make_online(demos, replay=plain)
@@ -351,13 +352,58 @@ def test_another_training_is_not_gone_on_with(demos, tmp_path):
     short = replace(CONFIG, frames=60)
     for given, message in (
         ({"config": replace(short, utd=0.2)}, "its online differs in utd"),
-        ({"config": short, "method": "sac"}, "its actor differs|its online differs"),
+        ({"config": configure("sac", frames=60), "method": "sac"}, "its actor differs|its online differs"),
         ({"config": short, "actor": make_actor(seed=1)}, "start"),
         ({"config": short, "replay": make_replay(demos, make_actor(), n_steps=2)}, "its replay differs in n_steps"),
         ({"config": short, "replay": make_replay(demos, make_actor(), reward="cost")}, "its replay differs in reward"),
     ):
         with pytest.raises(ValueError, match=message):
             make_online(demos, **{"checkpoint": path, **given})
+
+
+def test_a_method_reads_its_own_configuration_and_no_others(demos, tmp_path):
+    with pytest.raises(
+        TypeError, match="of the method 'td3' must be of class TD3Config, got SACConfig, which is of 'sac'"
+    ):
+        make_online(demos, "td3", config=configure("sac"))
+    with pytest.raises(TypeError, match="of the method 'td3' must be of class TD3Config, got ResidualConfig"):
+        make_online(demos, "td3", config=configure("residual"))
+    with pytest.raises(TypeError, match="beta"):
+        replace(CONFIG, beta=1.0)
+    common = lw.OnlineConfig(frames=60, rows=4, batch_size=8)
+    assert make_online(demos, "td3", config=common).config == TD3Config(frames=60, rows=4, batch_size=8)
+    assert lw.OnlineTrainer(make_actor(), make_replay(demos, make_actor()), method="ppo").config == PPOConfig()
+
+
+def test_a_checkpoint_that_lists_what_other_methods_read_is_gone_on_with(demos, tmp_path):
+    path, config = tmp_path / "checkpoint.zip", configure(frames=60)
+    trainer = make_online(demos, checkpoint=path, config=config)
+    trainer.train()
+    said = trainer.described | {"online": {**trainer.described["online"], "beta": 2.0, "gae_lambda": 0.95}}
+    POLICY.write(path, said, trainer.contents(), trainer.state_dict())
+    assert make_online(demos, checkpoint=path, config=config).round == 1
+
+
+def test_a_learner_may_bring_its_own_configuration(demos, monkeypatch):
+    @dataclass(frozen=True, kw_only=True)
+    class EagerConfig(ReplayConfig):
+        eagerness: int = 3
+
+    class Eager(Learner):
+        config_type = EagerConfig
+
+        def make(self, critic):
+            self.loss, self.asked = torch.nn.Linear(1, 1), 0
+
+        def learn(self, steps):
+            self.asked += steps * self.config.eagerness
+
+    monkeypatch.setitem(LEARNERS, "eager", Eager)
+    trainer = make_online(demos, "eager")
+    trainer.train()
+    assert trainer.learner.asked == 3 * int((240 - 40) * 0.1)
+    with pytest.raises(TypeError, match="of the method 'eager' must be of class EagerConfig, got TD3Config"):
+        make_online(demos, "eager", config=CONFIG)
 
 
 @pytest.mark.parametrize("damage", ["round", "learner", "replay", "history", "optimizer", "nan"])

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 import torch
 from hostile_files import parts, rebuild, refuses
-from small_online import CONFIG, collect_demos, everything, make_actor, make_online
+from small_online import collect_demos, configure, everything, make_actor, make_online
 from small_training import assert_same, flat
 
 import lw_torchrl as lw
 
-OFTEN = replace(CONFIG, exploration=0.5, gripper_exploration=1.0, max_steps=40, round_steps=40, frames=320)
+OFTEN = dict(exploration=0.5, gripper_exploration=1.0, max_steps=40, round_steps=40, frames=320)
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +44,7 @@ def rows_that_came(trainer):
 @pytest.mark.slow
 def test_what_is_done_outside_of_the_steps_is_what_the_base_does_without_noise(demos, steps, method):
     actor = make_residual(steps)
-    trainer = make_online(demos, method, actor=actor, config=OFTEN)
+    trainer = make_online(demos, method, actor=actor, config=configure(method, **OFTEN))
     trainer.train()
     rows = rows_that_came(trainer)
     state = rows.select("observation", "task_id", "qaf").copy()
@@ -64,7 +62,7 @@ def test_without_steps_there_is_noise_everywhere(demos):
     base = make_actor()
     torch.manual_seed(1)
     actor = lw.ResidualActor(base, width=16, depth=1)
-    trainer = make_online(demos, "residual", actor=actor, config=replace(OFTEN, first_frames=10_000))
+    trainer = make_online(demos, "residual", actor=actor, config=configure("residual", **OFTEN, first_frames=10_000))
     trainer.train()
     rows = rows_that_came(trainer)
     with torch.no_grad():
@@ -100,7 +98,7 @@ def test_stopped_in_a_round_it_ends_with_the_same_bits(demos, tmp_path):
 
 
 def test_a_training_of_another_step_is_not_gone_on_with(demos, tmp_path):
-    path, short = tmp_path / "checkpoint.zip", replace(CONFIG, frames=60)
+    path, short = tmp_path / "checkpoint.zip", configure("residual", frames=60)
     make_online(demos, "residual", path, actor=make_residual({"push": [0]}), config=short).train()
     for steps in ({"push": [1]}, {"push": [0, 1]}, {"reach": [0]}):
         with pytest.raises(ValueError, match="its actor differs"):
@@ -112,7 +110,7 @@ def test_the_other_tasks_of_the_policy_fare_exactly_as_before(demos):
     actor = make_residual({"push": [0, 1]})
     start = make_actor()
     start.load_state_dict(actor.base.state_dict())
-    make_online(demos, "residual", actor=actor, config=replace(CONFIG, actor_learning_rate=0.1)).train()
+    make_online(demos, "residual", actor=actor, config=configure("residual", actor_learning_rate=0.1)).train()
     given = dict(episodes_per_task=2, seed=5, max_steps=30, record_actions=True, progress=False)
     for tasks, same in ((["reach", "drawer-close"], True), (["push"], False)):
         was, now = (lw.evaluate(policy, tasks=tasks, **given) for policy in (start, actor))

@@ -7,10 +7,8 @@ from typing import Any
 
 from lw_torchrl._checks import check_choice
 from lw_torchrl.envs.engine import Engine
-from lw_torchrl.envs.engines.metaworld import MetaWorldEngine, naming_absent_renderer
-
-with naming_absent_renderer():  # it imports MuJoCo
-    from lw_torchrl.envs.engines.vectorized.engine import VectorizedEngine
+from lw_torchrl.envs.engines.metaworld import MetaWorldEngine
+from lw_torchrl.envs.engines.vectorized.engine import VectorizedEngine
 
 ENGINES: dict[str, Callable[..., Engine]] = {"vectorized": VectorizedEngine, "metaworld": MetaWorldEngine}
 """Name to ``(row_tasks, *, reward, num_threads) -> Engine``."""

@@ -5,13 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Literal
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from lw_torchrl._rendering import naming_absent_renderer
-from lw_torchrl.envs.cameras import Cameras
-from lw_torchrl.envs.engine import OBSERVATION_SIZE, BodyPoses, EngineStep, RowModel
+from lw_torchrl.envs.cameras import SeenRows
+from lw_torchrl.envs.engine import OBSERVATION_SIZE, EngineStep, RowModel
 from lw_torchrl.language.tasks import check_task
+
+UNSTABLE = slice(int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADQACC) + 1)
+"""MuJoCo's three warnings of an unstable simulation: bad positions, velocities or accelerations."""
 
 
 def import_metaworld() -> Any:
@@ -36,7 +40,7 @@ def make_metaworld_env(task: str, *, max_steps: int = 500) -> Any:
     return env
 
 
-class MetaWorldEngine:
+class MetaWorldEngine(SeenRows):
     """Meta-World's ``env.step`` in a loop, in one thread: slow, and the oracle for every other engine."""
 
     def __init__(
@@ -45,12 +49,7 @@ class MetaWorldEngine:
         self._dense = reward == "dense"
         # The environment above counts the steps; Meta-World's own limit must not come first.
         self._envs = [make_metaworld_env(task, max_steps=2**31 - 1) for task in tasks]
-        self._tasks = tuple(tasks)
-        self._cameras: Cameras | None = None
         self._last = np.zeros((len(self._envs), OBSERVATION_SIZE))
-        import mujoco
-
-        self._unstable = slice(int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADQACC) + 1)
 
     def reset(self, rows: Sequence[int], seeds: Sequence[int]) -> NDArray[np.float64]:
         for row, seed in zip(rows, seeds, strict=True):
@@ -67,7 +66,7 @@ class MetaWorldEngine:
             env = self._envs[row]
             observation, dense, _, _, info = env.step(action[row])
             # MuJoCo silently restarts an unstable simulation, and only counts a warning; a reset clears it.
-            warned = env.data.warning.number[self._unstable].any()
+            warned = env.data.warning.number[UNSTABLE].any()
             if warned or env._did_see_sim_exception or not np.isfinite(observation).all():
                 fault[row] = True
                 continue
@@ -76,23 +75,12 @@ class MetaWorldEngine:
             reward[row] = dense if self._dense else success[row]
         return EngineStep(self._last.copy(), reward, success, fault)
 
-    def render(self, rows: Sequence[int], *, camera: str, height: int, width: int) -> NDArray[np.uint8]:
-        self._cameras = self._cameras or Cameras()
-        size: Any = {"camera": camera, "height": height, "width": width}
-        envs = [(self._tasks[row], self._envs[row]) for row in rows]
-        return np.stack([self._cameras.picture(task, env.model, env.data, **size) for task, env in envs])
-
-    def model(self, row: int) -> RowModel:
+    def _seen(self, row: int) -> tuple[RowModel, Any]:
         env = self._envs[row]
-        return RowModel(str(env.model_name), env.model)
-
-    def poses(self, row: int) -> BodyPoses:
-        data = self._envs[row].data
-        return BodyPoses(data.xpos.copy(), data.xquat.copy())
+        return RowModel(str(env.model_name), env.model), env.data
 
     def close(self) -> None:
-        if self._cameras is not None:
-            self._cameras.close()
+        super().close()
         for env in self._envs:
             env.close()
         self._envs = []

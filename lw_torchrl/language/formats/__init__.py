@@ -6,7 +6,7 @@ import re
 from collections import UserDict
 
 from lw_torchrl._checks import check_choice, checked, shown
-from lw_torchrl.language.formats.plan_format import STYLES, PlanFormat
+from lw_torchrl.language.formats.base import STYLES, PlanFormat
 from lw_torchrl.language.formats.prose import md
 from lw_torchrl.language.formats.python import py, py_md
 from lw_torchrl.language.plans import ConditionalPlan

@@ -7,9 +7,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from lw_torchrl._checks import shown
-from lw_torchrl.language.formats.plan_format import END, Clause, PlanFormat, Reading, Style, item
+from lw_torchrl.language.formats.base import END, Clause, PlanFormat, Reading, Style, item
 from lw_torchrl.language.named_objects import GRIPPER
-from lw_torchrl.language.plans import ConditionalPlan, one_line
+from lw_torchrl.language.plan_text import one_line
+from lw_torchrl.language.plans import ConditionalPlan
 from lw_torchrl.language.tasks import TASKS, Task
 
 
@@ -69,19 +70,17 @@ def read_prose(text: str) -> Reading:
     A clause is a bullet that begins with "When", "If", "Once" and the like; in a text without such bullets, sentences
     like "When C, the robot should S" count. Other sentences before a clause are its reason.
     """
-    return _Reader(text).reading
+    return _Reader(text)
 
 
 def _is_comment(line: str) -> bool:
-    """Whether a line is only a sentence, which does not change how a plan is read."""
     is_plan = END.search(line) or _heading(line) or _BULLET.match(line) or item(line) or _clause(1, line, bullet=False)
     return not is_plan and _listing(line) is None
 
 
-class _Reader:
+class _Reader(Reading):
     def __init__(self, text: str) -> None:
-        self.reading = Reading()
-        self.section = self.reading.sections[0]
+        super().__init__()
         self.bulleted: dict[int, bool] = {}  # of a section, by its place: whether its clauses are bullets
         self.reason: list[str] = []
         self.listing = False
@@ -89,14 +88,14 @@ class _Reader:
             said, *cut = END.split(line, maxsplit=1)
             self.read(number, said.strip())
             if cut:
-                self.reading.note(number, "the answer ends here")
+                self.note(number, "the answer ends here")
                 break
 
     def read(self, number: int, raw: str) -> None:
         line = " ".join(raw.split())
         bullet = _BULLET.match(line)
         if name := _heading(line):
-            self.section = self.reading.open(name, number)
+            self.open(name, number)
             self.listing = False
             self.reason.clear()
         elif (steps := _listing(raw)) is not None:
@@ -107,13 +106,13 @@ class _Reader:
             self.section.listed += f"  {numbered[0]}. {numbered[1]}"
             return
         elif bullet and not item(line):
-            self.reading.note(number, f"a rule without a condition or a skill is left out: {shown(line)}")
+            self.note(number, f"a rule without a condition or a skill is left out: {shown(line)}")
         elif line and not line.startswith(("```", "~~~")) and not line.endswith(":"):
             self.reason.append(line)
         self.listing = self.listing and steps is not None
 
     def add(self, found: Clause, bullet: bool, line: str) -> None:
-        place = len(self.reading.sections)
+        place = len(self.sections)
         if bullet and not self.bulleted.get(place, True):
             self.section.clauses.clear()  # sentences that only say why
         if bullet or not self.bulleted.get(place, False):

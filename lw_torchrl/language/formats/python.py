@@ -7,9 +7,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from lw_torchrl._checks import shown
-from lw_torchrl.language.formats.plan_format import END, Clause, PlanFormat, Reading, Style, item
+from lw_torchrl.language.formats.base import END, Clause, PlanFormat, Reading, Style, item
 from lw_torchrl.language.named_objects import GRIPPER
-from lw_torchrl.language.plans import ConditionalPlan, PlanStep, function_head, one_line, quote
+from lw_torchrl.language.plan_text import function_head, one_line, quote
+from lw_torchrl.language.plans import ConditionalPlan, PlanStep
 from lw_torchrl.language.queries import Query
 from lw_torchrl.language.tasks import TASKS, Task
 
@@ -95,7 +96,7 @@ _MOST_JOINED = 6  # lines of one statement
 
 def read_python(text: str) -> Reading:
     """What a text says in Python, for :attr:`PlanFormat.read`."""
-    return _Reader(text).reading
+    return _Reader(text)
 
 
 @dataclass
@@ -108,12 +109,11 @@ class _Block:
     body: int | None = None
 
 
-class _Reader:
+class _Reader(Reading):
     """Matches lines against a few forms; blocks follow the indentation, and an ``if`` in a block asks for both."""
 
     def __init__(self, text: str) -> None:
-        self.reading = Reading()
-        self.section = self.reading.sections[0]
+        super().__init__()
         self.blocks: list[_Block] = []
         self.reason: list[str] = []
         self.listing = False
@@ -125,7 +125,7 @@ class _Reader:
 
     def note(self, line: int, text: str) -> None:
         self.flush()
-        self.reading.note(line, text)
+        super().note(line, text)
 
     def flush(self) -> None:
         """Note the lines that were passed over."""
@@ -133,7 +133,7 @@ class _Reader:
             first, last, line = self.ignored
             self.ignored = None
             which = "is" if first == last else f"and what follows up to line {last} is"
-            self.reading.note(first, f"{which} no part of a plan: {shown(line.strip())}")
+            super().note(first, f"{which} no part of a plan: {shown(line.strip())}")
 
     def read(self, number: int, line: str) -> bool:
         """Take a line in; False if the answer ends with it."""
@@ -166,7 +166,7 @@ class _Reader:
                 self.reason.append(words.strip())
 
     def open(self, name: str, number: int) -> None:
-        self.section = self.reading.open(name, number)
+        super().open(name, number)
         self.blocks.clear()
         self.reason.clear()
         self.listing = False
@@ -270,7 +270,6 @@ def _state_to_reach(place: str, named: dict[str, str]) -> tuple[str, str]:
 
 
 def _unquoted(strings: str) -> str:
-    """The text of one or more string literals in a row."""
     bodies = [literal.lstrip("fFrRbBuU")[1:-1] for literal in re.findall(_STRING, strings)]
     return " ".join("".join(re.sub(r"\\(.)", r"\1", body) for body in bodies).split())
 

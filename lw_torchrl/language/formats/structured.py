@@ -7,8 +7,9 @@ import re
 from typing import Any
 
 from lw_torchrl._checks import shown
-from lw_torchrl.language.formats.plan_format import Clause, Reading, Style
-from lw_torchrl.language.plans import ConditionalPlan, one_line
+from lw_torchrl.language.formats.base import Clause, Reading, Style
+from lw_torchrl.language.plan_text import one_line
+from lw_torchrl.language.plans import ConditionalPlan
 from lw_torchrl.language.queries import Query
 
 _STEPS = re.compile(r'"steps"\s*:\s*\[')
@@ -65,7 +66,7 @@ def read_structured(text: str) -> Reading:
         if clause is None:
             reading.note(line, f"a step without a condition or a skill is left out: {shown(step)}")
         else:
-            reading.sections[0].clauses.append(clause)
+            reading.section.clauses.append(clause)
 
 
 def _clause(step: Any, line: int) -> Clause | None:

@@ -1,11 +1,13 @@
-"""The methods of ``lw-torchrl online``: a file each, and a line in :data:`LEARNERS`."""
+"""The methods of ``lw-torchrl online``: a file each, with what it reads and what it does, and a line in
+:data:`LEARNERS`."""
 
-from lw_torchrl.training.algorithms.advantage import AdvantageLearner
-from lw_torchrl.training.algorithms.expert_iteration import ExpertIterationLearner
+from lw_torchrl._checks import check_choice
+from lw_torchrl.training.algorithms.advantage import AdvantageConfig, AdvantageLearner
+from lw_torchrl.training.algorithms.expert_iteration import ExpertIterationConfig, ExpertIterationLearner
 from lw_torchrl.training.algorithms.learner import Learner, OnlineConfig
-from lw_torchrl.training.algorithms.ppo import PPOLearner
-from lw_torchrl.training.algorithms.sac import SACLearner
-from lw_torchrl.training.algorithms.td3 import ResidualLearner, TD3Learner
+from lw_torchrl.training.algorithms.ppo import PPOConfig, PPOLearner
+from lw_torchrl.training.algorithms.sac import SACConfig, SACLearner
+from lw_torchrl.training.algorithms.td3 import ResidualConfig, ResidualLearner, TD3Config, TD3Learner
 
 LEARNERS: dict[str, type[Learner]] = {
     "advantage": AdvantageLearner,
@@ -17,4 +19,37 @@ LEARNERS: dict[str, type[Learner]] = {
 }
 """Name to method; yours can be added."""
 
-__all__ = ["LEARNERS", "Learner", "OnlineConfig"]
+
+def method_config(method: str, given: OnlineConfig | None = None) -> OnlineConfig:
+    """The configuration of a method: the given one; of a plain :class:`OnlineConfig`, or None, the method's defaults
+    for all that it does not say.
+
+    Raises:
+        TypeError: it is another method's.
+
+    Example:
+        >>> method_config("td3", OnlineConfig(frames=200)).policy_delay
+        2
+    """
+    own, given = LEARNERS[check_choice("method", method, LEARNERS)].config_type, given or OnlineConfig()
+    if type(given) is OnlineConfig:
+        return own(**vars(given))
+    if type(given) is not own:
+        others = " and ".join(repr(name) for name, one in LEARNERS.items() if one.config_type is type(given))
+        found = type(given).__name__ + (f", which is of {others}" if others else "")
+        raise TypeError(f"config of the method {method!r} must be of class {own.__name__}, got {found}")
+    return given
+
+
+__all__ = [
+    "LEARNERS",
+    "AdvantageConfig",
+    "ExpertIterationConfig",
+    "Learner",
+    "OnlineConfig",
+    "PPOConfig",
+    "ResidualConfig",
+    "SACConfig",
+    "TD3Config",
+    "method_config",
+]

@@ -2,20 +2,34 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 from tensordict import TensorDictBase
 from torch import nn
 from torchrl.objectives import SoftUpdate
 
+from lw_torchrl._checks import Probability, Scale
 from lw_torchrl.modules.critics import QValue, Value
 from lw_torchrl.objectives.advantage_weighted import AdvantageWeightedLoss, ExpectileValueLoss, standardize_by_task
-from lw_torchrl.training.algorithms.learner import Learner, adamw, encoder_like
+from lw_torchrl.training.algorithms.learner import CriticConfig, Learner, NoiseConfig, adamw, encoder_like
+
+
+@dataclass(frozen=True, kw_only=True)
+class AdvantageConfig(NoiseConfig, CriticConfig):
+    """How "advantage" trains."""
+
+    cloning_learning_rate: Scale = 3e-4  # of AdamW, of the actor
+    expectile: Probability = 0.7  # of the value
+    beta: Scale = 2.0  # how sharply advantages weigh
 
 
 class AdvantageLearner(Learner):
     """A value by expectile regression, and imitation of demonstrations and of the policy's own steps, as much as each
     one's advantage says: nothing is done that was not tried, so a value that errs about the untried harms nothing."""
+
+    config_type = AdvantageConfig
+    config: AdvantageConfig
 
     def make(self, critic: Any) -> None:
         start, config = self.policy, self.config

@@ -2,19 +2,30 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 
-from lw_torchrl.training.algorithms.learner import Learner, adamw
+from lw_torchrl._checks import Scale
+from lw_torchrl.training.algorithms.learner import Learner, NoiseConfig, adamw
 from lw_torchrl.training.behavioral_cloning import bc_loss
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExpertIterationConfig(NoiseConfig):
+    """How "expert-iteration" trains."""
+
+    cloning_learning_rate: Scale = 3e-4  # of AdamW
 
 
 class ExpertIterationLearner(Learner):
     """Behavioral cloning of demonstrations and of the policy's own successful episodes, half of each minibatch each;
     as many gradient steps at the end of each round as other methods make in it."""
 
+    config_type = ExpertIterationConfig
+    config: ExpertIterationConfig
     wants_round = True
 
     def make(self, critic: Any) -> None:

@@ -1,10 +1,11 @@
-"""What learns from the environment, whatever the method: the options, and the contract of a learner."""
+"""What learns from the environment, whatever the method: the contract of a learner, and options of several."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from tensordict import TensorDictBase
@@ -13,7 +14,7 @@ from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import LossModule, SoftUpdate
 
-from lw_torchrl._checks import check_choice, check_fields, check_int, check_probability, check_scale
+from lw_torchrl._checks import Count, Natural, Probability, Scale, check_fields
 from lw_torchrl._state_tree import check_like, check_optimizer_state
 from lw_torchrl.modules.conditioned_actor import ConditionedActor
 from lw_torchrl.modules.critics import QValue
@@ -25,89 +26,33 @@ from lw_torchrl.modules.policy import Policy
 from lw_torchrl.modules.residual_actor import ResidualActor
 from lw_torchrl.training.file_checks import copy_weights, tensors_of
 
-_FROM_1 = ("frames", "rows", "max_steps", "round_steps", "batch_size", "policy_delay", "exploration_hold", "epochs")
-_RATES = ("actor_learning_rate", "critic_learning_rate", "cloning_learning_rate", "utd")
-_WEIGHTS = ("beta", "bc_weight", "entropy", "clip", "residual_scale")
-_NOISES = ("policy_noise", "noise_clip", "exploration", "stuck_exploration", "gripper_exploration", "init_std")
 
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class OnlineConfig:
-    """How a policy is trained in its environment. What a method does not do, it does not read.
+    """How a policy is trained in its environment: what every method reads. Each has a subclass with what else it reads.
 
     Attributes:
         frames: steps of the environment in all, of every row; ``rows`` must divide it.
         rows: environments at once.
         max_steps: of an episode, until truncation.
         round_steps: steps of each row in a round. At its end all rows begin new episodes, and a checkpoint is written.
-        utd: gradient steps for each step of the environment.
-        batch_size: rows of a minibatch; half of it is demonstrations.
-        first_frames: steps of the environment before the first gradient step.
-        warm_up: gradient steps in which the critics alone are trained.
-        actor_learning_rate, critic_learning_rate: of AdamW.
-        cloning_learning_rate: of AdamW, of the actors of "advantage" and "expert-iteration".
+        exploration_hold: steps of each row between two turns of the learner, for which each draw of noise is kept.
+        batch_size: rows of a minibatch; half of it is demonstrations, of methods that learn from them.
         gamma: the discount; that of the buffer.
-        target_eps: how much of the target networks stays, in each gradient step.
-        expectile: of the value, of "advantage".
-        beta: how sharply advantages weigh, of "advantage".
-        policy_delay: gradient steps of the critics for one of the actor, of "td3" and "residual".
-        policy_noise, noise_clip: of the targets' actions, of "td3" and "residual".
-        bc_weight: of the imitation of demonstrations.
-        distance: to the action that is imitated.
-        exploration: standard deviation of the noise on the executed action.
-        stuck_exploration: the same for the hand where the plan has not gone on for longer than in any demonstration; of
-            a policy without a plan, and of distributions, "sac" and "ppo", it is not read.
-        exploration_hold: steps for which each draw of it is kept.
-        gripper_exploration: what it is multiplied by for the gripper.
-        init_std: the distribution's standard deviation at first, of "sac" and "ppo".
-        entropy: weight of the entropy, of "ppo", and where that of "sac" begins.
-        gae_lambda, epochs, clip: of "ppo"; ``utd`` is not read.
-        residual_scale: how far the action can be corrected, of "residual".
         seed: of the environment's episodes, of critics' first weights, of minibatches and noise.
     """
 
-    frames: int = 60_000
-    rows: int = 20
-    max_steps: int = 250
-    round_steps: int = 250
-    utd: float = 0.4
-    batch_size: int = 200
-    first_frames: int = 1_000
-    warm_up: int = 2_000
-    actor_learning_rate: float = 1e-4
-    critic_learning_rate: float = 5e-4
-    cloning_learning_rate: float = 3e-4
-    gamma: float = 0.99
-    target_eps: float = 0.995
-    expectile: float = 0.7
-    beta: float = 2.0
-    policy_delay: int = 2
-    policy_noise: float = 0.1
-    noise_clip: float = 0.3
-    bc_weight: float = 2.0
-    distance: Literal["l1", "l2"] = "l1"
-    exploration: float = 0.05
-    stuck_exploration: float = 0.5
-    exploration_hold: int = 5
-    gripper_exploration: float = 0.2
-    init_std: float = 0.15
-    entropy: float = 1e-3
-    gae_lambda: float = 0.95
-    epochs: int = 10
-    clip: float = 0.2
-    residual_scale: float = 0.3
+    frames: Count = 60_000
+    rows: Count = 20
+    max_steps: Count = 250
+    round_steps: Count = 250
+    exploration_hold: Count = 5
+    batch_size: Count = 200
+    gamma: Probability = 0.99
     seed: int = 0
 
     def __post_init__(self) -> None:
         check_fields(self)
-        for name in (*_FROM_1, "first_frames", "warm_up"):
-            check_int(name, getattr(self, name), minimum=int(name in _FROM_1))
-        for name in (*_RATES, *_WEIGHTS, *_NOISES):
-            check_scale(name, getattr(self, name))
-        for name in ("gamma", "target_eps", "expectile", "gae_lambda"):
-            check_probability(name, getattr(self, name))
-        check_choice("distance", self.distance, ("l1", "l2"))
-        check_int("seed", self.seed)
         if self.frames % self.rows:
             raise ValueError(
                 f"frames must be a multiple of rows, {self.rows}, got {self.frames}; the nearest is "
@@ -124,28 +69,62 @@ class OnlineConfig:
         """How many there are, the last one perhaps shorter."""
         return -(-self.steps // self.round_steps)
 
+    def due(self, frames: int) -> int:
+        """The gradient steps that are to be made in the first so many steps of the environment, before a round ends."""
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayConfig(OnlineConfig):
+    """Of methods that learn from the buffer: demonstrations and rows that came."""
+
+    utd: Scale = 0.4  # gradient steps for each step of the environment
+    first_frames: Natural = 1_000  # steps of the environment before the first gradient step
+    distance: Literal["l1", "l2"] = "l1"  # to the action that is imitated
+
+    def due(self, frames: int) -> int:
+        return int(max(0, frames - self.first_frames) * self.utd)
+
+
+@dataclass(frozen=True, kw_only=True)
+class NoiseConfig(ReplayConfig):
+    """Of methods that explore by noise on the executed action; others draw actions from a distribution."""
+
+    exploration: Scale = 0.05  # the noise's standard deviation
+    stuck_exploration: Scale = 0.5  # of the hand where a plan has not gone on for longer than in any demonstration
+    gripper_exploration: Scale = 0.2  # what ``exploration`` is multiplied by for the gripper
+
+
+@dataclass(frozen=True, kw_only=True)
+class CriticConfig(ReplayConfig):
+    """Of methods with critics and their targets."""
+
+    warm_up: Natural = 2_000  # gradient steps in which the critics alone are trained
+    critic_learning_rate: Scale = 5e-4  # of AdamW
+    target_eps: Probability = 0.995  # how much of the target networks stays, in each gradient step
+
 
 class Learner:
     """How a policy learns: a subclass makes what it trains, and says what it does with rows and at a round's end.
 
     Args:
         start: the policy to begin with.
-        replay: demonstrations, and what comes.
-        config: how to train.
-        critic: whose copies are trained, where the method has one; None for one that sees what the policy sees.
+        replay, config, critic: as of :class:`~lw_torchrl.OnlineTrainer`; the configuration is of ``config_type``.
 
     Attributes:
+        config_type: of its configuration; with a :class:`NoiseConfig` noise is added to its actions, else they are
+            drawn from the policy's distribution.
         policy: what acts, and is kept: the start itself, or another made of it.
         loss: holds all that is trained.
         optimizers: by what they train.
-        noisy: whether noise is added to its actions; if not, they are drawn from its distribution.
         wants_round: whether :meth:`end_round` reads the round's rows.
         made: gradient steps.
     """
 
-    loss: nn.Module
-    noisy = True
+    config_type: ClassVar[type[OnlineConfig]] = OnlineConfig
     wants_round = False
+    config: Any
+    loss: nn.Module
 
     def __init__(
         self, start: Policy, replay: TensorDictReplayBuffer, config: OnlineConfig, critic: QValue | None = None
@@ -161,9 +140,7 @@ class Learner:
 
     def act(self, state: TensorDictBase) -> TensorDictBase:
         """Write ``action`` (N, 4) float32, without the noise."""
-        if self.noisy:
-            return self.policy(state)
-        with set_exploration_type(ExplorationType.RANDOM):
+        with nullcontext() if isinstance(self.config, NoiseConfig) else set_exploration_type(ExplorationType.RANDOM):
             return self.policy(state)
 
     def noise_weight(self, state: TensorDictBase) -> Tensor | float:
@@ -220,9 +197,18 @@ class Learner:
         self.made = state["made"]
 
 
+@dataclass(frozen=True, kw_only=True)
+class OffPolicyConfig(CriticConfig):
+    """Of methods whose actor follows critics that judge actions."""
+
+    actor_learning_rate: Scale = 1e-4  # of AdamW
+    bc_weight: Scale = 2.0  # of the imitation of demonstrations
+
+
 class OffPolicyLearner(Learner):
     """Learns from demonstrations and rows that came, half of a minibatch each, with critics and their targets."""
 
+    config: OffPolicyConfig
     loss: Any
     targets: SoftUpdate
 

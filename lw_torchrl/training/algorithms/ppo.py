@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -10,15 +11,29 @@ from torch.nn.utils import clip_grad_norm_
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
+from lw_torchrl._checks import Count, Probability, Scale
 from lw_torchrl.data.rewards import REWARDS
 from lw_torchrl.modules.critics import Value
-from lw_torchrl.training.algorithms.learner import Learner, adamw, stochastic
+from lw_torchrl.training.algorithms.learner import Learner, OnlineConfig, adamw, stochastic
+
+
+@dataclass(frozen=True, kw_only=True)
+class PPOConfig(OnlineConfig):
+    """How "ppo" trains."""
+
+    actor_learning_rate: Scale = 1e-4  # of AdamW, of the actor and the value
+    init_std: Scale = 0.15  # the distribution's standard deviation at first
+    entropy: Scale = 1e-3  # weight of the entropy
+    gae_lambda: Probability = 0.95  # of the advantages
+    epochs: Count = 10  # passes over a round's rows
+    clip: Scale = 0.2  # how far the ratio of probabilities may be from 1
 
 
 class PPOLearner(Learner):
     """PPO: several passes over each round's rows. It sees no demonstrations but in its start."""
 
-    noisy = False
+    config_type = PPOConfig
+    config: PPOConfig
     wants_round = True
 
     def make(self, critic: Any) -> None:

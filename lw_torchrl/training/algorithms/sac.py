@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
+from lw_torchrl._checks import Scale
 from lw_torchrl.objectives.demonstrated import DemonstratedSACLoss
-from lw_torchrl.training.algorithms.learner import OffPolicyLearner, adamw, stochastic
+from lw_torchrl.training.algorithms.learner import OffPolicyConfig, OffPolicyLearner, adamw, stochastic
+
+
+@dataclass(frozen=True, kw_only=True)
+class SACConfig(OffPolicyConfig):
+    """How "sac" trains."""
+
+    init_std: Scale = 0.15  # the distribution's standard deviation at first
+    entropy: Scale = 1e-3  # where the weight of the entropy begins
 
 
 class SACLearner(OffPolicyLearner):
     """SAC with as many demonstrations as rows that came, and imitation of the former by the distribution's mode."""
 
-    noisy = False
+    config_type = SACConfig
+    config: SACConfig
 
     def make(self, critic: Any) -> None:
         config = self.config

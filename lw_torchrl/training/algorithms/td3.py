@@ -2,20 +2,32 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
-from lw_torchrl.modules.policy import Policy
+from lw_torchrl._checks import Count, Scale
 from lw_torchrl.modules.residual_actor import ResidualActor
 from lw_torchrl.objectives.demonstrated import DemonstratedTD3Loss
-from lw_torchrl.training.algorithms.learner import OffPolicyLearner
+from lw_torchrl.training.algorithms.learner import NoiseConfig, OffPolicyConfig, OffPolicyLearner
+
+
+@dataclass(frozen=True, kw_only=True)
+class TD3Config(NoiseConfig, OffPolicyConfig):
+    """How "td3" trains; what other methods read too is in ``learner.py``."""
+
+    policy_delay: Count = 2  # gradient steps of the critics for one of the actor
+    policy_noise: Scale = 0.1  # standard deviation of the noise on the targets' actions
+    noise_clip: Scale = 0.3  # the most of it
 
 
 class TD3Learner(OffPolicyLearner):
     """TD3 with as many demonstrations as rows that came, and imitation of the former."""
 
+    config_type = TD3Config
+    config: TD3Config
+
     def make(self, critic: Any) -> None:
         config = self.config
-        self.policy = self.make_policy(self.policy)
         loss = DemonstratedTD3Loss(
             self.policy,
             self.q_value(critic),
@@ -26,10 +38,6 @@ class TD3Learner(OffPolicyLearner):
             loss_function=config.distance,
         )
         self.set_loss(loss)
-
-    def make_policy(self, start: Policy) -> Policy:
-        """What is trained, of the policy to begin with."""
-        return start
 
     def learn(self, steps: int) -> None:
         for _ in range(steps):
@@ -45,10 +53,21 @@ class TD3Learner(OffPolicyLearner):
             self.made += 1
 
 
+@dataclass(frozen=True, kw_only=True)
+class ResidualConfig(TD3Config):
+    """How "residual" trains."""
+
+    residual_scale: Scale = 0.3  # how far the action can be corrected; not read if the start is a residual
+
+
 class ResidualLearner(TD3Learner):
     """TD3 of a small network that corrects the start's actions, which stays as it is; of the start itself if it is such
     a :class:`~lw_torchrl.ResidualActor`."""
 
-    def make_policy(self, start: Policy) -> Policy:
-        made = start if isinstance(start, ResidualActor) else ResidualActor(start, scale=self.config.residual_scale)
-        return made.eval()
+    config_type = ResidualConfig
+    config: ResidualConfig
+
+    def make(self, critic: Any) -> None:
+        if not isinstance(self.policy, ResidualActor):
+            self.policy = ResidualActor(self.policy, scale=self.config.residual_scale).eval()
+        super().make(critic)

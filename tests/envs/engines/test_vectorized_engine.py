@@ -146,10 +146,10 @@ def test_a_reset_finds_the_model_as_compiled():
     tasks = ["plate-slide", "plate-slide-back"]
     engine = VectorizedEngine(tasks, num_threads=1)
     engine.reset([0], [0])
-    moved, compiled = engine._rows[0]._body_pos, engine._rows[0].shared.compiled_body_pos
+    moved, compiled = engine._rows[0]._places[0], engine._rows[0].shared.compiled[0]
     assert not np.array_equal(moved, compiled)
     engine.reset([1], [0])
-    assert np.array_equal(engine._rows[1]._body_pos, compiled)
+    assert np.array_equal(engine._rows[1]._places[0], compiled)
 
 
 def test_actions_keep_their_own_precision():
@@ -299,12 +299,12 @@ def test_an_engine_that_is_forgotten_gives_its_models_back():
     engine = VectorizedEngine(["plate-slide"], num_threads=1)
     engine.reset([0], [5])
     shared = engine._rows[0].shared
-    assert not np.array_equal(shared.body_pos, shared.compiled_body_pos)
+    assert not np.array_equal(shared.places[0], shared.compiled[0])
     del engine
     path = model_path("plate-slide")
     borrowed = borrow_model(path)
     assert borrowed is shared
-    assert np.array_equal(shared.body_pos, shared.compiled_body_pos)
+    assert np.array_equal(shared.places[0], shared.compiled[0])
     return_models([borrowed])
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import weakref
-from collections import defaultdict
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -12,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lw_torchrl._checks import check_choice, check_int
-from lw_torchrl.envs.cameras import Cameras
-from lw_torchrl.envs.engine import ACTION_SIZE, OBSERVATION_SIZE, BodyPoses, EngineStep, RowModel
+from lw_torchrl.envs.cameras import SeenRows
+from lw_torchrl.envs.engine import ACTION_SIZE, OBSERVATION_SIZE, EngineStep, RowModel
 from lw_torchrl.envs.engines.vectorized import observation as at
 from lw_torchrl.envs.engines.vectorized import simulated_rows, task_programs
 from lw_torchrl.envs.engines.vectorized.observation import Array, Index, Mask, Observer, SuccessFunction
@@ -26,12 +25,10 @@ FINGERS = np.array([1.0, -1.0])
 
 
 def available_cores() -> int:
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-class VectorizedEngine:
+class VectorizedEngine(SeenRows):
     """Simulates all rows together: physics in threads, by default one a core, everything else in NumPy over all rows.
 
     Its numbers are those of :class:`~lw_torchrl.envs.engines.metaworld.MetaWorldEngine`, bit for bit, whatever the
@@ -55,35 +52,27 @@ class VectorizedEngine:
     ) -> None:
         task_programs.check_versions()
         dense = check_choice("reward", reward, ("sparse", "dense")) == "dense"
-        if num_threads is None:
-            num_threads = available_cores()
-        num_threads = check_int("num_threads", num_threads, minimum=1)
-        table = simulation_table()
+        num_threads = check_int("num_threads", available_cores() if num_threads is None else num_threads, minimum=1)
         tasks = [check_task(task) for task in tasks]
         self._groups = simulated_rows.split_into_groups([task_programs.model_path(task) for task in tasks], num_threads)
-        self._group_of_row = np.empty(len(tasks), dtype=np.intp)
-        builders: list[Any] = [None] * len(tasks)
+        rewards = [reward_table()[task] if dense else None for task in tasks]
+        rows: dict[int, simulated_rows.SimulatedRow] = {}
         models: list[task_programs.SharedModel] = []
         # A borrowed model goes back even if the engine is never closed.
         self._return_models = weakref.finalize(self, task_programs.return_models, models)
-        for number, group in enumerate(self._groups):
+        for group in self._groups:
             models.append(task_programs.borrow_model(task_programs.model_path(tasks[group.rows[0]])))
             here = {tasks[row] for row in group.rows}
-            programs = {task: task_programs.make_task_program(task, models[-1]) for task in here}
+            programs = {task: task_programs.program_class(task)(models[-1].model) for task in here}
             for row in group.rows:
-                self._group_of_row[row] = number
-                builders[row] = programs[tasks[row]]
-        rewards = [reward_table()[task] if dense else None for task in tasks]
+                sources, program = simulation_table()[tasks[row]], programs[tasks[row]]
+                rows[row] = simulated_rows.SimulatedRow(sources, models[-1], program, rewards[row])
+        self._rows = [rows[row] for row in range(len(tasks))]
         self._starts = EpisodeStarts([reward for reward in rewards if reward is not None]) if dense else None
         self._width = at.REWARD_WIDTH if dense else at.WIDTH
-        self._rows = [
-            simulated_rows.SimulatedRow(table[task], models[number], builder, task_reward)
-            for task, number, builder, task_reward in zip(tasks, self._group_of_row, builders, rewards, strict=True)
-        ]
         self._pool = simulated_rows.WorkerPool(num_threads)
-        self._cameras: Cameras | None = None
 
-        n = len(tasks)
+        n, builders = len(tasks), [row.builder for row in self._rows]
         bounds = [builder.sawyer_observation_space for builder in builders]
         self._low = np.array([space.low for space in bounds]).reshape(n, OBSERVATION_SIZE)
         self._high = np.array([space.high for space in bounds]).reshape(n, OBSERVATION_SIZE)
@@ -139,24 +128,18 @@ class VectorizedEngine:
         reward, success = np.zeros(n), np.zeros(n, dtype=bool)
         running = active & ~self._faulted
         if running.any():
-            self._step_running(self._running_rows(running), action, reward, success)
+            key = running.tobytes()
+            if self._running is None or self._running.key != key:  # the mask seldom changes
+                self._running = _RunningRows(self, running, key)
+            self._step_running(self._running, action, reward, success)
         return EngineStep(self._observation.copy(), reward, success, active & self._faulted)
 
-    def render(self, rows: Sequence[int], *, camera: str, height: int, width: int) -> NDArray[np.uint8]:
-        cameras = self._cameras = self._cameras or Cameras()
-        pictures = [self._rows[row].picture(cameras, camera=camera, height=height, width=width) for row in rows]
-        return np.stack(pictures)
-
-    def model(self, row: int) -> RowModel:
-        return self._rows[row].model
-
-    def poses(self, row: int) -> BodyPoses:
-        return self._rows[row].poses()
+    def _seen(self, row: int) -> tuple[RowModel, Any]:
+        return self._rows[row].seen()
 
     def close(self) -> None:
         """End the threads and give the models back, for the next engine of this process."""
-        if self._cameras is not None:
-            self._cameras.close()
+        super().close()
         self._pool.close()
         self._rows = []
         self._running = None
@@ -169,7 +152,7 @@ class VectorizedEngine:
         mocap = np.minimum(np.maximum(self._mocap[rows] + shift, running.mocap_low), running.mocap_high)
         self._mocap[rows] = mocap
         sensors = np.empty((len(rows), self._width))
-        warnings = np.empty((len(rows), simulated_rows.WARNING_KINDS), dtype=np.int32)
+        warnings = np.empty((len(rows), 3), dtype=np.int32)
         control = action[:, 3:] * FINGERS
 
         def simulate(k: int) -> None:
@@ -183,7 +166,8 @@ class VectorizedEngine:
         np.clip(observation, running.low, running.high, out=observation)
         achieved = running.success(sensors, current, goal)
         rewards = achieved if running.reward is None else running.reward(sensors, observation, goal, action)
-        stable = simulated_rows.is_stable(observation, warnings)
+        warned = (warnings != task_programs.WARNED_ALREADY).any(axis=1)
+        stable = np.isfinite(observation).all(axis=1) & ~warned
         if not stable.all():
             self._faulted[rows[~stable]] = True
             rows, current, observation = rows[stable], current[stable], observation[stable]
@@ -193,18 +177,10 @@ class VectorizedEngine:
         success[rows] = achieved
         reward[rows] = rewards
 
-    def _running_rows(self, running: Mask) -> _RunningRows:
-        """These rows; kept for the next step, since the mask seldom changes."""
-        key = running.tobytes()
-        if self._running is None or self._running.key != key:
-            self._running = _RunningRows(self, running, key)
-        return self._running
-
     def _by_group(self, rows: Index) -> list[tuple[simulated_rows.RowGroup, list[int]]]:
-        items: dict[int, list[int]] = defaultdict(list)
-        for row, number in zip(rows.tolist(), self._group_of_row[rows].tolist(), strict=True):
-            items[number].append(row)
-        return [(self._groups[number], members) for number, members in items.items()]
+        wanted = set(rows.tolist())
+        found = [(group, [row for row in group.rows if row in wanted]) for group in self._groups]
+        return [(group, members) for group, members in found if members]
 
 
 class _RunningRows:

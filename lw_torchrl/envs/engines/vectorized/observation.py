@@ -9,7 +9,7 @@ import numpy as np
 from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
-from lw_torchrl.envs.engines.vectorized.tables import TaskReward, TaskSources, parse_place
+from lw_torchrl.envs.engines.vectorized.tables import TaskReward, TaskSources
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -50,89 +50,63 @@ class StateView:
 
     def __init__(self, model: Any, data: Any) -> None:
         self._model = model
-        self._positions = {"body": data.xpos, "geom": data.geom_xpos, "site": data.site_xpos}
-        self._matrices = {"body": data.xmat, "geom": data.geom_xmat, "site": data.site_xmat}
-        self._quaternions: Array = data.xquat
-        self._joints: Array = data.qpos
-        arrays = [*self._positions.values(), *self._matrices.values(), self._quaternions, self._joints]
-        first = min(arrays, key=_address)
+        positions = {"body": data.xpos, "geom": data.geom_xpos, "site": data.site_xpos}
+        matrices = {"matrix of body": data.xmat, "matrix of geom": data.geom_xmat, "matrix of site": data.site_xmat}
+        self._arrays = positions | matrices | {"quaternion of body": data.xquat, "joint": data.qpos}
+        first = min(self._arrays.values(), key=_address)
         self._start = _address(first)
-        size = max(_address(array) + array.nbytes for array in arrays) - self._start
+        size = max(_address(array) + array.nbytes for array in self._arrays.values()) - self._start
         if size > data.nbuffer:
             raise RuntimeError("MuJoCo keeps this state in more than one block of memory")
         self.numbers = as_strided(first, shape=(size // first.itemsize,), strides=(first.itemsize,))
 
-    def position(self, place: str) -> Array:
-        """The position of "body NAME", "geom NAME" or "site NAME"."""
-        kind, number = self._find(place)
-        return self._positions[kind][number]
-
-    def matrix(self, place: str) -> Array:
-        """The rotation matrix of a place, nine numbers."""
-        kind, number = self._find(place)
-        return self._matrices[kind][number]
-
-    def quaternion(self, place: str) -> Array:
-        kind, number = self._find(place)
-        if kind != "body":
-            raise ValueError(f"only a body has a quaternion of its own, got {place!r}")
-        return self._quaternions[number]
-
-    def joint(self, name: str) -> Array:
-        """The coordinate of a joint that has one."""
-        address = self._model.joint(name).qposadr[0]
-        return self._joints[address : address + 1]
-
-    def where(self, array: Array) -> int:
-        """The index in ``numbers`` of the first number of one of the arrays above."""
-        return (_address(array) - self._start) // array.itemsize
-
-    def _find(self, place: str) -> tuple[str, int]:
-        kind, name = parse_place(place)
-        return kind, getattr(self._model, kind)(name).id
+    def find(self, what: str) -> Index:
+        """Where in ``numbers`` are the position of "body NAME", "geom NAME" or "site NAME"; the nine numbers of "matrix
+        of geom NAME", or of a body or site; the four of "quaternion of body NAME"; or the one of "joint NAME"."""
+        kind, _, name = what.rpartition(" ")
+        if kind not in self._arrays:
+            raise ValueError(f"a state has {', '.join(self._arrays)}, got {what!r}")
+        named = getattr(self._model, kind.split()[-1])(name)
+        row = named.qposadr[0] if kind == "joint" else named.id
+        own = self._arrays[kind][row : row + 1]
+        return (_address(own) - self._start) // own.itemsize + np.arange(own.size)
 
 
 def _address(array: Array) -> int:
     return array.__array_interface__["data"][0]
 
 
-def sensor_index(window: StateView, sources: TaskSources, reward: TaskReward | None) -> NDArray[np.intp]:
+def sensor_index(window: StateView, sources: TaskSources, reward: TaskReward | None) -> Index:
     """(WIDTH,) which numbers of the window make a task's row of sensors; (REWARD_WIDTH,) with a dense reward."""
     success = sources.success
-    parts = [
-        (HAND, window.position("body hand")),
-        (OBJECT, window.position(sources.object)),
-        (RIGHT_CLAW, window.position("body rightclaw")),
-        (LEFT_CLAW, window.position("body leftclaw")),
-    ]
+    parts = [(HAND, "body hand"), (OBJECT, sources.object)]
+    parts += [(RIGHT_CLAW, "body rightclaw"), (LEFT_CLAW, "body leftclaw")]
     if sources.quaternion.startswith(MATRIX_OF):
-        parts.append((MATRIX, window.matrix(sources.quaternion.removeprefix(MATRIX_OF))))
+        parts.append((MATRIX, sources.quaternion))
     elif sources.quaternion not in ("zeros", "identity"):
-        parts.append((QUATERNION, window.quaternion(sources.quaternion)))
+        parts.append((QUATERNION, f"quaternion of {sources.quaternion}"))
     if sources.second is not None:
-        parts.append((SECOND, window.position(sources.second)))
+        parts.append((SECOND, sources.second))
         if sources.second_quaternion != "zeros":
-            parts.append((SECOND_QUATERNION, window.quaternion(sources.second_quaternion)))
+            parts.append((SECOND_QUATERNION, f"quaternion of {sources.second_quaternion}"))
     if success.point == "gripper" or reward is not None:
-        parts.append((RIGHT_TIP, window.position("site rightEndEffector")))
-        parts.append((LEFT_TIP, window.position("site leftEndEffector")))
+        parts += [(RIGHT_TIP, "site rightEndEffector"), (LEFT_TIP, "site leftEndEffector")]
     if (point := success.stick_end or success.point) not in ("object", "second", "gripper"):
-        parts.append((POINT, window.position(point)))
+        parts.append((POINT, point))
     joint = sources.dial or success.joint
     if reward is not None:
         joint = joint or reward.joint
-        parts.append((LEFT_PAD, window.position("body leftpad")))
-        parts.append((RIGHT_PAD, window.position("body rightpad")))
+        parts += [(LEFT_PAD, "body leftpad"), (RIGHT_PAD, "body rightpad")]
         if reward.place is not None:
-            parts.append((PLACE, window.position(reward.place)))
+            parts.append((PLACE, reward.place))
         for number, corner in enumerate(reward.corners):
             start = CORNERS.start + 3 * number
-            parts.append((slice(start, start + 3), window.position(corner)))
+            parts.append((slice(start, start + 3), corner))
     if joint is not None:
-        parts.append((JOINT, window.joint(joint)))
+        parts.append((JOINT, f"joint {joint}"))
     index = np.zeros(WIDTH if reward is None else REWARD_WIDTH, dtype=np.intp)
-    for columns, array in parts:
-        index[columns] = window.where(array) + np.arange(array.size)
+    for columns, what in parts:
+        index[columns] = window.find(what)
     return index
 
 
@@ -149,7 +123,13 @@ class Observer:
         self._offset = np.array([row.offset for row in sources])
         self._seconds = np.flatnonzero([row.second is not None for row in sources])
         self._second_offset = np.array([row.second_offset for row in sources if row.second is not None])
-        self._constant, self._is_constant = _constants(sources)
+        self._constant = np.zeros((len(sources), CURRENT.stop))
+        self._is_constant = np.zeros(self._constant.shape, dtype=bool)
+        for k, row in enumerate(sources):
+            self._is_constant[k, QUATERNION] = row.quaternion in ("zeros", "identity")
+            self._constant[k, QUATERNION.start] = row.quaternion == "identity"
+            self._is_constant[k, SECOND] = row.second is None
+            self._is_constant[k, SECOND_QUATERNION] = row.second is None or row.second_quaternion == "zeros"
 
     def current(self, sensors: Array) -> Array:
         """(rows, 18) the part of the observation that describes the present state."""
@@ -167,18 +147,6 @@ class Observer:
             current[self._dials, OBJECT.start] += np.sin(angle) * DIAL_RADIUS
             current[self._dials, OBJECT.start + 1] -= np.cos(angle) * DIAL_RADIUS
         return current
-
-
-def _constants(sources: Sequence[TaskSources]) -> tuple[Array, NDArray[np.bool_]]:
-    """The constant part of each row: its value, and where."""
-    value = np.zeros((len(sources), CURRENT.stop))
-    fixed = np.zeros(value.shape, dtype=bool)
-    for k, row in enumerate(sources):
-        fixed[k, QUATERNION] = row.quaternion in ("zeros", "identity")
-        value[k, QUATERNION.start] = row.quaternion == "identity"
-        fixed[k, SECOND] = row.second is None
-        fixed[k, SECOND_QUATERNION] = row.second is None or row.second_quaternion == "zeros"
-    return value, fixed
 
 
 def row_norm(vectors: Array) -> Array:
@@ -305,15 +273,14 @@ class SuccessFunction:
         for k in np.flatnonzero(held):
             current, program = scene.current[rows[k]], self._programs(int(rows[k]))
             lifted = current[OBJECT][2] - STICK_LIFT > program.stick_init_pos[2]
-            held[k] = current[GRIPPER] > 0.0 and lifted and both_pads_press(program, "objGeom")
+            held[k] = current[GRIPPER] > 0.0 and lifted and _both_pads_press(program.model, program.data)
         return held
 
 
-def both_pads_press(program: Any, geom: str) -> bool:
-    """Whether both pads of the gripper push against a geom, by the contact forces Meta-World looks at."""
-    model, data = program.model, program.data
+def _both_pads_press(model: Any, data: Any) -> bool:
+    """Whether both pads of the gripper push against the stick, by the contact forces Meta-World looks at."""
     pairs = data.contact.geom
-    touched = (pairs == model.geom(geom).id).any(axis=1)
+    touched = (pairs == model.geom("objGeom").id).any(axis=1)
     for pad in ("leftpad_geom", "rightpad_geom"):
         contacts = touched & (pairs == model.geom(pad).id).any(axis=1)
         if not sum(data.efc_force[data.contact.efc_address[contacts]]) > 0:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from itertools import pairwise
 from math import ceil
 from time import perf_counter
 from typing import Any
@@ -14,18 +13,13 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl.envs.cameras import Cameras
-from lw_torchrl.envs.engine import BodyPoses, RowModel
+from lw_torchrl.envs.engine import RowModel
+from lw_torchrl.envs.engines.metaworld import UNSTABLE
 from lw_torchrl.envs.engines.vectorized.observation import Array, StateView, sensor_index
 from lw_torchrl.envs.engines.vectorized.tables import TaskReward, TaskSources
-from lw_torchrl.envs.engines.vectorized.task_programs import WARNED_ALREADY, SharedModel
+from lw_torchrl.envs.engines.vectorized.task_programs import SharedModel
 
-UNSTABLE = slice(int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADQACC) + 1)
-"""MuJoCo's three warnings of an unstable simulation: bad positions, velocities or accelerations."""
-
-WARNING_KINDS = 3
-
-VELOCITIES_DONE = int(mujoco.mjtStage.mjSTAGE_VEL)
+_VELOCITIES_DONE = int(mujoco.mjtStage.mjSTAGE_VEL)
 
 
 class SimulatedRow:
@@ -37,11 +31,10 @@ class SimulatedRow:
         self.sources = sources
         self.shared = shared
         self.program: Any = None
-        self._builder = builder
+        self.builder = builder
         self._model = shared.model
         self._data = mujoco.MjData(shared.model)
-        self._body_pos = shared.compiled_body_pos.copy()
-        self._site_pos = shared.compiled_site_pos.copy()
+        self._places = shared.compiled[0].copy(), shared.compiled[1].copy()
         self._substeps: int = builder.frame_skip
         self.mocap: Array = self._data.mocap_pos[0]  # that the hand is drawn to
         self._control: Array = self._data.ctrl
@@ -55,10 +48,9 @@ class SimulatedRow:
         """Start an episode, a function of the seed alone; returns the first observation."""
         self.shared.restore()
         self._looked = False
-        self.program = self._builder.on(self._data)
+        self.program = self.builder.on(self._data)
         observation = self.program.start_episode(seed)
-        self._body_pos[...] = self.shared.body_pos
-        self._site_pos[...] = self.shared.site_pos
+        self._places[0][...], self._places[1][...] = self.shared.places
         self.shared.holder = self
         return observation
 
@@ -79,16 +71,10 @@ class SimulatedRow:
         self._numbers.take(self._sensor_index, out=sensors, mode="clip")
         warnings[...] = self._warnings
 
-    @property
-    def model(self) -> RowModel:
-        return RowModel(self.shared.path, self._model)
-
-    def poses(self) -> BodyPoses:
-        return BodyPoses(self._data.xpos.copy(), self._data.xquat.copy())
-
-    def picture(self, cameras: Cameras, **size: Any) -> NDArray[np.uint8]:
+    def seen(self) -> tuple[RowModel, Any]:
+        """Its model, with this row's places in it, and its data."""
         self._take_model()
-        return cameras.picture(self.shared.path, self._model, self._data, **size)
+        return RowModel(self.shared.path, self._model), self._data
 
     def _substep_after_look(self) -> None:
         """One ``mj_step`` where since the last ``mj_forward`` only the controls and the mocap body have moved.
@@ -101,17 +87,12 @@ class SimulatedRow:
         mujoco.mj_kinematics(model, data)
         mujoco.mj_makeConstraint(model, data)
         mujoco.mj_referenceConstraint(model, data)
-        mujoco.mj_forwardSkip(model, data, VELOCITIES_DONE, 1)  # 1: no sensors
+        mujoco.mj_forwardSkip(model, data, _VELOCITIES_DONE, 1)  # 1: no sensors
         mujoco.mj_Euler(model, data)
 
     def _take_model(self) -> None:
         if self.shared.holder is not self:
-            self.shared.load(self, self._body_pos, self._site_pos)
-
-
-def is_stable(observation: Array, warnings: NDArray[np.int32]) -> NDArray[np.bool_]:
-    """(rows,) whether the numbers are finite and MuJoCo has given none of its three warnings since the reset."""
-    return np.isfinite(observation).all(axis=1) & (warnings == WARNED_ALREADY).all(axis=1)
+            self.shared.load(self, self._places)
 
 
 class RowGroup:
@@ -128,12 +109,8 @@ def split_into_groups(keys: Sequence[str], num_threads: int) -> list[RowGroup]:
     for row, key in enumerate(keys):
         by_key[key].append(row)
     largest = len(keys) if num_threads == 1 else ceil(len(keys) / (2 * num_threads))
-    groups = []
-    for rows in by_key.values():
-        parts = ceil(len(rows) / largest)
-        bounds = [len(rows) * part // parts for part in range(parts + 1)]
-        groups += [RowGroup(rows[low:high]) for low, high in pairwise(bounds)]
-    return groups
+    parts = [part for rows in by_key.values() for part in np.array_split(rows, ceil(len(rows) / largest))]
+    return [RowGroup(part.tolist()) for part in parts]
 
 
 class WorkerPool:

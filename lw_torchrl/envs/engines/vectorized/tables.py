@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -9,26 +10,17 @@ from functools import cache
 from importlib.resources import files
 from math import inf, nan
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Literal
 
-from lw_torchrl._checks import check_choice
+from lw_torchrl._checks import check_choice, check_fields
 
 Vector = tuple[float, float, float]
 Pair = tuple[float, float]
 
-PLACES = ("body", "geom", "site")
 RULES = ("point below goal", "object above goal", "joint above", "joint near", "stick inserted", "stick held")
 
 NO_OFFSET: Vector = (-0.0, -0.0, -0.0)
 """Adding -0.0 leaves every number as it is, 0.0 and -0.0 included; adding 0.0 does not."""
-
-
-def parse_place(text: str) -> tuple[str, str]:
-    """The kind, "body", "geom" or "site", and the name of a part of the model, "site goal" say."""
-    kind, _, name = text.partition(" ")
-    if kind not in PLACES or not name:
-        raise ValueError(f"a place is 'body NAME', 'geom NAME' or 'site NAME', got {text!r}")
-    return kind, name
 
 
 @dataclass(frozen=True)
@@ -48,10 +40,10 @@ class SuccessSources:
     stick_end: str | None = None
 
     def __post_init__(self) -> None:
-        if self.rule is not None and self.rule not in RULES:
-            raise ValueError(f"success.rule must be one of {', '.join(RULES)}, got {self.rule!r}")
-        if self.point not in ("object", "second", "gripper"):
-            parse_place(self.point)
+        if self.rule is not None:
+            check_choice("success.rule", self.rule, RULES)
+        if self.point not in ("object", "second", "gripper") and not re.fullmatch("(body|geom|site) .+", self.point):
+            raise ValueError(f"a place is 'body NAME', 'geom NAME' or 'site NAME', got {self.point!r}")
 
 
 @dataclass(frozen=True)
@@ -71,8 +63,6 @@ class TaskSources:
 POINTS = (
     "hand", "object", "second", "goal", "tcp", "left pad", "grip", "place", "start", "tcp at start", "mark", "waypoint",
 )  # fmt: skip
-CURVES = ("long tail", "gaussian")
-DENSITIES = ("sparse", "high", "medium")
 FIRST_DISTANCE = "first distance"
 
 
@@ -95,13 +85,13 @@ class Term:
     margin: tuple[str, str] | float | str = 1.0
     margin_offset: Vector = NO_OFFSET
     less: float = 0.0
-    curve: str = "long tail"
+    curve: Literal["long tail", "gaussian"] = "long tail"
 
     def __post_init__(self) -> None:
         _check_points(self.between, 2)
         if isinstance(self.margin, tuple):
             _check_points(self.margin, 2)
-        check_choice("curve", self.curve, CURVES)
+        check_fields(self)
 
 
 @dataclass(frozen=True)
@@ -112,7 +102,7 @@ class Cage:
     pad: float
     across: float
     effort: float = 1.0
-    density: str = "sparse"
+    density: Literal["sparse", "high", "medium"] = "sparse"
     start: str = "start"
     slide: float = 0.0
     offset: Vector = NO_OFFSET
@@ -120,7 +110,7 @@ class Cage:
     pinch: float = inf
 
     def __post_init__(self) -> None:
-        check_choice("cage.density", self.density, DENSITIES)
+        check_fields(self, "cage.")
         check_choice("cage.start", self.start, POINTS)
 
 
@@ -186,14 +176,9 @@ class TaskReward:
     def terms(self) -> tuple[Term, Term, Term, Term]:
         """near, placed and via, and how close the gripper is across the object."""
         across = Term()
-        if self.cage is not None:
-            across = Term(
-                between=("tcp", "grip"),
-                axes=(1.0, 0.0, 1.0),
-                within=self.cage.across,
-                margin=(self.cage.start, "tcp at start"),
-                less=self.cage.across,
-            )
+        if (cage := self.cage) is not None:
+            margin = cage.start, "tcp at start"
+            across = Term(("tcp", "grip"), axes=(1.0, 0.0, 1.0), within=cage.across, margin=margin, less=cage.across)
         return self.near, self.placed, self.via, across
 
 

@@ -35,36 +35,26 @@ def check_versions() -> None:
             )
 
 
+Places = tuple[NDArray[np.float64], NDArray[np.float64]]
+
+
 class SharedModel:
     """A compiled model that many rows use in turn: a reset of a Meta-World task moves bodies and sites of the model
-    itself, so each row keeps its own ``body_pos`` and ``site_pos``, and loads them before its physics unless it is
-    still the ``holder``."""
+    itself, so each row keeps its own ``places`` of both, and loads them before its physics unless it is still the
+    ``holder``."""
 
-    def __init__(self, path: str, model: Any) -> None:
-        self.path = path
-        self.model = model
-        self.body_pos: NDArray[np.float64] = model.body_pos
-        self.site_pos: NDArray[np.float64] = model.site_pos
-        self.compiled_body_pos = self.body_pos.copy()
-        self.compiled_site_pos = self.site_pos.copy()
+    def __init__(self, path: str, model: Any, compiled: Places | None = None) -> None:
+        self.path, self.model = path, model
+        self.places: Places = (model.body_pos, model.site_pos)
+        self.compiled: Places = compiled or (model.body_pos.copy(), model.site_pos.copy())
         self.holder: object = None
 
-    def load(self, holder: object, body_pos: NDArray[np.float64], site_pos: NDArray[np.float64]) -> None:
+    def load(self, holder: object, places: Places) -> None:
         self.holder = holder
-        self.body_pos[...] = body_pos
-        self.site_pos[...] = site_pos
+        self.places[0][...], self.places[1][...] = places
 
     def restore(self) -> None:
-        self.load(None, self.compiled_body_pos, self.compiled_site_pos)
-
-    def duplicate(self) -> SharedModel:
-        """A second model, for rows that are to run beside this one's; copied, not compiled."""
-        twin = SharedModel(self.path, copy.copy(self.model))
-        # This model may be in use: take what never changes from it, not its present state.
-        twin.compiled_body_pos = self.compiled_body_pos
-        twin.compiled_site_pos = self.compiled_site_pos
-        twin.restore()
-        return twin
+        self.load(None, self.compiled)
 
 
 # reentrant: an engine that Python collects gives its models back, perhaps inside borrow_model
@@ -78,10 +68,13 @@ def borrow_model(path: str) -> SharedModel:
     with _lock:
         if (idle := _idle.pop(path, None)) is not None:
             return idle
-        if path in _compiled:
-            return _compiled[path].duplicate()
-        _compiled[path] = SharedModel(path, mujoco.MjModel.from_xml_path(path))
-        return _compiled[path]
+        if (known := _compiled.get(path)) is None:
+            _compiled[path] = SharedModel(path, mujoco.MjModel.from_xml_path(path))
+            return _compiled[path]
+        # It may be in use: take what never changes from it, not its present state.
+        twin = SharedModel(path, copy.copy(known.model), known.compiled)
+        twin.restore()
+        return twin
 
 
 def return_models(models: Iterable[SharedModel]) -> None:
@@ -107,7 +100,6 @@ class TaskProgram:
     frame_skip: int
     hand_init_pos: NDArray[np.float64]
     tcp_center: NDArray[np.float64]
-    _target_pos: NDArray[np.float64]
     reset_model: Callable[[], NDArray[np.float64]]
     get_body_com: Callable[[str], NDArray[np.float64]]
 
@@ -140,9 +132,8 @@ class TaskProgram:
 
     def start_episode(self, seed: int) -> NDArray[np.float64]:
         """Reset as Meta-World's ``env.seed(seed); env.reset()`` does; returns the first observation. Meta-World places
-        everything twice and simulates the hand's way both times. Of the first round only the random draws and the
-        positions of bodies and sites survive, which do not depend on the hand, so here the first round does not move
-        it."""
+        everything twice and moves the hand both times. Of the first round only the random draws and the positions of
+        bodies and sites survive, which do not depend on the hand, so here the first round does not move it."""
         self.np_random, _ = seeding.np_random(seed)
         mujoco.mj_resetData(self.model, self.data)
         self.data.warning.number[:] = WARNED_ALREADY
@@ -175,7 +166,7 @@ def _task_class(task: str) -> Any:
 
 
 @cache
-def _program_class(task: str) -> Any:
+def program_class(task: str) -> Any:
     base = _task_class(task)
     return type(f"{base.__name__}Program", (TaskProgram, base), {})
 
@@ -183,7 +174,3 @@ def _program_class(task: str) -> Any:
 def model_path(task: str) -> str:
     """The XML file of a task; 36 files serve the 50 tasks."""
     return object.__new__(_task_class(task)).model_name
-
-
-def make_task_program(task: str, shared: SharedModel) -> Any:
-    return _program_class(task)(shared.model)

@@ -33,7 +33,7 @@ class EpisodeStarts:
     def begin(self, row: int, program: Any) -> None:
         reward = self.rewards[row]
         features = np.zeros(terms.FEATURES)
-        features[terms.CONSTANT] = terms.waypoint_numbers(reward)
+        features[terms.CONSTANT] = [0.0 if isinstance(value, str) else value for value in reward.waypoint]
         for columns, name in ((terms.START, reward.start), (terms.TCP_START, "init_tcp"), (terms.MARK, reward.mark)):
             if name is not None:
                 features[columns] = getattr(program, name)
@@ -53,7 +53,6 @@ class DenseReward:
         self._proximity = terms.ProximityTerms(task)
         self._caging = terms.CagingTerm(task)
         self._funnels = terms.FunnelTerm(task)
-        self._every_row = np.arange(len(rows))
         self._lifts = [(LIFTS[name], np.flatnonzero(task.lift == name)) for name in np.unique(task.lift) if name]
         self._formulas = [(FORMULAS[name], np.flatnonzero(task.formula == name)) for name in np.unique(task.formula)]
 
@@ -62,8 +61,7 @@ class DenseReward:
         (rows, 3) and actions (rows, 4) in their own precision."""
         # Index whose simulation broke, and branches that are not taken, may hold anything.
         with np.errstate(all="ignore"):
-            less = self._starts.less[self._rows]
-            points = self._starts.points[self._rows]
+            less, points = self._starts.less[self._rows], self._starts.points[self._rows]
             features = terms.gather_features(self._task, sensors, observation[:, CURRENT], goal, points)
             proximity = self._proximity(features, less)
             self._starts.less[self._rows] = less
@@ -113,7 +111,7 @@ class DenseReward:
     def _held(self, features: Array, proximity: terms.Proximity) -> Mask:
         task = self._task
         near, opening = proximity.distance[:, terms.NEAR], features[:, GRIPPER]
-        height = features[self._every_row, OBJECT.start + task.held.lifted_axis]
+        height = features[np.arange(len(features)), OBJECT.start + task.held.lifted_axis]
         moved = proximity.margin[:, terms.PLACED] - proximity.distance[:, terms.PLACED]
         held = (near < task.held.near) & (near <= task.held.within)
         held &= (opening > task.held.opened) & (opening >= task.held.opened_from) & (opening < task.held.opened_under)

@@ -128,27 +128,25 @@ def carry(s: StepState, rows: Index, cast: Cast) -> Any:
     return np.where(s.held[rows], carried, reward)
 
 
-def carry_over_wall(s: StepState, rows: Index, cast: Cast) -> Any:
-    """By way of a point above the wall; what is beyond the wall, to the goal."""
-    gripped = hamacher_product(cast(s.grasp[rows]), cast(s.via[rows]))
-    rising = gripped + 1.0 + cast(4.0 * s.via[rows])
-    sinking = gripped + 1.0 + 4.0 + cast(3.0 * s.placed[rows])
-    carried = np.where(s.features[rows, at.OBJECT.start + 1] > 0.75, sinking, rising)
+def _by_way(s: StepState, rows: Index, cast: Cast, gripped: Any) -> Any:
+    """Where held, first to a point at the wall; what is beyond the wall, to the goal."""
+    coming = gripped + 1.0 + cast(4.0 * s.via[rows])
+    going = gripped + 1.0 + 4.0 + cast(3.0 * s.placed[rows])
+    carried = np.where(s.features[rows, at.OBJECT.start + 1] > 0.75, going, coming)
     return np.where(s.held[rows], carried, gripped)
+
+
+def carry_over_wall(s: StepState, rows: Index, cast: Cast) -> Any:
+    return _by_way(s, rows, cast, hamacher_product(cast(s.grasp[rows]), cast(s.via[rows])))
+
+
+def push_round_wall(s: StepState, rows: Index, cast: Cast) -> Any:
+    return _by_way(s, rows, cast, 2 * cast(s.grasp[rows]))
 
 
 def push(s: StepState, rows: Index, cast: Cast) -> Any:
     reward = 2 * cast(s.grasp[rows])
     return np.where(s.held[rows], reward + (1.0 + reward + cast(5.0 * s.placed[rows])), reward)
-
-
-def push_round_wall(s: StepState, rows: Index, cast: Cast) -> Any:
-    """By way of a point beside the wall; what is beyond it, to the goal."""
-    reward = 2 * cast(s.grasp[rows])
-    coming = reward + 1.0 + cast(4.0 * s.via[rows])
-    going = reward + 1.0 + 4.0 + cast(3.0 * s.placed[rows])
-    pushed = np.where(s.features[rows, at.OBJECT.start + 1] > 0.75, going, coming)
-    return np.where(s.held[rows], pushed, reward)
 
 
 def unplug(s: StepState, rows: Index, cast: Cast) -> Any:
@@ -173,11 +171,16 @@ def soccer(s: StepState, rows: Index, cast: Cast) -> Any:
     return 3 * s.grasp[rows] + 6.5 * placed
 
 
+def _with_tool(s: StepState, rows: Index, cast: Cast, placed: Array, upright: Array) -> Any:
+    """Grip and place, all of it turned as the tool should be."""
+    turned = turned_like(s.features[rows, at.QUATERNION], upright, 0.4)
+    return (2.0 * cast(s.grasp[rows]) + cast(6.0 * placed)) * cast(turned)
+
+
 def peg(s: StepState, rows: Index, cast: Cast) -> Any:
     """Bring the ring over the peg: far away high up, then down."""
-    features = s.features[rows]
-    ring = features[:, at.PLACE]
-    error = features[:, terms.GOAL] - ring
+    ring = s.features[rows, at.PLACE]
+    error = s.features[rows, terms.GOAL] - ring
     radius = row_norm(error[:, :2])
     on_peg = (radius < 0.02) & (error[:, 2] > 0.0)
     rim = np.where(on_peg, 0.02, 0.01)
@@ -185,28 +188,23 @@ def peg(s: StepState, rows: Index, cast: Cast) -> Any:
     error[:, 2] = height - ring[:, 2]
     lifted = (ring[:, 2] > 0.02) | (radius < rim)
     placed = 0.1 * lifted + 0.9 * tolerance(row_norm(error * TALL), 0.0, 0.02, 0.4)
-    reward = _with_tool(s, rows, cast, placed, turned_like(features[:, at.QUATERNION], UPRIGHT, 0.4))
-    return np.where(on_peg, 10.0, reward)
+    return np.where(on_peg, 10.0, _with_tool(s, rows, cast, placed, UPRIGHT))
 
 
 def unpeg(s: StepState, rows: Index, cast: Cast) -> Any:
     """Lift the ring from the peg."""
     features = s.features[rows]
     placed = 0.1 * (features[:, at.PLACE.start + 2] > 0.02) + 0.9 * s.placed[rows]
-    reward = _with_tool(s, rows, cast, placed, turned_like(features[:, at.QUATERNION], UPRIGHT, 0.4))
-    return np.where(features[:, at.OBJECT.start + 2] > features[:, terms.GOAL.start + 2], 10.0, reward)
+    off_peg = features[:, at.OBJECT.start + 2] > features[:, terms.GOAL.start + 2]
+    return np.where(off_peg, 10.0, _with_tool(s, rows, cast, placed, UPRIGHT))
 
 
 def hammer(s: StepState, rows: Index, cast: Cast) -> Any:
     """Bring the hammer's head to the nail, and drive it in."""
     features = s.features[rows]
     placed = 0.1 * (features[:, at.OBJECT.start + 2] > 0.02) + 0.9 * s.placed[rows]
-    reward = _with_tool(s, rows, cast, placed, turned_like(features[:, at.QUATERNION], LYING, 0.4))
+    reward = _with_tool(s, rows, cast, placed, LYING)
     return np.where((features[:, at.JOINT.start] > 0.09) & (reward > 5.0), 10.0, reward)
-
-
-def _with_tool(s: StepState, rows: Index, cast: Cast, placed: Array, turned: Array) -> Any:
-    return (2.0 * cast(s.grasp[rows]) + cast(6.0 * placed)) * cast(turned)
 
 
 def stick_push(s: StepState, rows: Index, cast: Cast) -> Any:

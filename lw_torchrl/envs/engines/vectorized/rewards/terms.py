@@ -24,7 +24,7 @@ FEATURES = GRIP.stop
 
 # The columns of each of POINTS but the last, the waypoint.
 _COLUMNS = at.HAND, at.OBJECT, at.SECOND, GOAL, TCP, at.LEFT_PAD, GRIP, at.PLACE, START, TCP_START, MARK
-COLUMNS = dict(zip(POINTS[:-1], _COLUMNS, strict=True))
+COLUMNS = {point: list(range(FEATURES)[columns]) for point, columns in zip(POINTS[:-1], _COLUMNS, strict=True)}
 
 NEAR, PLACED, VIA, ACROSS = range(4)
 
@@ -71,15 +71,15 @@ def _parameters(rewards: Sequence[TaskReward]) -> Parameters:
         cage=Parameters(
             **_numbers(Cage, cages),
             used=np.array([reward.cage is not None for reward in rewards]),
-            start=np.array([COLUMNS["grip" if cage.signed else cage.start].start + 1 for cage in cages]),
+            start=np.array([COLUMNS["grip" if cage.signed else cage.start][1] for cage in cages]),
             high=np.array([cage.density == "high" for cage in cages]),
             medium=np.array([cage.density == "medium" for cage in cages]),
         ),
         funnel=Parameters(
             **_numbers(Funnel, funnels),
             used=np.array([reward.funnel is not None for reward in rewards]),
-            over=np.array([COLUMNS[funnel.over].start + 2 for funnel in funnels]),
-            about=np.array([_about(funnel) for funnel in funnels]),
+            over=np.array([COLUMNS[funnel.over][2] for funnel in funnels]),
+            about=np.array([[COLUMNS[point][:2] for point in (one.about[0], one.about[-1])] for one in funnels]),
         ),
         held=Parameters(**_numbers(Held, [reward.held for reward in rewards])),
     )
@@ -96,21 +96,12 @@ def _numbers(kind: Any, parts: Sequence[Any]) -> dict[str, Any]:
 def _points(reward: TaskReward) -> list[list[list[list[int]]]]:
     margins = [term.margin if isinstance(term.margin, tuple) else term.between[:1] * 2 for term in reward.terms]
     pairs = [[term.between for term in reward.terms], margins]
-    return [[[_columns(reward, pair[end]) for pair in kind] for end in (0, 1)] for kind in pairs]
-
-
-def _columns(reward: TaskReward, point: str) -> list[int]:
-    if point != "waypoint":
-        return list(range(FEATURES)[COLUMNS[point]])
-    return [
-        COLUMNS[value].start + axis if isinstance(value, str) else CONSTANT.start + axis
-        for axis, value in enumerate(reward.waypoint)
+    constant = range(FEATURES)[CONSTANT]
+    waypoint = [
+        (COLUMNS[value] if isinstance(value, str) else constant)[axis] for axis, value in enumerate(reward.waypoint)
     ]
-
-
-def waypoint_numbers(reward: TaskReward) -> list[float]:
-    """The waypoint's numbers, 0 where it takes a point's."""
-    return [0.0 if isinstance(value, str) else value for value in reward.waypoint]
+    columns = COLUMNS | {"waypoint": waypoint}
+    return [[[columns[pair[end]] for pair in kind] for end in (0, 1)] for kind in pairs]
 
 
 def _less(term: Term) -> float:
@@ -120,11 +111,6 @@ def _less(term: Term) -> float:
     if term.margin == FIRST_DISTANCE:
         return nan
     return 0.0 if isinstance(term.margin, str) else term.margin
-
-
-def _about(funnel: Funnel) -> list[list[int]]:
-    """The columns of x and y of two points, which may be the same."""
-    return [[COLUMNS[point].start, COLUMNS[point].start + 1] for point in (funnel.about[0], funnel.about[-1])]
 
 
 def gather_features(task: Parameters, sensors: Array, current: Array, goal: Array, episode: Array) -> Array:

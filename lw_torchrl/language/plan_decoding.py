@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 from lw_torchrl._checks import check_choice, check_probability, checked, counted, shown
 from lw_torchrl.language.formats import PLAN_FORMATS
-from lw_torchrl.language.formats.plan_format import Clause, Note, Reading, Section, listed_steps
+from lw_torchrl.language.formats.base import Clause, Note, Reading, Section, listed_steps
 from lw_torchrl.language.formats.prose import read_prose
 from lw_torchrl.language.formats.python import read_python
 from lw_torchrl.language.nearest import StepMapper
-from lw_torchrl.language.plans import MOST_STEPS, ConditionalPlan, PlanStep
+from lw_torchrl.language.plan_text import MOST_STEPS
+from lw_torchrl.language.plans import ConditionalPlan, PlanStep
 from lw_torchrl.language.queries import Query, read_query
-from lw_torchrl.language.skill_words import canonical_skill
-from lw_torchrl.language.skills import ScriptedSkill
-from lw_torchrl.language.tasks import TASKS, Task, check_task
+from lw_torchrl.language.skills import Skills, canonical_skill
+from lw_torchrl.language.tasks import TASKS, Task, Tasks, get_task
 
 
 @dataclass(frozen=True)
@@ -77,8 +77,8 @@ def decode_plan(
     by: Literal["edit", "embedding"] = "edit",
     limit: float = LIMIT,
     skill_limit: float = SKILL_LIMIT,
-    skills: Mapping[str, ScriptedSkill] | None = None,
-    tasks: Mapping[str, Task] = TASKS,
+    skills: Skills | None = None,
+    tasks: Tasks = TASKS,
 ) -> DecodedPlan:
     """Read a plan from whatever a language model wrote. No text is an error, and none is executed.
 
@@ -113,7 +113,7 @@ def decode_plan(
 
     Source: paper sections 'Conditional Plan Generation' and 'LLM Experiments'.
     """
-    owner = task if isinstance(task, Task) else tasks[check_task(task, tasks)]
+    owner = get_task(task, tasks)
     read = PLAN_FORMATS[check_choice("format", format, PLAN_FORMATS)].read
     limits = check_probability("limit", limit), check_probability("skill_limit", skill_limit)
     return decode_as(text, read, StepMapper(owner, skills, by, *limits))
@@ -151,7 +151,6 @@ def decode_as(text: str, read: Callable[[str], Reading], mapper: StepMapper) -> 
 
 
 def _same(name: str, task: Task) -> bool:
-    """Whether a name in a text means the task, whatever its spelling."""
     return re.sub(r"[^a-z0-9]", "", name.lower()) == task.name.replace("-", "")
 
 
@@ -175,15 +174,13 @@ def _in_words(goal: str) -> str:
     said = []
     for state in re.split(r"\s+and\s+", goal):
         found = re.match(r"(?:the\s+)?(?:robot's\s+)?(.+?)\s+is\s+(.+)", state)
-        if found and found.groups() in (("gripper", "open"), ("gripper", "closed")):
-            said.append(f"{found[2].removesuffix('d')} the gripper")
-        else:
-            said.append(f"move {found[1]} {found[2]}" if found else f"move until {state}")
+        thing, place = found.groups() if found else ("until", state)
+        closing = thing == "gripper" and place in ("open", "closed")
+        said.append(f"{place.removesuffix('d')} the gripper" if closing else f"move {thing} {place}")
     return " and ".join(said)
 
 
 def _mapped(clause: Clause, mapper: StepMapper, notes: list[Note]) -> DecodedStep:
-    """A clause mapped, with notes of what was changed and why it was dropped."""
 
     def note(text: str) -> None:
         notes.append(Note(clause.line, text))
@@ -255,12 +252,6 @@ def without_thoughts(text: str, notes: list[Note]) -> str:
 
     A closing tag alone closes what began before the text, if it ends its line outside of a plan's comments. An opening
     tag in a comment or a string opens nothing. The tags of gpt-oss always count. JSON has no thoughts.
-
-    Example:
-        >>> without_thoughts("<think>A draft.\\n</think>Done.", [])
-        '\\nDone.'
-        >>> without_thoughts("A draft. [/THINK]\\nDone. # </think>", [])
-        '\\nDone. # </think>'
     """
     spans, opened, at, comment, quotes = list[tuple[int, int]](), None, 0, False, 0
     for tag in _TAG.finditer("" if _IS_JSON.match(text) else text):

@@ -19,45 +19,35 @@ Point = tuple[float, float, float]
 SIMPLE_EYE: tuple[Point, Point] = ((0.54, 0.23, 0.46), (0.03, 0.63, 0.10))
 ROBOT_EYE: tuple[Point, Point] = ((0.54, 0.18, 0.47), (-0.02, 0.62, 0.13))
 
-CURVES = {
-    "distance": ("Distance of what the skill moves from where it goes, cm", 3),
-    "action": ("Action", 4),
-    "reward": ("Reward", 2),
-    "skill_weights": ("Skill weights", 4),
-    "corrected": ("How much of the correction counts", 2),
+CURVES: dict[str, tuple[str, int, tuple[float, float] | None]] = {
+    "distance": ("Distance of what the skill moves from where it goes, cm", 3, None),
+    "action": ("Action", 4, (-1.2, 1.2)),
+    "reward": ("Reward", 2, None),
+    "skill_weights": ("Skill weights", 4, (-0.1, 1.1)),
+    "corrected": ("How much of the correction counts", 2, (-0.1, 1.1)),
 }
-"""Each curve's title and its share of the height."""
-LIMITS = {"action": (-1.2, 1.2), "skill_weights": (-0.1, 1.1), "corrected": (-0.1, 1.1)}
-"""The range of a curve whose numbers have one."""
+"""Each curve's title, its share of the height, and the range of its numbers where they have one."""
 
 
 @dataclass(frozen=True)
 class Page:
-    """What was logged of an episode, as far as its views depend on it.
-
-    Attributes:
-        trails: entities that are shown up to the cursor.
-        eye: where the scene is seen from, and what is looked at.
-        shown: the first and last step worth a look.
-        decisive: the step to open it at.
-        steps, rows: how many steps the plan has, and how many rows the timeline.
-    """
+    """What was logged of an episode, as far as its views depend on it."""
 
     root: str
     title: str
-    trails: Collection[str]
-    eye: tuple[Point, Point]
-    shown: tuple[int, int]
-    decisive: int
+    trails: Collection[str]  # entities that are shown up to the cursor
+    eye: tuple[Point, Point]  # where the scene is seen from, and what is looked at
+    shown: tuple[int, int]  # the first and last step worth a look
+    decisive: int  # the step to open it at
     curves: Collection[str]
-    steps: int
-    rows: int
+    steps: int  # of the plan
+    rows: int  # of the timeline
     good: bool
 
     def tab(self) -> rrb.Horizontal:
         """Scene and curves on the left, words and timeline on the right."""
-        left: list[tuple[float, Any]] = [(13, self._scene("Scene"))]
-        left += [(share, self._curve(name)) for name, (_, share) in CURVES.items() if name in self.curves]
+        left: list[tuple[float, Any]] = [(13, self._scene())]
+        left += [(share, self._curve(name)) for name, (_, share, _) in CURVES.items() if name in self.curves]
         # Shares are about as many pixels as a view needs; what is longer scrolls.
         right: list[tuple[float, Any]] = [(115 if self.good else 215, self._words("verdict", "Verdict"))]
         if self.steps:
@@ -68,17 +58,19 @@ class Page:
     def column(self, shown: tuple[int, int]) -> rrb.Vertical:
         """Verdict, scene, timeline and distance in a column, beside others that show the same steps."""
         page = replace(self, shown=shown)
-        parts: list[tuple[float, Any]] = [(130, page._words("verdict", self.title)), (420, page._scene("Scene"))]
+        parts: list[tuple[float, Any]] = [(130, page._words("verdict", self.title)), (420, page._scene())]
         if "distance" in page.curves:
             parts.append((120, page._curve("distance")))
         parts += page._timeline()
         return _stacked(parts, self.title)
 
-    def _scene(self, name: str) -> rrb.Spatial3DView:
-        trail = rrb.VisibleTimeRanges([_up_to_now(timeline) for timeline in (EPISODE_TIMELINE, SECONDS_TIMELINE)])
+    def _scene(self) -> rrb.Spatial3DView:
+        first, now = rr.TimeRangeBoundary.infinite(), rr.TimeRangeBoundary.cursor_relative()
+        timelines = EPISODE_TIMELINE, SECONDS_TIMELINE
+        trail = rrb.VisibleTimeRanges([rr.VisibleTimeRange(name, start=first, end=now) for name in timelines])
         return rrb.Spatial3DView(
             origin=f"{self.root}/scene",
-            name=name,
+            name="Scene",
             background=BACKGROUND,
             line_grid=False,
             eye_controls=rrb.EyeControls3D(position=self.eye[0], look_target=self.eye[1], eye_up=(0.0, 0.0, 1.0)),
@@ -96,11 +88,11 @@ class Page:
         return [(50 + 40 * min(self.rows, 8), view)]
 
     def _curve(self, name: str) -> rrb.TimeSeriesView:
-        limits = LIMITS.get(name)
+        title, _, limits = CURVES[name]
         many = name in ("action", "skill_weights")
         return rrb.TimeSeriesView(
             origin=f"{self.root}/{name}",
-            name=CURVES[name][0],
+            name=title,
             axis_x=_window(self.shown),
             axis_y=None if limits is None else rrb.ScalarAxis(range=limits, zoom_lock=True),
             plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=many),
@@ -144,8 +136,3 @@ def send_page(
 def _window(shown: tuple[int, int]) -> Any:
     first, last = (rr.TimeRangeBoundary.absolute(seq=step) for step in shown)
     return rrb.TimeAxis(view_range=rr.TimeRange(start=first, end=last))
-
-
-def _up_to_now(timeline: str) -> Any:
-    first, now = rr.TimeRangeBoundary.infinite(), rr.TimeRangeBoundary.cursor_relative()
-    return rr.VisibleTimeRange(timeline, start=first, end=now)

@@ -86,16 +86,17 @@ class Reading:
     sections: list[Section] = field(default_factory=lambda: [Section("", 1)])
     notes: list[Note] = field(default_factory=list)
 
+    @property
+    def section(self) -> Section:
+        return self.sections[-1]
+
     def note(self, line: int, text: str) -> None:
         self.notes.append(Note(line, text))
 
-    def open(self, task: str, line: int) -> Section:
-        """The section of a task that is named here; a heading and a ``def`` right below it open one together."""
-        last = self.sections[-1]
-        if last.task != task or last.clauses:
-            last = Section(task, line)
-            self.sections.append(last)
-        return last
+    def open(self, task: str, line: int) -> None:
+        """Begin the section of a task that is named here; a heading and a ``def`` right below it begin one together."""
+        if self.section.task != task or self.section.clauses:
+            self.sections.append(Section(task, line))
 
 
 def listed_steps(text: str, count: int) -> list[str]:

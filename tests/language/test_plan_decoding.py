@@ -16,10 +16,10 @@ import lw_torchrl as lw
 from benchmarks.decoding import mutated
 from lw_torchrl.language import nearest
 from lw_torchrl.language import text as text_encoders
-from lw_torchrl.language.decoding import decode_as, without_thoughts
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.formats.structured import read_structured, write_structured
 from lw_torchrl.language.nearest import StepMapper
+from lw_torchrl.language.plan_decoding import decode_as, without_thoughts
 from lw_torchrl.language.skills import ScriptedSkill
 
 formats = st.sampled_from(list(lw.PLAN_FORMATS))

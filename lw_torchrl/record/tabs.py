@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from lw_torchrl._checks import unknown_name
 from lw_torchrl.record.conventions import EPISODE_TIMELINE, METRIC_TIMELINE, Stream, entity_path, rr, rrb
-from lw_torchrl.record.page import Page, side_by_side
+from lw_torchrl.record.episode_page import Page, side_by_side
 
 TABS = {kind: kind.title() for kind in ("metrics", "histograms", "images", "videos")} | {"hparams": "Hyperparameters"}
 """Titles of the tabs that show no episode. Their keys begin entity paths, so no episode has such a name."""
@@ -24,6 +24,7 @@ class Tab(NamedTuple):
     name: str
     title: str
     episodes: list[str]
+    timeline: str = EPISODE_TIMELINE
 
 
 class Layout:
@@ -98,7 +99,12 @@ class Layout:
                 shown = [_view(kind, names) for names in views]
                 tabs.append(shown[0] if kind == "hparams" else rrb.Grid(*shown, name=TABS[kind]))
         front = None if tab is None else self._find(tab)
-        time: dict[str, Any] = {"timeline": self.timeline(tab), "fps": 80.0, "play_state": "paused", "loop_mode": "all"}
+        time: dict[str, Any] = {
+            "timeline": self.tab(tab).timeline,
+            "fps": 80.0,
+            "play_state": "paused",
+            "loop_mode": "all",
+        }
         panels = [rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed")]
         panels.append(rrb.TimePanel(state="collapsed", **time))
         return rrb.Blueprint(rrb.Tabs(*tabs, active_tab=front), *panels, auto_views=False)
@@ -108,7 +114,11 @@ class Layout:
         return [
             *(Tab(title, title, names) for title, names in self._compared),
             *(Tab(name, page.title, [name]) for name, page in list(self.pages.items())),
-            *(Tab(TABS[kind], TABS[kind], []) for kind, views in self._views.items() if views),
+            *(
+                Tab(TABS[kind], TABS[kind], [], METRIC_TIMELINE if kind in OF_TRAINING else EPISODE_TIMELINE)
+                for kind, views in self._views.items()
+                if views
+            ),
         ]
 
     def _find(self, name: str | None) -> int:
@@ -120,20 +130,14 @@ class Layout:
             return (exact or holding)[0]
         raise unknown_name("episode", str(name), [tab.name for tab in tabs])
 
-    def episodes(self, tab: str | None = None) -> list[str]:
-        """The episodes that a tab shows; without a name the first tab."""
-        return self.tabs()[self._find(tab)].episodes if tab is not None or self.tabs() else []
-
-    def timeline(self, tab: str | None = None) -> str:
-        """The timeline of what a tab shows; without a name of the first tab."""
-        if tab is None and not self.tabs():
-            return METRIC_TIMELINE
-        title = self.tabs()[self._find(tab)].title
-        return METRIC_TIMELINE if title in (TABS[kind] for kind in OF_TRAINING) else EPISODE_TIMELINE
+    def tab(self, name: str | None = None) -> Tab:
+        """The tab of a name, or the first one."""
+        tabs = self.tabs()
+        return tabs[self._find(name)] if tabs or name is not None else Tab("", "", [], METRIC_TIMELINE)
 
     def opening_step(self, tab: str | None = None) -> int | None:
         """The step to open a tab at, the earliest decisive one of its episodes; None for a tab of no episode."""
-        return min((self.pages[name].decisive for name in self.episodes(tab)), default=None)
+        return min((self.pages[name].decisive for name in self.tab(tab).episodes), default=None)
 
 
 def _view(kind: str, names: Sequence[str]) -> Any:

@@ -14,11 +14,13 @@ from lw_torchrl._keys import check_apart, read
 from lw_torchrl.transforms.environment import KeepsEnvState
 
 
-def kept(before: Tensor | None, now: Tensor, begun: Tensor | None) -> Tensor:
-    """B, a value ``now`` of each row that has ``begun``, B bool or None for all; the others keep ``before``."""
+def kept(before: Tensor | None, now: Tensor, begun: Tensor | None, more: int = 0) -> Tensor:
+    """``now`` (B, ...), with ``more`` dimensions beyond B, of each row that has ``begun``, B bool or None for all; the
+    others keep ``before``."""
     if before is None or begun is None or before.shape != now.shape:
         return now
-    return torch.where(begun.reshape(now.shape), now, before)
+    shape = (*now.shape[: now.dim() - more], *[1] * more)
+    return torch.where(begun.reshape(shape), now, before)
 
 
 class RowAnswers:
@@ -48,15 +50,9 @@ class RowAnswers:
     def begin(self, answers: Tensor, rows: Tensor | None) -> Tensor:
         """Begin the episodes of rows (B bool, None for all) with answers (B, S): what each row is shown."""
         shape = answers.shape[:-1]
-        if rows is None or self._step is None or self._taken is None or self._shown is None:
-            self._step = torch.zeros(shape, dtype=torch.int64, device=answers.device)
-            self._taken = answers.unsqueeze(-2).repeat(*(1 for _ in shape), self._places, 1)
-            self._shown = answers.clone()
-        else:
-            begun = rows.reshape(shape)
-            self._step = torch.where(begun, 0, self._step)
-            self._taken = torch.where(begun[..., None, None], answers.unsqueeze(-2), self._taken)
-            self._shown = torch.where(begun.unsqueeze(-1), answers, self._shown)
+        self._step = kept(self._step, torch.zeros(shape, dtype=torch.int64, device=answers.device), rows)
+        self._taken = kept(self._taken, answers.unsqueeze(-2).repeat(*[1] * len(shape), self._places, 1), rows, 2)
+        self._shown = kept(self._shown, answers.clone(), rows, 1)
         return self._shown.clone()
 
     def due(self, rows: Tensor | None) -> Tensor:
@@ -83,17 +79,11 @@ class RowAnswers:
 
 
 class HeldAnswers(KeepsEnvState):
-    """Writes logits (B, S) float32, asked for at a row's reset and then every so many steps of its episode, held in
-    between and shown so many steps late; :meth:`HeldEvaluator.transform` makes it.
+    """Writes logits (B, S) float32 as :class:`RowAnswers` shows them; :meth:`HeldEvaluator.transform` makes it.
 
-    Only the rows whose answers are due are asked about. Behind a transform that changes the observation it reads the
-    changed one. Its ``state_dict`` holds the environment's, as :class:`EnvState` does; after ``load_state_dict`` the
-    environment must be reset.
-
-    Args:
-        ask: from a TensorDict of n rows with ``in_keys`` to their logits (n, S) float32.
-        columns: S.
-        every, delay: as for :class:`RowAnswers`.
+    ``ask`` gives those of the rows that are due, from a TensorDict of n rows with ``in_keys`` to (n, S) float32; S is
+    ``columns``. Behind a transform that changes the observation it reads the changed one. Its ``state_dict`` holds the
+    environment's, as :class:`EnvState` does; after ``load_state_dict`` the environment must be reset.
     """
 
     def __init__(
@@ -134,7 +124,6 @@ class HeldAnswers(KeepsEnvState):
         return next_tensordict.set(self.out_keys[0], self._rows.advance(answers, moved))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Raise: rows of a replay buffer are in no episode whose steps could be counted."""
         raise ValueError(
             f"HeldEvaluator(every={self.every}, delay={self.delay}) counts the steps of an environment's episodes, "
             "which rows of a replay buffer do not tell: train a policy with the evaluator inside it, and hold that "
@@ -142,7 +131,6 @@ class HeldAnswers(KeepsEnvState):
         )
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        """Add the logits to the specs."""
         assert isinstance(observation_spec, Composite)
         key, shape, device = self.out_keys[0], (*observation_spec.shape, self.columns), observation_spec.device
         if key in observation_spec.keys(True, True):
