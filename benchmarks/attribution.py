@@ -140,7 +140,7 @@ def run_unit(unit: Unit, args: Arguments, plans: lw.Plans, reference: lw.Plans, 
                 "also": one.also,
                 "step": one.step,
                 "rule": by_rule[one.task, one.episode],
-                "swaps": dict(one.swaps),
+                "counterfactuals": dict(one.counterfactuals),
                 "evidence": dict(one.evidence),
             }
             for one in result.failures or ()

@@ -1,4 +1,4 @@
-"""attribute_failures: why episodes failed, by exchanging one part of what acted in them and running them again."""
+"""attribute_failures: why episodes failed, by running them again with one part of what acted replaced."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ from lw_torchrl.language.tasks import TASKS, task_id
 from lw_torchrl.modules.networks import evaluating
 from lw_torchrl.modules.policy import plans_of
 
-_MARGIN = 0.3  # minimum lead for a larger exchange to win, as a share of the task's failed episodes
-_EXCHANGES: dict[str, tuple[Cause, str]] = {  # the smaller ones first; time counts where nothing else mends
+_MARGIN = 0.3  # minimum lead for a larger replacement to win, as a share of the task's failed episodes
+_COUNTERFACTUALS: dict[str, tuple[Cause, str]] = {  # the smaller ones first; time counts where nothing else mends
     "query": ("query", "true answers"),
     "skill": ("skill", "a script in one step"),
     "plan": ("plan", "the reference plan"),
@@ -77,10 +77,10 @@ def attribute_failures(
     **A counterfactual decides**, with ``actor``: the very same episode, its noise too, is run again with true answers,
     where they were wrong; with scripted skills in one step of the plan, or, if that mends nothing, in all (where a text
     is no scripted skill, with the expert's actions); with the reference plan; with twice the time. What alone mends the
-    episode is its cause. Where several do, the smallest exchange counts: answers, a skill in one step, the plan,
+    episode is its cause. Where several do, the smallest replacement counts: answers, a skill in one step, the plan,
     skills in all steps, unless a larger one mends clearly more of the task's failed episodes; time counts last. Where
     none mends, pairs are tried, which give ``cause`` and ``also``. One mended episode may be luck: ``evidence`` holds
-    how much of the task's failed episodes each exchange mended.
+    how much of the task's failed episodes each mended.
 
     Args:
         rollouts: episodes as :func:`evaluate` gives them to ``on_episode``, or TensorDicts of batch (T,), each one
@@ -90,7 +90,7 @@ def attribute_failures(
             ``skill_weights`` (T, S) float32, for the step in force.
         plans: the plans that were carried out.
         actor: what acted: anything with ``plans`` and ``with_plans`` that writes ``action`` and ``skill_weights``. One
-            that draws its actions cannot be run again alike; its exchanges tell less.
+            that draws its actions cannot be run again alike; its counterfactuals tell less.
         reference: other plans, for some of the tasks, which are trusted.
         evaluator: what answered in the query answering function's place, between it and the actor: a
             :class:`QueryEvaluator`, or a module, function or :class:`torchrl.envs.Transform` that writes ``qaf``. An
@@ -107,7 +107,7 @@ def attribute_failures(
             actor's, or an episode that does not begin as (task, seed, episode) does.
 
     Warns:
-        UserWarning: the policy cannot carry out the reference; no plan is exchanged.
+        UserWarning: the policy cannot carry out the reference; no plan is replaced.
 
     Example:
         A wrong offset, planted in the skill that reaches:
@@ -121,10 +121,10 @@ def attribute_failures(
         >>> told = {"also_record": keys, "on_episode": episodes.append}
         >>> _ = lw.evaluate(actor, tasks="reach", episodes_per_task=1, **run, **told)
         >>> [failure] = attribute_failures(episodes, plans, actor=actor, **run)
-        >>> failure.cause, failure.swaps
+        >>> failure.cause, failure.counterfactuals
         ('skill', {'skill': True})
 
-    Source: the plan's conditions, its steps and what carries them out are apart, so each can be exchanged.
+    Source: the plan's conditions, its steps and what carries them out are apart, so each can be replaced.
     """
     answered = as_plans(plans)
     check_scale("noise_scale", noise_scale)
@@ -217,11 +217,13 @@ def keys_to_attribute(actor: Any, env: EnvBase) -> list[NestedKey]:
 
 
 def decide(mended: Iterable[str], shares: Mapping[str, float]) -> str | None:
-    """Of the single exchanges that mend an episode, the one that counts: the smallest, unless a larger one mends more
-    of the task's failed episodes by 0.3 of them. More time counts alone; None of none."""
+    """Of the single replacements that mend an episode, the one that counts; None of none.
+
+    It is the smallest, unless a larger one mends more of the task's failed episodes by 0.3 of them. More time comes last.
+    """
     given = set(mended)
     best = None
-    for name in _EXCHANGES:
+    for name in _COUNTERFACTUALS:
         lead = best is None or (name != "time" and shares.get(name, 0.0) >= shares.get(best, 0.0) + _MARGIN)
         best = name if name in given and lead else best
     return best
@@ -252,30 +254,30 @@ def _by_counterfactuals(
     which = one.task, one.episode
     first = {name: results[which] for name, results in tried.found.items() if which in results}
     mended = [name for name, hit in first.items() if hit is not None]
-    swaps: dict[str, bool] = {}
+    replaced: dict[str, bool] = {}
     for name in first:
         shown = "skill" if name == "skills" else name
-        swaps[shown] = swaps.get(shown, False) or name in mended
+        replaced[shown] = replaced.get(shown, False) or name in mended
     cause: Cause = "undecided"
     also: Cause | None = None
     same = told.evidence.get("plan_departs") == 0.0
     best = decide([name for name in mended if not (same and name == "plan")], shares)
     if best is not None:
-        cause, exchanged = _EXCHANGES[best]
-        words = f"With {exchanged} the same episode succeeds, at step {first[best]}"
-        if others := [name for name in mended if name in _EXCHANGES and name not in ("time", best)]:
-            words += f"; with {_listed(others, 'and')} too, which is more to exchange or mends less of the task"
+        cause, part = _COUNTERFACTUALS[best]
+        words = f"With {part} the same episode succeeds, at step {first[best]}"
+        if others := [name for name in mended if name in _COUNTERFACTUALS and name not in ("time", best)]:
+            words += f"; with {_listed(others, 'and')} too, which replaces more or mends less of the task"
     elif (pair := decide_pair(mended, shares)) is not None:
         cause, also = pair
         words = f"Neither {_PARTS[cause]} nor {_PARTS[also]} alone mend it, both together do"
     elif same and "plan" in mended:
         words = "With the reference plan it succeeds, though in no state that asks for anything else"
     elif told.cause == "query" and "query" not in first:
-        cause, words = "query", "These answers could not be exchanged"
+        cause, words = "query", "These answers could not be replaced"
     elif first:
         words = f"It fails as well with {_listed(first, 'or with')}"
     else:
-        words = "There is nothing to exchange"
+        words = "There is nothing to replace"
     if cause == "undecided" and told.cause != "undecided":
         words += f". By the states alone it would be the {told.cause}: {told.why[told.cause]}"
     step, at, why = told.steps[cause], told.at[cause], told.why[cause]
@@ -284,12 +286,12 @@ def _by_counterfactuals(
         at, why = settled(one, step), in_charge(one, tried.plans[one.task], step)
     by = {f"mended_by_{name.replace(' + ', '_and_')}": share for name, share in shares.items()}
     evidence = {**told.evidence, **by}
-    return Failure(one.task, seed, one.episode, cause, also, step, at, _text(why, words), evidence, swaps)
+    return Failure(one.task, seed, one.episode, cause, also, step, at, _text(why, words), evidence, replaced)
 
 
 def _listed(names: Iterable[str], joint: str) -> str:
     words = [
-        _EXCHANGES[name][1] if name in _EXCHANGES else " and ".join(_PARTS[part] for part in _PAIRS[name])
+        _COUNTERFACTUALS[name][1] if name in _COUNTERFACTUALS else " and ".join(_PARTS[part] for part in _PAIRS[name])
         for name in names
     ]
     return f" {joint} ".join(words) if len(words) < 3 else f"{', '.join(words[:-1])} {joint} {words[-1]}"

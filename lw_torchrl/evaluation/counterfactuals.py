@@ -1,4 +1,4 @@
-"""Counterfactuals: failed episodes run again with one part of what acted exchanged for a sound one."""
+"""Counterfactuals: failed episodes run again with one part of what acted replaced by a sound one."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from lw_torchrl.transforms.qaf import plan_program
 Acts = Callable[[TensorDictBase], TensorDictBase]
 EpisodeId = tuple[str, int]  # task, episode
 _ROWS = 256
-_TRIED_STEPS = 3  # in which a skill is exchanged, one at a time, before it is in all steps
+_TRIED_STEPS = 3  # in which a skill is replaced, one at a time, before it is in all steps
 
 
 class TrueAnswers(QueryEvaluator):
@@ -201,13 +201,13 @@ class Rerun:
 
 
 class Counterfactuals:
-    """Runs the exchanges that are worth it, and keeps what each gave."""
+    """Runs the counterfactuals that are worth it, and keeps what each gave."""
 
     def __init__(
         self, actor: Any, plans: Plans, evaluator: Any, reference: Plans | None, scripts: Scripts, rerun: Rerun
     ) -> None:
         self.actor, self.plans, self.evaluator, self.scripts, self.rerun = actor, plans, evaluator, scripts, rerun
-        self.found: dict[str, dict[EpisodeId, int | None]] = {}  # exchange to episodes and their first success
+        self.found: dict[str, dict[EpisodeId, int | None]] = {}  # counterfactual to episodes and their first success
         self.step: dict[EpisodeId, int] = {}  # in which a script mends the episode
         self.reference: Plans | None = None
         self.other = self.other_evaluator = None  # that carry out the reference
@@ -221,12 +221,12 @@ class Counterfactuals:
             self.other, self.other_evaluator, self.reference = other, theirs, reference
         except (AttributeError, ImportError, RuntimeError, TypeError, ValueError) as error:
             warnings.warn(
-                f"reference: the policy cannot carry it out, so no plan is exchanged ({type(error).__name__}: {error})",
+                f"reference: the policy cannot carry it out, so no plan is replaced ({type(error).__name__}: {error})",
                 stacklevel=4,
             )
 
     def run(self, seen: Sequence[EpisodeStates], same: Collection[EpisodeId] = ()) -> None:
-        """Run all exchanges that are worth it."""
+        """Run all that are worth it."""
         every = [(one.task, one.episode) for one in seen]
         wrong = [w for w, one in zip(every, seen, strict=True) if bool((one.given != one.truth).any())]
         with_reference = [w for w in every if self.reference is not None and w[0] in self.reference]
@@ -285,7 +285,7 @@ class Counterfactuals:
         self._run("skills", "scripts in all steps", which, scripted, self.plans, self.evaluator)
 
     def shares(self) -> dict[str, dict[str, float]]:
-        """Task to the share of its failed episodes that each exchange mends, of those it was tried in."""
+        """Task to the share of its failed episodes that each mends, of those it was tried in."""
         found: dict[str, dict[str, float]] = {}
         for name, results in self.found.items():
             for task in {task for task, _ in results}:

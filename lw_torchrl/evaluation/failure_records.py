@@ -32,8 +32,8 @@ class Failure:
         at: the step of the episode to look at first, counted from 0.
         why: a sentence or two for people, with the numbers.
         evidence: name to number, what ``why`` rests on.
-        swaps: what was exchanged, "query", "plan", "skill", "time", or two as "query + plan", and whether the
-            same episode then succeeded; empty where none was tried.
+        counterfactuals: what was replaced, "query", "plan", "skill", "time", or two as "query + plan", and whether
+            the same episode then succeeded; empty where none was tried.
     """
 
     task: str
@@ -45,10 +45,10 @@ class Failure:
     at: int
     why: str
     evidence: Mapping[str, float] = field(default_factory=dict)
-    swaps: Mapping[str, bool] = field(default_factory=dict)
+    counterfactuals: Mapping[str, bool] = field(default_factory=dict)
 
 
-SWAPS = ("query", "plan", "skill", "time")
+PARTS = ("query", "plan", "skill", "time")
 
 
 def count_causes(tasks: Sequence[str], failures: Sequence[Failure]) -> dict[str, dict[str, int]]:
@@ -75,6 +75,9 @@ def failure_table(tasks: Sequence[str], episodes_per_task: int, failures: Sequen
 
 def read_failures(stated: Any, config: Mapping[str, Any], failed: Sequence[tuple[str, int]]) -> tuple[Failure, ...]:
     """The failures of a file: one for each failed episode, given by task and number, else :class:`ValueError`."""
+    if isinstance(stated, list):  # earlier files say "swaps"
+        new = {"swaps": "counterfactuals"}
+        stated = [{new.get(k, k): v for k, v in one.items()} if isinstance(one, dict) else one for one in stated]
     found = read_records("failures", stated, Failure, lambda failure: _rules(failure, config))
     if sorted(failed) != sorted((failure.task, failure.episode) for failure in found):
         raise ValueError("failures must be one for each episode without success")
@@ -82,7 +85,7 @@ def read_failures(stated: Any, config: Mapping[str, Any], failed: Sequence[tuple
 
 
 def _rules(failure: Failure, config: Mapping[str, Any]) -> Rules:
-    cause, also, evidence, swaps = failure.cause, failure.also, failure.evidence, failure.swaps
+    cause, also, evidence, replaced = failure.cause, failure.also, failure.evidence, failure.counterfactuals
     causes = [name for name in CAUSES if name != "undecided"]
     yield "task", isinstance(failure.task, str) and failure.task in config["tasks"], "one of config"
     yield "seed", type(failure.seed) is int and failure.seed == config["seed"], "config's"
@@ -94,7 +97,7 @@ def _rules(failure: Failure, config: Mapping[str, Any]) -> Rules:
     yield "at", is_integer(failure.at, 0, config["max_steps"] - 1), "a step of the episode"
     yield "why", isinstance(failure.why, str), "a text"
     yield "evidence", isinstance(evidence, dict) and all(map(is_number, evidence.values())), "names and numbers"
-    holds = isinstance(swaps, dict) and all(
-        set(name.split(" + ")) <= set(SWAPS) and type(bit) is bool for name, bit in swaps.items()
+    holds = isinstance(replaced, dict) and all(
+        set(name.split(" + ")) <= set(PARTS) and type(bit) is bool for name, bit in replaced.items()
     )
-    yield "swaps", holds, f"some of {', '.join(SWAPS)}, or two of them, to true or false"
+    yield "counterfactuals", holds, f"some of {', '.join(PARTS)}, or two of them, to true or false"

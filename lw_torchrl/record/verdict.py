@@ -88,9 +88,10 @@ def _why(failure: Failure, episode: RecordedEpisode) -> list[str]:
     if failure.step is not None and failure.step < len(episode.steps):
         seen += f", in {_step(episode, failure.step)}"
     lines.append(f"{seen}.")
-    mended, useless = ([swap for swap, worked in failure.swaps.items() if worked == good] for good in (True, False))
-    told = [f"exchanging {' or '.join(mended)} made it a success"] if mended else []
-    told += [f"exchanging {' or '.join(useless)} did not help"] if useless else []
+    mended = [part for part, worked in failure.counterfactuals.items() if worked]
+    useless = [part for part, worked in failure.counterfactuals.items() if not worked]
+    told = [f"replacing {' or '.join(mended)} made it a success"] if mended else []
+    told += [f"replacing {' or '.join(useless)} did not help"] if useless else []
     if told:
         lines.append("; ".join(told).capitalize() + ".")
     return lines

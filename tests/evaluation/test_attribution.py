@@ -83,7 +83,7 @@ class Lie(lw.QueryEvaluator):
 def test_a_clumsy_skill_and_the_step_it_is_in():
     [failure] = evaluated(clumsy(), reference=REFERENCE).failures
     assert (failure.cause, failure.also, failure.step) == ("skill", None, 1)
-    assert failure.swaps == {"skill": True, "plan": False}
+    assert failure.counterfactuals == {"skill": True, "plan": False}
     assert "lower the gripper around the drawer handle" in failure.why
     assert failure.evidence["mended_by_skill"] == 1.0
     assert 0 <= failure.at < STEPS
@@ -92,14 +92,14 @@ def test_a_clumsy_skill_and_the_step_it_is_in():
 def test_a_plan_that_leads_astray():
     [failure] = evaluated(lw.ScriptedSkillActor(hopeless()), reference=REFERENCE).failures
     assert (failure.cause, failure.step) == ("plan", 1)
-    assert failure.swaps == {"plan": True}, "its skills are the scripts, so there is none to exchange"
+    assert failure.counterfactuals == {"plan": True}, "its skills are the scripts, so there is none to replace"
     assert failure.evidence["plan_departs_late"] > 0.5
 
 
 def test_a_lie_and_the_condition_it_is_about():
     [failure] = evaluated(lw.ScriptedSkillActor(PLANS), evaluator=lie, reference=REFERENCE).failures
     assert (failure.cause, failure.step) == ("query", 1)
-    assert failure.swaps["query"] is True
+    assert failure.counterfactuals["query"] is True
     assert str(PLANS[TASK].steps[1].condition) in failure.why
     assert failure.evidence["answers_wrong"] == 1.0
 
@@ -107,27 +107,27 @@ def test_a_lie_and_the_condition_it_is_about():
 def test_two_faults_at_once_are_both_named():
     [failure] = evaluated(clumsy(), evaluator=lie).failures
     assert (failure.cause, failure.also) == ("query", "skill")
-    assert failure.swaps["query + skill"] is True
-    assert not any(bit for name, bit in failure.swaps.items() if "+" not in name)
+    assert failure.counterfactuals["query + skill"] is True
+    assert not any(bit for name, bit in failure.counterfactuals.items() if "+" not in name)
     assert "both together" in failure.why
 
 
 def test_what_lacks_time_alone_is_out_of_time():
     [failure] = evaluated(lw.ScriptedSkillActor(PLANS), max_steps=45).failures
-    assert (failure.cause, failure.swaps, failure.at) == ("out of time", {"time": True}, 44)
+    assert (failure.cause, failure.counterfactuals, failure.at) == ("out of time", {"time": True}, 44)
 
 
 def test_what_nothing_mends_is_undecided():
     plans = hopeless()
     [failure] = evaluated(lw.ScriptedSkillActor(plans)).failures
-    assert (failure.cause, failure.also, failure.swaps) == ("undecided", None, {"time": False})
+    assert (failure.cause, failure.also, failure.counterfactuals) == ("undecided", None, {"time": False})
 
 
 def test_the_rule_alone_runs_nothing_and_is_weaker():
     episodes = []
     lw.evaluate(clumsy(), tasks=TASK, episodes_per_task=1, also_record=RECORDED, on_episode=episodes.append, **RUN)
     [alone] = attribute_failures(episodes, PLANS, seed=SEED)
-    assert (alone.cause, alone.swaps) == ("undecided", {})
+    assert (alone.cause, alone.counterfactuals) == ("undecided", {})
     [judged] = attribute_failures(episodes, PLANS, reference=REFERENCE, seed=SEED)
     assert judged.cause in ("skill", "plan")
     steps = episodes[0].steps
@@ -141,7 +141,7 @@ def test_a_hole_in_the_plan_is_no_skill_s_fault():
     pairs = [(str(step.condition), step.skill) for step in PLANS[TASK].steps]
     holed = lw.Plans({TASK: lw.ConditionalPlan.from_pairs(TASK, pairs[1:])})
     [failure] = evaluated(still(plans=holed)).failures
-    assert (failure.cause, failure.swaps) == ("undecided", {"time": False})
+    assert (failure.cause, failure.counterfactuals) == ("undecided", {"time": False})
     assert failure.evidence["no_condition_late"] == 1.0
 
 
@@ -165,17 +165,17 @@ ENSEMBLE = pytest.param(lambda actor: lw.modules.ActorEnsemble([actor, still()])
 
 
 @pytest.mark.parametrize("wrapped", [lambda actor: actor, ENSEMBLE])
-def test_a_network_s_skills_are_exchanged_and_its_mode_stays(wrapped):
+def test_a_network_s_skills_are_replaced_and_its_mode_stays(wrapped):
     actor = wrapped(still()).train()
     actor.get_submodule(next(name for name, _ in actor.named_modules() if name)).eval()
     modes = [module.training for module in actor.modules()]
     [failure] = evaluated(actor).failures
-    assert (failure.cause, failure.swaps) == ("skill", {"skill": True})
+    assert (failure.cause, failure.counterfactuals) == ("skill", {"skill": True})
     assert failure.step is not None
     assert [module.training for module in actor.modules()] == modes
 
 
-def test_an_evaluator_inside_a_policy_is_exchanged_for_the_truth():
+def test_an_evaluator_inside_a_policy_is_replaced_by_the_truth():
     actor = still(evaluator=Lie(PLANS))
     true = with_true_answers(actor)
     assert true is not actor
@@ -201,7 +201,7 @@ def test_a_policy_that_cannot_carry_out_the_reference_is_told():
 
     with pytest.warns(UserWarning, match="the policy cannot carry it out"):
         [failure] = evaluated(Fixed(), reference=REFERENCE, max_steps=20).failures
-    assert "plan" not in failure.swaps
+    assert "plan" not in failure.counterfactuals
 
 
 # ---- the same whatever runs beside
@@ -217,7 +217,7 @@ def test_failures_hang_on_neither_environments_nor_order():
 # ---- what decides
 
 
-def test_the_smallest_exchange_decides_unless_another_mends_clearly_more():
+def test_the_smallest_replacement_decides_unless_another_mends_clearly_more():
     same = dict.fromkeys(("query", "skill", "plan", "skills", "time"), 0.5)
     assert decide(["skills", "plan", "skill", "query"], same) == "query"
     assert decide(["skills", "plan", "time"], same) == "plan"

@@ -94,7 +94,7 @@ DAMAGE = {
     "at": [-1, 500, None],
     "why": [None, 3],
     "evidence": [[], {"x": "1"}, {"x": 1e301}, {"x": True}],
-    "swaps": [[], {"luck": True}, {"query": 1}, {"": True}],
+    "counterfactuals": [[], {"luck": True}, {"query": 1}, {"": True}],
 }
 
 

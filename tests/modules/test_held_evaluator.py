@@ -194,7 +194,7 @@ def test_late_answers_are_what_failed():
     run = {"tasks": "drawer-open", "episodes_per_task": 1, "seed": 7, "max_steps": 80, "progress": False}
     [failure] = lw.evaluate(actor, attribute=True, stop_at_success=True, **run).failures
     assert failure.cause == "query"
-    assert failure.swaps["query"] is True
+    assert failure.counterfactuals["query"] is True
 
 
 def test_recordings_have_both_truths():

@@ -170,13 +170,13 @@ def failure_of(rollout, **changes):
 def test_a_failure_is_the_verdict(tmp_path, pushed):
     failed = pushed.clone()
     failed["next", "success"][:] = False
-    why = failure_of(failed, swaps={"skill": True, "plan": False, "query": False})
+    why = failure_of(failed, counterfactuals={"skill": True, "plan": False, "query": False})
     _, found = logged(tmp_path / "a.rrd", failed, plans=PLANS, seed=SEED, policy="mine", failure=why)
     verdict = found.text("/push-0/verdict")
     assert verdict.startswith("## FAILED, skill: a skill was clumsy\n\nIt came to rest 10 cm away.\n")
     skill = PLANS["push"].steps[1].skill
     assert f"Seen at step 33 of 60, in step 2, **“{skill}”**." in verdict
-    assert "Exchanging skill made it a success; exchanging plan or query did not help." in verdict
+    assert "Replacing skill made it a success; replacing plan or query did not help." in verdict
     assert "push · episode 0 · seed 5 · mine" in verdict
     assert opening_step(tmp_path / "a.rrd") == 33
     (store,) = found.reader.blueprints()
