@@ -219,7 +219,8 @@ def keys_to_attribute(actor: Any, env: EnvBase) -> list[NestedKey]:
 def decide(mended: Iterable[str], shares: Mapping[str, float]) -> str | None:
     """Of the single replacements that mend an episode, the one that counts; None of none.
 
-    It is the smallest, unless a larger one mends more of the task's failed episodes by 0.3 of them. More time comes last.
+    It is the smallest, unless a larger one mends more of the task's failed episodes by 0.3 of them.
+    More time comes last.
     """
     given = set(mended)
     best = None
