@@ -14,14 +14,14 @@ from torchrl.envs import EnvBase
 from lw_torchrl._checks import check_int, check_scale, checked, missing_keys
 from lw_torchrl._devices import device_of
 from lw_torchrl.envs.episodes import FinishedEpisode
-from lw_torchrl.evaluation.counterfactuals import Counterfactuals, EpisodeId, Rerun, own_evaluators
+from lw_torchrl.evaluation.counterfactuals import Counterfactuals, EpisodeId, EpisodeRepeater, own_evaluators
 from lw_torchrl.evaluation.explanation import (
     EpisodeStates,
     Explanation,
     Scripts,
+    describe_active_time,
     explain,
-    in_charge,
-    settled,
+    stall_step,
     states_of,
 )
 from lw_torchrl.evaluation.failure_records import Cause, Failure
@@ -151,8 +151,8 @@ def attribute_failures(
     tasks = {name: TASKS.get(name, answered[name].definition) for name in names}
     firsts = {(one.task, one.episode): one.steps.get("observation")[0] for one in seen}
     env = {"seed": seed, "engine": engine, "num_threads": num_threads}
-    rerun = Rerun(tasks, firsts, env, noise_scale, max_steps, num_envs, device, progress)
-    tried = Counterfactuals(actor, answered, evaluator, trusted, scripts, rerun)
+    repeat = EpisodeRepeater(tasks, firsts, env, noise_scale, max_steps, num_envs, device, progress)
+    tried = Counterfactuals(actor, answered, evaluator, trusted, scripts, repeat)
     tried.run(seen, [which for which, one in told.items() if one.evidence.get("plan_departs") == 0.0])
     shares = tried.shares()
     return [
@@ -216,7 +216,7 @@ def keys_to_attribute(actor: Any, env: EnvBase) -> list[NestedKey]:
     return list(dict.fromkeys(keys))
 
 
-def decide(mended: Iterable[str], shares: Mapping[str, float]) -> str | None:
+def choose_cause(mended: Iterable[str], shares: Mapping[str, float]) -> str | None:
     """Of the single replacements that mend an episode, the one that counts; None of none.
 
     It is the smallest, unless a larger one mends more of the task's failed episodes by 0.3 of them.
@@ -230,7 +230,7 @@ def decide(mended: Iterable[str], shares: Mapping[str, float]) -> str | None:
     return best
 
 
-def decide_pair(mended: Iterable[str], shares: Mapping[str, float]) -> tuple[Cause, Cause] | None:
+def choose_cause_pair(mended: Iterable[str], shares: Mapping[str, float]) -> tuple[Cause, Cause] | None:
     """The pair that counts, the first the cause: wrong answers, which are a fact; else what alone mends more of the
     task's failed episodes."""
     alone = {**shares, "skill": max(shares.get("skill", 0.0), shares.get("skills", 0.0))}
@@ -262,13 +262,13 @@ def _by_counterfactuals(
     cause: Cause = "undecided"
     also: Cause | None = None
     same = told.evidence.get("plan_departs") == 0.0
-    best = decide([name for name in mended if not (same and name == "plan")], shares)
+    best = choose_cause([name for name in mended if not (same and name == "plan")], shares)
     if best is not None:
         cause, part = _COUNTERFACTUALS[best]
         words = f"With {part} the same episode succeeds, at step {first[best]}"
         if others := [name for name in mended if name in _COUNTERFACTUALS and name not in ("time", best)]:
             words += f"; with {_listed(others, 'and')} too, which replaces more or mends less of the task"
-    elif (pair := decide_pair(mended, shares)) is not None:
+    elif (pair := choose_cause_pair(mended, shares)) is not None:
         cause, also = pair
         words = f"Neither {_PARTS[cause]} nor {_PARTS[also]} alone mend it, both together do"
     elif same and "plan" in mended:
@@ -284,7 +284,7 @@ def _by_counterfactuals(
     step, at, why = told.steps[cause], told.at[cause], told.why[cause]
     if best == "skill":
         step = tried.step[which]
-        at, why = settled(one, step), in_charge(one, tried.plans[one.task], step)
+        at, why = stall_step(one, step), describe_active_time(one, tried.plans[one.task], step)
     by = {f"mended_by_{name.replace(' + ', '_and_')}": share for name, share in shares.items()}
     evidence = {**told.evidence, **by}
     return Failure(one.task, seed, one.episode, cause, also, step, at, _text(why, words), evidence, replaced)

@@ -151,7 +151,7 @@ class WithScripts(nn.Module):
 
 
 @dataclass(frozen=True)
-class Rerun:
+class EpisodeRepeater:
     """Runs episodes again as they were run, whatever acts in them."""
 
     tasks: Mapping[str, Task]
@@ -204,9 +204,15 @@ class Counterfactuals:
     """Runs the counterfactuals that are worth it, and keeps what each gave."""
 
     def __init__(
-        self, actor: Any, plans: Plans, evaluator: Any, reference: Plans | None, scripts: Scripts, rerun: Rerun
+        self,
+        actor: Any,
+        plans: Plans,
+        evaluator: Any,
+        reference: Plans | None,
+        scripts: Scripts,
+        repeat: EpisodeRepeater,
     ) -> None:
-        self.actor, self.plans, self.evaluator, self.scripts, self.rerun = actor, plans, evaluator, scripts, rerun
+        self.actor, self.plans, self.evaluator, self.scripts, self.repeat = actor, plans, evaluator, scripts, repeat
         self.found: dict[str, dict[EpisodeId, int | None]] = {}  # counterfactual to episodes and their first success
         self.step: dict[EpisodeId, int] = {}  # in which a script mends the episode
         self.reference: Plans | None = None
@@ -258,7 +264,7 @@ class Counterfactuals:
 
     def _run(self, name: str, what: str, which: Sequence[EpisodeId], actor: Any, plans: Any, *options: Any) -> None:
         if which and actor is not None and plans is not None:
-            self.found.setdefault(name, {}).update(self.rerun(what, which, actor, plans, *options))
+            self.found.setdefault(name, {}).update(self.repeat(what, which, actor, plans, *options))
 
     def _scripted(self, actor: Any, plans: Plans | None, steps: Mapping[EpisodeId, int] | None = None) -> Any:
         if actor is None or plans is None:

@@ -130,7 +130,7 @@ def candidates(seen: EpisodeStates, among: Tensor | None = None) -> list[int]:
     return [step for step in dict.fromkeys(ranked) if step in present]
 
 
-def stay(states: Tensor) -> int:
+def last_stay_start(states: Tensor) -> int:
     """(T,) bool to where the last stay in them begins; interruptions of up to 25 states do not end it."""
     found = states.nonzero().flatten()
     if not len(found):
@@ -139,17 +139,17 @@ def stay(states: Tensor) -> int:
     return int(found[gaps[-1] + 1] if len(gaps) else found[0])
 
 
-def settled(seen: EpisodeStates, step: int) -> int:
+def stall_step(seen: EpisodeStates, step: int) -> int:
     """Where the last stay in a step shows: the first state in it after which the hand gets no further, else its
     beginning."""
     inside = seen.in_force == step
-    begin = stay(inside)
+    begin = last_stay_start(inside)
     hand = seen.steps.get("observation")[begin:, HAND]
     still = ((hand[_AHEAD:] - hand[:-_AHEAD]).norm(dim=-1) < _STILL) & inside[begin : begin + len(hand[_AHEAD:])]
     return begin + (int(still.int().argmax()) if still.any() else 0)
 
 
-def in_charge(seen: EpisodeStates, plan: ConditionalPlan, step: int) -> str:
+def describe_active_time(seen: EpisodeStates, plan: ConditionalPlan, step: int) -> str:
     """How long a step was in force, in words."""
     late = min(_LATE, len(seen.in_force))
     inside = int((seen.in_force == step)[-late:].sum())
@@ -166,7 +166,7 @@ def explain(
     late = min(_LATE, length)
     stuck = next(iter(candidates(seen)), len(plan.steps) - 1)
     steps: dict[str, int | None] = {"out of time": stuck, "undecided": stuck}
-    at = {"out of time": length - 1, "undecided": settled(seen, stuck)}
+    at = {"out of time": length - 1, "undecided": stall_step(seen, stuck)}
     why, evidence = {}, {"states": float(length)}
 
     wrong = seen.given != seen.truth
@@ -192,7 +192,10 @@ def explain(
         where = departs.clone()
         where[:-late] &= not bool(departs[-late:].any())
         step = int(torch.bincount(ours[where]).argmax()) if where.any() else stuck
-        steps["plan"], at["plan"] = step, stay(departs & (ours == step)) if departs.any() else at["undecided"]
+        steps["plan"], at["plan"] = (
+            step,
+            last_stay_start(departs & (ours == step)) if departs.any() else at["undecided"],
+        )
         other = int(torch.bincount(theirs[where & (ours == step)]).argmax()) if where.any() else 0
         asked = reference[seen.task].steps[other].skill
         if where.any() and none[where].float().mean() > 0.5:
@@ -206,13 +209,13 @@ def explain(
         states = f"{often} of the last {late}" if often else f"{int(departs.sum())} of {length}"
         why["plan"] = f"in {states} states {said}"
     else:
-        steps["plan"], at["plan"] = stuck, stay(none) if none.any() else at["undecided"]
+        steps["plan"], at["plan"] = stuck, last_stay_start(none) if none.any() else at["undecided"]
         why["plan"] = f"no condition of the plan held in {int(none[-late:].sum())} of the last {late} states"
 
     inside = seen.in_force == stuck
     evidence["in_step_late"] = float(inside[-late:].float().mean())
-    steps["skill"], at["skill"] = stuck, settled(seen, stuck)
-    told = in_charge(seen, plan, stuck)
+    steps["skill"], at["skill"] = stuck, stall_step(seen, stuck)
+    told = describe_active_time(seen, plan, stuck)
     if scripts.known[seen.task][stuck]:
         far = float(scripts.distance(observation[-1:], task_id[-1:], stuck))
         evidence["distance_at_end"] = far

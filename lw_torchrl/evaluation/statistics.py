@@ -68,7 +68,7 @@ def mean_rate(rates: ArrayLike, *, confidence: float = 0.95) -> Estimate:
         >>> print(mean_rate([[1.0, 0.2], [0.9, 0.3], [1.0, 0.1]]))
         0.583 [0.512, 0.655]
     """
-    return _estimate(np.mean, [check_rates("rates", rates)], confidence, least=0.0)
+    return _seed_interval(np.mean, [check_rates("rates", rates)], confidence, least=0.0)
 
 
 @checked
@@ -81,7 +81,7 @@ def interquartile_mean(rates: ArrayLike, *, confidence: float = 0.95) -> Estimat
 
     Source: Agarwal et al. 2021; the same as ``scipy.stats.trim_mean(rates, 0.25, axis=None)``.
     """
-    return _estimate(_interquartile_mean, [check_rates("rates", rates)], confidence, least=0.0)
+    return _seed_interval(_interquartile_mean, [check_rates("rates", rates)], confidence, least=0.0)
 
 
 @checked
@@ -93,7 +93,7 @@ def mean_difference(x: ArrayLike, y: ArrayLike, *, confidence: float = 0.95) -> 
         >>> print(mean_difference([[1.0, 0.5], [0.9, 0.4]], [[0.6, 0.3], [0.7, 0.3]]))
         0.225 [-0.121, 0.571]
     """
-    return _estimate(lambda a, b: a.mean() - b.mean(), _pair(x, y), confidence, least=-1.0)
+    return _seed_interval(lambda a, b: a.mean() - b.mean(), _pair(x, y), confidence, least=-1.0)
 
 
 @checked
@@ -107,7 +107,7 @@ def probability_of_improvement(x: ArrayLike, y: ArrayLike, *, confidence: float 
 
     Source: Agarwal et al. 2021; the Mann-Whitney statistic of each task, averaged.
     """
-    return _estimate(
+    return _seed_interval(
         lambda a, b: ((a[:, None] > b) + 0.5 * (a[:, None] == b)).mean(), _pair(x, y), confidence, least=0.0
     )
 
@@ -147,7 +147,7 @@ def _pair(x: ArrayLike, y: ArrayLike) -> list[Array]:
     return pair
 
 
-def _estimate(
+def _seed_interval(
     statistic: Callable[..., Any], methods: list[Array], confidence: float, *, least: float, most: float = 1.0
 ) -> Estimate:
     """The statistic of the methods' rates and its interval, cut to what the statistic can be."""

@@ -15,7 +15,7 @@ from urllib.parse import parse_qsl, unquote, urlsplit
 from lw_torchrl._checks import counted, shown
 from lw_torchrl.planners.answers import PlannerError, Reply
 from lw_torchrl.planners.chat_reply import NoCompletion, bounded_client, in_a_line, read_completion
-from lw_torchrl.planners.hiding import Hider
+from lw_torchrl.planners.redaction import Redactor
 
 OPENAI = "https://api.openai.com/v1"
 _KEY = "OPENAI_API_KEY"
@@ -86,7 +86,7 @@ class ChatServer:
             raise PlannerError(f"the key in {_KEY} has characters that no key has: set it anew", fatal=True)
         given = urlsplit(_given(base_url))  # with what server_address leaves out
         inside = [given.username, given.password, *(value for _, value in parse_qsl(given.query))]
-        self._hidden = Hider([self._key, *(unquote(text) for text in inside if text)])
+        self._hidden = Redactor([self._key, *(unquote(text) for text in inside if text)])
         self.dialect = dialect or Dialect("max_completion_tokens" if own else "max_tokens")
         self._settled = False  # whether it has answered, so that its dialect is known
         self._client = openai.AsyncOpenAI(

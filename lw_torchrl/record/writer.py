@@ -19,7 +19,7 @@ from queue import SimpleQueue
 
 from lw_torchrl._files import replacing
 from lw_torchrl.record.conventions import rr
-from lw_torchrl.record.opening import copy_recording
+from lw_torchrl.record.recording_file import copy_recording
 
 PERIOD = 0.5
 """Seconds between two writes: with them done, a kill loses less than a second of what was logged."""

@@ -17,7 +17,7 @@ from lw_torchrl._checks import check_int, checked
 from lw_torchrl._keys import as_keys
 from lw_torchrl._rendering import check_cameras
 from lw_torchrl.transforms.environment import KeepsEnvState, base_env
-from lw_torchrl.transforms.late_answers import kept
+from lw_torchrl.transforms.late_answers import reset_rows
 
 
 class CameraTransform(KeepsEnvState):
@@ -100,7 +100,7 @@ class CameraTransform(KeepsEnvState):
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         begun = self._rows(tensordict.get("_reset", None))
-        self._steps = kept(self._steps, torch.zeros(len(begun), dtype=torch.int64), begun)
+        self._steps = reset_rows(self._steps, torch.zeros(len(begun), dtype=torch.int64), begun)
         return self._draw(begun, tensordict_reset)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:

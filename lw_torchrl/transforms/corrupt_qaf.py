@@ -17,7 +17,7 @@ from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.queries import Query, read_query
 from lw_torchrl.language.task_index import PlanTables
 from lw_torchrl.transforms.environment import EpisodeTransform
-from lw_torchrl.transforms.late_answers import RowAnswers, kept
+from lw_torchrl.transforms.late_answers import DelayedAnswers, reset_rows
 from lw_torchrl.transforms.qaf import plan_number_key
 
 _BLOCK = 64  # steps of an episode whose draws are made at once
@@ -93,7 +93,7 @@ class CorruptQAF(EpisodeTransform):
         self._forget_episodes()
 
     def _forget_episodes(self) -> None:
-        self._rows = RowAnswers(delay=self.lag)
+        self._rows = DelayedAnswers(delay=self.lag)
         self._draws = {purpose: _Draws(purpose, self.seed, self._tables, self.plans) for purpose in ("stick", "flip")}
 
     def with_plans(self, plans: Plans | Mapping[str, ConditionalPlan]) -> CorruptQAF:
@@ -107,7 +107,7 @@ class CorruptQAF(EpisodeTransform):
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         truth, task, episode = read(tensordict_reset, self.in_keys)
         begun = tensordict.get("_reset", None)
-        self._task, self._episode = kept(self._task, task, begun), kept(self._episode, episode, begun)
+        self._task, self._episode = reset_rows(self._task, task, begun), reset_rows(self._episode, episode, begun)
         self._plan = self._tables.rows(self._task)
         number = tensordict_reset.get(plan_number_key(self.in_keys[0]), None)
         if number is not None and bool(((number != self._tables.number[self._plan]) & (number != 0)).any()):

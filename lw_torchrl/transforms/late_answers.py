@@ -14,7 +14,7 @@ from lw_torchrl._keys import check_apart, read
 from lw_torchrl.transforms.environment import KeepsEnvState
 
 
-def kept(before: Tensor | None, now: Tensor, begun: Tensor | None, more: int = 0) -> Tensor:
+def reset_rows(before: Tensor | None, now: Tensor, begun: Tensor | None, more: int = 0) -> Tensor:
     """``now`` (B, ...), with ``more`` dimensions beyond B, of each row that has ``begun``, B bool or None for all; the
     others keep ``before``."""
     if before is None or begun is None or before.shape != now.shape:
@@ -23,7 +23,7 @@ def kept(before: Tensor | None, now: Tensor, begun: Tensor | None, more: int = 0
     return torch.where(begun.reshape(shape), now, before)
 
 
-class RowAnswers:
+class DelayedAnswers:
     """Counts the steps of each row's episode, and keeps the answers that it is still to be shown.
 
     In step t of its episode, 0 at the reset, a row is shown those of step every · ⌊max(t - delay, 0) / every⌋.
@@ -50,9 +50,9 @@ class RowAnswers:
     def begin(self, answers: Tensor, rows: Tensor | None) -> Tensor:
         """Begin the episodes of rows (B bool, None for all) with answers (B, S): what each row is shown."""
         shape = answers.shape[:-1]
-        self._step = kept(self._step, torch.zeros(shape, dtype=torch.int64, device=answers.device), rows)
-        self._taken = kept(self._taken, answers.unsqueeze(-2).repeat(*[1] * len(shape), self._places, 1), rows, 2)
-        self._shown = kept(self._shown, answers.clone(), rows, 1)
+        self._step = reset_rows(self._step, torch.zeros(shape, dtype=torch.int64, device=answers.device), rows)
+        self._taken = reset_rows(self._taken, answers.unsqueeze(-2).repeat(*[1] * len(shape), self._places, 1), rows, 2)
+        self._shown = reset_rows(self._shown, answers.clone(), rows, 1)
         return self._shown.clone()
 
     def due(self, rows: Tensor | None) -> Tensor:
@@ -79,7 +79,7 @@ class RowAnswers:
 
 
 class HeldAnswers(KeepsEnvState):
-    """Writes logits (B, S) float32 as :class:`RowAnswers` shows them; :meth:`HeldEvaluator.transform` makes it.
+    """Writes logits (B, S) float32 as :class:`DelayedAnswers` shows them; :meth:`HeldEvaluator.transform` makes it.
 
     ``ask`` gives those of the rows that are due, from a TensorDict of n rows with ``in_keys`` to (n, S) float32; S is
     ``columns``. Behind a transform that changes the observation it reads the changed one. Its ``state_dict`` holds the
@@ -102,7 +102,7 @@ class HeldAnswers(KeepsEnvState):
         self._forget_episodes()
 
     def _forget_episodes(self) -> None:
-        self._rows = RowAnswers(self.every, self.delay)
+        self._rows = DelayedAnswers(self.every, self.delay)
 
     def _asked(self, tensordict: TensorDictBase, due: Tensor) -> Tensor:
         """(B, S) float32, the answers of the rows that are due, B bool; zeros of the others."""

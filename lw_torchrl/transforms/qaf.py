@@ -19,7 +19,7 @@ from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.query_program import QueryProgram
 from lw_torchrl.language.task_index import PlanTables, TaskTables
 from lw_torchrl.transforms.environment import KeepsEnvState, base_env, refuse_changed, transforms_beside
-from lw_torchrl.transforms.late_answers import RowAnswers, kept
+from lw_torchrl.transforms.late_answers import DelayedAnswers, reset_rows
 
 _HALF = (torch.float16, torch.bfloat16)  # in which metres are not told apart as conditions do
 
@@ -106,7 +106,7 @@ class QAFTransform(KeepsEnvState):
         self._forget_episodes()
 
     def _forget_episodes(self) -> None:
-        self._rows = RowAnswers(self.every, self.delay) if self.every > 1 or self.delay else None
+        self._rows = DelayedAnswers(self.every, self.delay) if self.every > 1 or self.delay else None
 
     def with_plans(self, plans: Plans | Mapping[str, ConditionalPlan]) -> QAFTransform:
         """One that answers the conditions of other plans as often and as late."""
@@ -134,7 +134,7 @@ class QAFTransform(KeepsEnvState):
             refuse_changed(self, self.in_keys[0])
             self._saw_workers = True
         begun, task = tensordict.get("_reset", None), tensordict_reset.get(self.in_keys[1], None)
-        self._task = task if task is None else kept(self._task, task, begun)
+        self._task = task if task is None else reset_rows(self._task, task, begun)
         self._write(tensordict_reset, self._task)
         if self._rows is not None:
             truth = tensordict_reset.get(self.out_keys[0])

@@ -13,9 +13,9 @@ from torch import nn
 import lw_torchrl as lw
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.evaluation import attribute_failures
-from lw_torchrl.evaluation.attribution import decide, decide_pair
+from lw_torchrl.evaluation.attribution import choose_cause, choose_cause_pair
 from lw_torchrl.evaluation.counterfactuals import own_evaluators, with_true_answers
-from lw_torchrl.evaluation.explanation import attended, chosen, settled, stay
+from lw_torchrl.evaluation.explanation import attended, chosen, last_stay_start, stall_step
 from lw_torchrl.transforms.qaf import plan_program
 
 TASK, SEED, STEPS = "drawer-open", 7, 80
@@ -219,19 +219,19 @@ def test_failures_hang_on_neither_environments_nor_order():
 
 def test_the_smallest_replacement_decides_unless_another_mends_clearly_more():
     same = dict.fromkeys(("query", "skill", "plan", "skills", "time"), 0.5)
-    assert decide(["skills", "plan", "skill", "query"], same) == "query"
-    assert decide(["skills", "plan", "time"], same) == "plan"
-    assert decide(["skills", "plan"], {**same, "skills": 0.9}) == "skills"
-    assert decide(["time"], same) == "time"
-    assert decide([], same) is None
+    assert choose_cause(["skills", "plan", "skill", "query"], same) == "query"
+    assert choose_cause(["skills", "plan", "time"], same) == "plan"
+    assert choose_cause(["skills", "plan"], {**same, "skills": 0.9}) == "skills"
+    assert choose_cause(["time"], same) == "time"
+    assert choose_cause([], same) is None
 
 
 def test_of_two_causes_the_certain_one_comes_first_or_the_one_that_mends_more():
-    assert decide_pair(["query + skill"], {"skill": 0.9}) == ("query", "skill")
-    assert decide_pair(["plan + skill"], {}) == ("plan", "skill")
-    assert decide_pair(["plan + skill"], {"skills": 0.2}) == ("skill", "plan")
-    assert decide_pair(["query + plan", "query + skill"], {"skill": 0.2}) == ("query", "skill")
-    assert decide_pair(["query"], {}) is None
+    assert choose_cause_pair(["query + skill"], {"skill": 0.9}) == ("query", "skill")
+    assert choose_cause_pair(["plan + skill"], {}) == ("plan", "skill")
+    assert choose_cause_pair(["plan + skill"], {"skills": 0.2}) == ("skill", "plan")
+    assert choose_cause_pair(["query + plan", "query + skill"], {"skill": 0.2}) == ("query", "skill")
+    assert choose_cause_pair(["query"], {}) is None
 
 
 def test_the_step_in_force():
@@ -248,15 +248,15 @@ def test_a_stay_is_seen_where_the_hand_gets_no_further():
     observation[:, 0] = torch.cat((torch.arange(25) * 0.02, torch.full((35,), 0.5)))  # at rest from state 25 on
     in_force = torch.cat((torch.zeros(20), torch.ones(40))).long()
     seen = SimpleNamespace(in_force=in_force, steps=TensorDict(observation=observation, batch_size=[60]))
-    assert settled(seen, 1) == 25
-    assert settled(seen, 0) == 0, "it moves all the while"
+    assert stall_step(seen, 1) == 25
+    assert stall_step(seen, 0) == 0, "it moves all the while"
 
 
 def test_a_stay_may_be_left_for_a_while():
     states = torch.zeros(100, dtype=torch.bool)
     states[[3, 40, 60, 61, 80]] = True
-    assert stay(states) == 40
-    assert stay(torch.zeros(5, dtype=torch.bool)) == 4
+    assert last_stay_start(states) == 40
+    assert last_stay_start(torch.zeros(5, dtype=torch.bool)) == 4
 
 
 # ---- what is refused

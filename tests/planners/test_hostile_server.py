@@ -14,7 +14,7 @@ import lw_torchrl as lw
 from lw_torchrl.planners import chat_reply
 from lw_torchrl.planners.answer_files import AnswerCache
 from lw_torchrl.planners.chat_reply import NoCompletion, read_completion
-from lw_torchrl.planners.hiding import Hider
+from lw_torchrl.planners.redaction import Redactor
 
 pytestmark = pytest.mark.usefixtures("no_account")
 
@@ -299,7 +299,7 @@ def test_a_mutated_reply_is_an_answer_or_no_completion(tmp_path_factory, mutatio
     for start, length, new in mutations:
         content = content[:start] + new + content[start + length :]
     try:
-        reply, answered = read_completion(content, Hider(["sk-proj-9fK2xQ7LmZ4tRw8B"]))
+        reply, answered = read_completion(content, Redactor(["sk-proj-9fK2xQ7LmZ4tRw8B"]))
     except NoCompletion as error:
         str(error).encode()
         return

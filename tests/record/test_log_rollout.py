@@ -16,7 +16,7 @@ import lw_torchrl as lw
 from lw_torchrl.envs.engines import MetaWorldEngine
 from lw_torchrl.envs.seeding import episode_seed
 from lw_torchrl.evaluation.failure_records import Failure
-from lw_torchrl.record.opening import opening_step
+from lw_torchrl.record.recording_file import opening_step
 from lw_torchrl.record.viewer import open_viewer
 
 PLANS = lw.load_plans("MT10")

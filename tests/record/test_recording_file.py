@@ -10,7 +10,7 @@ import pytest
 from recordings import Recording, make_rollout
 
 from lw_torchrl.record import RerunLogger
-from lw_torchrl.record.opening import is_whole, opened
+from lw_torchrl.record.recording_file import is_whole, opened
 
 
 def test_the_file_has_its_name_from_the_start(tmp_path):

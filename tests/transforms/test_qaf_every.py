@@ -16,7 +16,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import Compose, EnvBase, ParallelEnv, SerialEnv, TransformedEnv, check_env_specs
 
 import lw_torchrl as lw
-from lw_torchrl.transforms.late_answers import RowAnswers
+from lw_torchrl.transforms.late_answers import DelayedAnswers
 
 ROWS = 4
 
@@ -167,7 +167,7 @@ def test_a_loaded_state_wants_a_reset_and_then_goes_on_bit_for_bit():
 
 def test_answers_under_way_do_not_outlive_a_loaded_state():
     """Also over an environment that does not ask for a reset itself."""
-    held = RowAnswers(every=2)
+    held = DelayedAnswers(every=2)
     with pytest.raises(RuntimeError, match="reset the environment"):
         held.advance(torch.zeros(2, 3, dtype=torch.bool), None)
     env = TransformedEnv(RandomStates(2), lw.QAFTransform(PLANS, every=2))

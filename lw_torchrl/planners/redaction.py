@@ -18,7 +18,7 @@ _LOGGERS = [f"httpcore{version}.{part}" for version in ("", "2") for part in ("c
 _LOGGERS += ["httpx", "httpx2", "openai._base_client"]
 
 
-class Hider(logging.Filter):
+class Redactor(logging.Filter):
     """Takes secrets out of texts, and out of the HTTP client's log while the block lasts.
 
     A secret is found whole or broken by white space, punctuation, invisible characters or tags, in either case, with
@@ -73,7 +73,7 @@ class Hider(logging.Filter):
         record.msg, record.args = self(record.getMessage()), ()
         return True
 
-    def __enter__(self) -> Hider:
+    def __enter__(self) -> Redactor:
         for name in _LOGGERS:
             logging.getLogger(name).addFilter(self)
         return self

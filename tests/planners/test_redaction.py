@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import lw_torchrl as lw
-from lw_torchrl.planners.hiding import Hider
+from lw_torchrl.planners.redaction import Redactor
 
 SECRET = "sk-proj-9fK2xQ7LmZ4tRw8B"
 
@@ -142,7 +142,7 @@ def test_what_an_address_hides_is_hidden(tmp_path):
 @settings(max_examples=80, deadline=None)
 @given(st.text(max_size=60), st.text(max_size=60))
 def test_a_text_without_a_key_stays_as_it_is(before, behind):
-    hide = Hider([SECRET, "", "a", "none", "EMPTY"])
+    hide = Redactor([SECRET, "", "a", "none", "EMPTY"])
     assert hide(before) == before or "none" in before or "EMPTY" in before
     found = hide(before + " " + SECRET + " " + behind)
     assert not known(found)
@@ -159,11 +159,11 @@ def test_a_text_without_a_key_stays_as_it_is(before, behind):
     ],
 )
 def test_a_short_key_is_hidden_where_it_stands_alone(key, text, found):
-    assert Hider([key])(text) == found
+    assert Redactor([key])(text) == found
 
 
 def test_accents_without_end_take_no_time():
-    hide, marks = Hider([SECRET]), "a" + "\u0300\u0316" * 100_000  # sorted pair by pair they take a minute
+    hide, marks = Redactor([SECRET]), "a" + "\u0300\u0316" * 100_000  # sorted pair by pair they take a minute
     begun = time.process_time()
     assert hide(marks) == marks
     assert hide(marks + SECRET) != marks + SECRET
@@ -182,7 +182,7 @@ def test_no_shipped_plan_holds_what_people_write_for_a_key():
         "token-abc123",
         "dummy",
     ]
-    hide = Hider(words)
+    hide = Redactor(words)
     for plan in PLANS.values():
         for format in lw.PLAN_FORMATS:
             text = lw.encode_plan(plan, format)
