@@ -33,8 +33,8 @@ class Slot:
 class Layout:
     """What the numbers of an observation and of an action are, for all tasks of a suite.
 
-    The frame is the same in every suite: metres, x to the right, y away from the robot, z above the table. A suite turns
-    its own numbers into this frame.
+    The frame is the same in every suite: metres, x to the right, y away from the robot, z above the table. A suite
+    turns its own numbers into this frame.
 
     Attributes:
         name: the suite's.
