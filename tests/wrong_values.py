@@ -127,6 +127,7 @@ for name in [
     "TensorDictBase",
     "EvaluationResult",
     "Query",
+    "Layout",
     "Task",
     "Tensor",
 ]:

@@ -135,12 +135,12 @@ def _kept_and_missing(config: CollectConfig, files: EpisodeFiles) -> tuple[dict[
     return kept, wanted
 
 
-def _clipped(policy: _Actor) -> _Actor:
+def _clipped(policy: _Actor, size: int) -> _Actor:
     """``policy`` with ``unclipped_action`` beside ``action``, as of :class:`ExpertActor`."""
 
     def run(tensordict: TensorDictBase) -> TensorDictBase:
         tensordict = policy(tensordict)
-        asked = read_action(tensordict)
+        asked = read_action(tensordict, size)
         return tensordict.set("unclipped_action", asked).set("action", asked.clamp(-1.0, 1.0))
 
     return run
@@ -152,9 +152,11 @@ def _env_and_actor(config: CollectConfig, policy: Policy | None, env: LanguageWo
     if policy is None:
         plans = segment_plans(config.tasks)
         actor = SegmentActor(config.policy, plans, config.seed, config.max_steps)
-        return TransformedEnv(env, QAFTransform(plans)), _clipped(actor)
+        return TransformedEnv(env, QAFTransform(plans)), _clipped(actor, env.layout.action_size)
     transform = policy.transform()
-    return env if transform is None else TransformedEnv(env, transform), _clipped(policy_of(policy))
+    return env if transform is None else TransformedEnv(env, transform), _clipped(
+        policy_of(policy), env.layout.action_size
+    )
 
 
 def run_missing_episodes(
@@ -169,7 +171,8 @@ def run_missing_episodes(
     options = {"num_envs": rows, "seed": config.seed, "max_steps": config.max_steps, "strict": policy is not None}
     base = LanguageWorldEnv(config.tasks, reward="dense", **options)  # type: ignore[arg-type]
     env, actor = _env_and_actor(config, policy, base)
-    scales = [(s, s, s, s * config.gripper_noise_factor) for s in config.noise_scale]
+    scales = np.array(config.noise_scale)[:, None].repeat(base.layout.action_size, 1)
+    scales[:, base.layout.gripper] *= config.gripper_noise_factor
     total = config.episodes_per_task * len(config.tasks)
     before = (total - missing) * config.max_steps
     bar = Progress("collecting", total * config.max_steps, "step", initial=before, show=progress)

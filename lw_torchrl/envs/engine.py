@@ -12,17 +12,14 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl.language.observation import ACTION_SIZE, OBSERVATION_SIZE
-
-__all__ = ["ACTION_SIZE", "OBSERVATION_SIZE", "BodyPoses", "Engine", "EngineStep", "RowModel"]
-
 
 class EngineStep(NamedTuple):
     """The result of one step of all rows, in fresh arrays; rows that were not active repeat their last observation,
     with reward 0, success False and fault False.
 
     Attributes:
-        observation: (N, 39) float64, Meta-World's vector (metres; gripper opening in [0, 1]; quaternions).
+        observation: (N, D) float64, as the layout says; of Meta-World its 39 numbers (metres; gripper opening in
+            [0, 1]; quaternions).
         reward, success: (N,) float64, Meta-World's dense reward, or the success as 0 and 1; (N,) bool, Meta-World's
             success.
         fault: (N,) bool, true where the simulation became unstable; such a row repeats its last stable observation
@@ -41,10 +38,10 @@ class Engine(Protocol):
 
     def reset(self, rows: Sequence[int], seeds: Sequence[int]) -> NDArray[np.float64]:
         """Start an episode in each of ``rows``, as Meta-World's own ``env.seed(seed); env.reset()`` does, whatever the
-        row did before; returns the first observations, (len(rows), 39) float64."""
+        row did before; returns the first observations, (len(rows), D) float64."""
 
     def step(self, action: NDArray[np.float32], active: NDArray[np.bool_]) -> EngineStep:
-        """Step the rows where ``active`` (N, bool) with ``action`` (N, 4) in [-1, 1], in the action's own precision."""
+        """Step the rows where ``active`` (N, bool) with ``action`` (N, A) in [-1, 1], in the action's own precision."""
 
     def close(self) -> None:
         """Free the simulators."""

@@ -13,9 +13,9 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 
 from lw_torchrl._keys import as_keys, dispatched, read, write
-from lw_torchrl.envs.engine import ACTION_SIZE, OBSERVATION_SIZE
 from lw_torchrl.envs.engines.metaworld import import_metaworld
 from lw_torchrl.envs.row_states import row_mask
+from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.tasks import resolve_tasks, task_id
 
 _quiet = Lock()  # Python's filters of warnings are the process's: two threads would leave ours behind
@@ -61,16 +61,16 @@ class ExpertActor(TensorDictModuleBase):
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         observation, given = read(tensordict, self.in_keys)
-        if observation.shape[-1:] != (OBSERVATION_SIZE,):
+        if observation.shape[-1:] != (METAWORLD.size,):
             raise ValueError(f"observation must have 39 numbers, got shape {tuple(observation.shape)}")
         if given.shape != observation.shape[:-1]:
             raise ValueError(
                 f"task_id must be of shape {tuple(observation.shape[:-1])}, one per observation, got "
                 f"{tuple(given.shape)}"
             )
-        states = observation.reshape(-1, OBSERVATION_SIZE).cpu().numpy().astype(np.float64)
+        states = observation.reshape(-1, METAWORLD.size).cpu().numpy().astype(np.float64)
         task_ids = given.reshape(-1).tolist()
-        action = np.zeros((len(task_ids), ACTION_SIZE), dtype=np.float32)
+        action = np.zeros((len(task_ids), METAWORLD.action_size), dtype=np.float32)
         with _quiet, warnings.catch_warnings():
             # The scripts warn nearly every step that they ask for more than [-1, 1].
             warnings.filterwarnings("ignore", message="Constant\\(s\\) may be too high")
@@ -78,5 +78,5 @@ class ExpertActor(TensorDictModuleBase):
                 if (task := task_ids[row]) not in self._policies:
                     raise ValueError(f"task_id {task} is none of this expert's tasks: {', '.join(self.tasks)}")
                 action[row] = self._policies[task].get_action(states[row])
-        asked = torch.from_numpy(action).to(observation.device).reshape(*observation.shape[:-1], ACTION_SIZE)
+        asked = torch.from_numpy(action).to(observation.device).reshape(*observation.shape[:-1], METAWORLD.action_size)
         return write(tensordict, self, [asked.clamp(-1.0, 1.0), asked])

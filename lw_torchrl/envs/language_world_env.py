@@ -19,12 +19,12 @@ from torchrl.envs import EnvBase
 
 from lw_torchrl._checks import check_int, checked
 from lw_torchrl._rendering import check_picture
-from lw_torchrl.envs.engine import ACTION_SIZE, Engine
+from lw_torchrl.envs.engine import Engine
 from lw_torchrl.envs.engines import make_engine
 from lw_torchrl.envs.row_states import RowStates, action_spec, clipped_action, done_spec, observation_spec, row_mask
 from lw_torchrl.envs.seeding import EpisodeCounter, check_worker, stated_episode
 from lw_torchrl.envs.workers import OneThread, one_thread_at_a_time, torchrl_worker
-from lw_torchrl.language.tasks import Task, named_tasks
+from lw_torchrl.language.tasks import Task, named_tasks, one_layout
 
 
 class LanguageWorldEnv(EnvBase):
@@ -117,7 +117,7 @@ class LanguageWorldEnv(EnvBase):
         batch_size: tuple[()] | None = None,
     ) -> None:
         named = named_tasks(tasks)
-        self.tasks = tuple(named)
+        self.tasks, self.layout = tuple(named), one_layout(named.values())
         n = len(self.tasks)
         num_envs = n if num_envs is None else check_int("num_envs", num_envs, minimum=1)
         if num_envs < n:
@@ -140,10 +140,10 @@ class LanguageWorldEnv(EnvBase):
         self._one_thread, self._last_one = OneThread(lock), OneThread(lock, patience=10.0)
         self._counter = EpisodeCounter([named[t] for t in self.row_tasks], check_int("seed", seed), self.worker)
         super().__init__(device=torch.device("cpu"), batch_size=(num_envs,) if batch_size is None else ())
-        self._rows = RowStates(self.row_tasks)
+        self._rows = RowStates(self.row_tasks, self.layout)
         which = ... if batch_size is None else 0
-        self.observation_spec = observation_spec(self._rows.task_id)[which]
-        self.action_spec = action_spec(num_envs)[which]
+        self.observation_spec = observation_spec(self._rows.task_id, self.layout)[which]
+        self.action_spec = action_spec(num_envs, self.layout)[which]
         self.reward_spec = Unbounded((num_envs, 1))[which]
         self.done_spec = done_spec(num_envs)[which]
         self._engine = make_engine(engine, self.row_tasks, reward=reward, num_threads=num_threads)
@@ -227,7 +227,8 @@ class LanguageWorldEnv(EnvBase):
 
     @one_thread_at_a_time
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        action = clipped_action(tensordict, self.batch_size).cpu().numpy().reshape(-1, ACTION_SIZE)
+        size = self.layout.action_size
+        action = clipped_action(tensordict, (*self.batch_size, size)).cpu().numpy().reshape(-1, size)
         active = row_mask(tensordict, "_step", len(self.row_tasks))
         if (active & self._rows.over).any():
             rows = np.flatnonzero(active & self._rows.over)[:5].tolist()

@@ -284,7 +284,8 @@ def _by_counterfactuals(
     step, at, why = told.steps[cause], told.at[cause], told.why[cause]
     if best == "skill":
         step = tried.step[which]
-        at, why = stall_step(one, step), describe_active_time(one, tried.plans[one.task], step)
+        plan = tried.plans[one.task]
+        at, why = stall_step(one, step, plan.definition.layout), describe_active_time(one, plan, step)
     by = {f"mended_by_{name.replace(' + ', '_and_')}": share for name, share in shares.items()}
     evidence = {**told.evidence, **by}
     return Failure(one.task, seed, one.episode, cause, also, step, at, _text(why, words), evidence, replaced)

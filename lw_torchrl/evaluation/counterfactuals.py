@@ -185,7 +185,7 @@ class EpisodeRepeater:
                 policy_of(actor, self.device),
                 wanted,
                 keys=["observation", ("next", "success")],
-                noise=(lambda _: (scale,) * 4) if scale else None,
+                noise=(lambda _: (scale,) * base.layout.action_size) if scale else None,
                 after_success=0,
                 on_progress=bar.update,
             ):

@@ -62,11 +62,12 @@ def _checked(policy: Acts, env: EnvBase, also_record: Iterable[NestedKey]) -> Ac
     """``policy``, whose action is checked, and at its first call whether it and ``env`` write ``also_record``."""
     unseen = [unravel_key(key) for key in also_record]
     specs = env.full_observation_spec, env.full_reward_spec, env.full_done_spec
+    size = env.action_spec.shape[-1]
     later = [unravel_key(("next", key)) for spec in specs for key in spec.keys(True, True)]
 
     def run(tensordict: TensorDictBase) -> TensorDictBase:
         tensordict = policy(tensordict)
-        read_action(tensordict)
+        read_action(tensordict, size)
         while unseen:
             key = unseen.pop()
             if key not in later and key not in tensordict.keys(True):
@@ -183,7 +184,7 @@ def evaluate(
             _checked(policy, env, seen),
             {task: range(episodes_per_task) for task in names},
             keys=["action", ("next", "success"), ("next", "reward"), *seen],
-            noise=(lambda _: (noise_scale,) * 4) if noise_scale else None,
+            noise=(lambda _: (noise_scale,) * env.action_spec.shape[-1]) if noise_scale else None,
             after_success=0 if stop_at_success else None,
             on_progress=bar.update,
         ):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any
@@ -22,6 +22,9 @@ class Slot:
 
     position: int
     quaternion: int | None = None
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
     @property
     def xyz(self) -> slice:
@@ -96,6 +99,9 @@ class Layout:
             raise ValueError(f"closes of layout {self.name!r} must be 1 or -1, got {shown(self.closes)}")
         if self.reach <= 0:
             raise ValueError(f"reach of layout {self.name!r} must be above 0 metres, got {shown(self.reach)}")
+        for relation, threshold in self.thresholds.items():
+            if not isinstance(relation, str) or type(threshold) is not float or abs(threshold) > 1e3:
+                raise ValueError(f"thresholds of layout {self.name!r} must map relations to metres, got {relation!r}")
         object.__setattr__(self, "thresholds", MappingProxyType(dict(self.thresholds)))
 
     @cached_property
@@ -126,12 +132,28 @@ class Layout:
             raise ValueError(f"layout {self.name!r} has no numbers of the step before")
         return slice(part.start + self.past, part.stop + self.past)
 
+    def to_json(self) -> dict[str, Any]:
+        """What :meth:`from_json` reads back."""
+        things = [[thing.position, thing.quaternion] for thing in self.things]
+        own = {each.name: getattr(self, each.name) for each in fields(self)}
+        return {**own, "things": things, "thresholds": dict(self.thresholds)}
+
+    @classmethod
+    def from_json(cls, found: Any) -> Layout:
+        """The layout of :meth:`to_json`; any other value is a ValueError."""
+        names = [each.name for each in fields(cls)]
+        if not isinstance(found, Mapping) or set(found) != set(names):
+            raise ValueError(f"layout must be a table of {', '.join(names)}, got {shown(found)}")
+        things = found["things"]
+        if not isinstance(things, list) or not all(isinstance(one, list) and len(one) == 2 for one in things):
+            raise ValueError(f"things of a layout must be pairs of indices, got {shown(things)}")
+        try:
+            return cls(**{**found, "things": tuple(Slot(*one) for one in things)})
+        except TypeError as error:
+            raise ValueError(f"layout: {error}") from error
+
     def __reduce__(self) -> Any:
-        return _restored, ({**vars(self), "thresholds": dict(self.thresholds)},)
-
-
-def _restored(values: Mapping[str, Any]) -> Layout:
-    return Layout(**{name: values[name] for name in Layout.__dataclass_fields__})
+        return Layout.from_json, (self.to_json(),)
 
 
 def places(part: slice) -> tuple[int, ...]:

@@ -88,7 +88,8 @@ class ConditionedActor(Policy):
                 "actor.stochastic()"
             )
         head: Any = dict(width=width, depth=depth, squash=squash, distribution=distribution, init_std=init_std)
-        self.head = ActionHead(self.encoder.width, **head)
+        self.layout = self.encoder.layout
+        self.head = ActionHead(self.encoder.width, actions=self.layout.action_size, **head)
         self.plans, self.tasks, self.in_keys = self.encoder.plans, self.encoder.tasks, self.encoder.in_keys
         extras = () if self.plans is None else ("skill_weights", "skill_latent")
         drawn = () if distribution is None else ("loc", "scale", "action_log_prob")

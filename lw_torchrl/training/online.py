@@ -24,9 +24,9 @@ from lw_torchrl.data.growing import GrowingStorage
 from lw_torchrl.data.replay import LanguageWorldExperienceReplay
 from lw_torchrl.data.rewards import REWARDS
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
+from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.tasks import Task, named_tasks
 from lw_torchrl.modules.critics import QValue
-from lw_torchrl.modules.networks import ACTION_SIZE
 from lw_torchrl.modules.policy import Policy
 from lw_torchrl.training.algorithms import LEARNERS, OnlineConfig, method_config
 from lw_torchrl.training.algorithms.learner import NoiseConfig
@@ -219,7 +219,9 @@ class OnlineTrainer(Training):
         config, learner = self.config, self.learner
         state, done_before = env.reset(), self.frames
         first = FirstEpisodes(config.rows)
-        exploration = Exploration(config, self._patience) if isinstance(config, NoiseConfig) else None
+        exploration = (
+            Exploration(config, self._patience, self.policy.layout) if isinstance(config, NoiseConfig) else None
+        )
         came = []
         steps = min(config.round_steps, config.steps - self.round * config.round_steps)
         due = 0
@@ -296,11 +298,14 @@ class Exploration:
     ``stuck_exploration``; the gripper's would open grasps.
     """
 
-    def __init__(self, config: NoiseConfig, patience: int) -> None:
+    def __init__(self, config: NoiseConfig, patience: int, layout: Layout = METAWORLD) -> None:
         self.patience = patience
-        self._scale = torch.tensor([1.0, 1.0, 1.0, config.gripper_exploration]) * config.exploration
-        self._stuck_scale = torch.tensor([*[config.stuck_exploration] * 3, float(self._scale[3])])
-        self._drawn = torch.zeros(config.rows, ACTION_SIZE)
+        moves = torch.ones(layout.action_size)
+        moves[layout.gripper] = config.gripper_exploration
+        self._scale = moves * config.exploration
+        self._stuck_scale = torch.full_like(moves, config.stuck_exploration)
+        self._stuck_scale[layout.gripper] = self._scale[layout.gripper]
+        self._drawn = torch.zeros(config.rows, layout.action_size)
         self._since = torch.zeros(config.rows)
         self._truth: Tensor | None = None
 
@@ -309,7 +314,7 @@ class Exploration:
         self._drawn = torch.randn_like(self._drawn)
 
     def noise(self, state: TensorDictBase) -> Tensor:
-        """(N, 4) float32, for the actions in these states, each one step after those of the last call or the first of
+        """(N, A) float32, for the actions in these states, each one step after those of the last call or the first of
         an episode; ``qaf`` (N, S) bool, if it is there."""
         truth = state.get("qaf", None)
         if not self.patience or truth is None:

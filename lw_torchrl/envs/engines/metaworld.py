@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from lw_torchrl._rendering import naming_absent_renderer
 from lw_torchrl.envs.cameras import SeenRows
-from lw_torchrl.envs.engine import OBSERVATION_SIZE, EngineStep, RowModel
+from lw_torchrl.envs.engine import EngineStep, RowModel
+from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.tasks import check_task
 
 UNSTABLE = slice(int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADQACC) + 1)
@@ -49,7 +50,7 @@ class MetaWorldEngine(SeenRows):
         self._dense = reward == "dense"
         # The environment above counts the steps; Meta-World's own limit must not come first.
         self._envs = [make_metaworld_env(task, max_steps=2**31 - 1) for task in tasks]
-        self._last = np.zeros((len(self._envs), OBSERVATION_SIZE))
+        self._last = np.zeros((len(self._envs), METAWORLD.size))
 
     def reset(self, rows: Sequence[int], seeds: Sequence[int]) -> NDArray[np.float64]:
         for row, seed in zip(rows, seeds, strict=True):

@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 
 from lw_torchrl._checks import check_choice, check_int
 from lw_torchrl.envs.cameras import SeenRows
-from lw_torchrl.envs.engine import ACTION_SIZE, OBSERVATION_SIZE, EngineStep, RowModel
+from lw_torchrl.envs.engine import EngineStep, RowModel
 from lw_torchrl.envs.engines.vectorized import observation as at
 from lw_torchrl.envs.engines.vectorized import simulated_rows, task_programs
 from lw_torchrl.envs.engines.vectorized.observation import Array, Index, Mask, Observer, SuccessFunction
 from lw_torchrl.envs.engines.vectorized.rewards.dense_reward import DenseReward, EpisodeStarts
 from lw_torchrl.envs.engines.vectorized.tables import reward_table, simulation_table
+from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.tasks import check_task
 
 FINGERS = np.array([1.0, -1.0])
@@ -74,8 +75,8 @@ class VectorizedEngine(SeenRows):
 
         n, builders = len(tasks), [row.builder for row in self._rows]
         bounds = [builder.sawyer_observation_space for builder in builders]
-        self._low = np.array([space.low for space in bounds]).reshape(n, OBSERVATION_SIZE)
-        self._high = np.array([space.high for space in bounds]).reshape(n, OBSERVATION_SIZE)
+        self._low = np.array([space.low for space in bounds]).reshape(n, METAWORLD.size)
+        self._high = np.array([space.high for space in bounds]).reshape(n, METAWORLD.size)
         self._mocap_low = np.array([builder.mocap_low for builder in builders]).reshape(n, 3)
         self._mocap_high = np.array([builder.mocap_high for builder in builders]).reshape(n, 3)
         scales = {builder.action_scale for builder in builders}
@@ -86,7 +87,7 @@ class VectorizedEngine(SeenRows):
         self._mocap = np.zeros((n, 3))
         self._goal = np.zeros((n, 3))
         self._current = np.zeros((n, 18))
-        self._observation = np.zeros((n, OBSERVATION_SIZE))
+        self._observation = np.zeros((n, METAWORLD.size))
         self._started = np.zeros(n, dtype=bool)
         self._faulted = np.zeros(n, dtype=bool)
         self._running: _RunningRows | None = None
@@ -115,9 +116,9 @@ class VectorizedEngine(SeenRows):
     def step(self, action: NDArray[Any], active: Mask) -> EngineStep:
         n = len(self._rows)
         action, active = np.asarray(action), np.asarray(active, dtype=bool)
-        if action.shape != (n, ACTION_SIZE) or active.shape != (n,):
+        if action.shape != (n, METAWORLD.action_size) or active.shape != (n,):
             raise ValueError(
-                f"action must be of shape {(n, ACTION_SIZE)} and active of {(n,)}, "
+                f"action must be of shape {(n, METAWORLD.action_size)} and active of {(n,)}, "
                 f"got {action.shape} and {active.shape}"
             )
         if not self._started[active].all():
