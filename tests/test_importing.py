@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 import lw_torchrl
-from lw_torchrl.envs.engines.metaworld import import_metaworld
+from lw_torchrl.suites.metaworld.plain_engine import import_metaworld
 
 
 class Failing(MetaPathFinder):

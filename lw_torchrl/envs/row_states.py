@@ -80,16 +80,6 @@ def _flag(n: int) -> Categorical:
     return Categorical(2, shape=(n, 1), dtype=torch.bool)
 
 
-def row_mask(tensordict: TensorDictBase | None, key: str, n: int) -> np.ndarray:
-    """The rows of a mask such as "_reset", (n,) bool; all if there is none."""
-    mask = None if tensordict is None else tensordict.get(key, None)
-    if mask is None:
-        return np.ones(n, dtype=bool)
-    if mask.dtype != torch.bool or mask.numel() != n:
-        raise ValueError(f"{key} must be bool of shape ({n},) or ({n}, 1), got {mask.dtype} of {tuple(mask.shape)}")
-    return mask.reshape(n).cpu().numpy()
-
-
 def clipped_action(tensordict: TensorDictBase, shape: tuple[int, ...]) -> Tensor:
     """The action as it is executed, float32 of this shape in [-1, 1]."""
     action = tensordict.get("action", None)

@@ -27,9 +27,10 @@ from lw_torchrl.evaluation.explanation import (
 from lw_torchrl.evaluation.failure_records import Cause, Failure
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.skills import ScriptedSkill, load_skills
-from lw_torchrl.language.tasks import TASKS, task_id
+from lw_torchrl.language.tasks import task_id
 from lw_torchrl.modules.networks import evaluating
 from lw_torchrl.modules.policy import plans_of
+from lw_torchrl.suites.suite import Suite, find_suite
 
 _MARGIN = 0.3  # minimum lead for a larger replacement to win, as a share of the task's failed episodes
 _COUNTERFACTUALS: dict[str, tuple[Cause, str]] = {  # the smaller ones first; time counts where nothing else mends
@@ -58,9 +59,10 @@ def attribute_failures(
     skills: Mapping[str, ScriptedSkill] | None = None,
     seed: int,
     noise_scale: float = 0.1,
-    max_steps: int = 500,
+    max_steps: int | None = None,
     num_envs: int | None = None,
-    engine: Any = "vectorized",
+    suite: str | Suite | None = None,
+    engine: Any = None,
     num_threads: int | None = None,
     device: str | torch.device | None = None,
     progress: bool = True,
@@ -96,7 +98,7 @@ def attribute_failures(
             :class:`QueryEvaluator`, or a module, function or :class:`torchrl.envs.Transform` that writes ``qaf``. An
             evaluator inside the policy is found there.
         skills: the scripted skills by text that are trusted; None for the shipped ones, :func:`load_skills`.
-        seed, noise_scale, max_steps, engine: with which the episodes were run.
+        seed, noise_scale, max_steps, suite, engine: with which the episodes were run.
         num_envs, num_threads, device, progress: as for :func:`evaluate`.
 
     Returns:
@@ -128,7 +130,6 @@ def attribute_failures(
     """
     answered = as_plans(plans)
     check_scale("noise_scale", noise_scale)
-    check_int("max_steps", max_steps, minimum=1)
     check_int("num_envs", 1 if num_envs is None else num_envs, minimum=1)
     if actor is not None and (own := plans_of(actor)) is not None and (other := answered.differences(own)):
         raise ValueError(f"plans differ from the actor's own for {', '.join(other)}; pass the actor's plans")
@@ -148,9 +149,11 @@ def attribute_failures(
     told = {(one.task, one.episode): explain(one, answered, scripts, trusted, theirs) for one in seen}
     if actor is None:
         return [_by_rule(one, told[one.task, one.episode], seed) for one in seen]
-    tasks = {name: TASKS.get(name, answered[name].definition) for name in names}
+    found = find_suite(names, suite)
+    tasks = {name: found.tasks.get(name, answered[name].definition) for name in names}
+    max_steps = found.max_steps if max_steps is None else check_int("max_steps", max_steps, minimum=1)
     firsts = {(one.task, one.episode): one.steps.get("observation")[0] for one in seen}
-    env = {"seed": seed, "engine": engine, "num_threads": num_threads}
+    env = {"seed": seed, "suite": found, "engine": engine, "num_threads": num_threads}
     repeat = EpisodeRepeater(tasks, firsts, env, noise_scale, max_steps, num_envs, device, progress)
     tried = Counterfactuals(actor, answered, evaluator, trusted, scripts, repeat)
     tried.run(seen, [which for which, one in told.items() if one.evidence.get("plan_departs") == 0.0])

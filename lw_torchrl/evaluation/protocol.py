@@ -22,9 +22,10 @@ from lw_torchrl.evaluation.attribution import attribute_failures, keys_to_attrib
 from lw_torchrl.evaluation.counterfactuals import Acts, answered_by, make_env
 from lw_torchrl.evaluation.result import EpisodeResult, EvaluationResult
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
-from lw_torchrl.language.tasks import TASKS, Task, named_tasks
+from lw_torchrl.language.tasks import Task, TaskList
 from lw_torchrl.modules.networks import evaluating
 from lw_torchrl.modules.policy import Policy, plans_of
+from lw_torchrl.suites.suite import Suite, find_suite
 
 _ROWS = 256  # more hardly make a step of all of them cheaper per row, and cost memory
 
@@ -43,10 +44,11 @@ def actor_plans(actor: Any, plans: Plans | Mapping[str, ConditionalPlan] | None)
     return own or given
 
 
-def tasks_of(tasks: str | Task | Iterable[str | Task], plans: Plans | None) -> dict[str, Task]:
-    """The tasks by name; a name of the user's own stands for the task that its plan is for."""
-    own = {} if plans is None else {plan.task: plan.definition for plan in plans.values() if plan.task not in TASKS}
-    return named_tasks(tasks, known={**TASKS, **own})
+def tasks_of(tasks: TaskList, plans: Plans | None, suite: str | Suite | None = None) -> tuple[Suite, dict[str, Task]]:
+    """The suite, and the tasks by name; a name of the user's own stands for the task that its plan is for."""
+    found = find_suite(tasks, suite)
+    own = {} if plans is None else {plan.task: plan.definition for plan in plans.values()}
+    return found, found.named_tasks(tasks, {name: task for name, task in own.items() if name not in found.tasks})
 
 
 def _result(finished: FinishedEpisode, stopped_early: bool, keep_actions: bool) -> EpisodeResult:
@@ -90,8 +92,9 @@ def evaluate(
     stop_at_success: bool = False,
     record_actions: bool = False,
     reward: Literal["sparse", "dense"] = "sparse",
-    max_steps: int = 500,
-    engine: Any = "vectorized",
+    max_steps: int | None = None,
+    suite: str | Suite | None = None,
+    engine: Any = None,
     num_threads: int | None = None,
     progress: bool = True,
     also_record: Sequence[NestedKey] = (),
@@ -104,7 +107,7 @@ def evaluate(
     """Run episodes 0 to k - 1 of each task and report how they went.
 
     The actor runs in eval mode with deterministic exploration. The executed action is its action plus
-    N(0, noise_scale²) on all four numbers, clipped. The result depends neither on ``num_envs`` nor on the tasks beside:
+    N(0, noise_scale²) on all its numbers, clipped. The result depends neither on ``num_envs`` nor on the tasks beside:
     the actor is run on blocks of a fixed number of rows, and all randomness comes from (task, seed, episode).
 
     Args:
@@ -118,7 +121,7 @@ def evaluate(
         stop_at_success: end an episode at its first success; success at the end and return are then None.
         record_actions: keep each episode's executed actions, (T, 4) float32.
         reward: "sparse" or "dense", summed in the return.
-        max_steps, engine, num_threads: as for :class:`LanguageWorldEnv`.
+        max_steps, suite, engine, num_threads: as for :class:`LanguageWorldEnv`.
         progress: show a progress bar when it takes longer than a second.
         also_record: more keys for ``on_episode`` to see: "qaf", "skill_weights".
         on_episode: called with each finished episode, a named tuple of ``task``, ``episode`` (its index) and ``steps``,
@@ -147,7 +150,7 @@ def evaluate(
     Source: paper section 'Conditional Plan Experiments': 20 episodes, action noise 0.1.
     """
     answered = actor_plans(actor, plans)
-    chosen = tasks_of(tasks, answered)
+    found_suite, chosen = tasks_of(tasks, answered, suite)
     names = tuple(chosen)
     if answered is not None:
         answered.require(names)
@@ -167,7 +170,9 @@ def evaluate(
     if num_envs is None:
         num_envs = len(names) * max(1, _ROWS // len(names))
     num_envs = min(check_int("num_envs", num_envs), len(names) * episodes_per_task)  # a row more would have no work
+    max_steps = found_suite.max_steps if max_steps is None else check_int("max_steps", max_steps, minimum=1)
     shared: dict[str, Any] = {"seed": seed, "engine": engine, "num_threads": num_threads, "max_steps": max_steps}
+    shared["suite"] = found_suite
     base = LanguageWorldEnv(list(chosen.values()), num_envs=num_envs, reward=reward, strict=True, **shared)
     env = make_env(actor, answered, base, evaluator)
     policy = policy_of(answered_by(actor, evaluator), device)

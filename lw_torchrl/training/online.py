@@ -25,9 +25,10 @@ from lw_torchrl.data.replay import LanguageWorldExperienceReplay
 from lw_torchrl.data.rewards import REWARDS
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.language.layout import METAWORLD, Layout
-from lw_torchrl.language.tasks import Task, named_tasks
+from lw_torchrl.language.tasks import Task
 from lw_torchrl.modules.critics import QValue
 from lw_torchrl.modules.policy import Policy
+from lw_torchrl.suites.suite import Suite, find_suite
 from lw_torchrl.training.algorithms import LEARNERS, OnlineConfig, method_config
 from lw_torchrl.training.algorithms.learner import NoiseConfig
 from lw_torchrl.training.buffers import check_minibatches, check_replay
@@ -55,6 +56,7 @@ class OnlineTrainer(Training):
             :class:`OnlineConfig` for the method's defaults of all else; None for its defaults.
         method: a name of :data:`LEARNERS`, whose classes say what they do.
         tasks: to run, as for :class:`LanguageWorldEnv`; None for those of the demonstrations.
+        suite: that has the tasks; None for the one that their names begin with.
         critic: whose copies are trained, where the method has one, with its normalisation as it is
             (``critic.fit_normalization``); None for one that sees what the actor sees, by the actor's.
         checkpoint, logger, progress: as of :class:`~lw_torchrl.training.loop.Training`, with its errors; the checkpoint
@@ -109,6 +111,7 @@ class OnlineTrainer(Training):
         *,
         method: str = "td3",
         tasks: str | Task | Iterable[str | Task] | None = None,
+        suite: str | Suite | None = None,
         critic: QValue | None = None,
         checkpoint: str | os.PathLike[str] | None = None,
         logger: Logger | None = None,
@@ -122,7 +125,9 @@ class OnlineTrainer(Training):
         if critic is not None:
             check_minibatches([critic], replay, config.batch_size)
         self.method, self.replay, self.num_threads = method, replay, num_threads
-        self.tasks = replay.tasks if tasks is None else list(named_tasks(tasks).values())
+        given: Any = replay.tasks if tasks is None else tasks
+        self.suite = find_suite(given, suite)
+        self.named = self.suite.named_tasks(given)
         generator = torch.Generator().manual_seed(config.seed)
         replay.set_rng(generator)
         self._drawn = generator.get_state()
@@ -140,7 +145,7 @@ class OnlineTrainer(Training):
                 "actor": self.policy.describe(),
                 "start": {"weights": start},
                 "critic": {} if critic is None else {"weights": _fingerprint(critic)},
-                "online": {"method": method, "tasks": list(named_tasks(self.tasks)), **asdict(config)},
+                "online": {"method": method, "tasks": list(self.named), **asdict(config)},
                 "data": describe_data(replay),
                 "replay": describe_learning(replay),
             }
@@ -181,7 +186,8 @@ class OnlineTrainer(Training):
         Ctrl-C ends it between two steps, and what came since the last round's end is lost; a second Ctrl-C at once.
         """
         base = LanguageWorldEnv(
-            self.tasks,
+            list(self.named.values()),
+            suite=self.suite,
             num_envs=self.config.rows,
             seed=self.config.seed,
             reward=REWARDS[self.replay.reward].source,

@@ -11,9 +11,9 @@ import pytest
 from metaworld.policies import ENV_POLICY_MAP
 from metaworld.utils import reward_utils
 
-from lw_torchrl.envs.engines.metaworld import MetaWorldEngine
-from lw_torchrl.envs.engines.vectorized.engine import VectorizedEngine
-from lw_torchrl.envs.engines.vectorized.observation import (
+from lw_torchrl.suites.metaworld.plain_engine import MetaWorldEngine
+from lw_torchrl.suites.metaworld.vectorized.engine import VectorizedEngine
+from lw_torchrl.suites.metaworld.vectorized.observation import (
     CORNERS,
     HAND,
     JOINT,
@@ -30,10 +30,10 @@ from lw_torchrl.envs.engines.vectorized.observation import (
     SECOND,
     Observer,
 )
-from lw_torchrl.envs.engines.vectorized.rewards import terms
-from lw_torchrl.envs.engines.vectorized.rewards.dense_reward import DenseReward, EpisodeStarts
-from lw_torchrl.envs.engines.vectorized.rewards.formulas import FORMULAS, LIFTS
-from lw_torchrl.envs.engines.vectorized.tables import parse_reward_table, reward_table, simulation_table
+from lw_torchrl.suites.metaworld.vectorized.rewards import terms
+from lw_torchrl.suites.metaworld.vectorized.rewards.dense_reward import DenseReward, EpisodeStarts
+from lw_torchrl.suites.metaworld.vectorized.rewards.formulas import FORMULAS, LIFTS
+from lw_torchrl.suites.metaworld.vectorized.tables import parse_reward_table, reward_table, simulation_table
 
 TASKS = list(simulation_table())
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
-from lw_torchrl.envs.engines.vectorized.tables import TaskReward, TaskSources
+from lw_torchrl.suites.metaworld.vectorized.tables import TaskReward, TaskSources
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -199,8 +199,8 @@ STICK_UPWARD = 0.06
 
 
 class SuccessFunction:
-    """The success of a fixed set of rows; ``programs`` gives a row's present
-    :class:`~lw_torchrl.envs.engines.vectorized.task_programs.TaskProgram`, for the one rule that looks at contacts."""
+    """The success of a fixed set of rows; ``programs`` gives a row's present :class:`TaskProgram`, for the one rule
+    that looks at contacts."""
 
     def __init__(self, sources: Sequence[TaskSources], programs: Callable[[int], Any]) -> None:
         success = [row.success for row in sources]

@@ -12,11 +12,10 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 
-from lw_torchrl._keys import as_keys, dispatched, read, write
-from lw_torchrl.envs.engines.metaworld import import_metaworld
-from lw_torchrl.envs.row_states import row_mask
+from lw_torchrl._keys import as_keys, dispatched, read, row_mask, write
 from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.tasks import resolve_tasks, task_id
+from lw_torchrl.suites.metaworld.plain_engine import import_metaworld
 
 _quiet = Lock()  # Python's filters of warnings are the process's: two threads would leave ours behind
 

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lw_torchrl.envs.engine import EngineStep
-from lw_torchrl.envs.engines.metaworld import MetaWorldEngine
-from lw_torchrl.envs.engines.vectorized.engine import VectorizedEngine
-from lw_torchrl.envs.engines.vectorized.observation import quaternion_of_matrix, row_norm
-from lw_torchrl.envs.engines.vectorized.simulated_rows import RowGroup, WorkerPool, split_into_groups
-from lw_torchrl.envs.engines.vectorized.tables import parse_simulation_table, simulation_table
-from lw_torchrl.envs.engines.vectorized.task_programs import borrow_model, model_path, return_models
+from lw_torchrl.suites.engine import EngineStep
+from lw_torchrl.suites.metaworld.plain_engine import MetaWorldEngine
+from lw_torchrl.suites.metaworld.vectorized.engine import VectorizedEngine
+from lw_torchrl.suites.metaworld.vectorized.observation import quaternion_of_matrix, row_norm
+from lw_torchrl.suites.metaworld.vectorized.simulated_rows import RowGroup, WorkerPool, split_into_groups
+from lw_torchrl.suites.metaworld.vectorized.tables import parse_simulation_table, simulation_table
+from lw_torchrl.suites.metaworld.vectorized.task_programs import borrow_model, model_path, return_models
 
 TASKS = list(simulation_table())
 

@@ -15,7 +15,7 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from lw_torchrl._checks import check_choice
-from lw_torchrl.envs.engines.metaworld import import_metaworld
+from lw_torchrl.suites.metaworld.plain_engine import import_metaworld
 
 SUPPORTED_VERSIONS = {"metaworld": "3.1.1", "mujoco": "3.3.0"}
 

@@ -33,7 +33,7 @@ class EngineStep(NamedTuple):
 
 
 class Engine(Protocol):
-    """Simulates N rows of Meta-World tasks. With the ``render`` of :class:`~lw_torchrl.envs.cameras.SeenRows` it also
+    """Simulates N rows of Meta-World tasks. With the ``render`` of :class:`~lw_torchrl.suites.cameras.SeenRows` it also
     gives pictures, with its ``model`` and ``poses`` recordings of the scene."""
 
     def reset(self, rows: Sequence[int], seeds: Sequence[int]) -> NDArray[np.float64]:

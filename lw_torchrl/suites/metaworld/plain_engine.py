@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lw_torchrl._rendering import naming_absent_renderer
-from lw_torchrl.envs.cameras import SeenRows
-from lw_torchrl.envs.engine import EngineStep, RowModel
 from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.tasks import check_task
+from lw_torchrl.suites.cameras import SeenRows
+from lw_torchrl.suites.engine import EngineStep, RowModel
 
 UNSTABLE = slice(int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADQACC) + 1)
 """MuJoCo's three warnings of an unstable simulation: bad positions, velocities or accelerations."""

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lw_torchrl._checks import check_choice
-from lw_torchrl.envs.engines.vectorized.observation import CURRENT, GRIPPER, OBJECT, Array, Index, Mask
-from lw_torchrl.envs.engines.vectorized.rewards import terms
-from lw_torchrl.envs.engines.vectorized.rewards.formulas import FORMULAS, LIFTS, StepState
-from lw_torchrl.envs.engines.vectorized.tables import FIRST_DISTANCE, TaskReward
+from lw_torchrl.suites.metaworld.vectorized.observation import CURRENT, GRIPPER, OBJECT, Array, Index, Mask
+from lw_torchrl.suites.metaworld.vectorized.rewards import terms
+from lw_torchrl.suites.metaworld.vectorized.rewards.formulas import FORMULAS, LIFTS, StepState
+from lw_torchrl.suites.metaworld.vectorized.tables import FIRST_DISTANCE, TaskReward
 
 FULL_REWARD = 10.0
 

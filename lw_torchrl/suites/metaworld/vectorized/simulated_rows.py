@@ -13,11 +13,11 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl.envs.engine import RowModel
-from lw_torchrl.envs.engines.metaworld import UNSTABLE
-from lw_torchrl.envs.engines.vectorized.observation import Array, StateView, sensor_index
-from lw_torchrl.envs.engines.vectorized.tables import TaskReward, TaskSources
-from lw_torchrl.envs.engines.vectorized.task_programs import SharedModel
+from lw_torchrl.suites.engine import RowModel
+from lw_torchrl.suites.metaworld.plain_engine import UNSTABLE
+from lw_torchrl.suites.metaworld.vectorized.observation import Array, StateView, sensor_index
+from lw_torchrl.suites.metaworld.vectorized.tables import TaskReward, TaskSources
+from lw_torchrl.suites.metaworld.vectorized.task_programs import SharedModel
 
 _VELOCITIES_DONE = int(mujoco.mjtStage.mjSTAGE_VEL)
 

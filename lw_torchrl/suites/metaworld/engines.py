@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from lw_torchrl._checks import check_choice
-from lw_torchrl.envs.engine import Engine
-from lw_torchrl.envs.engines.metaworld import MetaWorldEngine
-from lw_torchrl.envs.engines.vectorized.engine import VectorizedEngine
+from lw_torchrl.suites.engine import Engine
+from lw_torchrl.suites.metaworld.plain_engine import MetaWorldEngine
+from lw_torchrl.suites.metaworld.vectorized.engine import VectorizedEngine
 
 ENGINES: dict[str, Callable[..., Engine]] = {"vectorized": VectorizedEngine, "metaworld": MetaWorldEngine}
 """Name to ``(row_tasks, *, reward, num_threads) -> Engine``."""

@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl.envs.engines.vectorized import observation as at
-from lw_torchrl.envs.engines.vectorized.observation import Array, Mask, row_norm
-from lw_torchrl.envs.engines.vectorized.tables import FIRST_DISTANCE, POINTS, Cage, Funnel, Held, TaskReward, Term
+from lw_torchrl.suites.metaworld.vectorized import observation as at
+from lw_torchrl.suites.metaworld.vectorized.observation import Array, Mask, row_norm
+from lw_torchrl.suites.metaworld.vectorized.tables import FIRST_DISTANCE, POINTS, Cage, Funnel, Held, TaskReward, Term
 
 # The columns of the features: first the sensors, then these. The first four are constant within an episode.
 START, TCP_START, MARK, CONSTANT, GOAL, TCP, GRIP = (

@@ -217,7 +217,7 @@ def parse_reward_table(text: str) -> dict[str, TaskReward]:
 
 
 def _shipped(name: str) -> str:
-    return (files("lw_torchrl.envs.engines.vectorized") / "data" / name).read_text(encoding="utf-8")
+    return (files("lw_torchrl.suites.metaworld.vectorized") / "data" / name).read_text(encoding="utf-8")
 
 
 @cache

@@ -11,15 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lw_torchrl._checks import check_choice, check_int
-from lw_torchrl.envs.cameras import SeenRows
-from lw_torchrl.envs.engine import EngineStep, RowModel
-from lw_torchrl.envs.engines.vectorized import observation as at
-from lw_torchrl.envs.engines.vectorized import simulated_rows, task_programs
-from lw_torchrl.envs.engines.vectorized.observation import Array, Index, Mask, Observer, SuccessFunction
-from lw_torchrl.envs.engines.vectorized.rewards.dense_reward import DenseReward, EpisodeStarts
-from lw_torchrl.envs.engines.vectorized.tables import reward_table, simulation_table
 from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.tasks import check_task
+from lw_torchrl.suites.cameras import SeenRows
+from lw_torchrl.suites.engine import EngineStep, RowModel
+from lw_torchrl.suites.metaworld.vectorized import observation as at
+from lw_torchrl.suites.metaworld.vectorized import simulated_rows, task_programs
+from lw_torchrl.suites.metaworld.vectorized.observation import Array, Index, Mask, Observer, SuccessFunction
+from lw_torchrl.suites.metaworld.vectorized.rewards.dense_reward import DenseReward, EpisodeStarts
+from lw_torchrl.suites.metaworld.vectorized.tables import reward_table, simulation_table
 
 FINGERS = np.array([1.0, -1.0])
 """The two fingers are driven against each other by one number of the action."""
@@ -32,9 +32,9 @@ def available_cores() -> int:
 class VectorizedEngine(SeenRows):
     """Simulates all rows together: physics in threads, by default one a core, everything else in NumPy over all rows.
 
-    Its numbers are those of :class:`~lw_torchrl.envs.engines.metaworld.MetaWorldEngine`, bit for bit, whatever the
-    number of threads. The rows of one XML file share a compiled model; each has a state of its own. Another Meta-World
-    or MuJoCo than the one this engine was compared with is an ImportError.
+    Its numbers are those of :class:`~lw_torchrl.suites.metaworld.plain_engine.MetaWorldEngine`, bit for bit, whatever
+    the number of threads. The rows of one XML file share a compiled model; each has a state of its own. Another
+    Meta-World or MuJoCo than the one this engine was compared with is an ImportError.
 
     A row faults when its action is not finite, or when its simulation becomes unstable. It then repeats its last stable
     observation and is not simulated until it is reset; other rows are not affected.

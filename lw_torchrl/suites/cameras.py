@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lw_torchrl._rendering import RENDER_LIBRARIES
-from lw_torchrl.envs.engine import BodyPoses, RowModel
+from lw_torchrl.suites.engine import BodyPoses, RowModel
 
 _ROLLED = ("corner", "corner2", "corner3", "corner4")  # Meta-World hangs them upside down
 _MOST_GEOMS = 2000

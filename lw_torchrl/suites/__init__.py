@@ -1,0 +1,5 @@
+"""Suites: simulators and robots that the language side works with; Meta-World and Fetch are shipped."""
+
+from lw_torchrl.suites.suite import SUITES, Suite, find_suite, known_suite, load_suite
+
+__all__ = ["SUITES", "Suite", "find_suite", "known_suite", "load_suite"]
