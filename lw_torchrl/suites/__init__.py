@@ -1,0 +1,1 @@
+"""Tasks of other simulators than Meta-World, in its words and axes."""
