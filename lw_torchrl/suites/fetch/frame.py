@@ -26,7 +26,7 @@ def our_positions(positions: Array, origin: Array) -> Array:
 
 
 def our_quaternions(quaternions: Array) -> Array:
-    """Fetch's quaternions (..., 4) float64, w first, with their axis of rotation in our axes. So the one of a thing that
+    """Fetch's quaternions (..., 4) float64, w first, with the axis of rotation in our axes. So that of a thing which
     was not turned stays (1, 0, 0, 0)."""
     w, x, y, z = np.moveaxis(quaternions, -1, 0)
     return np.stack((w, -y, x, z), -1)
