@@ -131,7 +131,7 @@ class FetchEngine(SeenRows):
     row did before: those of ``gymnasium.make(id)`` after ``reset(seed=seed)`` and the same actions. The action that
     equals (right, away, up, effort) there is (away, -right, up, -effort), of the same dtype: float32 stays float32. A
     displacement of 1 asks for 5 cm, of which the hand makes 3.2 in a step. The gripper's effort counts from where the
-    fingers are: 0 holds them there. Reach, push and slide keep them closed.
+    fingers are: 0 leaves them there, without the force that holds a puck. Reach, push and slide keep them closed.
 
     Observations have 25 numbers (:data:`~lw_torchrl.suites.fetch.FETCH`), in metres and in Meta-World's axes. Reach has
     no thing: its numbers are zeros, and its goal is where the hand shall be, 3 cm above the grip site's goal. A
