@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
-_NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
+_NAME = re.compile(r"([a-z][a-z0-9]*/)?[a-z][a-z0-9]*(-[a-z0-9]+)*")
 _OWN_IDS = 2**31 - 50  # so that an id is an int32 too
 _MOST_OBJECTS = 64  # the base queries are of all pairs of them
 
@@ -43,7 +43,8 @@ class Task:
     """One manipulation task in words.
 
     Attributes:
-        name: "drawer-open", Meta-World's name without its version; or your own, lower-case words joined by hyphens.
+        name: "drawer-open", Meta-World's name without its version; or your own, lower-case words joined by hyphens,
+            after a suite's name and a slash if it is one of a suite: "fetch/push".
         description: one sentence that says what is to be done.
         objects: at most 64 with different names: the robot's gripper first, the points that we named last.
         layout: what the numbers of its observations and actions are.
