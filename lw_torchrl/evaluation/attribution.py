@@ -97,7 +97,8 @@ def attribute_failures(
         evaluator: what answered in the query answering function's place, between it and the actor: a
             :class:`QueryEvaluator`, or a module, function or :class:`torchrl.envs.Transform` that writes ``qaf``. An
             evaluator inside the policy is found there.
-        skills: the scripted skills by text that are trusted; None for the shipped ones, :func:`load_skills`.
+        skills: the scripted skills by text that are trusted; None for the suite's, :func:`load_skills` of
+            Meta-World.
         seed, noise_scale, max_steps, suite, engine: with which the episodes were run.
         num_envs, num_threads, device, progress: as for :func:`evaluate`.
 
@@ -133,13 +134,14 @@ def attribute_failures(
     check_int("num_envs", 1 if num_envs is None else num_envs, minimum=1)
     if actor is not None and (own := plans_of(actor)) is not None and (other := answered.differences(own)):
         raise ValueError(f"plans differ from the actor's own for {', '.join(other)}; pass the actor's plans")
-    table = load_skills() if skills is None else skills
     if not isinstance(rollouts, Iterable):
         raise TypeError(f"rollouts must be a list of finished episodes, got {type(rollouts).__name__}")
     failed = _failed(rollouts, answered)
     if not failed:
         return []
     names = sorted({task for task, _, _ in failed})
+    found = find_suite(names, suite)
+    table = (found.skills or load_skills()) if skills is None else skills
     given = {} if reference is None else as_plans(reference, "reference")
     others = {task: plan for task, plan in given.items() if task in names}
     trusted = Plans(others) if others else None
@@ -149,7 +151,6 @@ def attribute_failures(
     told = {(one.task, one.episode): explain(one, answered, scripts, trusted, theirs) for one in seen}
     if actor is None:
         return [_by_rule(one, told[one.task, one.episode], seed) for one in seen]
-    found = find_suite(names, suite)
     tasks = {name: found.tasks.get(name, answered[name].definition) for name in names}
     max_steps = found.max_steps if max_steps is None else check_int("max_steps", max_steps, minimum=1)
     firsts = {(one.task, one.episode): one.steps.get("observation")[0] for one in seen}

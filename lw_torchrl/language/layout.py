@@ -50,9 +50,11 @@ class Layout:
             past.
         action_size: A, how many numbers an action has, each in [-1, 1].
         displacement: index of the x of the hand's displacement; y and z follow.
-        reach: metres that the hand is asked to move by a displacement of 1.
+        reach: metres that the hand moves in a step at a displacement of 1, once it moves.
         gripper: index of the gripper's effort.
         closes: the effort's sign that closes, 1 or -1.
+        binary_gripper: whether the gripper opens or closes fully within a few steps, so that an effort in between has
+            to be decided.
         thresholds: relation to a threshold, metres, that replaces the published one, where the hand is measured
             elsewhere; only for relations of one comparison.
 
@@ -78,6 +80,7 @@ class Layout:
     reach: float = 0.01
     gripper: int = 3
     closes: int = 1
+    binary_gripper: bool = False
     thresholds: Mapping[str, float] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:

@@ -28,6 +28,7 @@ POLICIES: dict[str, str | type[Policy]] = {
     "PlanConditionedActor": "lw_torchrl.modules.plan_conditioned_actor",
     "ResidualActor": "lw_torchrl.modules.residual_actor",
     "ScriptedSkillActor": "lw_torchrl.modules.scripted_skill_actor",
+    "TransferredActor": "lw_torchrl.modules.transferred_actor",
 }
 """The name of a class, as in policy files, to the module that has the class, or to the class itself."""
 

@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from importlib import import_module
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 from lw_torchrl._checks import check_fields, shown, unknown_name
-from lw_torchrl._files import read_toml
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.skills import Skills
-from lw_torchrl.language.tasks import Task, TaskError, TaskList, Tasks, named_tasks
+from lw_torchrl.language.tasks import Task, TaskList, Tasks, named_tasks
 from lw_torchrl.suites.engine import Engine
 
 
@@ -130,9 +128,3 @@ def known_suite(task: str) -> Suite | None:
     except ImportError:
         return None
     return found if found is not None and task in found.tasks else None
-
-
-def suite_tasks(folder: Path, suite: str, layout: Layout) -> Tasks:
-    """The tasks of a suite's tasks.toml, in the format of language/data/tasks.toml."""
-    rows = read_toml(folder / "tasks.toml", TaskError)
-    return {f"{suite}/{name}": Task.from_json(f"{suite}/{name}", row, layout) for name, row in rows.items()}

@@ -14,11 +14,11 @@ from lw_torchrl.language.tasks import Task, TaskError, Tasks
 
 _DATA = files("lw_torchrl.suites.fetch") / "data"
 
-FETCH = Layout("fetch", 25, hand=0, opening=3, things=(Slot(4, 7),), goal=22, past=11, reach=0.05)
+FETCH = Layout("fetch", 25, hand=0, opening=3, things=(Slot(4, 7),), goal=22, past=11, reach=0.032, binary_gripper=True)
 """The 25 numbers of an observation: hand, opening, puck and its quaternion, the same 11 a step before, goal."""
 
 TASKS: Tasks = MappingProxyType(
-    {name: Task.from_json(name, row) for name, row in sorted(read_toml(_DATA / "tasks.toml", TaskError).items())}
+    {name: Task.from_json(name, row, FETCH) for name, row in sorted(read_toml(_DATA / "tasks.toml", TaskError).items())}
 )
 """The four names, sorted, to their :class:`~lw_torchrl.language.tasks.Task`."""
 
