@@ -36,7 +36,7 @@ _Mask = NDArray[np.bool_]
 
 class _Scene(NamedTuple):
     """A task's class in gymnasium-robotics, and where our origin is: metres, in Fetch's axes. A thing that rests on the
-    table is at our z = 0.018, two millimetres below what counts as touching; hands start near (0, 0.6, 0.1)."""
+    table is at our z = 0.018, two millimetres below what counts as touching; hands start near x = 0, y = 0.6."""
 
     module: str
     env: str

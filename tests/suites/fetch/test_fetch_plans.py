@@ -32,6 +32,13 @@ def test_plans_and_tasks_can_be_saved(tmp_path):
     assert len({lw.task_id(name) for name in TASKS}) == len(TASKS)
 
 
+@pytest.mark.parametrize("format", lw.PLAN_FORMATS)
+def test_plans_survive_every_format(format):
+    for name, plan in load_plans().items():
+        told = lw.encode_plan(plan, format)
+        assert lw.decode_plan(told, TASKS[name], format, skills=load_skills()).plan == plan
+
+
 @pytest.mark.parametrize("name", ["fetch/", "/push", "a/b/c", "Fetch/push", "fetch-it/push", "fetch//push"])
 def test_a_suite_is_one_word_before_a_slash(name):
     with pytest.raises(ValueError, match="lower-case words joined by hyphens"):
