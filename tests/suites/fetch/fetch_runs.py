@@ -6,11 +6,10 @@ import gymnasium
 import gymnasium_robotics
 import numpy as np
 import torch
-from lw_torchrl.language.observation import OBSERVATION_SIZE
 from tensordict import TensorDict
 
 import lw_torchrl as lw
-from lw_torchrl.suites.fetch import FETCH, FetchEngine, load_plans, load_skills
+from lw_torchrl.suites.fetch import FetchEngine, load_plans, load_skills
 from lw_torchrl.transforms.qaf import plan_program
 
 gymnasium.register_envs(gymnasium_robotics)
@@ -99,8 +98,7 @@ def scripted(task: str, seeds: range, steps: int) -> tuple[np.ndarray, np.ndarra
     numbers, task_id = engine.reset(range(rows), seeds), torch.full((rows,), lw.task_id(task))
     actions, successes, true = [], [], []
     for _ in range(steps):
-        observation = torch.zeros(rows, OBSERVATION_SIZE)  # programs read as many numbers as Meta-World's have
-        observation[:, : FETCH.size] = torch.from_numpy(numbers)
+        observation = torch.from_numpy(numbers).float()
         qaf = program(observation, task_id)
         state = actor(TensorDict({"observation": observation, "task_id": task_id, "qaf": qaf}, [rows]))
         result = engine.step(state["action"].numpy(), np.ones(rows, bool))
