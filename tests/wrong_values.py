@@ -135,8 +135,8 @@ for name in [
 OF_ONE_NAME: dict[str, list[Any]] = {
     "ImageQueryEvaluator.names": ["gripper", 3, [3]],  # those that a plan speaks of must be there
     "resolve_tasks.tasks": [3, "MT10", ["reach"]],
-    "evaluate.engine": [3, "mujoco", None, []],
-    "attribute_failures.engine": [3, "mujoco", None, []],
+    "evaluate.engine": [3, "mujoco", []],
+    "attribute_failures.engine": [3, "mujoco", []],
     "evaluate.evaluator": FUNCTION,
     "attribute_failures.evaluator": FUNCTION,
     "attribute_failures.actor": FUNCTION,

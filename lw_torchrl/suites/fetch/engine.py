@@ -14,8 +14,16 @@ from numpy.typing import NDArray
 from lw_torchrl._checks import check_choice, check_int
 from lw_torchrl._rendering import naming_absent_renderer
 from lw_torchrl.suites.cameras import SeenRows
-from lw_torchrl.suites.engine import EngineStep, RowModel
-from lw_torchrl.suites.fetch.frame import HAND_HEIGHT, OPEN, Array, fetch_actions, our_positions, our_quaternions
+from lw_torchrl.suites.engine import BodyPoses, EngineStep, RowModel
+from lw_torchrl.suites.fetch.frame import (
+    HAND_HEIGHT,
+    OPEN,
+    Array,
+    fetch_actions,
+    our_positions,
+    our_quaternions,
+    turned_quaternions,
+)
 from lw_torchrl.suites.fetch.words import FETCH
 from lw_torchrl.suites.metaworld.plain_engine import UNSTABLE
 from lw_torchrl.suites.metaworld.vectorized.engine import available_cores
@@ -255,6 +263,11 @@ class FetchEngine(SeenRows):
 
     def _seen(self, row: int) -> tuple[RowModel, Any]:
         return self._rows[row].seen()
+
+    def poses(self, row: int) -> BodyPoses:
+        """Where all bodies of a row are now, in our axes."""
+        found = super().poses(row)
+        return BodyPoses(our_positions(found.position, self._origin[row]), turned_quaternions(found.quaternion))
 
     def render(self, rows: Sequence[int], *, camera: str, height: int, width: int) -> NDArray[np.uint8]:
         """As :meth:`SeenRows.render`, by one of Fetch's own cameras."""

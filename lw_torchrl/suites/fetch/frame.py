@@ -32,6 +32,12 @@ def our_quaternions(quaternions: Array) -> Array:
     return np.stack((w, -y, x, z), -1)
 
 
+def turned_quaternions(quaternions: Array) -> Array:
+    """Orientations of bodies (..., 4) float64, w first, in Fetch's axes, as they are in ours: turned by a quarter."""
+    w, x, y, z = np.moveaxis(quaternions, -1, 0)
+    return np.sqrt(0.5) * np.stack((w - z, x - y, x + y, w + z), -1)
+
+
 def fetch_actions(action: NDArray[Any]) -> NDArray[Any]:
     """The actions of gymnasium-robotics that equal ours, (..., 4) of the same dtype: displacement x, y, z, where 1 asks
     for 5 cm, and the gripper's effort, where +1 opens. Ours go to the right, away and up, and +1 closes."""
