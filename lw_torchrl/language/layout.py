@@ -55,6 +55,8 @@ class Layout:
         closes: the effort's sign that closes, 1 or -1.
         binary_gripper: whether the gripper opens or closes fully within a few steps, so that an effort in between has
             to be decided.
+        closes_above: the effort above which such a gripper closes. Meta-World's fingers, which close as fast as the
+            effort is large, have closed within a quarter of a second at 0.3.
         thresholds: relation to a threshold, metres, that replaces the published one, where the hand is measured
             elsewhere; only for relations of one comparison.
 
@@ -81,6 +83,7 @@ class Layout:
     gripper: int = 3
     closes: int = 1
     binary_gripper: bool = False
+    closes_above: float = 0.3
     thresholds: Mapping[str, float] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:

@@ -17,15 +17,13 @@ from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.policy import Policy, from_description
 
-DECIDES_AT = 0.5  # halfway between an effort that holds and one that closes
-
 
 class TransferredActor(Policy):
     """The same weights under plans of another suite, and their actions turned into that suite's.
 
     A displacement keeps its metres a step: it is multiplied by the ratio of the layouts' ``reach``, and cut off at 1.
-    Where the suite's gripper opens or closes within a few steps, ``binary_gripper``, it closes at an effort above 0.5
-    and opens below.
+    Where the suite's gripper opens or closes within a few steps, ``binary_gripper``, it closes at an effort above
+    ``closes_above`` and opens below.
 
     Reads what the policy reads, of the other layout; writes ``action`` (B, A) float32 in [-1, 1], and what else the
     policy writes.
@@ -79,7 +77,7 @@ class TransferredActor(Policy):
         turned[..., new.displacement : new.displacement + 3] = moved.clamp(-1.0, 1.0)
         effort = action[..., old.gripper] * old.closes
         if new.binary_gripper:
-            effort = torch.where(effort > DECIDES_AT, 1.0, -1.0)
+            effort = torch.where(effort > new.closes_above, 1.0, -1.0)
         turned[..., new.gripper] = effort * new.closes
         return turned
 

@@ -116,10 +116,10 @@ def test_a_policy_of_meta_world_acts_in_it():
     """Without training it only shows that sizes, units and signs are turned."""
     trained = lw.PlanConditionedActor(lw.load_plans("MT10"), features="opening", roles=True, **SMALL).eval()
     moved = TransferredActor(ActorEnsemble([trained, trained]), SUITE.plans)
-    given = torch.tensor([[0.5, -1.0, 0.2, 0.7], [0.0, 0.0, 0.0, 0.3]])
+    given = torch.tensor([[0.5, -1.0, 0.2, 0.7], [0.0, 0.0, 0.0, 0.2]])
     turned = moved.turned(given)
     torch.testing.assert_close(turned[0], torch.tensor([0.0, 0.1, -0.2, 0.04, 0.0, 0.0, -1.0]))
-    assert turned[1, 6] == 1.0  # below a half it opens, and -1 closes here
+    assert turned[1, 6] == 1.0  # below 0.3 it opens, and -1 closes here
     result = lw.evaluate(moved, tasks="toy", suite=SUITE, episodes_per_task=1, seed=3, progress=False)
     assert set(result.success_once) == set(TASKS)
 
