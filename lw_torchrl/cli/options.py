@@ -202,6 +202,14 @@ SuiteName = Annotated[
 ]
 
 
+def is_suite(name: str) -> bool:
+    """Whether a word names a suite: a shipped one, or an object as my_module:suite."""
+    from lw_torchrl.suites.suite import SUITES
+
+    module, _, attribute = name.partition(":")
+    return name in SUITES or (attribute.isidentifier() and all(part.isidentifier() for part in module.split(".")))
+
+
 def read_suite(name: str | None, tasks: Sequence[str] = ()) -> Suite | None:
     """The suite of --suite: a name, or "package.module:object", for which the working folder is searched first; without
     one that of ``tasks`` like fetch/push. None for Meta-World."""
