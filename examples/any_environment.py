@@ -2,7 +2,10 @@
 
 import argparse
 
+import gymnasium
+import gymnasium_robotics
 import torch
+from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import Compose, TransformedEnv
@@ -13,6 +16,7 @@ import lw_torchrl as lw
 from lw_torchrl.suites.fetch import load_plans
 from lw_torchrl.transforms import SuiteTransform
 
+gymnasium.register_envs(gymnasium_robotics)
 PLANS = lw.Plans([load_plans()["fetch/reach"]])
 
 
@@ -38,13 +42,20 @@ def main() -> None:
     actor = lw.PlanConditionedActor(PLANS, roles=True)
     loss = TD3Loss(actor, lw.PlanConditionedQValue(PLANS, roles=True), bounds=(-1.0, 1.0), num_qvalue_nets=2)
     loss.make_value_estimator(gamma=0.9)
-    targets, optimizer = SoftUpdate(loss, eps=0.995), torch.optim.AdamW(loss.parameters(), lr=1e-3)
+    targets, optimizer = SoftUpdate(loss, eps=0.99), torch.optim.AdamW(loss.parameters(), lr=3e-4)
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(args.frames), batch_size=128)
-    noisy = lambda state: (td := actor(state)).set("action", (td["action"] + 0.2 * torch.randn(4)).clamp(-1, 1))  # noqa: E731
-    collector = Collector(env, noisy, frames_per_batch=50, total_frames=args.frames)
+    noisy = TensorDictModule(lambda action: (action + 0.2 * torch.randn(4)).clamp(-1, 1), ["action"], ["action"])
+    collector = Collector(
+        env,
+        TensorDictSequential(actor, noisy),
+        frames_per_batch=50,
+        total_frames=args.frames,
+        init_random_frames=500,
+        auto_register_policy_transforms=False,
+    )
     for number, episode in enumerate(collector):
         buffer.extend(episode)
-        for _ in range(25):
+        for _ in range(50):
             losses = loss(buffer.sample())
             optimizer.zero_grad()
             (losses["loss_actor"] + losses["loss_qvalue"]).backward()

@@ -23,13 +23,13 @@ class SuiteTransform(Transform):
     :class:`~lw_torchrl.LanguageWorldEnv`.
 
     Reads ``in_keys``; writes ``observation`` (..., D) float32 and ``task_id`` (...) int64. Where the layout has numbers
-    of the step before, it fills them; at a reset they are those of now. With ``act``, ``action`` (..., A) float32 in [-1,
-    1] is an action of the layout.
+    of the step before, it fills them; at a reset they are those of now. With ``act``, ``action`` (..., A) float32 in
+    [-1, 1] is an action of the layout.
 
     Args:
         task: what is to be done; its layout says what D and A are.
-        observe: from the tensors of ``in_keys`` to (..., D) numbers in the layout's order and frame. Numbers of the step
-            before may be anything.
+        observe: from the tensors of ``in_keys`` to (..., D) numbers in the layout's order and frame. Numbers of the
+            step before may be anything.
         act: from an action of the layout (..., A) to one of the environment; None where they are the same.
         in_keys: what ``observe`` is given.
 
@@ -40,15 +40,15 @@ class SuiteTransform(Transform):
         >>> import lw_torchrl as lw, torch
         >>> from lw_torchrl.transforms import SuiteTransform
         >>> from torchrl.envs import TransformedEnv
-        >>> env = TransformedEnv(
-        ...     lw.LanguageWorldEnv("reach"), SuiteTransform(lw.TASKS["push"], lambda seen: seen, in_keys=["observation"])
-        ... )
+        >>> env = TransformedEnv(lw.LanguageWorldEnv("reach"), SuiteTransform(lw.TASKS["push"], lambda seen: seen))
         >>> env.reset()["task_id"].tolist() == [lw.task_id("push")]
         True
         >>> env.close()
 
     Source: as ``torchrl.envs.transforms.CatTensors``, with a meaning for each number.
     """
+
+    makes_observation = True
 
     @checked
     def __init__(
@@ -102,6 +102,9 @@ class SuiteTransform(Transform):
 
     def transform_action_spec(self, action_spec: TensorSpec) -> TensorSpec:
         if self.act is None:
+            return action_spec
+        if isinstance(action_spec, Composite):
+            action_spec["action"] = self.transform_action_spec(action_spec["action"])
             return action_spec
         shape = (*action_spec.shape[:-1], self.layout.action_size)
         return Bounded(-1.0, 1.0, shape, device=action_spec.device, dtype=torch.float32)
