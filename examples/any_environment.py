@@ -1,4 +1,4 @@
-"""Train on somebody else's environment, here gymnasium's FetchReach, by TorchRL alone: TD3 on our actor and critic."""
+"""Train on somebody else's environment, gymnasium's FetchReach, by TorchRL alone: TD3 on our actor and critic."""
 
 import argparse
 

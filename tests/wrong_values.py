@@ -33,6 +33,8 @@ WRONG: dict[str, list[Any]] = {
     ],
     "ConditionalPlan": A_CLASS,
     "Sequence[ConditionalPlan]": [3, "reach", [], [3], object()],
+    "str | Suite": [3, "mujoco", [], b"fetch"],
+    "Callable[[Tensor], Tensor]": [3, "act", []],
     "str | Task": [3, "reech", b"reach", [], 1.5],
     "str | Task | Iterable[str | Task]": TASKS,
     "str | Iterable[str | Task]": TASKS,
@@ -128,6 +130,7 @@ for name in [
     "EvaluationResult",
     "Query",
     "Layout",
+    "Suite",
     "Task",
     "Tensor",
 ]:

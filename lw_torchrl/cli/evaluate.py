@@ -98,7 +98,8 @@ def evaluate(
     chosen = chosen or (lw.MT10 if elsewhere is None else tuple(elsewhere.tasks))
     how: dict[str, Any] = {"tasks": chosen, "episodes_per_task": episodes, "seed": seed, "noise_scale": noise}
     how |= {"stop_at_success": stop_at_success, "num_envs": num_envs, "device": there, "attribute": attribute}
-    where: dict[str, Any] = {"suite": elsewhere, "max_steps": max_steps}
+    where: dict[str, Any] = {} if elsewhere is None else {"suite": elsewhere}
+    where |= {} if max_steps is None else {"max_steps": max_steps}
     trusted = options.read_plans(reference, known) if reference else None
     result = lw.evaluate(policy or lw.ExpertActor(chosen), reference=trusted, **how, **where)
     output = Output(json)

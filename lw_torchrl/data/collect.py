@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 from tensordict import TensorDictBase
 
-from lw_torchrl._checks import checked, differences
+from lw_torchrl._checks import checked, differences, shown
 from lw_torchrl._files import flush, held, write_json
 from lw_torchrl._versions import SIMULATORS, package_versions, version_changes
 from lw_torchrl.data import dataset, memory_map
@@ -21,10 +21,10 @@ from lw_torchrl.data.behaviours import Behaviour, behaviour_of
 from lw_torchrl.data.dataset import CollectConfig, DamagedDatasetError, DatasetError, Demonstrations, write_metadata
 from lw_torchrl.data.memory_map import write_rows
 from lw_torchrl.data.missing_episodes import EpisodeFiles, run_missing_episodes, write_failed
-from lw_torchrl.language.tasks import task_id
+from lw_torchrl.language.tasks import Task, task_id
 from lw_torchrl.modules.networks import evaluating
 from lw_torchrl.modules.policy import Policy
-from lw_torchrl.suites.suite import Suite, find_suite
+from lw_torchrl.suites.suite import Suite, find_suite, listed_tasks
 
 
 def _open_episode_files(
@@ -238,6 +238,9 @@ def collect_demonstrations(
         (80, {'reach': 1.0})
     """
     try:
+        tasks = listed_tasks(tasks)
+        if own := [one for one in ([tasks] if isinstance(tasks, Task) else tasks) if isinstance(one, Task)]:
+            raise TypeError(f"task must be a task's name, got {shown(own[0])} (Task)")
         found_suite = find_suite(tasks, suite)
         names = tuple(found_suite.named_tasks(tasks))
     except TypeError as error:

@@ -26,7 +26,7 @@ from lw_torchrl.envs.workers import OneThread, one_thread_at_a_time, torchrl_wor
 from lw_torchrl.language.tasks import Task, one_layout
 from lw_torchrl.suites.engine import Engine
 from lw_torchrl.suites.metaworld.engines import make_engine
-from lw_torchrl.suites.suite import Suite, find_suite
+from lw_torchrl.suites.suite import Suite, find_suite, listed_tasks
 
 
 class LanguageWorldEnv(EnvBase):
@@ -122,6 +122,7 @@ class LanguageWorldEnv(EnvBase):
         worker: tuple[int, int] | None = None,
         batch_size: tuple[()] | None = None,
     ) -> None:
+        tasks = listed_tasks(tasks)
         self.suite = find_suite(tasks, suite)
         named = self.suite.named_tasks(tasks)
         self.tasks, self.layout = tuple(named), one_layout(named.values())

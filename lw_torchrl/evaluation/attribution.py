@@ -131,6 +131,7 @@ def attribute_failures(
     """
     answered = as_plans(plans)
     check_scale("noise_scale", noise_scale)
+    check_int("max_steps", 1 if max_steps is None else max_steps, minimum=1)
     check_int("num_envs", 1 if num_envs is None else num_envs, minimum=1)
     if actor is not None and (own := plans_of(actor)) is not None and (other := answered.differences(own)):
         raise ValueError(f"plans differ from the actor's own for {', '.join(other)}; pass the actor's plans")
@@ -152,7 +153,7 @@ def attribute_failures(
     if actor is None:
         return [_by_rule(one, told[one.task, one.episode], seed) for one in seen]
     tasks = {name: found.tasks.get(name, answered[name].definition) for name in names}
-    max_steps = found.max_steps if max_steps is None else check_int("max_steps", max_steps, minimum=1)
+    max_steps = found.max_steps if max_steps is None else max_steps
     firsts = {(one.task, one.episode): one.steps.get("observation")[0] for one in seen}
     env = {"seed": seed, "suite": found, "engine": engine, "num_threads": num_threads}
     repeat = EpisodeRepeater(tasks, firsts, env, noise_scale, max_steps, num_envs, device, progress)

@@ -25,7 +25,7 @@ from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.tasks import Task, TaskList
 from lw_torchrl.modules.networks import evaluating
 from lw_torchrl.modules.policy import Policy, plans_of
-from lw_torchrl.suites.suite import Suite, find_suite
+from lw_torchrl.suites.suite import Suite, find_suite, listed_tasks
 
 _ROWS = 256  # more hardly make a step of all of them cheaper per row, and cost memory
 
@@ -46,6 +46,7 @@ def actor_plans(actor: Any, plans: Plans | Mapping[str, ConditionalPlan] | None)
 
 def tasks_of(tasks: TaskList, plans: Plans | None, suite: str | Suite | None = None) -> tuple[Suite, dict[str, Task]]:
     """The suite, and the tasks by name; a name of the user's own stands for the task that its plan is for."""
+    tasks = listed_tasks(tasks)
     found = find_suite(tasks, suite)
     own = {} if plans is None else {plan.task: plan.definition for plan in plans.values()}
     return found, found.named_tasks(tasks, {name: task for name, task in own.items() if name not in found.tasks})

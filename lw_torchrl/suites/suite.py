@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from importlib import import_module
 from types import MappingProxyType
@@ -102,6 +102,11 @@ def load_suite(suite: str | Suite) -> Suite:
     if isinstance(found, str):
         found = SUITES[suite] = import_module(found).make_suite()
     return found
+
+
+def listed_tasks(tasks: Any) -> Any:
+    """The tasks as they were given, but an iterator as a list, which can be read twice."""
+    return list(tasks) if isinstance(tasks, Iterator) else tasks
 
 
 def find_suite(tasks: Any, suite: str | Suite | None = None) -> Suite:

@@ -28,7 +28,7 @@ from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.tasks import Task
 from lw_torchrl.modules.critics import QValue
 from lw_torchrl.modules.policy import Policy
-from lw_torchrl.suites.suite import Suite, find_suite
+from lw_torchrl.suites.suite import Suite, find_suite, listed_tasks
 from lw_torchrl.training.algorithms import LEARNERS, OnlineConfig, method_config
 from lw_torchrl.training.algorithms.learner import NoiseConfig
 from lw_torchrl.training.buffers import check_minibatches, check_replay
@@ -125,7 +125,7 @@ class OnlineTrainer(Training):
         if critic is not None:
             check_minibatches([critic], replay, config.batch_size)
         self.method, self.replay, self.num_threads = method, replay, num_threads
-        given: Any = replay.tasks if tasks is None else tasks
+        given: Any = replay.tasks if tasks is None else listed_tasks(tasks)
         self.suite = find_suite(given, suite)
         self.named = self.suite.named_tasks(given)
         generator = torch.Generator().manual_seed(config.seed)

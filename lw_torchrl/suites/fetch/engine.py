@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import redirect_stderr
 from functools import cache
 from importlib import import_module
+from io import StringIO
 from typing import Any, Literal, NamedTuple
 
 import mujoco
@@ -64,7 +66,7 @@ def _builder(task: str) -> Any:
     """Gymnasium-robotics' environment of a task, built once in a process. Its compiled model never changes, so all rows
     of all engines read it at the same time."""
     scene = _SCENES[task]
-    with naming_absent_renderer():
+    with naming_absent_renderer(), redirect_stderr(StringIO()):  # importing it prints news of other environments
         try:
             module = import_module(f"gymnasium_robotics.envs.fetch.{scene.module}")
         except ImportError as error:
