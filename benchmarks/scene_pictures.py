@@ -26,9 +26,9 @@ import tyro
 from rerun.experimental import ViewerClient
 
 import lw_torchrl as lw
-from lw_torchrl.envs.engines.vectorized.engine import VectorizedEngine
 from lw_torchrl.envs.seeding import episode_seed
 from lw_torchrl.record.mujoco_scene import Motion, log_model, log_motion, model_geometry
+from lw_torchrl.suites.metaworld.vectorized.engine import VectorizedEngine
 
 EYE, TARGET = np.array([0.75, 0.0, 0.65]), np.array([-0.05, 0.6, 0.15])
 FIELD_OF_VIEW = 55.0  # degrees, of rerun's eye

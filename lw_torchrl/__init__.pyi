@@ -7,6 +7,7 @@ from lw_torchrl import objectives as objectives
 from lw_torchrl import paper as paper
 from lw_torchrl import planners as planners
 from lw_torchrl import record as record
+from lw_torchrl import suites as suites
 from lw_torchrl import training as training
 from lw_torchrl import transforms as transforms
 from lw_torchrl.data import CoLearningSampler as CoLearningSampler

@@ -7,6 +7,8 @@ from functools import wraps
 from inspect import Parameter, Signature
 from typing import Any
 
+import numpy as np
+import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch, skip_existing
 from tensordict.utils import NestedKey, unravel_key
@@ -89,3 +91,13 @@ def dispatched(forward: Callable[[Any, TensorDictBase], TensorDictBase]) -> Call
 
 
 _ANY = Parameter("args", Parameter.VAR_POSITIONAL), Parameter("kwargs", Parameter.VAR_KEYWORD)
+
+
+def row_mask(tensordict: TensorDictBase | None, key: str, n: int) -> np.ndarray:
+    """The rows of a mask such as "_reset", (n,) bool; all if there is none."""
+    mask = None if tensordict is None else tensordict.get(key, None)
+    if mask is None:
+        return np.ones(n, dtype=bool)
+    if mask.dtype != torch.bool or mask.numel() != n:
+        raise ValueError(f"{key} must be bool of shape ({n},) or ({n}, 1), got {mask.dtype} of {tuple(mask.shape)}")
+    return mask.reshape(n).cpu().numpy()

@@ -2,7 +2,7 @@
 
 from functools import cache
 
-from lw_torchrl.envs.cameras import Cameras
+from lw_torchrl.suites.cameras import Cameras
 
 
 @cache

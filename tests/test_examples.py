@@ -63,6 +63,14 @@ def run(path, folder, *options):
 
 
 @pytest.mark.slow
+def test_somebody_else_s_environment_trains(tmp_path):
+    pytest.importorskip("gymnasium_robotics")
+    done = run("any_environment.py", tmp_path, "--frames", 500)
+    assert "500 steps, the last episode's reward" in done.stdout
+    assert not any("lw_torchrl.envs" in name for name in names(EXAMPLES / "any_environment.py"))
+
+
+@pytest.mark.slow
 def test_ppo_runs(tmp_path):
     done = run("ppo.py", tmp_path, "--updates", 2, "--rows", 4, "--horizon", 20, "--clone", 5)
     assert "update   1  reward" in done.stdout

@@ -33,6 +33,8 @@ WRONG: dict[str, list[Any]] = {
     ],
     "ConditionalPlan": A_CLASS,
     "Sequence[ConditionalPlan]": [3, "reach", [], [3], object()],
+    "str | Suite": [3, "mujoco", [], b"fetch"],
+    "Callable[[Tensor], Tensor]": [3, "act", []],
     "str | Task": [3, "reech", b"reach", [], 1.5],
     "str | Task | Iterable[str | Task]": TASKS,
     "str | Iterable[str | Task]": TASKS,
@@ -127,6 +129,8 @@ for name in [
     "TensorDictBase",
     "EvaluationResult",
     "Query",
+    "Layout",
+    "Suite",
     "Task",
     "Tensor",
 ]:
@@ -134,8 +138,8 @@ for name in [
 OF_ONE_NAME: dict[str, list[Any]] = {
     "ImageQueryEvaluator.names": ["gripper", 3, [3]],  # those that a plan speaks of must be there
     "resolve_tasks.tasks": [3, "MT10", ["reach"]],
-    "evaluate.engine": [3, "mujoco", None, []],
-    "attribute_failures.engine": [3, "mujoco", None, []],
+    "evaluate.engine": [3, "mujoco", []],
+    "attribute_failures.engine": [3, "mujoco", []],
     "evaluate.evaluator": FUNCTION,
     "attribute_failures.evaluator": FUNCTION,
     "attribute_failures.actor": FUNCTION,

@@ -1,4 +1,4 @@
-"""``lw-torchrl check``: what is wrong with plans, skills or tasks of one's own."""
+"""``lw-torchrl check``: what is wrong with plans, skills, tasks or a suite of one's own."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from tyro.conf import Positional
 
 from lw_torchrl._checks import counted, nearest
-from lw_torchrl.cli.options import File, Json, SkillFile, TaskFile, read_skills, read_tasks
+from lw_torchrl.cli.options import File, Json, SkillFile, TaskFile, is_suite, read_skills, read_suite, read_tasks
 from lw_torchrl.cli.output import Output
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def check(
-    file: Positional[File],  # a .plan file, a folder of them, or a .toml file of skills or of tasks
+    file: Positional[File],  # a .plan file, a folder of them, a .toml file of skills or of tasks, or a suite
     /,
     task: str | None = None,  # the task that a plan must be for
     skill_file: SkillFile = None,
@@ -28,12 +28,17 @@ def check(
 ) -> Output:
     """Validate a file of plans, skills or tasks of your own: what is wrong, where, and the nearest allowed text.
 
+    A suite, by name or as my_module:suite, is simulated for a few steps: axes, units, gripper, and how things rest.
+
     Example: lw-torchrl check my-plans/push.plan
+    Example: lw-torchrl check my_module:suite
     """
     import lw_torchrl as lw
     from lw_torchrl._files import read_text
     from lw_torchrl.language.plan_text import PLAN_LIMIT
 
+    if not file.exists() and is_suite(str(file)):
+        return _check_suite(str(file), json)
     if not file.exists():
         raise FileNotFoundError(f"file: there is no {str(file)!r}")
     known = read_tasks(task_file)
@@ -67,6 +72,26 @@ def check(
         unknown = any(" is no task" in fault for fault in faults)
         hint = "; tasks of yours come by --task-file" if unknown and task_file is None else ""
         output.fault = f"{counted(len(faults), 'fault')} in {counted(len(paths), 'file')}{hint}"
+    return output
+
+
+def _check_suite(name: str, json: bool) -> Output:
+    """What was measured in each task of a suite, beside what its layout says."""
+    from lw_torchrl.suites import check_suite
+
+    suite = read_suite(name)
+    assert suite is not None
+    rows = check_suite(suite)
+    output = Output(json)
+    width = [max(len(getattr(row, key)) for row in rows) for key in ("task", "what", "measured")]
+    lines = [
+        f"{'ok ' if row.right else 'OFF'}  {row.task:{width[0]}}  {row.what:{width[1]}}  {row.measured:{width[2]}}  "
+        f"{'' if row.right else f'wanted: {row.wanted}'}".rstrip()
+        for row in rows
+    ]
+    output.show("suite", [vars(row) for row in rows], "\n".join(lines))
+    if off := sum(not row.right for row in rows):
+        output.fault = f"{counted(off, 'number')} of suite {suite.name!r} {'is' if off == 1 else 'are'} off"
     return output
 
 

@@ -24,6 +24,8 @@ def evaluate(
     plans: tuple[str, ...] = (),
     task_file: options.TaskFile = None,
     text_encoder: options.OwnEncoder = None,
+    suite: options.SuiteName = None,
+    max_steps: int | None = None,  # of an episode; the suite's if none is given, Meta-World's 500
     episodes: int = 20,  # of each task
     seed: int = 1000,  # fixes initial states, goals and noise; not one that the demonstrations used
     noise: float = 0.1,  # standard deviation of the noise on the executed action
@@ -37,6 +39,8 @@ def evaluate(
     json: options.Json = False,
 ) -> Output:
     """Evaluate a trained policy, or the scripted experts, and write the result, a figure and a recording.
+
+    With --suite a policy that was trained with another robot acts there, under that suite's plans.
 
     Example: lw-torchrl evaluate runs/mt10.zip --out runs/mt10
 
@@ -54,12 +58,17 @@ def evaluate(
     if evaluator is not None:
         options.check_saved("evaluator", evaluator, "network", "train-evaluator")
     options.check_encoder(text_encoder)
-    known = dict(options.read_tasks(task_file))
-    chosen = options.simulated("tasks", options.one_or_many(tasks), known) if tasks else ()
+    elsewhere = options.read_suite(suite, tasks)
+    known = dict(options.read_tasks(task_file)) | dict({} if elsewhere is None else elsewhere.tasks)
+    if elsewhere is not None:
+        chosen = tuple(elsewhere.named_tasks(options.one_or_many(tasks))) if tasks else ()
+    else:
+        chosen = options.simulated("tasks", options.one_or_many(tasks), known) if tasks else ()
     given = options.read_plans(plans, known) if plans else None
     import lw_torchrl as lw
     from lw_torchrl._devices import check_device
     from lw_torchrl._files import held
+    from lw_torchrl.data.missing_episodes import suite_expert
     from lw_torchrl.evaluation import plot_failures
     from lw_torchrl.record.rollouts import run_recorded, write_recording
     from lw_torchrl.training.files import demonstrated_tasks, load_evaluator
@@ -68,7 +77,9 @@ def evaluate(
     there = check_device("device", device)
     policy = None
     if str(checkpoint) != "expert":
-        policy = options.load_policy(checkpoint, seed, given, text_encoder)
+        policy = options.load_policy(checkpoint, seed, None if elsewhere else given, text_encoder)
+        if elsewhere is not None:
+            policy = options.moved(policy, elsewhere, given)
         if evaluator is not None:
             if policy.plans is None:
                 raise ValueError(f"--evaluator is for a policy with plans, {type(policy).__name__} has none")
@@ -77,15 +88,20 @@ def evaluate(
         known.update({task: found for task in policy.tasks if (found := policy.definition(task)) is not None})
     if not chosen and policy is not None:
         chosen = _default_tasks(policy, set() if plans else demonstrated_tasks(checkpoint))
+    if policy is None and elsewhere is not None:
+        chosen = chosen or tuple(elsewhere.plans or elsewhere.tasks)
+        policy = suite_expert(elsewhere, chosen)
     if policy is None and there.type != "cpu":
         raise ValueError("--device is for a policy; the scripted experts work on the CPU")
     if attribute and (policy is None or policy.plans is None):
         raise ValueError(f"--attribute is for a policy with plans, {checkpoint} has none")
-    chosen = chosen or lw.MT10
+    chosen = chosen or (lw.MT10 if elsewhere is None else tuple(elsewhere.tasks))
     how: dict[str, Any] = {"tasks": chosen, "episodes_per_task": episodes, "seed": seed, "noise_scale": noise}
     how |= {"stop_at_success": stop_at_success, "num_envs": num_envs, "device": there, "attribute": attribute}
+    where: dict[str, Any] = {} if elsewhere is None else {"suite": elsewhere}
+    where |= {} if max_steps is None else {"max_steps": max_steps}
     trusted = options.read_plans(reference, known) if reference else None
-    result = lw.evaluate(policy or lw.ExpertActor(chosen), reference=trusted, **how)
+    result = lw.evaluate(policy or lw.ExpertActor(chosen), reference=trusted, **how, **where)
     output = Output(json)
     output.result(result)
     if attribute:
@@ -93,7 +109,7 @@ def evaluate(
         output.show("failures", failures, f"\n{result.failure_table()}")
     if out is not None:
         with held(out, "out", folder=True, wait=True):
-            told: dict[str, Any] = {} if policy is None else {"checkpoint": checkpoint}
+            told: dict[str, Any] = {} if str(checkpoint) == "expert" else {"checkpoint": checkpoint}
             told |= {} if policy is None or policy.plans is None else {"plans": policy.plans.fingerprint}
             told |= {} if evaluator is None else {"evaluator": evaluator}
             result.save(out / "results.json", **told)
@@ -102,18 +118,18 @@ def evaluate(
                 plot_failures(result, out / "failures.png", title=str(checkpoint))
             if policy is not None:
                 shown: list[str | Task] = list(result.config["tasks"][:3])
-                recorded = run_recorded(policy, shown, seed=seed, noise_scale=noise)
+                recorded = run_recorded(policy, shown, seed=seed, noise_scale=noise, **where)
                 write_recording(out / "rollout.rrd", recorded, policy.plans, seed=seed, policy=checkpoint.stem)
         print(f"written to {out}")
     return output
 
 
 def _default_tasks(policy: Policy, shown: set[str]) -> tuple[str, ...]:
-    """The tasks that a policy was ``shown``, or all it has, if the simulator has them; what is left out is printed."""
-    from lw_torchrl.language.tasks import TASKS
+    """The tasks that a policy was ``shown``, or all it has, if a suite has them; what is left out is printed."""
+    from lw_torchrl.suites.suite import known_suite
 
     chosen = [task for task in policy.tasks if task in shown] or list(policy.tasks)
-    own = [task for task in chosen if task not in TASKS]
+    own = [task for task in chosen if known_suite(task) is None]
     if len(own) == len(chosen):
         raise ValueError(
             f"the simulator has none of the policy's tasks, {', '.join(own)}; name others with --tasks, or run these "
@@ -124,7 +140,7 @@ def _default_tasks(policy: Policy, shown: set[str]) -> tuple[str, ...]:
         print(f"on the {ran} that it was trained on, of {len(policy.tasks)} that it knows; --tasks names others")
     if own:
         print(f"without {', '.join(own)}, which the simulator lacks")
-    return tuple(task for task in chosen if task in TASKS)
+    return tuple(task for task in chosen if task not in own)
 
 
 def scripted(

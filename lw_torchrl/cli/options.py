@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from lw_torchrl.language.tasks import Task
     from lw_torchrl.language.text import TextEncoder
     from lw_torchrl.modules.policy import Policy
+    from lw_torchrl.suites.suite import Suite
 
 Loaded = TypeVar("Loaded")
 SETS = ("MT10", "MT50")
@@ -196,6 +197,40 @@ def read_encoder(name: str | None) -> TextEncoder | None:
     return found
 
 
+SuiteName = Annotated[
+    str | None, arg(help="the suite that has the tasks, fetch for example, or yours, as my_module:suite.")
+]
+
+
+def is_suite(name: str) -> bool:
+    """Whether a word names a suite: a shipped one, or an object as my_module:suite."""
+    from lw_torchrl.suites.suite import SUITES
+
+    module, _, attribute = name.partition(":")
+    return name in SUITES or (attribute.isidentifier() and all(part.isidentifier() for part in module.split(".")))
+
+
+def read_suite(name: str | None, tasks: Sequence[str] = ()) -> Suite | None:
+    """The suite of --suite: a name, or "package.module:object", for which the working folder is searched first; without
+    one that of ``tasks`` like fetch/push. None for Meta-World."""
+    from lw_torchrl.suites.suite import Suite, find_suite, load_suite
+
+    if name is None:
+        return find_suite(tasks) if any("/" in task for task in tasks) else None
+    if ":" not in name:
+        return load_suite(name)
+    module, _, attribute = name.partition(":")
+    if "" not in sys.path:
+        sys.path.insert(0, "")
+    try:
+        found: Any = getattr(import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(f"suite {name!r} names no object: {error}") from error
+    if not isinstance(found, Suite):
+        raise ValueError(f"suite {name!r} must name a Suite, it names {type(found).__name__}")
+    return found
+
+
 def make_logger(kind: Literal["csv", "tensorboard", "wandb"], out: Path) -> Any:
     """The TorchRL logger of --logger, in a folder beside ``out``."""
     from torchrl.record.loggers import get_logger
@@ -204,6 +239,17 @@ def make_logger(kind: Literal["csv", "tensorboard", "wandb"], out: Path) -> Any:
         return get_logger(kind, str(out.parent / "logs"), out.stem)
     except ImportError as error:
         raise ImportError(f"--logger {kind} needs the package {kind}: pip install {kind}") from error
+
+
+def moved(policy: Policy, suite: Suite, plans: Plans | None) -> Policy:
+    """The policy under plans of a suite, turned into its actions where it was trained with another robot."""
+    from lw_torchrl.modules.transferred_actor import TransferredActor
+
+    if policy.layout == suite.layout:
+        return policy if plans is None else policy.with_plans(plans)
+    if (there := plans or suite.plans) is None:
+        raise ValueError(f"--suite {suite.name} has no plans of its own; name yours with --plans")
+    return TransferredActor(policy, there)
 
 
 def load_policy(checkpoint: Path, seed: int, plans: Plans | None, text_encoder: str | None) -> Policy:

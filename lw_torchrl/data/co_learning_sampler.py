@@ -24,7 +24,7 @@ GROWN = "grown"  # the target that is what a buffer was extended with
 
 def _check_target(target: Any) -> str | Tensor:
     if isinstance(target, str):
-        if target not in TASKS and target != GROWN:
+        if target not in TASKS and target != GROWN and "/" not in target:
             raise unknown_name("target", target, [GROWN, *TASKS])
         return target
     wanted = "target must be a task's name or one bool for each episode"

@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 from tensordict import TensorDictBase
 
-from lw_torchrl._checks import checked, differences
+from lw_torchrl._checks import checked, differences, shown
 from lw_torchrl._files import flush, held, write_json
 from lw_torchrl._versions import SIMULATORS, package_versions, version_changes
 from lw_torchrl.data import dataset, memory_map
@@ -21,9 +21,10 @@ from lw_torchrl.data.behaviours import Behaviour, behaviour_of
 from lw_torchrl.data.dataset import CollectConfig, DamagedDatasetError, DatasetError, Demonstrations, write_metadata
 from lw_torchrl.data.memory_map import write_rows
 from lw_torchrl.data.missing_episodes import EpisodeFiles, run_missing_episodes, write_failed
-from lw_torchrl.language.tasks import resolve_tasks, task_id
+from lw_torchrl.language.tasks import Task, task_id
 from lw_torchrl.modules.networks import evaluating
 from lw_torchrl.modules.policy import Policy
+from lw_torchrl.suites.suite import Suite, find_suite, listed_tasks
 
 
 def _open_episode_files(
@@ -46,7 +47,7 @@ def _open_episode_files(
         write_json(of_packages, versions)
     if not begun:
         write_json(stated, config.to_json())
-    files = EpisodeFiles(folder, config.tasks, config.max_steps)
+    files = EpisodeFiles(folder, config.tasks, config.max_steps, config.layout)
     files.drop_damaged()
     return files, versions
 
@@ -107,7 +108,11 @@ def _take_apart(root: Path, config: CollectConfig, whole: list[dataset.EpisodeIn
     files, _ = _open_episode_files(root, config, dataset.read_metadata(root).versions if whole else None)
     for info in whole:
         if not files.has(info.task, info.episode):
-            files.put(info.task, info.episode, memory_map.read_rows(root / dataset.DATA, info.start, info.length))
+            files.put(
+                info.task,
+                info.episode,
+                memory_map.read_rows(root / dataset.DATA, info.start, info.length, config.layout),
+            )
     (root / dataset.METADATA).unlink()
 
 
@@ -131,7 +136,7 @@ def _assemble(
     for old in (building, root / dataset.DATA):
         shutil.rmtree(old, ignore_errors=True)
     try:
-        write_rows(building, episodes())
+        write_rows(building, episodes(), config.layout)
         os.replace(building, root / dataset.DATA)
         flush(root)
         attempts = {task: max(kept[task]) + 1 for task in config.tasks}
@@ -139,11 +144,11 @@ def _assemble(
         write_metadata(Demonstrations(root, config, versions, task_ids, tuple(infos), attempts))
     except OSError as error:
         shutil.rmtree(building, ignore_errors=True)
-        raise write_failed(root, len(listed) * config.max_steps * memory_map.ROW_BYTES, error) from error
+        raise write_failed(root, len(listed) * config.max_steps * memory_map.row_bytes(config.layout), error) from error
 
 
 def _made(
-    root: Path, config: CollectConfig, policy: Policy | None, num_envs: int | None, progress: bool
+    root: Path, config: CollectConfig, policy: Policy | None, num_envs: int | None, suite: Suite, progress: bool
 ) -> Demonstrations:
     """The dataset, finished or repaired if need be; the folder must be held, and another call may have come first."""
     finished = (root / dataset.METADATA).is_file()
@@ -158,7 +163,7 @@ def _made(
         if finished:
             _take_apart(root, config, whole, reason)
         files, versions = _open_episode_files(root, config)
-        _assemble(root, config, versions, files, run_missing_episodes(config, policy, files, num_envs, progress))
+        _assemble(root, config, versions, files, run_missing_episodes(config, policy, files, num_envs, suite, progress))
         found = dataset.read_metadata(root)
     shutil.rmtree(root / dataset.PARTIAL, ignore_errors=True)
     return found
@@ -170,6 +175,7 @@ def collect_demonstrations(
     *,
     episodes_per_task: int,
     root: str | os.PathLike[str],
+    suite: str | Suite | None = None,
     policy: str | Behaviour | Policy = "expert",
     behaviour: str | None = None,
     seed: int = 0,
@@ -177,7 +183,7 @@ def collect_demonstrations(
     noise_hold: int = 1,
     gripper_noise_factor: float = 0.2,
     redraw_failures: bool = False,
-    max_steps: int = 500,
+    max_steps: int | None = None,
     num_envs: int | None = None,
     progress: bool = True,
 ) -> Demonstrations:
@@ -196,9 +202,11 @@ def collect_demonstrations(
         next/success, next/done, next/terminated, next/truncated: (R, 1) bool.
 
     Args:
-        tasks: of the 50, as for :func:`resolve_tasks`; docs/training.md shows demonstrations in tasks of your own.
+        tasks: of the 50, as for :func:`resolve_tasks`, or of another suite; docs/training.md shows demonstrations in
+            tasks of your own.
         episodes_per_task: how many episodes of each task to keep.
         root: the dataset's folder, new or left by an earlier call.
+        suite: the :class:`~lw_torchrl.suites.Suite` that has the tasks; None for the one that their names begin with.
         policy: who acts in the whole dataset; mixtures are lists of datasets. "expert", Meta-World's script;
             "scripted", the shipped plans with scripted skills; "spoilt-60" or "spoilt-30", the same in so many of 100
             pieces of 8 to 24 steps, and any skill of the plan in the others; "wrong", any skill of the plan; "random",
@@ -230,7 +238,11 @@ def collect_demonstrations(
         (80, {'reach': 1.0})
     """
     try:
-        names = resolve_tasks(tasks)
+        tasks = listed_tasks(tasks)
+        if own := [one for one in ([tasks] if isinstance(tasks, Task) else tasks) if isinstance(one, Task)]:
+            raise TypeError(f"task must be a task's name, got {shown(own[0])} (Task)")
+        found_suite = find_suite(tasks, suite)
+        names = tuple(found_suite.named_tasks(tasks))
     except TypeError as error:
         raise TypeError(
             f"{error}. Meta-World's experts demonstrate its own 50 tasks; docs/training.md shows demonstrations by a "
@@ -247,7 +259,8 @@ def collect_demonstrations(
         noise_hold=noise_hold,
         gripper_noise_factor=gripper_noise_factor,
         redraw_failures=bool(redraw_failures),
-        max_steps=max_steps,
+        max_steps=found_suite.max_steps if max_steps is None else max_steps,
+        layout=found_suite.layout,
         policy=behaviour_of(policy, names, behaviour),
     )
     folder = Path(root)
@@ -263,5 +276,5 @@ def collect_demonstrations(
     if found is None or partial.is_dir():
         lock = held(folder, "root", "collect_demonstrations", folder=True, error=DatasetError)
         with lock, nullcontext() if actor is None else evaluating(actor):
-            found = _made(folder, config, actor, num_envs, progress)
+            found = _made(folder, config, actor, num_envs, found_suite, progress)
     return found

@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from reprlib import repr as short
 from typing import Any, TypeVar
@@ -19,6 +19,7 @@ from typing import Any, TypeVar
 from lw_torchrl._checks import check_fields, check_int, check_scale
 from lw_torchrl._files import read_json, write_json
 from lw_torchrl.data.behaviours import EXPERT, NOISY, Behaviour, check_own_label
+from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.tasks import MT50, resolve_tasks
 
 DATA, METADATA, PARTIAL, LOCK = "data", "metadata.json", ".partial", ".lock"
@@ -40,6 +41,14 @@ def _whole_number(argument: str, given: Any, minimum: int) -> int:
     return value
 
 
+def _own_tasks(tasks: tuple[str, ...], layout: Layout) -> tuple[str, ...]:
+    """The names of another suite's tasks, sorted; the suite itself need not be installed."""
+    named = all(isinstance(task, str) and task.startswith(f"{layout.name}/") for task in tasks)
+    if not tasks or not named or len(set(tasks)) != len(tasks):
+        raise ValueError(f"tasks must be different ones named '{layout.name}/...', got {short(tasks)}")
+    return tuple(sorted(tasks))
+
+
 @dataclass(frozen=True)
 class CollectConfig:
     """How demonstrations are made, by the arguments of :func:`collect_demonstrations`; equal configurations give equal
@@ -54,6 +63,7 @@ class CollectConfig:
     redraw_failures: bool = False
     max_steps: int = 500
     policy: Behaviour = EXPERT
+    layout: Layout = METAWORLD
 
     def __post_init__(self) -> None:
         if not isinstance(self.policy, Behaviour):
@@ -63,7 +73,7 @@ class CollectConfig:
         if not self.noise_scale:
             raise ValueError("noise_scale must hold at least one number, got an empty sequence")
         checked = {
-            "tasks": resolve_tasks(self.tasks),
+            "tasks": resolve_tasks(self.tasks) if self.layout == METAWORLD else _own_tasks(self.tasks, self.layout),
             "episodes_per_task": _whole_number("episodes_per_task", self.episodes_per_task, 1),
             "seed": _whole_number("seed", self.seed, -_MOST),
             "noise_scale": tuple(check_scale("noise_scale", scale) for scale in self.noise_scale),
@@ -75,9 +85,16 @@ class CollectConfig:
             object.__setattr__(self, name, value)
 
     def to_json(self) -> dict[str, Any]:
-        """As JSON; ``policy`` is left out for the expert, as older datasets do."""
-        found = {key: list(v) if isinstance(v, tuple) else v for key, v in asdict(self).items()}
-        return {key: v for key, v in found.items() if key != "policy" or self.policy != EXPERT}
+        """As JSON; ``policy`` is left out for the expert, and ``layout`` for Meta-World's, as older datasets do."""
+        found = {each.name: getattr(self, each.name) for each in fields(self)}
+        found = {key: list(value) if isinstance(value, tuple) else value for key, value in found.items()}
+        usual = {"policy": EXPERT, "layout": METAWORLD}
+        stated = {key: value for key, value in found.items() if key not in usual or value != usual[key]}
+        if "policy" in stated:
+            stated["policy"] = asdict(self.policy)
+        if "layout" in stated:
+            stated["layout"] = self.layout.to_json()
+        return stated
 
     @property
     def behaviour(self) -> str:
@@ -197,7 +214,8 @@ def read_partial(path: Path, parse: Callable[[Any], Parsed]) -> Parsed:
 def parse_config(stated: Any) -> CollectConfig:
     """A configuration from its JSON; ValueError, TypeError or OverflowError if it is none."""
     there = stated if isinstance(stated, Mapping) else {}
-    names = [name for name in CollectConfig.__dataclass_fields__ if name != "policy" or name in there]
+    optional = ("policy", "layout")
+    names = [name for name in CollectConfig.__dataclass_fields__ if name not in optional or name in there]
     found = _object("config", stated, names)
     for name, longest in (("tasks", len(MT50)), ("noise_scale", None)):
         if not isinstance(found[name], list) or (longest and len(found[name]) > longest):
@@ -205,6 +223,8 @@ def parse_config(stated: Any) -> CollectConfig:
     options: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in found.items()}
     if "policy" in options:
         options["policy"] = Behaviour.from_json(options["policy"])
+    if "layout" in options:
+        options["layout"] = Layout.from_json(options["layout"])
     config = CollectConfig(**options)
     if list(config.tasks) != found["tasks"]:
         raise ValueError(f"tasks must be sorted, got {short(found['tasks'])}")

@@ -1,7 +1,7 @@
 """The rows of a dataset: a file for each column, memory-mapped, and the checksums of its episodes.
 
 The files are those of ``TensorDict.memmap``, so ``TensorDict.load_memmap`` reads them too. Here they are mapped as
-:data:`COLUMNS` says, so that nothing in the folder can ask for another shape, class or pickle. The map is
+:func:`columns_of` says, so that nothing in the folder can ask for another shape, class or pickle. The map is
 copy-on-write: what is written to a column changes it for this process, never the file. The files themselves are not
 written through a map, since a full disk under one ends the process silently.
 """
@@ -10,10 +10,12 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
+from functools import cache
 from math import prod
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 from zlib import crc32
 
@@ -26,36 +28,61 @@ from lw_torchrl._checks import counted
 from lw_torchrl._files import flush, read_json
 from lw_torchrl._progress import Progress
 from lw_torchrl.data.dataset import DATA, METADATA, DamagedDatasetError, DatasetError, Demonstrations, EpisodeInfo
+from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.tasks import task_id
 
 Column = tuple[str, ...]
-COLUMNS: dict[Column, tuple[tuple[int, ...], torch.dtype]] = {
-    ("observation",): ((39,), torch.float32),
-    ("task_id",): ((), torch.int64),
-    ("episode",): ((), torch.int64),
-    ("action",): ((4,), torch.float32),
-    ("expert_action",): ((4,), torch.float32),
-    ("unclipped_action",): ((4,), torch.float32),
-    ("collector", "traj_ids"): ((), torch.int64),
-    ("next", "observation"): ((39,), torch.float32),
-    ("next", "task_id"): ((), torch.int64),
-    ("next", "reward_sparse"): ((1,), torch.float32),
-    ("next", "reward_dense"): ((1,), torch.float32),
-    **{("next", flag): ((1,), torch.bool) for flag in ("success", "done", "terminated", "truncated")},
-}
+Columns = Mapping[Column, tuple[tuple[int, ...], torch.dtype]]
+
+
+@cache
+def columns_of(layout: Layout) -> Columns:
+    """The columns of a dataset, and what each row of one is: its shape and dtype."""
+    observation, action = ((layout.size,), torch.float32), ((layout.action_size,), torch.float32)
+    return MappingProxyType(
+        {
+            ("observation",): observation,
+            ("task_id",): ((), torch.int64),
+            ("episode",): ((), torch.int64),
+            ("action",): action,
+            ("expert_action",): action,
+            ("unclipped_action",): action,
+            ("collector", "traj_ids"): ((), torch.int64),
+            ("next", "observation"): observation,
+            ("next", "task_id"): ((), torch.int64),
+            ("next", "reward_sparse"): ((1,), torch.float32),
+            ("next", "reward_dense"): ((1,), torch.float32),
+            **{("next", flag): ((1,), torch.bool) for flag in ("success", "done", "terminated", "truncated")},
+        }
+    )
+
+
+COLUMNS = columns_of(METAWORLD)
+"""Those of Meta-World; other suites' differ in the sizes alone."""
 _META = "meta.json"
-_WIDTH = {key: prod(tail) * dtype.itemsize for key, (tail, dtype) in COLUMNS.items()}
-ROW_BYTES = sum(_WIDTH.values())
+
+
+@cache
+def _widths(layout: Layout) -> Mapping[Column, int]:
+    return MappingProxyType({key: prod(tail) * dtype.itemsize for key, (tail, dtype) in columns_of(layout).items()})
+
+
+def row_bytes(layout: Layout) -> int:
+    """The bytes of a row in all columns."""
+    return sum(_widths(layout).values())
+
+
+ROW_BYTES = row_bytes(METAWORLD)
 
 
 def _path(folder: Path, key: Column) -> Path:
     return folder.joinpath(*key[:-1], f"{key[-1]}.memmap")
 
 
-def _meta(rows: int) -> dict[str, dict[str, Any]]:
+def _meta(rows: int, layout: Layout = METAWORLD) -> dict[str, dict[str, Any]]:
     """The description in each folder, as TensorDict writes it; "" is the folder of the rows."""
     found: dict[str, dict[str, Any]] = {"": {}}
-    for (*parents, name), (tail, dtype) in COLUMNS.items():
+    for (*parents, name), (tail, dtype) in columns_of(layout).items():
         for parent in parents:
             found[""][parent] = {"type": "TensorDict"}
         leaf = {"device": "cpu", "shape": [rows, *tail], "dtype": str(dtype), "is_nested": False}
@@ -64,7 +91,7 @@ def _meta(rows: int) -> dict[str, dict[str, Any]]:
     return {folder: entries | about for folder, entries in found.items()}
 
 
-def write_rows(folder: Path, episodes: Iterable[TensorDictBase]) -> None:
+def write_rows(folder: Path, episodes: Iterable[TensorDictBase], layout: Layout) -> None:
     """Write episodes one after another, and flush them to the disk; an :class:`OSError` leaves a part of them."""
     rows = 0
     for name in _meta(0):
@@ -75,18 +102,18 @@ def write_rows(folder: Path, episodes: Iterable[TensorDictBase]) -> None:
             rows += len(steps)
             for key, file in files.items():
                 file.write(steps.get(key).contiguous().numpy().data)
-    for name, entries in _meta(rows).items():
+    for name, entries in _meta(rows, layout).items():
         (folder / name / _META).write_text(json.dumps(entries, separators=(",", ":")), encoding="utf-8")
     for path in sorted(folder.rglob("*"), reverse=True):
         flush(path)
     flush(folder)
 
 
-def read_rows(folder: Path, start: int, length: int) -> TensorDict | None:
+def read_rows(folder: Path, start: int, length: int, layout: Layout) -> TensorDict | None:
     """Some rows of the files, in memory; None where a column is missing or too short."""
     found = TensorDict({}, [length])
-    for key, (tail, dtype) in COLUMNS.items():
-        path, width = _path(folder, key), _WIDTH[key]
+    for key, (tail, dtype) in columns_of(layout).items():
+        path, width = _path(folder, key), _widths(layout)[key]
         if not path.is_file() or path.stat().st_size < (start + length) * width:
             return None
         with path.open("rb") as file:
@@ -117,15 +144,15 @@ def holds_columns(folder: Path) -> bool:
     return any(_path(folder, key).is_file() for key in COLUMNS) and not _surplus(folder)
 
 
-def _check_files(folder: Path, rows: int) -> None:
+def _check_files(folder: Path, rows: int, layout: Layout) -> None:
     """Raise unless the files are as they were written; mapping one that is too short would lengthen it."""
-    for name, expected in _meta(rows).items():
+    for name, expected in _meta(rows, layout).items():
         found = read_json(folder / name / _META, "the description", limit=2**20)
         if not name and found.get("shape") != [rows]:
             raise ValueError(f"they are of shape {found.get('shape')}, the metadata say {rows} rows")
         if odd := [key for key in {**expected, **found} if expected.get(key) != found.get(key)]:
             raise ValueError(f"{name}/{_META} differs from what was written, in {', '.join(map(repr, odd[:5]))}")
-    for key, width in _WIDTH.items():
+    for key, width in _widths(layout).items():
         if (size := _path(folder, key).stat().st_size) != rows * width:
             raise ValueError(f"{'/'.join(key)}.memmap has {size} bytes, not {rows * width}")
 
@@ -159,8 +186,9 @@ def map_rows(demonstrations: Demonstrations) -> TensorDict:
             f"root: {', '.join(map(repr, odd[:5]))} in {str(folder)!r} is no part of a dataset; move it elsewhere"
         )
     try:
-        _check_files(folder, number)
-        found = {key: MappedColumn.of(_path(folder, key), (number, *like[0]), like[1]) for key, like in COLUMNS.items()}
+        _check_files(folder, number, demonstrations.config.layout)
+        columns = columns_of(demonstrations.config.layout).items()
+        found = {key: MappedColumn.of(_path(folder, key), (number, *like[0]), like[1]) for key, like in columns}
     except (OSError, ValueError, RuntimeError) as error:
         raise DamagedDatasetError(
             f"root: the rows in {str(folder)!r} cannot be read ({error}); the same collect_demonstrations keeps the "
@@ -202,7 +230,7 @@ def whole_episodes(demonstrations: Demonstrations, *, progress: bool) -> list[Ep
     whole = []
     with Progress("checking", len(demonstrations.episodes), "episode", show=progress) as bar:
         for info in demonstrations.episodes:
-            rows = read_rows(demonstrations.root / DATA, info.start, info.length)
+            rows = read_rows(demonstrations.root / DATA, info.start, info.length, demonstrations.config.layout)
             bar.update()
             if rows is not None and _as_written(demonstrations, info, rows):
                 whole.append(info)
@@ -222,7 +250,7 @@ def verify(demonstrations: Demonstrations, episodes: Sequence[EpisodeInfo], *, e
     files = _files(root)
     before, known = _VERIFIED.get(root, (files, set()))
     known = known if before == files else set()
-    size = sum(info.length for info in episodes) * ROW_BYTES
+    size = sum(info.length for info in episodes) * row_bytes(demonstrations.config.layout)
     asked = episodes if every else episodes[:: -(-size // READ_AT_ONCE)]
     broken = [
         info

@@ -20,11 +20,15 @@ from lw_torchrl._files import replacing
 from lw_torchrl._progress import Progress
 from lw_torchrl.data.behaviours import SegmentActor, segment_plans
 from lw_torchrl.data.dataset import CollectConfig, DatasetError
-from lw_torchrl.data.memory_map import COLUMNS, ROW_BYTES
+from lw_torchrl.data.memory_map import COLUMNS, columns_of, row_bytes
 from lw_torchrl.envs.episodes import policy_of, read_action, run_episodes
-from lw_torchrl.envs.experts import ExpertActor
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
+from lw_torchrl.language.layout import METAWORLD, Layout
+from lw_torchrl.language.plans import Plans
 from lw_torchrl.modules.policy import Policy
+from lw_torchrl.modules.scripted_skill_actor import ScriptedSkillActor
+from lw_torchrl.suites.metaworld.experts import ExpertActor
+from lw_torchrl.suites.suite import Suite
 from lw_torchrl.transforms.qaf import QAFTransform
 
 _STORED = [key for key in COLUMNS if key != ("collector", "traj_ids")]
@@ -33,14 +37,19 @@ _HEADERS = 2**16  # bytes of a file beside its rows, at the most
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
+def _file_name(task: str) -> str:
+    return task.replace("/", "+")
+
+
 class EpisodeFiles:
     """The episodes so far, one file each, so that a kill costs only those under way; FAILED stands for one not kept."""
 
-    def __init__(self, folder: Path, tasks: Sequence[str], max_steps: int) -> None:
-        self.folder, self.tasks, self.max_steps = folder, tasks, max_steps
+    def __init__(self, folder: Path, tasks: Sequence[str], max_steps: int, layout: Layout = METAWORLD) -> None:
+        self.folder, self.max_steps, self.layout = folder, max_steps, layout
+        self.tasks = {_file_name(task): task for task in tasks}
 
     def _path(self, task: str, episode: int) -> Path:
-        return self.folder / f"{task}.{episode}.npz"
+        return self.folder / f"{_file_name(task)}.{episode}.npz"
 
     def put(self, task: str, episode: int, steps: TensorDictBase | None) -> None:
         content = _FAILED
@@ -70,7 +79,7 @@ class EpisodeFiles:
             columns = {key: torch.from_numpy(found["/".join(key)]) for key in _STORED}
         length = len(columns["episode",])
         for key, column in columns.items():
-            tail, dtype = COLUMNS[key]
+            tail, dtype = columns_of(self.layout)[key]
             if column.shape != (length, *tail) or column.dtype != dtype:
                 raise ValueError(f"{'/'.join(key)} must be {dtype} of shape {(length, *tail)}")
         if not 0 < length <= self.max_steps or (columns["episode",] != episode).any():
@@ -79,7 +88,7 @@ class EpisodeFiles:
 
     def _content(self, path: Path) -> bytes:
         found = path.lstat()
-        if not stat.S_ISREG(found.st_mode) or found.st_size > self.max_steps * ROW_BYTES + _HEADERS:
+        if not stat.S_ISREG(found.st_mode) or found.st_size > self.max_steps * row_bytes(self.layout) + _HEADERS:
             raise ValueError("it is no file, or larger than an episode can be")
         return path.read_bytes()
 
@@ -93,7 +102,7 @@ class EpisodeFiles:
                 raise DatasetError(f"root: {str(path)!r} is a folder, and no episode's file; move it elsewhere")
             try:
                 if self._content(path) != _FAILED:
-                    self.get(task, int(number))
+                    self.get(self.tasks[task], int(number))
             except Exception:  # whatever is wrong with it, the episode can be run again
                 path.unlink()
 
@@ -135,30 +144,49 @@ def _kept_and_missing(config: CollectConfig, files: EpisodeFiles) -> tuple[dict[
     return kept, wanted
 
 
-def _clipped(policy: _Actor) -> _Actor:
+def _clipped(policy: _Actor, size: int) -> _Actor:
     """``policy`` with ``unclipped_action`` beside ``action``, as of :class:`ExpertActor`."""
 
     def run(tensordict: TensorDictBase) -> TensorDictBase:
         tensordict = policy(tensordict)
-        asked = read_action(tensordict)
+        asked = read_action(tensordict, size)
         return tensordict.set("unclipped_action", asked).set("action", asked.clamp(-1.0, 1.0))
 
     return run
 
 
 def _env_and_actor(config: CollectConfig, policy: Policy | None, env: LanguageWorldEnv) -> tuple[EnvBase, _Actor]:
-    if config.policy.kind == "expert":
+    if config.policy.kind == "expert" and config.layout == METAWORLD:
         return env, ExpertActor(config.tasks)
+    if config.policy.kind == "expert":
+        policy = suite_expert(env.suite, config.tasks)
     if policy is None:
         plans = segment_plans(config.tasks)
         actor = SegmentActor(config.policy, plans, config.seed, config.max_steps)
-        return TransformedEnv(env, QAFTransform(plans)), _clipped(actor)
+        return TransformedEnv(env, QAFTransform(plans)), _clipped(actor, env.layout.action_size)
     transform = policy.transform()
-    return env if transform is None else TransformedEnv(env, transform), _clipped(policy_of(policy))
+    return env if transform is None else TransformedEnv(env, transform), _clipped(
+        policy_of(policy), env.layout.action_size
+    )
+
+
+def suite_expert(suite: Suite, tasks: Sequence[str]) -> ScriptedSkillActor:
+    """A suite's own demonstrator: its plans, carried out by its scripted skills; ValueError without."""
+    if suite.plans is None or suite.skills is None:
+        raise ValueError(
+            f"policy='expert': suite {suite.name!r} has no plans with scripted skills; give a policy of yours"
+        )
+    suite.plans.require(tasks)
+    return ScriptedSkillActor(Plans([suite.plans[task] for task in tasks]), skills=suite.skills)
 
 
 def run_missing_episodes(
-    config: CollectConfig, policy: Policy | None, files: EpisodeFiles, num_envs: int | None, progress: bool
+    config: CollectConfig,
+    policy: Policy | None,
+    files: EpisodeFiles,
+    num_envs: int | None,
+    suite: Suite,
+    progress: bool,
 ) -> dict[str, list[int]]:
     """Run episodes until the files hold all; returns the kept ones of each task."""
     kept, wanted = _kept_and_missing(config, files)
@@ -167,9 +195,10 @@ def run_missing_episodes(
         return kept
     rows = max(len(config.tasks), min(50, missing)) if num_envs is None else num_envs
     options = {"num_envs": rows, "seed": config.seed, "max_steps": config.max_steps, "strict": policy is not None}
-    base = LanguageWorldEnv(config.tasks, reward="dense", **options)  # type: ignore[arg-type]
+    base = LanguageWorldEnv(config.tasks, suite=suite, reward="dense", **options)  # type: ignore[arg-type]
     env, actor = _env_and_actor(config, policy, base)
-    scales = [(s, s, s, s * config.gripper_noise_factor) for s in config.noise_scale]
+    scales = np.array(config.noise_scale)[:, None].repeat(base.layout.action_size, 1)
+    scales[:, base.layout.gripper] *= config.gripper_noise_factor
     total = config.episodes_per_task * len(config.tasks)
     before = (total - missing) * config.max_steps
     bar = Progress("collecting", total * config.max_steps, "step", initial=before, show=progress)

@@ -14,7 +14,6 @@ from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv, step_mdp
 
 from lw_torchrl._devices import CPU, in_blocks, place
-from lw_torchrl.envs.engine import ACTION_SIZE
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.envs.seeding import action_noise
 
@@ -42,9 +41,9 @@ def policy_of(actor: Any, device: str | torch.device | None = None) -> Callable[
     return lambda tensordict: tensordict.update(policy(tensordict.to(there)).to(CPU))
 
 
-def read_action(tensordict: TensorDictBase) -> Tensor:
-    """The ``action`` that an actor wrote, (N, 4) float32; :class:`ValueError` if it is none."""
-    action, shape = tensordict.get("action", None), (*tensordict.batch_size, ACTION_SIZE)
+def read_action(tensordict: TensorDictBase, size: int) -> Tensor:
+    """The ``action`` that an actor wrote, (N, size) float32; :class:`ValueError` if it is none."""
+    action, shape = tensordict.get("action", None), (*tensordict.batch_size, size)
     if action is None:
         raise ValueError(f"the actor must write 'action', got {', '.join(map(str, tensordict.keys()))}")
     if action.shape != shape or action.dtype != torch.float32:
@@ -76,7 +75,7 @@ def run_episodes(
         policy: called on all N rows, with a ``_step`` mask of those that count.
         episodes: task name to episode indices; one that is listed several times is run as often.
         keys: what to record of each step, ``("next", "success")`` say; ``action`` is the executed one.
-        noise, noise_hold: episode index to the four standard deviations of the noise added to the action, and the steps
+        noise, noise_hold: episode index to the A standard deviations of the noise added to the action, and the steps
             for which each draw is kept.
         after_success: end an episode so many steps after its first successful one; None for never.
         clean_action, place: keys for the action before the noise, and for the place of each row's episode in its task's
@@ -95,7 +94,7 @@ def run_episodes(
     active = torch.zeros(rows, dtype=torch.bool)
     steps = np.zeros(rows, dtype=np.int64)
     last = np.zeros(rows, dtype=np.int64)  # the step after which an episode ends early
-    noises = np.zeros((rows, base.max_steps, 4), dtype=np.float32)
+    noises = np.zeros((rows, base.max_steps, base.layout.action_size), dtype=np.float32)
     buffers: TensorDictBase | None = None
     state: TensorDictBase = env.full_done_spec.zero()
     idle = torch.ones(rows, dtype=torch.bool)
@@ -108,8 +107,9 @@ def run_episodes(
                 episode[row], starting[row], steps[row], last[row] = number, True, 0, base.max_steps
                 if noise is not None:
                     scale = np.asarray(noise(number), dtype=np.float32)
-                    drawn = action_noise(base.task_of_row[row], base.seed, number, base.max_steps, noise_hold)
-                    noises[row] = drawn * scale
+                    noises[row] = scale * action_noise(
+                        base.task_of_row[row], base.seed, number, base.max_steps, noise_hold, base.layout.action_size
+                    )
         active = (active & ~idle) | starting
         if not active.any():
             return

@@ -18,13 +18,15 @@ from torchrl.data import Unbounded
 from torchrl.envs import EnvBase
 
 from lw_torchrl._checks import check_int, checked
+from lw_torchrl._keys import row_mask
 from lw_torchrl._rendering import check_picture
-from lw_torchrl.envs.engine import ACTION_SIZE, Engine
-from lw_torchrl.envs.engines import make_engine
-from lw_torchrl.envs.row_states import RowStates, action_spec, clipped_action, done_spec, observation_spec, row_mask
+from lw_torchrl.envs.row_states import RowStates, action_spec, clipped_action, done_spec, observation_spec
 from lw_torchrl.envs.seeding import EpisodeCounter, check_worker, stated_episode
 from lw_torchrl.envs.workers import OneThread, one_thread_at_a_time, torchrl_worker
-from lw_torchrl.language.tasks import Task, named_tasks
+from lw_torchrl.language.tasks import Task, one_layout
+from lw_torchrl.suites.engine import Engine
+from lw_torchrl.suites.metaworld.engines import make_engine
+from lw_torchrl.suites.suite import Suite, find_suite, listed_tasks
 
 
 class LanguageWorldEnv(EnvBase):
@@ -64,15 +66,18 @@ class LanguageWorldEnv(EnvBase):
         done, terminated, truncated: (N, 1) bool; terminated stays false unless ``terminate_on_success``.
 
     Args:
-        tasks: "MT10", "MT50", a task's name, or a list of names. A :class:`~lw_torchrl.Task` stands for its name; one
-            that Meta-World does not have needs an engine of your own.
+        tasks: "MT10", "MT50", a task's name, "fetch/push" for another suite's, or a list of names. A
+            :class:`~lw_torchrl.Task` stands for its name; one that no suite has needs an engine of your own.
         num_envs: N, at least the number of tasks; None for one environment each.
         seed: any integer; :meth:`set_seed` starts again at episode 0.
-        engine: "vectorized", the fast one; "metaworld" for Meta-World's own environments in a loop, which gives the
-            same numbers; or a callable ``(row_tasks, *, reward, num_threads) -> Engine``.
+        suite: the :class:`~lw_torchrl.suites.Suite` that has the tasks, or its name; None for the one that their names
+            begin with, "fetch/push", and Meta-World for those without.
+        engine: None for the suite's. Of Meta-World that is "vectorized", the fast one; "metaworld" for its own
+            environments in a loop, which gives the same numbers; or a callable ``(row_tasks, *, reward, num_threads) ->
+            Engine``.
         num_threads: of the simulation, by default the cores this process may use; never changes a result.
         reward: "sparse", the success as 0 and 1, or "dense", Meta-World's own.
-        max_steps: steps of the simulation until truncation.
+        max_steps: steps of the simulation until truncation; None for the suite's, Meta-World's 500.
         frame_skip: steps of the simulation for each action; their rewards are added, and any may succeed.
         terminate_on_success: end an episode at its first success, with ``terminated``.
         strict: raise on a NaN action, instead of truncating the row with a warning as for an unstable simulation.
@@ -106,25 +111,28 @@ class LanguageWorldEnv(EnvBase):
         *,
         num_envs: int | None = None,
         seed: int = 0,
-        engine: Literal["vectorized", "metaworld"] | Callable[..., Engine] = "vectorized",
+        suite: str | Suite | None = None,
+        engine: Literal["vectorized", "metaworld"] | Callable[..., Engine] | None = None,
         num_threads: int | None = None,
         reward: Literal["sparse", "dense"] = "sparse",
-        max_steps: int = 500,
+        max_steps: int | None = None,
         frame_skip: int = 1,
         terminate_on_success: bool = False,
         strict: bool = False,
         worker: tuple[int, int] | None = None,
         batch_size: tuple[()] | None = None,
     ) -> None:
-        named = named_tasks(tasks)
-        self.tasks = tuple(named)
+        tasks = listed_tasks(tasks)
+        self.suite = find_suite(tasks, suite)
+        named = self.suite.named_tasks(tasks)
+        self.tasks, self.layout = tuple(named), one_layout(named.values())
         n = len(self.tasks)
         num_envs = n if num_envs is None else check_int("num_envs", num_envs, minimum=1)
         if num_envs < n:
             raise ValueError(f"num_envs must be at least the number of tasks, {n}, got {num_envs}")
         if num_threads is not None:
             check_int("num_threads", num_threads, minimum=1)
-        self.max_steps = check_int("max_steps", max_steps, minimum=1)
+        self.max_steps = self.suite.max_steps if max_steps is None else check_int("max_steps", max_steps, minimum=1)
         self.frame_skip = check_int("frame_skip", frame_skip, minimum=1)
         self.strict, self.terminate_on_success = strict, terminate_on_success
         if batch_size is not None and (batch_size not in ((), []) or num_envs != 1):
@@ -140,13 +148,17 @@ class LanguageWorldEnv(EnvBase):
         self._one_thread, self._last_one = OneThread(lock), OneThread(lock, patience=10.0)
         self._counter = EpisodeCounter([named[t] for t in self.row_tasks], check_int("seed", seed), self.worker)
         super().__init__(device=torch.device("cpu"), batch_size=(num_envs,) if batch_size is None else ())
-        self._rows = RowStates(self.row_tasks)
+        self._rows = RowStates(self.row_tasks, self.layout)
         which = ... if batch_size is None else 0
-        self.observation_spec = observation_spec(self._rows.task_id)[which]
-        self.action_spec = action_spec(num_envs)[which]
+        self.observation_spec = observation_spec(self._rows.task_id, self.layout)[which]
+        self.action_spec = action_spec(num_envs, self.layout)[which]
         self.reward_spec = Unbounded((num_envs, 1))[which]
         self.done_spec = done_spec(num_envs)[which]
-        self._engine = make_engine(engine, self.row_tasks, reward=reward, num_threads=num_threads)
+        options: Any = {"reward": reward, "num_threads": num_threads}
+        if engine is None:
+            self._engine = self.suite.make_engine(list(self.row_tasks), **options)
+        else:
+            self._engine = make_engine(engine, self.row_tasks, **options)
         self.is_closed = False  # EnvBase starts with True
 
     def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
@@ -227,7 +239,8 @@ class LanguageWorldEnv(EnvBase):
 
     @one_thread_at_a_time
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        action = clipped_action(tensordict, self.batch_size).cpu().numpy().reshape(-1, ACTION_SIZE)
+        size = self.layout.action_size
+        action = clipped_action(tensordict, (*self.batch_size, size)).cpu().numpy().reshape(-1, size)
         active = row_mask(tensordict, "_step", len(self.row_tasks))
         if (active & self._rows.over).any():
             rows = np.flatnonzero(active & self._rows.over)[:5].tolist()
@@ -313,7 +326,7 @@ class LanguageWorldEnv(EnvBase):
             raise RuntimeError("there is nothing to see before a reset: call env.reset()")
         if not hasattr(self._engine, "render"):
             raise NotImplementedError(
-                f"engine {type(self._engine).__name__} has no render; see lw_torchrl.envs.cameras"
+                f"engine {type(self._engine).__name__} has no render; see lw_torchrl.suites.cameras"
             )
         if not asked:
             return torch.zeros(0, height, width, 3, dtype=torch.uint8)

@@ -12,7 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 
-from lw_torchrl.envs.engine import ACTION_SIZE, OBSERVATION_SIZE
+from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.tasks import MT50, task_id
 
 
@@ -53,23 +53,23 @@ class TaskIds(Categorical):
     __getitem__ = _moving(Categorical.__getitem__, Tensor.__getitem__)
 
 
-def observation_spec(task_id: Tensor) -> Composite:
+def observation_spec(task_id: Tensor, layout: Layout) -> Composite:
     """The outputs beside reward and done, of rows with these tasks, (N,) int64."""
     n = len(task_id)
     ids = len(MT50) if int(task_id.max()) < len(MT50) else 2**32  # a task of one's own has a hash
     return Composite(
-        observation=Unbounded((n, OBSERVATION_SIZE)),
+        observation=Unbounded((n, layout.size)),
         task_id=TaskIds(ids, task_id),
         episode=Unbounded((n,), dtype=torch.int64),
         success=_flag(n),
         fault=_flag(n),
-        executed_action=action_spec(n),
+        executed_action=action_spec(n, layout),
         shape=(n,),
     )
 
 
-def action_spec(n: int) -> Bounded:
-    return Bounded(-1.0, 1.0, (n, ACTION_SIZE))
+def action_spec(n: int, layout: Layout) -> Bounded:
+    return Bounded(-1.0, 1.0, (n, layout.action_size))
 
 
 def done_spec(n: int) -> Composite:
@@ -80,22 +80,12 @@ def _flag(n: int) -> Categorical:
     return Categorical(2, shape=(n, 1), dtype=torch.bool)
 
 
-def row_mask(tensordict: TensorDictBase | None, key: str, n: int) -> np.ndarray:
-    """The rows of a mask such as "_reset", (n,) bool; all if there is none."""
-    mask = None if tensordict is None else tensordict.get(key, None)
-    if mask is None:
-        return np.ones(n, dtype=bool)
-    if mask.dtype != torch.bool or mask.numel() != n:
-        raise ValueError(f"{key} must be bool of shape ({n},) or ({n}, 1), got {mask.dtype} of {tuple(mask.shape)}")
-    return mask.reshape(n).cpu().numpy()
-
-
-def clipped_action(tensordict: TensorDictBase, batch_size: torch.Size) -> Tensor:
-    """The action as it is executed, (*batch_size, 4) float32 in [-1, 1]."""
+def clipped_action(tensordict: TensorDictBase, shape: tuple[int, ...]) -> Tensor:
+    """The action as it is executed, float32 of this shape in [-1, 1]."""
     action = tensordict.get("action", None)
-    if action is None or action.shape != (*batch_size, ACTION_SIZE) or action.dtype != torch.float32:
+    if action is None or action.shape != shape or action.dtype != torch.float32:
         given = "none" if action is None else f"{action.dtype} of shape {tuple(action.shape)}"
-        raise ValueError(f"action must be float32 of shape {(*batch_size, ACTION_SIZE)}, got {given}")
+        raise ValueError(f"action must be float32 of shape {shape}, got {given}")
     return action.detach().clamp(-1.0, 1.0)
 
 
@@ -103,14 +93,14 @@ Rows = NDArray[np.intp]
 
 
 class RowStates:
-    """The last observation (N, 39) float32 of N rows; the episode, -1 before the first reset, and the steps since the
+    """The last observation (N, D) float32 of N rows; the episode, -1 before the first reset, and the steps since the
     reset, (N,) int64; and the flags over, terminated, fault and success, (N,) bool. A row never reset is over."""
 
-    def __init__(self, tasks: Sequence[str]) -> None:
-        self.tasks = tasks
+    def __init__(self, tasks: Sequence[str], layout: Layout) -> None:
+        self.tasks, self.layout = tasks, layout
         self.task_id = torch.tensor([task_id(task) for task in tasks])
         n = len(tasks)
-        self.observation = np.zeros((n, OBSERVATION_SIZE), dtype=np.float32)
+        self.observation = np.zeros((n, layout.size), dtype=np.float32)
         self.episode = np.full(n, -1, dtype=np.int64)
         self.steps = np.zeros(n, dtype=np.int64)
         self._flags = np.zeros((4, n), dtype=bool)
@@ -124,10 +114,11 @@ class RowStates:
         self._flags[:, rows] = False
 
     def as_tensordict(self, executed_action: NDArray[np.float32] | None = None, **more: Tensor) -> TensorDict:
-        """All of it as fresh tensors, N rows, with ``executed_action`` (N, 4) float32, zeros for None, and ``more``."""
+        """All of it as fresh tensors, N rows, with ``executed_action`` (N, A) float32, zeros for None, and ``more``."""
         n = len(self.tasks)
         over, terminated, fault, success = (torch.from_numpy(flag.copy()).unsqueeze(-1) for flag in self._flags)
-        executed = torch.zeros(n, ACTION_SIZE) if executed_action is None else torch.from_numpy(executed_action)
+        if executed_action is None:
+            executed_action = np.zeros((n, self.layout.action_size), dtype=np.float32)
         return TensorDict(
             {
                 "observation": torch.from_numpy(self.observation.copy()),
@@ -135,7 +126,7 @@ class RowStates:
                 "episode": torch.from_numpy(self.episode.copy()),
                 "success": success,
                 "fault": fault,
-                "executed_action": executed,
+                "executed_action": torch.from_numpy(executed_action),
                 "done": over,
                 "terminated": terminated,
                 "truncated": over & ~terminated,
@@ -159,7 +150,7 @@ class RowStates:
         wanted = tensordict.get("observation", None)
         if wanted is None:
             return
-        wanted = wanted.cpu().numpy().reshape(-1, OBSERVATION_SIZE)[rows]
+        wanted = wanted.cpu().numpy().reshape(-1, self.layout.size)[rows]
         later = rows[(wanted != self.observation[rows]).any(-1)]
         if len(later):
             self.over[later] = True

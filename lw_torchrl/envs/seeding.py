@@ -31,9 +31,12 @@ def episode_seed(task: str | Task, seed: int, episode: int) -> int:
     return episode_hash("episode", task, seed, episode)
 
 
-def action_noise(task: str | Task, seed: int, episode: int, steps: int, hold: int = 1) -> NDArray[np.float32]:
-    """Standard normal noise for an episode's actions, (steps, 4) float32; each draw is kept for ``hold`` steps."""
-    draws = episode_generator("noise", task, seed, episode).standard_normal((-(-steps // hold), 4), dtype=np.float32)
+def action_noise(
+    task: str | Task, seed: int, episode: int, steps: int, hold: int = 1, size: int = 4
+) -> NDArray[np.float32]:
+    """Standard normal noise for an episode's actions, (steps, size) float32; each draw is kept for ``hold`` steps."""
+    generator = episode_generator("noise", task, seed, episode)
+    draws = generator.standard_normal((-(-steps // hold), size), dtype=np.float32)
     return draws.repeat(hold, axis=0)[:steps]
 
 

@@ -27,9 +27,10 @@ from lw_torchrl.evaluation.explanation import (
 from lw_torchrl.evaluation.failure_records import Cause, Failure
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.skills import ScriptedSkill, load_skills
-from lw_torchrl.language.tasks import TASKS, task_id
+from lw_torchrl.language.tasks import task_id
 from lw_torchrl.modules.networks import evaluating
 from lw_torchrl.modules.policy import plans_of
+from lw_torchrl.suites.suite import Suite, find_suite
 
 _MARGIN = 0.3  # minimum lead for a larger replacement to win, as a share of the task's failed episodes
 _COUNTERFACTUALS: dict[str, tuple[Cause, str]] = {  # the smaller ones first; time counts where nothing else mends
@@ -58,9 +59,10 @@ def attribute_failures(
     skills: Mapping[str, ScriptedSkill] | None = None,
     seed: int,
     noise_scale: float = 0.1,
-    max_steps: int = 500,
+    max_steps: int | None = None,
     num_envs: int | None = None,
-    engine: Any = "vectorized",
+    suite: str | Suite | None = None,
+    engine: Any = None,
     num_threads: int | None = None,
     device: str | torch.device | None = None,
     progress: bool = True,
@@ -95,8 +97,9 @@ def attribute_failures(
         evaluator: what answered in the query answering function's place, between it and the actor: a
             :class:`QueryEvaluator`, or a module, function or :class:`torchrl.envs.Transform` that writes ``qaf``. An
             evaluator inside the policy is found there.
-        skills: the scripted skills by text that are trusted; None for the shipped ones, :func:`load_skills`.
-        seed, noise_scale, max_steps, engine: with which the episodes were run.
+        skills: the scripted skills by text that are trusted; None for the suite's, :func:`load_skills` of
+            Meta-World.
+        seed, noise_scale, max_steps, suite, engine: with which the episodes were run.
         num_envs, num_threads, device, progress: as for :func:`evaluate`.
 
     Returns:
@@ -128,17 +131,18 @@ def attribute_failures(
     """
     answered = as_plans(plans)
     check_scale("noise_scale", noise_scale)
-    check_int("max_steps", max_steps, minimum=1)
+    check_int("max_steps", 1 if max_steps is None else max_steps, minimum=1)
     check_int("num_envs", 1 if num_envs is None else num_envs, minimum=1)
     if actor is not None and (own := plans_of(actor)) is not None and (other := answered.differences(own)):
         raise ValueError(f"plans differ from the actor's own for {', '.join(other)}; pass the actor's plans")
-    table = load_skills() if skills is None else skills
     if not isinstance(rollouts, Iterable):
         raise TypeError(f"rollouts must be a list of finished episodes, got {type(rollouts).__name__}")
     failed = _failed(rollouts, answered)
     if not failed:
         return []
     names = sorted({task for task, _, _ in failed})
+    found = find_suite(names, suite)
+    table = (found.skills or load_skills()) if skills is None else skills
     given = {} if reference is None else as_plans(reference, "reference")
     others = {task: plan for task, plan in given.items() if task in names}
     trusted = Plans(others) if others else None
@@ -148,9 +152,10 @@ def attribute_failures(
     told = {(one.task, one.episode): explain(one, answered, scripts, trusted, theirs) for one in seen}
     if actor is None:
         return [_by_rule(one, told[one.task, one.episode], seed) for one in seen]
-    tasks = {name: TASKS.get(name, answered[name].definition) for name in names}
+    tasks = {name: found.tasks.get(name, answered[name].definition) for name in names}
+    max_steps = found.max_steps if max_steps is None else max_steps
     firsts = {(one.task, one.episode): one.steps.get("observation")[0] for one in seen}
-    env = {"seed": seed, "engine": engine, "num_threads": num_threads}
+    env = {"seed": seed, "suite": found, "engine": engine, "num_threads": num_threads}
     repeat = EpisodeRepeater(tasks, firsts, env, noise_scale, max_steps, num_envs, device, progress)
     tried = Counterfactuals(actor, answered, evaluator, trusted, scripts, repeat)
     tried.run(seen, [which for which, one in told.items() if one.evidence.get("plan_departs") == 0.0])
@@ -284,7 +289,8 @@ def _by_counterfactuals(
     step, at, why = told.steps[cause], told.at[cause], told.why[cause]
     if best == "skill":
         step = tried.step[which]
-        at, why = stall_step(one, step), describe_active_time(one, tried.plans[one.task], step)
+        plan = tried.plans[one.task]
+        at, why = stall_step(one, step, plan.definition.layout), describe_active_time(one, plan, step)
     by = {f"mended_by_{name.replace(' + ', '_and_')}": share for name, share in shares.items()}
     evidence = {**told.evidence, **by}
     return Failure(one.task, seed, one.episode, cause, also, step, at, _text(why, words), evidence, replaced)

@@ -19,7 +19,6 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from lw_torchrl._progress import Progress
 from lw_torchrl.envs.episodes import policy_of, run_episodes
-from lw_torchrl.envs.experts import ExpertActor
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.evaluation.explanation import EpisodeStates, Scripts, attended, candidates, unlike_scripts
 from lw_torchrl.language.plans import Plans
@@ -29,6 +28,7 @@ from lw_torchrl.modules.networks import evaluating
 from lw_torchrl.modules.plan_encoder import IN_FORCE
 from lw_torchrl.modules.policy import transform_of
 from lw_torchrl.modules.query_evaluator import QueryEvaluator
+from lw_torchrl.suites.metaworld.experts import ExpertActor
 from lw_torchrl.transforms.qaf import plan_program
 
 Acts = Callable[[TensorDictBase], TensorDictBase]
@@ -185,7 +185,7 @@ class EpisodeRepeater:
                 policy_of(actor, self.device),
                 wanted,
                 keys=["observation", ("next", "success")],
-                noise=(lambda _: (scale,) * 4) if scale else None,
+                noise=(lambda _: (scale,) * base.layout.action_size) if scale else None,
                 after_success=0,
                 on_progress=bar.update,
             ):

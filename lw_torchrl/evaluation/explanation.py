@@ -15,8 +15,8 @@ from torch.nn.functional import one_hot
 from lw_torchrl._devices import device_of
 from lw_torchrl.evaluation.failure_records import Cause
 from lw_torchrl.evaluation.plan_use import where_stuck
+from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.named_objects import GRIPPER
-from lw_torchrl.language.observation import HAND
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.language.skill_program import SkillProgram
 from lw_torchrl.language.skills import ScriptedSkill
@@ -139,12 +139,12 @@ def last_stay_start(states: Tensor) -> int:
     return int(found[gaps[-1] + 1] if len(gaps) else found[0])
 
 
-def stall_step(seen: EpisodeStates, step: int) -> int:
+def stall_step(seen: EpisodeStates, step: int, layout: Layout = METAWORLD) -> int:
     """Where the last stay in a step shows: the first state in it after which the hand gets no further, else its
     beginning."""
     inside = seen.in_force == step
     begin = last_stay_start(inside)
-    hand = seen.steps.get("observation")[begin:, HAND]
+    hand = seen.steps.get("observation")[begin:, layout.positions[0]]
     still = ((hand[_AHEAD:] - hand[:-_AHEAD]).norm(dim=-1) < _STILL) & inside[begin : begin + len(hand[_AHEAD:])]
     return begin + (int(still.int().argmax()) if still.any() else 0)
 
@@ -166,7 +166,7 @@ def explain(
     late = min(_LATE, length)
     stuck = next(iter(candidates(seen)), len(plan.steps) - 1)
     steps: dict[str, int | None] = {"out of time": stuck, "undecided": stuck}
-    at = {"out of time": length - 1, "undecided": stall_step(seen, stuck)}
+    at = {"out of time": length - 1, "undecided": stall_step(seen, stuck, plans.layout)}
     why, evidence = {}, {"states": float(length)}
 
     wrong = seen.given != seen.truth
@@ -214,7 +214,7 @@ def explain(
 
     inside = seen.in_force == stuck
     evidence["in_step_late"] = float(inside[-late:].float().mean())
-    steps["skill"], at["skill"] = stuck, stall_step(seen, stuck)
+    steps["skill"], at["skill"] = stuck, stall_step(seen, stuck, plans.layout)
     told = describe_active_time(seen, plan, stuck)
     if scripts.known[seen.task][stuck]:
         far = float(scripts.distance(observation[-1:], task_id[-1:], stuck))

@@ -23,7 +23,7 @@ from lw_torchrl.language.query_program import QueryProgram
 from lw_torchrl.language.skill_program import SkillProgram
 from lw_torchrl.language.skills import ScriptedSkill
 from lw_torchrl.language.task_index import TaskIndex
-from lw_torchrl.language.tasks import TASKS
+from lw_torchrl.suites.suite import Suite, find_suite
 
 _ROWS = 256
 _PLACE = "place"
@@ -38,7 +38,8 @@ def evaluate_plans(
     choose: Literal["random", "first"] = "random",
     skills: Mapping[str, ScriptedSkill] | None = None,
     noise_scale: float = 0.0,
-    max_steps: int = 500,
+    max_steps: int | None = None,
+    suite: str | Suite | None = None,
     num_envs: int = _ROWS,
     num_threads: int | None = None,
     progress: bool = True,
@@ -54,7 +55,7 @@ def evaluate_plans(
         episodes, seed: of each plan, which end at their first success; of the environment and the choice.
         choose: of several true steps, a "random" one in every state, the paper's rule, or the "first".
         skills: the scripted skills by text; None for the shipped ones, :func:`~lw_torchrl.load_skills`.
-        noise_scale, max_steps, num_envs, num_threads, progress: as for :func:`evaluate`.
+        noise_scale, max_steps, suite, num_envs, num_threads, progress: as for :func:`evaluate`.
         on_plan: told the index of a plan, and how it fared, once all its episodes are done.
 
     Raises:
@@ -80,8 +81,10 @@ def evaluate_plans(
     different = {task: [plans[same[0]] for same in found] for task, found in equal.items()}
     policy = _PlanOfRow(different, episodes, seed, choose, skills)
     most = max(len(listed) for listed in different.values()) * episodes
+    found = find_suite(list(different), suite)
     env = LanguageWorldEnv(
-        [TASKS.get(task, listed[0].definition) for task, listed in different.items()],
+        [found.tasks.get(task, listed[0].definition) for task, listed in different.items()],
+        suite=found,
         num_envs=len(different) * max(1, min(most, num_envs // len(different))),
         seed=seed,
         max_steps=max_steps,
@@ -90,7 +93,7 @@ def evaluate_plans(
     )
     listed = {task: list(range(episodes)) * len(found) for task, found in different.items()}
     total = sum(map(len, listed.values()))
-    bar = Progress("carrying out plans", total * max_steps, "step", show=progress)
+    bar = Progress("carrying out plans", total * env.max_steps, "step", show=progress)
     won: dict[int, dict[int, bool]] = {index: {} for index in range(len(plans))}
 
     def in_order(index: int) -> tuple[bool, ...]:
@@ -102,7 +105,7 @@ def evaluate_plans(
             policy_of(policy),
             listed,
             keys=[_PLACE, ("next", "success")],
-            noise=(lambda _: (noise_scale,) * 4) if noise_scale else None,
+            noise=(lambda _: (noise_scale,) * env.layout.action_size) if noise_scale else None,
             after_success=0,
             place=_PLACE,
             on_progress=bar.update,

@@ -14,10 +14,10 @@ from torchrl.envs import TransformedEnv
 
 from lw_torchrl._checks import check_choice, checked
 from lw_torchrl.envs.episodes import FinishedEpisode, run_episodes
-from lw_torchrl.envs.experts import ExpertActor
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.tasks import resolve_tasks
+from lw_torchrl.suites.metaworld.experts import ExpertActor
 from lw_torchrl.transforms import QAFTransform
 
 _AFTER = 20  # steps after the first success that still count, as in training data

@@ -22,9 +22,10 @@ from lw_torchrl.evaluation.attribution import attribute_failures, keys_to_attrib
 from lw_torchrl.evaluation.counterfactuals import Acts, answered_by, make_env
 from lw_torchrl.evaluation.result import EpisodeResult, EvaluationResult
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
-from lw_torchrl.language.tasks import TASKS, Task, named_tasks
+from lw_torchrl.language.tasks import Task, TaskList
 from lw_torchrl.modules.networks import evaluating
 from lw_torchrl.modules.policy import Policy, plans_of
+from lw_torchrl.suites.suite import Suite, find_suite, listed_tasks
 
 _ROWS = 256  # more hardly make a step of all of them cheaper per row, and cost memory
 
@@ -43,10 +44,12 @@ def actor_plans(actor: Any, plans: Plans | Mapping[str, ConditionalPlan] | None)
     return own or given
 
 
-def tasks_of(tasks: str | Task | Iterable[str | Task], plans: Plans | None) -> dict[str, Task]:
-    """The tasks by name; a name of the user's own stands for the task that its plan is for."""
-    own = {} if plans is None else {plan.task: plan.definition for plan in plans.values() if plan.task not in TASKS}
-    return named_tasks(tasks, known={**TASKS, **own})
+def tasks_of(tasks: TaskList, plans: Plans | None, suite: str | Suite | None = None) -> tuple[Suite, dict[str, Task]]:
+    """The suite, and the tasks by name; a name of the user's own stands for the task that its plan is for."""
+    tasks = listed_tasks(tasks)
+    found = find_suite(tasks, suite)
+    own = {} if plans is None else {plan.task: plan.definition for plan in plans.values()}
+    return found, found.named_tasks(tasks, {name: task for name, task in own.items() if name not in found.tasks})
 
 
 def _result(finished: FinishedEpisode, stopped_early: bool, keep_actions: bool) -> EpisodeResult:
@@ -62,11 +65,12 @@ def _checked(policy: Acts, env: EnvBase, also_record: Iterable[NestedKey]) -> Ac
     """``policy``, whose action is checked, and at its first call whether it and ``env`` write ``also_record``."""
     unseen = [unravel_key(key) for key in also_record]
     specs = env.full_observation_spec, env.full_reward_spec, env.full_done_spec
+    size = env.action_spec.shape[-1]
     later = [unravel_key(("next", key)) for spec in specs for key in spec.keys(True, True)]
 
     def run(tensordict: TensorDictBase) -> TensorDictBase:
         tensordict = policy(tensordict)
-        read_action(tensordict)
+        read_action(tensordict, size)
         while unseen:
             key = unseen.pop()
             if key not in later and key not in tensordict.keys(True):
@@ -89,8 +93,9 @@ def evaluate(
     stop_at_success: bool = False,
     record_actions: bool = False,
     reward: Literal["sparse", "dense"] = "sparse",
-    max_steps: int = 500,
-    engine: Any = "vectorized",
+    max_steps: int | None = None,
+    suite: str | Suite | None = None,
+    engine: Any = None,
     num_threads: int | None = None,
     progress: bool = True,
     also_record: Sequence[NestedKey] = (),
@@ -103,7 +108,7 @@ def evaluate(
     """Run episodes 0 to k - 1 of each task and report how they went.
 
     The actor runs in eval mode with deterministic exploration. The executed action is its action plus
-    N(0, noise_scale²) on all four numbers, clipped. The result depends neither on ``num_envs`` nor on the tasks beside:
+    N(0, noise_scale²) on all its numbers, clipped. The result depends neither on ``num_envs`` nor on the tasks beside:
     the actor is run on blocks of a fixed number of rows, and all randomness comes from (task, seed, episode).
 
     Args:
@@ -117,7 +122,7 @@ def evaluate(
         stop_at_success: end an episode at its first success; success at the end and return are then None.
         record_actions: keep each episode's executed actions, (T, 4) float32.
         reward: "sparse" or "dense", summed in the return.
-        max_steps, engine, num_threads: as for :class:`LanguageWorldEnv`.
+        max_steps, suite, engine, num_threads: as for :class:`LanguageWorldEnv`.
         progress: show a progress bar when it takes longer than a second.
         also_record: more keys for ``on_episode`` to see: "qaf", "skill_weights".
         on_episode: called with each finished episode, a named tuple of ``task``, ``episode`` (its index) and ``steps``,
@@ -146,7 +151,7 @@ def evaluate(
     Source: paper section 'Conditional Plan Experiments': 20 episodes, action noise 0.1.
     """
     answered = actor_plans(actor, plans)
-    chosen = tasks_of(tasks, answered)
+    found_suite, chosen = tasks_of(tasks, answered, suite)
     names = tuple(chosen)
     if answered is not None:
         answered.require(names)
@@ -166,7 +171,9 @@ def evaluate(
     if num_envs is None:
         num_envs = len(names) * max(1, _ROWS // len(names))
     num_envs = min(check_int("num_envs", num_envs), len(names) * episodes_per_task)  # a row more would have no work
+    max_steps = found_suite.max_steps if max_steps is None else check_int("max_steps", max_steps, minimum=1)
     shared: dict[str, Any] = {"seed": seed, "engine": engine, "num_threads": num_threads, "max_steps": max_steps}
+    shared["suite"] = found_suite
     base = LanguageWorldEnv(list(chosen.values()), num_envs=num_envs, reward=reward, strict=True, **shared)
     env = make_env(actor, answered, base, evaluator)
     policy = policy_of(answered_by(actor, evaluator), device)
@@ -183,7 +190,7 @@ def evaluate(
             _checked(policy, env, seen),
             {task: range(episodes_per_task) for task in names},
             keys=["action", ("next", "success"), ("next", "reward"), *seen],
-            noise=(lambda _: (noise_scale,) * 4) if noise_scale else None,
+            noise=(lambda _: (noise_scale,) * env.action_spec.shape[-1]) if noise_scale else None,
             after_success=0 if stop_at_success else None,
             on_progress=bar.update,
         ):

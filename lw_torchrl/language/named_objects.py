@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from lw_torchrl._checks import check_choice, shown
-from lw_torchrl.language.observation import OBSERVATION_SIZE
+from lw_torchrl.language.layout import METAWORLD, Layout, places
 
 GRIPPER = "robot's gripper"
 Coordinate = int | float
@@ -33,13 +33,14 @@ def typed(position: Sequence[Coordinate]) -> TypedPosition:
     return tuple((isinstance(coordinate, int), coordinate) for coordinate in position)
 
 
-def coordinate_index(coordinate: Coordinate, constants: list[float]) -> int:
-    """The index of a coordinate in the 39 numbers of an observation followed by ``constants``, which grow at need."""
+def coordinate_index(coordinate: Coordinate, constants: list[float], size: int) -> int:
+    """The index of a coordinate in the ``size`` numbers of an observation followed by ``constants``, which grow at
+    need."""
     if isinstance(coordinate, int):
         return coordinate
     if coordinate not in constants:
         constants.append(coordinate)
-    return OBSERVATION_SIZE + constants.index(coordinate)
+    return size + constants.index(coordinate)
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ class NamedObject:
 
     Attributes:
         name: "drawer handle", in lower case and without an article.
-        position: x, y and z: an int is an index into the 39 numbers of the observation, a float is in metres.
+        position: x, y and z: an int is an index into the numbers of the observation, a float is in metres.
         offset: added to it, metres; for a point beside an object.
         ours: a point that we named, which the published object list lacks.
     """
@@ -65,9 +66,6 @@ class NamedObject:
             raise ValueError(f"name may not contain 'and', 'is', 'not' or 'the', got {shown(self.name)}")
         if not is_triple(self.position):
             raise ValueError(f"position of {self.name!r} must hold 3 ints or finite floats, got {shown(self.position)}")
-        for coordinate in self.position:
-            if isinstance(coordinate, int) and not 0 <= coordinate < OBSERVATION_SIZE:
-                raise ValueError(f"position of {self.name!r}: obs[{coordinate}] is outside the 39 numbers, 0 to 38")
         if not is_triple(self.offset):
             raise ValueError(f"offset of {self.name!r} must be three numbers in metres, got {shown(self.offset)}")
 
@@ -107,7 +105,21 @@ def read_point(name: str, at: Any, objects: Mapping[str, NamedObject]) -> NamedO
     return NamedObject(name, objects[at["object"]].position, tuple(at["offset"]), ours=True)
 
 
-def read_objects(row: Mapping[str, Any]) -> tuple[NamedObject, ...]:
+def gripper_of(layout: Layout) -> NamedObject:
+    """The robot's gripper, which every task has first."""
+    x, y, z = places(layout.positions[0])
+    return NamedObject(GRIPPER, (x, y, z))
+
+
+def check_inside(named: NamedObject, size: int) -> None:
+    """Raise :class:`ValueError` if a position's index is outside the ``size`` numbers of an observation."""
+    for coordinate in named.position:
+        if isinstance(coordinate, int) and not 0 <= coordinate < size:
+            numbers = f"the {size} numbers, 0 to {size - 1}"
+            raise ValueError(f"position of {named.name!r}: obs[{coordinate}] is outside {numbers}")
+
+
+def read_objects(row: Mapping[str, Any], layout: Layout = METAWORLD) -> tuple[NamedObject, ...]:
     """The gripper, then the objects and the points of a row of tasks.toml."""
 
     def table(key: str) -> Mapping[str, Any]:
@@ -116,7 +128,7 @@ def read_objects(row: Mapping[str, Any]) -> tuple[NamedObject, ...]:
             raise ValueError(f"{key} must be a table of names and positions, got {shown(found)}")
         return found
 
-    objects = {GRIPPER: NamedObject(GRIPPER, (0, 1, 2))}
+    objects = {GRIPPER: gripper_of(layout)}
     for named, at in table("objects").items():
         if named in objects:
             raise ValueError(f"objects may not name {named!r}, which every task has")

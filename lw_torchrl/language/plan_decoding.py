@@ -151,7 +151,7 @@ def decode_as(text: str, read: Callable[[str], Reading], mapper: StepMapper) -> 
 
 
 def _same(name: str, task: Task) -> bool:
-    return re.sub(r"[^a-z0-9]", "", name.lower()) == task.name.replace("-", "")
+    return re.sub(r"[^a-z0-9]", "", name.lower()) == re.sub(r"[-/]", "", task.name)
 
 
 def _read(text: str, task: Task, read: Callable[[str], Reading]) -> tuple[Reading, Section]:

@@ -69,7 +69,7 @@ def _read_all(found: list[Traversable], tasks: Tasks) -> Plans:
     plans: dict[str, ConditionalPlan] = {}
     source: dict[str, str] = {}
     for file in found:
-        stem = file.name.removesuffix(".plan")
+        stem = file.name.removesuffix(".plan").replace("__", "/")
         text = read_text(file, PlanError, limit=PLAN_LIMIT)
         plan = parse_plan(text, stem if stem in tasks else None, file.name, tasks)
         if plan.task in plans:
@@ -112,8 +112,8 @@ def _read_pairs(path: Path, tasks: Tasks) -> Plans:
 
 @checked
 def save_plans(plans: Plans | Mapping[str, ConditionalPlan], folder: str | os.PathLike[str]) -> list[Path]:
-    """Write each plan to ``folder``/<task>.plan; a file is replaced whole or not at all."""
-    texts = {Path(folder) / f"{task}.plan": str(plan) for task, plan in as_plans(plans).items()}
+    """Write each plan to ``folder``/<task>.plan, "__" for a slash; a file is replaced whole or not at all."""
+    texts = {Path(folder) / f"{task.replace('/', '__')}.plan": str(plan) for task, plan in as_plans(plans).items()}
     Path(folder).mkdir(parents=True, exist_ok=True)
     for file, text in texts.items():
         write_text(file, text)

@@ -32,7 +32,8 @@ def quote(text: str) -> str:
 
 def function_head(task: Task) -> str:
     """The lines with which the function of a task begins."""
-    return f"# {task.name}: {one_line(task.description)}\ndef {task.name.replace('-', '_')}(robot):\n"
+    name = task.name.replace("/", "__").replace("-", "_")
+    return f"# {task.name}: {one_line(task.description)}\ndef {name}(robot):\n"
 
 
 def too_many_steps(what: str, number: int) -> str:
@@ -70,7 +71,7 @@ def read_plan_text(
         elif match := _DEF.fullmatch(line):
             if found is not None:
                 return report(f"{where}: a second plan begins; a plan file holds one")
-            found = match[1].replace("_", "-")
+            found = match[1].replace("__", "/").replace("_", "-")
             if found not in tasks:
                 return report(no_task(where, found, tasks))
             if task is not None and found != task:

@@ -10,11 +10,12 @@ from hashlib import sha256
 from typing import Any, NoReturn
 
 from lw_torchrl._checks import check_fields, checked, shown
+from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.plan_text import MOST_STEPS, function_head, one_line, quote, read_plan_text, too_many_steps
 from lw_torchrl.language.queries import Query, check_query, read_query
-from lw_torchrl.language.relations import PREDICATES
+from lw_torchrl.language.relations import comparisons
 from lw_torchrl.language.skills import canonical_skill, load_skills
-from lw_torchrl.language.tasks import TASKS, Task, Tasks, check_task, get_task
+from lw_torchrl.language.tasks import TASKS, Task, Tasks, check_task, get_task, one_layout
 
 
 class PlanError(ValueError):
@@ -170,6 +171,7 @@ class Plans(Mapping[str, ConditionalPlan]):
     """An immutable mapping from task names, sorted, to their plans.
 
     Attributes:
+        layout: of the tasks' observations and actions.
         num_steps: S, the steps of the longest plan.
         skills: every skill text once, sorted.
     """
@@ -192,6 +194,10 @@ class Plans(Mapping[str, ConditionalPlan]):
         if not listed:
             raise PlanError("plans must hold at least one plan, got none")
         self._plans = {plan.task: plan for plan in sorted(listed, key=lambda p: p.task)}
+        try:
+            self.layout: Layout = one_layout(plan.definition for plan in listed)
+        except ValueError as error:
+            raise PlanError(str(error)) from None
 
     def __getitem__(self, task: str) -> ConditionalPlan:
         return self._plans[task]
@@ -228,7 +234,7 @@ class Plans(Mapping[str, ConditionalPlan]):
         used = {clause.predicate for plan in self.values() for step in plan.steps for clause in step.condition.clauses}
         told = {
             "steps": self.num_steps,
-            "predicates": {name: [asdict(part) for part in PREDICATES[name]] for name in sorted(used)},
+            "predicates": {name: [asdict(part) for part in comparisons(name, self.layout)] for name in sorted(used)},
             "plans": {
                 task: {
                     "steps": [(str(step.condition), step.skill) for step in plan.steps],
@@ -240,6 +246,8 @@ class Plans(Mapping[str, ConditionalPlan]):
                 for task, plan in self.items()
             },
         }
+        if self.layout != METAWORLD:
+            told["layout"] = self.layout.to_json()
         return sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:32]
 
     def to_json(self) -> dict[str, Any]:

@@ -11,8 +11,8 @@ from itertools import permutations
 from rapidfuzz import fuzz, process
 
 from lw_torchrl._checks import checked
+from lw_torchrl.language.layout import places
 from lw_torchrl.language.named_objects import GRIPPER
-from lw_torchrl.language.observation import FIRST, SECOND, places
 from lw_torchrl.language.relations import PREDICATES, PUBLISHED, RELATIONS, TOUCHING, UNARY
 from lw_torchrl.language.tasks import Task, get_task
 
@@ -68,8 +68,9 @@ def base_clauses(task: Task, relations: tuple[str, ...]) -> tuple[Clause, ...]:
         for relation in relations:
             if relation != "around" or first == GRIPPER:
                 clauses += [Clause(first, relation, second, negated) for negated in (False, True)]
+    things = [places(part) for part in task.layout.positions[1:-1]]
     for thing in task.objects:
-        if not thing.ours and thing.position in (places(FIRST), places(SECOND)):
+        if not thing.ours and thing.position in things:
             clauses += [Clause(thing.name, TOUCHING), Clause(thing.name, TOUCHING, negated=True)]
     return (*clauses, Clause(GRIPPER, "open"), Clause(GRIPPER, "closed"))
 

@@ -16,7 +16,7 @@ def answer(
 ) -> bool:  # fmt: skip
     """Write the truth (B, S) bool of each row's queries, with the operations of the tables, in their order.
 
-    ``observation`` is (B, 39) float32 or float64, metres, ``task_id`` (B,) int64; ``ids`` and what follows are the
+    ``observation`` is (B, D) float32 or float64, metres, ``task_id`` (B,) int64; ``ids`` and what follows are the
     tables of :class:`QueryFacts`. False for a task without queries, or an observation that holds NaN or infinity.
     """
     size = observation.shape[1]

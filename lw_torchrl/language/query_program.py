@@ -11,11 +11,10 @@ import torch
 from torch import Tensor, nn
 
 from lw_torchrl._checks import check_choice, shown
-from lw_torchrl.language.observation import OBSERVATION_SIZE
 from lw_torchrl.language.queries import Query, check_query
 from lw_torchrl.language.query_tables import QueryTables, compile_facts, compile_queries
 from lw_torchrl.language.task_index import TaskIndex, TaskTables
-from lw_torchrl.language.tasks import TASKS, Task
+from lw_torchrl.language.tasks import TASKS, Task, one_layout
 from lw_torchrl.language.value_checks import check_finite
 
 _LEAST, _MOST = 1e-6, 1e4  # of the size of a logit, and of metres where a length has a gradient
@@ -44,6 +43,7 @@ class QueryProgram(nn.Module):
     Attributes:
         tasks: the names of the tasks it answers for, sorted.
         num_queries: S, the length of the longest list.
+        layout: of the tasks.
 
     Example:
         >>> import torch
@@ -76,6 +76,7 @@ class QueryProgram(nn.Module):
                 raise TypeError(f"queries[{task.name!r}] must hold strings or Query, got {shown(wrong[0])}")
             compiled[task] = tuple(check_query(query, task) for query in listed)
         super().__init__()
+        self.layout = one_layout(compiled)
         self.queries = dict(sorted(((task.name, found) for task, found in compiled.items())))
         self.tasks = tuple(self.queries)
         self.num_queries = max(map(len, compiled.values()))
@@ -94,14 +95,14 @@ class QueryProgram(nn.Module):
         """Answer the queries.
 
         Args:
-            observation: (..., 39) float, Meta-World's vector, metres.
+            observation: (..., D) float, as the tasks' layout says; Meta-World's 39 numbers, metres.
             task_id: (...) int64.
 
         Returns:
             (..., S) bool on the observation's device, in the order of the task's list; padding is false. NaN or
             infinity in the observation, or a task without queries, is a :class:`ValueError`.
         """
-        _check_batch(observation, task_id)
+        _check_batch(observation, task_id, self.layout.size)
         if (kernel := self._kernel(observation, task_id)) is not None:
             return self._answer(kernel, observation, task_id)
         check_finite("observation", observation)
@@ -120,7 +121,7 @@ class QueryProgram(nn.Module):
         gradient is that of the comparison that decides; it is finite everywhere.
 
         Args:
-            observation: (..., 39) float, Meta-World's vector, metres.
+            observation: (..., D) float, as the tasks' layout says; Meta-World's 39 numbers, metres.
             task_id: (...) int64.
             temperature: multiplies every comparison's own, between 1e-6 and 1e6.
 
@@ -155,7 +156,7 @@ class QueryProgram(nn.Module):
 
     def _answer(self, kernel: Callable[..., bool], observation: Tensor, task_id: Tensor) -> Tensor:
         """Few operations of PyTorch: after the physics, which empties the processor's caches, each is slow."""
-        states = observation.numpy(force=observation.requires_grad).reshape(-1, OBSERVATION_SIZE)
+        states = observation.numpy(force=observation.requires_grad).reshape(-1, self.layout.size)
         ids = task_id.numpy().reshape(-1)
         truth = np.empty((len(ids), self.num_queries), dtype=bool)
         given = np.ascontiguousarray(states), np.ascontiguousarray(ids, dtype=np.int64)
@@ -170,7 +171,7 @@ class QueryProgram(nn.Module):
 
     def _values(self, observation: Tensor, tables: QueryTables, floor: float = 0.0) -> Tensor:
         """What each atom compares, (B, A) metres; a length of 0 has no gradient, so ``floor`` bounds it from below."""
-        numbers = torch.cat((observation.reshape(-1, OBSERVATION_SIZE), tables.constants), 1)
+        numbers = torch.cat((observation.reshape(-1, self.layout.size), tables.constants), 1)
         d = (numbers.gather(1, tables.first) - numbers.gather(1, tables.second)).unflatten(1, (3, -1)) + tables.shift
         x, y, z = d.unbind(1)
         squared = x.square() + y.square() + z.square()
@@ -180,13 +181,13 @@ class QueryProgram(nn.Module):
         return torch.where(tables.length, length, x + y + z)
 
 
-def _check_batch(observation: Tensor, task_id: Tensor) -> None:
+def _check_batch(observation: Tensor, task_id: Tensor, size: int) -> None:
     for name, given in (("observation", observation), ("task_id", task_id)):
         if not isinstance(given, Tensor):
             raise TypeError(f"{name} must be a tensor, got {type(given).__name__}; torch.as_tensor makes one")
     shape, ids = tuple(observation.shape), tuple(task_id.shape)
-    if shape[-1:] != (OBSERVATION_SIZE,) or not observation.is_floating_point():
+    if shape[-1:] != (size,) or not observation.is_floating_point():
         got = f"{observation.dtype} of shape {shape}"
-        raise ValueError(f"observation must be float of shape (..., {OBSERVATION_SIZE}), got {got}")
+        raise ValueError(f"observation must be float of shape (..., {size}), got {got}")
     if ids != shape[:-1] or task_id.dtype not in (torch.int64, torch.int32):
         raise ValueError(f"task_id must be int64 of shape {shape[:-1]}, got {task_id.dtype} of shape {ids}")

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lw_torchrl.language.named_objects import TypedPosition, coordinate_index, typed
-from lw_torchrl.language.observation import OPENING
 from lw_torchrl.language.queries import Clause, Query
-from lw_torchrl.language.relations import PREDICATES, Comparison
-from lw_torchrl.language.tasks import MT50, Task, task_id
+from lw_torchrl.language.relations import Comparison, comparisons
+from lw_torchrl.language.tasks import MT50, Task, one_layout, task_id
 
 
 class Atom(NamedTuple):
@@ -25,11 +24,11 @@ class Atom(NamedTuple):
     shift: tuple[float, float, float]  # metres, added to first - second
     part: Comparison
 
-    def coordinates(self, side: int, constants: list[float]) -> list[int]:
+    def coordinates(self, side: int, constants: list[float], size: int) -> list[int]:
         """Where the coordinates of one position stand; those of 0 for an axis left out."""
         position = (self.first, self.second)[side if self.part.sense == "<" else 1 - side]
         used = [c if axis in self.part.axes else 0.0 for axis, (_, c) in zip("xyz", position, strict=True)]
-        return [coordinate_index(c, constants) for c in used]
+        return [coordinate_index(c, constants, size) for c in used]
 
     @property
     def _sign(self) -> int:
@@ -64,7 +63,7 @@ _NEVER = Atom(_ORIGIN, _ORIGIN, _NO_SHIFT, Comparison("xyz", "<", -1e4, temperat
 
 def clause_atoms(clause: Clause, task: Task) -> list[Atom]:
     """The atoms that must all hold for a clause without its "not"."""
-    first, second, shift = typed((0.0, 0.0, OPENING)), _ORIGIN, _NO_SHIFT
+    first, second, shift = typed((0.0, 0.0, task.layout.opening)), _ORIGIN, _NO_SHIFT
     if clause.predicate not in ("open", "closed"):
         subject = task.object(clause.subject)
         first, shift = typed(subject.position), subject.offset
@@ -73,7 +72,7 @@ def clause_atoms(clause: Clause, task: Task) -> list[Atom]:
             second = typed(other.position)
             x, y, z = (a - b for a, b in zip(shift, other.offset, strict=True))
             shift = (x, y, z)
-    return [Atom(first, second, shift, part) for part in PREDICATES[clause.predicate]]
+    return [Atom(first, second, shift, part) for part in comparisons(clause.predicate, task.layout)]
 
 
 class QueryTables(NamedTuple):
@@ -101,15 +100,15 @@ def compile_queries(queries: Mapping[Task, Sequence[Query]]) -> QueryTables:
     parts = max(2, *(len(each) for _, places, _ in found for row in places for each in row))
     filled = [[[[*each, *[0] * (parts - len(each))] for each in row] for row in places] for _, places, _ in found]
     listed = [atoms + [_ALWAYS] * (most - len(atoms)) for atoms, _, _ in found]
-    constants = [0.0]
+    constants, size = [0.0], one_layout(queries).size
 
     def table(value: Callable[[Atom], Any], dtype: torch.dtype = torch.int64) -> Tensor:
         values = torch.tensor([[value(atom) for atom in atoms] for atoms in listed], dtype=dtype)
         return values.movedim(1, -1).contiguous()
 
     return QueryTables(
-        first=table(lambda atom: atom.coordinates(0, constants)).flatten(1),
-        second=table(lambda atom: atom.coordinates(1, constants)).flatten(1),
+        first=table(lambda atom: atom.coordinates(0, constants, size)).flatten(1),
+        second=table(lambda atom: atom.coordinates(1, constants, size)).flatten(1),
         shift=table(lambda atom: atom.offset, torch.float64),
         length=table(lambda atom: atom.part.length, torch.bool),
         far=table(lambda atom: atom.far, torch.bool),
@@ -191,14 +190,14 @@ def compile_facts(queries: Mapping[Task, Sequence[Query]]) -> QueryFacts | None:
     tasks = [_task_facts(task, listed) for task, listed in queries.items()]
     if max(len(atoms) + len(together) for atoms, together, _ in tasks) > MOST_FACTS:
         return None
-    constants = [0.0]
+    constants, size = [0.0], one_layout(queries).size
     places: list[list[int]] = []
     conjunctions: list[tuple[int, int]] = []
     ends, metres, bits, flipped = [], [], [], []
     for atoms, together, _ in tasks:
         begin = len(places)
         for atom in sorted(atoms, key=lambda atom: not atom.part.length):
-            first, second = (atom.coordinates(side, constants) for side in (0, 1))
+            first, second = (atom.coordinates(side, constants, size) for side in (0, 1))
             axes = [0, 1, 2] if atom.part.length else ["xyz".index(atom.part.axes)] * 3
             places.append([place for axis in axes for place in (first[axis], second[axis])])
             metres.append([*(atom.offset[axis] for axis in axes), -1.0 if atom.far else 1.0, atom.threshold])

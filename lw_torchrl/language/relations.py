@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import re
 from collections import ChainMap, UserDict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.resources import files
 from types import MappingProxyType
 from typing import Literal
 
 from lw_torchrl._checks import check_choice, shown
 from lw_torchrl._files import read_toml
+from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.named_objects import is_number
 
 
@@ -84,3 +85,13 @@ PUBLISHED: tuple[str, ...] = tuple(_TABLE["published"])
 
 PREDICATES = ChainMap[str, tuple[Comparison, ...]](UNARY, RELATIONS)  # type: ignore[arg-type]
 """All that a clause can say: the relations, also those that are added, then the predicates of one object."""
+
+
+def comparisons(predicate: str, layout: Layout) -> tuple[Comparison, ...]:
+    """What a predicate compares in a suite, whose layout may have a threshold of its own."""
+    parts = PREDICATES[predicate]
+    if (threshold := layout.thresholds.get(predicate)) is None:
+        return parts
+    if len(parts) != 1:
+        raise ValueError(f"thresholds of layout {layout.name!r}: {predicate!r} has {len(parts)} comparisons, not one")
+    return (replace(parts[0], threshold=threshold),)

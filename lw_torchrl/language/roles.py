@@ -6,15 +6,14 @@ import re
 from dataclasses import dataclass, replace
 from typing import Literal
 
+from lw_torchrl.language.layout import places
 from lw_torchrl.language.named_objects import GRIPPER, NamedObject, typed
-from lw_torchrl.language.observation import FIRST, GOAL, HAND, SECOND, places
 from lw_torchrl.language.plans import ConditionalPlan, PlanStep
 from lw_torchrl.language.skills import Skills, skills_for
 from lw_torchrl.language.tasks import Task
 
 Source = Literal["skill", "words", "condition", "nothing"]
 _TARGET = "target location"
-_GOAL = NamedObject(_TARGET, (GOAL.start, GOAL.start + 1, GOAL.start + 2))
 _NAMES_OF_THE_GOAL = (_TARGET, "reach target")
 _ACTED_ON = re.compile(r"(?:^|, |and |then )\w+ (?:the )?<([^>]*)>")
 _TOOL = re.compile(r"(?<!in line )(?<!level )(?<!aligned )\bwith (the )?(?=<)")
@@ -34,7 +33,12 @@ _NOTHING = Roles(None, None, "nothing")
 
 def role_object(task: Task, name: str) -> NamedObject:
     """The object of a role: the task's, or the goal as "target location", which every observation has."""
-    return _GOAL if name == _TARGET and name not in task.object_names else task.object(name)
+    return _goal(task) if name == _TARGET and name not in task.object_names else task.object(name)
+
+
+def _goal(task: Task) -> NamedObject:
+    x, y, z = places(task.layout.positions[-1])
+    return NamedObject(_TARGET, (x, y, z))
 
 
 def plan_roles(plan: ConditionalPlan, skills: Skills | None = None) -> tuple[Roles, ...]:
@@ -131,7 +135,7 @@ def _carried(roles: Roles, step: PlanStep, task: Task) -> Roles:
         return roles
     thing = next(one.name for one in task.objects if _same_thing(one.name, at[-1], task) and not any(one.offset))
     if any(name in step.skill for name in _NAMES_OF_THE_GOAL) and _same_thing(at[-1], roles.target, task):
-        goal = next((one.name for one in task.objects if typed(one.position) == typed(_GOAL.position)), _TARGET)
+        goal = next((one.name for one in task.objects if typed(one.position) == typed(_goal(task).position)), _TARGET)
         return Roles(goal, GRIPPER if "gripper" in step.skill.split() else thing, "words")
     held = _holds(step, "closed", GRIPPER) and re.match(rf"\w+ the {re.escape(thing)}\b", step.skill)
     return replace(roles, moved=thing) if held and roles.target != thing else roles
@@ -148,7 +152,7 @@ def _same_thing(first: str, second: str, task: Task) -> bool:
 
 def _can_move(name: str, task: Task) -> bool:
     position = typed(role_object(task, name).position)
-    return any(position == typed(places(thing)) for thing in (HAND, FIRST, SECOND))
+    return any(position == typed(places(thing)) for thing in task.layout.positions[:-1])
 
 
 def _point(roles: Roles, step: PlanStep, task: Task) -> str | None:

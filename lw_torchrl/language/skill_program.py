@@ -10,10 +10,9 @@ from torch import Tensor, nn
 
 from lw_torchrl._checks import check_choice
 from lw_torchrl.language.named_objects import coordinate_index
-from lw_torchrl.language.observation import OBSERVATION_SIZE
 from lw_torchrl.language.skills import ScriptedSkill, Skills, load_skills
 from lw_torchrl.language.task_index import TaskIndex, TaskTables
-from lw_torchrl.language.tasks import Task, get_task
+from lw_torchrl.language.tasks import Task, get_task, one_layout
 
 
 class _Tables(NamedTuple):
@@ -23,7 +22,7 @@ class _Tables(NamedTuple):
     moved: Tensor  # (T, 3*S) int64, of what is to arrive there
     gain: Tensor  # (T, 3*S) float64
     shift: Tensor  # (T, 3*S) float64, gain times offset
-    effort: Tensor  # (T, S, 4) float64, zeros and the gripper's
+    effort: Tensor  # (T, S, A) float64, zeros and the gripper's
     constants: Tensor  # (T, C) float64, read as if they followed the observation
 
 
@@ -36,6 +35,7 @@ class SkillProgram(nn.Module):
 
     Attributes:
         num_skills: S, the length of the longest list.
+        layout: of the tasks.
 
     Example:
         >>> import torch
@@ -61,22 +61,25 @@ class SkillProgram(nn.Module):
 
         found = {get_task(task): [look_up(one).for_task(task) for one in listed] for task, listed in skills.items()}
         super().__init__()
+        self.layout = layout = one_layout(found)
         self.num_skills = max(map(len, found.values()))
         index = TaskIndex(task.name for task in found)
         constants = [0.0]
-        place = torch.full((len(found), 2, self.num_skills, 3), OBSERVATION_SIZE)
+        place = torch.full((len(found), 2, self.num_skills, 3), layout.size)
         numbers = torch.zeros(len(found), 2, self.num_skills, 3, dtype=torch.float64)  # gain, gain times offset
-        effort = torch.zeros(len(found), self.num_skills, 4, dtype=torch.float64)
+        effort = torch.zeros(len(found), self.num_skills, layout.action_size, dtype=torch.float64)
         for task, listed in found.items():
             t = index.row(task.name)
             for s, skill in enumerate(listed):
                 ends = task.object(skill.target), task.object(skill.moved)
                 for side, end in enumerate(ends):
-                    place[t, side, s] = torch.tensor([coordinate_index(c, constants) for c in end.position])
+                    place[t, side, s] = torch.tensor(
+                        [coordinate_index(c, constants, layout.size) for c in end.position]
+                    )
                 offsets = torch.tensor([skill.offset, *(end.offset for end in ends)], dtype=torch.float64)
                 numbers[t, 0, s] = torch.tensor(skill.gain, dtype=torch.float64)
                 numbers[t, 1, s] = numbers[t, 0, s] * (offsets[0] + offsets[1] - offsets[2])
-                effort[t, s, 3] = skill.gripper
+                effort[t, s, layout.gripper] = layout.closes * skill.gripper
         fixed = torch.tensor([constants] * len(found), dtype=torch.float64)
         (target, moved), (gain, shift) = place.flatten(2).unbind(1), numbers.flatten(2).unbind(1)
         self._tables = TaskTables(index, _Tables(target, moved, gain, shift, effort, fixed), "tasks without skills")
@@ -85,20 +88,22 @@ class SkillProgram(nn.Module):
         """The action of each skill.
 
         Args:
-            observation: (..., 39) float, Meta-World's vector, metres.
+            observation: (..., D) float, as the tasks' layout says; Meta-World's 39 numbers, metres.
             task_id: (...) int64.
 
         Returns:
-            (..., S, 4) of the observation's dtype: displacement xyz and gripper effort, each in [-1, 1]; zeros
-            beyond the task's last skill. A task without skills is a :class:`ValueError`.
+            (..., S, A) of the observation's dtype: an action of the layout, in Meta-World displacement xyz and gripper
+            effort, each in [-1, 1]; zeros beyond the task's last skill. A task without skills is a :class:`ValueError`.
         """
-        if observation.shape[-1:] != (OBSERVATION_SIZE,) or task_id.shape != observation.shape[:-1]:
+        size = self.layout.size
+        if observation.shape[-1:] != (size,) or task_id.shape != observation.shape[:-1]:
             got = f"{tuple(observation.shape)} and {tuple(task_id.shape)}"
-            raise ValueError(f"observation must be of shape (..., {OBSERVATION_SIZE}) and task_id of (...), got {got}")
+            raise ValueError(f"observation must be of shape (..., {size}) and task_id of (...), got {got}")
         tables = self._tables.select(task_id.reshape(-1), observation)
-        state = torch.cat((observation.reshape(-1, OBSERVATION_SIZE), tables.constants), 1)
+        state = torch.cat((observation.reshape(-1, size), tables.constants), 1)
         way = state.gather(1, tables.target) - state.gather(1, tables.moved)
         shift = torch.addcmul(tables.shift, tables.gain, way).clamp_(-1.0, 1.0)
         action = tables.effort.clone()
-        action[..., :3] = shift.unflatten(1, (-1, 3))
-        return action.reshape(*task_id.shape, self.num_skills, 4)
+        begin = self.layout.displacement
+        action[..., begin : begin + 3] = shift.unflatten(1, (-1, 3))
+        return action.reshape(*task_id.shape, self.num_skills, self.layout.action_size)

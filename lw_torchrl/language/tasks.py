@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from hashlib import blake2b
 from importlib.resources import files
@@ -15,13 +15,21 @@ from typing import TYPE_CHECKING, Any
 
 from lw_torchrl._checks import check_choice, check_fields, checked, nearest, shown, unknown_name
 from lw_torchrl._files import read_toml
-from lw_torchrl.language.named_objects import GRIPPER, Coordinate, NamedObject, read_objects, write_objects
+from lw_torchrl.language.layout import METAWORLD, Layout
+from lw_torchrl.language.named_objects import (
+    GRIPPER,
+    Coordinate,
+    NamedObject,
+    check_inside,
+    read_objects,
+    write_objects,
+)
 
 if TYPE_CHECKING:
     from torch import Tensor
 
 
-_NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
+_NAME = re.compile(r"([a-z][a-z0-9]*/)?[a-z][a-z0-9]*(-[a-z0-9]+)*")
 _OWN_IDS = 2**31 - 50  # so that an id is an int32 too
 _MOST_OBJECTS = 64  # the base queries are of all pairs of them
 
@@ -35,20 +43,27 @@ class Task:
     """One manipulation task in words.
 
     Attributes:
-        name: "drawer-open", Meta-World's name without its version; or your own, lower-case words joined by hyphens.
+        name: "drawer-open", Meta-World's name without its version; or your own, lower-case words joined by hyphens,
+            after a suite's name and a slash if it is one of a suite: "fetch/push".
         description: one sentence that says what is to be done.
         objects: at most 64 with different names: the robot's gripper first, the points that we named last.
+        layout: what the numbers of its observations and actions are.
     """
 
     name: str
     description: str
     objects: tuple[NamedObject, ...]
+    layout: Layout = METAWORLD
 
     def __post_init__(self) -> None:
         check_fields(self)
         if not isinstance(self.objects, tuple) or not all(isinstance(one, NamedObject) for one in self.objects):
             raise TypeError(f"objects of task {self.name!r} must be a tuple of NamedObject, got {shown(self.objects)}")
         _check_name(self.name)
+        if not isinstance(self.layout, Layout):
+            raise TypeError(f"layout of task {self.name!r} must be a Layout, got {shown(self.layout)}")
+        for named in self.objects:
+            check_inside(named, self.layout.size)
         if len(self.objects) > _MOST_OBJECTS:
             count = f"at most {_MOST_OBJECTS}, the gripper included, got {len(self.objects)}"
             raise ValueError(f"objects of task {self.name!r} must be {count}")
@@ -66,7 +81,7 @@ class Task:
     @cached_property
     def published(self) -> Task:
         """The task without the points that we named."""
-        return Task(self.name, self.description, tuple(named for named in self.objects if not named.ours))
+        return replace(self, objects=tuple(named for named in self.objects if not named.ours))
 
     def object(self, name: str) -> NamedObject:
         """The object called ``name``; :class:`ValueError` names the nearest if there is none."""
@@ -76,7 +91,7 @@ class Task:
         raise unknown_name(f"object of task {self.name!r}", name, self.object_names)
 
     def positions(self, observation: Tensor) -> dict[str, Tensor]:
-        """Where each object is: (..., 39) float, metres, to name -> (..., 3) of the same dtype, metres."""
+        """Where each object is: (..., D) float, metres, to name -> (..., 3) of the same dtype, metres."""
         import torch  # here, since words alone should not wait for it
 
         def coordinate(at: Coordinate, shift: float) -> Tensor:
@@ -93,6 +108,8 @@ class Task:
             {'reach target': 'obs[36:39]'}
         """
         row = {"description": self.description, **write_objects(self.objects)}
+        if self.layout != METAWORLD:
+            row["layout"] = self.layout.to_json()
         try:
             same = Task.from_json(self.name, row) == self
         except TaskError:
@@ -102,17 +119,21 @@ class Task:
         return {key: found for key, found in row.items() if found}
 
     @classmethod
-    def from_json(cls, name: str, row: Any) -> Task:
-        """The task of a row of tasks.toml, as :meth:`to_json` gives it; any other value is a :class:`TaskError`."""
+    def from_json(cls, name: str, row: Any, layout: Layout = METAWORLD) -> Task:
+        """The task of a row of tasks.toml, as :meth:`to_json` gives it; any other value is a :class:`TaskError`.
+
+        ``layout`` counts where the row states none.
+        """
         try:
             if not isinstance(row, Mapping):
                 raise ValueError(f"must be a table, got {shown(row)}")
             for key in row:
-                check_choice("key", key, ("description", "objects", "points", "mt10"))
+                check_choice("key", key, ("description", "objects", "points", "layout", "mt10"))
             description = row.get("description")
             if not isinstance(description, str) or not description.strip():
                 raise ValueError(f"description must be a sentence, got {shown(description)}")
-            return cls(name, description, read_objects(row))
+            layout = Layout.from_json(row["layout"]) if "layout" in row else layout
+            return cls(name, description, read_objects(row, layout), layout)
         except (ValueError, TypeError) as error:
             raise TaskError(f"task {shown(name)}: {error}") from error
 
@@ -216,6 +237,15 @@ def named_tasks(tasks: TaskList, *, known: Tasks = TASKS) -> dict[str, Task]:
 def get_task(task: str | Task, tasks: Tasks = TASKS) -> Task:
     """The :class:`Task` of a name among ``tasks``; a Task is returned as it is."""
     return task if isinstance(task, Task) else tasks[check_task(task, tasks)]
+
+
+def one_layout(tasks: Iterable[Task]) -> Layout:
+    """The layout of tasks that are used together; :class:`ValueError` if they have different ones."""
+    found = {task.layout: task.name for task in tasks}
+    if len(found) != 1:
+        told = ", ".join(f"{layout.name!r} ({name})" for layout, name in found.items())
+        raise ValueError(f"tasks must be of one layout, got {told}; use a program, buffer or policy for each suite")
+    return next(iter(found))
 
 
 @checked

@@ -18,6 +18,7 @@ from lw_torchrl.modules.relative_positions import PlanFocus
 from lw_torchrl.modules.residual_actor import ResidualActor
 from lw_torchrl.modules.scripted_skill_actor import ScriptedSkillActor
 from lw_torchrl.modules.state_query_evaluator import StateQueryEvaluator
+from lw_torchrl.modules.transferred_actor import TransferredActor
 
 __all__ = [
     "EVALUATORS",
@@ -45,6 +46,7 @@ __all__ = [
     "ResidualActor",
     "ScriptedSkillActor",
     "StateQueryEvaluator",
+    "TransferredActor",
     "Value",
     "make_policy",
     "plan_actor_value",

@@ -58,7 +58,7 @@ class ActorEnsemble(Policy):
                 "members must have no HeldEvaluator of their own, an environment holds one evaluator's answers: let "
                 "members read qaf, and give the HeldEvaluator to evaluate(..., evaluator=)"
             )
-        self.plans, self.tasks = first.plans, first.tasks
+        self.plans, self.tasks, self.layout = first.plans, first.tasks, first.layout
         self.in_keys = first.in_keys
         self.out_keys = first.out_keys_source[: 1 if first.plans is None else 2]
         self.draws = any(member.draws for member in members)

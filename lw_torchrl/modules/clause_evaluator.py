@@ -10,7 +10,6 @@ import torch
 from torch import Tensor, nn
 
 from lw_torchrl._checks import shown, unknown_name
-from lw_torchrl.language.observation import OBSERVATION_SIZE, OPENING
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.language.queries import Clause
 from lw_torchrl.language.relations import PREDICATES
@@ -20,8 +19,6 @@ from lw_torchrl.language.text import TextEncoder, encoded
 from lw_torchrl.modules.networks import unit_scale
 from lw_torchrl.modules.query_evaluator import QueryEvaluator
 
-NOTHING = OBSERVATION_SIZE
-"""The index of a 0 that stands behind an observation's 39 numbers."""
 _PADDING = -1e4  # as QueryProgram.logits has it
 
 
@@ -196,15 +193,16 @@ def _vectors(texts: Sequence[str], encoder: TextEncoder | None) -> Tensor:
 def _position(task: Task, name: str) -> tuple[list[int], list[float]]:
     """Where in an observation an object's three numbers stand, and what is added to them."""
     found = task.object(name)
-    index = [at if isinstance(at, int) else NOTHING for at in found.position]
+    nothing = task.layout.size  # the index of a 0 that stands behind an observation's numbers
+    index = [at if isinstance(at, int) else nothing for at in found.position]
     fixed = [0.0 if isinstance(at, int) else at for at in found.position]
     return index, [one + offset for one, offset in zip(fixed, found.offset, strict=True)]
 
 
 def _ends(clause: Clause, task: Task) -> tuple[list[int], list[int], list[float]]:
-    nothing = [NOTHING] * 3
+    nothing = [task.layout.size] * 3
     if clause.predicate in ("open", "closed"):
-        return [NOTHING, NOTHING, OPENING], nothing, [0.0] * 3
+        return [*nothing[:2], task.layout.opening], nothing, [0.0] * 3
     first, shift = _position(task, clause.subject)
     if clause.object is None:
         return first, nothing, shift

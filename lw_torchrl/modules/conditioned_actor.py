@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 from torchrl.envs import Transform
 
-from lw_torchrl._checks import checked
+from lw_torchrl._checks import check_int, checked
 from lw_torchrl._keys import as_keys, check_apart, dispatched, key_beside, read, write
 from lw_torchrl.language.tasks import Task
 from lw_torchrl.modules.encoder import Encoder, Encoding
@@ -46,6 +46,8 @@ class ConditionedActor(Policy):
         distribution: None for a deterministic actor; for RL "tanh_normal", a Normal through tanh, or "normal", about
             the action, clipped by the environment.
         init_std: the Normal's initial standard deviation, in every state: before tanh for "tanh_normal".
+        action_size: A, the numbers of an action; None for those of the tasks' layout. A policy that was trained with
+            another robot, see :class:`~lw_torchrl.modules.TransferredActor`, has that robot's.
         out_keys: other names for what it writes, in the order above; nested ones too.
         **options: of the encoder.
 
@@ -74,6 +76,7 @@ class ConditionedActor(Policy):
         squash: bool = True,
         distribution: DistributionName | None = None,
         init_std: float = 0.3,
+        action_size: int | None = None,
         out_keys: Sequence[NestedKey] | None = None,
         **options: Any,
     ) -> None:
@@ -88,12 +91,16 @@ class ConditionedActor(Policy):
                 "actor.stochastic()"
             )
         head: Any = dict(width=width, depth=depth, squash=squash, distribution=distribution, init_std=init_std)
-        self.head = ActionHead(self.encoder.width, **head)
+        self.layout = self.encoder.layout
+        actions = self.layout.action_size if action_size is None else check_int("action_size", action_size, minimum=1)
+        self.head = ActionHead(self.encoder.width, actions=actions, **head)
         self.plans, self.tasks, self.in_keys = self.encoder.plans, self.encoder.tasks, self.encoder.in_keys
         extras = () if self.plans is None else ("skill_weights", "skill_latent")
         drawn = () if distribution is None else ("loc", "scale", "action_log_prob")
         self._written = ("action", *extras, *drawn)
         self.config = {**self.encoder.config, **head}
+        if action_size is not None:
+            self.config["action_size"] = action_size
         self.out_keys = as_keys("out_keys", out_keys, self._written)
 
     @property

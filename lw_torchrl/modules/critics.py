@@ -16,7 +16,7 @@ from lw_torchrl._checks import check_int, checked, passes_on
 from lw_torchrl._keys import as_keys, check_apart, check_key, dispatched, read, write
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.modules.encoder import Encoder
-from lw_torchrl.modules.networks import ACTION_SIZE, DistributionName, check_width, head
+from lw_torchrl.modules.networks import DistributionName, check_width, head
 from lw_torchrl.modules.plan_conditioned_actor import PlanConditionedActor
 from lw_torchrl.modules.plan_encoder import PlanEncoder
 
@@ -48,7 +48,7 @@ class Value(TensorDictModuleBase):
     """
 
     _written = ("state_value", "state_values")
-    _more = 0
+    _of_action = False  # whether it reads one
     _numbers = 1  # of a value
 
     @checked
@@ -68,8 +68,9 @@ class Value(TensorDictModuleBase):
         self.in_keys: list[NestedKey] = list(encoder.in_keys)
         self.out_keys = as_keys("out_keys", out_keys, self._written[: 1 if ensemble == 1 else 2])
         check_apart(self.in_keys, self.out_keys)
+        more = encoder.layout.action_size if self._of_action else 0
         self.heads = nn.ModuleList(
-            head(encoder.width + self._more, self._numbers, width, depth, layer_norm=layer_norm)
+            head(encoder.width + more, self._numbers, width, depth, layer_norm=layer_norm)
             for _ in range(check_int("ensemble", ensemble, minimum=1))
         )
 
@@ -109,7 +110,7 @@ class QValue(Value):
     """
 
     _written = ("state_action_value", "state_action_values")
-    _more = ACTION_SIZE
+    _of_action = True
 
     @passes_on(Value.__init__)
     @checked

@@ -14,7 +14,7 @@ from lw_torchrl._checks import checked, passes_on
 from lw_torchrl._keys import as_keys, check_apart
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.task_index import TaskIndex
-from lw_torchrl.language.tasks import MT50, TASKS, Task, named_tasks
+from lw_torchrl.language.tasks import MT50, TASKS, Task, named_tasks, one_layout
 from lw_torchrl.language.text import TextEncoder, encoded
 from lw_torchrl.modules.conditioned_actor import ConditionedActor
 from lw_torchrl.modules.encoder import Encoder, Encoding
@@ -58,7 +58,7 @@ class DescriptorEncoder(Encoder):
         if features == "opening":
             raise ValueError("features='opening' shows nothing of where things are; only plans with roles or focus do")
         self.definitions = named_tasks(tasks)
-        self.tasks = tuple(self.definitions)
+        self.tasks, self.layout = tuple(self.definitions), one_layout(self.definitions.values())
         self.in_keys = as_keys("in_keys", in_keys, ("observation", "task_id"))
         self.out_keys = as_keys("out_keys", out_keys, ("encoding",))
         check_apart(self.in_keys, self.out_keys)
@@ -82,7 +82,7 @@ class DescriptorEncoder(Encoder):
         self.register_buffer("text_vectors", vectors, persistent=False)
         self.latent_size = latent_size
         self.texts = text_to_latent(found.shape[1], latent_size, encoder_width, encoder_depth)
-        self.features = ObservationFeatures(features, feature_noise)
+        self.features = ObservationFeatures(features, feature_noise, self.layout)
 
     def definition(self, task: str) -> Task | None:
         return self.definitions.get(task)

@@ -12,6 +12,7 @@ from torch import Tensor
 from torchrl.envs import Transform
 
 from lw_torchrl._keys import dispatched, read, write
+from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.language.tasks import TASKS, Task
 from lw_torchrl.language.text import TextEncoder
@@ -38,11 +39,13 @@ class Prepared(TensorDictModuleBase):
         config: the keyword arguments that make it again, as JSON.
         plans: the plans that it is conditioned on; None for none.
         tasks: the names of the tasks that it knows.
+        layout: what the observations and actions are: its plans', or Meta-World's.
     """
 
     config: dict[str, Any]
     plans: Plans | None = None
     tasks: tuple[str, ...]
+    layout: Layout = METAWORLD
 
     def definition(self, task: str) -> Task | None:
         """What it knows of a task: its plan's definition, or the shipped one; None if it knows none."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from math import sqrt
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -65,7 +66,7 @@ class PointingNetwork(ClauseNetwork):
     numbers = 4
     ends = 2 * KEYS + 2
 
-    def __init__(self, encoder: nn.Module, features: int, *, cameras: int, names: int, **trunk: int) -> None:
+    def __init__(self, encoder: nn.Module, features: int, *, cameras: int, names: int, **trunk: Any) -> None:
         super().__init__(**trunk)
         self.encoder, self.cameras = encoder, cameras
         self.key = nn.Conv2d(features, KEYS, 1)

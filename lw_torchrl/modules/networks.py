@@ -14,8 +14,6 @@ from torchrl.modules import MLP, IndependentNormal, TanhNormal
 
 from lw_torchrl._checks import check_choice, check_flag, check_int, check_scale
 
-ACTION_SIZE = 4
-
 
 @contextmanager
 def evaluating(network: nn.Module) -> Iterator[None]:
@@ -77,6 +75,7 @@ class ActionHead(nn.Module):
 
     Args:
         size: of the encoding.
+        actions: A, the numbers of an action.
         width, depth, squash, distribution, init_std: as for :class:`ConditionedActor`.
     """
 
@@ -88,6 +87,7 @@ class ActionHead(nn.Module):
         squash: bool = True,
         distribution: DistributionName | None = None,
         init_std: float = 0.3,
+        actions: int = 4,
     ) -> None:
         super().__init__()
         check_flag("squash", squash)
@@ -97,20 +97,20 @@ class ActionHead(nn.Module):
             raise ValueError("squash must be true for the distribution 'tanh_normal', which squashes; take 'normal'")
         if check_scale("init_std", init_std) <= _LEAST_STD:
             raise ValueError(f"init_std must be over {_LEAST_STD}, got {init_std}")
-        self.squash, self.distribution = squash, distribution
-        self.network = head(size, ACTION_SIZE * (1 if distribution is None else 2), width, depth)
+        self.squash, self.distribution, self.actions = squash, distribution, actions
+        self.network = head(size, actions * (1 if distribution is None else 2), width, depth)
         self._first = math.log(math.expm1(init_std - _LEAST_STD)) if init_std < 20 else init_std
         if distribution is not None:  # the same at every state, until it is trained
             with torch.no_grad():
-                self.network[-1].weight[ACTION_SIZE:] = 0.0
-                self.network[-1].bias[ACTION_SIZE:] = 0.0
+                self.network[-1].weight[actions:] = 0.0
+                self.network[-1].bias[actions:] = 0.0
 
     def forward(self, encoding: Tensor) -> Tensor:
-        """(..., size) float32 to the action (..., 4) float32, the distribution's mode where there is one."""
+        """(..., size) float32 to the action (..., A) float32, the distribution's mode where there is one."""
         return self.mode(self.loc_scale(encoding)[0]) if self.distribution else self._squashed(self.network(encoding))
 
     def loc_scale(self, encoding: Tensor) -> tuple[Tensor, Tensor]:
-        """(..., size) float32 to the Normal's mean and standard deviation, (..., 4) float32 each."""
+        """(..., size) float32 to the Normal's mean and standard deviation, (..., A) float32 each."""
         loc, scale = self.network(encoding).chunk(2, -1)
         if self.distribution == "normal":
             loc = self._squashed(loc)
@@ -133,5 +133,5 @@ class ActionHead(nn.Module):
         for own, theirs in zip([*self.network][:-1], [*other.network][:-1], strict=True):
             own.load_state_dict(theirs.state_dict())
         with torch.no_grad():
-            self.network[-1].weight[:ACTION_SIZE] = other.network[-1].weight
-            self.network[-1].bias[:ACTION_SIZE] = other.network[-1].bias
+            self.network[-1].weight[: self.actions] = other.network[-1].weight
+            self.network[-1].bias[: self.actions] = other.network[-1].bias

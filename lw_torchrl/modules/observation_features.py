@@ -11,32 +11,35 @@ from torch import Tensor, nn
 from torchrl.objectives import add_random_module
 
 from lw_torchrl._checks import check_choice, check_scale
-from lw_torchrl.language.observation import HAND, OBSERVATION_SIZE, OPENING, POSITIONS
+from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.value_checks import check_finite
 
 Features = Literal["raw", "differences", "relative", "opening", "both"]
 _FINE, _COARSE = 0.02, 0.1  # metres: where the two squashed copies of each difference bend
 
 
-def relative(observation: Tensor) -> Tensor:
-    """The pairwise differences between hand, both objects and goal, (..., 39) to (..., 54).
+def relative(observation: Tensor, layout: Layout = METAWORLD) -> Tensor:
+    """The pairwise differences between hand, things and goal: of Meta-World's two things (..., 39) to (..., 54).
 
-    Six differences of three metres each, the same through tanh at 2 cm and at 10 cm. Differences to a second object
-    that the task does not have are zero.
+    Differences of three metres each, the same through tanh at 2 cm and at 10 cm. Differences to a thing behind the
+    first that the task does not have are zero.
     """
-    places = [observation[..., place] for place in POSITIONS]
-    absent = (places[2] == 0).all(-1, keepdim=True)
+    places = [observation[..., place] for place in layout.positions]
+    absent = {n: (places[n] == 0).all(-1, keepdim=True) for n in range(2, len(places) - 1)}
     pairs = []
-    for first, second in combinations(range(4), 2):
+    for first, second in combinations(range(len(places)), 2):
         difference = places[second] - places[first]
-        pairs.append(torch.where(absent, 0.0, difference) if 2 in (first, second) else difference)
+        for thing in {first, second} & absent.keys():
+            difference = torch.where(absent[thing], 0.0, difference)
+        pairs.append(difference)
     d = torch.cat(pairs, -1)
     return torch.cat((d, *squash(d)), -1)
 
 
-def differences(observation: Tensor) -> Tensor:
+def differences(observation: Tensor, layout: Layout = METAWORLD) -> Tensor:
     """:func:`relative`, the hand's height and the gripper's opening, (..., 39) to (..., 56)."""
-    return torch.cat((relative(observation), observation[..., HAND.stop - 1 : OPENING + 1]), -1)
+    height, opening = (observation[..., at : at + 1] for at in (layout.hand + 2, layout.opening))
+    return torch.cat((relative(observation, layout), height, opening), -1)
 
 
 def squash(difference: Tensor) -> tuple[Tensor, Tensor]:
@@ -44,20 +47,22 @@ def squash(difference: Tensor) -> tuple[Tensor, Tensor]:
     return torch.tanh(difference / _FINE), torch.tanh(difference / _COARSE)
 
 
-_KINDS: dict[str, tuple[int, Callable[[Tensor], Tensor]]] = {
-    "raw": (OBSERVATION_SIZE, lambda observation: observation),
-    "differences": (56, differences),
-    "relative": (54, relative),
-    "opening": (1, lambda observation: observation[..., OPENING : OPENING + 1]),
-    "both": (OBSERVATION_SIZE + 56, lambda observation: torch.cat((observation, differences(observation)), -1)),
+_KINDS: dict[str, Callable[[Tensor, Layout], Tensor]] = {
+    "raw": lambda observation, layout: observation,
+    "differences": differences,
+    "relative": relative,
+    "opening": lambda observation, layout: observation[..., layout.opening : layout.opening + 1],
+    "both": lambda observation, layout: torch.cat((observation, differences(observation, layout)), -1),
 }
+TRANSFERS = ("opening",)
+"""The features that mean the same in every layout."""
 
 
-def check_observation(observation: Tensor) -> None:
-    """Raise :class:`ValueError` unless it is (..., 39) float32."""
-    if observation.shape[-1:] != (OBSERVATION_SIZE,) or observation.dtype != torch.float32:
+def check_observation(observation: Tensor, layout: Layout) -> None:
+    """Raise :class:`ValueError` unless it is (..., D) float32, of a layout."""
+    if observation.shape[-1:] != (layout.size,) or observation.dtype != torch.float32:
         raise ValueError(
-            f"observation must be float32 of shape (..., {OBSERVATION_SIZE}), got {observation.dtype} of shape "
+            f"observation must be float32 of shape (..., {layout.size}), got {observation.dtype} of shape "
             f"{tuple(observation.shape)}"
         )
 
@@ -70,6 +75,7 @@ class ObservationFeatures(nn.Module):
     Args:
         kind: "raw", the 39 numbers; "differences", see :func:`differences`; "relative", see :func:`relative`;
             "opening", the gripper's opening alone; "both", the 39 numbers and the differences.
+        layout: of the observations.
         noise: standard deviation of the noise, in standard deviations of each feature.
 
     Attributes:
@@ -80,18 +86,33 @@ class ObservationFeatures(nn.Module):
     mean: Tensor
     std: Tensor
 
-    def __init__(self, kind: Features = "differences", noise: float = 0.0) -> None:
+    def __init__(self, kind: Features = "differences", noise: float = 0.0, layout: Layout = METAWORLD) -> None:
         super().__init__()
+        self.layout = layout
         self.noise = check_scale("feature_noise", noise)
         self.kind = check_choice("features", kind, _KINDS)
-        self.width, _ = _KINDS[kind]
+        self.width = _KINDS[kind](torch.zeros(layout.size), layout).shape[-1]
         self.register_buffer("mean", torch.zeros(self.width))
         self.register_buffer("std", torch.ones(self.width))
 
     def _select(self, observation: Tensor) -> Tensor:
-        check_observation(observation)
+        check_observation(observation, self.layout)
         check_finite("observation", observation)
-        return _KINDS[self.kind][1](observation)
+        return _KINDS[self.kind](observation, self.layout)
+
+    def for_layout(self, layout: Layout) -> ObservationFeatures:
+        """The same statistics, shared, for observations of another layout; :class:`ValueError` if they do not carry
+        over."""
+        if layout == self.layout:
+            return self
+        if self.kind not in TRANSFERS:
+            raise ValueError(
+                f"features={self.kind!r} of layout {self.layout.name!r} do not carry over to {layout.name!r}; those "
+                f"that do are {', '.join(map(repr, TRANSFERS))} with roles=True"
+            )
+        other = ObservationFeatures(self.kind, self.noise, layout)
+        other.mean, other.std = self.mean, self.std
+        return other
 
     @torch.no_grad()
     def fit(self, observation: Tensor, weights: Tensor | None = None) -> None:
@@ -101,7 +122,7 @@ class ObservationFeatures(nn.Module):
             observation: (..., 39) float32, R in all; finite.
             weights: of each, (R,) float32, with the sum 1; None for equal ones.
         """
-        found = self._select(observation.reshape(-1, OBSERVATION_SIZE))
+        found = self._select(observation.reshape(-1, self.layout.size))
         if weights is None:
             mean, std = found.mean(0), found.std(0, unbiased=False)
         else:

@@ -127,6 +127,9 @@ class PlanConditionedActor(ConditionedActor):
         """An actor that carries out other plans with the same weights: training either trains both."""
         encoder = self.encoder.with_plans(as_plans(plans))
         text_encoder = self.encoder.text_encoder
-        other = PlanConditionedActor(plans, evaluator=encoder.evaluator, text_encoder=text_encoder, **self.config)
+        options = dict(self.config)
+        if self.head.actions != encoder.layout.action_size:
+            options["action_size"] = self.head.actions
+        other = PlanConditionedActor(plans, evaluator=encoder.evaluator, text_encoder=text_encoder, **options)
         other.encoder, other.head = encoder, self.head
         return other.train(self.training)

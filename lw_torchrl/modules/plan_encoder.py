@@ -149,7 +149,7 @@ class PlanEncoder(ReadsPlans, Encoder):
         self.roles = PlanRoles(self.plans, self.attention.tables, feature_noise, jitter) if roles else None
         about = mentioned(self.plans, self.attention.tables, self.roles)
         self.register_buffer("mentioned", about, persistent=False)
-        self.features = ObservationFeatures(features, feature_noise)
+        self.features = ObservationFeatures(features, feature_noise, self.plans.layout)
 
     @property
     def width(self) -> int:
@@ -182,9 +182,10 @@ class PlanEncoder(ReadsPlans, Encoder):
         in_force = weights > IN_FORCE
         if probability := self.config["swap_unmentioned"]:
             kept = (in_force.unsqueeze(-1) & self.mentioned[rows]).any(-2)
-            observation = swap_unmentioned(observation, kept, probability)
+            observation = swap_unmentioned(observation, kept, probability, self.plans.layout)
         if probability := self.config["hide_opening"]:
-            observation = hide_opening(observation, (in_force & self.closing[rows]).any(-1), probability)
+            closes_now = (in_force & self.closing[rows]).any(-1)
+            observation = hide_opening(observation, closes_now, probability, self.plans.layout)
         return observation
 
     def fit_contacts(self, observation: Tensor, task_id: Tensor) -> None:
@@ -222,7 +223,7 @@ class PlanEncoder(ReadsPlans, Encoder):
     def with_plans(self, plans: Plans | Mapping[str, ConditionalPlan]) -> PlanEncoder:
         evaluator = None if self.evaluator is None else self.evaluator.with_plans(as_plans(plans))
         other = PlanEncoder(plans, evaluator=evaluator, text_encoder=self.text_encoder, **self.config)
-        other.texts, other.features = self.texts, self.features
+        other.texts, other.features = self.texts, self.features.for_layout(other.plans.layout)
         if self.roles is not None and other.roles is not None:
             other.roles.share_contact(self.roles)
         return other.train(self.training)

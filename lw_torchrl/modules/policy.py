@@ -17,7 +17,6 @@ from lw_torchrl._keys import dispatched, write
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.encoder import Prepared
-from lw_torchrl.modules.networks import ACTION_SIZE
 from lw_torchrl.transforms.qaf import QAFTransform
 
 if TYPE_CHECKING:
@@ -29,6 +28,7 @@ POLICIES: dict[str, str | type[Policy]] = {
     "PlanConditionedActor": "lw_torchrl.modules.plan_conditioned_actor",
     "ResidualActor": "lw_torchrl.modules.residual_actor",
     "ScriptedSkillActor": "lw_torchrl.modules.scripted_skill_actor",
+    "TransferredActor": "lw_torchrl.modules.transferred_actor",
 }
 """The name of a class, as in policy files, to the module that has the class, or to the class itself."""
 
@@ -101,9 +101,9 @@ class Policy(Prepared):
 
     @property
     def spec(self) -> Composite:
-        """Of the action, which losses ask for: (4,) float32 in [-1, 1]."""
+        """Of the action, which losses ask for: (A,) float32, Meta-World's 4, in [-1, 1]."""
         spec = Composite()
-        spec[self.out_keys_source[0]] = Bounded(-1.0, 1.0, (ACTION_SIZE,))
+        spec[self.out_keys_source[0]] = Bounded(-1.0, 1.0, (self.layout.action_size,))
         return spec
 
     @classmethod

@@ -142,7 +142,7 @@ class ReadsPlans(Prepared):
     ) -> None:
         """Take the arguments that they share; ``own_keys`` are ``in_keys`` without those that the evaluator adds."""
         self.plans = as_plans(plans)
-        self.tasks = tuple(self.plans)
+        self.tasks, self.layout = tuple(self.plans), self.plans.layout
         if evaluator is not None and evaluator.plans.fingerprint != self.plans.fingerprint:
             raise ValueError("evaluator must be of the actor's plans, it answers the conditions of others")
         self.evaluator = evaluator

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from lw_torchrl._checks import check_scale
+from lw_torchrl.language.layout import places
 from lw_torchrl.language.named_objects import GRIPPER, NamedObject, coordinate_index
-from lw_torchrl.language.observation import FIRST, HAND, OBSERVATION_SIZE, places
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.language.roles import plan_roles, role_object
 from lw_torchrl.language.skills import closes, presses, pushes
@@ -54,14 +54,17 @@ class RelativePositions(nn.Module):
         self.width = 9 * number
         constants = [0.0]
         shape = (len(plans), plans.num_steps, number, 3)
-        index = torch.full((2, *shape), OBSERVATION_SIZE)  # the constant 0
+        self.layout, size = plans.layout, plans.layout.size
+        index = torch.full((2, *shape), size)  # the constant 0
         offset = torch.zeros(shape)
         for task, plan in plans.items():
             for step, found in enumerate(pairs(plan)):
                 for one, ends in enumerate(found):
                     at = (tables.index.row(task), step, one)
                     for side, thing in enumerate(ends):
-                        index[(side, *at)] = torch.tensor([coordinate_index(c, constants) for c in thing.position])
+                        index[(side, *at)] = torch.tensor(
+                            [coordinate_index(c, constants, size) for c in thing.position]
+                        )
                         offset[at] += torch.tensor(thing.offset) * (2 * side - 1)
         # The tables come from the plans, not from training: they are not part of the state that is saved.
         self.register_buffer("begin", index[0], persistent=False)
@@ -75,7 +78,7 @@ class RelativePositions(nn.Module):
         :class:`RandomYaw` turned the observation.
         """
         if yaw is not None:
-            observation = turn_observation(observation, -yaw)
+            observation = turn_observation(observation, -yaw, self.layout)
         known = torch.cat((observation, self.constants.expand(*observation.shape[:-1], -1)), -1)
         begin, end = self.begin[rows], self.end[rows]  # (..., S, P, 3)
         flat = (*begin.shape[: rows.ndim], -1)
@@ -184,7 +187,8 @@ class PlanRoles(RelativePositions):
         first object, pushes or pulls it, or moves it. What is pressed from above has none: the gripper goes through it.
         """
         held = (weights * self.acts[rows]).sum(-1) > 0.5
-        away = observation[:, HAND] - observation[:, FIRST]
+        hand, first, *_ = self.layout.positions
+        away = observation[:, hand] - observation[:, first]
         for row in rows[held].unique().tolist():
             self.contact[row] = away[held & (rows == row)].median(0).values
         self.fitted.fill_(True)
@@ -220,4 +224,4 @@ class PlanRoles(RelativePositions):
 def _is_first(plan: ConditionalPlan, name: str) -> bool:
     """Whether a name is that of the first object itself, not of a point beside it."""
     thing = role_object(plan.definition, name)
-    return thing.position == places(FIRST) and not any(thing.offset)
+    return thing.position == places(plan.definition.layout.things[0].xyz) and not any(thing.offset)

@@ -16,7 +16,7 @@ from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.tasks import Task
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.conditioned_actor import ConditionedActor
-from lw_torchrl.modules.networks import ACTION_SIZE, head
+from lw_torchrl.modules.networks import head
 from lw_torchrl.modules.plan_encoder import IN_FORCE, PlanEncoder
 from lw_torchrl.modules.policy import Policy, from_description
 
@@ -82,7 +82,8 @@ class ResidualActor(Policy):
         self.base = base.requires_grad_(False).eval()
         self.plans, self.tasks = base.plans, base.tasks
         self.in_keys, self.out_keys = base.in_keys, base.out_keys_source[:1]
-        self.network = head(base.encoder.width + ACTION_SIZE, ACTION_SIZE, width, depth)
+        self.layout, actions = base.layout, base.layout.action_size
+        self.network = head(base.encoder.width + actions, actions, width, depth)
         nn.init.zeros_(self.network[-1].weight)
         nn.init.zeros_(self.network[-1].bias)
         self.config = {"scale": check_scale("scale", scale), "width": width, "depth": depth}

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torchrl.modules import MLP
 
 from lw_torchrl._checks import check_int, checked
-from lw_torchrl.language.observation import OPENING, POSITIONS
+from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.clause_evaluator import ClauseEvaluator, Clauses
@@ -20,7 +20,6 @@ from lw_torchrl.modules.observation_features import check_observation
 MOST = 30.0
 """The size of the largest logit of a clause: a probability of 1e-13."""
 _SCALES = (0.005, 0.02, 0.1, 0.5)  # metres: where the squashed copies of d bend
-_SLOTS = len(POSITIONS) + 2  # the opening, and nothing, beside the positions
 
 
 class ClauseNetwork(nn.Module):
@@ -39,13 +38,18 @@ class ClauseNetwork(nn.Module):
         width, depth: hidden layers of the trunk, and the width of the text's.
         predicates: P, how many there are; 0 for a network that reads texts.
         text_size: E, the numbers of a text's vector, where it reads texts.
+        layout: of the observations.
     """
 
     numbers: int = 3  # of a difference
-    ends: int = 2 * _SLOTS  # numbers of a text's vector that say which two things it is about
+    ends: int = 0  # numbers of a text's vector that say which two things it is about; 0: one for each slot, twice
 
-    def __init__(self, width: int, depth: int, *, predicates: int = 0, text_size: int = 0) -> None:
+    def __init__(
+        self, width: int, depth: int, *, predicates: int = 0, text_size: int = 0, layout: Layout = METAWORLD
+    ) -> None:
         super().__init__()
+        self.layout = layout
+        self.slots = len(layout.positions) + 2  # the opening, and nothing, beside the positions
         check_int("width", width, minimum=1)
         check_int("depth", depth, minimum=1)
         self.width, self.reads_text = width, not predicates
@@ -59,7 +63,7 @@ class ClauseNetwork(nn.Module):
         if predicates:
             self.predicates = nn.Embedding(predicates, width + 1)
         else:
-            self.texts = text_to_latent(text_size, self.ends + self.numbers + width + 1, width, 1)
+            self.texts = text_to_latent(text_size, (self.ends or 2 * self.slots) + self.numbers + width + 1, width, 1)
 
     def forward(self, observation: Tensor, clauses: Clauses, text_vectors: Tensor | None = None) -> Tensor:
         """Observations (B, 39), clauses (B, C) and texts' vectors (U, E) to logits (B, C) of size 30 at most."""
@@ -81,10 +85,10 @@ class ClauseNetwork(nn.Module):
 
     def _from_text(self, observation: Tensor, read: Tensor) -> tuple[Tensor, Tensor]:
         """d (B, C, 3), and what is asked of it (B, C, W + 1), of what is read of texts (B, C, ...)."""
-        first, second, shift, asked = read.split([_SLOTS, _SLOTS, 3, self.width + 1], -1)
-        opening = observation[..., OPENING]
+        first, second, shift, asked = read.split([self.slots, self.slots, 3, self.width + 1], -1)
+        opening = observation[..., self.layout.opening]
         zero = torch.zeros_like(opening)
-        positions = [observation[..., place] for place in POSITIONS]
+        positions = [observation[..., place] for place in self.layout.positions]
         gripper, nothing = (torch.stack((zero, zero, last), -1) for last in (opening, zero))
         slots = torch.stack([*positions, gripper, nothing], -2)
         chosen = (first.softmax(-1) - second.softmax(-1)).unsqueeze(-1) * slots.unsqueeze(-3)
@@ -134,8 +138,9 @@ class StateQueryEvaluator(ClauseEvaluator):
         text_encoder: TextEncoder | None = None,
     ) -> None:
         super().__init__(plans, structure=structure, predicates=predicates, text_encoder=text_encoder)
-        self.network = ClauseNetwork(width, depth, predicates=len(self.predicates), text_size=self.text_size)
+        sizes = {"predicates": len(self.predicates), "text_size": self.text_size}
+        self.network = ClauseNetwork(width, depth, **sizes, layout=self.plans.layout)
         self.config |= {"width": width, "depth": depth}
 
     def check_seen(self, seen: Tensor) -> None:
-        check_observation(seen)
+        check_observation(seen, self.plans.layout)

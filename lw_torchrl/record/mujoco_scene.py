@@ -12,8 +12,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl.envs.engine import RowModel
 from lw_torchrl.record.conventions import Stream, entity_path, rr, time_columns
+from lw_torchrl.suites.engine import RowModel
 
 SHOWN_GROUPS = (0, 1, 2)
 """Meta-World keeps what only collides in group 4."""

@@ -12,9 +12,11 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
 
+from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.language.skills import load_skills
 from lw_torchrl.language.tasks import Task
+from lw_torchrl.suites.suite import known_suite
 
 NOBODY = -1
 """In the place of a step's number: no step is in force alone."""
@@ -49,8 +51,8 @@ class TargetPose(NamedTuple):
 class RecordedEpisode:
     """T rows of one episode, checked, on the CPU; S is the number of steps of its plan."""
 
-    observation: NDArray[np.float32]  # T×39; metres, gripper opening in [0,1] at index 3, goal at 36:39
-    action: NDArray[np.float32]  # T×4, displacement xyz and gripper effort in [-1,1]
+    observation: NDArray[np.float32]  # T×D, as the layout says; metres, gripper opening in [0,1]
+    action: NDArray[np.float32]  # T×A, of Meta-World displacement xyz and gripper effort, in [-1,1]
     objects: dict[str, NDArray[np.float32]]  # name -> T×3 position in metres; the gripper is among them
     qaf: NDArray[np.bool_] | None  # T×S, truth of each condition
     believed: NDArray[np.bool_] | None  # T×S, what a learned evaluator takes for it
@@ -60,6 +62,7 @@ class RecordedEpisode:
     corrected: NDArray[np.float32] | None  # T, how much of a correction counts
     steps: tuple[tuple[str, str], ...]  # the S (condition, skill) texts; empty where there is no plan
     target_poses: tuple[TargetPose | None, ...] = ()  # of each step; None where its skill is no scripted one
+    layout: Layout = METAWORLD
 
     @property
     def answers(self) -> NDArray[np.bool_] | None:
@@ -99,7 +102,9 @@ class RecordedEpisode:
 
     def with_target_poses(self, task: Task) -> RecordedEpisode:
         """The episode with the target poses of its plan's skills in ``task``."""
-        scripted, positions = load_skills(), task.positions(torch.from_numpy(self.observation))
+        suite = known_suite(task.name)
+        scripted = load_skills() if suite is None or suite.skills is None else suite.skills
+        positions = task.positions(torch.from_numpy(self.observation))
         poses: list[TargetPose | None] = [None] * len(self.steps)
         for step, (_, text) in enumerate(self.steps):
             if text in scripted and scripted[text].suits(task):
@@ -115,7 +120,11 @@ class RecordedEpisode:
 
     @classmethod
     def from_rollout(
-        cls, rollout: TensorDictBase, objects: Mapping[str, Any], plan: PlanLike | None = None
+        cls,
+        rollout: TensorDictBase,
+        objects: Mapping[str, Any],
+        plan: PlanLike | None = None,
+        layout: Layout = METAWORLD,
     ) -> RecordedEpisode:
         """Check a rollout; see :meth:`lw_torchrl.RerunLogger.log_episode` for the keys and the errors."""
         if not isinstance(rollout, TensorDictBase):
@@ -146,12 +155,12 @@ class RecordedEpisode:
             return array[:, 0] if flat else array[:, : needed or None]
 
         logits = optional("qaf_logits")
-        observation = column("observation", 39)
+        observation = column("observation", layout.size)
         executed = ("next", "executed_action")
         return cls(
             observation=observation,
-            action=column("action" if rollout.get(executed, None) is None else executed, 4),
-            objects=_positions(objects, observation),
+            action=column("action" if rollout.get(executed, None) is None else executed, layout.action_size),
+            objects=_positions(objects, observation, layout),
             qaf=optional("qaf", truth=True),
             believed=None if logits is None else logits > 0,
             skill_weights=optional("skill_weights"),
@@ -159,6 +168,7 @@ class RecordedEpisode:
             reward=optional(("next", "reward"), flat=True),
             corrected=optional("action_corrected", flat=True),
             steps=steps,
+            layout=layout,
         )
 
 
@@ -177,11 +187,11 @@ def _array(value: Any, label: str, shape: tuple[int | None, ...]) -> NDArray[Any
     return array
 
 
-def _positions(objects: Any, observation: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:
+def _positions(objects: Any, observation: NDArray[np.float32], layout: Layout) -> dict[str, NDArray[np.float32]]:
     if not isinstance(objects, Mapping):
         raise TypeError(f"objects must map names to T×3 positions, got {type(objects).__name__}")
     for name in objects:
         if not isinstance(name, str) or not name:
             raise TypeError(f"objects must be named by non-empty strings, got {name!r}")
     checked = {name: _array(value, f"objects[{name!r}]", (len(observation), 3)) for name, value in objects.items()}
-    return checked if GRIPPER in checked else checked | {GRIPPER: observation[:, :3]}
+    return checked if GRIPPER in checked else checked | {GRIPPER: observation[:, layout.positions[0]]}

@@ -21,6 +21,8 @@ from torch import Tensor
 from torchrl.record.loggers import Logger
 
 from lw_torchrl._checks import check_choice, checked
+from lw_torchrl.language.layout import METAWORLD
+from lw_torchrl.language.plans import ConditionalPlan
 from lw_torchrl.record import metrics
 from lw_torchrl.record.conventions import CONTROL_PERIOD, METRIC_TIMELINE, entity_path, rr, time_columns
 from lw_torchrl.record.episode_page import send_page
@@ -301,7 +303,8 @@ class RerunLogger(Logger):
         """
         if not isinstance(task, str) or not task.strip():
             raise ValueError(f"task must be a task's name, got {task!r}")
-        episode = RecordedEpisode.from_rollout(rollout, objects, plan)
+        layout = plan.definition.layout if isinstance(plan, ConditionalPlan) else METAWORLD
+        episode = RecordedEpisode.from_rollout(rollout, objects, plan, layout)
         return self.add_page(Heading(task), episode, name=name)
 
     def add_page(

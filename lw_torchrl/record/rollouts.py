@@ -20,12 +20,12 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from lw_torchrl._checks import checked, missing_keys, shown
 from lw_torchrl._files import replacing
 from lw_torchrl._progress import Progress
-from lw_torchrl.envs.engines.vectorized.engine import VectorizedEngine
 from lw_torchrl.envs.episodes import FinishedEpisode, policy_of, run_episodes
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.envs.seeding import episode_seed
 from lw_torchrl.evaluation.failure_records import Failure
 from lw_torchrl.evaluation.protocol import actor_plans, make_env, tasks_of
+from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.tasks import MT50, TASKS, Task, task_id
@@ -33,6 +33,7 @@ from lw_torchrl.record.mujoco_scene import Motion
 from lw_torchrl.record.recorded_episode import RecordedEpisode
 from lw_torchrl.record.rerun_logger import RerunLogger
 from lw_torchrl.record.verdict import Heading
+from lw_torchrl.suites.suite import Suite, known_suite, load_suite
 
 _KEYS: list[NestedKey] = ["observation", "task_id", "episode", "action", ("next", "success"), ("next", "reward")]
 _PLAN_KEYS = {"qaf", "skill_weights", "action_corrected"}
@@ -100,7 +101,7 @@ def log_rollout(
     if isinstance(failure, Sequence):
         raise ValueError(f"failure must be one Failure for one episode, got {len(failure)}")
     heading, episode = read_rollout(rollout, plans, seed=seed, policy=policy, failure=failure, tasks=tasks)
-    motion = _motion(heading, episode) if seed is not None and heading.task in TASKS else None
+    motion = _motion(heading, episode) if seed is not None else None
     return logger.add_page(heading, episode, motion=motion, name=name)
 
 
@@ -138,12 +139,12 @@ def read_rollout(
         )
     observation = rollout.get("observation", None)
     objects: dict[str, Tensor] = {}
-    if task is not None and observation is not None and observation.shape[1:] == (39,):
+    if task is not None and observation is not None and observation.shape[1:] == (task.layout.size,):
         told_of = [] if plan is None else [f"{step.condition} {step.skill}" for step in plan.steps]
         for name, position in task.positions(observation).items():
             if plan is None or name == GRIPPER or any(name in words for words in told_of):
                 objects[name] = position
-    episode = RecordedEpisode.from_rollout(rollout, objects, plan)
+    episode = RecordedEpisode.from_rollout(rollout, objects, plan, METAWORLD if task is None else task.layout)
     if task is not None and plan is not None:
         episode = episode.with_target_poses(task)
     return Heading(label, index, seed, policy, failure), episode
@@ -154,16 +155,22 @@ class DiffersError(ValueError):
 
 
 def simulate_again(
-    task: str, seed: int, episode: int, action: NDArray[np.float32], observation: NDArray[np.float32]
+    task: str,
+    seed: int,
+    episode: int,
+    action: NDArray[np.float32],
+    observation: NDArray[np.float32],
+    suite: Suite | None = None,
 ) -> Motion:
     """The motion of all bodies in an episode, of T + 1 rows; a :class:`DiffersError` where it is another episode.
 
     The simulation depends on the seed and the actions alone, so equal observations, bit for bit, mean equal motion.
-    Actions are T×4 float32 in [-1, 1], as executed; observations T×39 float32, those from which they were taken.
+    Actions are T×A float32 in [-1, 1], as executed; observations T×D float32, those from which they were taken.
     """
-    engine = VectorizedEngine([task], num_threads=1)
+    suite = load_suite("metaworld") if suite is None else suite
+    engine: Any = suite.make_engine([task], reward="sparse", num_threads=1)
     try:
-        seen = engine.reset([0], [episode_seed(task, seed, episode)])[0].astype(np.float32)
+        seen = engine.reset([0], [episode_seed(suite.tasks[task], seed, episode)])[0].astype(np.float32)
         shape, active = (len(action) + 1, engine.model(0).model.nbody), np.ones(1, bool)
         positions, quaternions = np.empty((*shape, 3), np.float32), np.empty((*shape, 4), np.float32)
         positions[0], quaternions[0] = engine.poses(0)
@@ -181,8 +188,10 @@ def simulate_again(
 def _motion(heading: Heading, episode: RecordedEpisode) -> Motion | None:
     assert heading.seed is not None
     assert heading.episode is not None
+    if (suite := known_suite(heading.task)) is None:
+        return None
     try:
-        return simulate_again(heading.task, heading.seed, heading.episode, episode.action, episode.observation)
+        return simulate_again(heading.task, heading.seed, heading.episode, episode.action, episode.observation, suite)
     except DiffersError as error:
         warnings.warn(
             f"simulating {heading.task}, episode {heading.episode} of seed {heading.seed}, again gives other numbers "
@@ -218,8 +227,9 @@ def run_recorded(
     seed: int,
     episodes: Sequence[int] = (0,),
     noise_scale: float = 0.1,
-    max_steps: int = 500,
-    engine: Any = "vectorized",
+    max_steps: int | None = None,
+    suite: str | Suite | None = None,
+    engine: Any = None,
     progress: bool = False,
 ) -> list[FinishedEpisode]:
     """Episodes with all that :func:`lw_torchrl.log_rollout` shows of them, run as :func:`lw_torchrl.evaluate` does.
@@ -235,13 +245,14 @@ def run_recorded(
         By task, as they were given, and episode: TensorDicts of batch (T,).
     """
     answered = actor_plans(actor, plans)
-    chosen = tasks_of(tasks, answered)
-    base = LanguageWorldEnv(list(chosen.values()), seed=seed, max_steps=max_steps, engine=engine, strict=True)
+    found_suite, chosen = tasks_of(tasks, answered, suite)
+    options: dict[str, Any] = {"seed": seed, "max_steps": max_steps, "suite": found_suite, "engine": engine}
+    base = LanguageWorldEnv(list(chosen.values()), strict=True, **options)
     env = make_env(actor, answered, base)
     written = set() if answered is None else {"qaf", *actor.out_keys}
     evaluator = getattr(actor, "evaluator", None)
     asked = [] if evaluator is None else evaluator.in_keys
-    bar = Progress("recording", len(chosen) * len(episodes) * max_steps, "step", show=progress)
+    bar = Progress("recording", len(chosen) * len(episodes) * base.max_steps, "step", show=progress)
     found = {}
     try:
         with bar, torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
@@ -250,7 +261,7 @@ def run_recorded(
                 policy_of(actor.eval()),
                 {task: list(episodes) for task in chosen},
                 keys=list(dict.fromkeys([*_KEYS, *sorted(_PLAN_KEYS & written), *asked])),
-                noise=(lambda _: (noise_scale,) * 4) if noise_scale else None,
+                noise=(lambda _: (noise_scale,) * base.layout.action_size) if noise_scale else None,
                 on_progress=bar.update,
             ):
                 steps = one.steps if evaluator is None else evaluator(one.steps)

@@ -57,7 +57,7 @@ def log_scene(stream: Stream, root: str, episode: RecordedEpisode, motion: Motio
         stream.log(f"{scene}/{path}", style, static=True)
         stream.send_columns(f"{scene}/{path}", times, rr.LineStrips3D.columns(strips=strips))
 
-    goal = np.ascontiguousarray(episode.observation[:, 36:39])
+    goal = np.ascontiguousarray(episode.observation[:, episode.layout.positions[-1]])
     # Objects that stand for the goal, like "target location", have its colour, and their own label.
     goals = [name for name, position in episode.objects.items() if np.allclose(goal, position, atol=1e-3)]
     others = [name for name in episode.objects if name != GRIPPER]
@@ -101,7 +101,7 @@ def _log_simple_robot(stream: Stream, scene: str, episode: RecordedEpisode) -> N
     box("gripper/wrist", [(0.0, 0.0, WRIST_RISE)], [WRIST_HALF], STEEL, [GRIPPER])
     box("gripper/fingers", None, [FINGER_HALF] * 2, GOLD)
     stream.send_columns(f"{scene}/gripper", times, rr.Transform3D.columns(translation=episode.objects[GRIPPER]))
-    half = episode.observation[:, 3] * FINGER_TRAVEL / 2 + FINGER_HALF[1]
+    half = episode.observation[:, episode.layout.opening] * FINGER_TRAVEL / 2 + FINGER_HALF[1]
     zero, drop = np.zeros_like(half), np.full_like(half, -FINGER_DROP)
     centers = np.stack([zero, half, drop, zero, -half, drop], axis=1).reshape(-1, 3)  # of two fingers, row by row
     fingers = rr.Boxes3D.columns(centers=centers.astype(np.float32))

@@ -15,7 +15,6 @@ from torch import Tensor, nn
 from lw_torchrl._checks import Count, Scale, checked_but
 from lw_torchrl._state_tree import check_like, check_optimizer_state
 from lw_torchrl.language.named_objects import GRIPPER
-from lw_torchrl.language.observation import OPENING
 from lw_torchrl.modules.clause_evaluator import ClauseEvaluator
 from lw_torchrl.modules.image_query_evaluator import ImageQueryEvaluator
 from lw_torchrl.modules.state_query_evaluator import StateQueryEvaluator
@@ -108,7 +107,7 @@ class _PictureMinibatches:
         counts = torch.ones(len(names), 4)
         for place, name in enumerate(names):
             known[:, place, :3] = positions[name]
-            known[:, place, 3] = asked.observation[:, OPENING]
+            known[:, place, 3] = asked.observation[:, asked.task.layout.opening]
             counts[place, 3] = name == GRIPPER
         return torch.tensor([number(name) for name in names], dtype=torch.int64), known, counts
 

@@ -26,7 +26,8 @@ from lw_torchrl._checks import (
 from lw_torchrl.language.queries import Clause, Query, base_clauses
 from lw_torchrl.language.query_program import QueryProgram
 from lw_torchrl.language.relations import RELATIONS
-from lw_torchrl.language.tasks import TASKS, Task, task_id
+from lw_torchrl.language.tasks import Task, task_id
+from lw_torchrl.suites.suite import find_suite
 
 _FAR = 0.02  # metres that a hand does not move unseen
 
@@ -122,7 +123,8 @@ class LabelledQueries:
     def __init__(
         self, replay: TensorDictReplayBuffer, config: QueryEvaluatorConfig, tasks: Iterable[Task] | None = None
     ) -> None:
-        known = {task_id(task.name): task for task in (TASKS.values() if tasks is None else tasks)}
+        shipped = find_suite(getattr(replay, "tasks", ())).tasks
+        known = {task_id(task.name): task for task in (shipped.values() if tasks is None else tasks)}
         rows = replay[:]
         if config.every > 1:
             _, lengths = torch.unique_consecutive(rows.get(("collector", "traj_ids")), return_counts=True)

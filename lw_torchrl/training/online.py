@@ -24,10 +24,11 @@ from lw_torchrl.data.growing import GrowingStorage
 from lw_torchrl.data.replay import LanguageWorldExperienceReplay
 from lw_torchrl.data.rewards import REWARDS
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
-from lw_torchrl.language.tasks import Task, named_tasks
+from lw_torchrl.language.layout import METAWORLD, Layout
+from lw_torchrl.language.tasks import Task
 from lw_torchrl.modules.critics import QValue
-from lw_torchrl.modules.networks import ACTION_SIZE
 from lw_torchrl.modules.policy import Policy
+from lw_torchrl.suites.suite import Suite, find_suite, listed_tasks
 from lw_torchrl.training.algorithms import LEARNERS, OnlineConfig, method_config
 from lw_torchrl.training.algorithms.learner import NoiseConfig
 from lw_torchrl.training.buffers import check_minibatches, check_replay
@@ -55,6 +56,7 @@ class OnlineTrainer(Training):
             :class:`OnlineConfig` for the method's defaults of all else; None for its defaults.
         method: a name of :data:`LEARNERS`, whose classes say what they do.
         tasks: to run, as for :class:`LanguageWorldEnv`; None for those of the demonstrations.
+        suite: that has the tasks; None for the one that their names begin with.
         critic: whose copies are trained, where the method has one, with its normalisation as it is
             (``critic.fit_normalization``); None for one that sees what the actor sees, by the actor's.
         checkpoint, logger, progress: as of :class:`~lw_torchrl.training.loop.Training`, with its errors; the checkpoint
@@ -109,6 +111,7 @@ class OnlineTrainer(Training):
         *,
         method: str = "td3",
         tasks: str | Task | Iterable[str | Task] | None = None,
+        suite: str | Suite | None = None,
         critic: QValue | None = None,
         checkpoint: str | os.PathLike[str] | None = None,
         logger: Logger | None = None,
@@ -122,7 +125,9 @@ class OnlineTrainer(Training):
         if critic is not None:
             check_minibatches([critic], replay, config.batch_size)
         self.method, self.replay, self.num_threads = method, replay, num_threads
-        self.tasks = replay.tasks if tasks is None else list(named_tasks(tasks).values())
+        given: Any = replay.tasks if tasks is None else listed_tasks(tasks)
+        self.suite = find_suite(given, suite)
+        self.named = self.suite.named_tasks(given)
         generator = torch.Generator().manual_seed(config.seed)
         replay.set_rng(generator)
         self._drawn = generator.get_state()
@@ -140,7 +145,7 @@ class OnlineTrainer(Training):
                 "actor": self.policy.describe(),
                 "start": {"weights": start},
                 "critic": {} if critic is None else {"weights": _fingerprint(critic)},
-                "online": {"method": method, "tasks": list(named_tasks(self.tasks)), **asdict(config)},
+                "online": {"method": method, "tasks": list(self.named), **asdict(config)},
                 "data": describe_data(replay),
                 "replay": describe_learning(replay),
             }
@@ -181,7 +186,8 @@ class OnlineTrainer(Training):
         Ctrl-C ends it between two steps, and what came since the last round's end is lost; a second Ctrl-C at once.
         """
         base = LanguageWorldEnv(
-            self.tasks,
+            list(self.named.values()),
+            suite=self.suite,
             num_envs=self.config.rows,
             seed=self.config.seed,
             reward=REWARDS[self.replay.reward].source,
@@ -219,7 +225,9 @@ class OnlineTrainer(Training):
         config, learner = self.config, self.learner
         state, done_before = env.reset(), self.frames
         first = FirstEpisodes(config.rows)
-        exploration = Exploration(config, self._patience) if isinstance(config, NoiseConfig) else None
+        exploration = (
+            Exploration(config, self._patience, self.policy.layout) if isinstance(config, NoiseConfig) else None
+        )
         came = []
         steps = min(config.round_steps, config.steps - self.round * config.round_steps)
         due = 0
@@ -296,11 +304,14 @@ class Exploration:
     ``stuck_exploration``; the gripper's would open grasps.
     """
 
-    def __init__(self, config: NoiseConfig, patience: int) -> None:
+    def __init__(self, config: NoiseConfig, patience: int, layout: Layout = METAWORLD) -> None:
         self.patience = patience
-        self._scale = torch.tensor([1.0, 1.0, 1.0, config.gripper_exploration]) * config.exploration
-        self._stuck_scale = torch.tensor([*[config.stuck_exploration] * 3, float(self._scale[3])])
-        self._drawn = torch.zeros(config.rows, ACTION_SIZE)
+        moves = torch.ones(layout.action_size)
+        moves[layout.gripper] = config.gripper_exploration
+        self._scale = moves * config.exploration
+        self._stuck_scale = torch.full_like(moves, config.stuck_exploration)
+        self._stuck_scale[layout.gripper] = self._scale[layout.gripper]
+        self._drawn = torch.zeros(config.rows, layout.action_size)
         self._since = torch.zeros(config.rows)
         self._truth: Tensor | None = None
 
@@ -309,7 +320,7 @@ class Exploration:
         self._drawn = torch.randn_like(self._drawn)
 
     def noise(self, state: TensorDictBase) -> Tensor:
-        """(N, 4) float32, for the actions in these states, each one step after those of the last call or the first of
+        """(N, A) float32, for the actions in these states, each one step after those of the last call or the first of
         an episode; ``qaf`` (N, S) bool, if it is there."""
         truth = state.get("qaf", None)
         if not self.patience or truth is None:

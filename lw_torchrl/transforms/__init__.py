@@ -6,5 +6,6 @@ from lw_torchrl.transforms.corrupt_qaf import CorruptQAF
 from lw_torchrl.transforms.environment import EnvState
 from lw_torchrl.transforms.qaf import QAFTransform
 from lw_torchrl.transforms.random_yaw import RandomYaw
+from lw_torchrl.transforms.suite_transform import SuiteTransform
 
-__all__ = ["CameraTransform", "CorruptQAF", "EnvState", "QAFTransform", "RandomYaw"]
+__all__ = ["CameraTransform", "CorruptQAF", "EnvState", "QAFTransform", "RandomYaw", "SuiteTransform"]

@@ -33,6 +33,8 @@ def refuse_changed(transform: Transform, key: NestedKey) -> None:
             written = [unravel_key(out) for out in earlier.__dict__.get("_out_keys") or ()]
             if entry not in written:
                 continue
+            if getattr(earlier, "makes_observation", False):
+                break  # it is the observation as it was, and what stands before it does not matter
             if isinstance(earlier, RenameTransform):
                 entry = unravel_key(earlier.in_keys[written.index(entry)])
                 continue

@@ -12,13 +12,12 @@ from torchrl.envs import EnvBase, Transform
 
 from lw_torchrl._checks import check_scale, checked, missing_keys
 from lw_torchrl._keys import as_keys, check_apart, key_beside, read
-from lw_torchrl.language.observation import FIRST, HAND, POSITIONS, SECOND, a_step_before
+from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.skills import has_direction
 from lw_torchrl.language.task_index import PlanTables
 from lw_torchrl.transforms.qaf import plan_number_key
 
-_STARTS = tuple(part.start for part in (*POSITIONS, *map(a_step_before, (HAND, FIRST, SECOND))))
 _KEYS = ("observation", "action", "expert_action", "unclipped_action")
 _NOT_FOR_ENVIRONMENTS = "RandomYaw is for replay buffers: an environment has done its action before it is turned"
 
@@ -32,9 +31,13 @@ def _turned(values: Tensor, starts: tuple[int, ...], cos: Tensor, sin: Tensor) -
     return turned
 
 
-def turn_observation(observation: Tensor, angle: Tensor) -> Tensor:
-    """The positions of observations (..., 39), turned about the vertical through the origin by (...) radians."""
-    return _turned(observation, _STARTS, angle.cos(), angle.sin())
+def _starts(layout: Layout) -> tuple[int, ...]:
+    return tuple(part.start for part in layout.all_positions)
+
+
+def turn_observation(observation: Tensor, angle: Tensor, layout: Layout = METAWORLD) -> Tensor:
+    """The positions of observations (..., D), turned about the vertical through the origin by (...) radians."""
+    return _turned(observation, _starts(layout), angle.cos(), angle.sin())
 
 
 def turn_vectors(vectors: Tensor, angle: Tensor) -> Tensor:
@@ -65,6 +68,7 @@ class RandomYaw(Transform):
         plans: the actor's plans: rows whose steps in force say no direction ("move the puck to the target location")
             are then turned by any angle. It reads ``qaf`` (B, S) bool and ``task_id`` (B,) int64; None turns all rows
             alike.
+        layout: of the observations and actions; None for that of the plans, or Meta-World's without plans.
         in_keys: where observation, action, the expert's action and the unclipped one are, in this order.
         out_keys: where they go, turned; None for the same places.
 
@@ -89,6 +93,7 @@ class RandomYaw(Transform):
         scale: float,
         *,
         plans: Plans | Mapping[str, ConditionalPlan] | None = None,
+        layout: Layout | None = None,
         in_keys: Sequence[NestedKey] | None = None,
         out_keys: Sequence[NestedKey] | None = None,
     ) -> None:
@@ -101,8 +106,12 @@ class RandomYaw(Transform):
                 check_apart(self.in_keys, [there])
         self.scale = check_scale("scale", scale)
         self._tables: PlanTables | None = None
+        self.layout = METAWORLD if layout is None else layout
         if plans is not None:
             plans = as_plans(plans)
+            if layout not in (None, plans.layout):
+                raise ValueError(f"layout must be that of the plans, {plans.layout.name!r}, got {layout.name!r}")
+            self.layout = plans.layout
             self.fingerprint = plans.fingerprint  # what checkpoints of trainers tell it by
             self._tables = PlanTables(plans)
             free = torch.tensor([not has_direction(skill) for skill in plans.skills])
@@ -129,16 +138,17 @@ class RandomYaw(Transform):
             raise missing_keys(tensordict.keys(True, True), *map(str, self.in_keys[:2]))
         angle = self._angle(tensordict, observation)
         cos, sin = angle.cos(), angle.sin()
-        tensordict.set(seen[1], _turned(observation, _STARTS, cos, sin)).set(yaw_key(seen[1]), angle)
+        starts, begin = _starts(self.layout), self.layout.displacement
+        tensordict.set(seen[1], _turned(observation, starts, cos, sin)).set(yaw_key(seen[1]), angle)
         if (following := tensordict.get(unravel_key(("next", seen[0])), None)) is not None:
             after = unravel_key(("next", seen[1]))
-            tensordict.set(after, _turned(following, _STARTS, cos, sin)).set(yaw_key(after), angle)
+            tensordict.set(after, _turned(following, starts, cos, sin)).set(yaw_key(after), angle)
         for key, turned_key in actions:
             if (action := tensordict.get(key, None)) is None:
                 continue
-            turned = _turned(action, (0,), cos, sin)
-            before, now = (one[..., :2].abs().amax(-1, keepdim=True) for one in (action, turned))
-            turned[..., :2] /= torch.where(before <= 1.0, now.clamp(min=1.0), 1.0)
+            turned = _turned(action, (begin,), cos, sin)
+            before, now = (one[..., begin : begin + 2].abs().amax(-1, keepdim=True) for one in (action, turned))
+            turned[..., begin : begin + 2] /= torch.where(before <= 1.0, now.clamp(min=1.0), 1.0)
             tensordict.set(turned_key, turned)
         return tensordict
 

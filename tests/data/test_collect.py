@@ -15,11 +15,11 @@ import lw_torchrl as lw
 from lw_torchrl.data import CollectConfig
 from lw_torchrl.data.dataset import read_metadata
 from lw_torchrl.data.memory_map import load_rows
-from lw_torchrl.envs.engines.metaworld import make_metaworld_env
-from lw_torchrl.envs.experts import ExpertActor
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.envs.seeding import action_noise, episode_seed
 from lw_torchrl.language.tasks import MT50
+from lw_torchrl.suites.metaworld.experts import ExpertActor
+from lw_torchrl.suites.metaworld.plain_engine import make_metaworld_env
 
 CONFIG = CollectConfig(TASKS, EPISODES, SEED, noise_scale=NOISE, max_steps=STEPS)
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from lw_torchrl.envs.engines import MetaWorldEngine
-from lw_torchrl.envs.engines.vectorized.engine import VectorizedEngine
+from lw_torchrl.suites.metaworld.engines import MetaWorldEngine
+from lw_torchrl.suites.metaworld.vectorized.engine import VectorizedEngine
 
 
 def test_poses_are_metaworlds():

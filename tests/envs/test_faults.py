@@ -13,7 +13,7 @@ from torchrl.envs import TransformedEnv, check_env_specs
 
 import lw_torchrl as lw
 from lw_torchrl.envs import episode_seed
-from lw_torchrl.envs.engine import EngineStep
+from lw_torchrl.suites.engine import EngineStep
 
 
 def test_a_row_with_a_nan_action_is_truncated_and_the_others_go_on(any_env):

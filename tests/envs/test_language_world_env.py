@@ -243,7 +243,6 @@ def test_sparse_reward_is_the_success(engine):
         ("reach", {"seed": None}, TypeError, "seed must be an integer, got None"),
         ("reach", {"engine": "metawrld"}, ValueError, "engine must be one of .* did you mean 'metaworld'"),
         ("reach", {"engine": 3}, (TypeError, ValueError), "engine must be"),
-        ("reach", {"engine": None}, (TypeError, ValueError), "engine must be"),
         ("reach", {"reward": "spars"}, ValueError, "reward must be one of .* did you mean 'sparse'"),
         ("reach", {"worker": 1}, TypeError, r"worker must be a pair \(rank, of\), got 1"),
         ("reach", {"worker": (2, 2)}, ValueError, "rank must be under the number of workers, 2, got 2"),

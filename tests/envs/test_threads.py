@@ -12,7 +12,7 @@ import torch
 from torchrl.envs import AsyncEnvPool, EnvBase
 
 import lw_torchrl as lw
-from lw_torchrl.envs.engine import EngineStep
+from lw_torchrl.suites.engine import EngineStep
 
 
 class Slow:

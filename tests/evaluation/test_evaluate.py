@@ -14,13 +14,13 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 
 from lw_torchrl.data import LanguageWorldExperienceReplay, TaskBalancedSampler, collect_demonstrations
 from lw_torchrl.envs import ExpertActor, LanguageWorldEnv
-from lw_torchrl.envs.engines.metaworld import MetaWorldEngine, make_metaworld_env
-from lw_torchrl.envs.engines.vectorized.engine import VectorizedEngine
 from lw_torchrl.envs.seeding import action_noise, episode_seed
 from lw_torchrl.evaluation import evaluate
 from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.modules import DescriptorConditionedActor, PlanConditionedActor, Policy
+from lw_torchrl.suites.metaworld.plain_engine import MetaWorldEngine, make_metaworld_env
+from lw_torchrl.suites.metaworld.vectorized.engine import VectorizedEngine
 from lw_torchrl.training import BehavioralCloningConfig, BehavioralCloningTrainer
 from lw_torchrl.transforms import QAFTransform
 

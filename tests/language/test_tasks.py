@@ -209,7 +209,7 @@ def test_an_object_name_that_queries_could_not_hold_is_refused(name):
 @pytest.mark.parametrize("position", [(4, 5), (4, 5, 39), (-1, 0, 1), ()])
 def test_a_position_outside_the_observation_is_refused(position):
     with pytest.raises(ValueError, match="puck"):
-        NamedObject("puck", position)
+        Task("mine", "Mine.", (NamedObject(GRIPPER, (0, 1, 2)), NamedObject("puck", position)))
 
 
 @pytest.mark.parametrize("names", [[], ["puck"], ["puck", GRIPPER], [GRIPPER, "puck", "puck"], [GRIPPER, GRIPPER]])

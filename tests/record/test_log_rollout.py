@@ -13,11 +13,11 @@ import torch
 from recordings import Recording, run
 
 import lw_torchrl as lw
-from lw_torchrl.envs.engines import MetaWorldEngine
 from lw_torchrl.envs.seeding import episode_seed
 from lw_torchrl.evaluation.failure_records import Failure
 from lw_torchrl.record.recording_file import opening_step
 from lw_torchrl.record.viewer import open_viewer
+from lw_torchrl.suites.metaworld.engines import MetaWorldEngine
 
 PLANS = lw.load_plans("MT10")
 SEED = 5

@@ -103,8 +103,8 @@ def test_timelines(tmp_path):
 
 
 def test_control_period_is_metaworlds():
-    from lw_torchrl.envs.engines.metaworld import make_metaworld_env
     from lw_torchrl.record.conventions import CONTROL_PERIOD
+    from lw_torchrl.suites.metaworld.plain_engine import make_metaworld_env
 
     env = make_metaworld_env("reach")
     period = env.frame_skip * env.model.opt.timestep

@@ -47,7 +47,7 @@ def _write(plan: ConditionalPlan, style: Style) -> str:
     return _opening(plan.definition) + "".join(f"{line}\n" for line in lines)
 
 
-_NAMED = re.compile(r"[\s#>*\"'`]*(?:the\s+)?task\b[\s:]*([`\"'“‘*]*)([A-Za-z0-9][\w-]*)", re.IGNORECASE)
+_NAMED = re.compile(r"[\s#>*\"'`]*(?:the\s+)?task\b[\s:]*([`\"'“‘*]*)([A-Za-z0-9][\w-]*(?:/[\w-]+)?)", re.IGNORECASE)
 _ALONE = re.compile(r"[\s#>*\"'`]*([a-z0-9]+(?:[-_][a-z0-9]+)*)[\s\"'`:,*]*")
 _BULLET = re.compile(r"\s*(?:[-*•–+>]|\(?\[?\d{1,3}[.)\]]|[a-z]\))\s+")
 _WHEN = re.compile(

@@ -1,0 +1,171 @@
+"""Layout: what the numbers of a suite's observations and actions mean."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+from types import MappingProxyType
+from typing import Any
+
+from lw_torchrl._checks import check_fields, shown
+
+
+@dataclass(frozen=True)
+class Slot:
+    """Where an observation tells of one thing.
+
+    Attributes:
+        position: index of its x; y and z follow.
+        quaternion: index of the first of its four numbers; None where they are not told.
+    """
+
+    position: int
+    quaternion: int | None = None
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+    @property
+    def xyz(self) -> slice:
+        """The numbers of the position."""
+        return slice(self.position, self.position + 3)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What the numbers of an observation and of an action are, for all tasks of a suite.
+
+    The frame is the same in every suite: metres, x to the right, y away from the robot, z above the table. A suite
+    turns its own numbers into this frame.
+
+    Attributes:
+        name: the suite's.
+        size: D, how many numbers an observation has.
+        hand: index of the gripper's x; y and z follow.
+        opening: index of the gripper's opening, from 0, closed, to 1, open.
+        things: the things, in the order in which tasks have them. All but the first may be absent: zeros.
+        goal: index of the x of the task's target.
+        past: by how many places the numbers of the step before stand further back; None without them. The goal has no
+            past.
+        action_size: A, how many numbers an action has, each in [-1, 1].
+        displacement: index of the x of the hand's displacement; y and z follow.
+        reach: metres that the hand moves in a step at a displacement of 1, once it moves.
+        gripper: index of the gripper's effort.
+        closes: the effort's sign that closes, 1 or -1.
+        binary_gripper: whether the gripper opens or closes fully within a few steps, so that an effort in between has
+            to be decided.
+        closes_above: the effort above which such a gripper closes. Meta-World's fingers, which close as fast as the
+            effort is large, have closed within a quarter of a second at 0.3.
+        thresholds: relation to a threshold, metres, that replaces the published one, where the hand is measured
+            elsewhere; only for relations of one comparison.
+
+    Raises:
+        ValueError: an index outside the numbers, or a wrong sign.
+
+    Example:
+        >>> METAWORLD.positions
+        (slice(0, 3, None), slice(4, 7, None), slice(11, 14, None), slice(36, 39, None))
+
+    Source: ours; Meta-World's numbers are those of ``SawyerXYZEnv._get_obs``.
+    """
+
+    name: str
+    size: int
+    hand: int
+    opening: int
+    things: tuple[Slot, ...]
+    goal: int
+    past: int | None = None
+    action_size: int = 4
+    displacement: int = 0
+    reach: float = 0.01
+    gripper: int = 3
+    closes: int = 1
+    binary_gripper: bool = False
+    closes_above: float = 0.3
+    thresholds: Mapping[str, float] = field(default_factory=dict, hash=False)
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        if not self.things or not all(isinstance(thing, Slot) for thing in self.things):
+            raise ValueError(
+                f"things of layout {self.name!r} must be a tuple of at least one Slot, got {self.things!r}"
+            )
+        ends = [self.hand + 3, self.opening + 1, self.goal + 3, *(thing.position + 3 for thing in self.things)]
+        ends += [thing.quaternion + 4 for thing in self.things if thing.quaternion is not None]
+        if min(self.hand, self.opening, self.goal) < 0 or max(ends) > self.size:
+            raise ValueError(f"layout {self.name!r} names numbers outside the {self.size} of an observation")
+        for name, index, width in (("displacement", self.displacement, 3), ("gripper", self.gripper, 1)):
+            if not 0 <= index <= self.action_size - width:
+                raise ValueError(
+                    f"{name} of layout {self.name!r} must be within {self.action_size} numbers, got {index}"
+                )
+        if self.closes not in (1, -1):
+            raise ValueError(f"closes of layout {self.name!r} must be 1 or -1, got {shown(self.closes)}")
+        if self.reach <= 0:
+            raise ValueError(f"reach of layout {self.name!r} must be above 0 metres, got {shown(self.reach)}")
+        for relation, threshold in self.thresholds.items():
+            if not isinstance(relation, str) or type(threshold) is not float or abs(threshold) > 1e3:
+                raise ValueError(f"thresholds of layout {self.name!r} must map relations to metres, got {relation!r}")
+        object.__setattr__(self, "thresholds", MappingProxyType(dict(self.thresholds)))
+
+    @cached_property
+    def positions(self) -> tuple[slice, ...]:
+        """The positions of this step: of the hand, of each thing, of the goal."""
+        starts = (self.hand, *(thing.position for thing in self.things), self.goal)
+        return tuple(slice(start, start + 3) for start in starts)
+
+    @cached_property
+    def all_positions(self) -> tuple[slice, ...]:
+        """All positions, also those of the step before."""
+        return (*self.positions, *(self.a_step_before(place) for place in self.positions[:-1] if self.past is not None))
+
+    @cached_property
+    def parts(self) -> tuple[tuple[slice, ...], ...]:
+        """The numbers of each thing, now and a step before, then those of the goal."""
+        found = []
+        for thing in self.things:
+            now = [thing.xyz]
+            if thing.quaternion is not None:
+                now.append(slice(thing.quaternion, thing.quaternion + 4))
+            found.append((*now, *(self.a_step_before(part) for part in now if self.past is not None)))
+        return (*found, (self.positions[-1],))
+
+    def a_step_before(self, part: slice) -> slice:
+        """Where the same numbers stand of the step before."""
+        if self.past is None:
+            raise ValueError(f"layout {self.name!r} has no numbers of the step before")
+        return slice(part.start + self.past, part.stop + self.past)
+
+    def to_json(self) -> dict[str, Any]:
+        """What :meth:`from_json` reads back."""
+        things = [[thing.position, thing.quaternion] for thing in self.things]
+        own = {each.name: getattr(self, each.name) for each in fields(self)}
+        return {**own, "things": things, "thresholds": dict(self.thresholds)}
+
+    @classmethod
+    def from_json(cls, found: Any) -> Layout:
+        """The layout of :meth:`to_json`; any other value is a ValueError."""
+        names = [each.name for each in fields(cls)]
+        if not isinstance(found, Mapping) or set(found) != set(names):
+            raise ValueError(f"layout must be a table of {', '.join(names)}, got {shown(found)}")
+        things = found["things"]
+        if not isinstance(things, list) or not all(isinstance(one, list) and len(one) == 2 for one in things):
+            raise ValueError(f"things of a layout must be pairs of indices, got {shown(things)}")
+        try:
+            return cls(**{**found, "things": tuple(Slot(*one) for one in things)})
+        except TypeError as error:
+            raise ValueError(f"layout: {error}") from error
+
+    def __reduce__(self) -> Any:
+        return Layout.from_json, (self.to_json(),)
+
+
+def places(part: slice) -> tuple[int, ...]:
+    """The numbers' indices: (36, 37, 38) for Meta-World's goal."""
+    return tuple(range(part.start, part.stop))
+
+
+METAWORLD = Layout("metaworld", 39, hand=0, opening=3, things=(Slot(4, 7), Slot(11, 14)), goal=36, past=18, reach=0.01)
+"""Meta-World's 39 numbers; the second thing is zeros in a task with one."""

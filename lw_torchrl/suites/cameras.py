@@ -1,0 +1,148 @@
+"""Pictures of MuJoCo states by Meta-World's cameras, one OpenGL context for all models; and where their bodies are."""
+
+from __future__ import annotations
+
+import atexit
+import os
+import sys
+from collections.abc import Sequence
+from typing import Any
+from weakref import WeakSet
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from lw_torchrl._rendering import RENDER_LIBRARIES
+from lw_torchrl.suites.engine import BodyPoses, RowModel
+
+_ROLLED = ("corner", "corner2", "corner3", "corner4")  # Meta-World hangs them upside down
+_MOST_GEOMS = 2000
+_LOOKS = (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION)  # a software renderer's time, fourfold
+
+
+def _open_gl() -> Any:
+    """A context of OpenGL without a window; of EGL without a display and MUJOCO_GL."""
+    headless = sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    if headless and not os.environ.get("MUJOCO_GL"):
+        before = os.environ.get("PYOPENGL_PLATFORM")
+        from mujoco.egl import GLContext  # which says "egl" to processes started from here, too
+
+        if before is None:
+            os.environ.pop("PYOPENGL_PLATFORM", None)
+    else:
+        from mujoco.gl_context import GLContext
+    return GLContext(64, 64)
+
+
+def _no_open_gl(error: Exception) -> ImportError:
+    backend = os.environ.get("MUJOCO_GL", "").lower().strip()
+    need = RENDER_LIBRARIES.get(backend or "egl", "OpenGL and a display")
+    return ImportError(
+        f"pictures need OpenGL, which does not open with MUJOCO_GL={backend or '(unset)'}: install {need}, or start "
+        f"Python with MUJOCO_GL=egl or MUJOCO_GL=osmesa. Simulations and recordings need none. ({error})"
+    )
+
+
+_open: WeakSet[Cameras] = WeakSet()
+_processes: set[int] = set()  # that opened OpenGL: this one and those it was forked from
+
+
+def _close_all() -> None:
+    for cameras in list(_open):
+        cameras.close()
+
+
+class Cameras:
+    """Takes pictures, in any thread, one at a time; a model's meshes and textures are loaded at its first picture."""
+
+    def __init__(self) -> None:
+        if _processes - {os.getpid()}:
+            raise RuntimeError(
+                "this process was forked from one that took pictures, and OpenGL's threads stayed there: start it with "
+                "mp_start_method='spawn', or take no picture before the fork"
+            )
+        try:
+            self._gl = _open_gl()
+        except Exception as error:  # each platform has its own, an AttributeError among them
+            raise _no_open_gl(error) from error
+        if not _open:
+            atexit.unregister(_close_all)
+            atexit.register(_close_all)  # before the platform ends, after which freeing a context is an error
+        _open.add(self)
+        _processes.add(os.getpid())
+        self._loaded: dict[str, tuple[Any, Any]] = {}
+
+    def picture(self, shown: RowModel, data: Any, *, camera: str, height: int, width: int) -> NDArray[np.uint8]:
+        """One picture of a state, (height, width, 3) uint8."""
+        self._gl.make_current()
+        try:
+            return self._picture(shown, data, camera, height, width)
+        finally:
+            if type(self._gl).__module__ == "mujoco.egl":  # another thread may take the context
+                from OpenGL import EGL  # type: ignore[import-untyped]
+
+                EGL.eglReleaseThread()
+
+    def _picture(self, shown: RowModel, data: Any, camera: str, height: int, width: int) -> NDArray[np.uint8]:
+        path, model = shown
+        if path not in self._loaded:
+            try:
+                context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+            except mujoco.FatalError as error:
+                raise _no_open_gl(error) from error
+            self._loaded[path] = mujoco.MjvScene(model=model, maxgeom=_MOST_GEOMS), context
+        view, context = self._loaded[path]
+        if (context.offWidth, context.offHeight) != (width, height):
+            mujoco.mjr_resizeOffscreen(width, height, context)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, context)
+        place = mujoco.MjvCamera()
+        place.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        place.fixedcamid = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
+        everything = mujoco.mjtCatBit.mjCAT_ALL.value
+        mujoco.mjv_updateScene(model, data, mujoco.MjvOption(), None, place, everything, view)
+        for look in _LOOKS:
+            view.flags[look] = 0
+        frame = mujoco.MjrRect(0, 0, width, height)
+        pixels = np.empty((height, width, 3), dtype=np.uint8)
+        mujoco.mjr_render(frame, view, context)
+        mujoco.mjr_readPixels(pixels, None, frame, context)  # the first line at the bottom
+        return pixels[:, ::-1] if camera in _ROLLED else pixels[::-1]
+
+    def close(self) -> None:
+        if self not in _open or os.getpid() not in _processes:
+            return
+        _open.remove(self)
+        self._gl.make_current()
+        for _, context in self._loaded.values():
+            context.free()
+        self._loaded = {}
+        self._gl.free()
+
+
+class SeenRows:
+    """What an engine has whose rows can be seen."""
+
+    _cameras: Cameras | None = None
+
+    def _seen(self, row: int) -> tuple[RowModel, Any]:
+        """A row's model, with the row's own places in it, and MuJoCo's data."""
+        raise NotImplementedError
+
+    def render(self, rows: Sequence[int], *, camera: str, height: int, width: int) -> NDArray[np.uint8]:
+        """Pictures of the rows as they are now: (len(rows), height, width, 3) uint8, the first line on top."""
+        cameras = self._cameras = self._cameras or Cameras()
+        return np.stack([cameras.picture(*self._seen(row), camera=camera, height=height, width=width) for row in rows])
+
+    def model(self, row: int) -> RowModel:
+        """The model of a row."""
+        return self._seen(row)[0]
+
+    def poses(self, row: int) -> BodyPoses:
+        """Where all bodies of a row are now."""
+        data = self._seen(row)[1]
+        return BodyPoses(data.xpos.copy(), data.xquat.copy())
+
+    def close(self) -> None:
+        if self._cameras is not None:
+            self._cameras.close()

@@ -1,0 +1,62 @@
+"""The engine interface: what :class:`~lw_torchrl.envs.LanguageWorldEnv` asks of a simulator.
+
+An engine holds N rows, each of a fixed task, and does not use TorchRL. Its numbers are Meta-World's own (float64
+observations); the environment converts them, counts steps and truncates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class EngineStep(NamedTuple):
+    """The result of one step of all rows, in fresh arrays; rows that were not active repeat their last observation,
+    with reward 0, success False and fault False.
+
+    Attributes:
+        observation: (N, D) float64, as the layout says; of Meta-World its 39 numbers (metres; gripper opening in
+            [0, 1]; quaternions).
+        reward, success: (N,) float64, Meta-World's dense reward, or the success as 0 and 1; (N,) bool, Meta-World's
+            success.
+        fault: (N,) bool, true where the simulation became unstable; such a row repeats its last stable observation
+            until it is reset.
+    """
+
+    observation: NDArray[np.float64]
+    reward: NDArray[np.float64]
+    success: NDArray[np.bool_]
+    fault: NDArray[np.bool_]
+
+
+class Engine(Protocol):
+    """Simulates N rows of Meta-World tasks. With the ``render`` of :class:`~lw_torchrl.suites.cameras.SeenRows` it also
+    gives pictures, with its ``model`` and ``poses`` recordings of the scene."""
+
+    def reset(self, rows: Sequence[int], seeds: Sequence[int]) -> NDArray[np.float64]:
+        """Start an episode in each of ``rows``, as Meta-World's own ``env.seed(seed); env.reset()`` does, whatever the
+        row did before; returns the first observations, (len(rows), D) float64."""
+
+    def step(self, action: NDArray[np.float32], active: NDArray[np.bool_]) -> EngineStep:
+        """Step the rows where ``active`` (N, bool) with ``action`` (N, A) in [-1, 1], in the action's own precision."""
+
+    def close(self) -> None:
+        """Free the simulators."""
+
+
+class RowModel(NamedTuple):
+    """The compiled MuJoCo model of a row, to read, and the ``path`` of its XML file; models of one file have the same
+    meshes. Rows share a model, so its ``body_pos`` and ``site_pos`` may be another row's."""
+
+    path: str
+    model: Any
+
+
+class BodyPoses(NamedTuple):
+    """Where the bodies are: (bodies, 3) float64, metres, in the world's frame, and (bodies, 4) float64, w first."""
+
+    position: NDArray[np.float64]
+    quaternion: NDArray[np.float64]

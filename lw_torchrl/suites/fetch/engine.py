@@ -1,0 +1,282 @@
+"""The Fetch engine: gymnasium-robotics bit for bit, its physics in threads."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import redirect_stderr
+from functools import cache
+from importlib import import_module
+from io import StringIO
+from typing import Any, Literal, NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from lw_torchrl._checks import check_choice, check_int
+from lw_torchrl._rendering import naming_absent_renderer
+from lw_torchrl.suites.cameras import SeenRows
+from lw_torchrl.suites.engine import BodyPoses, EngineStep, RowModel
+from lw_torchrl.suites.fetch.frame import (
+    HAND_HEIGHT,
+    OPEN,
+    Array,
+    fetch_actions,
+    our_positions,
+    our_quaternions,
+    turned_quaternions,
+)
+from lw_torchrl.suites.fetch.words import FETCH
+from lw_torchrl.suites.metaworld.plain_engine import UNSTABLE
+from lw_torchrl.suites.metaworld.vectorized.engine import available_cores
+from lw_torchrl.suites.metaworld.vectorized.simulated_rows import RowGroup, WorkerPool, split_into_groups
+from lw_torchrl.suites.metaworld.vectorized.task_programs import WARNED_ALREADY
+
+CAMERAS = ("external_camera_0", "head_camera_rgb", "gripper_camera_rgb", "lidar")
+"""The cameras of Fetch's scenes."""
+
+_NOW = FETCH.past or 0  # how many numbers tell of this step
+_READ = 12  # grip site (3), finger joints (2), thing's site (3) and quaternion (4), in Fetch's axes
+_FINGERS = ("robot0:r_gripper_finger_joint", "robot0:l_gripper_finger_joint")
+_TURN = np.array([1.0, 0.0, 1.0, 0.0])  # what each action adds to the hand's quaternion: fingers down
+_METRES = 0.05  # per unit of a displacement
+_SUCCESS = 0.05  # metres
+_Mask = NDArray[np.bool_]
+
+
+class _Scene(NamedTuple):
+    """A task's class in gymnasium-robotics, and where our origin is: metres, in Fetch's axes. A thing that rests on the
+    table is at our z = 0.018, two millimetres below what counts as touching; hands start near x = 0, y = 0.6."""
+
+    module: str
+    env: str
+    origin: tuple[float, float, float]
+
+
+_SCENES = {
+    "fetch/reach": _Scene("reach", "MujocoFetchReachEnv", (0.745, 0.75, 0.40675)),
+    "fetch/push": _Scene("push", "MujocoFetchPushEnv", (0.745, 0.75, 0.40675)),
+    "fetch/slide": _Scene("slide", "MujocoFetchSlideEnv", (0.395, 0.75, 0.3955)),
+    "fetch/pick-and-place": _Scene("pick_and_place", "MujocoFetchPickAndPlaceEnv", (0.745, 0.75, 0.40675)),
+}
+
+
+@cache
+def _builder(task: str) -> Any:
+    """Gymnasium-robotics' environment of a task, built once in a process. Its compiled model never changes, so all rows
+    of all engines read it at the same time."""
+    scene = _SCENES[task]
+    with naming_absent_renderer(), redirect_stderr(StringIO()):  # importing it prints news of other environments
+        try:
+            module = import_module(f"gymnasium_robotics.envs.fetch.{scene.module}")
+        except ImportError as error:
+            raise ImportError("the Fetch suite needs the extra [fetch]: pip install 'lw_torchrl[fetch]'") from error
+    return getattr(module, scene.env)()
+
+
+class _Row:
+    """A state of its own on a shared model. Resets are gymnasium-robotics' own code, on a light copy of the builder."""
+
+    def __init__(self, task: str) -> None:
+        built = _builder(task)
+        self._model, self._substeps = built.model, int(built.n_substeps)
+        self.data = data = mujoco.MjData(self._model)
+        self._env = object.__new__(type(built))
+        self._env.__dict__.update(built.__dict__, data=data, mujoco_renderer=None)
+        self.path = str(built.fullpath)
+        self.has_thing, self._blocked = bool(built.has_object), bool(built.block_gripper)
+        self.goal: Array = np.zeros(3)
+
+        hand = self._model.body("robot0:gripper_link").id
+        self._hand = data.xpos[hand], data.xquat[hand]
+        self._mocap = data.mocap_pos[0], data.mocap_quat[0]
+        self._fingers = [int(self._model.joint(name).qposadr[0]) for name in _FINGERS]
+        # The order of the drives, which are driven from where their fingers are; two tasks of the four have none.
+        self._driven = self._model.jnt_qposadr[self._model.actuator_trnid[:, 0]]
+        self._target = self._model.site("target0").id
+        self._sites = [data.site_xpos[self._model.site("robot0:grip").id]]
+        self._quaternion: Array | None = None
+        if self.has_thing:
+            self._sites.append(data.site_xpos[self._model.site("object0").id])
+            self._quaternion = data.xquat[self._model.body("object0").id]
+        self._warnings = data.warning.number
+
+    def reset(self, seed: int, read: Array) -> None:
+        """Start an episode and fill ``read`` (12,)."""
+        self.goal = self._env.reset(seed=seed)[0]["desired_goal"]
+        self._warnings[:] = WARNED_ALREADY
+        self._read(read)
+
+    def simulate(self, displacement: Array, effort: np.float64, read: Array, warnings: NDArray[np.int32]) -> None:
+        """One step of 20 of physics; ``displacement`` (3,) is in metres, ``effort`` is Fetch's. ``read`` (12,) and
+        ``warnings`` (3,) are filled."""
+        data = self.data
+        np.add(self._hand[0], displacement, out=self._mocap[0])
+        np.add(self._hand[1], _TURN, out=self._mocap[1])
+        if len(self._driven):
+            data.ctrl[:] = data.qpos[self._driven] + (0.0 if self._blocked else effort)
+        mujoco.mj_step(self._model, data, self._substeps)
+        if self._blocked:
+            data.qpos[self._fingers] = 0.0
+            mujoco.mj_forward(self._model, data)
+        self._read(read)
+        warnings[:] = self._warnings[UNSTABLE]
+
+    def _read(self, read: Array) -> None:
+        read[:3] = self._sites[0]
+        read[3:5] = self.data.qpos[self._fingers]
+        if self._quaternion is not None:
+            read[5:8], read[8:] = self._sites[1], self._quaternion
+
+    def seen(self) -> tuple[RowModel, Any]:
+        """Its model and data, the mark of the target at the goal; no physics reads that site."""
+        self.data.site_xpos[self._target] = self.goal
+        return RowModel(self.path, self._model), self.data
+
+
+class FetchEngine(SeenRows):
+    """Simulates rows of FetchReach-v4, FetchPush-v4, FetchSlide-v4 and FetchPickAndPlace-v4.
+
+    Its states, goals and successes are gymnasium-robotics', bit for bit, whatever the number of threads and whatever a
+    row did before: those of ``gymnasium.make(id)`` after ``reset(seed=seed)`` and the same actions. The action that
+    equals (right, away, up, effort) there is (away, -right, up, -effort), of the same dtype: float32 stays float32. A
+    displacement of 1 asks for 5 cm, of which the hand makes 3.2 in a step. The gripper's effort counts from where the
+    fingers are: 0 leaves them there, without the force that holds a puck. Reach, push and slide keep them closed.
+
+    Observations have 25 numbers (:data:`~lw_torchrl.suites.fetch.FETCH`), in metres and in Meta-World's axes. Reach has
+    no thing: its numbers are zeros, and its goal is where the hand shall be, 3 cm above the grip site's goal. A
+    quaternion has its axis in our axes, see :func:`~lw_torchrl.suites.fetch.frame.our_quaternions`.
+
+    A row faults when its action is not finite, or when its simulation becomes unstable. It then repeats its last stable
+    observation and is not simulated until it is reset.
+
+    Args:
+        tasks: the task of each row.
+        reward: "sparse" for the success as 0 and 1; "dense" for minus the distance from what was achieved to the goal,
+            metres, as the Dense environments give it.
+        num_threads: that simulate; None for one a core.
+
+    Example:
+        >>> engine = FetchEngine(["fetch/reach", "fetch/push"], num_threads=1)
+        >>> engine.reset([0, 1], seeds=[7, 8]).shape
+        (2, 25)
+        >>> engine.step(np.zeros((2, 4), np.float32), np.array([True, True])).success
+        array([False, False])
+        >>> engine.close()
+
+    Source: Plappert et al., 'Multi-Goal Reinforcement Learning'; gymnasium-robotics 1.4.2.
+    """
+
+    def __init__(
+        self, tasks: Sequence[str], *, reward: Literal["sparse", "dense"] = "sparse", num_threads: int | None = None
+    ) -> None:
+        self._dense = check_choice("reward", reward, ("sparse", "dense")) == "dense"
+        num_threads = check_int("num_threads", available_cores() if num_threads is None else num_threads, minimum=1)
+        tasks = [check_choice("task", task, _SCENES) for task in tasks]
+        self._rows = [_Row(task) for task in tasks]
+        # Rows do not share what they write, so any of them may be together.
+        self._groups = split_into_groups([""] * len(tasks), num_threads)
+        self._pool = WorkerPool(num_threads)
+
+        n = len(tasks)
+        self._origin = np.array([_SCENES[task].origin for task in tasks]).reshape(n, 3)
+        self._has_thing = np.array([row.has_thing for row in self._rows], dtype=bool)
+        self._read = np.zeros((n, _READ))
+        self._goal = np.zeros((n, 3))
+        self._observation = np.zeros((n, FETCH.size))
+        self._started = np.zeros(n, dtype=bool)
+        self._faulted = np.zeros(n, dtype=bool)
+
+    def reset(self, rows: Sequence[int], seeds: Sequence[int]) -> Array:
+        index = np.asarray(rows, dtype=np.intp).reshape(-1)
+        if len(index) != len(seeds):
+            raise ValueError(f"seeds must be as many as rows, {len(index)}, got {len(seeds)}")
+        seed_of = dict(zip(index.tolist(), map(int, seeds), strict=True))
+        # A reset that fails half-way leaves rows that must not be stepped.
+        self._started[index] = False
+
+        def reset(row: int) -> None:
+            self._rows[row].reset(seed_of[row], self._read[row])
+            self._goal[row] = self._rows[row].goal
+
+        self._pool.work(self._by_group(index), reset)
+        now = self._now(index)
+        lift = np.where(self._has_thing[index], 0.0, HAND_HEIGHT)
+        goal = our_positions(self._goal[index], self._origin[index])
+        goal[:, 2] += lift
+        self._observation[index] = np.concatenate((now, now, goal), axis=1)
+        self._faulted[index] = False
+        self._started[index] = True
+        return self._observation[index]
+
+    def step(self, action: NDArray[Any], active: _Mask) -> EngineStep:
+        n = len(self._rows)
+        action, active = np.asarray(action), np.asarray(active, dtype=bool)
+        if action.shape != (n, FETCH.action_size) or active.shape != (n,):
+            raise ValueError(
+                f"action must be of shape {(n, FETCH.action_size)} and active of {(n,)}, "
+                f"got {action.shape} and {active.shape}"
+            )
+        if not self._started[active].all():
+            row = int(np.flatnonzero(active & ~self._started)[0])
+            raise RuntimeError(f"row {row} must be reset before it is stepped")
+        # NaN must not reach the physics: MuJoCo would silently restart the row.
+        self._faulted |= active & ~np.isfinite(action).all(axis=1)
+        rows = np.flatnonzero(active & ~self._faulted)
+        reward, success = np.zeros(n), np.zeros(n, dtype=bool)
+        warnings = np.full((n, 3), WARNED_ALREADY, dtype=np.int32)
+        theirs = fetch_actions(np.clip(action, -1, 1))
+        displacement = (theirs[:, :3] * _METRES).astype(np.float64)  # multiplied in the action's own precision
+        effort = theirs[:, 3].astype(np.float64)
+
+        def simulate(row: int) -> None:
+            self._rows[row].simulate(displacement[row], effort[row], self._read[row], warnings[row])
+
+        self._pool.work(self._by_group(rows), simulate)
+
+        now = self._now(rows)
+        stable = np.isfinite(now).all(axis=1) & (warnings[rows] == WARNED_ALREADY).all(axis=1)
+        self._faulted[rows[~stable]] = True
+        rows, now = rows[stable], now[stable]
+        achieved = np.where(self._has_thing[rows, None], self._read[rows, 5:8], self._read[rows, :3])
+        distance = np.linalg.norm(achieved - self._goal[rows], axis=-1)
+        success[rows] = distance < _SUCCESS
+        reward[rows] = -distance if self._dense else success[rows]
+        self._observation[rows, _NOW : 2 * _NOW] = self._observation[rows, :_NOW]
+        self._observation[rows, :_NOW] = now
+        return EngineStep(self._observation.copy(), reward, success, active & self._faulted)
+
+    def _now(self, rows: NDArray[np.intp]) -> Array:
+        """The first 11 numbers of the rows' observations."""
+        read, origin = self._read[rows], self._origin[rows]
+        now = np.zeros((len(rows), _NOW))
+        now[:, :3] = our_positions(read[:, :3], origin)
+        now[:, 2] += HAND_HEIGHT
+        now[:, 3] = np.clip((read[:, 3] + read[:, 4]) / OPEN, 0.0, 1.0)
+        thing = self._has_thing[rows]
+        now[thing, 4:7] = our_positions(read[thing, 5:8], origin[thing])
+        now[thing, 7:] = our_quaternions(read[thing, 8:])
+        return now
+
+    def _by_group(self, rows: NDArray[np.intp]) -> list[tuple[RowGroup, list[int]]]:
+        wanted = set(rows.tolist())
+        found = [(group, [row for row in group.rows if row in wanted]) for group in self._groups]
+        return [(group, members) for group, members in found if members]
+
+    def _seen(self, row: int) -> tuple[RowModel, Any]:
+        return self._rows[row].seen()
+
+    def poses(self, row: int) -> BodyPoses:
+        """Where all bodies of a row are now, in our axes."""
+        found = super().poses(row)
+        return BodyPoses(our_positions(found.position, self._origin[row]), turned_quaternions(found.quaternion))
+
+    def render(self, rows: Sequence[int], *, camera: str, height: int, width: int) -> NDArray[np.uint8]:
+        """As :meth:`SeenRows.render`, by one of Fetch's own cameras."""
+        return super().render(rows, camera=check_choice("camera", camera, CAMERAS), height=height, width=width)
+
+    def close(self) -> None:
+        """End the threads."""
+        super().close()
+        self._pool.close()
+        self._rows = []

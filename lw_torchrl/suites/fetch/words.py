@@ -1,0 +1,33 @@
+"""What the Fetch suite's numbers mean, and its tasks, skills and plans."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+from types import MappingProxyType
+
+from lw_torchrl._files import read_toml
+from lw_torchrl.language import plan_files, skills
+from lw_torchrl.language.layout import Layout, Slot
+from lw_torchrl.language.plans import Plans
+from lw_torchrl.language.skills import Skills
+from lw_torchrl.language.tasks import Task, TaskError, Tasks
+
+_DATA = files("lw_torchrl.suites.fetch") / "data"
+
+FETCH = Layout("fetch", 25, hand=0, opening=3, things=(Slot(4, 7),), goal=22, past=11, reach=0.032, binary_gripper=True)
+"""The 25 numbers of an observation: hand, opening, puck and its quaternion, the same 11 a step before, goal."""
+
+TASKS: Tasks = MappingProxyType(
+    {name: Task.from_json(name, row, FETCH) for name, row in sorted(read_toml(_DATA / "tasks.toml", TaskError).items())}
+)
+"""The four names, sorted, to their :class:`~lw_torchrl.language.tasks.Task`."""
+
+
+def load_skills() -> Skills:
+    """The scripted skills by their text: Fetch's, and Meta-World's under other texts."""
+    return skills.load_skills(str(_DATA / "skills.toml"), tasks=TASKS)
+
+
+def load_plans() -> Plans:
+    """A plan for each task, every step with a scripted skill of :func:`load_skills`."""
+    return plan_files.load_plans(str(_DATA / "plans"), tasks=TASKS)

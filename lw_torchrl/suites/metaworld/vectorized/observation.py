@@ -1,0 +1,288 @@
+"""What is read from the states after each step, and the observations and successes made of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.lib.stride_tricks import as_strided
+from numpy.typing import NDArray
+
+from lw_torchrl.suites.metaworld.vectorized.tables import TaskReward, TaskSources
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+
+# The columns of the sensors. The first 18 are laid out like the observation, whose number 3, the opening of the
+# gripper, is computed. Columns that a task does not have hold arbitrary numbers.
+HAND = slice(0, 3)
+GRIPPER = 3
+OBJECT = slice(4, 7)
+QUATERNION = slice(7, 11)
+SECOND = slice(11, 14)
+SECOND_QUATERNION = slice(14, 18)
+CURRENT = slice(0, 18)
+RIGHT_CLAW = slice(18, 21)
+LEFT_CLAW = slice(21, 24)
+MATRIX = slice(24, 33)
+RIGHT_TIP = slice(33, 36)
+LEFT_TIP = slice(36, 39)
+POINT = slice(39, 42)
+JOINT = slice(42, 43)
+WIDTH = 43
+
+# Of the dense reward only.
+LEFT_PAD = slice(43, 46)
+RIGHT_PAD = slice(46, 49)
+PLACE = slice(49, 52)
+CORNERS = slice(52, 64)
+REWARD_WIDTH = 64
+
+MATRIX_OF = "matrix of "
+
+
+class StateView:
+    """The arrays of a MuJoCo state, which are in one block of memory, as one, so that a single ``take`` reads from any:
+    joining ten small arrays, out of the processor's cache, costs four times as much. The state must outlive this view.
+    """
+
+    def __init__(self, model: Any, data: Any) -> None:
+        self._model = model
+        positions = {"body": data.xpos, "geom": data.geom_xpos, "site": data.site_xpos}
+        matrices = {"matrix of body": data.xmat, "matrix of geom": data.geom_xmat, "matrix of site": data.site_xmat}
+        self._arrays = positions | matrices | {"quaternion of body": data.xquat, "joint": data.qpos}
+        first = min(self._arrays.values(), key=_address)
+        self._start = _address(first)
+        size = max(_address(array) + array.nbytes for array in self._arrays.values()) - self._start
+        if size > data.nbuffer:
+            raise RuntimeError("MuJoCo keeps this state in more than one block of memory")
+        self.numbers = as_strided(first, shape=(size // first.itemsize,), strides=(first.itemsize,))
+
+    def find(self, what: str) -> Index:
+        """Where in ``numbers`` are the position of "body NAME", "geom NAME" or "site NAME"; the nine numbers of "matrix
+        of geom NAME", or of a body or site; the four of "quaternion of body NAME"; or the one of "joint NAME"."""
+        kind, _, name = what.rpartition(" ")
+        if kind not in self._arrays:
+            raise ValueError(f"a state has {', '.join(self._arrays)}, got {what!r}")
+        named = getattr(self._model, kind.split()[-1])(name)
+        row = named.qposadr[0] if kind == "joint" else named.id
+        own = self._arrays[kind][row : row + 1]
+        return (_address(own) - self._start) // own.itemsize + np.arange(own.size)
+
+
+def _address(array: Array) -> int:
+    return array.__array_interface__["data"][0]
+
+
+def sensor_index(window: StateView, sources: TaskSources, reward: TaskReward | None) -> Index:
+    """(WIDTH,) which numbers of the window make a task's row of sensors; (REWARD_WIDTH,) with a dense reward."""
+    success = sources.success
+    parts = [(HAND, "body hand"), (OBJECT, sources.object)]
+    parts += [(RIGHT_CLAW, "body rightclaw"), (LEFT_CLAW, "body leftclaw")]
+    if sources.quaternion.startswith(MATRIX_OF):
+        parts.append((MATRIX, sources.quaternion))
+    elif sources.quaternion not in ("zeros", "identity"):
+        parts.append((QUATERNION, f"quaternion of {sources.quaternion}"))
+    if sources.second is not None:
+        parts.append((SECOND, sources.second))
+        if sources.second_quaternion != "zeros":
+            parts.append((SECOND_QUATERNION, f"quaternion of {sources.second_quaternion}"))
+    if success.point == "gripper" or reward is not None:
+        parts += [(RIGHT_TIP, "site rightEndEffector"), (LEFT_TIP, "site leftEndEffector")]
+    if (point := success.stick_end or success.point) not in ("object", "second", "gripper"):
+        parts.append((POINT, point))
+    joint = sources.dial or success.joint
+    if reward is not None:
+        joint = joint or reward.joint
+        parts += [(LEFT_PAD, "body leftpad"), (RIGHT_PAD, "body rightpad")]
+        if reward.place is not None:
+            parts.append((PLACE, reward.place))
+        for number, corner in enumerate(reward.corners):
+            start = CORNERS.start + 3 * number
+            parts.append((slice(start, start + 3), corner))
+    if joint is not None:
+        parts.append((JOINT, f"joint {joint}"))
+    index = np.zeros(WIDTH if reward is None else REWARD_WIDTH, dtype=np.intp)
+    for columns, what in parts:
+        index[columns] = window.find(what)
+    return index
+
+
+WIDEST_GRIP = 0.1  # metres
+DIAL_RADIUS = 0.05  # metres
+
+
+class Observer:
+    """Makes the observations of a fixed set of rows, by Meta-World's operations in its order, bit for bit."""
+
+    def __init__(self, sources: Sequence[TaskSources]) -> None:
+        self._matrices = np.flatnonzero([row.quaternion.startswith(MATRIX_OF) for row in sources])
+        self._dials = np.flatnonzero([row.dial is not None for row in sources])
+        self._offset = np.array([row.offset for row in sources])
+        self._seconds = np.flatnonzero([row.second is not None for row in sources])
+        self._second_offset = np.array([row.second_offset for row in sources if row.second is not None])
+        self._constant = np.zeros((len(sources), CURRENT.stop))
+        self._is_constant = np.zeros(self._constant.shape, dtype=bool)
+        for k, row in enumerate(sources):
+            self._is_constant[k, QUATERNION] = row.quaternion in ("zeros", "identity")
+            self._constant[k, QUATERNION.start] = row.quaternion == "identity"
+            self._is_constant[k, SECOND] = row.second is None
+            self._is_constant[k, SECOND_QUATERNION] = row.second is None or row.second_quaternion == "zeros"
+
+    def current(self, sensors: Array) -> Array:
+        """(rows, 18) the part of the observation that describes the present state."""
+        current = sensors[:, CURRENT].copy()
+        np.copyto(current, self._constant, where=self._is_constant)
+        span = row_norm(sensors[:, RIGHT_CLAW] - sensors[:, LEFT_CLAW])
+        current[:, GRIPPER] = np.minimum(span / WIDEST_GRIP, 1.0)
+        current[:, OBJECT] += self._offset
+        if self._seconds.size:
+            current[self._seconds, SECOND] += self._second_offset
+        if self._matrices.size:
+            current[self._matrices, QUATERNION] = quaternion_of_matrix(sensors[self._matrices, MATRIX])
+        if self._dials.size:
+            angle = sensors[self._dials, JOINT.start]
+            current[self._dials, OBJECT.start] += np.sin(angle) * DIAL_RADIUS
+            current[self._dials, OBJECT.start + 1] -= np.cos(angle) * DIAL_RADIUS
+        return current
+
+
+def row_norm(vectors: Array) -> Array:
+    """The length of each row, with the bits of ``np.linalg.norm`` of that row alone, which takes the dot product from
+    BLAS as ``vecdot`` does; a sum of squares over an axis rounds differently in one case out of nine."""
+    return np.sqrt(np.vecdot(vectors, vectors))
+
+
+def quaternion_of_matrix(matrix: Array) -> Array:
+    """(n, 4) quaternions, x y z w, of (n, 9) rotation matrices, with the bits of SciPy's
+    ``Rotation.from_matrix(...).as_quat()`` at a fraction of its cost."""
+    m00, m01, m02, m10, m11, m12, m20, m21, m22 = matrix.T
+    trace = m00 + m11 + m22
+    quaternion = np.stack((m21 - m12, m02 - m20, m10 - m01, 1.0 + trace))
+    # Most objects stand about upright and have a large w. Where another component is the largest, SciPy takes
+    # that one from the diagonal and the others from it, which loses fewer digits.
+    tilted = (trace <= m00) | (trace <= m11) | (trace <= m22)
+    if tilted.any():
+        for k in np.flatnonzero(tilted):
+            quaternion[:, k] = _quaternion_of_tilted(matrix[k].reshape(3, 3).tolist(), float(trace[k]))
+    x, y, z, w = quaternion * quaternion
+    return (quaternion / np.sqrt(x + y + z + w)).T
+
+
+def _quaternion_of_tilted(m: list[list[float]], trace: float) -> list[float]:
+    """x, y, z, w, not yet of length 1, where w is not the largest. Few rows at a time: plain numbers are fast."""
+    i = max(range(3), key=lambda axis: m[axis][axis])
+    j, k = (i + 1) % 3, (i + 2) % 3
+    quaternion = [0.0, 0.0, 0.0, m[k][j] - m[j][k]]
+    quaternion[i] = 1.0 - trace + 2.0 * m[i][i]
+    quaternion[j] = m[j][i] + m[i][j]
+    quaternion[k] = m[k][i] + m[i][k]
+    return quaternion
+
+
+class Scene(NamedTuple):
+    """The inputs of a rule, one entry a row: whether the point is as close to the goal as the table asks, the sensors,
+    the first 18 numbers of the observations, the goals (rows, 3), and the points (rows, 3) that are to reach them."""
+
+    near: Mask
+    sensors: Array
+    current: Array
+    goal: Array
+    point: Array
+
+
+STICK_LIFT = 0.01  # metres above where the stick lay
+STICK_SIDEWAYS = 0.04  # metres between the stick's end and the handle
+STICK_UPWARD = 0.06
+
+
+class SuccessFunction:
+    """The success of a fixed set of rows; ``programs`` gives a row's present :class:`TaskProgram`, for the one rule
+    that looks at contacts."""
+
+    def __init__(self, sources: Sequence[TaskSources], programs: Callable[[int], Any]) -> None:
+        success = [row.success for row in sources]
+        self._programs = programs
+        self._offset, self._axes, self._within, self._under, self._above, self._angle = (
+            np.array([getattr(row, name) for row in success])
+            for name in ("offset", "axes", "within", "under", "above", "angle")
+        )
+        points = [row.point for row in success]
+        self._seconds = np.flatnonzero([point == "second" for point in points])
+        self._grippers = np.flatnonzero([point == "gripper" for point in points])
+        self._places = np.flatnonzero([point not in ("object", "second", "gripper") for point in points])
+        self._at_height = np.flatnonzero([row.goal_height is not None for row in success])
+        self._goal_height = np.array([row.goal_height for row in success if row.goal_height is not None])
+        rules = [row.rule for row in success]
+        self._rules = [
+            (getattr(SuccessFunction, "_" + name.replace(" ", "_")), np.flatnonzero([rule == name for rule in rules]))
+            for name in sorted({rule for rule in rules if rule is not None})
+        ]
+
+    def __call__(self, sensors: Array, current: Array, goal: Array) -> Mask:
+        """(rows,) whether each row succeeds, by sensors (rows, WIDTH), observations (rows, 18) and goals (rows, 3)."""
+        point = current[:, OBJECT].copy()
+        if self._seconds.size:
+            point[self._seconds] = current[self._seconds, SECOND]
+        if self._grippers.size:
+            tips = sensors[self._grippers]
+            point[self._grippers] = (tips[:, RIGHT_TIP] + tips[:, LEFT_TIP]) / 2.0
+        if self._places.size:
+            point[self._places] = sensors[self._places, POINT]
+        if self._at_height.size:
+            goal = goal.copy()
+            goal[self._at_height, 2] = self._goal_height
+        distance = row_norm((point + self._offset - goal) * self._axes)
+        success = (distance <= self._within) & (distance < self._under)
+        scene = Scene(success, sensors, current, goal, point)
+        for rule, rows in self._rules:
+            success[rows] = rule(self, rows, scene)
+        return success
+
+    def _point_below_goal(self, rows: Index, scene: Scene) -> Mask:
+        """The ring is over the peg and has sunk below its top."""
+        return scene.near[rows] & (scene.goal[rows, 2] - scene.point[rows, 2] > 0.0)
+
+    def _object_above_goal(self, rows: Index, scene: Scene) -> Mask:
+        """The object is higher than the goal, wherever it is."""
+        return scene.current[rows, OBJECT.stop - 1] > scene.goal[rows, 2]
+
+    def _joint_above(self, rows: Index, scene: Scene) -> Mask:
+        """The joint has moved further than ``above``."""
+        return scene.sensors[rows, JOINT.start] > self._above[rows]
+
+    def _joint_near(self, rows: Index, scene: Scene) -> Mask:
+        """The joint is within ``within`` of ``angle``."""
+        return np.abs(scene.sensors[rows, JOINT.start] - self._angle[rows]) <= self._within[rows]
+
+    def _stick_inserted(self, rows: Index, scene: Scene) -> Mask:
+        """The container is at the goal, and the stick's end is through its handle."""
+        held = scene.near[rows]
+        if held.any():
+            end, handle = scene.sensors[rows, POINT], scene.current[rows, SECOND]
+            aside = np.abs(end - handle)
+            held &= end[:, 0] >= handle[:, 0]
+            held &= (aside[:, 1] <= STICK_SIDEWAYS) & (aside[:, 2] <= STICK_UPWARD)
+        return held
+
+    def _stick_held(self, rows: Index, scene: Scene) -> Mask:
+        """The container is at the goal, and the gripper holds the stick up."""
+        held = scene.near[rows]
+        for k in np.flatnonzero(held):
+            current, program = scene.current[rows[k]], self._programs(int(rows[k]))
+            lifted = current[OBJECT][2] - STICK_LIFT > program.stick_init_pos[2]
+            held[k] = current[GRIPPER] > 0.0 and lifted and _both_pads_press(program.model, program.data)
+        return held
+
+
+def _both_pads_press(model: Any, data: Any) -> bool:
+    """Whether both pads of the gripper push against the stick, by the contact forces Meta-World looks at."""
+    pairs = data.contact.geom
+    touched = (pairs == model.geom("objGeom").id).any(axis=1)
+    for pad in ("leftpad_geom", "rightpad_geom"):
+        contacts = touched & (pairs == model.geom(pad).id).any(axis=1)
+        if not sum(data.efc_force[data.contact.efc_address[contacts]]) > 0:
+            return False
+    return True

@@ -1,0 +1,279 @@
+"""The formula of each kind of reward, and the lifts: how well a held object is on its way to the goal."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lw_torchrl.suites.metaworld.vectorized import observation as at
+from lw_torchrl.suites.metaworld.vectorized.observation import Array, Index, Mask, row_norm
+from lw_torchrl.suites.metaworld.vectorized.rewards import terms
+from lw_torchrl.suites.metaworld.vectorized.rewards.terms import Numbers, hamacher_product, limited, square, tolerance
+
+Cast = Callable[[Any], Any]
+"""Brings numbers to the precision that a formula is computed in: single, where a number of a float32 action takes part,
+for NumPy gives way to it where a plain Python number meets it."""
+
+Formula = Callable[["StepState", Index, Cast], Numbers]
+"""(state, rows, cast) -> (len(rows),) their rewards."""
+
+
+@dataclass
+class StepState:
+    """All rows after one step, one entry a row."""
+
+    task: terms.Parameters
+    features: Array  # (rows, FEATURES)
+    proximity: terms.Proximity
+    near: Array  # the values of these terms
+    placed: Array
+    via: Array
+    above: Array  # how well the hand keeps above the floor of the funnel
+    lift: Array  # how well a held object is on its way to the goal
+    wide: Mask  # where ``lift`` is a NumPy number, not a Python one, so that single precision gives way to it
+    grasp: Array  # how well the object is gripped
+    narrow: Mask  # where a number of the action takes part, so that the reward has the action's precision
+    closed: Numbers  # how far the gripper is told to close, from 0 to 1
+    effort: Numbers  # the gripper's action, from 0, open, to 1, closed
+    held: Mask  # whether the object counts as held
+
+
+def _by_name(*functions: Any) -> dict[str, Any]:
+    """Functions by their names in data/rewards.toml."""
+    return {one.__name__.replace("_", " "): one for one in functions}
+
+
+TO_HANDLE = np.array([-0.05, 0.0, 0.0])
+BESIDE_HANDLE = np.array([0.05, 0.03, -0.01])
+UPRIGHT = np.array([0.707, 0.0, 0.0, 0.707])
+
+
+def reach(s: StepState, rows: Index, cast: Cast) -> Array:
+    return 10 * s.placed[rows]
+
+
+def press(s: StepState, rows: Index, cast: Cast) -> Array:
+    """Be near with the gripper open (``shut``: closed); where held, press as well. ``weights`` of the two."""
+    opening = s.features[rows, at.GRIPPER]
+    opening = np.where(s.task.shut[rows], 1 - opening, opening)
+    first, second = s.task.weights[rows].T
+    reward = first * hamacher_product(opening, s.near[rows])
+    return reward + np.where(s.held[rows], second * s.placed[rows], 0.0)
+
+
+def press_behind_wall(s: StepState, rows: Index, cast: Cast) -> Array:
+    """Come near with the gripper closed, then open it and press."""
+    opening = s.features[rows, at.GRIPPER]
+    coming = 2 * hamacher_product((1 - opening) / 2.0, s.near[rows])
+    return np.where(s.held[rows], 2 + 2 * (1 + opening) + 4 * square(s.placed[rows]), coming)
+
+
+def weighted_sum(s: StepState, rows: Index, cast: Cast) -> Array:
+    """Near and placed, with ``weights``, times ``factor``."""
+    first, second = s.task.weights[rows].T
+    return (first * s.near[rows] + second * s.placed[rows]) * s.task.factor[rows]
+
+
+def both(s: StepState, rows: Index, cast: Cast) -> Any:
+    """Near as well as placed, times ``factor``; ``gripper``: and the gripper is told to close."""
+    near = cast(s.near[rows])
+    near = np.where(s.task.gripper[rows], hamacher_product(near, cast(s.closed[rows])), near)
+    return cast(s.task.factor[rows]) * hamacher_product(near, cast(s.placed[rows]))
+
+
+def slide(s: StepState, rows: Index, cast: Cast) -> Array:
+    """Come near; low down and near, slide."""
+    low = s.features[rows, terms.TCP.start + 2] <= 0.03
+    return np.where(low & s.held[rows], 2 + 7 * s.placed[rows], 1.5 * s.near[rows])
+
+
+def door(s: StepState, rows: Index, cast: Cast) -> Array:
+    """Come to the handle from above, told to close the gripper, and turn the door."""
+    features = s.features[rows]
+    handle, angle = features[:, at.OBJECT], -features[:, at.JOINT.start]
+    near = tolerance(row_norm(features[:, at.HAND] - (handle + TO_HANDLE) - BESIDE_HANDLE), 0.0, 0.06, 0.5)
+    ready = hamacher_product(s.above[rows], near)
+    turned = tolerance(np.pi / 2.0 + np.pi / 6 - angle, 0.0, 0.5, np.pi / 3.0)
+    opened = 0.2 * (-angle < -np.pi / 90.0) + 0.8 * turned
+    reward = 2.0 * hamacher_product(ready, s.effort[rows]) + 8.0 * opened
+    return np.where(np.abs(handle[:, 0] - features[:, terms.GOAL.start]) <= 0.08, 10.0, reward)
+
+
+def lid(s: StepState, rows: Index, cast: Cast) -> Array:
+    """Come to the lid from above, told to close the gripper, lift it and bring it over the box, all of it upright."""
+    ready = hamacher_product(s.above[rows], s.near[rows])
+    lifted = 0.2 * (s.features[rows, at.OBJECT.stop - 1] + 0.02 > 0.04) + 0.8 * s.placed[rows]
+    reward = 2.0 * hamacher_product(s.effort[rows], ready) + 8.0 * lifted
+    reward = np.where(s.proximity.distance[rows, terms.VIA] < 0.08, 10.0, reward)
+    return reward * turned_like(s.features[rows, at.QUATERNION], UPRIGHT, 0.2)
+
+
+def turned_like(quaternion: Array, ideal: Array, margin: float) -> Array:
+    """1 where a quaternion is the ideal one, 0 from ``margin`` on."""
+    return np.maximum(1.0 - row_norm(quaternion - ideal) / margin, 0.0)
+
+
+TALL = np.array([1.0, 1.0, 3.0])
+LYING = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+def carry(s: StepState, rows: Index, cast: Cast) -> Any:
+    """Grip and place; where held, 1 more, and ``bonus`` times the lift."""
+    reward = hamacher_product(cast(s.grasp[rows]), cast(s.placed[rows]))
+    more = 1.0 + s.task.bonus[rows] * s.lift[rows]
+    carried = np.where(s.wide[rows], reward + more, reward + cast(more))
+    return np.where(s.held[rows], carried, reward)
+
+
+def _by_way(s: StepState, rows: Index, cast: Cast, gripped: Any) -> Any:
+    """Where held, first to a point at the wall; what is beyond the wall, to the goal."""
+    coming = gripped + 1.0 + cast(4.0 * s.via[rows])
+    going = gripped + 1.0 + 4.0 + cast(3.0 * s.placed[rows])
+    carried = np.where(s.features[rows, at.OBJECT.start + 1] > 0.75, going, coming)
+    return np.where(s.held[rows], carried, gripped)
+
+
+def carry_over_wall(s: StepState, rows: Index, cast: Cast) -> Any:
+    return _by_way(s, rows, cast, hamacher_product(cast(s.grasp[rows]), cast(s.via[rows])))
+
+
+def push_round_wall(s: StepState, rows: Index, cast: Cast) -> Any:
+    return _by_way(s, rows, cast, 2 * cast(s.grasp[rows]))
+
+
+def push(s: StepState, rows: Index, cast: Cast) -> Any:
+    reward = 2 * cast(s.grasp[rows])
+    return np.where(s.held[rows], reward + (1.0 + reward + cast(5.0 * s.placed[rows])), reward)
+
+
+def unplug(s: StepState, rows: Index, cast: Cast) -> Any:
+    """Grip; once the plug has moved a little, pull it to the goal."""
+    reward = 2 * cast(s.grasp[rows])
+    moved = s.features[rows, at.OBJECT.start] - s.features[rows, terms.START.start] > 0.015
+    return np.where(s.held[rows] & moved, 1 + reward + cast(5 * s.placed[rows]), reward)
+
+
+def sweep(s: StepState, rows: Index, cast: Cast) -> Any:
+    grasp = s.grasp[rows]
+    return 2 * grasp + 6 * hamacher_product(grasp, s.placed[rows])
+
+
+def soccer(s: StepState, rows: Index, cast: Cast) -> Any:
+    """Less where the ball comes to the goal line beside the goal."""
+    ball, goal = s.features[rows, at.OBJECT], s.features[rows, terms.GOAL]
+    placed, line = s.placed[rows], goal[:, 1] - 0.1
+    missed = (ball[:, 1] > line) & (np.abs(ball[:, 0] - goal[:, 0]) > 0.1)
+    beyond = 2 * ((ball[:, 1] - line) / (1 - line))
+    placed = np.where(missed, limited(placed - beyond, 0.0, 1.0), placed)
+    return 3 * s.grasp[rows] + 6.5 * placed
+
+
+def _with_tool(s: StepState, rows: Index, cast: Cast, placed: Array, upright: Array) -> Any:
+    """Grip and place, all of it turned as the tool should be."""
+    turned = turned_like(s.features[rows, at.QUATERNION], upright, 0.4)
+    return (2.0 * cast(s.grasp[rows]) + cast(6.0 * placed)) * cast(turned)
+
+
+def peg(s: StepState, rows: Index, cast: Cast) -> Any:
+    """Bring the ring over the peg: far away high up, then down."""
+    ring = s.features[rows, at.PLACE]
+    error = s.features[rows, terms.GOAL] - ring
+    radius = row_norm(error[:, :2])
+    on_peg = (radius < 0.02) & (error[:, 2] > 0.0)
+    rim = np.where(on_peg, 0.02, 0.01)
+    height = np.where(radius > rim, 0.02 * np.log(radius - rim) + 0.2, 0.0)
+    error[:, 2] = height - ring[:, 2]
+    lifted = (ring[:, 2] > 0.02) | (radius < rim)
+    placed = 0.1 * lifted + 0.9 * tolerance(row_norm(error * TALL), 0.0, 0.02, 0.4)
+    return np.where(on_peg, 10.0, _with_tool(s, rows, cast, placed, UPRIGHT))
+
+
+def unpeg(s: StepState, rows: Index, cast: Cast) -> Any:
+    """Lift the ring from the peg."""
+    features = s.features[rows]
+    placed = 0.1 * (features[:, at.PLACE.start + 2] > 0.02) + 0.9 * s.placed[rows]
+    off_peg = features[:, at.OBJECT.start + 2] > features[:, terms.GOAL.start + 2]
+    return np.where(off_peg, 10.0, _with_tool(s, rows, cast, placed, UPRIGHT))
+
+
+def hammer(s: StepState, rows: Index, cast: Cast) -> Any:
+    """Bring the hammer's head to the nail, and drive it in."""
+    features = s.features[rows]
+    placed = 0.1 * (features[:, at.OBJECT.start + 2] > 0.02) + 0.9 * s.placed[rows]
+    reward = _with_tool(s, rows, cast, placed, LYING)
+    return np.where((features[:, at.JOINT.start] > 0.09) & (reward > 5.0), 10.0, reward)
+
+
+def stick_push(s: StepState, rows: Index, cast: Cast) -> Any:
+    """Grip the stick; held, bring it and with it the container to the goal."""
+    carried = 2.0 + 5.0 * s.via[rows] + 3.0 * s.placed[rows]
+    carried = np.where(s.proximity.distance[rows, terms.PLACED] <= 0.12, 10.0, carried)
+    return np.where(s.held[rows], carried, cast(s.grasp[rows]))
+
+
+def stick_pull(s: StepState, rows: Index, cast: Cast) -> Any:
+    """Grip the stick, bring it to the handle; once through it, pull the container to the goal."""
+    features = s.features[rows]
+    stick, handle = features[:, at.OBJECT], features[:, at.SECOND]
+    end, goal = features[:, at.PLACE], features[:, terms.GOAL]
+    gripped = hamacher_product(cast(s.grasp[rows]), cast(s.via[rows]))
+    reward = np.where(s.held[rows], 1.0 + gripped + cast(5.0 * s.via[rows]), gripped)
+    aside = np.abs(end - handle)
+    through = s.held[rows] & (end[:, 0] >= handle[:, 0]) & (aside[:, 1] <= 0.04) & (aside[:, 2] <= 0.06)
+    if not through.any():
+        return reward
+    at_goal = tolerance(row_norm(stick - goal), 0.0, 0.05, row_norm(features[:, terms.START] - goal))
+    pulled = 1.0 + gripped + 5.0 + 2.0 * at_goal + 1.0 * s.placed[rows]
+    pulled = np.where(row_norm(handle - goal) <= 0.12, 10.0, pulled)
+    return np.where(through, pulled, reward)
+
+
+FORMULAS: dict[str, Formula] = {
+    "sum": weighted_sum,
+    **_by_name(
+        *(reach, press, press_behind_wall, both, slide, door, lid, carry, carry_over_wall, push, push_round_wall),
+        *(unplug, sweep, soccer, peg, unpeg, hammer, stick_push, stick_pull),
+    ),
+}
+
+
+def over_funnel(s: StepState, rows: Index) -> None:
+    """The hand is to come from above, and to stay so."""
+    s.lift[rows] = hamacher_product(s.above[rows], s.placed[rows])
+
+
+def into_box(s: StepState, rows: Index) -> None:
+    """The peg's head counts as less placed within two corners of the box, where it would collide."""
+    features = s.features[rows]
+    head = features[:, at.PLACE]
+    zero_1, one_1, zero_2, one_2 = features[:, at.CORNERS].reshape(-1, 4, 3).transpose(1, 0, 2)
+    (first, in_first), (second, in_second) = _within_prism(head, zero_1, one_1), _within_prism(head, zero_2, one_2)
+    s.placed[rows] = s.lift[rows] = hamacher_product(s.placed[rows], hamacher_product(second, first))
+    s.narrow[rows] &= ~(in_first | in_second)  # a NumPy number then, to which single precision gives way
+
+
+def _within_prism(point: Array, zero: Array, one: Array) -> tuple[Array, Any]:
+    """Within a box, the product of how far the point is along each axis; 1 outside. And whether it is within."""
+    inside = ((np.minimum(zero, one) <= point) & (point <= np.maximum(zero, one))).all(axis=1)
+    x, y, z = ((point - zero) / (one - zero)).T
+    return np.where(inside, x * y * z, 1.0), inside
+
+
+def onto_shelf(s: StepState, rows: Index) -> None:
+    """In front of the shelf and below its board the object counts as less placed, under the board as not at all."""
+    features = s.features[rows]
+    thing, goal, placed = features[:, at.OBJECT], features[:, terms.GOAL], s.placed[rows]
+    x, y, z = thing.T
+    low = (z > 0.0) & (z < 0.24) & (goal[:, 0] - 0.15 < x) & (x < goal[:, 0] + 0.15)
+    edge = goal[:, 1] - 3 * 0.05
+    before, under = low & (edge < y) & (y < goal[:, 1]), low & (y > goal[:, 1])
+    loss = hamacher_product((y - edge) / (3 * 0.05), (0.24 - z) / 0.24)
+    lift = np.where(before, limited(placed - loss, 0.0, 1.0), placed)
+    s.lift[rows] = np.where(under, 0.0, lift)
+    s.wide[rows] = before
+
+
+LIFTS: dict[str, Callable[[StepState, Index], None]] = _by_name(over_funnel, into_box, onto_shelf)

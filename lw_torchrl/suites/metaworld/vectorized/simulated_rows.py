@@ -1,0 +1,156 @@
+"""Simulated rows, each a MuJoCo state on a shared model, and the threads that work through groups of rows."""
+
+from __future__ import annotations
+
+from collections import defaultdict, deque
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from math import ceil
+from time import perf_counter
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from lw_torchrl.suites.engine import RowModel
+from lw_torchrl.suites.metaworld.plain_engine import UNSTABLE
+from lw_torchrl.suites.metaworld.vectorized.observation import Array, StateView, sensor_index
+from lw_torchrl.suites.metaworld.vectorized.tables import TaskReward, TaskSources
+from lw_torchrl.suites.metaworld.vectorized.task_programs import SharedModel
+
+_VELOCITIES_DONE = int(mujoco.mjtStage.mjSTAGE_VEL)
+
+
+class SimulatedRow:
+    """A state, the positions that its last reset gave to bodies and sites, and Meta-World's program for its task, a
+    copy of ``builder`` for each episode. No other thread may use the ``shared`` model while this row simulates or
+    resets."""
+
+    def __init__(self, sources: TaskSources, shared: SharedModel, builder: Any, reward: TaskReward | None) -> None:
+        self.sources = sources
+        self.shared = shared
+        self.program: Any = None
+        self.builder = builder
+        self._model = shared.model
+        self._data = mujoco.MjData(shared.model)
+        self._places = shared.compiled[0].copy(), shared.compiled[1].copy()
+        self._substeps: int = builder.frame_skip
+        self.mocap: Array = self._data.mocap_pos[0]  # that the hand is drawn to
+        self._control: Array = self._data.ctrl
+        window = StateView(self._model, self._data)
+        self._numbers = window.numbers
+        self._sensor_index = sensor_index(window, sources, reward)
+        self._looked = False
+        self._warnings: NDArray[np.int32] = self._data.warning.number[UNSTABLE]
+
+    def reset(self, seed: int) -> Array:
+        """Start an episode, a function of the seed alone; returns the first observation."""
+        self.shared.restore()
+        self._looked = False
+        self.program = self.builder.on(self._data)
+        observation = self.program.start_episode(seed)
+        self._places[0][...], self._places[1][...] = self.shared.places
+        self.shared.holder = self
+        return observation
+
+    def simulate(self, mocap: Array, control: Array, sensors: Array, warnings: NDArray[np.int32]) -> None:
+        """One step of the environment: five of physics, and a look without moving, ``mj_forward``, which also leaves
+        the accelerations from which the next step's solver starts. ``sensors`` (as wide as its index) and ``warnings``
+        (3,) are filled while the state is still in the processor's cache."""
+        self._take_model()
+        self.mocap[...] = mocap
+        self._control[...] = control
+        if self._looked:
+            self._substep_after_look()
+            mujoco.mj_step(self._model, self._data, self._substeps - 1)
+        else:
+            mujoco.mj_step(self._model, self._data, self._substeps)
+        mujoco.mj_forward(self._model, self._data)
+        self._looked = True
+        self._numbers.take(self._sensor_index, out=sensors, mode="clip")
+        warnings[...] = self._warnings
+
+    def seen(self) -> tuple[RowModel, Any]:
+        """Its model, with this row's places in it, and its data."""
+        self._take_model()
+        return RowModel(self.shared.path, self._model), self._data
+
+    def _substep_after_look(self) -> None:
+        """One ``mj_step`` where since the last ``mj_forward`` only the controls and the mocap body have moved.
+
+        That body touches nothing, and only the weld to the hand depends on it. So contacts, inertia, velocities and
+        what they cause are still those of the look, which saves a tenth of the step with the same bits. Newton's solver
+        needs no projection of constraints. The substep after this one finds numbers that are not finite or too large.
+        """
+        model, data = self._model, self._data
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_makeConstraint(model, data)
+        mujoco.mj_referenceConstraint(model, data)
+        mujoco.mj_forwardSkip(model, data, _VELOCITIES_DONE, 1)  # 1: no sensors
+        mujoco.mj_Euler(model, data)
+
+    def _take_model(self) -> None:
+        if self.shared.holder is not self:
+            self.shared.load(self, self._places)
+
+
+class RowGroup:
+    """Rows that share a model, and so take turns; ``seconds`` is the time of each row's last work."""
+
+    def __init__(self, rows: Sequence[int]) -> None:
+        self.rows = tuple(rows)
+        self.seconds = 1.0
+
+
+def split_into_groups(keys: Sequence[str], num_threads: int) -> list[RowGroup]:
+    """Put the rows with one key together, apart only if they would keep a thread busy for over half of its share."""
+    by_key: dict[str, list[int]] = defaultdict(list)
+    for row, key in enumerate(keys):
+        by_key[key].append(row)
+    largest = len(keys) if num_threads == 1 else ceil(len(keys) / (2 * num_threads))
+    parts = [part for rows in by_key.values() for part in np.array_split(rows, ceil(len(rows) / largest))]
+    return [RowGroup(part.tolist()) for part in parts]
+
+
+class WorkerPool:
+    """Threads that take one group after another, those that took long last time first, until none is left. One thread
+    at a time works on a group, so its rows may share a model; which thread changes no result."""
+
+    def __init__(self, num_threads: int) -> None:
+        self._helpers = num_threads - 1
+        self._threads = ThreadPoolExecutor(self._helpers, "lw_torchrl") if self._helpers else None
+
+    def work(self, groups: Iterable[tuple[RowGroup, Sequence[int]]], do: Callable[[int], None]) -> None:
+        """Call ``do(item)`` for every item of every ``(group, items)``, the items of a group in turn."""
+        if self._threads is None:
+            for _, items in groups:
+                for item in items:
+                    do(item)
+            return
+        waiting = deque(sorted(groups, key=lambda job: job[0].seconds * len(job[1]), reverse=True))
+
+        def work_through() -> None:
+            while True:
+                try:
+                    group, items = waiting.popleft()
+                except IndexError:
+                    return
+                start = perf_counter()
+                for item in items:
+                    do(item)
+                group.seconds = (perf_counter() - start) / len(items)
+
+        helpers = min(self._helpers, len(waiting) - 1)
+        futures = [self._threads.submit(work_through) for _ in range(helpers)]
+        try:
+            work_through()
+        finally:
+            waiting.clear()
+            errors = [error for future in futures if (error := future.exception()) is not None]
+        for error in errors:
+            raise error
+
+    def close(self) -> None:
+        if self._threads is not None:
+            self._threads.shutdown()

@@ -1,0 +1,230 @@
+"""The tables of all tasks: data/simulation.toml (observation, success) and data/rewards.toml, read and checked."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from importlib.resources import files
+from math import inf, nan
+from types import MappingProxyType
+from typing import Any, Literal
+
+from lw_torchrl._checks import check_choice, check_fields
+
+Vector = tuple[float, float, float]
+Pair = tuple[float, float]
+
+RULES = ("point below goal", "object above goal", "joint above", "joint near", "stick inserted", "stick held")
+
+NO_OFFSET: Vector = (-0.0, -0.0, -0.0)
+"""Adding -0.0 leaves every number as it is, 0.0 and -0.0 included; adding 0.0 does not."""
+
+
+@dataclass(frozen=True)
+class SuccessSources:
+    """What makes a task a success; see the head of data/simulation.toml for each field."""
+
+    within: float = inf
+    under: float = inf
+    point: str = "object"
+    offset: Vector = NO_OFFSET
+    axes: Vector = (1.0, 1.0, 1.0)
+    goal_height: float | None = None
+    rule: str | None = None
+    joint: str | None = None
+    angle: float = 0.0
+    above: float = 0.0
+    stick_end: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.rule is not None:
+            check_choice("success.rule", self.rule, RULES)
+        if self.point not in ("object", "second", "gripper") and not re.fullmatch("(body|geom|site) .+", self.point):
+            raise ValueError(f"a place is 'body NAME', 'geom NAME' or 'site NAME', got {self.point!r}")
+
+
+@dataclass(frozen=True)
+class TaskSources:
+    """Where one task's observation comes from; see the head of data/simulation.toml for each field."""
+
+    object: str
+    quaternion: str
+    success: SuccessSources
+    offset: Vector = NO_OFFSET
+    dial: str | None = None
+    second: str | None = None
+    second_offset: Vector = NO_OFFSET
+    second_quaternion: str = "zeros"
+
+
+POINTS = (
+    "hand", "object", "second", "goal", "tcp", "left pad", "grip", "place", "start", "tcp at start", "mark", "waypoint",
+)  # fmt: skip
+FIRST_DISTANCE = "first distance"
+
+
+def _check_points(points: tuple[str, ...], *numbers: int) -> None:
+    if len(points) not in numbers:
+        wanted = " or ".join(("one", "two")[number - 1] for number in numbers)
+        raise ValueError(f"{wanted} points are needed, got {', '.join(points)}")
+    for point in points:
+        check_choice("a point", point, POINTS)
+
+
+@dataclass(frozen=True)
+class Term:
+    """How close two points are; see the head of data/rewards.toml for each field."""
+
+    between: tuple[str, str] = ("object", "object")
+    offset: Vector = NO_OFFSET
+    axes: Vector = (1.0, 1.0, 1.0)
+    within: float = inf
+    margin: tuple[str, str] | float | str = 1.0
+    margin_offset: Vector = NO_OFFSET
+    less: float = 0.0
+    curve: Literal["long tail", "gaussian"] = "long tail"
+
+    def __post_init__(self) -> None:
+        _check_points(self.between, 2)
+        if isinstance(self.margin, tuple):
+            _check_points(self.margin, 2)
+        check_fields(self)
+
+
+@dataclass(frozen=True)
+class Cage:
+    """How the gripper is to enclose the object."""
+
+    radius: float
+    pad: float
+    across: float
+    effort: float = 1.0
+    density: Literal["sparse", "high", "medium"] = "sparse"
+    start: str = "start"
+    slide: float = 0.0
+    offset: Vector = NO_OFFSET
+    signed: bool = False
+    pinch: float = inf
+
+    def __post_init__(self) -> None:
+        check_fields(self, "cage.")
+        check_choice("cage.start", self.start, POINTS)
+
+
+@dataclass(frozen=True)
+class Funnel:
+    """Above what a point is to stay on its way."""
+
+    over: str
+    about: tuple[str, ...]
+    rim: float
+    slope: float
+    height: float
+    margin: float = nan
+    offset: Vector = NO_OFFSET
+
+    def __post_init__(self) -> None:
+        _check_points((self.over,), 1)
+        _check_points(self.about, 1, 2)
+
+
+@dataclass(frozen=True)
+class Held:
+    """When the object counts as held; without limits, always."""
+
+    near: float = inf
+    within: float = inf
+    opened: float = -inf
+    opened_from: float = -inf
+    opened_under: float = inf
+    lifted: float = -inf
+    lifted_axis: int = 2
+    moved: float = -inf
+    grasps: bool = False
+
+
+@dataclass(frozen=True)
+class TaskReward:
+    """One task's dense reward."""
+
+    formula: str
+    near: Term = field(default_factory=Term)
+    placed: Term = field(default_factory=Term)
+    via: Term = field(default_factory=Term)
+    cage: Cage | None = None
+    funnel: Funnel | None = None
+    held: Held = field(default_factory=Held)
+    done_under: float = -inf
+    done_within: float = -inf
+    start: str = "obj_init_pos"
+    mark: str | None = None
+    place: str | None = None
+    waypoint: tuple[float | str, float | str, float | str] = (0.0, 0.0, 0.0)
+    corners: tuple[str, ...] = ()
+    joint: str | None = None
+    weights: Pair = (1.0, 1.0)
+    factor: float = 1.0
+    bonus: float = 5.0
+    shut: bool = False
+    gripper: bool = False
+    lift: str | None = None
+
+    @property
+    def terms(self) -> tuple[Term, Term, Term, Term]:
+        """near, placed and via, and how close the gripper is across the object."""
+        across = Term()
+        if (cage := self.cage) is not None:
+            margin = cage.start, "tcp at start"
+            across = Term(("tcp", "grip"), axes=(1.0, 0.0, 1.0), within=cage.across, margin=margin, less=cage.across)
+        return self.near, self.placed, self.via, across
+
+
+def _plain(table: Mapping[str, Any]) -> dict[str, Any]:
+    """TOML's lists as tuples and its whole numbers as floats, everything else as it is."""
+
+    def number(value: Any) -> Any:
+        return float(value) if type(value) is int else value
+
+    return {
+        key: tuple(map(number, value)) if isinstance(value, list) else value if key == "lifted_axis" else number(value)
+        for key, value in table.items()
+    }
+
+
+def _parse(text: str, kind: str, task: Any, parts: Mapping[str, Any]) -> dict[str, Any]:
+    tasks = {}
+    for name, entry in tomllib.loads(text).items():
+        try:
+            made = {key: parts[key](**_plain(entry.pop(key))) for key in parts.keys() & entry.keys()}
+            tasks[name] = task(**_plain(entry), **made)
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"{kind} table, task {name!r}: {error}") from error
+    return tasks
+
+
+def parse_simulation_table(text: str) -> dict[str, TaskSources]:
+    """Read TOML; :class:`ValueError` names the task of an entry that is not understood."""
+    return _parse(text, "simulation", TaskSources, {"success": SuccessSources})
+
+
+def parse_reward_table(text: str) -> dict[str, TaskReward]:
+    """As :func:`parse_simulation_table`."""
+    parts = {"near": Term, "placed": Term, "via": Term, "cage": Cage, "funnel": Funnel, "held": Held}
+    return _parse(text, "reward", TaskReward, parts)
+
+
+def _shipped(name: str) -> str:
+    return (files("lw_torchrl.suites.metaworld.vectorized") / "data" / name).read_text(encoding="utf-8")
+
+
+@cache
+def simulation_table() -> Mapping[str, TaskSources]:
+    return MappingProxyType(parse_simulation_table(_shipped("simulation.toml")))
+
+
+@cache
+def reward_table() -> Mapping[str, TaskReward]:
+    return MappingProxyType(parse_reward_table(_shipped("rewards.toml")))

@@ -1,0 +1,176 @@
+"""Meta-World's own reset, on compiled models that rows share."""
+
+from __future__ import annotations
+
+import copy
+import importlib.metadata
+import threading
+from collections.abc import Callable, Iterable
+from functools import cache
+from typing import Any
+
+import mujoco
+import numpy as np
+from gymnasium.utils import seeding
+from numpy.typing import NDArray
+
+from lw_torchrl._checks import check_choice
+from lw_torchrl.suites.metaworld.plain_engine import import_metaworld
+
+SUPPORTED_VERSIONS = {"metaworld": "3.1.1", "mujoco": "3.3.0"}
+
+
+def check_versions() -> None:
+    """Raise ImportError for a Meta-World or MuJoCo whose numbers have not been compared with this engine's."""
+    for package, supported in SUPPORTED_VERSIONS.items():
+        try:
+            installed = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            installed = "none"
+        if installed != supported:
+            raise ImportError(
+                f"the vectorized engine reproduces {package} {supported}, but the installed version is "
+                f"{installed}. Install {package}=={supported}, or choose engine='metaworld', which runs "
+                "whatever is installed."
+            )
+
+
+Places = tuple[NDArray[np.float64], NDArray[np.float64]]
+
+
+class SharedModel:
+    """A compiled model that many rows use in turn: a reset of a Meta-World task moves bodies and sites of the model
+    itself, so each row keeps its own ``places`` of both, and loads them before its physics unless it is still the
+    ``holder``."""
+
+    def __init__(self, path: str, model: Any, compiled: Places | None = None) -> None:
+        self.path, self.model = path, model
+        self.places: Places = (model.body_pos, model.site_pos)
+        self.compiled: Places = compiled or (model.body_pos.copy(), model.site_pos.copy())
+        self.holder: object = None
+
+    def load(self, holder: object, places: Places) -> None:
+        self.holder = holder
+        self.places[0][...], self.places[1][...] = places
+
+    def restore(self) -> None:
+        self.load(None, self.compiled)
+
+
+# reentrant: an engine that Python collects gives its models back, perhaps inside borrow_model
+_lock = threading.RLock()
+_compiled: dict[str, SharedModel] = {}
+_idle: dict[str, SharedModel] = {}
+
+
+def borrow_model(path: str) -> SharedModel:
+    """A model of the XML file that nobody else uses, compiled only once in a process."""
+    with _lock:
+        if (idle := _idle.pop(path, None)) is not None:
+            return idle
+        if (known := _compiled.get(path)) is None:
+            _compiled[path] = SharedModel(path, mujoco.MjModel.from_xml_path(path))
+            return _compiled[path]
+        # It may be in use: take what never changes from it, not its present state.
+        twin = SharedModel(path, copy.copy(known.model), known.compiled)
+        twin.restore()
+        return twin
+
+
+def return_models(models: Iterable[SharedModel]) -> None:
+    """Give borrowed models back. One of each XML file is kept for the next borrower."""
+    with _lock:
+        for model in models:
+            model.restore()
+            _compiled[model.path] = _idle.setdefault(model.path, model)
+
+
+WARNED_ALREADY = 1000
+"""MuJoCo prints a warning, and writes MUJOCO_LOG.TXT, only when its count of that kind is zero. We start the
+counts here instead: nothing is written, and a count that is another number tells of a warning."""
+
+
+class TaskProgram:
+    """A Meta-World environment without a simulator of its own, mixed into one of Meta-World's classes. It is built once
+    for each model; every episode of every row runs on a light copy (:meth:`on`) that shares everything but the state.
+    """
+
+    model: Any
+    data: Any
+    frame_skip: int
+    hand_init_pos: NDArray[np.float64]
+    tcp_center: NDArray[np.float64]
+    reset_model: Callable[[], NDArray[np.float64]]
+    get_body_com: Callable[[str], NDArray[np.float64]]
+
+    _moves_hand = True
+
+    def __init__(self, model: Any) -> None:
+        self.model = model
+        super().__init__()
+        # The goal is part of the observation; each reset draws a new initial state and goal from the seed.
+        self._partially_observable = False
+        self.__dict__.pop("sawyer_observation_space", None)
+        self._set_task_called = True
+        self._freeze_rand_vec = False
+        self.seeded_rand_vec = True
+        self.mujoco_renderer = None
+        self.data = None
+
+    def _initialize_simulation(self) -> tuple[Any, Any]:
+        return self.model, mujoco.MjData(self.model)
+
+    def on(self, data: Any) -> TaskProgram:
+        """A copy of this program, as it was when built, that works on ``data``."""
+        program = object.__new__(type(self))
+        program.__dict__.update(self.__dict__)
+        program.data = data
+        # Two attributes are views of the state: in Meta-World they follow the fingers.
+        program.init_left_pad = program.get_body_com("leftpad")  # type: ignore[attr-defined]
+        program.init_right_pad = program.get_body_com("rightpad")  # type: ignore[attr-defined]
+        return program
+
+    def start_episode(self, seed: int) -> NDArray[np.float64]:
+        """Reset as Meta-World's ``env.seed(seed); env.reset()`` does; returns the first observation. Meta-World places
+        everything twice and moves the hand both times. Of the first round only the random draws and the positions of
+        bodies and sites survive, which do not depend on the hand, so here the first round does not move it."""
+        self.np_random, _ = seeding.np_random(seed)
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.warning.number[:] = WARNED_ALREADY
+        mujoco.mj_forward(self.model, self.data)
+        self._moves_hand = False
+        self.reset_model()
+
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.warning.number[:] = WARNED_ALREADY
+        self._moves_hand = True
+        observation = self.reset_model()
+        observation[18:36] = observation[:18]
+        return observation
+
+    def _reset_hand(self, steps: int = 50) -> None:
+        if self._moves_hand:
+            self.data.mocap_pos[:] = self.hand_init_pos
+            self.data.mocap_quat[:] = (1.0, 0.0, 1.0, 0.0)
+            self.data.ctrl[:] = (-1.0, 1.0)
+            mujoco.mj_step(self.model, self.data, nstep=steps * self.frame_skip)
+        self.init_tcp = self.tcp_center
+
+
+def _task_class(task: str) -> Any:
+    import_metaworld()
+    from metaworld.env_dict import ALL_V3_ENVIRONMENTS
+
+    check_choice("task", f"{task}-v3", ALL_V3_ENVIRONMENTS)
+    return ALL_V3_ENVIRONMENTS[f"{task}-v3"]
+
+
+@cache
+def program_class(task: str) -> Any:
+    base = _task_class(task)
+    return type(f"{base.__name__}Program", (TaskProgram, base), {})
+
+
+def model_path(task: str) -> str:
+    """The XML file of a task; 36 files serve the 50 tasks."""
+    return object.__new__(_task_class(task)).model_name

@@ -1,0 +1,135 @@
+"""Suite: the tasks of a simulator, what their numbers mean, and what simulates them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from importlib import import_module
+from types import MappingProxyType
+from typing import Any
+
+from lw_torchrl._checks import check_fields, shown, unknown_name
+from lw_torchrl.language.layout import Layout
+from lw_torchrl.language.plans import Plans
+from lw_torchrl.language.skills import Skills
+from lw_torchrl.language.tasks import Task, TaskList, Tasks, named_tasks
+from lw_torchrl.suites.engine import Engine
+
+
+@dataclass(frozen=True)
+class Suite:
+    """Tasks of one simulator and robot, for everything that takes ``suite=``.
+
+    Attributes:
+        name: "fetch"; its tasks are called "fetch/push".
+        layout: what the numbers of observations and actions are.
+        tasks: full name to :class:`Task`, each of this layout.
+        make_engine: ``(row_tasks, *, reward, num_threads) -> Engine``, the simulator of rows of these tasks.
+        skills: the scripted skills by their text; None for none.
+        plans: a plan for each task that has one; None for none.
+        max_steps: how many steps an episode has, unless the user says another number.
+
+    Raises:
+        ValueError: a task of another layout, or whose name does not begin with the suite's.
+
+    Example:
+        >>> from lw_torchrl.suites import load_suite
+        >>> load_suite("metaworld").tasks["reach"].name
+        'reach'
+
+    Source: ours; as gymnasium's ``EnvSpec``, with words.
+    """
+
+    name: str
+    layout: Layout
+    tasks: Tasks
+    make_engine: Callable[..., Engine]
+    skills: Skills | None = None
+    plans: Plans | None = None
+    max_steps: int = 500
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        if not self.tasks:
+            raise ValueError(f"tasks of suite {self.name!r} must name at least one task")
+        for name, task in self.tasks.items():
+            if not isinstance(task, Task) or task.name != name:
+                raise TypeError(f"tasks of suite {self.name!r} must map names to their Task, got {shown(task)}")
+            if task.layout != self.layout:
+                raise ValueError(f"task {name!r} must have the layout of suite {self.name!r}, got {task.layout.name!r}")
+            if self.name != "metaworld" and not name.startswith(f"{self.name}/"):
+                raise ValueError(f"tasks of suite {self.name!r} must be named '{self.name}/...', got {name!r}")
+        if self.plans is not None and (other := set(self.plans) - set(self.tasks)):
+            raise ValueError(f"plans of suite {self.name!r} are for tasks that it lacks: {', '.join(sorted(other))}")
+        if not isinstance(self.tasks, MappingProxyType):
+            object.__setattr__(self, "tasks", MappingProxyType(dict(sorted(self.tasks.items()))))
+
+    def named_tasks(self, tasks: TaskList, own: Tasks | None = None) -> dict[str, Task]:
+        """Full task names, sorted, to the tasks that are meant: the suite's name for all of them, a name with or
+        without the suite's in front, a :class:`Task`, or a list of these. ``own`` tasks are known beside them."""
+        known = {**self.tasks, **own} if own else self.tasks
+        if tasks == self.name:
+            return dict(self.tasks)
+        if isinstance(tasks, (str, Task)) or not isinstance(tasks, Iterable):
+            return named_tasks(self._full(tasks), known=known)
+        return named_tasks([self._full(task) for task in tasks], known=known)
+
+    def _full(self, task: Any) -> Any:
+        if not isinstance(task, str) or task in self.tasks or f"{self.name}/{task}" not in self.tasks:
+            return task
+        return f"{self.name}/{task}"
+
+
+SUITES: dict[str, str | Suite] = {"metaworld": "lw_torchrl.suites.metaworld", "fetch": "lw_torchrl.suites.fetch"}
+"""The name of a suite to the suite, or to the module that makes it by ``make_suite()``. Add yours here to use it by
+name; nobody has to, since every ``suite=`` takes the object too."""
+
+
+def load_suite(suite: str | Suite) -> Suite:
+    """The suite of a name, "fetch"; a :class:`Suite` is returned as it is.
+
+    Raises:
+        ValueError: there is none of that name; it gives the nearest.
+        ImportError: the simulator is not installed; it says what to install.
+    """
+    if isinstance(suite, Suite):
+        return suite
+    if not isinstance(suite, str):
+        raise TypeError(f"suite must be a suite's name or a Suite, got {shown(suite)} ({type(suite).__name__})")
+    if suite not in SUITES:
+        raise unknown_name("suite", suite, SUITES)
+    found = SUITES[suite]
+    if isinstance(found, str):
+        found = SUITES[suite] = import_module(found).make_suite()
+    return found
+
+
+def listed_tasks(tasks: Any) -> Any:
+    """The tasks as they were given, but an iterator as a list, which can be read twice."""
+    return list(tasks) if isinstance(tasks, Iterator) else tasks
+
+
+def find_suite(tasks: Any, suite: str | Suite | None = None) -> Suite:
+    """The suite of some tasks: the given one, or the one that their names begin with; else Meta-World's.
+
+    Raises:
+        ValueError: names of several suites, or of a suite that is not known.
+    """
+    if suite is not None:
+        return load_suite(suite)
+    listed = [tasks] if isinstance(tasks, (str, Task)) else list(tasks) if isinstance(tasks, Iterable) else []
+    names = {one.name if isinstance(one, Task) else one for one in listed if isinstance(one, (str, Task))}
+    prefixes = {name.partition("/")[0] if "/" in name or name in SUITES else "metaworld" for name in names}
+    if len(prefixes) > 1:
+        raise ValueError(f"tasks must be of one suite, got tasks of {', '.join(sorted(prefixes))}")
+    return load_suite(next(iter(prefixes), "metaworld"))
+
+
+def known_suite(task: str) -> Suite | None:
+    """The suite in :data:`SUITES` that has a task of this name and is installed; None for a task of one's own."""
+    name = task.partition("/")[0] if "/" in task else "metaworld"
+    try:
+        found = load_suite(name) if name in SUITES else None
+    except ImportError:
+        return None
+    return found if found is not None and task in found.tasks else None

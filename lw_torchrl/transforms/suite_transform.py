@@ -1,0 +1,110 @@
+"""SuiteTransform: somebody else's environment, seen and moved as a layout says."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
+from torchrl.envs import Transform
+
+from lw_torchrl._checks import checked
+from lw_torchrl._keys import check_key, read
+from lw_torchrl.language.tasks import Task, task_id
+
+
+class SuiteTransform(Transform):
+    """Turns the keys of any TorchRL environment into a layout's ``observation``, and says which task it is.
+
+    Behind it :class:`QAFTransform`, our actors, TorchRL's collectors and its losses work as they do with
+    :class:`~lw_torchrl.LanguageWorldEnv`.
+
+    Reads ``in_keys``; writes ``observation`` (..., D) float32 and ``task_id`` (...) int64. Where the layout has numbers
+    of the step before, it fills them; at a reset they are those of now. With ``act``, ``action`` (..., A) float32 in
+    [-1, 1] is an action of the layout.
+
+    Args:
+        task: what is to be done; its layout says what D and A are.
+        observe: from the tensors of ``in_keys`` to (..., D) numbers in the layout's order and frame. Numbers of the
+            step before may be anything.
+        act: from an action of the layout (..., A) to one of the environment; None where they are the same.
+        in_keys: what ``observe`` is given.
+
+    Raises:
+        ValueError: at call time, a missing key, or another number of numbers than the layout's.
+
+    Example:
+        >>> import lw_torchrl as lw, torch
+        >>> from lw_torchrl.transforms import SuiteTransform
+        >>> from torchrl.envs import TransformedEnv
+        >>> env = TransformedEnv(lw.LanguageWorldEnv("reach"), SuiteTransform(lw.TASKS["push"], lambda seen: seen))
+        >>> env.reset()["task_id"].tolist() == [lw.task_id("push")]
+        True
+        >>> env.close()
+
+    Source: as ``torchrl.envs.transforms.CatTensors``, with a meaning for each number.
+    """
+
+    makes_observation = True
+
+    @checked
+    def __init__(
+        self,
+        task: Task,
+        observe: Callable[..., Tensor],
+        *,
+        act: Callable[[Tensor], Tensor] | None = None,
+        in_keys: Sequence[NestedKey] = ("observation",),
+    ) -> None:
+        for key in in_keys:
+            check_key("in_keys", key)
+        inverse = ["action"] if act is not None else []
+        super().__init__(
+            in_keys=list(in_keys), out_keys=["observation", "task_id"], in_keys_inv=inverse, out_keys_inv=inverse
+        )
+        self.task, self.observe, self.act, self.layout = task, observe, act, task.layout
+
+    def _seen(self, tensordict: TensorDictBase) -> Tensor:
+        found = self.observe(*read(tensordict, self.in_keys)).to(torch.float32)
+        if found.shape[-1:] != (self.layout.size,):
+            raise ValueError(
+                f"observe must give the {self.layout.size} numbers of layout {self.layout.name!r}, got shape "
+                f"{tuple(found.shape)}"
+            )
+        return found.clone()
+
+    def _write(self, tensordict: TensorDictBase, before: Tensor | None) -> TensorDictBase:
+        seen, past = self._seen(tensordict), self.layout.past
+        if past is not None:
+            seen[..., past : 2 * past] = (seen if before is None else before)[..., :past]
+        number = torch.full(seen.shape[:-1], task_id(self.task.name), device=seen.device)
+        return tensordict.set("observation", seen).set("task_id", number)
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        return self._write(tensordict_reset, None)
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return self._write(next_tensordict, tensordict.get("observation"))
+
+    def _inv_apply_transform(self, action: Tensor) -> Tensor:
+        assert self.act is not None
+        return self.act(action)
+
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        assert isinstance(observation_spec, Composite)
+        shape, device = observation_spec.shape, observation_spec.device
+        observation_spec["observation"] = Unbounded((*shape, self.layout.size), device=device, dtype=torch.float32)
+        observation_spec["task_id"] = Unbounded(shape, device=device, dtype=torch.int64)
+        return observation_spec
+
+    def transform_action_spec(self, action_spec: TensorSpec) -> TensorSpec:
+        if self.act is None:
+            return action_spec
+        if isinstance(action_spec, Composite):
+            action_spec["action"] = self.transform_action_spec(action_spec["action"])
+            return action_spec
+        shape = (*action_spec.shape[:-1], self.layout.action_size)
+        return Bounded(-1.0, 1.0, shape, device=action_spec.device, dtype=torch.float32)

@@ -1,0 +1,165 @@
+"""FetchEngine against gymnasium-robotics, bit for bit, and what it refuses."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+
+pytest.importorskip("gymnasium_robotics")
+from fetch_runs import IDS, engine_episode, gymnasium_episode, random_actions, scripted
+
+from lw_torchrl.suites.fetch import FETCH, FetchEngine
+from lw_torchrl.suites.fetch import engine as fetch_engine
+
+STEPS = 50
+
+
+def assert_same(task: str, seed: int, actions: np.ndarray) -> None:
+    engine = FetchEngine([task, task], reward="dense", num_threads=1)
+    engine_episode(engine, 1, seed + 1, random_actions(seed, 7))  # an earlier episode leaves nothing over
+    found, expected = engine_episode(engine, 1, seed, actions), gymnasium_episode(task, seed, actions)
+    engine.close()
+    for name, numbers in expected.items():
+        np.testing.assert_array_equal(found[name], numbers, err_msg=name)
+
+
+@pytest.mark.parametrize("task", IDS)
+def test_an_episode_is_gymnasiums(task):
+    assert_same(task, 3, random_actions(3, 15))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1, 2, 1_000, 2**31])
+@pytest.mark.parametrize("task", IDS)
+def test_episodes_of_random_and_scripted_actions_are_gymnasiums(task, seed):
+    assert_same(task, seed, random_actions(seed, STEPS))
+    assert_same(task, seed, scripted(task, range(seed, seed + 1), STEPS)[0][:, 0])
+    assert_same(task, seed, random_actions(seed, 10).astype(np.float64) * 1.5)  # cut off in double precision
+
+
+def all_rows(tasks: list[str], threads: int) -> list[np.ndarray]:
+    """Eight steps of all rows, which have a seed and actions of their task."""
+    engine = FetchEngine(tasks, num_threads=threads)
+    names = sorted(IDS)
+    seeds = [names.index(task) for task in tasks]
+    found = [engine.reset(range(len(tasks)), seeds)]
+    actions = [random_actions(seed, 8) for seed in seeds]
+    for step in range(8):
+        result = engine.step(np.stack([one[step] for one in actions]), np.ones(len(tasks), bool))
+        found += [result.observation, result.reward]
+    engine.close()
+    return found
+
+
+def test_neither_threads_nor_the_order_of_rows_matter():
+    tasks = sorted(IDS)
+    expected = all_rows(tasks, 1)
+    for order, threads in (([0, 1, 2, 3], 3), ([2, 0, 3, 1], 2)):
+        found = all_rows([tasks[row] for row in order], threads)
+        assert all(np.array_equal(a, b[order]) for a, b in zip(found, expected, strict=True))
+
+
+def test_rows_that_rest_repeat_their_observation():
+    engine = FetchEngine(["fetch/push", "fetch/reach"], num_threads=1)
+    first = engine.reset([0, 1], [5, 6])
+    result = engine.step(np.ones((2, 4), np.float32), np.array([True, False]))
+    assert (result.observation[0] != first[0]).any()
+    assert np.array_equal(result.observation[1], first[1])
+    assert np.array_equal(result.observation[0, 11:22], first[0, :11])
+    assert np.array_equal(engine.reset([0], [5]), first[:1])
+    engine.close()
+
+
+def test_things_rest_on_the_table_and_reach_has_none():
+    engine = FetchEngine(sorted(IDS), num_threads=1)
+    numbers = engine.reset(range(4), range(4))
+    things, reach = numbers[[0, 1, 3]], numbers[2]
+    assert numbers.dtype == np.float64
+    assert numbers.shape == (4, FETCH.size)
+    assert ((things[:, 6] > 0.015) & (things[:, 6] < 0.0195)).all()
+    np.testing.assert_allclose(numbers[:, :2], [[0.0, 0.6]] * 4, atol=0.005)
+    assert not reach[4:11].any()
+    engine.close()
+
+
+def test_our_axes():
+    engine = FetchEngine(["fetch/pick-and-place"] * 3, num_threads=1)
+    first = engine.reset(range(3), [0] * 3)
+    for _ in range(5):
+        found = engine.step(np.eye(4, dtype=np.float32)[:3], np.ones(3, bool)).observation
+    moved = found[:, :3] - first[:, :3]
+    np.testing.assert_allclose(moved, np.eye(3) * 0.157, atol=0.008)
+    engine.close()
+
+
+def test_an_effort_of_one_closes():
+    engine = FetchEngine(["fetch/pick-and-place"], num_threads=1)
+    engine.reset([0], [0])
+    for effort, opening in ((-1.0, 1.0), (0.0, 1.0), (1.0, 0.0)):
+        for _ in range(10):
+            found = engine.step(np.array([[0, 0, 0, effort]], np.float32), np.ones(1, bool)).observation
+        assert found[0, 3] == pytest.approx(opening, abs=0.02)
+    engine.close()
+
+
+def test_a_row_faults_alone():
+    engine = FetchEngine(["fetch/push"] * 3, num_threads=2)
+    alone = FetchEngine(["fetch/push"], num_threads=1)
+    first, active = engine.reset(range(3), range(3)), np.ones(3, bool)
+    alone.reset([0], [0])
+    engine._rows[2].data.qvel[:] = 1e12
+    action = np.zeros((3, 4), np.float32)
+    action[1] = np.nan
+    result = engine.step(action, active)
+    assert result.fault.tolist() == [False, True, True]
+    assert np.array_equal(result.observation[1:], first[1:])
+    assert np.array_equal(result.observation[:1], alone.step(action[:1], active[:1]).observation)
+    assert engine.step(np.zeros((3, 4), np.float32), active).fault.tolist() == [False, True, True]
+    assert np.array_equal(engine.reset([1, 2], [1, 2]), first[1:])
+    assert not engine.step(np.zeros((3, 4), np.float32), active).fault.any()
+    engine.close()
+    alone.close()
+
+
+def test_a_recording_shows_the_goal_and_changes_nothing():
+    engine, other = (FetchEngine(["fetch/push"], num_threads=1) for _ in range(2))
+    engine.reset([0], [0]), other.reset([0], [0])
+    for action in random_actions(0, 5):
+        poses, model = engine.poses(0), engine.model(0)
+        assert poses.position.shape == (model.model.nbody, 3)
+        assert model.path.endswith("push.xml")
+        site = engine._rows[0].data.site("target0").xpos
+        assert np.array_equal(site, engine._rows[0].goal)
+        found, expected = (one.step(action[None], np.ones(1, bool)) for one in (engine, other))
+        assert np.array_equal(found.observation, expected.observation)
+    engine.close(), other.close()
+
+
+def test_the_absent_package_is_named(monkeypatch):
+    builder = fetch_engine._builder
+    monkeypatch.setattr(fetch_engine, "_builder", builder.__wrapped__)
+    monkeypatch.setitem(sys.modules, "gymnasium_robotics.envs.fetch.push", None)
+    with pytest.raises(ImportError, match=r"pip install 'lw_torchrl\[fetch\]'"):
+        FetchEngine(["fetch/push"])
+
+
+def test_wrong_arguments_are_named():
+    with pytest.raises(ValueError, match=r"task must be one of .*'fetch/psuh'; did you mean 'fetch/push'"):
+        FetchEngine(["fetch/psuh"])
+    with pytest.raises(ValueError, match=r"reward must be one of .*'dens'; did you mean 'dense'"):
+        FetchEngine(["fetch/push"], reward="dens")
+    with pytest.raises(ValueError, match="num_threads must be at least 1, got 0"):
+        FetchEngine(["fetch/push"], num_threads=0)
+    engine = FetchEngine(["fetch/push"], num_threads=1)
+    with pytest.raises(RuntimeError, match="row 0 must be reset"):
+        engine.step(np.zeros((1, 4), np.float32), np.ones(1, bool))
+    with pytest.raises(ValueError, match="seeds must be as many as rows, 1, got 2"):
+        engine.reset([0], [1, 2])
+    engine.reset([0], [1])
+    with pytest.raises(ValueError, match=r"action must be of shape \(1, 4\)"):
+        engine.step(np.zeros((1, 3), np.float32), np.ones(1, bool))
+    with pytest.raises(ValueError, match=r"camera must be one of 'external_camera_0'"):
+        engine.render([0], camera="corner", height=8, width=8)
+    engine.close()

@@ -1,0 +1,61 @@
+"""The Fetch suite's words: tasks, skills and plans, and that the plans succeed."""
+
+from __future__ import annotations
+
+import pytest
+
+pytest.importorskip("gymnasium_robotics")
+from fetch_runs import IDS, scripted
+
+import lw_torchrl as lw
+from lw_torchrl.language.roles import plan_roles
+from lw_torchrl.language.skills import skills_for
+from lw_torchrl.suites.fetch import TASKS, load_plans, load_skills
+
+
+def test_every_step_has_a_scripted_skill_and_roles():
+    plans, skills = load_plans(), load_skills()
+    assert list(plans) == list(TASKS) == sorted(IDS)
+    for plan in plans.values():
+        allowed = skills_for(plan.definition, skills)
+        assert {step.skill for step in plan.steps} <= set(allowed)
+        for step, roles in zip(plan.steps, plan_roles(plan, skills), strict=True):
+            assert (roles.moved is None) == (step.skill == "hold the gripper still")
+
+
+def test_plans_and_tasks_can_be_saved(tmp_path):
+    plans = load_plans()
+    lw.save_plans(plans, tmp_path)
+    assert lw.load_plans(tmp_path, tasks={**lw.TASKS, **TASKS}).fingerprint == plans.fingerprint
+    assert lw.Plans.from_json(plans.to_json()).fingerprint == plans.fingerprint
+    assert all(lw.Task.from_json(name, task.to_json()) == task for name, task in TASKS.items())
+    assert len({lw.task_id(name) for name in TASKS}) == len(TASKS)
+
+
+@pytest.mark.parametrize("format", lw.PLAN_FORMATS)
+def test_plans_survive_every_format(format):
+    for name, plan in load_plans().items():
+        told = lw.encode_plan(plan, format)
+        assert lw.decode_plan(told, TASKS[name], format, skills=load_skills()).plan == plan
+
+
+@pytest.mark.parametrize("name", ["fetch/", "/push", "a/b/c", "Fetch/push", "fetch-it/push", "fetch//push"])
+def test_a_suite_is_one_word_before_a_slash(name):
+    with pytest.raises(ValueError, match="lower-case words joined by hyphens"):
+        lw.Task(name, "Do it.", TASKS["fetch/push"].objects)
+
+
+def test_a_plan_succeeds():
+    _, success, _ = scripted("fetch/pick-and-place", range(4), 30)
+    assert success.any(0).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("task", "least"),
+    [("fetch/reach", 0.98), ("fetch/push", 0.95), ("fetch/pick-and-place", 0.95), ("fetch/slide", 0.35)],
+)
+def test_plans_succeed_within_fetchs_fifty_steps(task, least):
+    _, success, true = scripted(task, range(50), 50)
+    assert success.any(0).mean() >= least
+    assert (true == 1).all(), "exactly one condition holds at each moment"

@@ -1,0 +1,66 @@
+"""A step's physics, part of which the look at the end of the step before has already done."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from lw_torchrl.suites.metaworld.vectorized.engine import VectorizedEngine
+from lw_torchrl.suites.metaworld.vectorized.simulated_rows import SimulatedRow
+from lw_torchrl.suites.metaworld.vectorized.tables import simulation_table
+
+TASKS = list(simulation_table())
+STATE = ("qpos", "qvel", "qacc", "qacc_warmstart", "xpos", "xquat", "site_xpos", "efc_force", "time")
+
+
+def whole_substep(row: SimulatedRow) -> None:
+    mujoco.mj_step(row._model, row._data)
+
+
+def test_a_substep_after_a_look_has_the_bits_of_a_whole_one(monkeypatch):
+    """All tasks, the state itself compared after every step, with a reset on the way."""
+    n, rng = len(TASKS), np.random.default_rng(0)
+    engine, plain = (VectorizedEngine(TASKS, num_threads=1) for _ in range(2))
+    for row in plain._rows:
+        monkeypatch.setattr(row, "_substep_after_look", lambda row=row: whole_substep(row))
+    for step in range(20):
+        if step % 10 == 0:
+            for k in (engine, plain):
+                k.reset(range(n), range(step, step + n))
+        action = rng.uniform(-1, 1, (n, 4)).astype(np.float32)
+        action[:, 2] -= 0.5  # downwards, where there is something to touch
+        for k in (engine, plain):
+            k.step(action, np.ones(n, bool))
+        for task, ours, whole in zip(TASKS, engine._rows, plain._rows, strict=True):
+            for name in STATE:
+                same = np.array_equal(getattr(ours._data, name), getattr(whole._data, name))
+                assert same, f"step {step}, {task}: {name}"
+    assert sum(row._data.ncon for row in engine._rows) > n
+
+
+def test_the_first_step_of_an_episode_is_whole(monkeypatch):
+    """A reset may leave places as they were before its last change."""
+    calls = []
+    engine = VectorizedEngine(["push"], num_threads=1)
+    monkeypatch.setattr(engine._rows[0], "_substep_after_look", lambda: calls.append(engine._rows[0]._data.time))
+    for _ in range(2):
+        engine.reset([0], [0])
+        engine.step(np.zeros((1, 4)), np.ones(1, bool))
+    assert calls == []
+    engine.step(np.zeros((1, 4)), np.ones(1, bool))
+    assert len(calls) == 1
+
+
+def test_the_mocap_body_touches_and_carries_nothing():
+    """What the shortened substep rests on."""
+    for row in VectorizedEngine(TASKS, num_threads=1)._rows:
+        model = row._model
+        (body,) = np.flatnonzero(model.body_mocapid >= 0)
+        own = model.geom_bodyid == body
+        assert not model.geom_contype[own].any()
+        assert not model.geom_conaffinity[own].any()
+        assert not (model.body_parentid == body).any()
+        assert model.neq == 1
+        assert model.eq_type[0] == mujoco.mjtEq.mjEQ_WELD
+        assert model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
+        assert model.nsensor == 0

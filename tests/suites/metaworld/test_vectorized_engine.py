@@ -1,0 +1,429 @@
+"""The fast engine against Meta-World's own environments, bit for bit."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import threading
+import time
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from lw_torchrl.suites.engine import EngineStep
+from lw_torchrl.suites.metaworld.plain_engine import MetaWorldEngine
+from lw_torchrl.suites.metaworld.vectorized.engine import VectorizedEngine
+from lw_torchrl.suites.metaworld.vectorized.observation import quaternion_of_matrix, row_norm
+from lw_torchrl.suites.metaworld.vectorized.simulated_rows import RowGroup, WorkerPool, split_into_groups
+from lw_torchrl.suites.metaworld.vectorized.tables import parse_simulation_table, simulation_table
+from lw_torchrl.suites.metaworld.vectorized.task_programs import borrow_model, model_path, return_models
+
+TASKS = list(simulation_table())
+
+# Three pairs of tasks that share a model; then a dial, two joints, constants, both kinds of quaternion.
+SHARING = ["drawer-open", "drawer-close", "assembly", "disassemble", "stick-push", "stick-pull"]
+VARIED = ["reach", "basketball", "dial-turn", "hammer", "lever-pull", "box-close"]
+
+
+def same_bits(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """(rows,) whether each row agrees in every bit: 0.0 is not -0.0, and a NaN is itself."""
+    assert left.dtype == right.dtype
+    assert left.shape == right.shape
+    left, right = np.ascontiguousarray(left), np.ascontiguousarray(right)
+    return (left.view(np.uint8) == right.view(np.uint8)).reshape(len(left), -1).all(axis=1)
+
+
+def differences(expected: EngineStep, got: EngineStep) -> set[tuple[int, str]]:
+    """The (row, field) pairs in which two results differ."""
+    pairs = zip(EngineStep._fields, expected, got, strict=True)
+    return {(int(row), field) for field, a, b in pairs for row in np.flatnonzero(~same_bits(a, b))}
+
+
+def experts(tasks: list[str]) -> list:
+    from metaworld.policies import ENV_POLICY_MAP
+
+    return [ENV_POLICY_MAP[f"{task}-v3"]() for task in tasks]
+
+
+def expert_actions(policies: list, observation: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    clean = np.stack([policy.get_action(seen) for policy, seen in zip(policies, observation, strict=True)])
+    return np.clip(clean + noise, -1.0, 1.0)
+
+
+def play(engine, tasks: list[str], steps: int, *, seed: int = 0) -> list[np.ndarray]:
+    """Reset all rows and step them with random actions; the observations of each step."""
+    n = len(tasks)
+    rng = np.random.default_rng(seed)
+    seen = [engine.reset(range(n), [seed + row for row in range(n)])]
+    for _ in range(steps):
+        action = rng.uniform(-1, 1, (n, 4)).astype(np.float32)
+        seen.append(engine.step(action, np.ones(n, bool)).observation)
+    return seen
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("tasks", [TASKS[k : k + 10] for k in range(0, 50, 10)], ids=lambda tasks: tasks[0])
+def test_every_task_equals_metaworld_in_every_bit(tasks):
+    """2 episodes of 500 steps, expert actions with noise, single precision and then double."""
+    n = len(tasks)
+    rng = np.random.default_rng(TASKS.index(tasks[0]))
+    oracle = MetaWorldEngine(tasks, reward="dense")
+    engines = [VectorizedEngine(tasks, reward="dense", num_threads=threads) for threads in (1, 2)]
+    policies = experts(tasks)
+    succeeded, wrong = np.zeros(n, bool), set()
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Constant.* may be too high")
+        for precision in (np.float32, np.float64):
+            seeds = rng.integers(2**31, size=n).tolist()
+            observation = oracle.reset(range(n), seeds)
+            for engine in engines:
+                agrees = same_bits(observation, engine.reset(range(n), seeds))
+                wrong |= {(tasks[row], "reset") for row in np.flatnonzero(~agrees)}
+            for _ in range(500):
+                noise = 0.2 * rng.random((n, 1)) * rng.normal(size=(n, 4))
+                action = expert_actions(policies, observation, noise).astype(precision)
+                expected = oracle.step(action, np.ones(n, bool))
+                for engine in engines:
+                    got = engine.step(action, np.ones(n, bool))
+                    wrong |= {(tasks[row], field) for row, field in differences(expected, got)}
+                observation = expected.observation
+                succeeded |= expected.success
+    for engine in (oracle, *engines):
+        engine.close()
+    assert not wrong
+    assert succeeded.sum() >= 8, "the comparison of successes says little if nothing succeeds"
+
+
+@pytest.mark.parametrize("tasks", [SHARING * 2, VARIED], ids=["shared models", "varied tasks"])
+def test_any_mask_and_any_history(tasks):
+    """Rows that share models, stepped and reset in any mixture by one or two threads, do as if each were alone."""
+    n = len(tasks)
+    rng = np.random.default_rng(1)
+    oracle, engines = MetaWorldEngine(tasks), [VectorizedEngine(tasks, num_threads=threads) for threads in (1, 2)]
+    everyone = np.ones(n, bool)
+    for k in (oracle, *engines):
+        k.reset(range(n), range(n))
+    for step in range(45):
+        if step % 7 == 3:
+            rows = rng.permutation(n)[: rng.integers(1, n)].tolist()
+            seeds = rng.integers(1000, size=len(rows)).tolist()
+            first = oracle.reset(rows, seeds)
+            assert all(same_bits(first, engine.reset(rows, seeds)).all() for engine in engines)
+        active = everyone if step % 5 == 0 else rng.random(n) < 0.6
+        action = rng.uniform(-1, 1, (n, 4)).astype(rng.choice([np.float32, np.float64]))
+        expected = oracle.step(action, active)
+        for engine in engines:
+            before = engine.step(np.zeros((n, 4)), ~everyone).observation
+            got = engine.step(action, active)
+            assert not differences(expected, got), f"step {step}"
+            assert same_bits(before, got.observation)[~active].all()
+            assert not got.reward[~active].any()
+            assert not got.success[~active].any()
+
+
+def test_an_episode_depends_on_seed_and_actions_alone():
+    """Neither what a row did before nor the rows beside it show in an episode."""
+    tasks = ["faucet-open", "faucet-close", "window-open"]
+    fresh = VectorizedEngine(tasks, num_threads=1)
+    used = VectorizedEngine(tasks * 3, num_threads=2)
+    expected = play(fresh, tasks, 20)
+    play(used, tasks * 3, 35, seed=5)
+    used.reset([0, 4], [1, 2])
+    rng = np.random.default_rng(0)
+    got = [used.reset([0, 1, 2], [0, 1, 2])]
+    active = np.arange(9) < 3
+    for _ in range(20):
+        action = np.zeros((9, 4), np.float32)
+        action[:3] = rng.uniform(-1, 1, (3, 4)).astype(np.float32)
+        got.append(used.step(action, active).observation[:3])
+    assert all(same_bits(a, b).all() for a, b in zip(expected, got, strict=True))
+
+
+def test_a_reset_finds_the_model_as_compiled():
+    """plate-slide moves a body that plate-slide-back, on the same model, leaves where it is."""
+    tasks = ["plate-slide", "plate-slide-back"]
+    engine = VectorizedEngine(tasks, num_threads=1)
+    engine.reset([0], [0])
+    moved, compiled = engine._rows[0]._places[0], engine._rows[0].shared.compiled[0]
+    assert not np.array_equal(moved, compiled)
+    engine.reset([1], [0])
+    assert np.array_equal(engine._rows[1]._places[0], compiled)
+
+
+def test_actions_keep_their_own_precision():
+    engine = VectorizedEngine(["reach", "reach"], num_threads=1)
+    engine.reset([0, 1], [3, 3])
+    action = np.full((2, 4), 0.1)
+    alone = np.array([True, False])
+    in_double = engine.step(action, alone).observation[0]
+    in_single = engine.step(action.astype(np.float32), ~alone).observation[1]
+    assert not np.array_equal(in_double, in_single)
+    assert np.allclose(in_double, in_single, atol=1e-6)
+
+
+def test_sparse_reward_is_the_success():
+    engine = VectorizedEngine(["reach"] * 2, num_threads=1)
+    observation = engine.reset([0, 1], [0, 1])
+    policies = experts(["reach"] * 2)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Constant.* may be too high")
+        for _ in range(100):
+            result = engine.step(expert_actions(policies, observation, np.zeros((2, 4))), np.ones(2, bool))
+            observation = result.observation
+            assert np.array_equal(result.reward, result.success.astype(float))
+    assert result.success.all()
+
+
+def test_results_belong_to_the_caller():
+    engine = VectorizedEngine(["reach", "push"], num_threads=1)
+    first = engine.reset([0, 1], [0, 1])
+    kept = first.copy()
+    result = engine.step(np.ones((2, 4), np.float32), np.ones(2, bool))
+    snapshot = [field.copy() for field in result]
+    engine.step(-np.ones((2, 4), np.float32), np.ones(2, bool))
+    assert np.array_equal(first, kept)
+    assert all(np.array_equal(a, b) for a, b in zip(snapshot, result, strict=True))
+    result.observation[:] = np.nan
+    assert np.isfinite(engine.step(np.ones((2, 4)), np.zeros(2, bool)).observation).all()
+
+
+def break_by_action(engine: VectorizedEngine, action: np.ndarray) -> None:
+    action[1, 2] = np.nan
+
+
+def break_by_position(engine: VectorizedEngine, action: np.ndarray) -> None:
+    engine._rows[1]._data.qpos[3] = np.nan
+
+
+def break_by_speed(engine: VectorizedEngine, action: np.ndarray) -> None:
+    engine._rows[1]._data.qvel[3] = 1e12
+
+
+def break_by_force(engine: VectorizedEngine, action: np.ndarray) -> None:
+    engine._rows[1]._data.qfrc_applied[:] = np.inf
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("damage", [break_by_action, break_by_position, break_by_speed, break_by_force])
+def test_a_fault_stays_in_its_row(damage, threads, tmp_path, monkeypatch, capfd):
+    """Rows 0 to 2 share a model; row 1 breaks at step 5."""
+    monkeypatch.chdir(tmp_path)
+    tasks = ["push", "push", "push", "drawer-open"]
+    engine = VectorizedEngine(tasks, num_threads=threads, reward="dense")
+    twin = VectorizedEngine(tasks, num_threads=1, reward="dense")
+    rng = np.random.default_rng(0)
+    everyone, others = np.ones(4, bool), np.array([0, 2, 3])
+    for k in (engine, twin):
+        k.reset(range(4), range(4))
+    for step in range(12):
+        action = rng.uniform(-1, 1, (4, 4)).astype(np.float32)
+        expected = twin.step(action, everyone)
+        if step == 5:
+            damage(engine, action)
+        got = engine.step(action, everyone)
+        assert not got.fault[others].any()
+        if step < 5:
+            stable = got.observation[1]
+            assert not differences(expected, got)
+        else:
+            assert {row for row, _ in differences(expected, got)} == {1}
+            assert got.fault[1]
+            assert got.reward[1] == 0.0
+            assert not got.success[1]
+            assert np.array_equal(got.observation[1], stable)
+    assert not engine.step(action, np.zeros(4, bool)).fault.any(), "a row that does not run does not fault"
+
+    assert same_bits(twin.reset([1], [77]), engine.reset([1], [77])).all()
+    for _ in range(20):
+        action = rng.uniform(-1, 1, (4, 4)).astype(np.float32)
+        assert not differences(twin.step(action, everyone), engine.step(action, everyone))
+    assert list(Path.cwd().iterdir()) == [], "MuJoCo left a log behind"
+    assert capfd.readouterr() == ("", "")
+
+
+def test_an_action_that_is_not_finite_is_a_fault_of_its_row_alone():
+    engine = VectorizedEngine(["reach"] * 3, num_threads=1)
+    engine.reset([0, 1, 2], [0, 1, 2])
+    action = np.zeros((3, 4), np.float32)
+    action[0, 3], action[2, 0] = np.inf, np.nan
+    assert engine.step(action, np.array([True, True, False])).fault.tolist() == [True, False, False]
+    assert engine.step(np.zeros((3, 4)), np.ones(3, bool)).fault.tolist() == [True, False, False]
+
+
+@pytest.mark.parametrize("threads", [2, 3, 8])
+def test_the_number_of_threads_changes_nothing(threads):
+    tasks = ["push", "soccer", *["pick-place"] * 5, "sweep"]
+    alone, together = (VectorizedEngine(tasks, num_threads=k) for k in (1, threads))
+    for a, b in zip(play(alone, tasks, 30), play(together, tasks, 30), strict=True):
+        assert same_bits(a, b).all()
+
+
+def test_two_engines_do_not_disturb_each_other():
+    tasks = ["coffee-pull", "coffee-push"]
+    expected = play(VectorizedEngine(tasks, num_threads=1), tasks, 10)
+    first, second = VectorizedEngine(tasks, num_threads=1), VectorizedEngine(tasks, num_threads=1)
+    assert first._rows[0].shared is not second._rows[0].shared
+    first.reset([0, 1], [0, 1])
+    second.reset([0, 1], [8, 9])
+    rng = np.random.default_rng(0)
+    for k in range(10):
+        action = rng.uniform(-1, 1, (2, 4)).astype(np.float32)
+        got = first.step(action, np.ones(2, bool)).observation
+        second.step(-action, np.ones(2, bool))
+        assert same_bits(expected[k + 1], got).all()
+
+
+def test_rows_are_light_and_models_are_kept():
+    def memory() -> int:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
+
+    tasks = ["reach", "push"] * 40
+    VectorizedEngine(["reach", "push"], num_threads=1).close()
+    before, start = memory(), time.perf_counter()
+    engine = VectorizedEngine(tasks, num_threads=1)
+    engine.reset(range(80), range(80))
+    engine.step(np.zeros((80, 4)), np.ones(80, bool))
+    if Path("/proc/self/statm").exists():
+        assert (memory() - before) / 80 < 1.2e6
+    assert time.perf_counter() - start < 5.0, "80 rows take some 0.6 s; compiling a model each would take 10"
+    models = {id(row.shared) for row in engine._rows}
+    assert len(models) == 2
+    engine.close()
+    again = VectorizedEngine(tasks, num_threads=1)
+    assert {id(row.shared) for row in again._rows} == models
+
+
+def test_an_engine_that_is_forgotten_gives_its_models_back():
+    engine = VectorizedEngine(["plate-slide"], num_threads=1)
+    engine.reset([0], [5])
+    shared = engine._rows[0].shared
+    assert not np.array_equal(shared.places[0], shared.compiled[0])
+    del engine
+    path = model_path("plate-slide")
+    borrowed = borrow_model(path)
+    assert borrowed is shared
+    assert np.array_equal(shared.places[0], shared.compiled[0])
+    return_models([borrowed])
+
+
+def test_a_reset_moves_nothing_in_a_model_but_bodies_and_sites():
+    """What a reset edits is kept for each row, so it must edit nothing that we do not keep."""
+
+    def arrays(model) -> dict[str, bytes]:
+        fields = {name: getattr(model, name) for name in dir(model) if not name.startswith("_")}
+        return {name: field.tobytes() for name, field in fields.items() if isinstance(field, np.ndarray)}
+
+    engine = VectorizedEngine(TASKS, num_threads=1)
+    edited = set()
+    for number, row in enumerate(engine._rows):
+        before = arrays(row.shared.model)
+        engine.reset([number], [number])
+        edited |= {name for name, field in arrays(row.shared.model).items() if field != before[name]}
+    assert edited == {"body_pos", "site_pos"}
+
+
+@pytest.mark.parametrize(("package", "other"), [("metaworld", "3.2.0"), ("mujoco", "3.4.0")])
+def test_other_versions_are_refused_by_name(monkeypatch, package, other):
+    real = importlib.metadata.version
+    monkeypatch.setattr(importlib.metadata, "version", lambda name: other if name == package else real(name))
+    with pytest.raises(ImportError, match=rf"{package} 3\.\d\.\d.*{other}.*engine='metaworld'"):
+        VectorizedEngine(["reach"])
+
+
+def test_mistakes_are_named():
+    with pytest.raises(ValueError, match=r"task must be one of .* got 'reech'; did you mean 'reach'"):
+        VectorizedEngine(["reech"])
+    with pytest.raises(ValueError, match="reward must be one of"):
+        VectorizedEngine(["reach"], reward="sparce")
+    with pytest.raises(ValueError, match="num_threads must be at least 1"):
+        VectorizedEngine(["reach"], num_threads=0)
+    engine = VectorizedEngine(["reach", "push"], num_threads=1)
+    with pytest.raises(ValueError, match="seeds must be as many as rows, 2, got 1"):
+        engine.reset([0, 1], [0])
+    engine.reset([0], [0])
+    with pytest.raises(RuntimeError, match="row 1 must be reset"):
+        engine.step(np.zeros((2, 4)), np.ones(2, bool))
+    with pytest.raises(ValueError, match=r"\(2, 4\).*\(1, 4\)"):
+        engine.step(np.zeros((1, 4)), np.ones(2, bool))
+    engine.step(np.zeros((2, 4)), np.array([True, False]))
+
+
+def test_the_table_names_metaworlds_tasks():
+    from metaworld.env_dict import ALL_V3_ENVIRONMENTS
+
+    assert {f"{task}-v3" for task in TASKS} == set(ALL_V3_ENVIRONMENTS)
+
+
+@pytest.mark.parametrize(
+    ("entry", "message"),
+    [
+        ('object = "thing x"\nquaternion = "zeros"\nsuccess.point = "thing x"', "'body NAME'"),
+        ('object = "body x"\nquaternion = "zeros"\nsuccess.rule = "luck"', "success.rule must be one of"),
+        ('object = "body x"\nquaternion = "zeros"', "success"),
+        ('object = "body x"\nquaternion = "zeros"\ncolour = 1\nsuccess.within = 1', "colour"),
+    ],
+)
+def test_a_table_entry_that_is_not_understood_is_named(entry, message):
+    with pytest.raises(ValueError, match=f"task 'x'.*{message}"):
+        parse_simulation_table(f"[x]\n{entry}")
+
+
+def test_quaternions_have_scipys_bits():
+    rng = np.random.default_rng(0)
+    random = Rotation.from_quat(rng.normal(size=(3000, 4))).as_matrix()
+    quarters = [np.round(Rotation.from_euler("xyz", k, degrees=True).as_matrix()) for k in np.ndindex(4, 4, 4)]
+    matrices = np.concatenate((random, quarters))
+    one_by_one = np.stack([Rotation.from_matrix(matrix).as_quat() for matrix in matrices])
+    assert same_bits(one_by_one, quaternion_of_matrix(matrices.reshape(-1, 9))).all()
+
+
+def test_norms_have_the_bits_of_one_norm():
+    vectors = np.random.default_rng(0).normal(size=(20000, 3)) * 0.1
+    assert same_bits(np.array([np.linalg.norm(v) for v in vectors]), row_norm(vectors)).all()
+
+
+def test_rows_of_one_model_stay_together_unless_a_thread_would_starve():
+    keys = ["a", "b", "a", "c", "a", "b"]
+    assert {group.rows for group in split_into_groups(keys, 1)} == {(0, 2, 4), (1, 5), (3,)}
+    assert {group.rows for group in split_into_groups(["a"] * 8, 2)} == {(0, 1), (2, 3), (4, 5), (6, 7)}
+    assert len(split_into_groups([str(k % 36) for k in range(1000)], 2)) == 36
+
+
+@pytest.mark.parametrize("threads", [1, 4])
+def test_a_worker_pool_does_each_item_once_and_a_group_in_turn(threads):
+    pool = WorkerPool(threads)
+    jobs = [(RowGroup(range(k, k + 5)), range(k, k + 5)) for k in range(0, 100, 5)]
+    busy = [threading.Lock() for _ in jobs]
+    done = []
+
+    def do(item: int) -> None:
+        lock = busy[item // 5]
+        assert lock.acquire(blocking=False), "two threads in one group"
+        time.sleep(1e-4)
+        done.append(item)
+        lock.release()
+
+    pool.work(jobs, do)
+    assert sorted(done) == list(range(100))
+    pool.close()
+
+
+def test_a_worker_pool_works_side_by_side():
+    pool, meeting = WorkerPool(3), threading.Barrier(3, timeout=10)
+    pool.work([(RowGroup([k]), [k]) for k in range(3)], lambda item: meeting.wait())
+    pool.close()
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_an_error_in_a_thread_reaches_the_caller(threads):
+    pool = WorkerPool(threads)
+
+    def do(item: int) -> None:
+        if item == 7:
+            raise ZeroDivisionError("item 7")
+
+    with pytest.raises(ZeroDivisionError, match="item 7"):
+        pool.work([(RowGroup([k]), [k]) for k in range(20)], do)
+    pool.close()

@@ -1,0 +1,187 @@
+"""A suite of one's own works wherever Meta-World does: environment, data, training, files, evaluation, recordings."""
+
+from functools import partial
+
+import pytest
+import torch
+from torchrl.envs import Compose, TransformedEnv, check_env_specs
+from toy_suite import SKILLS, TASKS, TOY, ToyEngine, make_toy_suite
+
+import lw_torchrl as lw
+from lw_torchrl.language.layout import METAWORLD
+from lw_torchrl.language.skills import ScriptedSkill
+from lw_torchrl.modules import ActorEnsemble, TransferredActor
+from lw_torchrl.suites import SUITES, Suite, check_suite, find_suite, load_suite
+
+SUITE = make_toy_suite()
+FEATURES = ["raw", "differences", "relative", "both"]
+SMALL = {"width": 16, "depth": 1, "latent_size": 4, "encoder_width": 8}
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory):
+    root = tmp_path_factory.mktemp("toy") / "demos"
+    return lw.collect_demonstrations(
+        ["touch-red", "toy/touch-blue"], suite=SUITE, episodes_per_task=3, root=root, progress=False
+    )
+
+
+def test_the_environment_keeps_torchrl_s_rules():
+    env = lw.LanguageWorldEnv("toy", suite=SUITE, num_envs=4)
+    assert (env.tasks, env.max_steps, env.layout) == (("toy/touch-blue", "toy/touch-red"), 30, TOY)
+    check_env_specs(env)
+    both = TransformedEnv(env, lw.QAFTransform(SUITE.plans))
+    assert both.rollout(3)["qaf"].shape == (4, 3, 2)
+    first = env.reset(episode=2)["observation"]
+    assert torch.equal(first, env.reset(episode=2)["observation"])
+    env.close()
+
+
+def test_scripted_plans_demonstrate_and_data_say_their_layout(demos):
+    assert demos.success_rate == {"toy/touch-blue": 1.0, "toy/touch-red": 1.0}
+    replay = lw.LanguageWorldExperienceReplay(demos.root, transform=lw.QAFTransform(SUITE.plans))
+    sample = replay.sample(8)
+    assert (sample["observation"].shape, sample["action"].shape) == ((8, 16), (8, 7))
+    assert replay.demonstrations.config.layout == TOY
+    assert lw.collect_demonstrations(
+        "toy", suite=SUITE, episodes_per_task=3, root=demos.root, progress=False
+    ).episodes == demos.episodes  # read again, not run  # fmt: skip
+
+
+@pytest.mark.parametrize("features", FEATURES)
+def test_every_feature_has_the_layout_s_width(features, demos):
+    replay = lw.LanguageWorldExperienceReplay(demos.root, transform=lw.QAFTransform(SUITE.plans))
+    actor = lw.PlanConditionedActor(SUITE.plans, features=features, focus=True, swap_unmentioned=0.5, **SMALL)
+    lw.BehavioralCloningTrainer(
+        actor, replay, lw.BehavioralCloningConfig(steps=2, batch_size=8), progress=False
+    ).train()  # fmt: skip
+    things = 10  # pairs of hand, three blocks and goal
+    widths = {"raw": 16, "relative": 9 * things, "differences": 9 * things + 2, "both": 16 + 9 * things + 2}
+    assert actor.encoder.features.width == widths[features]
+    assert actor.spec["action"].shape == (7,)
+
+
+def test_a_policy_is_trained_saved_evaluated_and_recorded(demos, tmp_path):
+    plans = SUITE.plans
+    replay = lw.LanguageWorldExperienceReplay(
+        demos.root,
+        sampler=lw.TaskBalancedSampler(),
+        transform=Compose(lw.QAFTransform(plans), lw.RandomYaw(0.3, plans=plans)),
+    )
+    actor = lw.PlanConditionedActor(plans, features="opening", roles=True, hide_opening=0.5, **SMALL)
+    config = lw.BehavioralCloningConfig(steps=300, batch_size=60, learning_rate=1e-2)
+    lw.BehavioralCloningTrainer(actor, replay, config, progress=False).train()
+    lw.save_actor(actor, tmp_path / "toy.zip")
+    again = lw.load_actor(tmp_path / "toy.zip")
+    run = {"tasks": "toy", "suite": SUITE, "episodes_per_task": 4, "seed": 1_000, "progress": False}
+    result = lw.evaluate(again, **run)
+    assert result.mean_success > 0.7
+    result.save(tmp_path / "results.json")
+    assert lw.EvaluationResult.load(tmp_path / "results.json").episodes == result.episodes
+    with lw.RerunLogger(tmp_path / "toy.rrd") as logger:
+        episodes = []
+        keys = ["observation", "task_id", "qaf", "skill_weights"]
+        lw.evaluate(again, **run, also_record=keys, on_episode=episodes.append)
+        names = [
+            lw.log_rollout(
+                logger, one.steps.set("episode", torch.full((len(one.steps),), one.episode)), plans, seed=1_000
+            )
+            for one in episodes[:1]
+        ]
+    assert names[0].startswith("toy")
+
+
+def test_failures_are_attributed_by_the_suite_s_own_skills():
+    spoilt = {text: ScriptedSkill(text, skill.target, offset=(0.1, 0.0, 0.0)) for text, skill in SKILLS.items()}
+    actor = lw.ScriptedSkillActor(SUITE.plans, skills=spoilt)
+    result = lw.evaluate(
+        actor, tasks="toy/touch-red", suite=SUITE, episodes_per_task=2, seed=7, attribute=True, progress=False
+    )
+    assert [failure.cause for failure in result.failures] == ["skill", "skill"]
+
+
+def test_evaluators_and_critics_read_the_layout(demos):
+    evaluator = lw.StateQueryEvaluator(SUITE.plans, width=8)
+    actor = lw.PlanConditionedActor(SUITE.plans, evaluator=evaluator, answers="tanh", **SMALL)
+    env = lw.LanguageWorldEnv("toy", suite=SUITE)
+    state = actor(env.reset())
+    assert state["action"].shape == (2, 7)
+    state = lw.QAFTransform(SUITE.plans)(env.reset())
+    state["action"] = torch.zeros(2, 7)
+    assert lw.PlanConditionedQValue(SUITE.plans, width=8)(state)["state_action_value"].shape == (2, 1)
+    env.close()
+
+
+def test_a_policy_of_meta_world_acts_in_it():
+    """Without training it only shows that sizes, units and signs are turned."""
+    trained = lw.PlanConditionedActor(lw.load_plans("MT10"), features="opening", roles=True, **SMALL).eval()
+    moved = TransferredActor(ActorEnsemble([trained, trained]), SUITE.plans)
+    given = torch.tensor([[0.5, -1.0, 0.2, 0.7], [0.0, 0.0, 0.0, 0.2]])
+    turned = moved.turned(given)
+    torch.testing.assert_close(turned[0], torch.tensor([0.0, 0.1, -0.2, 0.04, 0.0, 0.0, -1.0]))
+    assert turned[1, 6] == 1.0  # below 0.3 it opens, and -1 closes here
+    result = lw.evaluate(moved, tasks="toy", suite=SUITE, episodes_per_task=1, seed=3, progress=False)
+    assert set(result.success_once) == set(TASKS)
+
+
+def test_what_does_not_carry_over_is_named():
+    trained = lw.PlanConditionedActor(lw.load_plans("MT10"), **SMALL)
+    with pytest.raises(ValueError, match="features='differences' of layout 'metaworld' do not carry over to 'toy'"):
+        TransferredActor(trained, SUITE.plans)
+    with pytest.raises(TypeError, match="with_plans is for policies with plans"):
+        TransferredActor(lw.DescriptorConditionedActor("MT10", **SMALL), SUITE.plans)
+
+
+def test_a_transferred_policy_is_saved(tmp_path):
+    trained = lw.PlanConditionedActor(lw.load_plans("MT10"), features="opening", roles=True, **SMALL).eval()
+    moved = TransferredActor(trained, SUITE.plans).eval()
+    lw.save_actor(moved, tmp_path / "moved.zip")
+    again = lw.load_actor(tmp_path / "moved.zip").eval()
+    env = lw.LanguageWorldEnv("toy", suite=SUITE)
+    state = lw.QAFTransform(SUITE.plans)(env.reset())
+    assert torch.equal(again(state.clone())["action"], moved(state.clone())["action"])
+    assert (again.layout, again.trained) == (TOY, METAWORLD)
+    env.close()
+
+
+def test_plans_of_two_suites_do_not_mix():
+    both = [*lw.load_plans("MT10").values(), *SUITE.plans.values()]
+    with pytest.raises(lw.PlanError, match="tasks must be of one layout, got 'metaworld'"):
+        lw.Plans(both)
+    with pytest.raises(ValueError, match="tasks must be of one suite, got tasks of fetch, metaworld"):
+        lw.LanguageWorldEnv(["fetch/reach", "reach"])
+
+
+def test_suites_are_found_by_name(monkeypatch):
+    monkeypatch.setitem(SUITES, "toy", SUITE)
+    assert find_suite(["toy/touch-red"]) is load_suite("toy") is SUITE
+    env = lw.LanguageWorldEnv("toy/touch-red")
+    assert env.suite is SUITE
+    env.close()
+    with pytest.raises(ValueError, match=r"suite must be one of .*got 'toi'; did you mean 'toy'"):
+        lw.LanguageWorldEnv("toi/touch-red")
+    with pytest.raises(ValueError, match="did you mean 'toy/touch-red'"):
+        lw.LanguageWorldEnv("toy/touch-rad")
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "says"),
+    [
+        ({"tasks": {}}, ValueError, "tasks of suite 'toy' must name at least one task"),
+        ({"tasks": {"toy/other": TASKS["toy/touch-red"]}}, TypeError, "must map names to their Task"),
+        ({"tasks": {"reach": lw.TASKS["reach"]}}, ValueError, "task 'reach' must have the layout of suite 'toy'"),
+        ({"name": "tay"}, ValueError, "tasks of suite 'tay' must be named 'tay/...'"),
+        ({"plans": lw.load_plans("MT10")}, ValueError, "plans of suite 'toy' are for tasks that it lacks"),
+    ],
+)
+def test_what_is_no_suite_is_named(change, error, says):
+    options = {"name": "toy", "layout": TOY, "tasks": TASKS, "make_engine": ToyEngine} | change
+    with pytest.raises(error, match=says):
+        Suite(**options)
+
+
+def test_the_check_says_what_is_off():
+    assert all(one.right for one in check_suite(SUITE))
+    slow = make_toy_suite(partial(ToyEngine, reach=0.02))
+    off = {one.what for one in check_suite(slow) if not one.right}
+    assert off == {"+x moves right", "+y moves away from the robot", "+z moves up"}

@@ -1,0 +1,77 @@
+"""A suite of one's own, in NumPy: three blocks, no step before, actions of 7 numbers of which 4 count."""
+
+from __future__ import annotations
+
+import numpy as np
+
+import lw_torchrl as lw
+from lw_torchrl.language.layout import Layout, Slot
+from lw_torchrl.language.named_objects import GRIPPER, NamedObject
+from lw_torchrl.language.skills import ScriptedSkill
+from lw_torchrl.suites import Suite
+from lw_torchrl.suites.engine import EngineStep
+
+TOY = Layout(
+    "toy", 16, hand=1, opening=0, things=(Slot(4), Slot(7), Slot(10)), goal=13, action_size=7, displacement=1,
+    gripper=6, closes=-1, reach=0.05, binary_gripper=True,
+)  # fmt: skip
+
+
+def _task(name: str, block: str, at: int) -> lw.Task:
+    things = (NamedObject(GRIPPER, (1, 2, 3)), NamedObject(block, (at, at + 1, at + 2)))
+    return lw.Task(f"toy/{name}", f"Touch the {block}.", things, TOY)
+
+
+TASKS = {task.name: task for task in (_task("touch-red", "red block", 4), _task("touch-blue", "blue block", 10))}
+SKILLS = {
+    f"move the gripper to the {block}": ScriptedSkill(f"move the gripper to the {block}", block, gripper=1.0)
+    for block in ("red block", "blue block")
+}
+
+
+def _plan(task: lw.Task) -> lw.ConditionalPlan:
+    block = task.object_names[1]
+    pairs = [
+        (f"the robot's gripper is not near the {block}", f"move the gripper to the {block}"),
+        (f"the robot's gripper is near the {block}", f"move the gripper to the {block}"),
+    ]
+    return lw.ConditionalPlan.from_pairs(task, pairs)
+
+
+class ToyEngine:
+    """Rows of one hand and three blocks; an action moves the hand, and closes a gripper in two steps."""
+
+    def __init__(self, row_tasks, *, reward="sparse", num_threads=None, reach=0.05):
+        self.target = np.array([TASKS[task].objects[1].position[0] for task in row_tasks])
+        self.state = np.zeros((len(row_tasks), TOY.size))
+        self.dense, self.reach = reward == "dense", reach
+
+    def reset(self, rows, seeds):
+        for row, seed in zip(rows, seeds, strict=True):
+            drawn = np.random.default_rng(seed)
+            self.state[row] = 0.0
+            self.state[row, 0] = 1.0
+            self.state[row, 1:4] = (0.0, 0.5, 0.2)
+            self.state[row, 4:13] = drawn.uniform(-0.2, 0.2, 9)
+            self.state[row, [6, 9, 12]] = 0.02
+            self.state[row, 13:16] = self.state[row, 4:7] + (0.0, 0.0, 0.2)
+        return self.state[list(rows)].copy()
+
+    def step(self, action, active):
+        asked = np.where(active[:, None], action.astype(float), 0.0)
+        self.state[:, 1:4] += self.reach * asked[:, 1:4]
+        self.state[:, 3] = np.maximum(self.state[:, 3], 0.02)
+        self.state[:, 0] = np.clip(self.state[:, 0] + 0.5 * np.sign(asked[:, 6]), 0.0, 1.0)
+        block = np.take_along_axis(self.state, self.target[:, None] + np.arange(3), 1)
+        gap = np.linalg.norm(block - self.state[:, 1:4], axis=1)
+        success = (gap < 0.03) & active
+        reward = np.where(active, -gap if self.dense else success.astype(float), 0.0)
+        return EngineStep(self.state.copy(), reward, success, np.zeros(len(gap), bool))
+
+    def close(self):
+        pass
+
+
+def make_toy_suite(engine=ToyEngine) -> Suite:
+    plans = lw.Plans([_plan(task) for task in TASKS.values()])
+    return Suite("toy", TOY, TASKS, engine, skills=SKILLS, plans=plans, max_steps=30)
