@@ -1,0 +1,68 @@
+"""SuiteTransform: the numbers of the step before, the task, actions of a layout, and what is refused."""
+
+import pytest
+import torch
+from torchrl.envs import Compose, TransformedEnv, check_env_specs
+
+import lw_torchrl as lw
+from lw_torchrl.transforms import SuiteTransform
+
+PUSH = lw.TASKS["push"]
+
+
+def forgetful(observation):
+    """Meta-World's numbers without those of the step before."""
+    seen = observation.clone()
+    seen[..., 18:36] = torch.nan
+    return seen
+
+
+def make(*more, **options):
+    return TransformedEnv(
+        lw.LanguageWorldEnv("push", num_envs=2, max_steps=9), Compose(SuiteTransform(PUSH, forgetful, **options), *more)
+    )
+
+
+def test_it_fills_the_numbers_of_the_step_before():
+    env = make()
+    check_env_specs(env)
+    rollout = env.rollout(9)
+    env.close()
+    seen = rollout["next", "observation"]
+    assert torch.equal(seen[..., 18:36], rollout["observation"][..., :18])
+    first = rollout["observation"][:, 0]
+    assert torch.equal(first[:, 18:36], first[:, :18]), "at a reset they are those of now"
+    assert (rollout["task_id"] == lw.task_id("push")).all()
+
+
+def test_queries_and_actors_work_behind_it():
+    plans = lw.Plans([lw.load_plans("MT10")["push"]])
+    env = make(lw.QAFTransform(plans))
+    rollout = env.rollout(3, lw.PlanConditionedActor(plans).eval())
+    assert rollout["qaf"].shape == rollout["skill_weights"].shape
+    env.close()
+
+
+def test_an_action_is_turned_for_the_environment_alone():
+    env = make(act=lambda action: -action)
+    state = env.reset()
+    state["action"] = torch.tensor([[0.5, -0.25, 0.0, 1.0]] * 2)
+    after = env.step(state)
+    assert torch.equal(after["next", "executed_action"], -state["action"])
+    assert torch.equal(after["action"], state["action"])
+    assert env.action_spec.shape == (2, 4)
+    env.close()
+
+
+def test_other_numbers_than_the_layout_s_are_refused():
+    env = TransformedEnv(lw.LanguageWorldEnv("push"), SuiteTransform(PUSH, lambda seen: seen[..., :7]))
+    with pytest.raises(ValueError, match="observe must give the 39 numbers of layout 'metaworld', got shape"):
+        env.reset()
+    env.close()
+
+
+def test_a_missing_key_is_named():
+    env = TransformedEnv(lw.LanguageWorldEnv("push"), SuiteTransform(PUSH, lambda seen: seen, in_keys=["state"]))
+    with pytest.raises(ValueError, match="state"):
+        env.reset()
+    env.close()
