@@ -180,18 +180,23 @@ def check_actor(argument: str, who: str) -> None:
         check_saved(argument, Path(who))
 
 
+def _imported(option: str, name: str, kind: str) -> Any:
+    """What "package.module:name" names; the working folder is searched first."""
+    module, _, attribute = name.partition(":")
+    if "" not in sys.path:
+        sys.path.insert(0, "")
+    try:
+        return getattr(import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(f"{option} {name!r} names no {kind}: {error}") from error
+
+
 def read_encoder(name: str | None) -> TextEncoder | None:
     """The function that --text-encoder names, "package.module:function"; the working folder is searched first."""
     if name is None:
         return None
     check_encoder(name)
-    module, _, function = name.partition(":")
-    if "" not in sys.path:
-        sys.path.insert(0, "")
-    try:
-        found: Any = getattr(import_module(module), function)
-    except (ImportError, AttributeError) as error:
-        raise ValueError(f"--text-encoder {name!r} names no function: {error}") from error
+    found = _imported("--text-encoder", name, "function")
     if not callable(found):
         raise ValueError(f"--text-encoder {name!r} must name a function, it names {type(found).__name__}")
     return found
@@ -219,13 +224,7 @@ def read_suite(name: str | None, tasks: Sequence[str] = ()) -> Suite | None:
         return find_suite(tasks) if any("/" in task for task in tasks) else None
     if ":" not in name:
         return load_suite(name)
-    module, _, attribute = name.partition(":")
-    if "" not in sys.path:
-        sys.path.insert(0, "")
-    try:
-        found: Any = getattr(import_module(module), attribute)
-    except (ImportError, AttributeError) as error:
-        raise ValueError(f"suite {name!r} names no object: {error}") from error
+    found = _imported("suite", name, "object")
     if not isinstance(found, Suite):
         raise ValueError(f"suite {name!r} must name a Suite, it names {type(found).__name__}")
     return found

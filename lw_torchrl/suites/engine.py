@@ -47,6 +47,30 @@ class Engine(Protocol):
         """Free the simulators."""
 
 
+def seeds_of_rows(rows: Sequence[int], seeds: Sequence[int]) -> tuple[NDArray[np.intp], dict[int, int]]:
+    """The rows to reset, as an array, and the seed of each; :class:`ValueError` if these are not as many."""
+    index = np.asarray(rows, dtype=np.intp).reshape(-1)
+    if len(index) != len(seeds):
+        raise ValueError(f"seeds must be as many as rows, {len(index)}, got {len(seeds)}")
+    return index, dict(zip(index.tolist(), map(int, seeds), strict=True))
+
+
+def checked_step(
+    action: Any, active: Any, started: NDArray[np.bool_], size: int
+) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+    """The actions (N, size) and the mask (N,) bool of a step, as arrays; an error for other shapes, or for a row that
+    has not ``started``."""
+    action, active, n = np.asarray(action), np.asarray(active, dtype=bool), len(started)
+    if action.shape != (n, size) or active.shape != (n,):
+        raise ValueError(
+            f"action must be of shape {(n, size)} and active of {(n,)}, got {action.shape} and {active.shape}"
+        )
+    if not started[active].all():
+        row = int(np.flatnonzero(active & ~started)[0])
+        raise RuntimeError(f"row {row} must be reset before it is stepped")
+    return action, active
+
+
 class RowModel(NamedTuple):
     """The compiled MuJoCo model of a row, to read, and the ``path`` of its XML file; models of one file have the same
     meshes. Rows share a model, so its ``body_pos`` and ``site_pos`` may be another row's."""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from lw_torchrl._checks import check_choice, check_int
 from lw_torchrl._rendering import naming_absent_renderer
 from lw_torchrl.suites.cameras import SeenRows
-from lw_torchrl.suites.engine import BodyPoses, EngineStep, RowModel
+from lw_torchrl.suites.engine import BodyPoses, EngineStep, RowModel, checked_step, seeds_of_rows
 from lw_torchrl.suites.fetch.frame import (
     HAND_HEIGHT,
     OPEN,
@@ -188,10 +188,7 @@ class FetchEngine(SeenRows):
         self._faulted = np.zeros(n, dtype=bool)
 
     def reset(self, rows: Sequence[int], seeds: Sequence[int]) -> Array:
-        index = np.asarray(rows, dtype=np.intp).reshape(-1)
-        if len(index) != len(seeds):
-            raise ValueError(f"seeds must be as many as rows, {len(index)}, got {len(seeds)}")
-        seed_of = dict(zip(index.tolist(), map(int, seeds), strict=True))
+        index, seed_of = seeds_of_rows(rows, seeds)
         # A reset that fails half-way leaves rows that must not be stepped.
         self._started[index] = False
 
@@ -211,15 +208,7 @@ class FetchEngine(SeenRows):
 
     def step(self, action: NDArray[Any], active: _Mask) -> EngineStep:
         n = len(self._rows)
-        action, active = np.asarray(action), np.asarray(active, dtype=bool)
-        if action.shape != (n, FETCH.action_size) or active.shape != (n,):
-            raise ValueError(
-                f"action must be of shape {(n, FETCH.action_size)} and active of {(n,)}, "
-                f"got {action.shape} and {active.shape}"
-            )
-        if not self._started[active].all():
-            row = int(np.flatnonzero(active & ~self._started)[0])
-            raise RuntimeError(f"row {row} must be reset before it is stepped")
+        action, active = checked_step(action, active, self._started, FETCH.action_size)
         # NaN must not reach the physics: MuJoCo would silently restart the row.
         self._faulted |= active & ~np.isfinite(action).all(axis=1)
         rows = np.flatnonzero(active & ~self._faulted)

@@ -14,7 +14,7 @@ from lw_torchrl._checks import check_choice, check_int
 from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.tasks import check_task
 from lw_torchrl.suites.cameras import SeenRows
-from lw_torchrl.suites.engine import EngineStep, RowModel
+from lw_torchrl.suites.engine import EngineStep, RowModel, checked_step, seeds_of_rows
 from lw_torchrl.suites.metaworld.vectorized import observation as at
 from lw_torchrl.suites.metaworld.vectorized import simulated_rows, task_programs
 from lw_torchrl.suites.metaworld.vectorized.observation import Array, Index, Mask, Observer, SuccessFunction
@@ -93,10 +93,7 @@ class VectorizedEngine(SeenRows):
         self._running: _RunningRows | None = None
 
     def reset(self, rows: Sequence[int], seeds: Sequence[int]) -> Array:
-        index = np.asarray(rows, dtype=np.intp).reshape(-1)
-        if len(index) != len(seeds):
-            raise ValueError(f"seeds must be as many as rows, {len(index)}, got {len(seeds)}")
-        seed_of = dict(zip(index.tolist(), map(int, seeds), strict=True))
+        index, seed_of = seeds_of_rows(rows, seeds)
         # A reset that fails half-way leaves rows that must not be stepped.
         self._started[index] = False
 
@@ -115,15 +112,7 @@ class VectorizedEngine(SeenRows):
 
     def step(self, action: NDArray[Any], active: Mask) -> EngineStep:
         n = len(self._rows)
-        action, active = np.asarray(action), np.asarray(active, dtype=bool)
-        if action.shape != (n, METAWORLD.action_size) or active.shape != (n,):
-            raise ValueError(
-                f"action must be of shape {(n, METAWORLD.action_size)} and active of {(n,)}, "
-                f"got {action.shape} and {active.shape}"
-            )
-        if not self._started[active].all():
-            row = int(np.flatnonzero(active & ~self._started)[0])
-            raise RuntimeError(f"row {row} must be reset before it is stepped")
+        action, active = checked_step(action, active, self._started, METAWORLD.action_size)
         # NaN must not reach the physics: MuJoCo would silently restart the row.
         self._faulted |= active & ~np.isfinite(action).all(axis=1)
         reward, success = np.zeros(n), np.zeros(n, dtype=bool)
