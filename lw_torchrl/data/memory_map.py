@@ -72,9 +72,6 @@ def row_bytes(layout: Layout) -> int:
     return sum(_widths(layout).values())
 
 
-ROW_BYTES = row_bytes(METAWORLD)
-
-
 def _path(folder: Path, key: Column) -> Path:
     return folder.joinpath(*key[:-1], f"{key[-1]}.memmap")
 

@@ -104,6 +104,11 @@ def load_suite(suite: str | Suite) -> Suite:
     return found
 
 
+def _suite_name(task: str) -> str:
+    """The suite that a task's name begins with, or is; Meta-World's tasks have no suite in front."""
+    return task.partition("/")[0] if "/" in task or task in SUITES else "metaworld"
+
+
 def listed_tasks(tasks: Any) -> Any:
     """The tasks as they were given, but an iterator as a list, which can be read twice."""
     return list(tasks) if isinstance(tasks, Iterator) else tasks
@@ -119,7 +124,7 @@ def find_suite(tasks: Any, suite: str | Suite | None = None) -> Suite:
         return load_suite(suite)
     listed = [tasks] if isinstance(tasks, (str, Task)) else list(tasks) if isinstance(tasks, Iterable) else []
     names = {one.name if isinstance(one, Task) else one for one in listed if isinstance(one, (str, Task))}
-    prefixes = {name.partition("/")[0] if "/" in name or name in SUITES else "metaworld" for name in names}
+    prefixes = {_suite_name(name) for name in names}
     if len(prefixes) > 1:
         raise ValueError(f"tasks must be of one suite, got tasks of {', '.join(sorted(prefixes))}")
     return load_suite(next(iter(prefixes), "metaworld"))
@@ -127,7 +132,7 @@ def find_suite(tasks: Any, suite: str | Suite | None = None) -> Suite:
 
 def known_suite(task: str) -> Suite | None:
     """The suite in :data:`SUITES` that has a task of this name and is installed; None for a task of one's own."""
-    name = task.partition("/")[0] if "/" in task else "metaworld"
+    name = _suite_name(task)
     try:
         found = load_suite(name) if name in SUITES else None
     except ImportError:

@@ -127,7 +127,7 @@ class OnlineTrainer(Training):
         self.method, self.replay, self.num_threads = method, replay, num_threads
         given: Any = replay.tasks if tasks is None else listed_tasks(tasks)
         self.suite = find_suite(given, suite)
-        self.named = self.suite.named_tasks(given)
+        self.tasks = self.suite.named_tasks(given)
         generator = torch.Generator().manual_seed(config.seed)
         replay.set_rng(generator)
         self._drawn = generator.get_state()
@@ -145,7 +145,7 @@ class OnlineTrainer(Training):
                 "actor": self.policy.describe(),
                 "start": {"weights": start},
                 "critic": {} if critic is None else {"weights": _fingerprint(critic)},
-                "online": {"method": method, "tasks": list(self.named), **asdict(config)},
+                "online": {"method": method, "tasks": list(self.tasks), **asdict(config)},
                 "data": describe_data(replay),
                 "replay": describe_learning(replay),
             }
@@ -186,7 +186,7 @@ class OnlineTrainer(Training):
         Ctrl-C ends it between two steps, and what came since the last round's end is lost; a second Ctrl-C at once.
         """
         base = LanguageWorldEnv(
-            list(self.named.values()),
+            list(self.tasks.values()),
             suite=self.suite,
             num_envs=self.config.rows,
             seed=self.config.seed,

@@ -14,8 +14,9 @@ from collecting import EPISODES, STEPS, collect, tree
 import lw_torchrl as lw
 from lw_torchrl.data import DatasetError, LanguageWorldExperienceReplay, memory_map
 from lw_torchrl.data.dataset import read_metadata
-from lw_torchrl.data.memory_map import COLUMNS, ROW_BYTES, load_rows
+from lw_torchrl.data.memory_map import COLUMNS, load_rows, row_bytes
 from lw_torchrl.data.missing_episodes import EpisodeFiles
+from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.training.behavioral_cloning import bc_loss
 
 TASKS = ("push", "reach")
@@ -151,7 +152,7 @@ def test_what_was_written_a_moment_ago_is_not_remembered(root, read, monkeypatch
 
 
 def test_a_large_dataset_is_read_in_part_and_wholly_when_asked(root, read, settled, monkeypatch):
-    monkeypatch.setattr(memory_map, "READ_AT_ONCE", 2 * STEPS * ROW_BYTES)
+    monkeypatch.setattr(memory_map, "READ_AT_ONCE", 2 * STEPS * row_bytes(METAWORLD))
     replay = LanguageWorldExperienceReplay(root)
     assert read == [ALL[0], ALL[3]]
     replay.verify()

@@ -14,11 +14,12 @@ from lw_torchrl.data.missing_episodes import write_failed
 COLLECT = """
 import os, sys
 from lw_torchrl.data import collect_demonstrations
-from lw_torchrl.data.memory_map import ROW_BYTES
+from lw_torchrl.data.memory_map import row_bytes
+from lw_torchrl.language.layout import METAWORLD
 
 folder, plain = sys.argv[1:]
 options = dict(episodes_per_task=4, max_steps=120, noise_scale=(0.0, 0.3), num_envs=1, progress=False)
-rows = 4 * 120 * ROW_BYTES
+rows = 4 * 120 * row_bytes(METAWORLD)
 
 def collect(root):
     return collect_demonstrations("reach", root=root, **options)
