@@ -53,9 +53,7 @@ def collect(
     """
     options.check_folder("--out", out)
     options.check_actor("policy", policy)
-    from lw_torchrl.language.tasks import TASKS
-
-    chosen = options.simulated("tasks", options.one_or_many(tasks), TASKS)
+    chosen = options.simulated("tasks", options.one_or_many(tasks), options.read_tasks(None, tasks))
     from lw_torchrl.data import collect_demonstrations
 
     acts: str | Policy = policy

@@ -25,6 +25,7 @@ def evaluate(
     task_file: options.TaskFile = None,
     text_encoder: options.OwnEncoder = None,
     suite: options.SuiteName = None,
+    speed: options.Speed = 1.0,
     max_steps: int | None = None,  # of an episode; the suite's if none is given, Meta-World's 500
     episodes: int = 20,  # of each task
     seed: int = 1000,  # fixes initial states, goals and noise; not one that the demonstrations used
@@ -79,7 +80,7 @@ def evaluate(
     if str(checkpoint) != "expert":
         policy = options.load_policy(checkpoint, seed, None if elsewhere else given, text_encoder)
         if elsewhere is not None:
-            policy = options.moved(policy, elsewhere, given)
+            policy = options.moved(policy, elsewhere, given, speed)
         if evaluator is not None:
             if policy.plans is None:
                 raise ValueError(f"--evaluator is for a policy with plans, {type(policy).__name__} has none")
@@ -162,7 +163,7 @@ def scripted(
     Example: lw-torchrl scripted MT50 --episodes 50
     """
     options.check_folder("--out", out)
-    known = options.read_tasks(task_file)
+    known = options.read_tasks(task_file, names)
     chosen = options.simulated("tasks", options.one_or_many(names), known)
     loaded = options.read_plans(plans, known)
     loaded.require(chosen)

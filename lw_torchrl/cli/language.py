@@ -24,7 +24,7 @@ def tasks(
     """
     import lw_torchrl as lw
 
-    known = options.read_tasks(task_file)
+    known = options.read_tasks(task_file, names)
     rows = [
         {"task": name, "mt10": name in lw.MT10, "description": known[name].description}
         | {"objects": [{"name": one.name, "ours": one.ours} for one in known[name].objects[1:]]}
@@ -56,7 +56,7 @@ def skills(
     from lw_torchrl.language.nearest import nearest_skill
     from lw_torchrl.language.tasks import check_task
 
-    known = options.read_tasks(task_file)
+    known = options.read_tasks(task_file, () if task is None else (task,))
     table = options.read_skills(skill_file, known)
     definition = None if task is None else known[check_task(task, known)]
     output = Output(json)
@@ -106,7 +106,7 @@ def plans(
     """
     from lw_torchrl.language.tasks import resolve_tasks
 
-    known = options.read_tasks(task_file)
+    known = options.read_tasks(task_file, names)
     loaded = options.read_plans(plans, known, skill_set)
     chosen = resolve_tasks(options.one_or_many(names), tasks=known) if names else tuple(loaded)
     loaded.require(chosen)
@@ -156,7 +156,7 @@ def queries(
     from lw_torchrl.language.nearest import nearest_query
     from lw_torchrl.language.tasks import check_task
 
-    known = options.read_tasks(task_file)
+    known = options.read_tasks(task_file, (task,))
     definition = known[check_task(task, known)]
     output = Output(json)
     if text is not None:
@@ -176,7 +176,7 @@ def query(
     task: Positional[Annotated[str, arg(metavar="TASK")]],  # a task's name
     text: Positional[options.Text] = None,  # the query; without one, all supported queries that hold are listed
     /,
-    step: int = 0,  # how many steps the expert does first, 0 to 500
+    step: int = 0,  # how many steps the expert does first, at most an episode's
     seed: int = 0,  # of the episode
     episode: int = 0,  # its index
     task_file: options.TaskFile = None,
@@ -186,28 +186,35 @@ def query(
 
     Example: lw-torchrl query pick-place "Is the gripper open and not above the puck?" --step 40
     """
+    from torchrl.envs import EnvBase, TransformedEnv
+
     import lw_torchrl as lw
     from lw_torchrl._checks import check_int
+    from lw_torchrl.data.missing_episodes import suite_expert
     from lw_torchrl.language.tasks import check_task
+    from lw_torchrl.suites.suite import find_suite
 
-    known = options.read_tasks(task_file)
+    known = options.read_tasks(task_file, (task,))
     (name,) = options.simulated("task", [check_task(task, known)], known)
     definition = known[name]
     asked = lw.supported_queries(definition) if text is None else [text]
     listed = [lw.parse_query(one, definition) for one in asked]
-    if check_int("step", step, minimum=0) > 500:
-        raise ValueError(f"step must be at most 500, got {step}")
-    env = lw.LanguageWorldEnv(name, seed=seed)
+    suite = find_suite(name)
+    if check_int("step", step, minimum=0) > suite.max_steps:
+        raise ValueError(f"step must be at most {suite.max_steps}, got {step}")
+    env: EnvBase = lw.LanguageWorldEnv(name, seed=seed)
+    if step and suite.make_expert is None and suite.plans is not None:
+        env = TransformedEnv(env, lw.QAFTransform(suite.plans))
     state = env.reset(episode=episode)
     if step:
-        state = env.rollout(step, lw.ExpertActor(name), auto_reset=False, tensordict=state)[:, -1]["next"]
+        state = env.rollout(step, suite_expert(suite, (name,)), auto_reset=False, tensordict=state)[:, -1]["next"]
     truths = lw.QueryProgram({definition: listed})(state["observation"], state["task_id"])[0].tolist()
     env.close()
     output = Output(json)
     positions = {place: at.tolist() for place, at in definition.positions(state["observation"][0]).items()}
     lines = [f"the {place:24} at {' '.join(f'{x:7.3f}' for x in at)} m" for place, at in positions.items()]
     output.show("positions", positions, "\n".join(lines))
-    opening = state["observation"][0, 3].item()
+    opening = state["observation"][0, suite.layout.opening].item()
     output.show("opening", opening, f"the gripper's opening       {opening:7.3f}\n")
     answers = [{"query": str(found), "holds": truth} for found, truth in zip(listed, truths, strict=True)]
     said = [one["query"] for one in answers if one["holds"]]

@@ -11,7 +11,16 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 from tyro.conf import Positional
 
 from lw_torchrl._checks import counted, shown
-from lw_torchrl.cli.options import Json, PlanSources, check_saved, make_logger, one_or_many, read_plans, simulated
+from lw_torchrl.cli.options import (
+    Json,
+    PlanSources,
+    check_saved,
+    make_logger,
+    one_or_many,
+    read_plans,
+    read_tasks,
+    simulated,
+)
 from lw_torchrl.cli.output import Output
 from lw_torchrl.cli.runs import Job, Scheduled
 
@@ -68,13 +77,12 @@ def online(
         if given is not None and not {*_READ_BY[option]} & {*methods}:
             of = f"the method{'s' * (len(_READ_BY[option]) > 1)} {', '.join(_READ_BY[option])}"
             raise ValueError(f"--{option} is of {of}, --methods are {', '.join(methods)}")
-    from lw_torchrl.language.tasks import TASKS
-
     if start is not None:
         check_saved("start", start)
     tuned = None if step is None else _read_step(step)
-    chosen = simulated("tasks", one_or_many(tasks), TASKS)
-    found = read_plans(plans, TASKS)
+    known = read_tasks(None, tasks)
+    chosen = simulated("tasks", one_or_many(tasks), known)
+    found = read_plans(plans, known)
     found.require(chosen)
     if isinstance(tuned, int) and start is None:
         for task in chosen:

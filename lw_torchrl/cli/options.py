@@ -49,22 +49,33 @@ TaskNames = Annotated[tuple[str, ...], arg(metavar="TASKS ...", help="MT10, MT50
 
 
 def one_or_many(names: tuple[str, ...]) -> str | tuple[str, ...]:
-    """MT10 is a set, not a list of one name."""
-    return names[0] if len(names) == 1 else names
+    """MT10 is a set, not a list of one name; a suite's name stands for all its tasks."""
+    if len(names) != 1:
+        return names
+    suite = read_suite(None, names)
+    return names[0] if suite is None or names[0] != suite.name else tuple(suite.tasks)
 
 
-def read_tasks(task_file: Path | None) -> Mapping[str, Task]:
-    """The 50 tasks, with those of --task-file, which replace them or join them."""
+def read_tasks(task_file: Path | None, names: Sequence[str] = ()) -> Mapping[str, Task]:
+    """The tasks of the suite that ``names`` are of, or the 50, which those of --task-file replace or join."""
     from lw_torchrl.language.tasks import TASKS, load_tasks
 
-    return TASKS if task_file is None else _load("--task-file", task_file, load_tasks)
+    if (suite := read_suite(None, names)) is None:
+        return TASKS if task_file is None else _load("--task-file", task_file, load_tasks)
+    if task_file is not None:
+        raise ValueError(f"--task-file is for tasks of Meta-World, those named are of the suite {suite.name}")
+    return suite.tasks
 
 
 def read_skills(skill_file: Path | None, tasks: Mapping[str, Task]) -> Mapping[str, ScriptedSkill]:
-    """The scripted skills, with those of --skill-file."""
+    """The scripted skills of the suite that ``tasks`` are of, with those of --skill-file."""
     from lw_torchrl.language.skills import load_skills
 
-    return load_skills() if skill_file is None else _load("--skill-file", skill_file, partial(load_skills, tasks=tasks))
+    own = {} if skill_file is None else _load("--skill-file", skill_file, partial(load_skills, tasks=tasks))
+    if (suite := _suite_of(tasks)) is None:
+        return own or load_skills()
+    shipped = load_skills()
+    return {**(suite.skills or {}), **{text: skill for text, skill in own.items() if shipped.get(text) != skill}}
 
 
 def _load(option: str, file: Path, load: Callable[[Path], Loaded]) -> Loaded:
@@ -81,6 +92,8 @@ def simulated(argument: str, names: str | Sequence[str], known: Mapping[str, Tas
     """The tasks behind ``names``, sorted; a task of the user's that the simulator lacks is refused."""
     from lw_torchrl.language.tasks import TASKS, resolve_tasks
 
+    if (suite := read_suite(None, [names] if isinstance(names, str) else names)) is not None:
+        return tuple(suite.named_tasks(names))
     given = [names] if isinstance(names, str) else names
     if own := [name for name in given if name not in (*SETS, *TASKS) and name in known]:
         raise ValueError(
@@ -91,14 +104,21 @@ def simulated(argument: str, names: str | Sequence[str], known: Mapping[str, Tas
 
 
 def read_plans(sources: Sequence[str], tasks: Mapping[str, Task], skills: Literal["own", "MT10"] = "own") -> Plans:
-    """The plans of --plans, of which the last for a task counts; shipped ones are carried over to ``tasks``."""
+    """The plans of --plans, of which the last for a task counts; shipped ones are carried over to ``tasks``.
+
+    Where these are of a suite, MT10 and MT50 stand for the plans that the suite ships.
+    """
     from lw_torchrl.language.plan_files import load_plans
     from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans
 
+    suite = _suite_of(tasks)
     found: dict[str, ConditionalPlan] = {}
     for source in sources:
         try:
-            found.update(load_plans(source, skills=skills) if source in SETS else load_plans(source, tasks=tasks))
+            if suite is not None and source in SETS:
+                found.update(suite.plans or {})
+            else:
+                found.update(load_plans(source, skills=skills) if source in SETS else load_plans(source, tasks=tasks))
         except (PlanError, FileNotFoundError) as error:
             raise type(error)(f"--plans {source}: {error}") from error
     if not found:
@@ -207,6 +227,11 @@ SuiteName = Annotated[
 ]
 
 
+Speed = Annotated[
+    float, arg(help="of a policy that was trained with another robot: times the metres a step that it moved there.")
+]
+
+
 def is_suite(name: str) -> bool:
     """Whether a word names a suite: a shipped one, or an object as my_module:suite."""
     from lw_torchrl.suites.suite import SUITES
@@ -217,17 +242,25 @@ def is_suite(name: str) -> bool:
 
 def read_suite(name: str | None, tasks: Sequence[str] = ()) -> Suite | None:
     """The suite of --suite: a name, or "package.module:object", for which the working folder is searched first; without
-    one that of ``tasks`` like fetch/push. None for Meta-World."""
-    from lw_torchrl.suites.suite import Suite, find_suite, load_suite
+    one that of ``tasks``, fetch or fetch/push. None for Meta-World."""
+    from lw_torchrl.suites.suite import SUITES, Suite, find_suite, load_suite
 
     if name is None:
-        return find_suite(tasks) if any("/" in task for task in tasks) else None
+        return find_suite(tasks) if any("/" in task or task in SUITES for task in tasks) else None
     if ":" not in name:
         return load_suite(name)
     found = _imported("suite", name, "object")
     if not isinstance(found, Suite):
         raise ValueError(f"suite {name!r} must name a Suite, it names {type(found).__name__}")
     return found
+
+
+def _suite_of(tasks: Mapping[str, Task]) -> Suite | None:
+    """The suite that :func:`read_tasks` took all of ``tasks`` from; None for Meta-World."""
+    from lw_torchrl.suites.suite import known_suite
+
+    first = next(iter(tasks))
+    return known_suite(first) if "/" in first else None
 
 
 def make_logger(kind: Literal["csv", "tensorboard", "wandb"], out: Path) -> Any:
@@ -240,7 +273,7 @@ def make_logger(kind: Literal["csv", "tensorboard", "wandb"], out: Path) -> Any:
         raise ImportError(f"--logger {kind} needs the package {kind}: pip install {kind}") from error
 
 
-def moved(policy: Policy, suite: Suite, plans: Plans | None) -> Policy:
+def moved(policy: Policy, suite: Suite, plans: Plans | None, speed: float = 1.0) -> Policy:
     """The policy under plans of a suite, turned into its actions where it was trained with another robot."""
     from lw_torchrl.modules.transferred_actor import TransferredActor
 
@@ -248,7 +281,7 @@ def moved(policy: Policy, suite: Suite, plans: Plans | None) -> Policy:
         return policy if plans is None else policy.with_plans(plans)
     if (there := plans or suite.plans) is None:
         raise ValueError(f"--suite {suite.name} has no plans of its own; name yours with --plans")
-    return TransferredActor(policy, there)
+    return TransferredActor(policy, there, speed=speed)
 
 
 def load_policy(checkpoint: Path, seed: int, plans: Plans | None, text_encoder: str | None) -> Policy:

@@ -29,7 +29,7 @@ def prompt(
     """
     from lw_torchrl.planners.prompts import plan_prompt
 
-    known = options.read_tasks(task_file)
+    known = options.read_tasks(task_file, (task,))
     found = plan_prompt(task, format, plans=options.read_plans(plans, known), vocabulary=vocabulary, tasks=known)
     print(found, end="")
 
@@ -59,7 +59,7 @@ def check(
 
     if not file.is_file():
         raise FileNotFoundError(f"file: there is no file {str(file)!r}")
-    known = options.read_tasks(task_file)
+    known = options.read_tasks(task_file, () if task is None else (task,))
     if task is None:
         task = re.sub(r"-\d+$", "", file.stem)
         if task not in known:

@@ -48,7 +48,7 @@ class Asking:
         import lw_torchrl as lw
         from lw_torchrl.language.tasks import named_tasks
 
-        known = options.read_tasks(self.task_file)
+        known = options.read_tasks(self.task_file, names)
         chosen = dict(named_tasks(options.one_or_many(names), known=known))
         ours = ("attempts", "out", "plans", "skill_file", "task_file")
         asked = {name: value for name, value in vars(self).items() if name not in ours}

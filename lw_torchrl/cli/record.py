@@ -29,11 +29,12 @@ def record(
     plans: tuple[str, ...] = (),
     attribute: bool = False,  # say why failed episodes failed, as evaluate does; for scripted and policies with plans
     reference: tuple[str, ...] = (),  # with --attribute, trusted plans for running failed episodes again
+    speed: options.Speed = 1.0,
     task_file: options.TaskFile = None,
     text_encoder: options.OwnEncoder = None,
     seed: int = 1000,  # fixes initial states, goals and noise
     noise: float = 0.1,  # standard deviation of the noise on the executed action
-    max_steps: int = 500,  # of an episode
+    max_steps: int | None = None,  # of an episode; the suite's if none is given, Meta-World's 500
     out: Path | None = None,  # the file; runs/recordings/TASK-POLICY.rrd if none is given; replaced if there
     json: options.Json = False,
 ) -> Output:
@@ -51,10 +52,10 @@ def record(
     for option, who in (("policy", policy), ("compare", compare or policy)):
         options.check_actor(option, who)
     options.check_encoder(text_encoder)
-    known = dict(options.read_tasks(task_file))
+    known = dict(options.read_tasks(task_file, names))
     tasks = options.simulated("names", options.one_or_many(names), known)
     given = options.read_plans(plans, known) if plans else None
-    label = names[0] if len(names) == 1 else f"{len(names)}-tasks"
+    label = names[0].replace("/", "-") if len(names) == 1 else f"{len(names)}-tasks"
     out = out or Path("runs/recordings") / f"{label}-{Path(policy).stem}.rrd"
     options.check_file("--out", out, ".rrd")
     import lw_torchrl as lw
@@ -65,7 +66,8 @@ def record(
     trusted = options.read_plans(reference, known) if reference else None
     episode_options: dict[str, Any] = {"seed": seed, "noise_scale": noise, "max_steps": max_steps}
     # What can be refused is refused before the first episode runs.
-    cast = [_cast(who, tasks, given, known, seed, max_steps, text_encoder) for who in filter(None, (policy, compare))]
+    how = (seed, max_steps, speed, text_encoder)
+    cast = [_cast(who, tasks, given, known, *how) for who in filter(None, (policy, compare))]
     output, rows = Output(json), []
     recorded: list[list[str]] = []
     with replacing(out) as file, lw.RerunLogger(file, exp_name=out.stem) as logger:
@@ -101,15 +103,20 @@ def _cast(
     plans: Plans | None,
     known: Mapping[str, Task],
     seed: int,
-    max_steps: int,
+    max_steps: int | None,
+    speed: float,
     text_encoder: str | None,
 ) -> tuple[Any, Plans | None, str]:
     """Who acts, the plans whose conditions are answered, and what the policy is called."""
     import lw_torchrl as lw
     from lw_torchrl.data.behaviours import SegmentActor, behaviour_of
+    from lw_torchrl.data.missing_episodes import suite_expert
+    from lw_torchrl.suites.suite import find_suite
 
     if who not in options.ACTORS:
-        actor = options.load_policy(Path(who), seed, plans, text_encoder)
+        there = options.read_suite(None, tasks)
+        actor = options.load_policy(Path(who), seed, None if there else plans, text_encoder)
+        actor = actor if there is None else options.moved(actor, there, plans, speed)
         if missing := [task for task in tasks if task not in actor.tasks]:
             knows = f"it knows {', '.join(actor.tasks)}"
             raise ValueError(f"the policy of {who!r} does not know {', '.join(missing)}; {knows}")
@@ -117,11 +124,14 @@ def _cast(
     shown = options.read_plans(("MT50",), known) if plans is None else plans
     shown.require(tasks)
     shown = lw.Plans({task: shown[task] for task in tasks})
+    suite = find_suite(tasks)
     if who == "expert":
-        return lw.ExpertActor(tasks), shown, who
+        return suite_expert(suite, tasks), shown, who
     if who == "scripted":
-        return lw.ScriptedSkillActor(shown), shown, who
-    return SegmentActor(behaviour_of(who, tasks), shown, seed, max_steps), shown, who
+        return lw.ScriptedSkillActor(shown, skills=suite.skills), shown, who
+    spoilt = behaviour_of(who, tasks, suite=suite)
+    steps = max_steps or suite.max_steps
+    return SegmentActor(spoilt, shown, seed, steps, skills=suite.skills), shown, who
 
 
 def view(

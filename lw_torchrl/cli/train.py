@@ -78,7 +78,10 @@ def train(
     options.check_dataset("data", data)
     check_choice("method", method, options.METHODS)
     options.check_encoder(text_encoder)
-    known = options.read_tasks(task_file)
+    from lw_torchrl.data.dataset import read_metadata
+
+    held = read_metadata(data).config
+    known = options.read_tasks(task_file, held.tasks)
     chosen = resolve_tasks(options.one_or_many(tasks), tasks=known) if tasks else ()
     if begin is not None:
         options.check_saved("--begin", begin)
@@ -94,7 +97,6 @@ def train(
     import lw_torchrl as lw
     from lw_torchrl import modules
     from lw_torchrl._devices import check_device
-    from lw_torchrl.data.dataset import read_metadata
     from lw_torchrl.modules.policy import make_policy, policy_class
 
     options.use_one_thread()
@@ -112,7 +114,6 @@ def train(
     config = lw.BehavioralCloningConfig(normalize=begin is None, **numbers)
     rows: dict[str, Any] = {"episodes": None, "after_success": after_success}
     if chosen:
-        held = read_metadata(data).config
         rows["episodes"] = {check_choice("tasks", task, held.tasks): held.episodes_per_task for task in chosen}
     replay = lw.LanguageWorldExperienceReplay(data, sampler=lw.TaskBalancedSampler(), device=there, **rows)
     torch.manual_seed(seed)

@@ -60,9 +60,9 @@ def train_evaluator(
     if text_encoder is not None and structure:
         raise ValueError("--text-encoder is for --no-structure; with structure no text is read")
     from lw_torchrl._rendering import CAMERAS
-    from lw_torchrl.language.tasks import TASKS
 
-    names = options.simulated("tasks", options.one_or_many(tasks), TASKS)
+    known = options.read_tasks(None, tasks)
+    names = options.simulated("tasks", options.one_or_many(tasks), known)
     drawn = len(held_out_tasks) == 1 and held_out_tasks[0].isdigit()
     for argument, given, allowed in (
         ("behaviours", behaviours, options.ACTORS),
@@ -93,7 +93,7 @@ def train_evaluator(
     network: dict[str, Any] = {"structure": structure, "depth": depth, "hidden" if cameras else "width": width}
     network["text_encoder"] = options.read_encoder(text_encoder)
     pictures: dict[str, Any] = {"cameras": cameras, "height": picture, "width": picture}
-    plans = lw.load_plans("MT50")
+    plans = options.read_plans(("MT50",), known)
     evaluator: ClauseEvaluator
     if cameras:
         own = lw.Plans({task: plans[task] for task in names})

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from contextlib import closing
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,7 +28,6 @@ from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.modules.policy import Policy
 from lw_torchrl.modules.scripted_skill_actor import ScriptedSkillActor
-from lw_torchrl.suites.metaworld.experts import ExpertActor
 from lw_torchrl.suites.suite import Suite
 from lw_torchrl.transforms.qaf import QAFTransform
 
@@ -156,13 +156,14 @@ def _clipped(policy: _Actor, size: int) -> _Actor:
 
 
 def _env_and_actor(config: CollectConfig, policy: Policy | None, env: LanguageWorldEnv) -> tuple[EnvBase, _Actor]:
-    if config.policy.kind == "expert" and config.layout == METAWORLD:
-        return env, ExpertActor(config.tasks)
     if config.policy.kind == "expert":
-        policy = suite_expert(env.suite, config.tasks)
+        expert = suite_expert(env.suite, config.tasks)
+        if not isinstance(expert, Policy):
+            return env, expert
+        policy = expert
     if policy is None:
-        plans = segment_plans(config.tasks)
-        actor = SegmentActor(config.policy, plans, config.seed, config.max_steps)
+        plans = segment_plans(config.tasks, env.suite)
+        actor = SegmentActor(config.policy, plans, config.seed, config.max_steps, skills=env.suite.skills)
         return TransformedEnv(env, QAFTransform(plans)), _clipped(actor, env.layout.action_size)
     transform = policy.transform()
     return env if transform is None else TransformedEnv(env, transform), _clipped(
@@ -170,8 +171,10 @@ def _env_and_actor(config: CollectConfig, policy: Policy | None, env: LanguageWo
     )
 
 
-def suite_expert(suite: Suite, tasks: Sequence[str]) -> ScriptedSkillActor:
-    """A suite's own demonstrator: its plans, carried out by its scripted skills; ValueError without."""
+def suite_expert(suite: Suite, tasks: Sequence[str]) -> Any:
+    """A suite's own demonstrator, or its plans, carried out by its scripted skills; ValueError without."""
+    if suite.make_expert is not None:
+        return suite.make_expert(tasks)
     if suite.plans is None or suite.skills is None:
         raise ValueError(
             f"policy='expert': suite {suite.name!r} has no plans with scripted skills; give a policy of yours"

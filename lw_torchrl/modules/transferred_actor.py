@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import Transform
 
-from lw_torchrl._checks import checked
+from lw_torchrl._checks import checked, shown
 from lw_torchrl._keys import dispatched, write
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
@@ -21,9 +21,9 @@ from lw_torchrl.modules.policy import Policy, from_description
 class TransferredActor(Policy):
     """The same weights under plans of another suite, and their actions turned into that suite's.
 
-    A displacement keeps its metres a step: it is multiplied by the ratio of the layouts' ``reach``, and cut off at 1.
-    Where the suite's gripper opens or closes within a few steps, ``binary_gripper``, it closes at an effort above
-    ``closes_above`` and opens below.
+    A displacement keeps its metres a step, times ``speed``: it is multiplied by the ratio of the layouts' ``reach`` and
+    cut off at 1. Where the suite's gripper opens or closes within a few steps, ``binary_gripper``, it closes at an
+    effort above ``closes_above`` and opens below.
 
     Reads what the policy reads, of the other layout; writes ``action`` (B, A) float32 in [-1, 1], and what else the
     policy writes.
@@ -32,9 +32,10 @@ class TransferredActor(Policy):
         actor: a policy with plans, all of whose features mean the same in both layouts: those of ``roles=True`` and
             ``features="opening"``.
         plans: what it is to do, of the other suite's tasks.
+        speed: how many times as many metres a step as where it was trained, for simulators whose steps last longer.
 
     Raises:
-        ValueError: features that do not carry over, by name.
+        ValueError: features that do not carry over, by name; a speed that is not above 0.
         TypeError: a policy without plans.
 
     Example:
@@ -48,14 +49,16 @@ class TransferredActor(Policy):
     """
 
     @checked
-    def __init__(self, actor: Policy, plans: Plans | Mapping[str, ConditionalPlan]) -> None:
+    def __init__(self, actor: Policy, plans: Plans | Mapping[str, ConditionalPlan], *, speed: float = 1.0) -> None:
         super().__init__()
-        self._take(actor.with_plans(as_plans(plans)), actor.layout)
+        self._take(actor.with_plans(as_plans(plans)), actor.layout, speed)
 
-    def _take(self, actor: Policy, trained: Layout) -> None:
+    def _take(self, actor: Policy, trained: Layout, speed: float) -> None:
         """Hold a policy that has the other suite's plans already, and weights of the layout ``trained``."""
         assert actor.plans is not None
-        self.actor, self.trained = actor, trained
+        if speed <= 0:
+            raise ValueError(f"speed must be above 0, got {shown(speed)}")
+        self.actor, self.trained, self.speed = actor, trained, speed
         self.plans, self.tasks, self.layout = actor.plans, actor.tasks, actor.plans.layout
         self.in_keys, self.out_keys = actor.in_keys, actor.out_keys_source
         self.draws, self.config = actor.draws, {}
@@ -73,7 +76,7 @@ class TransferredActor(Policy):
         """An action of the layout that was trained with, (..., A), as one of this layout."""
         old, new = self.trained, self.layout
         turned = action.new_zeros((*action.shape[:-1], new.action_size))
-        moved = action[..., old.displacement : old.displacement + 3] * (old.reach / new.reach)
+        moved = action[..., old.displacement : old.displacement + 3] * (self.speed * old.reach / new.reach)
         turned[..., new.displacement : new.displacement + 3] = moved.clamp(-1.0, 1.0)
         effort = action[..., old.gripper] * old.closes
         if new.binary_gripper:
@@ -82,7 +85,11 @@ class TransferredActor(Policy):
         return turned
 
     def describe(self) -> dict[str, Any]:
-        return super().describe() | {"actor": self.actor.describe(), "trained": self.trained.to_json()}
+        return super().describe() | {
+            "actor": self.actor.describe(),
+            "trained": self.trained.to_json(),
+            "speed": self.speed,
+        }
 
     @classmethod
     def from_description(cls, found: Mapping[str, Any], text_encoder: TextEncoder | None = None) -> TransferredActor:
@@ -90,11 +97,11 @@ class TransferredActor(Policy):
             raise ValueError("the actor of a TransferredActor must be a policy that is none itself")
         made = cls.__new__(cls)
         Policy.__init__(made)
-        made._take(from_description(inner, text_encoder), Layout.from_json(found["trained"]))
+        made._take(from_description(inner, text_encoder), Layout.from_json(found["trained"]), found["speed"])
         return made
 
     def with_plans(self, plans: Plans | Mapping[str, ConditionalPlan]) -> TransferredActor:
         made = TransferredActor.__new__(TransferredActor)
         Policy.__init__(made)
-        made._take(self.actor.with_plans(plans), self.trained)
+        made._take(self.actor.with_plans(plans), self.trained, self.speed)
         return made.train(self.training)

@@ -27,6 +27,8 @@ class Suite:
         make_engine: ``(row_tasks, *, reward, num_threads) -> Engine``, the simulator of rows of these tasks.
         skills: the scripted skills by their text; None for none.
         plans: a plan for each task that has one; None for none.
+        make_expert: ``(tasks) -> actor``, a demonstrator that writes ``action`` (N, A) float32 in [-1, 1] and
+            ``unclipped_action``, the same before it is cut off; None for the plans with their scripted skills.
         max_steps: how many steps an episode has, unless the user says another number.
 
     Raises:
@@ -46,6 +48,7 @@ class Suite:
     make_engine: Callable[..., Engine]
     skills: Skills | None = None
     plans: Plans | None = None
+    make_expert: Callable[..., Any] | None = None
     max_steps: int = 500
 
     def __post_init__(self) -> None:

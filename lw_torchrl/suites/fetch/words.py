@@ -14,7 +14,20 @@ from lw_torchrl.language.tasks import Task, TaskError, Tasks
 
 _DATA = files("lw_torchrl.suites.fetch") / "data"
 
-FETCH = Layout("fetch", 25, hand=0, opening=3, things=(Slot(4, 7),), goal=22, past=11, reach=0.032, binary_gripper=True)
+HELD = 0.55
+"""The opening below which the fingers hold the puck, with edges of 5 cm; their pads reach it at 0.48."""
+FETCH = Layout(
+    "fetch",
+    25,
+    hand=0,
+    opening=3,
+    things=(Slot(4, 7),),
+    goal=22,
+    past=11,
+    reach=0.032,
+    binary_gripper=True,
+    thresholds={"open": HELD, "closed": HELD},
+)
 """The 25 numbers of an observation: hand, opening, puck and its quaternion, the same 11 a step before, goal."""
 
 TASKS: Tasks = MappingProxyType(

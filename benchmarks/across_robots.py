@@ -1,0 +1,110 @@
+"""python -m benchmarks.across_robots POLICIES: policies of Meta-World with Fetch, without one demonstration there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+import tyro
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+import lw_torchrl as lw
+from lw_torchrl._files import write_json, write_text
+from lw_torchrl.evaluation.summary import markdown_table
+from lw_torchrl.language.layout import METAWORLD, Layout
+from lw_torchrl.modules import TransferredActor
+from lw_torchrl.suites import load_suite
+
+TASKS = {"fetch/reach": "reach", "fetch/push": "push", "fetch/pick-and-place": "pick-place"}
+"""Fetch's tasks, and those of MT10 that ask for the same."""
+METHODS = ("pcbc", "dc", "one-hot")
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Evaluate the zero-shot policies of each method and training seed with a Fetch.
+
+    PCBC has Fetch's plans. A policy conditioned on descriptions or on task numbers is given what the best adapter could
+    give it: the task of MT10 that asks for the same, and Fetch's numbers in their places of Meta-World's. Actions are
+    turned alike.
+    """
+
+    policies: tyro.conf.Positional[Path]
+    """The folder strong of `lw-torchrl reproduce zero-shot`."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Of the trainings."""
+    methods: tuple[str, ...] = METHODS
+    """Of pcbc, dc and one-hot."""
+    episodes: int = 50
+    """Of each task."""
+    seed: int = 3000
+    """Of the episodes."""
+    max_steps: int = 250
+    """Of an episode; success at any of them counts."""
+    speed: float = 1.5
+    """Times the metres a step of Meta-World."""
+    out: Path = Path("runs/across_robots")
+    """Folder for results.json and table.md."""
+
+
+class Adapted(TensorDictModuleBase):
+    """A policy without plans, shown Fetch's numbers as Meta-World's."""
+
+    def __init__(self, actor: lw.Policy, turned: Any) -> None:
+        super().__init__()
+        self.in_keys, self.out_keys = ["observation", "task_id"], ["action"]
+        self.actor, self.turned = actor, turned
+        self.task_ids = {lw.task_id(there): lw.task_id(here) for there, here in TASKS.items()}
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        seen = tensordict.select("observation", "task_id")
+        seen["observation"] = as_metaworld(seen["observation"], load_suite("fetch").layout)
+        seen["task_id"] = seen["task_id"].clone().apply_(self.task_ids.__getitem__)
+        return tensordict.set("action", self.turned(self.actor(seen)["action"]))
+
+
+def as_metaworld(observation: Tensor, layout: Layout) -> Tensor:
+    """Numbers (B, D) of a layout with one thing in their places of Meta-World's 39, (B, 39)."""
+    seen = observation.new_zeros(len(observation), METAWORLD.size)
+    here, there = layout.things[0], METAWORLD.things[0]
+    places = [(layout.hand, METAWORLD.hand, 3), (layout.opening, METAWORLD.opening, 1)]
+    places += [(here.position, there.position, 3), (here.quaternion, there.quaternion, 4)]
+    for old, new, width in places:
+        for past in (False, True):
+            start, end = (old + layout.past, new + METAWORLD.past) if past else (old, new)
+            seen[:, end : end + width] = observation[:, start : start + width]
+    seen[:, METAWORLD.goal : METAWORLD.goal + 3] = observation[:, layout.goal : layout.goal + 3]
+    return seen
+
+
+def main(arguments: Arguments) -> None:
+    plans = lw.Plans([load_suite("fetch").plans[task] for task in TASKS])
+    rows, found = [], {}
+    for method in arguments.methods:
+        for seed in arguments.seeds:
+            turner = TransferredActor(trained(arguments.policies, "pcbc", seed), plans, speed=arguments.speed)
+            actor = turner if method == "pcbc" else Adapted(trained(arguments.policies, method, seed), turner.turned)
+            how: dict[str, Any] = {"tasks": list(TASKS), "episodes_per_task": arguments.episodes}
+            how |= {"seed": arguments.seed, "max_steps": arguments.max_steps, "noise_scale": 0.0}
+            result = lw.evaluate(actor, **how)
+            found[f"{method}, seed {seed}"] = {"once": result.success_once, "at end": result.success_at_end}
+            rows.append([method, str(seed), *(f"{result.success_once[task]:.2f}" for task in TASKS)])
+            print(*rows[-1], flush=True)
+    table = markdown_table(["method", "training seed", *TASKS], rows)
+    write_json(arguments.out / "results.json", found)
+    write_text(arguments.out / "table.md", table)
+    print(table)
+
+
+def trained(folder: Path, method: str, seed: int) -> lw.Policy:
+    """The policy that `lw-torchrl reproduce zero-shot` wrote."""
+    return lw.load_actor(folder / method / f"seed{seed}" / "policy.zip").eval()
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    main(tyro.cli(Arguments))
