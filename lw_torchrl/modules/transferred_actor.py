@@ -34,7 +34,7 @@ class TransferredActor(Policy):
         plans: what it is to do, of the other suite's tasks.
 
     Raises:
-        ValueError: features that do not carry over, by name.
+        ValueError: features that do not carry over, by name; a layout without a displacement.
         TypeError: a policy without plans.
 
     Example:
@@ -57,6 +57,8 @@ class TransferredActor(Policy):
         assert actor.plans is not None
         self.actor, self.trained = actor, trained
         self.plans, self.tasks, self.layout = actor.plans, actor.tasks, actor.plans.layout
+        for layout in (self.trained, self.layout):
+            layout.displaced("TransferredActor")
         self.in_keys, self.out_keys = actor.in_keys, actor.out_keys_source
         self.draws, self.config = actor.draws, {}
 
@@ -73,12 +75,12 @@ class TransferredActor(Policy):
         """An action of the layout that was trained with, (..., A), as one of this layout."""
         old, new = self.trained, self.layout
         turned = action.new_zeros((*action.shape[:-1], new.action_size))
-        moved = action[..., old.displacement : old.displacement + 3] * (old.reach / new.reach)
-        turned[..., new.displacement : new.displacement + 3] = moved.clamp(-1.0, 1.0)
-        effort = action[..., old.gripper] * old.closes
+        moved = action[..., old.displaced("TransferredActor")] * (old.reach / new.reach)
+        turned[..., new.displaced("TransferredActor")] = moved.clamp(-1.0, 1.0)
+        effort = action[..., old.effort].sum(-1, keepdim=True) * old.closes
         if new.binary_gripper:
             effort = torch.where(effort > new.closes_above, 1.0, -1.0)
-        turned[..., new.gripper] = effort * new.closes
+        turned[..., new.effort] = effort * new.closes
         return turned
 
     def describe(self) -> dict[str, Any]:
