@@ -17,11 +17,12 @@ from torch import Tensor
 
 from lw_torchrl._checks import check_fields, check_int, check_probability, shown, unknown_name
 from lw_torchrl._seeding import episode_generator
-from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.plans import Plans
+from lw_torchrl.language.skills import Skills
 from lw_torchrl.language.tasks import task_id
 from lw_torchrl.modules.policy import Policy
 from lw_torchrl.modules.scripted_skill_actor import ScriptedSkillActor
+from lw_torchrl.suites.suite import Suite, load_suite
 
 _MOST_STEPS = 100_000
 _OF_SEGMENTS = ("right", "otherwise", "shortest", "longest")
@@ -108,14 +109,22 @@ def check_own_label(behaviour: Behaviour) -> None:
         )
 
 
-def segment_plans(tasks: Iterable[str]) -> Plans:
-    """The plans that behaviours of kind "segments" carry out, or spoil: the shipped ones."""
-    known = load_plans("MT50")
-    return Plans([known[task] for task in tasks])
+def segment_plans(tasks: Iterable[str], suite: str | Suite = "metaworld") -> Plans:
+    """The plans that behaviours of kind "segments" carry out, or spoil: the suite's; ValueError without."""
+    suite, tasks = load_suite(suite), list(tasks)
+    if suite.plans is None:
+        raise ValueError(
+            f"policy: suite {suite.name!r} has no plans, which this behaviour follows; give a policy of yours"
+        )
+    suite.plans.require(tasks)
+    return Plans([suite.plans[task] for task in tasks])
 
 
-def behaviour_of(policy: Any, tasks: Iterable[str], name: str | None = None) -> Behaviour:
-    """The behaviour in these tasks that an argument ``policy`` stands for, under another name if one is given."""
+def behaviour_of(
+    policy: Any, tasks: Iterable[str], name: str | None = None, suite: str | Suite = "metaworld"
+) -> Behaviour:
+    """The behaviour in these tasks of ``suite`` that an argument ``policy`` stands for, under another name if one is
+    given."""
     if isinstance(policy, Policy):
         if name is None:
             raise ValueError("behaviour must name the policy in the dataset, behaviour='my-policy' say, got None")
@@ -136,7 +145,7 @@ def behaviour_of(policy: Any, tasks: Iterable[str], name: str | None = None) -> 
     if found.kind == "policy":
         raise ValueError(f"policy: the Behaviour {found.name!r} is of a trained policy; give the policy itself")
     if found.kind == "segments":
-        found = replace(found, fingerprint=segment_plans(tasks).fingerprint)
+        found = replace(found, fingerprint=segment_plans(tasks, suite).fingerprint)
     return found if name is None else replace(found, name=name)
 
 
@@ -155,18 +164,22 @@ def policy_fingerprint(policy: Policy) -> str:
 class SegmentActor(TensorDictModuleBase):
     """Acts as a :class:`Behaviour` of kind "segments", in episodes of ``max_steps`` that are run from their beginning.
 
-    Reads ``observation`` (N, 39) float32, ``task_id`` and ``episode`` (N,) int64, ``qaf`` (N, S) bool and ``_step``
-    (N,) bool, the rows that count; writes ``action`` (N, 4) float32 in [-1, 1]. An episode begins in a row whose task
-    or episode differs from the last call's. ``plans`` has a plan of scripted skills for each task.
+    Reads ``observation`` (N, D) float32, ``task_id`` and ``episode`` (N,) int64, ``qaf`` (N, S) bool and ``_step``
+    (N,) bool, the rows that count; writes ``action`` (N, A) float32 in [-1, 1]. An episode begins in a row whose task
+    or episode differs from the last call's. ``plans`` has a plan for each task, of scripted ``skills`` unless all that
+    it does is chance.
     """
 
     row_by_row = True  # no network: its rows need no blocks of one size
 
-    def __init__(self, behaviour: Behaviour, plans: Plans, seed: int, max_steps: int) -> None:
+    def __init__(
+        self, behaviour: Behaviour, plans: Plans, seed: int, max_steps: int, skills: Skills | None = None
+    ) -> None:
         super().__init__()
-        self.behaviour, self.seed, self.max_steps = behaviour, seed, max_steps
-        self.script = ScriptedSkillActor(plans)
-        self.in_keys = [*self.script.in_keys, "episode", "_step"]
+        self.behaviour, self.plans, self.seed, self.max_steps = behaviour, plans, seed, max_steps
+        chance = behaviour.right == 0 and behaviour.otherwise == "action"
+        self.script = None if chance else ScriptedSkillActor(plans, skills=skills)
+        self.in_keys = ["observation", "task_id", "qaf", "episode", "_step"]
         self.out_keys = ["action"]
         self._task = {task_id(task): plan.definition for task, plan in plans.items()}
         self._begun = torch.empty(0, 2, dtype=torch.int64)
@@ -175,7 +188,7 @@ class SegmentActor(TensorDictModuleBase):
         steps = rows, self.max_steps
         self._begun, self._done = torch.full((rows, 2), -1), torch.zeros(rows, dtype=torch.int64)
         self._right, self._skill = torch.zeros(steps, dtype=torch.bool), torch.zeros(steps, dtype=torch.int64)
-        self._held = torch.zeros(*steps, 4)
+        self._held = torch.zeros(*steps, self.plans.layout.action_size)
 
     def _draw(self, row: int, task: int, episode: int) -> None:
         how, definition = self.behaviour, self._task[task]
@@ -183,16 +196,15 @@ class SegmentActor(TensorDictModuleBase):
         length = draws.integers(how.shortest, how.longest + 1, -(-self.max_steps // how.shortest))
         pieces = np.repeat(np.arange(len(length)), length)[: self.max_steps]
         right = draws.random(len(length)) < how.right
-        skill = draws.integers(len(self.script.plans[definition.name].steps), size=len(length))
-        held = draws.uniform(-1.0, 1.0, (len(length), 4)).astype(np.float32)
+        skill = draws.integers(len(self.plans[definition.name].steps), size=len(length))
+        held = draws.uniform(-1.0, 1.0, (len(length), self.plans.layout.action_size)).astype(np.float32)
         self._right[row] = torch.from_numpy(right[pieces])
         self._skill[row] = torch.from_numpy(skill[pieces])
         self._held[row] = torch.from_numpy(held[pieces])
         self._done[row] = 0
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        weights, actions = self.script.prepare(tensordict)
-        rows = torch.arange(len(weights))
+        rows = torch.arange(len(tensordict.get("task_id")))
         if len(self._begun) != len(rows):
             self._begin(len(rows))
         now = torch.stack((tensordict.get("task_id"), tensordict.get("episode")), -1)
@@ -201,9 +213,12 @@ class SegmentActor(TensorDictModuleBase):
             self._draw(row, *now[row].tolist())
         self._begun = torch.where(active.unsqueeze(-1), now, self._begun)
         step = self._done.clamp(max=self.max_steps - 1)
+        self._done += active
         other = self._held[rows, step]
+        if self.script is None:
+            return tensordict.set("action", other)
+        weights, actions = self.script.prepare(tensordict)
         if self.behaviour.otherwise == "skill":
             other = actions[rows, self._skill[rows, step]]
         follows = self._right[rows, step].unsqueeze(-1)
-        self._done += active
         return tensordict.set("action", torch.where(follows, (weights.unsqueeze(-1) * actions).sum(-2), other))

@@ -261,7 +261,7 @@ def collect_demonstrations(
         redraw_failures=bool(redraw_failures),
         max_steps=found_suite.max_steps if max_steps is None else max_steps,
         layout=found_suite.layout,
-        policy=behaviour_of(policy, names, behaviour),
+        policy=behaviour_of(policy, names, behaviour, found_suite),
     )
     folder = Path(root)
     partial = folder / dataset.PARTIAL

@@ -161,8 +161,8 @@ def _env_and_actor(config: CollectConfig, policy: Policy | None, env: LanguageWo
     if config.policy.kind == "expert":
         policy = suite_expert(env.suite, config.tasks)
     if policy is None:
-        plans = segment_plans(config.tasks)
-        actor = SegmentActor(config.policy, plans, config.seed, config.max_steps)
+        plans = segment_plans(config.tasks, env.suite)
+        actor = SegmentActor(config.policy, plans, config.seed, config.max_steps, env.suite.skills)
         return TransformedEnv(env, QAFTransform(plans)), _clipped(actor, env.layout.action_size)
     transform = policy.transform()
     return env if transform is None else TransformedEnv(env, transform), _clipped(

@@ -7,30 +7,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from rerun.chunk import RrdReader
 from torchrl.envs import TransformedEnv, check_env_specs
-from torchrl.objectives import TD3Loss
+from torchrl.objectives import SoftUpdate, TD3Loss
 
 import lw_torchrl as lw
-from lw_torchrl.language.named_objects import NamedObject
-from lw_torchrl.language.relations import PREDICATES, STATES, Comparison
 from lw_torchrl.language.skills import ScriptedSkill
+from lw_torchrl.record.rollouts import run_recorded
 from lw_torchrl.suites import check_suite
+from lw_torchrl.training.algorithms import TD3Config
+from lw_torchrl.training.online import Exploration
 
 pytest.importorskip("gymnasium_robotics")
-from gymnasium_robotics.envs.franka_kitchen.kitchen_env import KitchenEnv
-from kitchen_suite import (
-    CABINET,
-    JOINTED,
-    KITCHEN,
-    MICROWAVE,
-    PLANS,
-    KitchenEngine,
-    Pusher,
-    make_suite,
-)
+from gymnasium_robotics.envs.franka_kitchen.kitchen_env import OBS_ELEMENT_GOALS, OBS_ELEMENT_INDICES, KitchenEnv
+from kitchen_suite import CABINET, JOINTED, KITCHEN, MICROWAVE, PLANS, KitchenEngine, Pusher, make_suite
 
 SUITE = make_suite()
 BOTH = ("kitchen/microwave", "kitchen/slide-cabinet")
@@ -79,23 +69,23 @@ def test_the_first_59_numbers_are_the_kitchen_s_own():
     ours.close()
 
 
-def test_what_is_open_is_the_simulator_s_success():
-    engine = KitchenEngine(BOTH)
-    engine.reset([0, 1], [1, 2])
-    program = lw.QueryProgram(
-        {task: [f"the {task.name[8:].replace('-', ' ')} is open"] for task in (MICROWAVE, CABINET)}
-    )
-    ids = torch.tensor([lw.task_id(task) for task in BOTH])
-    still, all_rows = np.zeros((2, 9)), np.ones(2, bool)
-    before = engine.step(still, all_rows)
+def test_all_seven_things_succeed_and_what_is_open_is_said_so():
+    engine = KitchenEngine([f"kitchen/{thing.replace(' ', '-')}" for thing in OBS_ELEMENT_GOALS])
+    rows = list(range(len(OBS_ELEMENT_GOALS)))
+    engine.reset(rows, rows)
+    program = lw.QueryProgram({MICROWAVE: [f"the {thing} is open" for thing in JOINTED]})
+    ids = torch.full((len(rows),), lw.task_id(MICROWAVE.name))
+    still, every_row = np.zeros((len(rows), 9)), np.ones(len(rows), bool)
+    before = engine.step(still, every_row)
     assert not before.success.any()
     assert not program(torch.from_numpy(before.observation), ids).any()
-    engine._rows[0].data.qpos[22] = -0.75
-    engine._rows[1].data.qpos[19] = 0.37
-    after = engine.step(still, all_rows)
+    for row, (thing, goal) in enumerate(OBS_ELEMENT_GOALS.items()):
+        engine._rows[row].data.qpos[OBS_ELEMENT_INDICES[thing]] = goal
+    after = engine.step(still, every_row)
     assert after.success.all()
-    assert after.reward.tolist() == [1.0, 1.0]
-    assert program(torch.from_numpy(after.observation), ids).all()
+    assert after.reward.tolist() == [1.0] * len(rows)
+    opened = [[one == thing for one in JOINTED] for thing in OBS_ELEMENT_GOALS]
+    assert program(torch.from_numpy(after.observation), ids).tolist() == opened
     engine.close()
 
 
@@ -106,89 +96,6 @@ def test_the_check_finds_nothing_wrong_and_names_an_opening_that_is_no_share():
     angle = tuple(replace(one, opening=3) if one.name == "microwave" else one for one in MICROWAVE.objects)
     wrong = replace(SUITE, tasks={MICROWAVE.name: replace(MICROWAVE, objects=angle)}, plans=None)
     assert [one.what for one in check_suite(wrong) if not one.right] == ["opening of the microwave"]
-
-
-shares = st.floats(0.0, 1.0, width=32)
-
-
-@given(st.lists(st.lists(shares, min_size=6, max_size=6), min_size=1, max_size=5), st.sampled_from(JOINTED))
-def test_open_and_closed_are_the_published_ones_of_a_thing_s_own_number(openings, thing):
-    state = torch.zeros(len(openings), 93)
-    state[:, 84:90] = torch.tensor(openings)
-    ids = torch.full((len(openings),), lw.task_id(MICROWAVE.name))
-    asked = [
-        f"the {thing} is open",
-        f"is the {thing} closed?",
-        f"the {thing} isn't open and the kettle is near the gripper",
-    ]
-    program = lw.QueryProgram({MICROWAVE: asked})
-    share = state[:, 84 + JOINTED.index(thing)]
-    expected = torch.stack((share > 0.75, share <= 0.75, share <= 0.75), -1)
-    assert torch.equal(program(state, ids), expected)
-    logits = program.logits(state, ids)
-    assert torch.equal(logits > 0, expected)
-    gripper = state.clone()
-    gripper[:, KITCHEN.opening] = share
-    same = lw.QueryProgram({MICROWAVE: ["the gripper is open"]})
-    assert torch.equal(same.logits(gripper, ids)[:, 0], logits[:, 0])
-
-
-def test_a_word_of_one_s_own_is_said_of_what_has_an_opening(monkeypatch):
-    with pytest.raises(lw.QueryError, match=r"expected one of .*'open', 'closed'"):
-        lw.parse_query("the light switch is on", MICROWAVE)
-    monkeypatch.setitem(STATES, "on", STATES["open"])
-    monkeypatch.setitem(
-        STATES, "ajar", (Comparison("z", ">", 0.1, length=False), Comparison("z", "<=", 0.75, length=False))
-    )
-    assert str(lw.parse_query("Is the light switch not on?", MICROWAVE)) == "the light switch is not on"
-    assert "the microwave is ajar" in lw.supported_queries(MICROWAVE)
-    assert "the robot's gripper is ajar" not in lw.supported_queries(MICROWAVE)
-    assert not any("microwave is" in query and "open" in query for query in lw.supported_queries(MICROWAVE, True))
-    state = torch.zeros(4, 93)
-    state[:, DOOR] = torch.tensor([0.05, 0.5, 0.75, 0.8])
-    program = lw.QueryProgram(
-        {MICROWAVE: ["the microwave is ajar", "the microwave is on and the light switch is not on"]}
-    )
-    found = program(state, torch.full((4,), lw.task_id(MICROWAVE.name)))
-    assert found.T.tolist() == [[False, True, True, False], [False, False, False, True]]
-    with pytest.raises(lw.QueryError, match=r"the kettle; only the robot's gripper and .* can be open or closed or on"):
-        lw.parse_query("the kettle is on", MICROWAVE)
-    with pytest.raises(lw.QueryError, match="only the robot's gripper can be"):
-        lw.parse_query("the puck is ajar", "push")
-
-
-@pytest.mark.parametrize(
-    ("name", "parts", "says"),
-    [
-        ("near", STATES["open"], "may not be named 'near'"),
-        ("touching the table", STATES["open"], "may not be named"),
-        ("on", (Comparison("x", ">", 0.5, length=False),), "must compare the opening, .*got Comparison"),
-        ("on", (Comparison("z", ">", 0.5),), "must compare the opening"),
-        ("on", Comparison("z", ">", 0.5, length=False), "must be a tuple of Comparison"),
-    ],
-)
-def test_what_is_no_state_is_refused(name, parts, says):
-    with pytest.raises(ValueError, match=says):
-        STATES[name] = parts
-    assert [*STATES] == ["open", "closed"]
-    assert [*PREDICATES][-3:] == ["touching the table", "open", "closed"]
-
-
-def test_openings_are_written_and_checked():
-    assert MICROWAVE.to_json()["objects"]["microwave"] == {"position": "obs[78:81]", "opening": f"obs[{DOOR}]"}
-    assert lw.Task.from_json(MICROWAVE.name, MICROWAVE.to_json()) == MICROWAVE
-    for opening, says in (
-        (93, r"obs\[93\] is outside the 93 numbers"),
-        (0.5, "must be an index"),
-        (True, "must be an index"),
-    ):
-        with pytest.raises(ValueError, match=says):
-            replace(MICROWAVE, objects=(*MICROWAVE.objects, NamedObject("drawer", (0, 1, 2), opening=opening)))
-    for at in ({"opening": "obs[3]"}, {"position": "obs[0:3]"}, {"position": "obs[0:3]", "opening": 3}):
-        with pytest.raises(ValueError, match="object 'door' must have a position and an opening like"):
-            lw.Task.from_json("mine", {"description": "Mine.", "objects": {"door": at}})
-    with pytest.raises(ValueError, match=r"key of object 'door' must be one of .*did you mean 'opening'"):
-        lw.Task.from_json("mine", {"description": "Mine.", "objects": {"door": {"openin": "obs[3]"}}})
 
 
 def test_plans_about_openings_are_read_from_every_format():
@@ -250,7 +157,7 @@ def demos(tmp_path_factory):
 def replay(demos):
     """Of the demonstrations' own actions; 64 a batch."""
     return lw.LanguageWorldExperienceReplay(
-        demos.root, label="executed", batch_size=64, transform=lw.QAFTransform(PLANS), seed=0
+        demos.root, label="executed", batch_size=64, transform=lw.QAFTransform(PLANS)
     )
 
 
@@ -262,9 +169,9 @@ def test_a_policy_learns_from_demonstrations_and_acts(demos, replay):
         config = lw.BehavioralCloningConfig(steps=600, batch_size=64, learning_rate=1e-3)
         trainer = lw.BehavioralCloningTrainer(actor, replay, config, progress=False)
         before, after = trainer.train(100), trainer.train()
-        assert after < 0.5 * before
+        assert after < 0.25 * before
         run = {"tasks": "slide-cabinet", "suite": SUITE, "episodes_per_task": 2, "seed": 1_000, "noise_scale": 0.0}
-        print(type(actor).__name__, before, after, lw.evaluate(actor, **run, progress=False).success_once)
+        assert lw.evaluate(actor, **run, progress=False).mean_success == 1.0
 
 
 @pytest.mark.slow
@@ -273,7 +180,7 @@ def test_torchrl_s_losses_step(replay):
     qvalue = lw.PlanConditionedQValue(PLANS, **SMALL)
     loss = TD3Loss(actor, qvalue, bounds=(-1.0, 1.0))
     loss.make_value_estimator(gamma=0.9)
-    optimizer = torch.optim.AdamW(loss.parameters(), lr=1e-3)
+    targets, optimizer = SoftUpdate(loss, eps=0.99), torch.optim.AdamW(loss.parameters(), lr=1e-3)
     before = {name: value.clone() for name, value in loss.named_parameters()}
     for _ in range(2):
         batch = replay.sample()
@@ -282,6 +189,7 @@ def test_torchrl_s_losses_step(replay):
         optimizer.zero_grad()
         (found["loss_actor"] + found["loss_qvalue"]).backward()
         optimizer.step()
+        targets.step()
     assert all(value.isfinite().all() for value in loss.parameters())
     moved = {name.partition(".")[0] for name, value in loss.named_parameters() if not torch.equal(value, before[name])}
     assert {"actor_network_params", "qvalue_network_params"} <= moved
@@ -293,5 +201,26 @@ def test_a_recording_shows_the_kitchen_as_it_moved(tmp_path):
     (one,) = run_recorded(actor, "kitchen/microwave", suite=SUITE, seed=7, max_steps=10)
     with lw.RerunLogger(tmp_path / "kitchen.rrd") as logger:
         assert lw.log_rollout(logger, one.steps, PLANS, seed=7, suite=SUITE) == "kitchen/microwave-0"
-    entities = [chunk.entity_path for chunk in RrdReader(tmp_path / "kitchen.rrd").stream()]
-    print(sorted(set(entities))[:400])
+    chunks = list(RrdReader(tmp_path / "kitchen.rrd").stream())
+    scene = r"/kitchen\/microwave-0/scene"
+    there = {chunk.entity_path for chunk in chunks}
+    assert {f"{scene}/bodies/{body}" for body in ("microdoorroot", "panda0_link7", "kettleroot")} <= there
+    assert {f"{scene}/objects/microwave", r"/kitchen\/microwave-0/plan"} <= there
+    assert f"{scene}/gripper" not in there  # a hand over a table, which stands for a robot that is not known
+    (kettle,) = (chunk.to_record_batch() for chunk in chunks if chunk.entity_path == f"{scene}/bodies/kettleroot")
+    x, y, z = kettle.column("Transform3D:translation").to_pylist()[0][0]
+    assert (round(x, 2), round(y, 2)) == (-0.27, 0.35)
+    assert abs(z) < 0.02  # on the counter, which is our z = 0
+
+
+def test_chance_acts_in_it_and_explores(tmp_path):
+    made = lw.collect_demonstrations(
+        "kitchen", suite=SUITE, policy="random", episodes_per_task=1, max_steps=4, redraw_failures=False,
+        root=tmp_path / "random", progress=False,
+    )  # fmt: skip
+    rows = lw.LanguageWorldExperienceReplay(made.root, label="executed")[:]
+    assert rows["action"].shape == (8, 9)
+    assert rows["action"].abs().amax(0).min() > 0
+    noise = Exploration(TD3Config(rows=4, exploration=0.5), 0, KITCHEN)
+    noise.draw()
+    assert noise.noise(rows[:4]).abs().min() > 0
