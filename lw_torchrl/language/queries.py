@@ -179,7 +179,7 @@ class _ClauseParser:
             raise self.error("one of " + ", ".join(map(repr, PREDICATES)))
         if predicate in STATES and subject not in self.task.openings:
             self.at -= len(predicate.split())
-            those = " and ".join(f"the {name}" for name in self.task.openings)
+            those = " and ".join(f"the {name}" for name in self.task.openings).replace(GRIPPER, "gripper")
             raise self.error(f"a predicate of the {subject}; only {those} can be {' or '.join(STATES)}")
         start, other = self.at, None if predicate in UNARY else self.name()
         if other is None and predicate not in UNARY:
