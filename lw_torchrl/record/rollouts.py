@@ -165,8 +165,8 @@ def simulate_again(
     observation: NDArray[np.float32],
     suite: Suite | None = None,
 ) -> Motion | None:
-    """The motion of all bodies in an episode, of T + 1 rows; a :class:`DiffersError` where it is another episode. None
-    where the suite's engine has no ``poses``.
+    """The motion of all bodies in an episode, of T + 1 rows; None where the suite's engine has no ``poses``; a
+    :class:`DiffersError` where it is another episode.
 
     The simulation depends on the seed and the actions alone, so equal observations, bit for bit, mean equal motion.
     Actions are T×A float32 in [-1, 1], as executed; observations T×D float32, those from which they were taken.
@@ -280,19 +280,17 @@ def write_recording(
     episodes: Iterable[FinishedEpisode],
     plans: Plans | None = None,
     *,
-    seed: int | None = None,
-    policy: str | None = None,
     tasks: Iterable[Task] = (),
-    suite: str | Suite | None = None,
+    **said: Any,
 ) -> None:
     """Write episodes of :func:`run_recorded` to a rerun file, which is replaced whole.
 
-    The other arguments are as for :func:`lw_torchrl.log_rollout`.
+    The other arguments, ``seed`` and ``suite`` among them, are as for :func:`lw_torchrl.log_rollout`.
     """
-    said: Any = {"seed": seed, "policy": policy, "tasks": list(tasks), "suite": suite}
+    tasks = list(tasks)
     with replacing(path) as file, RerunLogger(file, exp_name=Path(path).stem) as logger:
         for one in episodes:
-            log_rollout(logger, one.steps, plans, **said)
+            log_rollout(logger, one.steps, plans, tasks=tasks, **said)
 
 
 def active_skills(episode: FinishedEpisode, plan: ConditionalPlan) -> list[tuple[str, int]]:
