@@ -12,6 +12,7 @@ from torchrl.envs import TransformedEnv, check_env_specs
 from torchrl.objectives import SoftUpdate, TD3Loss
 
 import lw_torchrl as lw
+from lw_torchrl.cli.main import main
 from lw_torchrl.language.skills import ScriptedSkill
 from lw_torchrl.record.rollouts import run_recorded
 from lw_torchrl.suites import check_suite
@@ -224,3 +225,13 @@ def test_chance_acts_in_it_and_explores(tmp_path):
     noise = Exploration(TD3Config(rows=4, exploration=0.5), 0, KITCHEN)
     noise.draw()
     assert noise.noise(rows[:4]).abs().min() > 0
+
+
+@pytest.mark.slow
+def test_the_command_line_evaluates_and_records_it(tmp_path, capsys):
+    lw.save_actor(lw.PlanConditionedActor(PLANS, width=8), tmp_path / "kitchen.zip")
+    where = ["--suite", f"{__name__}:SUITE", "--episodes", "1", "--max-steps", "3", "--out", str(tmp_path / "out")]
+    main(["evaluate", str(tmp_path / "kitchen.zip"), *where])
+    assert "kitchen/slide-cabinet" in capsys.readouterr().out
+    seen = {chunk.entity_path for chunk in RrdReader(tmp_path / "out" / "rollout.rrd").stream()}
+    assert r"/kitchen\/slide-cabinet-0/scene/bodies/panda0_link7" in seen
