@@ -15,6 +15,7 @@ from lw_torchrl.cli.output import Output
 if TYPE_CHECKING:
     from lw_torchrl.language.tasks import Task
     from lw_torchrl.modules.policy import Policy
+    from lw_torchrl.suites.suite import Suite
 
 
 def evaluate(
@@ -88,7 +89,7 @@ def evaluate(
             policy = policy.with_evaluator(load_evaluator(evaluator, policy.plans, text_encoder=encoder))
         known.update({task: found for task in policy.tasks if (found := policy.definition(task)) is not None})
     if not chosen and policy is not None:
-        chosen = _default_tasks(policy, set() if plans else demonstrated_tasks(checkpoint))
+        chosen = _default_tasks(policy, set() if plans else demonstrated_tasks(checkpoint), elsewhere)
     if policy is None and elsewhere is not None:
         chosen = chosen or tuple(elsewhere.plans or elsewhere.tasks)
         policy = suite_expert(elsewhere, chosen)
@@ -120,17 +121,18 @@ def evaluate(
             if policy is not None:
                 shown: list[str | Task] = list(result.config["tasks"][:3])
                 recorded = run_recorded(policy, shown, seed=seed, noise_scale=noise, **where)
-                write_recording(out / "rollout.rrd", recorded, policy.plans, seed=seed, policy=checkpoint.stem)
+                said: dict[str, Any] = {"seed": seed, "policy": checkpoint.stem, "suite": elsewhere}
+                write_recording(out / "rollout.rrd", recorded, policy.plans, **said)
         print(f"written to {out}")
     return output
 
 
-def _default_tasks(policy: Policy, shown: set[str]) -> tuple[str, ...]:
-    """The tasks that a policy was ``shown``, or all it has, if a suite has them; what is left out is printed."""
+def _default_tasks(policy: Policy, shown: set[str], suite: Suite | None) -> tuple[str, ...]:
+    """The tasks that a policy was ``shown``, or all it has, if the suite, or any, has them; prints what is left out."""
     from lw_torchrl.suites.suite import known_suite
 
     chosen = [task for task in policy.tasks if task in shown] or list(policy.tasks)
-    own = [task for task in chosen if known_suite(task) is None]
+    own = [task for task in chosen if (known_suite(task) is None if suite is None else task not in suite.tasks)]
     if len(own) == len(chosen):
         raise ValueError(
             f"the simulator has none of the policy's tasks, {', '.join(own)}; name others with --tasks, or run these "

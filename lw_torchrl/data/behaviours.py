@@ -109,17 +109,22 @@ def check_own_label(behaviour: Behaviour) -> None:
         )
 
 
-def segment_plans(tasks: Iterable[str], suite: Suite | None = None) -> Plans:
-    """The plans that behaviours of kind "segments" carry out, or spoil: those that the suite ships."""
-    suite = suite or load_suite("metaworld")
-    if suite.plans is None or suite.skills is None:
-        raise ValueError(f"policy: suite {suite.name!r} has no plans with scripted skills; give a policy of yours")
-    suite.plans.require(tasks := tuple(tasks))
+def segment_plans(tasks: Iterable[str], suite: str | Suite = "metaworld") -> Plans:
+    """The plans that behaviours of kind "segments" carry out, or spoil: the suite's; ValueError without."""
+    suite, tasks = load_suite(suite), list(tasks)
+    if suite.plans is None:
+        raise ValueError(
+            f"policy: suite {suite.name!r} has no plans, which this behaviour follows; give a policy of yours"
+        )
+    suite.plans.require(tasks)
     return Plans([suite.plans[task] for task in tasks])
 
 
-def behaviour_of(policy: Any, tasks: Iterable[str], name: str | None = None, suite: Suite | None = None) -> Behaviour:
-    """The behaviour in these tasks that an argument ``policy`` stands for, under another name if one is given."""
+def behaviour_of(
+    policy: Any, tasks: Iterable[str], name: str | None = None, suite: str | Suite = "metaworld"
+) -> Behaviour:
+    """The behaviour in these tasks of ``suite`` that an argument ``policy`` stands for, under another name if one is
+    given."""
     if isinstance(policy, Policy):
         if name is None:
             raise ValueError("behaviour must name the policy in the dataset, behaviour='my-policy' say, got None")
@@ -161,18 +166,20 @@ class SegmentActor(TensorDictModuleBase):
 
     Reads ``observation`` (N, D) float32, ``task_id`` and ``episode`` (N,) int64, ``qaf`` (N, S) bool and ``_step``
     (N,) bool, the rows that count; writes ``action`` (N, A) float32 in [-1, 1]. An episode begins in a row whose task
-    or episode differs from the last call's. ``plans`` has a plan of scripted skills for each task.
+    or episode differs from the last call's. ``plans`` has a plan for each task, of scripted ``skills`` unless all that
+    it does is chance.
     """
 
     row_by_row = True  # no network: its rows need no blocks of one size
 
     def __init__(
-        self, behaviour: Behaviour, plans: Plans, seed: int, max_steps: int, *, skills: Skills | None = None
+        self, behaviour: Behaviour, plans: Plans, seed: int, max_steps: int, skills: Skills | None = None
     ) -> None:
         super().__init__()
-        self.behaviour, self.seed, self.max_steps = behaviour, seed, max_steps
-        self.script = ScriptedSkillActor(plans, skills=skills)
-        self.in_keys = [*self.script.in_keys, "episode", "_step"]
+        self.behaviour, self.plans, self.seed, self.max_steps = behaviour, plans, seed, max_steps
+        chance = behaviour.right == 0 and behaviour.otherwise == "action"
+        self.script = None if chance else ScriptedSkillActor(plans, skills=skills)
+        self.in_keys = ["observation", "task_id", "qaf", "episode", "_step"]
         self.out_keys = ["action"]
         self._task = {task_id(task): plan.definition for task, plan in plans.items()}
         self._begun = torch.empty(0, 2, dtype=torch.int64)
@@ -181,7 +188,7 @@ class SegmentActor(TensorDictModuleBase):
         steps = rows, self.max_steps
         self._begun, self._done = torch.full((rows, 2), -1), torch.zeros(rows, dtype=torch.int64)
         self._right, self._skill = torch.zeros(steps, dtype=torch.bool), torch.zeros(steps, dtype=torch.int64)
-        self._held = torch.zeros(*steps, self.script.plans.layout.action_size)
+        self._held = torch.zeros(*steps, self.plans.layout.action_size)
 
     def _draw(self, row: int, task: int, episode: int) -> None:
         how, definition = self.behaviour, self._task[task]
@@ -189,16 +196,15 @@ class SegmentActor(TensorDictModuleBase):
         length = draws.integers(how.shortest, how.longest + 1, -(-self.max_steps // how.shortest))
         pieces = np.repeat(np.arange(len(length)), length)[: self.max_steps]
         right = draws.random(len(length)) < how.right
-        skill = draws.integers(len(self.script.plans[definition.name].steps), size=len(length))
-        held = draws.uniform(-1.0, 1.0, (len(length), self._held.shape[-1])).astype(np.float32)
+        skill = draws.integers(len(self.plans[definition.name].steps), size=len(length))
+        held = draws.uniform(-1.0, 1.0, (len(length), self.plans.layout.action_size)).astype(np.float32)
         self._right[row] = torch.from_numpy(right[pieces])
         self._skill[row] = torch.from_numpy(skill[pieces])
         self._held[row] = torch.from_numpy(held[pieces])
         self._done[row] = 0
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        weights, actions = self.script.prepare(tensordict)
-        rows = torch.arange(len(weights))
+        rows = torch.arange(len(tensordict.get("task_id")))
         if len(self._begun) != len(rows):
             self._begin(len(rows))
         now = torch.stack((tensordict.get("task_id"), tensordict.get("episode")), -1)
@@ -207,9 +213,12 @@ class SegmentActor(TensorDictModuleBase):
             self._draw(row, *now[row].tolist())
         self._begun = torch.where(active.unsqueeze(-1), now, self._begun)
         step = self._done.clamp(max=self.max_steps - 1)
+        self._done += active
         other = self._held[rows, step]
+        if self.script is None:
+            return tensordict.set("action", other)
+        weights, actions = self.script.prepare(tensordict)
         if self.behaviour.otherwise == "skill":
             other = actions[rows, self._skill[rows, step]]
         follows = self._right[rows, step].unsqueeze(-1)
-        self._done += active
         return tensordict.set("action", torch.where(follows, (weights.unsqueeze(-1) * actions).sum(-2), other))

@@ -201,7 +201,7 @@ def run_missing_episodes(
     base = LanguageWorldEnv(config.tasks, suite=suite, reward="dense", **options)  # type: ignore[arg-type]
     env, actor = _env_and_actor(config, policy, base)
     scales = np.array(config.noise_scale)[:, None].repeat(base.layout.action_size, 1)
-    scales[:, base.layout.gripper] *= config.gripper_noise_factor
+    scales[:, base.layout.effort] *= config.gripper_noise_factor
     total = config.episodes_per_task * len(config.tasks)
     before = (total - missing) * config.max_steps
     bar = Progress("collecting", total * config.max_steps, "step", initial=before, show=progress)

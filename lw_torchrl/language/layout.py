@@ -49,9 +49,10 @@ class Layout:
         past: by how many places the numbers of the step before stand further back; None without them. The goal has no
             past.
         action_size: A, how many numbers an action has, each in [-1, 1].
-        displacement: index of the x of the hand's displacement; y and z follow.
+        displacement: index of the x of the hand's displacement; y and z follow. None where actions are something else,
+            velocities of joints for one: scripted skills, ``RandomYaw`` and ``TransferredActor`` then refuse it.
         reach: metres that the hand moves in a step at a displacement of 1, once it moves.
-        gripper: index of the gripper's effort.
+        gripper: index of the gripper's effort; None where no number is one.
         closes: the effort's sign that closes, 1 or -1.
         binary_gripper: whether the gripper opens or closes fully within a few steps, so that an effort in between has
             to be decided.
@@ -78,9 +79,9 @@ class Layout:
     goal: int
     past: int | None = None
     action_size: int = 4
-    displacement: int = 0
+    displacement: int | None = 0
     reach: float = 0.01
-    gripper: int = 3
+    gripper: int | None = 3
     closes: int = 1
     binary_gripper: bool = False
     closes_above: float = 0.3
@@ -97,7 +98,7 @@ class Layout:
         if min(self.hand, self.opening, self.goal) < 0 or max(ends) > self.size:
             raise ValueError(f"layout {self.name!r} names numbers outside the {self.size} of an observation")
         for name, index, width in (("displacement", self.displacement, 3), ("gripper", self.gripper, 1)):
-            if not 0 <= index <= self.action_size - width:
+            if index is not None and not 0 <= index <= self.action_size - width:
                 raise ValueError(
                     f"{name} of layout {self.name!r} must be within {self.action_size} numbers, got {index}"
                 )
@@ -131,6 +132,19 @@ class Layout:
                 now.append(slice(thing.quaternion, thing.quaternion + 4))
             found.append((*now, *(self.a_step_before(part) for part in now if self.past is not None)))
         return (*found, (self.positions[-1],))
+
+    @property
+    def effort(self) -> slice:
+        """The gripper's effort among the numbers of an action; none of them where there is none."""
+        return slice(0, 0) if self.gripper is None else slice(self.gripper, self.gripper + 1)
+
+    def displaced(self, what: str) -> slice:
+        """The hand's displacement among the numbers of an action; :class:`ValueError` names ``what`` needs one."""
+        if self.displacement is None:
+            raise ValueError(
+                f"{what}: an action of layout {self.name!r} has no displacement of the hand, which it needs"
+            )
+        return slice(self.displacement, self.displacement + 3)
 
     def a_step_before(self, part: slice) -> slice:
         """Where the same numbers stand of the step before."""

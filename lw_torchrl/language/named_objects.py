@@ -52,12 +52,15 @@ class NamedObject:
         position: x, y and z: an int is an index into the numbers of the observation, a float is in metres.
         offset: added to it, metres; for a point beside an object.
         ours: a point that we named, which the published object list lacks.
+        opening: index of a number of the observation, from 0, closed, to 1, open, that queries call "open" and
+            "closed"; None for what does not open, turn or slide. The gripper's is the layout's.
     """
 
     name: str
     position: tuple[Coordinate, Coordinate, Coordinate]
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     ours: bool = False
+    opening: int | None = None
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[a-z][a-z0-9'-]*( [a-z0-9][a-z0-9'-]*)*", self.name):
@@ -68,6 +71,10 @@ class NamedObject:
             raise ValueError(f"position of {self.name!r} must hold 3 ints or finite floats, got {shown(self.position)}")
         if not is_triple(self.offset):
             raise ValueError(f"offset of {self.name!r} must be three numbers in metres, got {shown(self.offset)}")
+        if self.opening is not None and (type(self.opening) is not int or self.ours or self.name == GRIPPER):
+            raise ValueError(
+                f"opening of {self.name!r} must be an index, of an object alone, got {shown(self.opening)}"
+            )
 
 
 def read_position(name: str, at: Any) -> tuple[Coordinate, Coordinate, Coordinate]:
@@ -89,6 +96,18 @@ def write_position(position: tuple[Coordinate, Coordinate, Coordinate]) -> str |
     if isinstance(first, int) and position == (first, first + 1, first + 2):
         return f"obs[{first}:{first + 3}]"
     return [f"obs[{c}]" if isinstance(c, int) else c for c in position]
+
+
+def read_object(name: str, at: Any) -> NamedObject:
+    """An object of tasks.toml: a position, or {position = ..., opening = "obs[92]"}."""
+    if not isinstance(at, Mapping):
+        return NamedObject(name, read_position(name, at))
+    for key in at:
+        check_choice(f"key of object {name!r}", key, ("position", "opening"))
+    stated = at.get("opening")
+    if "position" not in at or not isinstance(stated, str) or not (match := _INDEX.fullmatch(stated)):
+        raise ValueError(f"object {name!r} must have a position and an opening like 'obs[92]', got {shown(at)}")
+    return NamedObject(name, read_position(name, at["position"]), opening=int(match[1]))
 
 
 def read_point(name: str, at: Any, objects: Mapping[str, NamedObject]) -> NamedObject:
@@ -113,7 +132,7 @@ def gripper_of(layout: Layout) -> NamedObject:
 
 def check_inside(named: NamedObject, size: int) -> None:
     """Raise :class:`ValueError` if a position's index is outside the ``size`` numbers of an observation."""
-    for coordinate in named.position:
+    for coordinate in (*named.position, 0 if named.opening is None else named.opening):
         if isinstance(coordinate, int) and not 0 <= coordinate < size:
             numbers = f"the {size} numbers, 0 to {size - 1}"
             raise ValueError(f"position of {named.name!r}: obs[{coordinate}] is outside {numbers}")
@@ -132,7 +151,7 @@ def read_objects(row: Mapping[str, Any], layout: Layout = METAWORLD) -> tuple[Na
     for named, at in table("objects").items():
         if named in objects:
             raise ValueError(f"objects may not name {named!r}, which every task has")
-        objects[named] = NamedObject(named, read_position(named, at))
+        objects[named] = read_object(named, at)
     points = [read_point(named, at, objects) for named, at in table("points").items()]
     return (*objects.values(), *points)
 
@@ -145,5 +164,7 @@ def write_objects(objects: Sequence[NamedObject]) -> dict[str, dict[str, Any]]:
         at: Any = write_position(named.position)
         if any(named.offset):
             at = {"object": published.get(typed(named.position), ""), "offset": list(named.offset)}
+        elif named.opening is not None:
+            at = {"position": at, "opening": f"obs[{named.opening}]"}
         row["points" if named.ours else "objects"][named.name] = at
     return row

@@ -12,7 +12,7 @@ from rapidfuzz import fuzz, process
 
 from lw_torchrl._checks import check_choice, checked, shown
 from lw_torchrl.language.queries import Clause, Query, QueryError, base_clauses, check_length, parse_query, read_query
-from lw_torchrl.language.relations import PUBLISHED, RELATIONS, UNARY
+from lw_torchrl.language.relations import PREDICATES, PUBLISHED, UNARY
 from lw_torchrl.language.skills import WORDS, ScriptedSkill, SkillError, Skills, load_skills, skills_for
 from lw_torchrl.language.tasks import Task, get_task
 
@@ -75,7 +75,7 @@ def nearest_query(
     sentence embedding or by string edit distance.
     """
     owner = get_task(task).published if published_only else get_task(task)
-    relations = PUBLISHED if published_only else tuple(RELATIONS)
+    relations = PUBLISHED if published_only else tuple(PREDICATES)
     if (query := _parse(text, owner, relations)) is not None:
         return QueryMatch(query, 1.0, tuple(QueryPart(str(clause), str(clause), 1.0) for clause in query.clauses))
     split = [" ".join(part.split()) for part in re.split(r"\b(?:and|but)\b", text, flags=re.IGNORECASE)]

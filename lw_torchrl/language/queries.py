@@ -13,7 +13,7 @@ from rapidfuzz import fuzz, process
 from lw_torchrl._checks import checked
 from lw_torchrl.language.layout import places
 from lw_torchrl.language.named_objects import GRIPPER
-from lw_torchrl.language.relations import PREDICATES, PUBLISHED, RELATIONS, TOUCHING, UNARY
+from lw_torchrl.language.relations import PREDICATES, PUBLISHED, RELATIONS, STATES, TOUCHING, UNARY
 from lw_torchrl.language.tasks import Task, get_task
 
 ARTICLES = ("the", "a", "an")
@@ -27,7 +27,7 @@ class Clause:
     """One statement about one or two objects."""
 
     subject: str
-    predicate: str  # one of the relations, "touching the table", "open" or "closed"
+    predicate: str  # one of the relations, "touching the table", or a state: "open", "closed"
     object: str | None = None  # the second object of a relation
     negated: bool = False  # whether it says that the predicate does not hold
 
@@ -61,8 +61,9 @@ def check_length(text: str, parts: Sequence[str]) -> None:
         raise QueryError(f"query {_cut(text)!r} must have at most {_MOST_CLAUSES} clauses, got {len(parts)}")
 
 
-def base_clauses(task: Task, relations: tuple[str, ...]) -> tuple[Clause, ...]:
-    """The clauses that :func:`supported_queries` lists as texts."""
+def base_clauses(task: Task, said: tuple[str, ...]) -> tuple[Clause, ...]:
+    """The clauses that :func:`supported_queries` lists as texts; ``said`` names the relations and states."""
+    relations, states = ([name for name in said if name in table] for table in (RELATIONS, STATES))
     clauses = []
     for first, second in permutations(task.object_names, 2):
         for relation in relations:
@@ -72,12 +73,13 @@ def base_clauses(task: Task, relations: tuple[str, ...]) -> tuple[Clause, ...]:
     for thing in task.objects:
         if not thing.ours and thing.position in things:
             clauses += [Clause(thing.name, TOUCHING), Clause(thing.name, TOUCHING, negated=True)]
+    clauses += [Clause(thing.name, state) for thing in task.objects if thing.opening is not None for state in states]
     return (*clauses, Clause(GRIPPER, "open"), Clause(GRIPPER, "closed"))
 
 
 @lru_cache(maxsize=256)
-def _supported(task: Task, relations: tuple[str, ...]) -> tuple[str, ...]:
-    return tuple(map(str, base_clauses(task, relations)))
+def _supported(task: Task, said: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(map(str, base_clauses(task, said)))
 
 
 @checked
@@ -85,7 +87,7 @@ def supported_queries(task: str | Task, published_only: bool = False) -> tuple[s
     """The base queries of a task, in canonical spelling.
 
     :func:`parse_query` reads more: any relation between two different objects, "touching the table" for any object,
-    the negations of open and closed, and conjunctions of all these.
+    the negations of open, closed and other states, and conjunctions of all these.
 
     Args:
         published_only: the paper's queries alone, without the points that we named and relations that were added.
@@ -95,7 +97,7 @@ def supported_queries(task: str | Task, published_only: bool = False) -> tuple[s
         (52, "the robot's gripper is near the reach target")
     """
     found = get_task(task)
-    return _supported(found.published, PUBLISHED) if published_only else _supported(found, tuple(RELATIONS))
+    return _supported(found.published, PUBLISHED) if published_only else _supported(found, tuple(PREDICATES))
 
 
 def _cut(text: str, most: int = 80) -> str:
@@ -131,7 +133,7 @@ class _ClauseParser:
         found = process.extract(said, named[1:], scorer=fuzz.partial_ratio, limit=_MOST_COMPARED - 1)
         kept = {GRIPPER, *(name for name, _, _ in found)}
         fewer = replace(self.task, objects=tuple(one for one in self.task.objects if one.name in kept))
-        return tuple(map(str, base_clauses(fewer, tuple(RELATIONS))))
+        return tuple(map(str, base_clauses(fewer, tuple(PREDICATES))))
 
     def take(self, phrase: str) -> bool:
         words = phrase.split()
@@ -175,9 +177,10 @@ class _ClauseParser:
         predicate = next((name for name in sorted(PREDICATES, key=len, reverse=True) if self.take(name)), None)
         if predicate is None:
             raise self.error("one of " + ", ".join(map(repr, PREDICATES)))
-        if predicate in ("open", "closed") and subject != GRIPPER:
-            self.at -= 1
-            raise self.error(f"a predicate of the {subject}; only the gripper is open or closed")
+        if predicate in STATES and subject not in self.task.openings:
+            self.at -= len(predicate.split())
+            those = " and ".join(f"the {name}" for name in self.task.openings).replace(GRIPPER, "gripper")
+            raise self.error(f"a predicate of the {subject}; only {those} can be {' or '.join(STATES)}")
         start, other = self.at, None if predicate in UNARY else self.name()
         if other is None and predicate not in UNARY:
             raise self.name_error()

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from lw_torchrl.language.named_objects import TypedPosition, coordinate_index, typed
 from lw_torchrl.language.queries import Clause, Query
-from lw_torchrl.language.relations import Comparison, comparisons
+from lw_torchrl.language.relations import STATES, Comparison, comparisons
 from lw_torchrl.language.tasks import MT50, Task, one_layout, task_id
 
 
@@ -63,8 +63,10 @@ _NEVER = Atom(_ORIGIN, _ORIGIN, _NO_SHIFT, Comparison("xyz", "<", -1e4, temperat
 
 def clause_atoms(clause: Clause, task: Task) -> list[Atom]:
     """The atoms that must all hold for a clause without its "not"."""
-    first, second, shift = typed((0.0, 0.0, task.layout.opening)), _ORIGIN, _NO_SHIFT
-    if clause.predicate not in ("open", "closed"):
+    second, shift = _ORIGIN, _NO_SHIFT
+    if clause.predicate in STATES:
+        first = typed((0.0, 0.0, task.openings[clause.subject]))
+    else:
         subject = task.object(clause.subject)
         first, shift = typed(subject.position), subject.offset
         if clause.object is not None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import ChainMap, UserDict
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from types import MappingProxyType
@@ -25,7 +26,7 @@ class Comparison:
         threshold: in metres.
         length: the Euclidean length over the axes; otherwise the signed coordinate of the one axis.
         raise_z: added to dz first, in metres.
-        temperature: of the soft truth, metres (or shares of the gripper's opening) to one logit, above 0.
+        temperature: of the soft truth, metres (or shares of an opening) to one logit, above 0.
     """
 
     axes: str
@@ -56,9 +57,8 @@ def _predicates(kind: str) -> dict[str, tuple[Comparison, ...]]:
 
 
 TOUCHING = "touching the table"
-UNARY = MappingProxyType(_predicates("unary"))
-"""The predicates of one object, with the origin as second position: "touching the table" compares the object's z,
-"open" and "closed" the gripper's opening in place of z."""
+PREDICATES = ChainMap[str, tuple[Comparison, ...]]()
+"""All that a clause can say: the relations, also those that are added, then the predicates of one object."""
 
 
 class Relations(UserDict[str, tuple[Comparison, ...]]):
@@ -68,13 +68,31 @@ class Relations(UserDict[str, tuple[Comparison, ...]]):
         words = name.split() if isinstance(name, str) else []
         if not words or name != " ".join(words) or not re.fullmatch(r"[a-z][a-z '-]*", name):
             raise ValueError(f"a relation must be named by lower-case words, like 'left of', got {shown(name)}")
-        if name in UNARY or words[0] in ("is", "isn't", "not") or {"and", "the", "a", "an"} & set(words):
+        taken = name in PREDICATES and name not in self
+        if taken or words[0] in ("is", "isn't", "not") or {"and", "the", "a", "an"} & set(words):
             raise ValueError(f"a relation may not be named {name!r}, which has a meaning of its own in a query")
         if isinstance(parts, Comparison) or not parts or not all(isinstance(part, Comparison) for part in parts):
             raise ValueError(f"relation {name!r} must be a tuple of Comparison, at least one, got {shown(parts)}")
         super().__setitem__(name, tuple(parts))
 
 
+class States(Relations):
+    """What is said of an object's opening, by name; comparisons of anything but that number are a ValueError."""
+
+    def __setitem__(self, name: str, parts: tuple[Comparison, ...]) -> None:
+        for one in parts if isinstance(parts, tuple) else ():
+            if isinstance(one, Comparison) and (one.axes, one.length) != ("z", False):
+                asked = "compare the opening, Comparison('z', ..., length=False)"
+                raise ValueError(f"state {name!r} must {asked}, got {shown(one)}")
+        super().__setitem__(name, parts)
+
+
+STATES = States(_predicates("states"))
+"""What is said of an opening, a number from 0, closed, to 1, open: "open", "closed", and what you add,
+``STATES["on"] = STATES["open"]``. It stands in place of z."""
+_OF_POSITION: Mapping[str, tuple[Comparison, ...]] = MappingProxyType(_predicates("unary"))
+UNARY = ChainMap[str, tuple[Comparison, ...]](STATES, _OF_POSITION)  # type: ignore[arg-type]
+"""The predicates of one object: "touching the table" compares its z with the table's, :data:`STATES` its opening."""
 RELATIONS = Relations(_predicates("relations"))
 """The relations between two objects: the 13 published ones, and those that you add (docs/queries.md shows how).
 
@@ -82,9 +100,7 @@ Source: paper section 'Query Answering Function'; the thresholds are the publish
 """
 PUBLISHED: tuple[str, ...] = tuple(_TABLE["published"])
 """The names of the paper's 13, whatever else :data:`RELATIONS` holds."""
-
-PREDICATES = ChainMap[str, tuple[Comparison, ...]](UNARY, RELATIONS)  # type: ignore[arg-type]
-"""All that a clause can say: the relations, also those that are added, then the predicates of one object."""
+PREDICATES.maps = [STATES, _OF_POSITION, RELATIONS]  # type: ignore[list-item]
 
 
 def comparisons(predicate: str, layout: Layout) -> tuple[Comparison, ...]:

@@ -62,6 +62,7 @@ class SkillProgram(nn.Module):
         found = {get_task(task): [look_up(one).for_task(task) for one in listed] for task, listed in skills.items()}
         super().__init__()
         self.layout = layout = one_layout(found)
+        self._displaced = layout.displaced("scripted skills")
         self.num_skills = max(map(len, found.values()))
         index = TaskIndex(task.name for task in found)
         constants = [0.0]
@@ -79,7 +80,7 @@ class SkillProgram(nn.Module):
                 offsets = torch.tensor([skill.offset, *(end.offset for end in ends)], dtype=torch.float64)
                 numbers[t, 0, s] = torch.tensor(skill.gain, dtype=torch.float64)
                 numbers[t, 1, s] = numbers[t, 0, s] * (offsets[0] + offsets[1] - offsets[2])
-                effort[t, s, layout.gripper] = layout.closes * skill.gripper
+                effort[t, s, layout.effort] = layout.closes * skill.gripper
         fixed = torch.tensor([constants] * len(found), dtype=torch.float64)
         (target, moved), (gain, shift) = place.flatten(2).unbind(1), numbers.flatten(2).unbind(1)
         self._tables = TaskTables(index, _Tables(target, moved, gain, shift, effort, fixed), "tasks without skills")
@@ -104,6 +105,5 @@ class SkillProgram(nn.Module):
         way = state.gather(1, tables.target) - state.gather(1, tables.moved)
         shift = torch.addcmul(tables.shift, tables.gain, way).clamp_(-1.0, 1.0)
         action = tables.effort.clone()
-        begin = self.layout.displacement
-        action[..., begin : begin + 3] = shift.unflatten(1, (-1, 3))
+        action[..., self._displaced] = shift.unflatten(1, (-1, 3))
         return action.reshape(*task_id.shape, self.num_skills, self.layout.action_size)

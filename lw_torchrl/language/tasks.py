@@ -80,8 +80,8 @@ class Task:
 
     @cached_property
     def published(self) -> Task:
-        """The task without the points that we named."""
-        return replace(self, objects=tuple(named for named in self.objects if not named.ours))
+        """The task without the points that we named and without openings but the gripper's."""
+        return replace(self, objects=tuple(replace(named, opening=None) for named in self.objects if not named.ours))
 
     def object(self, name: str) -> NamedObject:
         """The object called ``name``; :class:`ValueError` names the nearest if there is none."""
@@ -89,6 +89,12 @@ class Task:
             if named.name == name:
                 return named
         raise unknown_name(f"object of task {self.name!r}", name, self.object_names)
+
+    @cached_property
+    def openings(self) -> dict[str, int]:
+        """The index of the opening of each object that has one, the gripper first."""
+        found = {named.name: named.opening for named in self.objects if named.opening is not None}
+        return {GRIPPER: self.layout.opening, **found}
 
     def positions(self, observation: Tensor) -> dict[str, Tensor]:
         """Where each object is: (..., D) float, metres, to name -> (..., 3) of the same dtype, metres."""

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from lw_torchrl._checks import shown, unknown_name
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.language.queries import Clause
-from lw_torchrl.language.relations import PREDICATES
+from lw_torchrl.language.relations import PREDICATES, STATES
 from lw_torchrl.language.task_index import TaskIndex, TaskTables
 from lw_torchrl.language.tasks import Task
 from lw_torchrl.language.text import TextEncoder, encoded
@@ -201,8 +201,8 @@ def _position(task: Task, name: str) -> tuple[list[int], list[float]]:
 
 def _ends(clause: Clause, task: Task) -> tuple[list[int], list[int], list[float]]:
     nothing = [task.layout.size] * 3
-    if clause.predicate in ("open", "closed"):
-        return [*nothing[:2], task.layout.opening], nothing, [0.0] * 3
+    if clause.predicate in STATES:
+        return [*nothing[:2], task.openings[clause.subject]], nothing, [0.0] * 3
     first, shift = _position(task, clause.subject)
     if clause.object is None:
         return first, nothing, shift

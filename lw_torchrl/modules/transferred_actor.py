@@ -35,7 +35,8 @@ class TransferredActor(Policy):
         speed: how many times as many metres a step as where it was trained, for simulators whose steps last longer.
 
     Raises:
-        ValueError: features that do not carry over, by name; a speed that is not above 0.
+        ValueError: features that do not carry over, by name; a layout without a displacement; a speed that is not above
+            0.
         TypeError: a policy without plans.
 
     Example:
@@ -60,6 +61,8 @@ class TransferredActor(Policy):
             raise ValueError(f"speed must be above 0, got {shown(speed)}")
         self.actor, self.trained, self.speed = actor, trained, speed
         self.plans, self.tasks, self.layout = actor.plans, actor.tasks, actor.plans.layout
+        for layout in (self.trained, self.layout):
+            layout.displaced("TransferredActor")
         self.in_keys, self.out_keys = actor.in_keys, actor.out_keys_source
         self.draws, self.config = actor.draws, {}
 
@@ -76,12 +79,12 @@ class TransferredActor(Policy):
         """An action of the layout that was trained with, (..., A), as one of this layout."""
         old, new = self.trained, self.layout
         turned = action.new_zeros((*action.shape[:-1], new.action_size))
-        moved = action[..., old.displacement : old.displacement + 3] * (self.speed * old.reach / new.reach)
-        turned[..., new.displacement : new.displacement + 3] = moved.clamp(-1.0, 1.0)
-        effort = action[..., old.gripper] * old.closes
+        moved = action[..., old.displaced("TransferredActor")] * (self.speed * old.reach / new.reach)
+        turned[..., new.displaced("TransferredActor")] = moved.clamp(-1.0, 1.0)
+        effort = action[..., old.effort].sum(-1, keepdim=True) * old.closes
         if new.binary_gripper:
             effort = torch.where(effort > new.closes_above, 1.0, -1.0)
-        turned[..., new.gripper] = effort * new.closes
+        turned[..., new.effort] = effort * new.closes
         return turned
 
     def describe(self) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from lw_torchrl.language.formats.structured import write_structured
 from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.queries import base_clauses
-from lw_torchrl.language.relations import RELATIONS
+from lw_torchrl.language.relations import PREDICATES, RELATIONS, STATES
 from lw_torchrl.language.skills import SkillError, Skills, skills_for
 from lw_torchrl.language.tasks import TASKS, Task, Tasks, get_task
 
@@ -92,7 +92,8 @@ def plan_prompt(
     hints = (
         f"The things in {owner.name} are: {', '.join(f'the {name}' for name in owner.object_names)}.",
         f"A condition says that one of them is, or is not, {', '.join(RELATIONS)} another one, or touching the table;",
-        "or that the robot's gripper is open or closed. Several conditions are joined by 'and'; there is no 'or'.",
+        f"or that the {' or '.join(owner.openings)} is {' or '.join(STATES)}. "
+        "Several conditions are joined by 'and'; there is no 'or'.",
     )
     return found.prompt(prompt_examples(owner, plans), owner, hints if vocabulary else ())
 
@@ -211,7 +212,7 @@ def passes(value: Any, schema: Mapping[str, Any]) -> bool:
 def _clauses(task: Task) -> list[dict[str, Any]]:
     """The base queries: for each thing what it can be, and to which others, so that no choice is a wrong one."""
     others: dict[tuple[str, str], list[str | None]] = {}
-    for clause in base_clauses(task, tuple(RELATIONS)):
+    for clause in base_clauses(task, tuple(PREDICATES)):
         said = f"not {clause.predicate}" if clause.negated else clause.predicate
         others.setdefault((clause.subject, said), []).append(clause.object)
     alike: dict[tuple[str, tuple[str | None, ...]], list[str]] = {}

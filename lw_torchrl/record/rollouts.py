@@ -50,6 +50,7 @@ def log_rollout(
     policy: str | None = None,
     failure: Failure | Sequence[Failure | None] | None = None,
     tasks: Iterable[Task] = (),
+    suite: str | Suite | None = None,
 ) -> Any:
     """Add a rollout to a recording: the robot in 3-D, a verdict, the plan at the cursor, the timeline and curves.
 
@@ -70,6 +71,7 @@ def log_rollout(
         policy: who acted, in a word, for the tab.
         failure: why it failed, for the verdict; of N rows one for each, None where there is none.
         tasks: of your own, where the plans do not say what they are.
+        suite: whose simulator runs it again; None for the one in :data:`~lw_torchrl.suites.SUITES` that has the task.
 
     Returns:
         The name; of N rows a list of names.
@@ -94,14 +96,15 @@ def log_rollout(
         failures = failure if isinstance(failure, Sequence) else [failure] * len(rollout)
         if len(failures) != len(rollout):
             raise ValueError(f"failure must be one for each of {len(rollout)} rows, got {len(failures)}")
-        rows, tasks = zip(rollout, failures, strict=True), list(tasks)
+        same: Any = {"seed": seed, "policy": policy, "tasks": list(tasks), "suite": suite}
         return [
-            log_rollout(logger, row, plans, seed=seed, policy=policy, failure=why, tasks=tasks) for row, why in rows
+            log_rollout(logger, row, plans, failure=why, **same) for row, why in zip(rollout, failures, strict=True)
         ]
     if isinstance(failure, Sequence):
         raise ValueError(f"failure must be one Failure for one episode, got {len(failure)}")
     heading, episode = read_rollout(rollout, plans, seed=seed, policy=policy, failure=failure, tasks=tasks)
-    motion = _motion(heading, episode) if seed is not None else None
+    found = known_suite(heading.task) if suite is None else load_suite(suite)
+    motion = _motion(heading, episode, found) if seed is not None and found is not None else None
     return logger.add_page(heading, episode, motion=motion, name=name)
 
 
@@ -161,8 +164,9 @@ def simulate_again(
     action: NDArray[np.float32],
     observation: NDArray[np.float32],
     suite: Suite | None = None,
-) -> Motion:
-    """The motion of all bodies in an episode, of T + 1 rows; a :class:`DiffersError` where it is another episode.
+) -> Motion | None:
+    """The motion of all bodies in an episode, of T + 1 rows; None where the suite's engine has no ``poses``; a
+    :class:`DiffersError` where it is another episode.
 
     The simulation depends on the seed and the actions alone, so equal observations, bit for bit, mean equal motion.
     Actions are T×A float32 in [-1, 1], as executed; observations T×D float32, those from which they were taken.
@@ -170,6 +174,8 @@ def simulate_again(
     suite = load_suite("metaworld") if suite is None else suite
     engine: Any = suite.make_engine([task], reward="sparse", num_threads=1)
     try:
+        if not hasattr(engine, "poses"):
+            return None
         seen = engine.reset([0], [episode_seed(suite.tasks[task], seed, episode)])[0].astype(np.float32)
         shape, active = (len(action) + 1, engine.model(0).model.nbody), np.ones(1, bool)
         positions, quaternions = np.empty((*shape, 3), np.float32), np.empty((*shape, 4), np.float32)
@@ -185,11 +191,9 @@ def simulate_again(
         engine.close()
 
 
-def _motion(heading: Heading, episode: RecordedEpisode) -> Motion | None:
+def _motion(heading: Heading, episode: RecordedEpisode, suite: Suite) -> Motion | None:
     assert heading.seed is not None
     assert heading.episode is not None
-    if (suite := known_suite(heading.task)) is None:
-        return None
     try:
         return simulate_again(heading.task, heading.seed, heading.episode, episode.action, episode.observation, suite)
     except DiffersError as error:
@@ -276,18 +280,17 @@ def write_recording(
     episodes: Iterable[FinishedEpisode],
     plans: Plans | None = None,
     *,
-    seed: int | None = None,
-    policy: str | None = None,
     tasks: Iterable[Task] = (),
+    **said: Any,
 ) -> None:
     """Write episodes of :func:`run_recorded` to a rerun file, which is replaced whole.
 
-    The other arguments are as for :func:`lw_torchrl.log_rollout`.
+    The other arguments, ``seed`` and ``suite`` among them, are as for :func:`lw_torchrl.log_rollout`.
     """
     tasks = list(tasks)
     with replacing(path) as file, RerunLogger(file, exp_name=Path(path).stem) as logger:
         for one in episodes:
-            log_rollout(logger, one.steps, plans, seed=seed, policy=policy, tasks=tasks)
+            log_rollout(logger, one.steps, plans, tasks=tasks, **said)
 
 
 def active_skills(episode: FinishedEpisode, plan: ConditionalPlan) -> list[tuple[str, int]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import dataclass
 from itertools import pairwise
@@ -12,9 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lw_torchrl._checks import checked
+from lw_torchrl.language.layout import Layout
 from lw_torchrl.suites.suite import Suite
 
 Array = NDArray[np.float64]
+_Row = tuple[str, str, str, bool]
 _AXES = {"x": "right", "y": "away from the robot", "z": "up"}
 _STEPS, _COUNTED, _SHARE = 14, 4, 0.25  # of a movement, and of its last steps; a slow hand takes some to get going
 _SETTLING = 30
@@ -63,11 +65,11 @@ def check_suite(suite: Suite, *, seed: int = 0) -> list[Finding]:
     found: list[Finding] = []
     for task in suite.tasks:
         with closing(suite.make_engine([task], reward="sparse", num_threads=1)) as engine:
-            found += [Finding(task, *row) for row in _rows(suite, engine, seed)]
+            found += [Finding(task, *row) for row in _rows(suite, task, engine, seed)]
     return found
 
 
-def _rows(suite: Suite, engine: Any, seed: int) -> Iterator[tuple[str, str, str, bool]]:
+def _rows(suite: Suite, task: str, engine: Any, seed: int) -> Iterator[_Row]:
     layout = suite.layout
     active = np.ones(1, bool)
 
@@ -77,9 +79,11 @@ def _rows(suite: Suite, engine: Any, seed: int) -> Iterator[tuple[str, str, str,
     def run(steps: int, **effort: float) -> list[Array]:
         """Observations of steps with one action: ``x``, ``y`` or ``z`` of the displacement, and ``close``."""
         action = np.zeros((1, layout.action_size), np.float32)
-        for axis, name in enumerate(_AXES):
-            action[0, layout.displacement + axis] = effort.get(name, 0.0)
-        action[0, layout.gripper] = effort.get("close", 0.0) * layout.closes
+        if layout.displacement is None:
+            action[:] = effort.get("x", 0.0)
+        else:
+            action[0, layout.displaced("x, y and z")] = [effort.get(name, 0.0) for name in _AXES]
+        action[0, layout.effort] = effort.get("close", 0.0) * layout.closes
         return [engine.step(action, active).observation[0].copy() for _ in range(steps)]
 
     first = reset()
@@ -96,7 +100,7 @@ def _rows(suite: Suite, engine: Any, seed: int) -> Iterator[tuple[str, str, str,
         kept = all(np.array_equal(b[width : 2 * width], a[:width]) for a, b in pairwise(walk))
         yield "numbers of the step before", "those" if kept else "others", "those", kept
     hand = layout.positions[0]
-    for axis, name in enumerate(_AXES):
+    for axis, name in enumerate(_AXES if layout.displacement is not None else ()):
         reset()
         run(2 * _STEPS, z=_SHARE)  # away from the table and what stands on it
         run(_STEPS)
@@ -105,6 +109,21 @@ def _rows(suite: Suite, engine: Any, seed: int) -> Iterator[tuple[str, str, str,
         told = ", ".join(f"{part * 100:.1f}" for part in moved)
         right = moved.argmax() == axis and abs(moved[axis] - layout.reach) < 0.35 * layout.reach
         yield f"+{name} moves {_AXES[name]}", f"({told}) cm a step", f"{layout.reach * 100:.1f} cm along {name}", right
+    if layout.gripper is not None:
+        yield from _gripper(reset, run, layout)
+    for name, place in suite.tasks[task].openings.items():
+        yield f"opening of the {name}", f"{first[place]:.2f}", "from 0 to 1", bool(-0.05 <= first[place] <= 1.05)
+    resting = [first, *([] if not layout.things else run(5))][-1]
+    for number, thing in enumerate(layout.things):
+        if not first[thing.xyz].any():
+            continue  # the task lacks it
+        height = float(resting[thing.position + 2])
+        name = f"thing {number + 1} rests at"
+        on = not _TABLE < height < _FLOATING
+        yield name, f"z = {height * 100:.1f} cm", f"{_TABLE * 100:.0f} cm or less where it lies on the table", on
+
+
+def _gripper(reset: Callable[[], Array], run: Callable[..., list[Array]], layout: Layout) -> Iterator[_Row]:
     reset()
     opened = [state[layout.opening] for state in run(_SETTLING, close=-1.0)]
     closed = [state[layout.opening] for state in run(_SETTLING, close=1.0)]
@@ -120,11 +139,3 @@ def _rows(suite: Suite, engine: Any, seed: int) -> Iterator[tuple[str, str, str,
             "few" if layout.binary_gripper else "any",
             not layout.binary_gripper or (steps <= _SETTLING // 3),
         )
-    resting = [first, *([] if not layout.things else run(5))][-1]
-    for number, thing in enumerate(layout.things):
-        if not first[thing.xyz].any():
-            continue  # the task lacks it
-        height = float(resting[thing.position + 2])
-        name = f"thing {number + 1} rests at"
-        on = not _TABLE < height < _FLOATING
-        yield name, f"z = {height * 100:.1f} cm", f"{_TABLE * 100:.0f} cm or less where it lies on the table", on

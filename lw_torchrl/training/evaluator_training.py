@@ -14,7 +14,6 @@ from torch import Tensor, nn
 
 from lw_torchrl._checks import Count, Scale, checked_but
 from lw_torchrl._state_tree import check_like, check_optimizer_state
-from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.modules.clause_evaluator import ClauseEvaluator
 from lw_torchrl.modules.image_query_evaluator import ImageQueryEvaluator
 from lw_torchrl.modules.state_query_evaluator import StateQueryEvaluator
@@ -100,15 +99,16 @@ class _PictureMinibatches:
         self.labels = _digest(tensor for one in asked for tensor in (one.observation, one.truth, one.seen("pixels")))
 
     def _known_positions(self, asked: Asked) -> tuple[Tensor, Tensor, Tensor]:
-        """A task's things, (n,); where they are, and how far the gripper is open, (R, n, 4); what counts, (n, 4)."""
+        """A task's things, (n,); where they are, and how far each is open, (R, n, 4); what counts, (n, 4)."""
         names = [name for name in asked.task.object_names if name in self.evaluator.names]
         positions, number = asked.task.positions(asked.observation), self.evaluator.names.index
         known = torch.zeros(len(asked.observation), len(names), 4)
         counts = torch.ones(len(names), 4)
         for place, name in enumerate(names):
             known[:, place, :3] = positions[name]
-            known[:, place, 3] = asked.observation[:, asked.task.layout.opening]
-            counts[place, 3] = name == GRIPPER
+            if (opening := asked.task.openings.get(name)) is not None:
+                known[:, place, 3] = asked.observation[:, opening]
+            counts[place, 3] = opening is not None
         return torch.tensor([number(name) for name in names], dtype=torch.int64), known, counts
 
     def loss(self, step: int, generator: torch.Generator) -> Tensor:

@@ -23,9 +23,10 @@ from lw_torchrl._checks import (
     checked,
     shown,
 )
+from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.queries import Clause, Query, base_clauses
 from lw_torchrl.language.query_program import QueryProgram
-from lw_torchrl.language.relations import RELATIONS
+from lw_torchrl.language.relations import PREDICATES
 from lw_torchrl.language.tasks import Task, task_id
 from lw_torchrl.suites.suite import find_suite
 
@@ -130,11 +131,11 @@ class LabelledQueries:
             _, lengths = torch.unique_consecutive(rows.get(("collector", "traj_ids")), return_counts=True)
             first = (lengths.cumsum(0) - lengths).repeat_interleave(lengths)
             rows = rows[(torch.arange(len(rows)) - first) % config.every == 0]
-        _check_pictures(rows)
         ids = rows.get("task_id")
         if other := sorted({*ids.unique().tolist()} - {*known}):
             raise ValueError(f"tasks must have all tasks of the rows, they lack those of the ids {shown(other)}")
         found = [known[number] for number in ids.unique().tolist()]
+        _check_pictures(rows, found[0].layout)
         generator = torch.Generator().manual_seed(config.seed)
         self.held_out_tasks = _drawn_tasks(config.held_out_tasks, [task.name for task in found], generator)
         trained = [task for task in found if task.name not in self.held_out_tasks]
@@ -144,7 +145,7 @@ class LabelledQueries:
         self.parts: dict[str, list[Asked]] = {"training": [], "states": [], "queries": [], "tasks": []}
         for task in found:
             own = ids == task_id(task.name)
-            clauses = [clause for clause in base_clauses(task, tuple(RELATIONS)) if not clause.negated]
+            clauses = [clause for clause in base_clauses(task, tuple(PREDICATES)) if not clause.negated]
             train = _some((own & ~kept).nonzero().flatten(), config.states_per_task, generator)
             test = _some((own & kept).nonzero().flatten(), config.states_per_task, generator)
             if task.name in self.held_out_tasks:
@@ -185,9 +186,9 @@ def _some(rows: Tensor, most: int, generator: torch.Generator) -> Tensor:
     return rows[torch.randperm(len(rows), generator=generator)[:most].sort().values]
 
 
-def _check_pictures(rows: TensorDictBase) -> None:
+def _check_pictures(rows: TensorDictBase, layout: Layout) -> None:
     """Raise where a picture stays while the hand moves on: it is of an earlier state, whose answers are others."""
-    pixels, hand = rows.get("pixels", None), rows.get("observation")[:, :3]
+    pixels, hand = rows.get("pixels", None), rows.get("observation")[:, layout.positions[0]]
     if pixels is None or len(rows) < 2:
         return
     far = (hand[1:] - hand[:-1]).norm(dim=-1) > _FAR

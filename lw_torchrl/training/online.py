@@ -307,10 +307,10 @@ class Exploration:
     def __init__(self, config: NoiseConfig, patience: int, layout: Layout = METAWORLD) -> None:
         self.patience = patience
         moves = torch.ones(layout.action_size)
-        moves[layout.gripper] = config.gripper_exploration
+        moves[layout.effort] = config.gripper_exploration
         self._scale = moves * config.exploration
         self._stuck_scale = torch.full_like(moves, config.stuck_exploration)
-        self._stuck_scale[layout.gripper] = self._scale[layout.gripper]
+        self._stuck_scale[layout.effort] = self._scale[layout.effort]
         self._drawn = torch.zeros(config.rows, layout.action_size)
         self._since = torch.zeros(config.rows)
         self._truth: Tensor | None = None

@@ -116,6 +116,7 @@ class RandomYaw(Transform):
             self._tables = PlanTables(plans)
             free = torch.tensor([not has_direction(skill) for skill in plans.skills])
             self.register_buffer("_free", free[self._tables.skill_index], persistent=False)
+        self._begin = self.layout.displaced("RandomYaw").start
 
     def _angle(self, tensordict: TensorDictBase, observation: Tensor) -> Tensor:
         angle = self.scale * torch.randn(observation.shape[:-1], device=observation.device)
@@ -138,7 +139,7 @@ class RandomYaw(Transform):
             raise missing_keys(tensordict.keys(True, True), *map(str, self.in_keys[:2]))
         angle = self._angle(tensordict, observation)
         cos, sin = angle.cos(), angle.sin()
-        starts, begin = _starts(self.layout), self.layout.displacement
+        starts, begin = _starts(self.layout), self._begin
         tensordict.set(seen[1], _turned(observation, starts, cos, sin)).set(yaw_key(seen[1]), angle)
         if (following := tensordict.get(unravel_key(("next", seen[0])), None)) is not None:
             after = unravel_key(("next", seen[1]))

@@ -1,5 +1,6 @@
 """A suite of one's own works wherever Meta-World does: environment, data, training, files, evaluation, recordings."""
 
+from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -48,6 +49,18 @@ def test_scripted_plans_demonstrate_and_data_say_their_layout(demos):
     ).episodes == demos.episodes  # read again, not run  # fmt: skip
 
 
+def test_behaviours_by_name_follow_the_suite_s_plans(tmp_path):
+    run = {"suite": SUITE, "episodes_per_task": 1, "redraw_failures": False, "progress": False}
+    plain, chance = (
+        lw.collect_demonstrations("toy", policy=who, root=tmp_path / who, **run) for who in ("scripted", "random")
+    )
+    assert plain.success_rate == {"toy/touch-blue": 1.0, "toy/touch-red": 1.0}
+    assert lw.LanguageWorldExperienceReplay(chance.root, label="executed")[:]["action"].shape == (60, 7)
+    bare = replace(SUITE, plans=None)
+    with pytest.raises(ValueError, match="suite 'toy' has no plans, which this behaviour follows; give a policy"):
+        lw.collect_demonstrations("toy", policy="random", root=tmp_path / "bare", **run | {"suite": bare})
+
+
 @pytest.mark.parametrize("features", FEATURES)
 def test_every_feature_has_the_layout_s_width(features, demos):
     replay = lw.LanguageWorldExperienceReplay(demos.root, transform=lw.QAFTransform(SUITE.plans))
@@ -84,7 +97,11 @@ def test_a_policy_is_trained_saved_evaluated_and_recorded(demos, tmp_path):
         lw.evaluate(again, **run, also_record=keys, on_episode=episodes.append)
         names = [
             lw.log_rollout(
-                logger, one.steps.set("episode", torch.full((len(one.steps),), one.episode)), plans, seed=1_000
+                logger,
+                one.steps.set("episode", torch.full((len(one.steps),), one.episode)),
+                plans,
+                seed=1_000,
+                suite=SUITE,
             )
             for one in episodes[:1]
         ]

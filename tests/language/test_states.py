@@ -1,0 +1,148 @@
+"""How far a thing is open: "open" and "closed" of its own number, words of one's own, and what is no such number."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lw_torchrl.language.layout import Layout, Slot
+from lw_torchrl.language.named_objects import GRIPPER, NamedObject
+from lw_torchrl.language.nearest import nearest_query
+from lw_torchrl.language.queries import QueryError, parse_query, supported_queries
+from lw_torchrl.language.query_program import QueryProgram
+from lw_torchrl.language.relations import PREDICATES, STATES, Comparison
+from lw_torchrl.language.tasks import Task, task_id
+from lw_torchrl.planners.prompts import plan_prompt
+
+THINGS = ("door", "light switch")
+LAYOUT = Layout("house", 15, hand=0, opening=3, things=(Slot(4), Slot(7)), goal=12)
+HOUSE = Task(
+    "house/tidy-up",
+    "Tidy up.",
+    (
+        NamedObject(GRIPPER, (0, 1, 2)),
+        NamedObject("door", (4, 5, 6), opening=10),
+        NamedObject("light switch", (7, 8, 9), opening=11),
+        NamedObject("cup", (12, 13, 14)),
+    ),
+    LAYOUT,
+)
+
+
+def answers(state, *asked):
+    ids = torch.full((len(state),), task_id(HOUSE.name))
+    program = QueryProgram({HOUSE: list(asked)})
+    truth, logits = program(state, ids), program.logits(state, ids)
+    assert torch.equal(logits > 0, truth)
+    return truth, logits
+
+
+shares = st.floats(0.0, 1.0, width=32)
+
+
+@given(st.lists(st.tuples(shares, shares, shares), min_size=1, max_size=9), st.sampled_from(THINGS))
+def test_open_and_closed_are_the_published_ones_of_a_thing_s_own_number(openings, thing):
+    state = torch.zeros(len(openings), 15)
+    state[:, [3, 10, 11]] = torch.tensor(openings)
+    share = state[:, HOUSE.openings[thing]]
+    both = f"the {thing} isn't open and the cup is near the gripper"
+    truth, logits = answers(state, f"the {thing} is open", f"is the {thing} closed?", both)
+    assert torch.equal(truth, torch.stack((share > 0.75, share <= 0.75, share <= 0.75), -1))
+    state[:, 3] = share
+    assert torch.equal(answers(state, "the gripper is open")[1][:, 0], logits[:, 0])
+
+
+def test_a_layout_s_own_threshold_counts():
+    half = replace(HOUSE, layout=replace(LAYOUT, thresholds={"open": 0.5}))
+    state = torch.zeros(1, 15)
+    state[0, 10] = 0.6
+    program = QueryProgram({half: ["the door is open"]})
+    assert program(state, torch.tensor([task_id(half.name)])).item()
+
+
+def test_what_opens_is_listed_and_prompted_with_its_states():
+    asked = supported_queries(HOUSE)
+    assert asked[-6:-2] == tuple(f"the {thing} is {state}" for thing in THINGS for state in ("open", "closed"))
+    assert not {*asked[-6:-2]} & {*supported_queries(HOUSE, published_only=True)}
+    assert str(nearest_query("the dor is opn", HOUSE).query) == "the door is open"
+    told = "or that the robot's gripper or door or light switch is open or closed. Several conditions"
+    assert told in plan_prompt(HOUSE, "basic_py", vocabulary=True)
+    assert "or that the robot's gripper is open or closed. Several" in plan_prompt("push", "basic_py", vocabulary=True)
+
+
+def test_a_word_of_one_s_own_is_said_of_what_has_an_opening(monkeypatch):
+    with pytest.raises(QueryError, match=r"expected one of .*'open', 'closed'"):
+        parse_query("the light switch is on", HOUSE)
+    ajar = Comparison("z", ">", 0.1, length=False), Comparison("z", "<=", 0.75, length=False)
+    monkeypatch.setitem(STATES, "on", STATES["open"])
+    monkeypatch.setitem(STATES, "ajar", ajar)
+    assert str(parse_query("Isn't the light switch on?", HOUSE)) == "the light switch is not on"
+    assert "the door is ajar" in supported_queries(HOUSE)
+    assert "the robot's gripper is ajar" not in supported_queries(HOUSE)
+    state = torch.zeros(4, 15)
+    state[:, 10] = torch.tensor([0.05, 0.5, 0.75, 0.8])
+    truth, _ = answers(
+        state, "the door is ajar", "the door is not ajar", "the door is on and the light switch is not on"
+    )
+    assert truth.T.tolist() == [[False, True, True, False], [True, False, False, True], [False, False, False, True]]
+    with pytest.raises(QueryError, match="of the cup; only the gripper and the door and the light switch can be"):
+        parse_query("the cup is on", HOUSE)
+    with pytest.raises(QueryError, match="only the gripper can be open or closed or on or ajar"):
+        parse_query("the puck is ajar", "push")
+
+
+@pytest.mark.parametrize(
+    ("name", "parts", "says"),
+    [
+        ("near", STATES["open"], "may not be named 'near'"),
+        ("touching the table", STATES["open"], "may not be named"),
+        ("on", (Comparison("x", ">", 0.5, length=False),), r"must compare the opening, .*got Comparison"),
+        ("on", (Comparison("z", ">", 0.5),), "must compare the opening"),
+        ("on", Comparison("z", ">", 0.5, length=False), "must be a tuple of Comparison"),
+    ],
+)
+def test_what_is_no_state_is_refused(name, parts, says):
+    with pytest.raises(ValueError, match=says):
+        STATES[name] = parts
+    assert [*STATES] == ["open", "closed"]
+    assert [*PREDICATES][-3:] == ["touching the table", "open", "closed"]
+
+
+def test_openings_are_written_and_read_again():
+    assert HOUSE.to_json()["objects"]["door"] == {"position": "obs[4:7]", "opening": "obs[10]"}
+    assert Task.from_json(HOUSE.name, HOUSE.to_json()) == HOUSE
+    for at in ({"opening": "obs[3]"}, {"position": "obs[0:3]"}, {"position": "obs[0:3]", "opening": 3}):
+        with pytest.raises(ValueError, match="object 'door' must have a position and an opening like"):
+            Task.from_json("mine", {"description": "Mine.", "objects": {"door": at}})
+    with pytest.raises(ValueError, match=r"key of object 'door' must be one of .*did you mean 'opening'"):
+        Task.from_json("mine", {"description": "Mine.", "objects": {"door": {"openin": "obs[3]"}}})
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"opening": 15}, r"obs\[15\] is outside the 15 numbers"),
+        ({"opening": -1}, r"obs\[-1\] is outside"),
+        ({"opening": 0.5}, "opening of 'drawer' must be an index, of an object alone, got 0.5"),
+        ({"opening": True}, "must be an index"),
+        ({"opening": 3, "ours": True}, "of an object alone"),
+    ],
+)
+def test_an_opening_that_is_none_is_refused(options, says):
+    with pytest.raises(ValueError, match=says):
+        replace(HOUSE, objects=(*HOUSE.objects, NamedObject("drawer", (0, 1, 2), **options)))
+
+
+def test_an_action_may_have_no_displacement_and_no_gripper():
+    joints = replace(LAYOUT, displacement=None, gripper=None, action_size=2)
+    assert Layout.from_json(joints.to_json()) == joints
+    assert (LAYOUT.effort, LAYOUT.displaced("it")) == (slice(3, 4), slice(0, 3))
+    assert joints.effort == slice(0, 0)
+    with pytest.raises(
+        ValueError, match="it: an action of layout 'house' has no displacement of the hand, which it needs"
+    ):
+        joints.displaced("it")

@@ -1,0 +1,237 @@
+"""A robot of another size, brought as a user would: joints for actions, and things that open, turn and slide."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from rerun.chunk import RrdReader
+from torchrl.envs import TransformedEnv, check_env_specs
+from torchrl.objectives import SoftUpdate, TD3Loss
+
+import lw_torchrl as lw
+from lw_torchrl.cli.main import main
+from lw_torchrl.language.skills import ScriptedSkill
+from lw_torchrl.record.rollouts import run_recorded
+from lw_torchrl.suites import check_suite
+from lw_torchrl.training.algorithms import TD3Config
+from lw_torchrl.training.online import Exploration
+
+pytest.importorskip("gymnasium_robotics")
+from gymnasium_robotics.envs.franka_kitchen.kitchen_env import OBS_ELEMENT_GOALS, OBS_ELEMENT_INDICES, KitchenEnv
+from kitchen_suite import CABINET, JOINTED, KITCHEN, MICROWAVE, PLANS, KitchenEngine, Pusher, make_suite
+
+SUITE = make_suite()
+BOTH = ("kitchen/microwave", "kitchen/slide-cabinet")
+DOOR = MICROWAVE.openings["microwave"]
+
+
+def letters(texts):
+    return torch.tensor([[float(text.count(letter)) for letter in "aeioust"] for text in texts])
+
+
+SMALL = {"width": 32, "depth": 1, "latent_size": 4, "text_encoder": letters}
+
+
+@pytest.fixture
+def env():
+    env = TransformedEnv(lw.LanguageWorldEnv("kitchen", suite=SUITE, num_envs=4), lw.QAFTransform(PLANS))
+    yield env
+    env.close()
+
+
+def test_the_environment_keeps_torchrl_s_rules(env):
+    check_env_specs(env)
+    assert (env.tasks, env.max_steps, env.action_spec.shape) == (BOTH, 160, (4, 9))
+    torch.manual_seed(0)
+    rollout = env.rollout(3)
+    assert rollout["observation"].shape == (4, 3, 93)
+    first = env.reset(episode=2)["observation"]
+    assert torch.equal(first, env.reset(episode=2)["observation"])
+    assert not torch.equal(first, env.reset(episode=3)["observation"])
+
+
+def test_the_first_59_numbers_are_the_kitchen_s_own():
+    theirs = KitchenEnv(tasks_to_complete=["microwave"])
+    ours = KitchenEngine([*BOTH, "kitchen/microwave"])
+    states = ours.reset([0, 1, 2], [5, 6, 7])
+    expected = theirs.reset(seed=7)[0]["observation"]
+    assert np.array_equal(states[2, :59], expected)
+    draws = np.random.default_rng(0)
+    for _ in range(3):
+        action = draws.uniform(-1, 1, (3, 9))
+        step = ours.step(action, np.array([True, False, True]))
+        assert np.array_equal(step.observation[2, :59], theirs.step(action[2])[0]["observation"])
+        assert np.array_equal(step.observation[1], states[1])
+    assert np.abs(states[0, KITCHEN.positions[-1]] - states[0, [78, 79, 80]]).max() > 0.1  # the door's goal is open
+    theirs.close()
+    ours.close()
+
+
+def test_all_seven_things_succeed_and_what_is_open_is_said_so():
+    engine = KitchenEngine([f"kitchen/{thing.replace(' ', '-')}" for thing in OBS_ELEMENT_GOALS])
+    rows = list(range(len(OBS_ELEMENT_GOALS)))
+    engine.reset(rows, rows)
+    program = lw.QueryProgram({MICROWAVE: [f"the {thing} is open" for thing in JOINTED]})
+    ids = torch.full((len(rows),), lw.task_id(MICROWAVE.name))
+    still, every_row = np.zeros((len(rows), 9)), np.ones(len(rows), bool)
+    before = engine.step(still, every_row)
+    assert not before.success.any()
+    assert not program(torch.from_numpy(before.observation), ids).any()
+    for row, (thing, goal) in enumerate(OBS_ELEMENT_GOALS.items()):
+        engine._rows[row].data.qpos[OBS_ELEMENT_INDICES[thing]] = goal
+    after = engine.step(still, every_row)
+    assert after.success.all()
+    assert after.reward.tolist() == [1.0] * len(rows)
+    opened = [[one == thing for one in JOINTED] for thing in OBS_ELEMENT_GOALS]
+    assert program(torch.from_numpy(after.observation), ids).tolist() == opened
+    engine.close()
+
+
+def test_the_check_finds_nothing_wrong_and_names_an_opening_that_is_no_share():
+    found = check_suite(SUITE)
+    assert all(one.right for one in found)
+    assert "opening of the microwave" in {one.what for one in found}
+    angle = tuple(replace(one, opening=3) if one.name == "microwave" else one for one in MICROWAVE.objects)
+    wrong = replace(SUITE, tasks={MICROWAVE.name: replace(MICROWAVE, objects=angle)}, plans=None)
+    assert [one.what for one in check_suite(wrong) if not one.right] == ["opening of the microwave"]
+
+
+def test_plans_about_openings_are_read_from_every_format():
+    plan = PLANS[MICROWAVE.name]
+    for name in lw.PLAN_FORMATS:
+        found = lw.decode_plan(lw.encode_plan(plan, name), MICROWAVE, format=name)
+        assert [str(step.condition) for step in found.plan.steps] == [str(step.condition) for step in plan.steps]
+
+
+def actors(features):
+    yield lw.PlanConditionedActor(PLANS, features=features, roles=features == "opening", **SMALL)
+    if features != "opening":
+        yield lw.DescriptorConditionedActor([MICROWAVE, CABINET], features=features, **SMALL)
+
+
+@pytest.mark.parametrize("features", ["raw", "differences", "relative", "opening", "both"])
+def test_actors_give_nine_numbers(features, env, tmp_path):
+    state = env.reset()
+    for actor in actors(features):
+        assert actor.eval()(state.clone())["action"].shape == (4, 9)
+        lw.save_actor(actor, tmp_path / "actor.zip")
+        again = lw.load_actor(tmp_path / "actor.zip", text_encoder=letters).eval()
+        assert again.layout == KITCHEN
+        assert torch.equal(again(state.clone())["action"], actor(state.clone())["action"])
+
+
+def test_an_evaluator_reads_a_thing_s_opening():
+    evaluator = lw.StateQueryEvaluator(PLANS, width=8)
+    state = torch.zeros(2, 93)
+    state[1, DOOR] = 1.0
+    ids = torch.full((2,), lw.task_id(MICROWAVE.name))
+    logits = evaluator.logits(state, ids)
+    assert not torch.equal(logits[0, 2], logits[1, 2])
+
+
+def test_what_needs_a_displacement_says_so():
+    go = ScriptedSkill("go there", "microwave")
+    plan = lw.ConditionalPlan.from_pairs(MICROWAVE, [("the microwave is closed", go.text)])
+    says = "an action of layout 'kitchen' has no displacement of the hand"
+    with pytest.raises(ValueError, match=f"scripted skills: {says}"):
+        lw.ScriptedSkillActor(lw.Plans([plan]), skills={go.text: go})
+    with pytest.raises(ValueError, match=f"RandomYaw: {says}"):
+        lw.RandomYaw(0.3, plans=PLANS)
+    trained = lw.PlanConditionedActor(lw.load_plans("MT10"), roles=True, features="opening", text_encoder=letters)
+    with pytest.raises(ValueError, match=f"TransferredActor: {says}"):
+        lw.modules.TransferredActor(trained, PLANS)
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory):
+    root = tmp_path_factory.mktemp("kitchen") / "demos"
+    return lw.collect_demonstrations(
+        "kitchen/slide-cabinet", suite=SUITE, policy=Pusher(), behaviour="pusher", episodes_per_task=3,
+        noise_scale=(0.0, 0.1), root=root, progress=False,
+    )  # fmt: skip
+
+
+@pytest.fixture
+def replay(demos):
+    """Of the demonstrations' own actions; 64 a batch."""
+    return lw.LanguageWorldExperienceReplay(
+        demos.root, label="executed", batch_size=64, transform=lw.QAFTransform(PLANS)
+    )
+
+
+@pytest.mark.slow
+def test_a_policy_learns_from_demonstrations_and_acts(demos, replay):
+    assert demos.success_rate == {CABINET.name: 1.0}
+    for actor in actors("both"):
+        torch.manual_seed(0)
+        config = lw.BehavioralCloningConfig(steps=600, batch_size=64, learning_rate=1e-3)
+        trainer = lw.BehavioralCloningTrainer(actor, replay, config, progress=False)
+        before, after = trainer.train(100), trainer.train()
+        assert after < 0.25 * before
+        run = {"tasks": "slide-cabinet", "suite": SUITE, "episodes_per_task": 2, "seed": 1_000, "noise_scale": 0.0}
+        assert lw.evaluate(actor, **run, progress=False).mean_success == 1.0
+
+
+@pytest.mark.slow
+def test_torchrl_s_losses_step(replay):
+    actor = lw.PlanConditionedActor(PLANS, **SMALL)
+    qvalue = lw.PlanConditionedQValue(PLANS, **SMALL)
+    loss = TD3Loss(actor, qvalue, bounds=(-1.0, 1.0))
+    loss.make_value_estimator(gamma=0.9)
+    targets, optimizer = SoftUpdate(loss, eps=0.99), torch.optim.AdamW(loss.parameters(), lr=1e-3)
+    before = {name: value.clone() for name, value in loss.named_parameters()}
+    for _ in range(2):
+        batch = replay.sample()
+        batch["next", "reward"] = batch["next", "success"].float()
+        found = loss(batch)
+        optimizer.zero_grad()
+        (found["loss_actor"] + found["loss_qvalue"]).backward()
+        optimizer.step()
+        targets.step()
+    assert all(value.isfinite().all() for value in loss.parameters())
+    moved = {name.partition(".")[0] for name, value in loss.named_parameters() if not torch.equal(value, before[name])}
+    assert {"actor_network_params", "qvalue_network_params"} <= moved
+
+
+@pytest.mark.slow
+def test_a_recording_shows_the_kitchen_as_it_moved(tmp_path):
+    actor = lw.PlanConditionedActor(PLANS, **SMALL)
+    (one,) = run_recorded(actor, "kitchen/microwave", suite=SUITE, seed=7, max_steps=10)
+    with lw.RerunLogger(tmp_path / "kitchen.rrd") as logger:
+        assert lw.log_rollout(logger, one.steps, PLANS, seed=7, suite=SUITE) == "kitchen/microwave-0"
+    chunks = list(RrdReader(tmp_path / "kitchen.rrd").stream())
+    scene = r"/kitchen\/microwave-0/scene"
+    there = {chunk.entity_path for chunk in chunks}
+    assert {f"{scene}/bodies/{body}" for body in ("microdoorroot", "panda0_link7", "kettleroot")} <= there
+    assert {f"{scene}/objects/microwave", r"/kitchen\/microwave-0/plan"} <= there
+    assert f"{scene}/gripper" not in there  # a hand over a table, which stands for a robot that is not known
+    (kettle,) = (chunk.to_record_batch() for chunk in chunks if chunk.entity_path == f"{scene}/bodies/kettleroot")
+    x, y, z = kettle.column("Transform3D:translation").to_pylist()[0][0]
+    assert (round(x, 2), round(y, 2)) == (-0.27, 0.35)
+    assert abs(z) < 0.02  # on the counter, which is our z = 0
+
+
+def test_chance_acts_in_it_and_explores(tmp_path):
+    made = lw.collect_demonstrations(
+        "kitchen", suite=SUITE, policy="random", episodes_per_task=1, max_steps=4, redraw_failures=False,
+        root=tmp_path / "random", progress=False,
+    )  # fmt: skip
+    rows = lw.LanguageWorldExperienceReplay(made.root, label="executed")[:]
+    assert rows["action"].shape == (8, 9)
+    assert rows["action"].abs().amax(0).min() > 0
+    noise = Exploration(TD3Config(rows=4, exploration=0.5), 0, KITCHEN)
+    noise.draw()
+    assert noise.noise(rows[:4]).abs().min() > 0
+
+
+@pytest.mark.slow
+def test_the_command_line_evaluates_and_records_it(tmp_path, capsys):
+    lw.save_actor(lw.PlanConditionedActor(PLANS, width=8), tmp_path / "kitchen.zip")
+    where = ["--suite", f"{__name__}:SUITE", "--episodes", "1", "--max-steps", "3", "--out", str(tmp_path / "out")]
+    main(["evaluate", str(tmp_path / "kitchen.zip"), *where])
+    assert "kitchen/slide-cabinet" in capsys.readouterr().out
+    seen = {chunk.entity_path for chunk in RrdReader(tmp_path / "out" / "rollout.rrd").stream()}
+    assert r"/kitchen\/slide-cabinet-0/scene/bodies/panda0_link7" in seen
