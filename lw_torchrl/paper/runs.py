@@ -19,9 +19,10 @@ from lw_torchrl._files import held, write_json, write_text
 from lw_torchrl.data import collect_demonstrations
 from lw_torchrl.evaluation import EvaluationResult, MethodComparison, evaluate, summarize
 from lw_torchrl.language.plans import Plans
-from lw_torchrl.language.tasks import TASKS, resolve_tasks
+from lw_torchrl.language.tasks import TASKS
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.policy import Policy
+from lw_torchrl.suites.suite import find_suite
 from lw_torchrl.training import load_actor, save_actor
 from lw_torchrl.training.envelope import check_description
 from lw_torchrl.training.files import describe_data
@@ -107,8 +108,8 @@ class Run(ABC):
 
     def evaluated(self, tasks: str | Sequence[str] | None) -> tuple[str, ...]:
         """Those of its tasks that are among the ones named; None for all."""
-        own = resolve_tasks(self.scope)
-        names = own if tasks is None else resolve_tasks(tasks)
+        own = tuple(find_suite(self.scope).named_tasks(self.scope))
+        names = own if tasks is None else tuple(find_suite(tasks).named_tasks(tasks))
         if not (shown := tuple(name for name in names if name in own)):
             raise ValueError(f"tasks must name some of the run's, {', '.join(own)}, got {', '.join(names)}")
         return shown
