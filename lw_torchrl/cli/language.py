@@ -203,11 +203,12 @@ def query(
     if check_int("step", step, minimum=0) > suite.max_steps:
         raise ValueError(f"step must be at most {suite.max_steps}, got {step}")
     env: EnvBase = lw.LanguageWorldEnv(name, seed=seed)
-    if step and suite.make_expert is None and suite.plans is not None:
-        env = TransformedEnv(env, lw.QAFTransform(suite.plans))
+    expert = suite_expert(suite, (name,)) if step else None
+    if isinstance(expert, lw.ScriptedSkillActor):
+        env = TransformedEnv(env, expert.transform())
     state = env.reset(episode=episode)
-    if step:
-        state = env.rollout(step, suite_expert(suite, (name,)), auto_reset=False, tensordict=state)[:, -1]["next"]
+    if expert is not None:
+        state = env.rollout(step, expert, auto_reset=False, tensordict=state)[:, -1]["next"]
     truths = lw.QueryProgram({definition: listed})(state["observation"], state["task_id"])[0].tolist()
     env.close()
     output = Output(json)

@@ -12,6 +12,7 @@ from torchrl.data import TensorDictReplayBuffer
 from torchrl.objectives import LossModule
 
 from lw_torchrl._checks import checked
+from lw_torchrl.language.layout import Layout
 from lw_torchrl.modules.critics import Value
 from lw_torchrl.modules.observation_features import ObservationFeatures
 from lw_torchrl.modules.policy import Policy
@@ -27,7 +28,7 @@ def fit_normalization(target: nn.Module, replay: TensorDictReplayBuffer) -> None
 
     Args:
         target: a :class:`Policy`, a critic, a module with :class:`ObservationFeatures` in it, or a loss of such.
-        replay: rows of ``observation`` (39,) float32.
+        replay: rows of ``observation`` (D,) float32.
 
     Raises:
         ValueError: there is nothing in it to normalise, or a row holds NaN or infinity, or no ``observation``; a loss
@@ -65,10 +66,11 @@ def fit_normalization(target: nn.Module, replay: TensorDictReplayBuffer) -> None
             "roles: where the hand touches things is taken from demonstrations by fit_normalization(actor, replay), "
             "before the loss is made of the actor"
         )
-    known: dict[str, ObservationFeatures] = {}
-    for kind, mean, std in _statistics(target):
+    known: dict[tuple[str, Layout], ObservationFeatures] = {}
+    for features, mean, std in _statistics(target):
+        kind = features.kind, features.layout
         if kind not in known:
-            known[kind] = ObservationFeatures(kind).to(observation.device)  # type: ignore[arg-type]
+            known[kind] = ObservationFeatures(features.kind, layout=features.layout).to(observation.device)
             known[kind].fit(observation, weights)
         with torch.no_grad():
             mean.copy_(known[kind].mean)
@@ -106,10 +108,10 @@ def _lacks_contacts(target: nn.Module) -> bool:
     return any(not of("fitted") for _, of in _held(target, PlanRoles))
 
 
-def _statistics(target: nn.Module) -> Iterator[tuple[str, Tensor, Tensor]]:
-    """The kind of each :class:`ObservationFeatures`, its mean and its standard deviation; of a loss, every copy's."""
+def _statistics(target: nn.Module) -> Iterator[tuple[ObservationFeatures, Tensor, Tensor]]:
+    """Each :class:`ObservationFeatures` with its mean and its standard deviation; of a loss, those of every copy."""
     for module, of in _held(target, ObservationFeatures):
-        yield module.kind, of("mean"), of("std")
+        yield module, of("mean"), of("std")
 
 
 def _held(target: nn.Module, kind: type[nn.Module]) -> Iterator[tuple[Any, Callable[[str], Tensor]]]:

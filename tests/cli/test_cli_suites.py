@@ -8,6 +8,7 @@ pytest.importorskip("gymnasium_robotics")
 
 import lw_torchrl as lw
 from lw_torchrl.cli.main import main
+from lw_torchrl.suites import load_suite
 
 OWN = """
 from dataclasses import replace
@@ -40,6 +41,41 @@ def test_a_policy_of_meta_world_is_evaluated_with_another_robot(capsys, tmp_path
 def test_a_suite_s_plans_demonstrate(capsys):
     main(["evaluate", "expert", "--tasks", "fetch/reach", "--episodes", "2", "--noise", "0", "--json"])
     assert json.loads(capsys.readouterr().out)["mean_success"] == 1.0
+
+
+def said(capsys, *command):
+    main([*command, "--json"])
+    return json.loads(capsys.readouterr().out)
+
+
+def test_commands_take_another_suite_s_tasks_by_name(capsys, tmp_path):
+    assert [row["task"] for row in said(capsys, "tasks", "fetch")["tasks"]] == list(load_suite("fetch").tasks)
+    assert said(capsys, "plans", "fetch/push")["plans"][0]["text"].count("robot.") == 13
+    assert {"query": "the puck is near the target location", "ours": False} in said(capsys, "queries", "fetch/push")[
+        "queries"
+    ]
+    assert len(said(capsys, "skills", "fetch/reach")["skills"]) < len(said(capsys, "skills")["skills"])
+    asked = ["query", "fetch/reach", "is the gripper near the reach target", "--step", "10"]
+    assert said(capsys, *asked)["queries"][0]["holds"]
+    with pytest.raises(SystemExit):
+        main(["query", "fetch/reach", "--step", "51"])
+    assert "step must be at most 50, got 51" in capsys.readouterr().err
+    scripted = said(capsys, "scripted", "fetch/reach", "--episodes", "2", "--out", str(tmp_path / "scripted"))
+    assert scripted["mean_success"] == 1.0
+    with pytest.raises(SystemExit):
+        main(["tasks", "fetch/rech"])
+    assert "did you mean 'fetch/reach'" in capsys.readouterr().err
+
+
+def test_data_policies_and_recordings_of_another_suite(capsys, tmp_path):
+    demos, policy, recording = tmp_path / "demos", tmp_path / "policy.zip", tmp_path / "episode.rrd"
+    made = said(capsys, "collect", "fetch/reach", "fetch/push", "--out", str(demos), "--episodes", "1")
+    assert made["steps"] == 100
+    main(["train", str(demos), "--steps", "2", "--out", str(policy)])
+    assert lw.load_actor(policy).tasks == tuple(load_suite("fetch").tasks)
+    main(["record", "fetch/reach", "--policy", str(policy), "--max-steps", "3", "--out", str(recording)])
+    main(["record", "fetch/reach", "--policy", "wrong", "--max-steps", "3", "--out", str(recording)])
+    assert recording.stat().st_size > 10_000
 
 
 def test_check_measures_a_suite(capsys, own):

@@ -1,11 +1,13 @@
 """A suite of one's own works wherever Meta-World does: environment, data, training, files, evaluation, recordings."""
 
+import math
 from dataclasses import replace
 from functools import partial
 
 import pytest
 import torch
 from torchrl.envs import Compose, TransformedEnv, check_env_specs
+from torchrl.objectives import TD3Loss
 from toy_suite import SKILLS, TASKS, TOY, ToyEngine, make_toy_suite
 
 import lw_torchrl as lw
@@ -13,6 +15,7 @@ from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.skills import ScriptedSkill
 from lw_torchrl.modules import ActorEnsemble, TransferredActor
 from lw_torchrl.suites import SUITES, Suite, check_suite, find_suite, load_suite
+from lw_torchrl.training.algorithms import PPOConfig, TD3Config
 
 SUITE = make_toy_suite()
 FEATURES = ["raw", "differences", "relative", "both"]
@@ -137,6 +140,8 @@ def test_a_policy_of_meta_world_acts_in_it():
     turned = moved.turned(given)
     torch.testing.assert_close(turned[0], torch.tensor([0.0, 0.1, -0.2, 0.04, 0.0, 0.0, -1.0]))
     assert turned[1, 6] == 1.0  # below 0.3 it opens, and -1 closes here
+    faster = TransferredActor(trained, SUITE.plans, speed=6.0).turned(given)[0]
+    torch.testing.assert_close(faster, torch.tensor([0.0, 0.6, -1.0, 0.24, 0.0, 0.0, -1.0]))
     result = lw.evaluate(moved, tasks="toy", suite=SUITE, episodes_per_task=1, seed=3, progress=False)
     assert set(result.success_once) == set(TASKS)
 
@@ -147,17 +152,20 @@ def test_what_does_not_carry_over_is_named():
         TransferredActor(trained, SUITE.plans)
     with pytest.raises(TypeError, match="with_plans is for policies with plans"):
         TransferredActor(lw.DescriptorConditionedActor("MT10", **SMALL), SUITE.plans)
+    carries = lw.PlanConditionedActor(lw.load_plans("MT10"), features="opening", roles=True, **SMALL)
+    with pytest.raises(ValueError, match=r"speed must be above 0, got 0\.0"):
+        TransferredActor(carries, SUITE.plans, speed=0.0)
 
 
 def test_a_transferred_policy_is_saved(tmp_path):
     trained = lw.PlanConditionedActor(lw.load_plans("MT10"), features="opening", roles=True, **SMALL).eval()
-    moved = TransferredActor(trained, SUITE.plans).eval()
+    moved = TransferredActor(trained, SUITE.plans, speed=1.5).eval()
     lw.save_actor(moved, tmp_path / "moved.zip")
     again = lw.load_actor(tmp_path / "moved.zip").eval()
     env = lw.LanguageWorldEnv("toy", suite=SUITE)
     state = lw.QAFTransform(SUITE.plans)(env.reset())
     assert torch.equal(again(state.clone())["action"], moved(state.clone())["action"])
-    assert (again.layout, again.trained) == (TOY, METAWORLD)
+    assert (again.layout, again.trained, again.speed) == (TOY, METAWORLD, 1.5)
     env.close()
 
 
@@ -202,3 +210,43 @@ def test_the_check_says_what_is_off():
     slow = make_toy_suite(partial(ToyEngine, reach=0.02))
     off = {one.what for one in check_suite(slow) if not one.right}
     assert off == {"+x moves right", "+y moves away from the robot", "+z moves up"}
+
+
+def td3(plans):
+    actor, critic = lw.PlanConditionedActor(plans, **SMALL), lw.PlanConditionedQValue(plans, width=8)
+    return TD3Loss(actor, critic, bounds=(-1.0, 1.0))
+
+
+def value(plans):
+    return lw.objectives.ExpectileValueLoss(lw.PlanConditionedValue(plans, width=8))
+
+
+@pytest.mark.parametrize("make_loss", [td3, value])
+def test_losses_train_offline_with_the_layout_s_statistics(make_loss, demos):
+    plans = SUITE.plans
+    loss = make_loss(plans)
+    loss.make_value_estimator(gamma=0.9)
+    replay = lw.LanguageWorldExperienceReplay(
+        demos.root, label="executed", n_steps=3, gamma=0.9, transform=lw.QAFTransform(plans)
+    )
+    trainer = lw.OfflineTrainer(loss, replay, lw.OfflineConfig(steps=2, batch_size=8), progress=False)
+    trainer.train()
+    assert all(math.isfinite(one) for one in trainer.last.values())
+
+
+@pytest.mark.parametrize(("config", "distribution"), [(TD3Config, None), (PPOConfig, "tanh_normal")])
+def test_a_policy_trains_online(config, distribution, demos):
+    actor = lw.PlanConditionedActor(SUITE.plans, distribution=distribution, **SMALL)
+    replay = lw.LanguageWorldExperienceReplay(
+        demos.root,
+        label="executed",
+        terminate_on_success=True,
+        grow=1_000,
+        sampler=lw.CoLearningSampler("grown"),
+        transform=lw.QAFTransform(SUITE.plans),
+    )
+    run = config(frames=20, rows=2, max_steps=5, batch_size=8)
+    method = config.__name__.removesuffix("Config").lower()
+    trainer = lw.OnlineTrainer(actor, replay, run, method=method, tasks="toy", suite=SUITE, progress=False)
+    trainer.train()
+    assert trainer.history[-1]["frames"] == 20
