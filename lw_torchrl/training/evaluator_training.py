@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from hashlib import blake2b
@@ -12,7 +11,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from lw_torchrl._checks import Count, Scale, checked_but
+from lw_torchrl._checks import Count, Scale, checked_but, passes_on
 from lw_torchrl._state_tree import check_like, check_optimizer_state
 from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.modules.clause_evaluator import ClauseEvaluator
@@ -96,20 +95,8 @@ class _PictureMinibatches:
             evaluator.check_seen(one.seen("pixels"))
         self.coded = [evaluator.code([(one.task, clause) for clause in one.clauses]) for one in asked]
         self.weights = [_answer_weights(one) for one in asked]
-        self.positions = [self._known_positions(one) for one in asked]
+        self.positions = [_known_positions(one, evaluator.names) for one in asked]
         self.labels = _digest(tensor for one in asked for tensor in (one.observation, one.truth, one.seen("pixels")))
-
-    def _known_positions(self, asked: Asked) -> tuple[Tensor, Tensor, Tensor]:
-        """A task's things, (n,); where they are, and how far the gripper is open, (R, n, 4); what counts, (n, 4)."""
-        names = [name for name in asked.task.object_names if name in self.evaluator.names]
-        positions, number = asked.task.positions(asked.observation), self.evaluator.names.index
-        known = torch.zeros(len(asked.observation), len(names), 4)
-        counts = torch.ones(len(names), 4)
-        for place, name in enumerate(names):
-            known[:, place, :3] = positions[name]
-            known[:, place, 3] = asked.observation[:, asked.task.layout.opening]
-            counts[place, 3] = name == GRIPPER
-        return torch.tensor([number(name) for name in names], dtype=torch.int64), known, counts
 
     def loss(self, step: int, generator: torch.Generator) -> Tensor:
         each = max(1, self.config.batch_size // len(self.asked))
@@ -136,6 +123,16 @@ class _PictureMinibatches:
         return (errors * weights).sum() / weights.sum() + self.config.position_weight * placed
 
 
+def _known_positions(asked: Asked, known: tuple[str, ...]) -> tuple[Tensor, Tensor, Tensor]:
+    """A task's things, (n,); where they are, and how far the gripper is open, (R, n, 4); what counts, (n, 4)."""
+    names = [name for name in asked.task.object_names if name in known]
+    opening, positions = asked.observation[:, asked.task.layout.opening, None], asked.task.positions(asked.observation)
+    found = [torch.cat((positions[name], opening), -1) for name in names]
+    counts = torch.tensor([[1.0, 1.0, 1.0, name == GRIPPER] for name in names]).reshape(-1, 4)
+    numbers = torch.tensor([known.index(name) for name in names], dtype=torch.int64)
+    return numbers, torch.stack(found, 1) if found else opening.new_empty(len(opening), 0, 4), counts
+
+
 def _answer_weights(asked: Asked) -> Tensor:
     """(2, Q) float32, of a clause's false and true answers: each predicate and truth weighs alike."""
     true = asked.truth.double().mean(0)
@@ -158,14 +155,14 @@ def _digest(tensors: Iterable[Tensor]) -> str:
 class QueryEvaluatorTrainer(Training):
     """Trains an evaluator on the answers of the query answering function to all base queries of tasks.
 
-    A minibatch has equally many pairs of a state and a clause of each predicate and truth, as far as there are any. An
-    evaluator that reads texts is asked half of the clauses negated. A minibatch hangs on the seed and the step alone.
+    A minibatch, which hangs on the seed and the step alone, has equally many pairs of a state and a clause of each
+    predicate and truth. An evaluator that reads texts is asked half of the clauses negated.
 
     Args:
         evaluator: it is trained in place; its plans do not matter.
         data: what is asked, and what of it is held out.
         config: how to train, the one that the data were made with.
-        checkpoint, progress: as of :class:`~lw_torchrl.training.loop.Training`, with its errors;
+        **options: as of :class:`~lw_torchrl.training.loop.Training`, with its errors;
             :func:`load_evaluator` reads the file.
 
     Raises:
@@ -187,20 +184,19 @@ class QueryEvaluatorTrainer(Training):
     trains: ClassVar[type[ClauseEvaluator]] = StateQueryEvaluator
     minibatches: ClassVar[Callable[..., _StateMinibatches | _PictureMinibatches]] = _StateMinibatches
 
+    @passes_on(Training.__init__)
     @checked_but("evaluator")
     def __init__(
         self,
         evaluator: ClauseEvaluator,
         data: LabelledQueries,
         config: QueryEvaluatorConfig | None = None,
-        *,
-        checkpoint: str | os.PathLike[str] | None = None,
-        progress: bool = True,
+        **options: Any,
     ) -> None:
         if not isinstance(evaluator, self.trains):
             raise TypeError(f"evaluator must be of class {self.trains.__name__}, got {type(evaluator).__name__}")
         config = config or QueryEvaluatorConfig()
-        super().__init__(config, [], checkpoint, progress=progress, title="training the evaluator")
+        super().__init__(config, [], **{"title": "training the evaluator", **options})
         self.evaluator, self.module, self.networks = evaluator, evaluator, [evaluator]
         if not data.parts["training"]:
             raise ValueError("data must have states and queries to train on, all are held out")

@@ -1,13 +1,22 @@
-"""The methods of ``lw-torchrl online``: a file each, with what it reads and what it does, and a line in
-:data:`LEARNERS`."""
+"""The methods of ``lw-torchrl online``: each is a :class:`Learner` with its configuration, in :data:`LEARNERS`."""
 
 from lw_torchrl._checks import check_choice
-from lw_torchrl.training.algorithms.advantage import AdvantageConfig, AdvantageLearner
-from lw_torchrl.training.algorithms.expert_iteration import ExpertIterationConfig, ExpertIterationLearner
+from lw_torchrl.training.algorithms.imitation import (
+    AdvantageConfig,
+    AdvantageLearner,
+    ExpertIterationConfig,
+    ExpertIterationLearner,
+)
 from lw_torchrl.training.algorithms.learner import Learner, OnlineConfig
+from lw_torchrl.training.algorithms.off_policy import (
+    ResidualConfig,
+    ResidualLearner,
+    SACConfig,
+    SACLearner,
+    TD3Config,
+    TD3Learner,
+)
 from lw_torchrl.training.algorithms.ppo import PPOConfig, PPOLearner
-from lw_torchrl.training.algorithms.sac import SACConfig, SACLearner
-from lw_torchrl.training.algorithms.td3 import ResidualConfig, ResidualLearner, TD3Config, TD3Learner
 
 LEARNERS: dict[str, type[Learner]] = {
     "advantage": AdvantageLearner,
@@ -42,14 +51,6 @@ def method_config(method: str, given: OnlineConfig | None = None) -> OnlineConfi
 
 
 __all__ = [
-    "LEARNERS",
-    "AdvantageConfig",
-    "ExpertIterationConfig",
-    "Learner",
-    "OnlineConfig",
-    "PPOConfig",
-    "ResidualConfig",
-    "SACConfig",
-    "TD3Config",
-    "method_config",
-]
+    "LEARNERS", "AdvantageConfig", "ExpertIterationConfig", "Learner", "OnlineConfig", "PPOConfig", "ResidualConfig",
+    "SACConfig", "TD3Config", "method_config",
+]  # fmt: skip

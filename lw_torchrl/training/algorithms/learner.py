@@ -12,17 +12,15 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from torchrl.objectives import LossModule, SoftUpdate
 
 from lw_torchrl._checks import Count, Natural, Probability, Scale, check_fields
 from lw_torchrl._state_tree import check_like, check_optimizer_state
 from lw_torchrl.modules.conditioned_actor import ConditionedActor
 from lw_torchrl.modules.critics import QValue
 from lw_torchrl.modules.descriptor_conditioned_actor import DescriptorEncoder
-from lw_torchrl.modules.encoder import Encoder
 from lw_torchrl.modules.networks import DistributionName
 from lw_torchrl.modules.plan_encoder import PlanEncoder
-from lw_torchrl.modules.policy import Policy
+from lw_torchrl.modules.policy import Encoder, Policy
 from lw_torchrl.modules.residual_actor import ResidualActor
 from lw_torchrl.training.file_checks import copy_weights, tensors_of
 
@@ -195,42 +193,6 @@ class Learner:
         for name, optimizer in self.optimizers.items():
             optimizer.load_state_dict(state["optimizers"][name])
         self.made = state["made"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class OffPolicyConfig(CriticConfig):
-    """Of methods whose actor follows critics that judge actions."""
-
-    actor_learning_rate: Scale = 1e-4  # of AdamW
-    bc_weight: Scale = 2.0  # of the imitation of demonstrations
-
-
-class OffPolicyLearner(Learner):
-    """Learns from demonstrations and rows that came, half of a minibatch each, with critics and their targets."""
-
-    config: OffPolicyConfig
-    loss: Any
-    targets: SoftUpdate
-
-    def set_loss(self, loss: LossModule) -> None:
-        """What is trained: a loss with ``actor_network`` and ``qvalue_network``."""
-        self.loss = loss
-        loss.make_value_estimator(gamma=self.config.gamma)
-        self.targets = SoftUpdate(loss, eps=self.config.target_eps)
-        actor, critics = loss.actor_network_params, loss.qvalue_network_params
-        self.optimizers["actor"] = adamw(actor.values(True, True), self.config.actor_learning_rate)
-        self.optimizers["critic"] = adamw(critics.values(True, True), self.config.critic_learning_rate)
-
-    def q_value(self, given: Any) -> QValue:
-        """The critic that is given, or one that sees what the policy sees, in eval mode."""
-        if given is None:
-            return QValue(encoder_like(self.policy)).eval()
-        if not isinstance(given, QValue):
-            raise TypeError(f"critic must be a QValue, which judges actions, got {type(given).__name__}")
-        return given.eval()
-
-    def observe(self, rows: TensorDictBase) -> None:
-        self.replay.extend(rows)
 
 
 def adamw(parameters: Iterable[Tensor], learning_rate: float) -> torch.optim.Optimizer:
