@@ -275,7 +275,7 @@ def make_logger(kind: Literal["csv", "tensorboard", "wandb"], out: Path) -> Any:
 
 def moved(policy: Policy, suite: Suite, plans: Plans | None, speed: float = 1.0) -> Policy:
     """The policy under plans of a suite, turned into its actions where it was trained with another robot."""
-    from lw_torchrl.modules.transferred_actor import TransferredActor
+    from lw_torchrl.modules.composed_actors import TransferredActor
 
     if policy.layout == suite.layout:
         return policy if plans is None else policy.with_plans(plans)

@@ -15,7 +15,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from lw_torchrl._checks import check_fields, check_int, check_probability, shown, unknown_name
+from lw_torchrl._checks import check_choice, check_fields, check_int, check_probability, shown
 from lw_torchrl._seeding import episode_generator
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.skills import Skills
@@ -63,10 +63,8 @@ class Behaviour:
         for field in ("shortest", "longest"):
             object.__setattr__(self, field, check_int(f"behaviour: {field}", getattr(self, field), minimum=1))
         if not self.shortest <= self.longest <= _MOST_STEPS:
-            raise ValueError(
-                f"behaviour: longest must be from shortest, {shown(self.shortest)}, to {_MOST_STEPS}, got "
-                f"{shown(self.longest)}"
-            )
+            allowed = f"from shortest, {shown(self.shortest)}, to {_MOST_STEPS}"
+            raise ValueError(f"behaviour: longest must be {allowed}, got {shown(self.longest)}")
         odd = [name for name in _OF_SEGMENTS if getattr(self, name) != getattr(Behaviour, name)]
         if self.kind != "segments" and odd:
             raise ValueError(f"behaviour: {', '.join(odd)} is of kind 'segments', got kind {self.kind!r}")
@@ -104,9 +102,8 @@ plan in the others; any skill of the plan throughout; one action in [-1, 1] afte
 def check_own_label(behaviour: Behaviour) -> None:
     """Raise :class:`ValueError` for a label that is another behaviour's."""
     if behaviour.name == NOISY or behaviour.acts != BEHAVIOURS.get(behaviour.name, behaviour.acts):
-        raise ValueError(
-            f"behaviour must be a label of its own, {behaviour.name!r} is another's: {', '.join((*BEHAVIOURS, NOISY))}"
-        )
+        others = ", ".join((*BEHAVIOURS, NOISY))
+        raise ValueError(f"behaviour must be a label of its own, {behaviour.name!r} is another's: {others}")
 
 
 def segment_plans(tasks: Iterable[str], suite: str | Suite = "metaworld") -> Plans:
@@ -129,19 +126,14 @@ def behaviour_of(
         if name is None:
             raise ValueError("behaviour must name the policy in the dataset, behaviour='my-policy' say, got None")
         if policy.draws:
-            raise ValueError(
-                f"policy: this {type(policy).__name__} draws in the order in which it is called, so its episodes would "
-                "depend on num_envs and on interruptions"
-            )
+            why = "so its episodes would depend on num_envs and on interruptions"
+            raise ValueError(f"policy: this {type(policy).__name__} draws in the order in which it is called, {why}")
         return Behaviour(name, "policy", fingerprint=policy_fingerprint(policy))
     if isinstance(policy, str):
-        if policy not in BEHAVIOURS:
-            raise unknown_name("policy", policy, BEHAVIOURS)
-        found = BEHAVIOURS[policy]
-    elif isinstance(policy, Behaviour):
-        found = policy
-    else:
+        policy = BEHAVIOURS[check_choice("policy", policy, BEHAVIOURS)]
+    if not isinstance(policy, Behaviour):
         raise TypeError(f"policy must be a name, a Behaviour or a Policy, got {type(policy).__name__}")
+    found: Behaviour = policy
     if found.kind == "policy":
         raise ValueError(f"policy: the Behaviour {found.name!r} is of a trained policy; give the policy itself")
     if found.kind == "segments":

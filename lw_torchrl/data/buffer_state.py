@@ -51,10 +51,7 @@ class RestorableReplay(BaseDatasetExperienceReplay):
 
     def __setitem__(self, index: Any, value: Any) -> NoReturn:
         """Raise: datasets are shown as they are on disk."""
-        raise RuntimeError(
-            "a dataset's rows cannot be assigned to: change what replay.sample() gives, which is yours, or give each "
-            "row a value of its own by add_column"
-        )
+        raise RuntimeError("a dataset's rows cannot be assigned to: change what sample() gives, or use add_column")
 
     def preprocess(self, *args: Any, **kwargs: Any) -> TensorStorage:
         """As TorchRL's, which needs the rows in one tensordict."""

@@ -12,7 +12,7 @@ from tensordict import NestedKey
 from torch import Tensor
 from torchrl.data.replay_buffers.storages import Storage
 
-from lw_torchrl._checks import unknown_name
+from lw_torchrl._checks import check_choice
 from lw_torchrl._keys import check_key
 from lw_torchrl.data.growing import GrowingStorage
 from lw_torchrl.data.samplers import GroupSampler, column, nearest_sizes
@@ -24,8 +24,7 @@ GROWN = "grown"  # the target that is what a buffer was extended with
 
 def _check_target(target: Any) -> str | Tensor:
     if isinstance(target, str):
-        if target not in TASKS and target != GROWN and "/" not in target:
-            raise unknown_name("target", target, [GROWN, *TASKS])
+        return target if "/" in target else check_choice("target", target, (GROWN, *TASKS))
         return target
     wanted = "target must be a task's name or one bool for each episode"
     try:
@@ -46,9 +45,8 @@ def _check_fraction(fraction: Any) -> Fraction:
         raise ValueError(f"target_fraction must lie between 0 and 1, both excluded, got {fraction}")
     exact = Fraction(fraction).limit_denominator(10_000)
     if not isclose(exact, fraction, rel_tol=1e-9):
-        raise ValueError(
-            f"target_fraction must be a ratio of whole numbers up to 10000, got {fraction}; the nearest is {exact}"
-        )
+        wanted = f"a ratio of whole numbers up to 10000, got {fraction}"
+        raise ValueError(f"target_fraction must be {wanted}; the nearest is {exact}")
     return exact
 
 
@@ -56,16 +54,14 @@ class CoLearningSampler(GroupSampler):
     """Half of every minibatch from the target's demonstrations, half in equal numbers from the base tasks; exactly.
 
     Target and base tasks are drawn without replacement, each in passes of its own: every row of a group comes once
-    before any comes again. An epoch, at whose end ``ran_out`` is true, is the pass that takes the most batches, as a
-    rule that of the largest base task. The sampler draws from the replay buffer's generator; its state, restored in the
-    middle of an epoch, continues with the same batches.
+    before any comes again. An epoch, at whose end ``ran_out`` is true, is the pass that takes the most batches. The
+    sampler draws from the replay buffer's generator; its state continues with the same batches.
 
     The target "grown" stands for the rows that the buffer was extended with: each is drawn with the same probability,
     with replacement. The demonstrations of all tasks are the base.
 
     Where a target by name is itself a base task, its base demonstrations are left out. A batch holds the target's rows,
     then those of the base tasks in the order of their ids, and one more column, ``is_target`` (B,) bool.
-
     Args:
         target: "grown"; a task's name, for all demonstrations of the task, or in a storage that joins datasets, those
             of the last one that has any; or one bool for each of ``replay.demonstrations.episodes``, in their order.
@@ -172,10 +168,10 @@ class CoLearningSampler(GroupSampler):
         part, whole = self.target_fraction.numerator, self.target_fraction.denominator
         unit = whole * base // gcd(base, whole - part)
         if batch_size % unit:
+            share = f"so that {self.target_fraction} of it is the target's and {base} base tasks share the rest equally"
+            near = nearest_sizes(batch_size, unit)
             raise ValueError(
-                f"batch_size must be a multiple of {unit}, so that {self.target_fraction} of it is the target's and "
-                f"{base} base tasks share the rest equally, got {batch_size}; the nearest are "
-                + nearest_sizes(batch_size, unit)
+                f"batch_size must be a multiple of {unit}, {share}, got {batch_size}; the nearest are {near}"
             )
         mine = batch_size // whole * part
         return torch.tensor([mine] * (not self._grown) + [(batch_size - mine) // base] * base)
@@ -202,12 +198,9 @@ class CoLearningSampler(GroupSampler):
         return torch.cat([grown, index]), info
 
     def _identity(self) -> dict[str, Tensor]:
-        if self._grown:
-            target = torch.tensor([-1])
-        else:
-            target = torch.tensor(task_id(self.target)) if isinstance(self.target, str) else self.target.clone()
         fraction = torch.tensor([self.target_fraction.numerator, self.target_fraction.denominator])
-        return {"target": target, "target_fraction": fraction}
+        target = torch.tensor(task_id(self.target)) if isinstance(self.target, str) else self.target.clone()
+        return {"target": torch.tensor([-1]) if self._grown else target, "target_fraction": fraction}
 
     def state_dict(self) -> dict[str, Any]:
         """The shuffled order, how far each pass has come, the target and the ratio."""

@@ -71,10 +71,8 @@ def _check_versions(root: Path, recorded: dict[str, str]) -> None:
 def _check_same(before: CollectConfig, config: CollectConfig, what: str) -> None:
     if before != config:
         was, now = (one.to_json() | {"policy": one.policy.to_json()} for one in (before, config))
-        differ = ", ".join(differences(was, now))
-        raise DatasetError(
-            f"{what} of another configuration ({differ}); choose another folder, or delete it to start again"
-        )
+        of = f"of another configuration ({', '.join(differences(was, now))})"
+        raise DatasetError(f"{what} {of}; choose another folder, or delete it to start again")
 
 
 def _read_through(
@@ -85,10 +83,8 @@ def _read_through(
         found = dataset.read_metadata(root)
     except DamagedDatasetError as error:
         if not memory_map.holds_columns(root / dataset.DATA):
-            raise DatasetError(
-                f"root: {str(root)!r} holds no dataset, or one damaged beyond telling ({error}); choose another "
-                "folder, or delete it to start again"
-            ) from error
+            what = f"root: {str(root)!r} holds no dataset, or one damaged beyond telling ({error})"
+            raise DatasetError(f"{what}; choose another folder, or delete it to start again") from error
         return None, [], str(error)
     _check_same(found.config, config, f"root: {str(root)!r} holds a dataset")
     whole = memory_map.whole_episodes(found, progress=progress)
@@ -108,11 +104,8 @@ def _take_apart(root: Path, config: CollectConfig, whole: list[dataset.EpisodeIn
     files, _ = _open_episode_files(root, config, dataset.read_metadata(root).versions if whole else None)
     for info in whole:
         if not files.has(info.task, info.episode):
-            files.put(
-                info.task,
-                info.episode,
-                memory_map.read_rows(root / dataset.DATA, info.start, info.length, config.layout),
-            )
+            rows = memory_map.read_rows(root / dataset.DATA, info.start, info.length, config.layout)
+            files.put(info.task, info.episode, rows)
     (root / dataset.METADATA).unlink()
 
 
@@ -156,10 +149,9 @@ def _made(
     if found is None:
         for path in (root / dataset.DATA, root / dataset.PARTIAL):
             if path.is_symlink() or (path.exists() and not path.is_dir()):
-                raise DatasetError(
-                    f"root: {str(path)!r} must be a folder for the dataset to be collected or mended, it is a "
-                    f"{'link' if path.is_symlink() else 'file'}; put the folder itself there, or choose another root"
-                )
+                kind = "link" if path.is_symlink() else "file"
+                what = f"must be a folder for the dataset to be collected or mended, it is a {kind}"
+                raise DatasetError(f"root: {str(path)!r} {what}; put the folder itself there, or choose another root")
         if finished:
             _take_apart(root, config, whole, reason)
         files, versions = _open_episode_files(root, config)
@@ -207,10 +199,9 @@ def collect_demonstrations(
         episodes_per_task: how many episodes of each task to keep.
         root: the dataset's folder, new or left by an earlier call.
         suite: the :class:`~lw_torchrl.suites.Suite` that has the tasks; None for the one that their names begin with.
-        policy: who acts in the whole dataset; mixtures are lists of datasets. "expert", Meta-World's script;
-            "scripted", the shipped plans with scripted skills; "spoilt-60" or "spoilt-30", the same in so many of 100
-            pieces of 8 to 24 steps, and any skill of the plan in the others; "wrong", any skill of the plan; "random",
-            random actions; a :class:`Behaviour`; or a trained :class:`Policy`, run as :func:`evaluate` runs it.
+        policy: who acts in the whole dataset; mixtures are lists of datasets. A name in :data:`BEHAVIOURS`: "expert",
+            Meta-World's script, "scripted", "spoilt-60", "spoilt-30", "wrong" or "random"; a :class:`Behaviour`; or a
+            trained :class:`Policy`, run as :func:`evaluate` runs it.
         behaviour: the label of its episodes, for :class:`EpisodeFilter`; None for its name. A Policy needs one.
         seed: evaluate on another one.
         noise_scale: standard deviation of the noise on the executed action; of a sequence, each episode's in turn.
@@ -244,10 +235,8 @@ def collect_demonstrations(
         found_suite = find_suite(tasks, suite)
         names = tuple(found_suite.named_tasks(tasks))
     except TypeError as error:
-        raise TypeError(
-            f"{error}. Meta-World's experts demonstrate its own 50 tasks; docs/training.md shows demonstrations by a "
-            "policy of one's own"
-        ) from error
+        why = "Meta-World's experts demonstrate its own 50 tasks; docs/training.md shows demonstrations in others"
+        raise TypeError(f"{error}. {why}") from error
     actor = policy if isinstance(policy, Policy) else None
     if actor is not None and (unknown := [task for task in names if task not in actor.tasks]):
         raise ValueError(f"tasks must be among the policy's, it was not made for {', '.join(unknown)}")
@@ -263,8 +252,7 @@ def collect_demonstrations(
         layout=found_suite.layout,
         policy=behaviour_of(policy, names, behaviour, found_suite),
     )
-    folder = Path(root)
-    partial = folder / dataset.PARTIAL
+    folder, partial = Path(root), Path(root, dataset.PARTIAL)
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"root must be a folder, {str(folder)!r} is a file")
     found = None

@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from reprlib import repr as short
 from typing import Any, TypeVar
@@ -87,14 +87,11 @@ class CollectConfig:
     def to_json(self) -> dict[str, Any]:
         """As JSON; ``policy`` is left out for the expert, and ``layout`` for Meta-World's, as older datasets do."""
         found = {each.name: getattr(self, each.name) for each in fields(self)}
-        found = {key: list(value) if isinstance(value, tuple) else value for key, value in found.items()}
-        usual = {"policy": EXPERT, "layout": METAWORLD}
-        stated = {key: value for key, value in found.items() if key not in usual or value != usual[key]}
-        if "policy" in stated:
-            stated["policy"] = asdict(self.policy)
-        if "layout" in stated:
-            stated["layout"] = self.layout.to_json()
-        return stated
+        found |= {"tasks": list(self.tasks), "noise_scale": list(self.noise_scale)}
+        for key, usual in (("policy", EXPERT), ("layout", METAWORLD)):
+            if (stated := found.pop(key)) != usual:
+                found[key] = stated.to_json()
+        return found
 
     @property
     def behaviour(self) -> str:
@@ -166,12 +163,10 @@ def read_metadata(root: str | os.PathLike[str]) -> Demonstrations:
     path = folder / METADATA
     if not folder.is_dir():
         raise FileNotFoundError(f"root: no dataset folder {str(folder)!r}; make one with collect_demonstrations")
+    if (folder / PARTIAL).is_dir() and not path.is_file():
+        what = f"root: the dataset in {str(folder)!r} is half-written"
+        raise DatasetError(f"{what}; run the same collect_demonstrations again, and it carries on")
     if not path.is_file():
-        if (folder / PARTIAL).is_dir():
-            raise DatasetError(
-                f"root: the dataset in {str(folder)!r} is half-written; run the same collect_demonstrations again, "
-                "and it carries on"
-            )
         raise DatasetError(f"root: {str(folder)!r} holds no {METADATA}, so it is no dataset of {FORMAT}")
     try:
         found = read_json(path, "root: the metadata")
@@ -179,8 +174,7 @@ def read_metadata(root: str | os.PathLike[str]) -> Demonstrations:
         if stated != (FORMAT, FORMAT_VERSION) or isinstance(stated[1], float):
             raise DatasetError(
                 f"root: {str(path)!r} is of format {short(stated[0])} version {short(stated[1])}; this package reads "
-                f"{FORMAT!r} version {FORMAT_VERSION}. Collect it again with the same collect_demonstrations, into "
-                "another folder or after deleting this one"
+                f"{FORMAT!r} version {FORMAT_VERSION}. Collect it again with the same collect_demonstrations"
             )
         config = parse_config(found["config"])
         episodes = _episodes(_object("episodes", found["episodes"], EpisodeInfo.__dataclass_fields__), config)
@@ -195,10 +189,9 @@ def read_metadata(root: str | os.PathLike[str]) -> Demonstrations:
     except DatasetError:
         raise
     except _BAD as error:
-        raise DamagedDatasetError(
-            f"root: {str(path)!r} is damaged ({type(error).__name__}: {str(error)[:500]}); the same "
-            "collect_demonstrations makes the dataset again"
-        ) from error
+        told = f"{type(error).__name__}: {str(error)[:500]}"
+        again = "the same collect_demonstrations makes the dataset again"
+        raise DamagedDatasetError(f"root: {str(path)!r} is damaged ({told}); {again}") from error
 
 
 def read_partial(path: Path, parse: Callable[[Any], Parsed]) -> Parsed:
@@ -206,26 +199,21 @@ def read_partial(path: Path, parse: Callable[[Any], Parsed]) -> Parsed:
     try:
         return parse(read_json(path, "root: the file"))
     except _BAD as error:
-        raise DatasetError(
-            f"root: {str(path)!r} is damaged ({str(error)[:500]}); delete {str(path.parent.parent)!r} to start again"
-        ) from error
+        again = f"delete {str(path.parent.parent)!r} to start again"
+        raise DatasetError(f"root: {str(path)!r} is damaged ({str(error)[:500]}); {again}") from error
 
 
 def parse_config(stated: Any) -> CollectConfig:
     """A configuration from its JSON; ValueError, TypeError or OverflowError if it is none."""
     there = stated if isinstance(stated, Mapping) else {}
-    optional = ("policy", "layout")
-    names = [name for name in CollectConfig.__dataclass_fields__ if name not in optional or name in there]
+    readers: dict[str, Callable[[Any], Any]] = {"policy": Behaviour.from_json, "layout": Layout.from_json}
+    names = [name for name in CollectConfig.__dataclass_fields__ if name not in readers or name in there]
     found = _object("config", stated, names)
     for name, longest in (("tasks", len(MT50)), ("noise_scale", None)):
         if not isinstance(found[name], list) or (longest and len(found[name]) > longest):
             raise ValueError(f"{name} must be a list, of at most {longest or 'any'} entries, got {short(found[name])}")
     options: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in found.items()}
-    if "policy" in options:
-        options["policy"] = Behaviour.from_json(options["policy"])
-    if "layout" in options:
-        options["layout"] = Layout.from_json(options["layout"])
-    config = CollectConfig(**options)
+    config = CollectConfig(**options | {key: read(found[key]) for key, read in readers.items() if key in found})
     if list(config.tasks) != found["tasks"]:
         raise ValueError(f"tasks must be sorted, got {short(found['tasks'])}")
     return config

@@ -21,8 +21,7 @@ from lw_torchrl.data.storage import DEMONSTRATION, DONE, REWARD, TRAJECTORY, Joi
 from lw_torchrl.data.trajectories import NONE_OPEN, Columns, OpenTrajectories
 
 ONE_PROCESS = (
-    "a buffer that grows is of one process, others would write to a copy: let the collector yield its batches, and "
-    "extend the buffer with them here"
+    "a buffer that grows is of one process, others would write to a copy: extend it with what a collector yields"
 )
 
 
@@ -30,15 +29,13 @@ class GrowingStorage(JoinedStorage):
     """A :class:`JoinedStorage` with a ring of rows behind it, allocated once, whose oldest are overwritten.
 
     The rows of the parts come first and stay; the i-th row ever written is at ``num_joined + i % grow``. A replay
-    buffer over it needs a :class:`GrowingWriter` and ``collate_fn=lambda batch: batch``;
-    ``LanguageWorldExperienceReplay(..., grow=)`` sets both. Samples have one column more, ``is_demonstration`` (B,)
-    bool: true of the parts' rows, false of those written.
+    buffer over it needs a :class:`GrowingWriter` and ``collate_fn=lambda batch: batch``. Samples have one column more,
+    ``is_demonstration`` (B,) bool: true of the parts' rows, false of those written.
 
-    Batches may have any dimensions, the last of which is time; the columns of the parts are stored, see
-    :func:`collected_rows`. ``("collector", "traj_ids")`` gets new numbers, above those of the parts: a trajectory keeps
-    its number from batch to batch as long as its newest row is in the ring, and no other trajectory ever gets it. A row
-    follows another if both have the collector's id, the other is not done, and its "next" is bit for bit this row; else
-    a trajectory begins, since a collector was reset, or another one counts from 0 as well.
+    Batches may have any dimensions, the last of which is time. ``("collector", "traj_ids")`` gets new numbers, above
+    those of the parts: a trajectory keeps its number from batch to batch as long as its newest row is in the ring, and
+    no other trajectory ever gets it. A row follows another if both have the collector's id, the other is not done, and
+    its "next" is bit for bit this row; else a trajectory begins.
 
     Args:
         parts, rows, n_steps, gamma: as for :class:`JoinedStorage`; ("collector", "traj_ids") and ("next", "done") are

@@ -175,22 +175,24 @@ class MappedColumn(Tensor):
         return self.clone()
 
 
+def damaged(what: str) -> DamagedDatasetError:
+    """The error for a dataset's rows that are not as they were written; the caller raises it."""
+    again = "the same collect_demonstrations keeps the episodes that are whole and collects the others again"
+    return DamagedDatasetError(f"root: {what}; {again}")
+
+
 def map_rows(demonstrations: Demonstrations) -> TensorDict:
     """The rows of a dataset as in the files, memory-mapped; DatasetError if these are not as the metadata say."""
     folder, number = demonstrations.root / DATA, demonstrations.num_steps
     if odd := _surplus(folder):
-        raise DatasetError(
-            f"root: {', '.join(map(repr, odd[:5]))} in {str(folder)!r} is no part of a dataset; move it elsewhere"
-        )
+        listed = ", ".join(map(repr, odd[:5]))
+        raise DatasetError(f"root: {listed} in {str(folder)!r} is no part of a dataset; move it elsewhere")
     try:
         _check_files(folder, number, demonstrations.config.layout)
         columns = columns_of(demonstrations.config.layout).items()
         found = {key: MappedColumn.of(_path(folder, key), (number, *like[0]), like[1]) for key, like in columns}
     except (OSError, ValueError, RuntimeError) as error:
-        raise DamagedDatasetError(
-            f"root: the rows in {str(folder)!r} cannot be read ({error}); the same collect_demonstrations keeps the "
-            "episodes that are whole and collects the others again"
-        ) from error
+        raise damaged(f"the rows in {str(folder)!r} cannot be read ({error})") from error
     return TensorDict(found, [number], device="cpu")
 
 
@@ -208,18 +210,14 @@ def load_rows(demonstrations: Demonstrations) -> TensorDict:
 
 READ_AT_ONCE = 2 * 2**30  # bytes of rows that are verified when a dataset is opened
 _SETTLED = 3 * 10**9  # ns; a younger file may be written again with the same time
-
-
+# For each folder, what :func:`_files` gave when this process verified episodes of it, and which.
 _VERIFIED: dict[Path, tuple[tuple[tuple[int, ...], ...], set[EpisodeInfo]]] = {}
-"""For each folder, what :func:`_files` gave when this process verified episodes of it, and which."""
 
 
 def _as_written(demonstrations: Demonstrations, info: EpisodeInfo, rows: TensorDictBase) -> bool:
-    return (
-        describe_episode(info.task, info.episode, info.start, rows) == info
-        and bool((rows.get("task_id") == demonstrations.task_ids[info.task]).all())
-        and bool((rows.get("episode") == info.episode).all())
-    )
+    stated = {"task_id": demonstrations.task_ids[info.task], "episode": info.episode}
+    same = all(bool((rows.get(key) == value).all()) for key, value in stated.items())
+    return same and describe_episode(info.task, info.episode, info.start, rows) == info
 
 
 def whole_episodes(demonstrations: Demonstrations, *, progress: bool) -> list[EpisodeInfo]:
@@ -249,17 +247,10 @@ def verify(demonstrations: Demonstrations, episodes: Sequence[EpisodeInfo], *, e
     known = known if before == files else set()
     size = sum(info.length for info in episodes) * row_bytes(demonstrations.config.layout)
     asked = episodes if every else episodes[:: -(-size // READ_AT_ONCE)]
-    broken = [
-        info
-        for info in asked
-        if info not in known and not _as_written(demonstrations, info, rows[info.start : info.start + info.length])
-    ]
-    if broken:
+    unknown = ((info, rows[info.start : info.start + info.length]) for info in asked if info not in known)
+    if broken := [info for info, own in unknown if not _as_written(demonstrations, info, own)]:
         listed = ", ".join(f"{info.episode} of {info.task!r}" for info in broken[:5]) + ", ..." * (len(broken) > 5)
-        raise DamagedDatasetError(
-            f"root: the rows in {str(demonstrations.root)!r} are not as they were written: "
-            f"{counted(len(broken), 'episode')} of {len(asked)} differ from their checksums, {listed}; the same "
-            "collect_demonstrations keeps the others and runs these again"
-        )
+        differ = f"{counted(len(broken), 'episode')} of {len(asked)} differ from their checksums, {listed}"
+        raise damaged(f"the rows in {str(demonstrations.root)!r} are not as they were written: {differ}")
     if max(max(one[3:]) for one in files) < time.time_ns() - _SETTLED:
         _VERIFIED[root] = (files, known | set(asked))

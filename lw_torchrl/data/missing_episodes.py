@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import EnvBase, Transform, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from lw_torchrl._files import replacing
@@ -110,11 +110,8 @@ class EpisodeFiles:
 def write_failed(folder: Path, size: int, error: OSError) -> OSError:
     """The error for something that could not be written while collecting; the caller raises it."""
     until = "there is room" if error.errno in _NO_ROOM else "that is mended"
-    return OSError(
-        error.errno,
-        f"root: writing {size} bytes to {str(folder)!r} failed: {error.strerror or error}. Nothing is lost: once "
-        f"{until}, the same collect_demonstrations carries on",
-    )
+    what = f"root: writing {size} bytes to {str(folder)!r} failed: {error.strerror or error}. Nothing is lost"
+    return OSError(error.errno, f"{what}: once {until}, the same collect_demonstrations carries on")
 
 
 _Actor = Callable[[TensorDictBase], TensorDictBase]
@@ -135,10 +132,8 @@ def _kept_and_missing(config: CollectConfig, files: EpisodeFiles) -> tuple[dict[
             candidate += 1
         missing = config.episodes_per_task - len(kept[task])
         if missing and candidate >= config.episodes_per_task * _MAX_ATTEMPTS:
-            raise RuntimeError(
-                f"task {task!r}: only {len(kept[task])} of {candidate} episodes of {config.behaviour!r} succeeded; "
-                "lower the noise_scale or set redraw_failures=False"
-            )
+            some = f"only {len(kept[task])} of {candidate} episodes of {config.behaviour!r} succeeded"
+            raise RuntimeError(f"task {task!r}: {some}; lower the noise_scale or set redraw_failures=False")
         ahead = range(candidate, candidate + missing)
         wanted[task] = [episode for episode in ahead if not files.has(task, episode)]
     return kept, wanted
@@ -163,12 +158,12 @@ def _env_and_actor(config: CollectConfig, policy: Policy | None, env: LanguageWo
         policy = expert
     if policy is None:
         plans = segment_plans(config.tasks, env.suite)
-        actor = SegmentActor(config.policy, plans, config.seed, config.max_steps, skills=env.suite.skills)
-        return TransformedEnv(env, QAFTransform(plans)), _clipped(actor, env.layout.action_size)
-    transform = policy.transform()
-    return env if transform is None else TransformedEnv(env, transform), _clipped(
-        policy_of(policy), env.layout.action_size
-    )
+        actor: _Actor = SegmentActor(config.policy, plans, config.seed, config.max_steps, skills=env.suite.skills)
+        transform: Transform | None = QAFTransform(plans)
+    else:
+        actor, transform = policy_of(policy), policy.transform()
+    seen = env if transform is None else TransformedEnv(env, transform)
+    return seen, _clipped(actor, env.layout.action_size)
 
 
 def suite_expert(suite: Suite, tasks: Sequence[str]) -> Any:
@@ -176,9 +171,7 @@ def suite_expert(suite: Suite, tasks: Sequence[str]) -> Any:
     if suite.make_expert is not None:
         return suite.make_expert(tasks)
     if suite.plans is None or suite.skills is None:
-        raise ValueError(
-            f"policy='expert': suite {suite.name!r} has no plans with scripted skills; give a policy of yours"
-        )
+        raise ValueError(f"policy='expert': suite {suite.name!r} has no plans with scripted skills; give a policy")
     suite.plans.require(tasks)
     return ScriptedSkillActor(Plans([suite.plans[task] for task in tasks]), skills=suite.skills)
 

@@ -149,11 +149,11 @@ def check_state(state: Any) -> dict[str, Any]:
         require(isinstance(given, Tensor) and given.dtype == dtype and given.numel() == 1, name, f"one {dtype}")
         found[name] = given.item()
     require(found["length"] >= 0, "length", "at least 0")
-    for name in ("order", "start", "size", "cursor", "known", "written"):
+    for name in (names := ("order", "start", "size", "cursor", "known", "written")):
         given = state.get(name)
         require(isinstance(given, Tensor) and given.dtype == torch.int64 and given.dim() == 1, name, "(n,) int64")
         found[name] = given.cpu()
-    order, start, size, cursor = (found[name] for name in ("order", "start", "size", "cursor"))
+    order, start, size, cursor, *_ = (found[name] for name in names)
     rows = len(order)
     sized = bool(((size > 0) & (size <= rows)).all()) and int(size.sum()) == rows
     require(sized, "size", f"of {rows} rows, none empty")

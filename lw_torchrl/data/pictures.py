@@ -197,11 +197,9 @@ def load_pictures(
     row = 0
     for (root, episode), length in zip(listed, lengths.tolist(), strict=True):
         if not wanted.file(root, episode).is_file():
-            raise DatasetError(
-                f"root: {str(root)!r} has no pictures of {episode.task}, episode {episode.episode}, by "
-                f"{', '.join(wanted.cameras)}, {height} times {width} pixels, every {every}; "
-                f"lw.data.add_pictures({str(root)!r}, ...) takes them"
-            )
+            by = f"by {', '.join(wanted.cameras)}, {height} times {width} pixels, every {every}"
+            what = f"root: {str(root)!r} has no pictures of {episode.task}, episode {episode.episode}, {by}"
+            raise DatasetError(f"{what}; lw.data.add_pictures({str(root)!r}, ...) takes them")
         found[row : row + length] = wanted.read(root, episode)[torch.arange(length) // every]
         row += length
     return found

@@ -18,7 +18,7 @@ from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.writers import Writer
 from torchrl.envs import Transform
 
-from lw_torchrl._checks import check_int, check_path, checked_but
+from lw_torchrl._checks import Count, Natural, check_path, checked_but
 from lw_torchrl._devices import CPU, check_device
 from lw_torchrl.data import replay_checks, selection
 from lw_torchrl.data.buffer_state import RestorableReplay, fingerprint
@@ -64,10 +64,8 @@ class LanguageWorldExperienceReplay(RestorableReplay):
         label: what ``action`` holds. "executed": what was executed, with reward and next; the only one for datasets in
             which others than the expert acted. "expert": what the expert wanted, in [-1, 1]; "unclipped": what its
             script asked for, up to 25; both without reward and next, which belong to the executed action.
-        reward: what ``("next", "reward")`` holds with label="executed": "sparse", the success as 0 and 1; "dense",
-            Meta-World's own, at most 10; "cost", -0.01 a step and 0 at success; or "dense_cost", what the dense reward
-            lacks of 10, divided by -100, and 0 at success. :meth:`extend` gives its rows the same reward.
-        after_success: drop the steps that come more than so many after the first success; None keeps all.
+        reward: what ``("next", "reward")`` holds with label="executed", a name in ``REWARDS``: "sparse", the success as
+            0 and 1; "dense", Meta-World's own; "cost" or "dense_cost". :meth:`extend` gives its rows the same.
         terminate_on_success: end each episode at its first success, with ``("next", "terminated")``, as
             ``LanguageWorldEnv(terminate_on_success=True)`` does; with label="executed".
         n_steps, gamma: as for :class:`JoinedStorage`, within the episode that is shown; with label="executed".
@@ -113,12 +111,12 @@ class LanguageWorldExperienceReplay(RestorableReplay):
         *,
         episodes: EpisodeChoice | Sequence[EpisodeChoice] = None,
         keep: EpisodeFilter | None = None,
-        batch_size: int | None = None,
+        batch_size: Count | None = None,
         sampler: Sampler | None = None,
         transform: Transform | None = None,
         label: Label = "expert",
         reward: RewardName = "sparse",
-        after_success: int | None = None,
+        after_success: Natural | None = None,
         terminate_on_success: bool = False,
         n_steps: int = 1,
         gamma: float | None = None,
@@ -130,18 +128,11 @@ class LanguageWorldExperienceReplay(RestorableReplay):
         check_n_steps(n_steps, gamma)
         replay_checks.check_transform(transform)
         if (prefetch := kwargs.get("prefetch") or 0) > 1:
-            raise ValueError(
-                f"prefetch must be None, 0 or 1, got {prefetch}: several threads draw the batches in an order that "
-                "differs from run to run"
-            )
+            raise ValueError(f"prefetch must be None, 0 or 1, got {prefetch}: several threads draw in no fixed order")
         if (n_steps > 1 or grow is not None) and label != "executed":
             raise ValueError(f"n_steps and grow need label='executed', whose actions the rewards are of, got {label!r}")
         if grow is not None:
             replay_checks.check_growing(sampler, kwargs)
-        if batch_size is not None:
-            check_int("batch_size", batch_size, minimum=1)
-        if after_success is not None:
-            check_int("after_success", after_success, minimum=0)
         if terminate_on_success and (label != "executed" or after_success is not None):
             raise ValueError(
                 "terminate_on_success ends an episode at its first success and needs label='executed' and no "
@@ -252,9 +243,7 @@ class LanguageWorldExperienceReplay(RestorableReplay):
             raise ValueError(f"add_column: {name!r} would be of no row that comes later, and this buffer grows")
         replay_checks.check_column(name, values, len(self), self.storage.get(slice(0, 1)).keys(), self.transform)
         if of is not None and not torch.equal(*(each.storage[:].get("observation").cpu() for each in (self, of))):
-            raise ValueError(
-                "of must show the rows of this buffer, in their order: the same folders, episodes and keep"
-            )
+            raise ValueError("of must show the rows of this buffer, in their order: the same episodes and keep")
         own = values.detach().clone()
         self.columns = {**self.columns, name: sha256(own.cpu().contiguous().numpy().tobytes()).hexdigest()}
         self.storage.add_column(name, own)

@@ -58,20 +58,15 @@ def check_reward(name: RewardName, reward: Tensor, success: Tensor) -> None:
     sparse = success.to(torch.float32)
     if stated.source == "sparse":
         if not torch.equal(reward, stated.of(sparse, success)):
-            raise ValueError(
-                f"batch: the reward is not the success, of which {name!r} is made; give reward='dense' or 'dense_cost' "
-                "for a dense one, make the environment with frame_skip=1, and scale rewards by a transform of the "
-                "buffer, not its own"
-            )
+            instead = "give reward='dense' or 'dense_cost' for a dense one, make the environment with frame_skip=1"
+            raise ValueError(f"batch: the reward is not the success, of which {name!r} is made; {instead}")
         return
     if stated.is_source and torch.equal(reward, sparse) and success.any():
         raise ValueError("batch: the reward is the success, but the demonstrations' is dense; give reward='sparse'")
     most = stated.of(reward.new_tensor([[_MOST]]), success.new_zeros(1, 1))
     if len(reward) and float(reward.max()) > float(most) + 1e-3:
-        raise ValueError(
-            f"batch: a reward of {float(reward.max()):.4g} is more than {name!r} gives in a step, {float(most):.4g}; "
-            "make the environment with frame_skip=1"
-        )
+        more = f"{float(reward.max()):.4g} is more than {name!r} gives in a step, {float(most):.4g}"
+        raise ValueError(f"batch: a reward of {more}; make the environment with frame_skip=1")
     if stated.at_success is not None and (reward[success] != stated.at_success).any():
         raise ValueError(f"batch: the reward of a success must be {stated.at_success} for {name!r}")
 

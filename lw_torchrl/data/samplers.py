@@ -135,8 +135,7 @@ class GroupSampler(Sampler):
         if worker is not None and worker.num_workers > 1 and self._process != os.getpid():
             raise RuntimeError(
                 f"each of the DataLoader's {worker.num_workers} workers would draw the same rows: in each, open the "
-                "buffer anew with a generator of its own, or replay.set_sampler(...) and replay.set_rng(...); see "
-                "docs/sampling.md"
+                "buffer anew, or replay.set_sampler(...) and replay.set_rng(...); see docs/sampling.md"
             )
         if not len(storage):
             raise ValueError("storage must hold at least one row, got an empty one")
@@ -230,9 +229,9 @@ class TaskBalancedSampler(GroupSampler):
     """Equal numbers from every task, exactly; within a task every row comes once before any comes again.
 
     The buffer may grow: new rows take random places in the present passes, and overwritten ones leave them; when a task
-    comes or goes, all passes begin anew. A batch costs no more than the rows written since the last one. It draws from
-    the replay buffer's generator, so ``ReplayBuffer(..., generator=...)`` fixes the batches; its state is saved with
-    the buffer's. An epoch is a pass over the largest task. The storage's entry ``task_key`` holds the task.
+    comes or goes, all passes begin anew. It draws from the replay buffer's generator, so ``ReplayBuffer(...,
+    generator=...)`` fixes the batches; its state is saved with the buffer's. An epoch is a pass over the largest task.
+    The storage's entry ``task_key`` holds the task.
 
     Raises:
         ValueError: at sampling, a batch size that the number of tasks does not divide (with the nearest that it does).
@@ -264,8 +263,6 @@ class TaskBalancedSampler(GroupSampler):
         groups = len(self._passes.size)
         count, rest = divmod(batch_size, groups)
         if rest or not count:
-            raise ValueError(
-                f"batch_size must be divisible by the number of tasks, {groups}, got {batch_size}; the nearest are "
-                + nearest_sizes(batch_size, groups)
-            )
+            what = f"batch_size must be divisible by the number of tasks, {groups}, got {batch_size}"
+            raise ValueError(f"{what}; the nearest are {nearest_sizes(batch_size, groups)}")
         return torch.full((groups,), count)

@@ -11,8 +11,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from lw_torchrl._checks import check_fields, check_int, check_probability, check_text, shown, unknown_name
-from lw_torchrl.data.dataset import CollectConfig, DamagedDatasetError, Demonstrations, EpisodeInfo
-from lw_torchrl.data.memory_map import load_rows
+from lw_torchrl.data.dataset import CollectConfig, Demonstrations, EpisodeInfo
+from lw_torchrl.data.memory_map import damaged, load_rows
 from lw_torchrl.data.passes import spans
 from lw_torchrl.data.rewards import REWARDS, RewardName
 from lw_torchrl.language.value_checks import finite
@@ -73,7 +73,7 @@ class EpisodeFilter:
         lost = []
         for task in sorted({episode.task for _, episode, *_ in listed}):
             ours = [row for row in listed if row[1].task == task]
-            left, share = [row for row in ours if self._keeps(parts[row[0]], row[1], row[2])], self.best
+            left, share = [row for row in ours if self._keeps(parts[row[0]], *row[1:3])], self.best
             if not left and self.else_best is not None:
                 left, share = ours, self.else_best
             if share is not None:  # the highest returns, and the shorter at a tie
@@ -145,20 +145,17 @@ def choose_episodes(found: Demonstrations, chosen: EpisodeChoice, argument: str 
 
 def _kept(episodes: Sequence[EpisodeInfo], after: int | None) -> tuple[Tensor, Tensor]:
     """The rows up to ``after`` steps past each episode's first success, and how many these are of each episode."""
-    shown = [
-        e.length if after is None or e.first_success is None else min(e.length, e.first_success + after)
-        for e in episodes
-    ]
+    cuts = [e.length if after is None or e.first_success is None else e.first_success + after for e in episodes]
+    shown = [min(e.length, cut) for e, cut in zip(episodes, cuts, strict=True)]
     starts, lengths = (torch.tensor(some, dtype=torch.int64) for some in ([e.start for e in episodes], shown))
     return spans(starts, lengths), lengths
 
 
 def returns_of(whole: Demonstrations, chosen: Demonstrations, reward: RewardName, after: int | None) -> Tensor:
     """The return and the number of rows, (E, 2) float64, of the chosen episodes up to ``after`` steps past success."""
-    rows, (kept, lengths) = load_rows(whole), _kept(chosen.episodes, after)
+    rows, (kept, lengths) = load_rows(whole).get("next"), _kept(chosen.episodes, after)
     made = REWARDS[reward]
-    source, success = (rows.get(("next", key))[kept] for key in (f"reward_{made.source}", "success"))
-    return episode_returns(made.of(source, success), lengths)
+    return episode_returns(made.of(rows.get(f"reward_{made.source}")[kept], rows.get("success")[kept]), lengths)
 
 
 def read_part(
@@ -176,10 +173,7 @@ def read_part(
         taken, other = ("expert_action", "unclipped_action")[:: 1 if label == "expert" else -1]
         rows = rows.exclude("next", "action", other).rename_key_(taken, "action")
     if not finite(rows.get("action")):
-        raise DamagedDatasetError(
-            f"root: an action in {str(whole.root)!r} is no finite number, for label={label!r}; the same "
-            "collect_demonstrations keeps the episodes that are whole and collects the others again"
-        )
+        raise damaged(f"an action in {str(whole.root)!r} is no finite number, for label={label!r}")
     if chosen.episodes == whole.episodes and after is None:
         return rows, None
     kept, lengths = _kept(chosen.episodes, after)

@@ -36,16 +36,13 @@ def _columns(parts: Sequence[TensorDictBase]) -> dict[NestedKey, list[Tensor]]:
         if number and (odd := sorted(map(column_name, found.keys() ^ columns.keys()))):
             raise ValueError(f"parts[{number}] must have the columns of parts[0], they differ in {', '.join(odd)}")
         for key, leaf in found.items():
+            where = f"parts[{number}]: column {column_name(key)} must be"
             if not isinstance(leaf, Tensor):
-                raise TypeError(
-                    f"parts[{number}]: column {column_name(key)} must be a tensor, got {type(leaf).__name__}"
-                )
+                raise TypeError(f"{where} a tensor, got {type(leaf).__name__}")
             before = columns.setdefault(key, [leaf])[0]
             if (leaf.shape[1:], leaf.dtype) != (before.shape[1:], before.dtype):
-                raise ValueError(
-                    f"parts[{number}]: column {column_name(key)} must be {before.dtype} of shape "
-                    f"{tuple(before.shape[1:])} a row as in parts[0], got {leaf.dtype} of shape {tuple(leaf.shape[1:])}"
-                )
+                wanted, got = (f"{one.dtype} of shape {tuple(one.shape[1:])}" for one in (before, leaf))
+                raise ValueError(f"{where} {wanted} a row as in parts[0], got {got}")
             if number:
                 columns[key].append(leaf)
     return columns
@@ -55,12 +52,11 @@ class JoinedStorage(Storage):
     """Rows of several tensordicts, memory-mapped ones say, behind one index; only the batch that is read is copied.
 
     The rows come in the order of the parts, and within a part in the order of ``rows``. The storage is read-only, and
-    its state is its length. A replay buffer over it needs ``collate_fn=lambda batch: batch``;
-    :class:`LanguageWorldExperienceReplay` sets that.
+    its state is its length. A replay buffer over it needs ``collate_fn=lambda batch: batch``.
 
     With ``n_steps``, the entries under ``"next"`` are those of the row so many steps ahead, or of the trajectory's last
     row if that comes before. ``("next", "reward")`` is the discounted sum on the way, and ``steps_to_next_obs``, (B,)
-    int64, the number of steps, which TorchRL's value estimators read. This takes three numbers a row in memory.
+    int64, the number of steps, which TorchRL's value estimators read.
 
     Args:
         parts: P tensordicts of one batch dimension and the same columns (names, dtypes, shapes of a row).
@@ -104,9 +100,8 @@ class JoinedStorage(Storage):
         for number, (one, (start, end)) in enumerate(zip(chosen, pairwise(self._bounds()), strict=True)):
             local = torch.arange(end - start) if one is None else one.to(torch.int64)
             if len(local) and not 0 <= int(local.min()) <= int(local.max()) < end - start:
-                raise IndexError(
-                    f"rows[{number}] must be in [0, {end - start}), got {int(local.min())}..{int(local.max())}"
-                )
+                got = f"{int(local.min())}..{int(local.max())}"
+                raise IndexError(f"rows[{number}] must be in [0, {end - start}), got {got}")
             taken.append(local + start)
         self._rows = torch.cat(taken)
         self.num_joined, self.num_parts = len(self._rows), len(parts)
@@ -212,9 +207,7 @@ class JoinedStorage(Storage):
 
     def contains(self, item: Any) -> Any:
         """Whether an index, or each of a tensor of indices, is one of a row."""
-        if isinstance(item, Tensor):
-            return (item >= -len(self)) & (item < len(self))
-        return -len(self) <= item < len(self)
+        return (item >= -len(self)) & (item < len(self))
 
     _refusal = "this storage is read-only: it shows datasets as they are on disk"
 
@@ -268,11 +261,8 @@ def to_device_of(storage: Storage, index: Tensor) -> Tensor:
 
 
 class DeviceStorage(JoinedStorage):
-    """The rows of a :class:`JoinedStorage`, copied once to a device's memory.
-
-    Samplers draw on the CPU, with the buffer's generator, so minibatches are the same on every device. Source:
-    ``torchrl.data.LazyTensorStorage(device=...)``, whose samplers need a generator of the device.
-    """
+    """The rows of a :class:`JoinedStorage`, copied once to a device's memory; samplers draw on the CPU all the same.
+    Source: ``torchrl.data.LazyTensorStorage(device=...)``, whose samplers need a generator of the device."""
 
     def __init__(self, storage: JoinedStorage, device: torch.device) -> None:
         rows: TensorDictBase = storage.get(slice(None))

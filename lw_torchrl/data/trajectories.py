@@ -19,22 +19,15 @@ MASK = ("collector", "mask")
 
 
 def collected_rows(batch: TensorDictBase, columns: Mapping[NestedKey, Tensor]) -> dict[NestedKey, Tensor]:
-    """The ``columns`` of a collector's batch (n, ...), flattened to one dimension.
-
-    ``action`` is ``("next", "executed_action")`` where the batch has that; a policy's own may be outside [-1, 1], which
-    is refused, as are other columns, dtypes or shapes, NaN, and rows of n steps or, by :data:`MASK`, of padding.
-    """
+    """The ``columns`` of a collector's batch (n, ...), flattened to one dimension; ``action`` is what was executed.
+    Other columns, dtypes or shapes, NaN, actions outside [-1, 1], and rows of n steps or of padding are refused."""
     names = set(batch.keys(True, True))
     if STEPS in names:
-        raise ValueError(
-            f"batch holds {STEPS}, so MultiStep or MultiStepTransform was here: leave it out and give the buffer "
-            "n_steps= and gamma=, which makes n steps of the demonstrations and of these rows alike"
-        )
+        why = "so MultiStep or MultiStepTransform was here: leave it out and give the buffer n_steps= and gamma="
+        raise ValueError(f"batch holds {STEPS}, {why}")
     if MASK in names and not batch.get(MASK).all():
-        raise ValueError(
-            "batch holds rows that are no steps: split_trajs=True fills trajectories up to one length; leave it out, "
-            "or give batch[batch['collector', 'mask']]"
-        )
+        instead = "leave it out, or give batch[batch['collector', 'mask']]"
+        raise ValueError(f"batch holds rows that are no steps: split_trajs=True fills trajectories up; {instead}")
     sources = {key: EXECUTED if key == "action" and EXECUTED in names else key for key in columns}
     if absent := [column_name(key) for key, source in sources.items() if source not in names]:
         raise ValueError(f"batch lacks the columns {', '.join(absent)}, which the demonstrations have")
@@ -43,18 +36,15 @@ def collected_rows(batch: TensorDictBase, columns: Mapping[NestedKey, Tensor]) -
         leaf = batch.get(sources[key])
         tail = leaf.shape[batch.ndim :]
         if leaf.dtype != like.dtype or tail != like.shape[1:]:
-            raise ValueError(
-                f"batch: column {column_name(sources[key])} must be {like.dtype} of shape {tuple(like.shape[1:])} a "
-                f"row as in the demonstrations, got {leaf.dtype} of shape {tuple(tail)}"
-            )
+            wanted = f"{like.dtype} of shape {tuple(like.shape[1:])} a row as in the demonstrations"
+            got = f"{leaf.dtype} of shape {tuple(tail)}"
+            raise ValueError(f"batch: column {column_name(sources[key])} must be {wanted}, got {got}")
         if leaf.dtype.is_floating_point and not leaf.isfinite().all():
             raise ValueError(f"batch: column {column_name(sources[key])} holds NaN or an infinite number")
         found[key] = leaf.detach().reshape(-1, *tail)
     if sources.get("action") == "action" and (most := float(found["action"].abs().max())) > 1.0:
-        raise ValueError(
-            f"batch: action must be what was done, in [-1, 1], got one of {most:.3g}; LanguageWorldEnv gives it as "
-            "('next', 'executed_action'), which is taken where it is there"
-        )
+        instead = "LanguageWorldEnv gives it as ('next', 'executed_action')"
+        raise ValueError(f"batch: action must be what was done, in [-1, 1], got one of {most:.3g}; {instead}")
     return found
 
 
@@ -101,11 +91,8 @@ def link_rows(
     batch: Columns, opened: OpenTrajectories, ring: Columns, serial: int, number: int
 ) -> tuple[Tensor, Tensor, OpenTrajectories]:
     """The serial number of the row before each, (n,) int64, -1 where a trajectory begins; each trajectory's number,
-    (n,) int64; and the trajectories that may continue.
-
-    Rows of one collector's id are in the order of time; :class:`GrowingStorage` says which row follows another, the
-    last rows of ``opened`` are in ``ring``, and ``serial`` and ``number`` are of the first row and the next trajectory.
-    """
+    (n,) int64; and the trajectories that may continue. :class:`GrowingStorage` says which row follows another; the last
+    rows of ``opened`` are in ``ring``, ``serial`` and ``number`` are of the first row and the next trajectory."""
     key, done = batch[TRAJECTORY].reshape(-1), batch[DONE].reshape(-1)
     slots = opened.last % len(ring[TRAJECTORY])
     order = key.argsort(stable=True)

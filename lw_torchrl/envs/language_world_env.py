@@ -17,7 +17,7 @@ from torchrl._utils import seed_generator
 from torchrl.data import Unbounded
 from torchrl.envs import EnvBase
 
-from lw_torchrl._checks import check_int, checked
+from lw_torchrl._checks import Count, check_int, checked
 from lw_torchrl._keys import row_mask
 from lw_torchrl._rendering import check_picture
 from lw_torchrl.envs.row_states import RowStates, action_spec, clipped_action, done_spec, observation_spec
@@ -33,25 +33,23 @@ class LanguageWorldEnv(EnvBase):
     """N environments over any mixture of the 50 tasks, stepped together, by the MT50-rand protocol: a random initial
     state and goal at every reset, the goal observed, 500 steps, ended only by truncation.
 
-    Row i has the task ``tasks[i % n]``. The m-th reset of the r-th of a task's R rows is that task's episode m·R + r.
-    An episode starts as Meta-World's own environment does after ``env.seed(episode_seed(task, seed, episode));
+    Row i has the task ``tasks[i % n]``. The m-th reset of the r-th of a task's R rows is that task's episode m·R + r;
+    in the w-th of W workers it is (m·W + w)·R + r, so that these run the episodes of one environment with W·R rows. An
+    episode starts as Meta-World's own environment does after ``env.seed(episode_seed(task, seed, episode));
     env.reset()``, whatever ran before or beside it.
 
     ``env.reset(episode=7)`` or ``env.reset(episode=tensor)``, int64 (N,), starts these episodes and counts as a reset.
     A SerialEnv or ParallelEnv takes ``reset(list_of_kwargs=[{"episode": ...}, ...])``. A reset ignores the ``episode``
     in a tensordict, unless ``reset(tensordict, set_state=True)`` asks for its beginning; an ``observation`` that is not
-    the episode's first is refused, since the middle of an episode cannot be restored. ``set_state`` does not reach
-    through a TransformedEnv, which hands down no outputs.
+    the episode's first is refused, and a TransformedEnv hands down no outputs.
 
-    In the w-th of W workers the m-th reset is episode (m·W + w)·R + r: W workers run the episodes of one environment
-    with W·R rows. TorchRL's SerialEnv, ParallelEnv, AsyncEnvPool and multi-process collectors are recognised when they
-    call the function that makes the environment; elsewhere (Ray, RPC, your own processes) give ``worker=(w, W)``, or
-    another seed to each.
+    TorchRL's SerialEnv, ParallelEnv, AsyncEnvPool and multi-process collectors are recognised when they call the
+    function that makes the environment; elsewhere (Ray, RPC, your own processes) give ``worker=(w, W)``, or another
+    seed to each.
 
     ``state_dict`` holds the seed and the counters; an environment that loads it must be reset, and continues with the
     next episodes. A TransformedEnv, and a Collector with it, saves it by its
-    :class:`~lw_torchrl.transforms.QAFTransform` or :class:`~lw_torchrl.transforms.EnvState`; call ``collector.reset()``
-    after ``collector.load_state_dict``.
+    :class:`~lw_torchrl.transforms.QAFTransform` or :class:`~lw_torchrl.transforms.EnvState`.
 
     Keys (B = (N,)); a ``_step`` mask leaves rows where they are, a ``_reset`` mask resets only its rows:
         observation: (N, 39) float32, Meta-World's vector: metres, gripper opening in [0, 1], quaternions.
@@ -109,14 +107,14 @@ class LanguageWorldEnv(EnvBase):
         self,
         tasks: str | Task | Iterable[str | Task],
         *,
-        num_envs: int | None = None,
+        num_envs: Count | None = None,
         seed: int = 0,
         suite: str | Suite | None = None,
         engine: Literal["vectorized", "metaworld"] | Callable[..., Engine] | None = None,
-        num_threads: int | None = None,
+        num_threads: Count | None = None,
         reward: Literal["sparse", "dense"] = "sparse",
-        max_steps: int | None = None,
-        frame_skip: int = 1,
+        max_steps: Count | None = None,
+        frame_skip: Count = 1,
         terminate_on_success: bool = False,
         strict: bool = False,
         worker: tuple[int, int] | None = None,
@@ -127,24 +125,20 @@ class LanguageWorldEnv(EnvBase):
         named = self.suite.named_tasks(tasks)
         self.tasks, self.layout = tuple(named), one_layout(named.values())
         n = len(self.tasks)
-        num_envs = n if num_envs is None else check_int("num_envs", num_envs, minimum=1)
+        num_envs = n if num_envs is None else int(num_envs)
         if num_envs < n:
             raise ValueError(f"num_envs must be at least the number of tasks, {n}, got {num_envs}")
-        if num_threads is not None:
-            check_int("num_threads", num_threads, minimum=1)
-        self.max_steps = self.suite.max_steps if max_steps is None else check_int("max_steps", max_steps, minimum=1)
-        self.frame_skip = check_int("frame_skip", frame_skip, minimum=1)
+        self.max_steps = self.suite.max_steps if max_steps is None else int(max_steps)
+        self.frame_skip = int(frame_skip)
         self.strict, self.terminate_on_success = strict, terminate_on_success
         if batch_size is not None and (batch_size not in ((), []) or num_envs != 1):
-            raise ValueError(
-                f"batch_size must be (), for a single environment, or None for one dimension of {num_envs} rows, got "
-                f"{batch_size!r}"
-            )
+            wanted = f"(), for a single environment, or None for one dimension of {num_envs} rows"
+            raise ValueError(f"batch_size must be {wanted}, got {batch_size!r}")
         self.row_tasks = tuple(self.tasks[i % n] for i in range(num_envs))
         found = torchrl_worker()  # which refuses some pools
         self.worker = found if worker is None else check_worker(worker)
         self._process = os.getpid()
-        lock = RLock()
+        lock = RLock()  # a Lock would stay taken if an interrupt came between taking it and the block
         self._one_thread, self._last_one = OneThread(lock), OneThread(lock, patience=10.0)
         self._counter = EpisodeCounter([named[t] for t in self.row_tasks], check_int("seed", seed), self.worker)
         super().__init__(device=torch.device("cpu"), batch_size=(num_envs,) if batch_size is None else ())
@@ -205,18 +199,15 @@ class LanguageWorldEnv(EnvBase):
         return super().load_state_dict(state_dict, strict=strict, assign=assign)
 
     def __getstate__(self) -> NoReturn:
-        raise TypeError(
-            "a LanguageWorldEnv holds running simulators and can be neither pickled nor copied: pass a function that "
-            "makes it, lambda: LanguageWorldEnv(...)"
-        )
+        raise TypeError("a LanguageWorldEnv can be neither pickled nor copied: pass a function that makes it")
 
     def _check_usable(self) -> None:
         if self.is_closed:
             raise RuntimeError("this environment is closed (a collector closes its own at its end): make a new one")
         if os.getpid() != self._process:
             raise RuntimeError(
-                "this environment was made in the process that this one was forked from, and its threads stayed there: "
-                "make the environment in this process (give ParallelEnv or a collector a function that makes it)"
+                "this environment was made in the process that this one was forked from: make the environment in this "
+                "process (give ParallelEnv or a collector a function that makes it)"
             )
 
     @one_thread_at_a_time
@@ -244,10 +235,8 @@ class LanguageWorldEnv(EnvBase):
         active = row_mask(tensordict, "_step", len(self.row_tasks))
         if (active & self._rows.over).any():
             rows = np.flatnonzero(active & self._rows.over)[:5].tolist()
-            raise RuntimeError(
-                f"rows {rows} have ended or were never reset, or not since load_state_dict: reset them before the "
-                "next step (env.reset(), collector.reset())"
-            )
+            what = "have ended or were never reset, or not since load_state_dict"
+            raise RuntimeError(f"rows {rows} {what}: reset them before the next step")
         stepped = active
         if math.isnan(action.sum()):  # of numbers in [-1, 1], so one of them is NaN
             broken = active & np.isnan(action).any(-1)
@@ -281,10 +270,9 @@ class LanguageWorldEnv(EnvBase):
         if not rows.any():
             return
         row = int(np.flatnonzero(rows)[0])
-        message = (
-            f"row {row}: {what}, in task {self.row_tasks[row]!r}, seed {self.seed}, episode "
-            f"{self._rows.episode[row]}, step {self._rows.steps[row]}" + f" ({rows.sum()} rows)" * int(rows.sum() > 1)
-        )
+        where = f"in task {self.row_tasks[row]!r}, seed {self.seed}, episode {self._rows.episode[row]}"
+        more = f" ({rows.sum()} rows)" if rows.sum() > 1 else ""
+        message = f"row {row}: {what}, {where}, step {self._rows.steps[row]}{more}"
         if fatal:
             raise ValueError(f"action must hold numbers: {message}")
         self._rows.fault |= rows
@@ -297,9 +285,8 @@ class LanguageWorldEnv(EnvBase):
         """Pictures of rows as they are now, for TorchRL's PixelRenderTransform and VideoRecorder, and
         :class:`CameraTransform`: (len(rows), height, width, 3) uint8, (height, width, 3) with ``batch_size=()``.
 
-        OpenGL draws them, without shadows; on Linux without a display and MUJOCO_GL it is EGL. A picture changes
-        nothing in the simulation. With a PixelRenderTransform, read the environment's ``observation_spec`` before the
-        first reset; otherwise the first step resets it.
+        OpenGL draws them, without shadows; on Linux without a display and MUJOCO_GL it is EGL. With a
+        PixelRenderTransform, read the environment's ``observation_spec`` before the first reset.
 
         Args:
             camera: "corner2", "corner", "corner3", "corner4", "topview", "behindGripper" or "gripperPOV".
@@ -325,9 +312,7 @@ class LanguageWorldEnv(EnvBase):
         if (self._rows.episode[list(asked)] < 0).any():
             raise RuntimeError("there is nothing to see before a reset: call env.reset()")
         if not hasattr(self._engine, "render"):
-            raise NotImplementedError(
-                f"engine {type(self._engine).__name__} has no render; see lw_torchrl.suites.cameras"
-            )
+            raise NotImplementedError(f"engine {type(self._engine).__name__} has no render; see suites.cameras")
         if not asked:
             return torch.zeros(0, height, width, 3, dtype=torch.uint8)
         pictures = torch.from_numpy(self._engine.render(asked, camera=camera, height=height, width=width))

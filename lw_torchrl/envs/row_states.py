@@ -140,10 +140,8 @@ class RowStates:
         """Raise :class:`ValueError` if a state to go to is of other tasks."""
         given = tensordict.get("task_id", None)
         if given is not None and not torch.equal(given.cpu().reshape(-1)[rows], self.task_id[rows]):
-            raise ValueError(
-                "set_state=True needs the state of an environment with the same rows, and task_id names other tasks "
-                f"than those of this one, {', '.join(self.tasks[:6])}{', ...' * (len(self.tasks) > 6)}"
-            )
+            told = f"those of this one, {', '.join(self.tasks[:6])}{', ...' * (len(self.tasks) > 6)}"
+            raise ValueError(f"set_state=True needs the state of the same rows, task_id names other tasks than {told}")
 
     def refuse_later_steps(self, tensordict: TensorDictBase, rows: Rows) -> None:
         """Raise :class:`ValueError`, and require a reset, if a state to go to is not the first of its episode."""
@@ -156,6 +154,5 @@ class RowStates:
             self.over[later] = True
             raise ValueError(
                 f"set_state=True goes to the beginning of an episode, and the observation of rows {later[:5].tolist()} "
-                "is of a later step, or of another seed: physics in the middle cannot be restored. Leave observation "
-                "out, or repeat the episode's executed actions from its beginning"
+                "is of a later step or another seed: leave it out, or repeat the actions, physics cannot be restored"
             )

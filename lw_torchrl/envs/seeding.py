@@ -61,10 +61,8 @@ def stated_episode(tensordict: TensorDictBase | None, episode: int | Tensor | No
     if episode is not None:
         raise ValueError("episode and set_state=True each name an episode: give one of them")
     if tensordict is None or (episode := tensordict.get("episode", None)) is None:
-        raise ValueError(
-            "set_state=True needs episode in the tensordict; a TransformedEnv does not hand it down: "
-            "reset(episode=tensordict['episode'])"
-        )
+        instead = "a TransformedEnv does not hand it down: reset(episode=tensordict['episode'])"
+        raise ValueError(f"set_state=True needs episode in the tensordict; {instead}")
     return episode
 
 
@@ -122,14 +120,11 @@ class EpisodeCounter:
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise ValueError(f"state_dict is none of a LanguageWorldEnv: {error!r:.200}") from error
         if names != self.names:
-            raise ValueError(
-                f"state_dict is of an environment with other rows, {len(names)}: {_few(names)}; this one has "
-                f"{len(self.names)}: {_few(self.names)}"
-            )
+            told = f"{len(names)}: {_few(names)}; this one has {len(self.names)}: {_few(self.names)}"
+            raise ValueError(f"state_dict is of an environment with other rows, {told}")
         if len(resets) != len(names) or any(type(one) is not int or not 0 <= one < _MOST_RESETS for one in resets):
-            raise ValueError(
-                f"state_dict must count the resets of {len(names)} rows, below {_MOST_RESETS}, got {shown(resets)}"
-            )
+            what = f"count the resets of {len(names)} rows, below {_MOST_RESETS}"
+            raise ValueError(f"state_dict must {what}, got {shown(resets)}")
         self.seed, self.resets = seed, np.array(resets, dtype=np.int64)
 
 

@@ -9,8 +9,7 @@ from multiprocessing import current_process, parent_process
 from types import FrameType
 from typing import Any, NoReturn, TypeVar
 
-MANY = 2**16
-"""Stands for a number of workers that TorchRL does not tell: more than there are."""
+MANY = 2**16  # stands for a number of workers that TorchRL does not tell: more than there are
 
 Locals = Mapping[str, Any]
 
@@ -20,10 +19,8 @@ def _by_process(level: int) -> tuple[int, int]:
 
 
 def _threads(found: Locals) -> NoReturn:
-    raise RuntimeError(
-        "a ThreadingAsyncEnvPool steps an environment now from one thread and now from another, which MuJoCo may not "
-        "survive, and does not say which of its environments this is: take backend='multiprocessing'"
-    )
+    what = "steps an environment from several threads, and does not say which of its environments this is"
+    raise RuntimeError(f"a ThreadingAsyncEnvPool {what}: take backend='multiprocessing'")
 
 
 def _remote(found: Locals) -> tuple[int, int]:
@@ -51,9 +48,8 @@ _WORKER_PROCESSES: dict[tuple[str, str], Callable[[Locals], tuple[int, int]]] = 
 
 
 def torchrl_worker() -> tuple[int, int]:
-    """(rank, of) of the worker that this is called in, (0, 1) outside; workers within workers are counted through. For
-    collectors and AsyncEnvPool ``of`` is :data:`MANY`. Workers of a ParallelEnv without shared buffers are known by the
-    order in which they were started."""
+    """(rank, of) of the worker that this is called in, (0, 1) outside; workers within workers are counted through. Of
+    collectors and AsyncEnvPool ``of`` is :data:`MANY`."""
     rank, of, processes = 0, 1, 0
     frame: FrameType | None = sys._getframe(1)
     while frame is not None:
@@ -76,8 +72,7 @@ Method = TypeVar("Method", bound=Callable[..., Any])
 
 class OneThread:
     """Lets one thread in at a time, which may enter again; two would break MuJoCo's memory or, silently, its numbers.
-    Entering raises a RuntimeError if another thread is in for longer than ``patience`` seconds. A Lock, unlike the
-    RLock, would stay taken if an interrupt came between taking it and the block."""
+    Entering raises a RuntimeError if another thread is in for longer than ``patience`` seconds."""
 
     def __init__(self, lock: Any, patience: float = 0.0) -> None:
         self._lock, self._patience = lock, patience
@@ -85,8 +80,8 @@ class OneThread:
     def __enter__(self) -> None:
         if not self._lock.acquire(timeout=self._patience):
             raise RuntimeError(
-                "another thread is stepping, resetting or drawing this environment, and a simulation takes one thread "
-                "at a time: make an environment in each thread, or one with num_envs= and step its rows together"
+                "another thread is stepping, resetting or drawing this environment, which takes one thread at a time: "
+                "make an environment in each thread, or one with num_envs= and step its rows together"
             )
 
     def __exit__(self, *error: object) -> None:

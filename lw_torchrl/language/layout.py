@@ -90,18 +90,15 @@ class Layout:
     def __post_init__(self) -> None:
         check_fields(self)
         if not self.things or not all(isinstance(thing, Slot) for thing in self.things):
-            raise ValueError(
-                f"things of layout {self.name!r} must be a tuple of at least one Slot, got {self.things!r}"
-            )
+            raise ValueError(f"things of layout {self.name!r} must be at least one Slot, got {self.things!r}")
         ends = [self.hand + 3, self.opening + 1, self.goal + 3, *(thing.position + 3 for thing in self.things)]
         ends += [thing.quaternion + 4 for thing in self.things if thing.quaternion is not None]
         if min(self.hand, self.opening, self.goal) < 0 or max(ends) > self.size:
             raise ValueError(f"layout {self.name!r} names numbers outside the {self.size} of an observation")
         for name, index, width in (("displacement", self.displacement, 3), ("gripper", self.gripper, 1)):
             if index is not None and not 0 <= index <= self.action_size - width:
-                raise ValueError(
-                    f"{name} of layout {self.name!r} must be within {self.action_size} numbers, got {index}"
-                )
+                within = f"within {self.action_size} numbers"
+                raise ValueError(f"{name} of layout {self.name!r} must be {within}, got {index}")
         if self.closes not in (1, -1):
             raise ValueError(f"closes of layout {self.name!r} must be 1 or -1, got {shown(self.closes)}")
         if self.reach <= 0:

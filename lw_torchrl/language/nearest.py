@@ -190,9 +190,8 @@ def nearest_skill(
 
 
 class StepMapper:
-    """Maps the words of one answer to queries and scripted skills. A distance is 1 minus a similarity in [0, 1].
-
-    The words of data/words.toml and the names of the task's target are replaced by ours first.
+    """Maps the words of one answer, those of data/words.toml replaced by ours, to queries and scripted skills; a
+    distance is 1 minus a similarity in [0, 1].
 
     Source: paper section 'LLM Experiments', which takes the nearest by string edit distance.
     """

@@ -10,8 +10,8 @@ from typing import Literal
 from lw_torchrl._checks import check_choice, check_probability, checked, counted, shown
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.formats.base import Clause, Note, Reading, Section, listed_steps
-from lw_torchrl.language.formats.prose import read_prose
-from lw_torchrl.language.formats.python import read_python
+from lw_torchrl.language.formats.prose import ProseReading
+from lw_torchrl.language.formats.python import PythonReading
 from lw_torchrl.language.nearest import StepMapper
 from lw_torchrl.language.plan_text import MOST_STEPS
 from lw_torchrl.language.plans import ConditionalPlan, PlanStep
@@ -157,7 +157,7 @@ def _same(name: str, task: Task) -> bool:
 def _read(text: str, task: Task, read: Callable[[str], Reading]) -> tuple[Reading, Section]:
     """What the text says, by the reader that finds something for the task, and the section that is taken."""
     found: list[tuple[Reading, Section]] = []
-    for reader in dict.fromkeys((read, read_python, read_prose)):
+    for reader in dict.fromkeys((read, PythonReading, ProseReading)):
         reading = reader(text)
         asked = [reading.sections[0], *(section for section in reading.sections[1:] if _same(section.task, task))]
         section = max(asked, key=lambda section: len(section.clauses))

@@ -95,10 +95,8 @@ class ConditionalPlan:
     @classmethod
     def from_pairs(cls, task: str | Task, pairs: Iterable[tuple[str | Query, str]]) -> ConditionalPlan:
         """A plan from (condition, skill) pairs, the conditions in any accepted spelling."""
-        definition, listed = get_task(task), list(pairs)
-        if len(listed) > MOST_STEPS:
-            raise PlanError(too_many_steps(f"plan of task {definition.name!r}", len(listed)))
-        steps = tuple(PlanStep(check_query(query, definition), skill) for query, skill in listed)
+        definition = get_task(task)
+        steps = tuple(PlanStep(check_query(query, definition), skill) for query, skill in pairs)
         return cls(definition.name, steps, definition)
 
     @property
@@ -181,14 +179,11 @@ class Plans(Mapping[str, ConditionalPlan]):
         listed = list(plans.values() if isinstance(plans, Mapping) else plans)
         for plan in listed:
             if not isinstance(plan, ConditionalPlan):
-                raise TypeError(
-                    f"plans must hold ConditionalPlan, got {plan!r} ({type(plan).__name__}); "
-                    "ConditionalPlan.from_pairs makes one of conditions and skills, QueryProgram takes queries alone"
-                )
-        if isinstance(plans, Mapping):
-            for name, plan in plans.items():
-                if name != plan.task:
-                    raise PlanError(f"plans[{name!r}] is a plan for another task, {plan.task!r}")
+                made = "from_pairs makes one of conditions and skills, QueryProgram takes queries alone"
+                raise TypeError(f"plans must hold ConditionalPlan, got {plan!r} ({type(plan).__name__}); {made}")
+        for name, plan in plans.items() if isinstance(plans, Mapping) else ():
+            if name != plan.task:
+                raise PlanError(f"plans[{name!r}] is a plan for another task, {plan.task!r}")
         if len({plan.task for plan in listed}) != len(listed):
             raise PlanError("plans must hold one plan for each task")
         if not listed:

@@ -117,12 +117,11 @@ class QueryProgram(nn.Module):
 
         A comparison's margin is the distance to its threshold, divided by its temperature (see
         :class:`~lw_torchrl.language.relations.Comparison`). A conjunction has the least margin of its parts, a
-        negation the opposite one. The sign is the hard truth, never zero: positive where the query holds. The
-        gradient is that of the comparison that decides; it is finite everywhere.
+        negation the opposite one. The sign is the hard truth, never zero. The gradient is that of the comparison that
+        decides; it is finite everywhere.
 
         Args:
-            observation: (..., D) float, as the tasks' layout says; Meta-World's 39 numbers, metres.
-            task_id: (...) int64.
+            observation, task_id: as for :meth:`forward`.
             temperature: multiplies every comparison's own, between 1e-6 and 1e6.
 
         Returns:
@@ -131,10 +130,8 @@ class QueryProgram(nn.Module):
         Example:
             >>> import torch, lw_torchrl as lw
             >>> program = QueryProgram({"reach": ["the gripper is near the reach target"]})
-            >>> state = torch.zeros(1, 39, requires_grad=True)
-            >>> logit = program.logits(state, torch.tensor([lw.task_id("reach")]))
-            >>> logit.item() > 0, torch.autograd.grad(logit.sum(), state)[0].isfinite().all().item()
-            (True, True)
+            >>> program.logits(torch.zeros(1, 39), torch.tensor([lw.task_id("reach")])).item() > 0
+            True
         """
         if not isinstance(temperature, Real) or not 1e-6 <= temperature <= 1e6:
             raise ValueError(f"temperature must be a number between 1e-6 and 1e6, got {temperature!r}")
@@ -187,7 +184,6 @@ def _check_batch(observation: Tensor, task_id: Tensor, size: int) -> None:
             raise TypeError(f"{name} must be a tensor, got {type(given).__name__}; torch.as_tensor makes one")
     shape, ids = tuple(observation.shape), tuple(task_id.shape)
     if shape[-1:] != (size,) or not observation.is_floating_point():
-        got = f"{observation.dtype} of shape {shape}"
-        raise ValueError(f"observation must be float of shape (..., {size}), got {got}")
+        raise ValueError(f"observation must be float of shape (..., {size}), got {observation.dtype} of shape {shape}")
     if ids != shape[:-1] or task_id.dtype not in (torch.int64, torch.int32):
         raise ValueError(f"task_id must be int64 of shape {shape[:-1]}, got {task_id.dtype} of shape {ids}")

@@ -31,19 +31,16 @@ class Atom(NamedTuple):
         return [coordinate_index(c, constants, size) for c in used]
 
     @property
-    def _sign(self) -> int:
-        return 1 if self.part.sense == "<" else -1
-
-    @property
     def offset(self) -> list[float]:
         """What is added to the difference of the positions, metres."""
-        moved = (self.shift[0], self.shift[1], self.shift[2] + self.part.raise_z)
-        used = zip("xyz", moved, strict=True)
-        return [self._sign * metres if axis in self.part.axes else 0.0 for axis, metres in used]
+        x, y, z = self.shift
+        used, sign = zip("xyz", (x, y, z + self.part.raise_z), strict=True), 1 if self.part.sense == "<" else -1
+        return [sign * metres if axis in self.part.axes else 0.0 for axis, metres in used]
 
     @property
     def threshold(self) -> float:
-        return self.part.threshold * self._sign  # metres; the value is below it where the atom holds
+        """Metres; the value is below it where the atom holds."""
+        return self.part.threshold if self.part.sense == "<" else -self.part.threshold
 
     @property
     def far(self) -> bool:
@@ -211,16 +208,7 @@ def compile_facts(queries: Mapping[Task, Sequence[Query]]) -> QueryFacts | None:
     steps = max(len(literals) for *_, literals in tasks)
     padded = [literals + [(_FALSE, _FALSE)] * (steps - len(literals)) for *_, literals in tasks]
     care, want = np.moveaxis(np.array(padded, np.uint64), 2, 0)
-    return QueryFacts(
-        ids=np.array(ids),
-        row_of=row_of,
-        ends=np.array(ends, np.uint64),
-        places=np.array(places, np.uint64),
-        metres=np.array(metres),
-        bit=np.array(bits, np.uint64),
-        flipped=np.array(flipped, np.uint64),
-        conjunction=np.array(conjunctions, np.uint64).reshape(-1, 2),
-        care=np.ascontiguousarray(care),
-        want=np.ascontiguousarray(want),
-        constants=np.array(constants),
-    )
+    whole = {"ends": ends, "places": places, "bit": bits, "flipped": flipped, "care": care, "want": want}
+    facts = {name: np.array(table, np.uint64, order="C") for name, table in whole.items()}
+    facts["conjunction"] = np.array(conjunctions, np.uint64).reshape(-1, 2)
+    return QueryFacts(ids=np.array(ids), row_of=row_of, metres=np.array(metres), constants=np.array(constants), **facts)

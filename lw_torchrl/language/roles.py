@@ -12,7 +12,6 @@ from lw_torchrl.language.plans import ConditionalPlan, PlanStep
 from lw_torchrl.language.skills import Skills, skills_for
 from lw_torchrl.language.tasks import Task
 
-Source = Literal["skill", "words", "condition", "nothing"]
 _TARGET = "target location"
 _NAMES_OF_THE_GOAL = (_TARGET, "reach target")
 _ACTED_ON = re.compile(r"(?:^|, |and |then )\w+ (?:the )?<([^>]*)>")
@@ -25,10 +24,7 @@ class Roles:
 
     target: str | None  # the object or point to go to; None if unknown
     moved: str | None  # what is to arrive there, the robot's gripper or a thing; None if unknown
-    source: Source  # what told it: a scripted skill, the step's text, or what the condition compares
-
-
-_NOTHING = Roles(None, None, "nothing")
+    source: Literal["skill", "words", "condition", "nothing"]  # what told it: a scripted skill, the text, the condition
 
 
 def role_object(task: Task, name: str) -> NamedObject:
@@ -44,12 +40,12 @@ def _goal(task: Task) -> NamedObject:
 def plan_roles(plan: ConditionalPlan, skills: Skills | None = None) -> tuple[Roles, ...]:
     """The roles of each step of a plan.
 
-    If the text is that of a scripted skill for the task, the skill's ``target`` and ``moved`` count, and nothing else
-    of it. Otherwise the words of the text decide; if they name nothing of the task ("close the gripper around the puck"
-    for a mug), the condition does. If the gripper goes to a thing and the condition compares it with a point on that
-    thing, the point is the target. If the text moves a thing that the condition says is held, the thing is moved,
-    though a script steers the gripper. "the target location" is the goal in every task.
-    ``skills`` are the scripted skills by their text; None for the shipped ones, an empty mapping for words alone.
+    If the text is that of a scripted skill for the task, the skill's ``target`` and ``moved`` count. Otherwise the
+    words of the text decide; if they name nothing of the task ("close the gripper around the puck" for a mug), the
+    condition does. If the gripper goes to a thing and the condition compares it with a point on that thing, the point
+    is the target. If the text moves a thing that the condition says is held, the thing is moved. ``skills`` are the
+    scripted skills by their text; None for the shipped ones, an empty mapping for words alone. "the target location" is
+    the goal in every task.
 
     Example:
         >>> from lw_torchrl.language.plan_files import load_plans
@@ -61,7 +57,7 @@ def plan_roles(plan: ConditionalPlan, skills: Skills | None = None) -> tuple[Rol
     """
     task, allowed, found = plan.definition, skills_for(plan.definition, skills), []
     for step in plan.steps:
-        roles = _of_skill(step, task, allowed) or _of_words(step, task) or _of_condition(step) or _NOTHING
+        roles = _of_skill(step, task, allowed) or _of_words(step, task) or _of_condition(step)
         roles = _carried(roles, step, task)
         found.append(replace(roles, target=_point(roles, step, task)))
     return tuple(found)
@@ -82,11 +78,13 @@ def _of_words(step: PlanStep, task: Task) -> Roles | None:
     named = re.findall(r"<([^>]*)>", text)
     if not named or named == [GRIPPER]:
         return None
-    acted_on = [name for name in _ACTED_ON.findall(text) if _can_move(name, task)]
+    movable = {typed(places(thing)) for thing in task.layout.positions[:-1]}
+    acted_on = [name for name in _ACTED_ON.findall(text) if typed(role_object(task, name).position) in movable]
     target, moved = named[-1], acted_on[0] if acted_on else tool
     if moved == target:  # "push the button down", "lift the cube": alone, it is where the gripper goes, or is moved
         moved = tool or GRIPPER
-        if tool is None and (others := _partners(target, step, task)):
+        others = [b for a, b in _pairs(step) if GRIPPER not in (a, b) and _same_thing(a, target, task)]
+        if tool is None and others:
             target, moved = others[-1], target
     elif moved is None:  # "move the puck to the target location" of a mug: what it holds
         held = [name for name in _compared(step, gripper=True) if not _same_thing(name, target, task)]
@@ -115,17 +113,12 @@ def _compared(step: PlanStep, *, gripper: bool) -> list[str]:
     return [b if a == GRIPPER else a for a, b in _pairs(step) if (GRIPPER in (a, b)) == gripper]
 
 
-def _partners(name: str, step: PlanStep, task: Task) -> list[str]:
-    """What the condition compares a thing, or a point on it, with, the gripper aside."""
-    return [b for a, b in _pairs(step) if GRIPPER not in (a, b) and _same_thing(a, name, task)]
-
-
-def _of_condition(step: PlanStep) -> Roles | None:
+def _of_condition(step: PlanStep) -> Roles:
     apart = [(b, a) for a, b in _pairs(step) if GRIPPER not in (a, b)]
     if apart and "gripper" not in step.skill.split():
         return Roles(*apart[-1], "condition")
     near = _compared(step, gripper=True)
-    return Roles(near[-1], GRIPPER, "condition") if near else None
+    return Roles(near[-1], GRIPPER, "condition") if near else Roles(None, None, "nothing")
 
 
 def _carried(roles: Roles, step: PlanStep, task: Task) -> Roles:
@@ -148,11 +141,6 @@ def _holds(step: PlanStep, relation: str, name: str) -> bool:
 
 def _same_thing(first: str, second: str, task: Task) -> bool:
     return typed(role_object(task, first).position) == typed(role_object(task, second).position)
-
-
-def _can_move(name: str, task: Task) -> bool:
-    position = typed(role_object(task, name).position)
-    return any(position == typed(places(thing)) for thing in task.layout.positions[:-1])
 
 
 def _point(roles: Roles, step: PlanStep, task: Task) -> str | None:

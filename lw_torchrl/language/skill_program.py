@@ -74,9 +74,8 @@ class SkillProgram(nn.Module):
             for s, skill in enumerate(listed):
                 ends = task.object(skill.target), task.object(skill.moved)
                 for side, end in enumerate(ends):
-                    place[t, side, s] = torch.tensor(
-                        [coordinate_index(c, constants, layout.size) for c in end.position]
-                    )
+                    found_at = [coordinate_index(c, constants, layout.size) for c in end.position]
+                    place[t, side, s] = torch.tensor(found_at)
                 offsets = torch.tensor([skill.offset, *(end.offset for end in ends)], dtype=torch.float64)
                 numbers[t, 0, s] = torch.tensor(skill.gain, dtype=torch.float64)
                 numbers[t, 1, s] = numbers[t, 0, s] * (offsets[0] + offsets[1] - offsets[2])
@@ -86,19 +85,15 @@ class SkillProgram(nn.Module):
         self._tables = TaskTables(index, _Tables(target, moved, gain, shift, effort, fixed), "tasks without skills")
 
     def forward(self, observation: Tensor, task_id: Tensor) -> Tensor:
-        """The action of each skill.
-
-        Args:
-            observation: (..., D) float, as the tasks' layout says; Meta-World's 39 numbers, metres.
-            task_id: (...) int64.
+        """The action of each skill, of observation (..., D) float, as the tasks' layout says, and task_id (...) int64.
 
         Returns:
             (..., S, A) of the observation's dtype: an action of the layout, in Meta-World displacement xyz and gripper
             effort, each in [-1, 1]; zeros beyond the task's last skill. A task without skills is a :class:`ValueError`.
         """
-        size = self.layout.size
-        if observation.shape[-1:] != (size,) or task_id.shape != observation.shape[:-1]:
-            got = f"{tuple(observation.shape)} and {tuple(task_id.shape)}"
+        size, ids = self.layout.size, tuple(task_id.shape)
+        if observation.shape[-1:] != (size,) or ids != observation.shape[:-1]:
+            got = f"{tuple(observation.shape)} and {ids}"
             raise ValueError(f"observation must be of shape (..., {size}) and task_id of (...), got {got}")
         tables = self._tables.select(task_id.reshape(-1), observation)
         state = torch.cat((observation.reshape(-1, size), tables.constants), 1)

@@ -63,10 +63,10 @@ class ScriptedSkill:
 
         for name in ("target", "moved"):
             check(name, "be the name of an object", lambda given: isinstance(given, str))
+        check("goal", "be a query in words", lambda given: isinstance(given, str))
         for name in ("offset", "gain"):
             check(name, "be three numbers", is_triple)
         check("gain", "not be negative", lambda given: min(given) >= 0)
-        check("goal", "be a query in words", lambda given: isinstance(given, str))
         check("gripper", "lie in [-1, 1]", lambda given: is_number(given) and -1 <= given <= 1)
 
     def for_task(self, task: str | Task) -> ScriptedSkill:
@@ -181,10 +181,8 @@ _LONGEST_BEFORE = max(map(len, _BEFORE_NOUN))
 
 
 def canonical_skill(skill: str, task: Task) -> str:
-    """The skill in plain English: articles go before the nouns that lack one, as in the paper.
-
-    A noun lacks one at the beginning and after a word like "above"; else ("the coffee mug") it is left alone.
-    """
+    """The skill in plain English: articles go before the nouns that lack one, as in the paper, at the beginning and
+    after a word like "above"; else ("the coffee mug") a noun is left alone."""
     first, _, details = " ".join(skill.split()).partition(" ")
     verb, *rest = first.replace("_", " ").split() or [""]
     if not re.fullmatch(r"[A-Za-z]\w*", verb):
@@ -221,7 +219,6 @@ def closes(skill: str) -> bool:
 
 
 def has_direction(skill: str) -> bool:
-    """Whether a skill says a direction in the plane, as seen by the robot or by the thing: "to the left", "toward the
-    robot", "in front of the drawer handle", "into the hole"; "toward the reach target" and "above the puck" say none.
-    """
+    """Whether a skill says a direction in the plane, "to the left", "toward the robot", "into the hole"; "toward the
+    reach target" and "above the puck" say none."""
     return not _DIRECTIONS.isdisjoint(skill.split())

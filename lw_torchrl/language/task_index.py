@@ -18,16 +18,13 @@ Tables = TypeVar("Tables", bound=tuple[Tensor, ...])
 
 
 class TaskIndex:
-    """The rows that tasks have in a table, in the order of their ids. It follows the ids to their device.
-
-    ``tasks`` are the names in the order of their rows. Two that have the same id are a ValueError.
+    """The rows that tasks have in a table, in the order of their ids, which it follows to their device; two tasks of
+    one id are a ValueError.
 
     Example:
         >>> index = TaskIndex(["reach", "stack-blocks", "push"])
-        >>> index.tasks
-        ('push', 'reach', 'stack-blocks')
-        >>> index.rows(torch.tensor([task_id("reach"), task_id("push")]), "tasks without a plan").tolist()
-        [1, 0]
+        >>> index.tasks, index.rows(torch.tensor([task_id("reach"), task_id("push")]), "tasks without a plan").tolist()
+        (('push', 'reach', 'stack-blocks'), [1, 0])
     """
 
     def __init__(self, tasks: Iterable[str]) -> None:
@@ -45,11 +42,9 @@ class TaskIndex:
         return self.tasks.index(task)
 
     def rows(self, task_id: Tensor, problem: str) -> Tensor:
-        """The row of each task, (...) int64 to (...) int64.
-
-        An id that has no row is a ValueError, which names the ``problem``, "tasks without a plan"; compiled or on a
-        GPU a RuntimeError when it runs. Inside ``torch.vmap`` it gets a row beyond the last.
-        """
+        """The row of each task, (...) int64 to (...) int64. An id without one is a ValueError that names the
+        ``problem``, "tasks without a plan"; compiled or on a GPU a RuntimeError when it runs. Inside ``torch.vmap`` it
+        gets a row beyond the last."""
         if task_id.dtype not in (torch.int64, torch.int32):
             raise ValueError(f"task_id must be int64, got {task_id.dtype}")
         kept = plain(task_id)
@@ -103,10 +98,8 @@ class PlanTables:
         return self.index.rows(task_id, self._problem)
 
     def refuse_others(self, number: Tensor | None, rows: Tensor) -> None:
-        """Raise :class:`ValueError` where queries were answered of other plans than those of ``rows``, (...) int64.
-
-        ``number``, (...) int64, is that of the plan whose queries were answered; 0 where unknown, None for all.
-        """
+        """Raise :class:`ValueError` where queries of other plans than those of ``rows``, (...) int64, were answered:
+        ``number``, (...) int64, is that plan's; 0 where unknown, None for all."""
         if number is None:
             return
         numbers = self.number
@@ -122,18 +115,15 @@ class PlanTables:
         own = numbers[rows]
         if not torch.equal(own, number) and (wrong := (own != number) & (number != 0)).any():
             tasks = ", ".join(self.index.tasks[row] for row in rows[wrong].unique().tolist()[:5])
-            raise ValueError(
-                f"qaf answers other plans than the actor's, for {tasks}: give QAFTransform the actor's plans, "
-                "QAFTransform(actor.plans), or the actor those of QAFTransform, actor.with_plans(plans)"
-            )
+            same = "give QAFTransform the actor's plans, or the actor those of QAFTransform, actor.with_plans(plans)"
+            raise ValueError(f"qaf answers other plans than the actor's, for {tasks}: {same}")
 
 
 class TaskTables(nn.Module, Generic[Tables]):
-    """Tables with a row for each task, and their rows for a batch.
+    """Tables, a named tuple of tensors (T, ...) with a row for each task, and their rows for a batch.
 
-    The tables are buffers that follow the module to a device, keep their precision and are not saved. What a batch
-    selected is kept for the next, since the rows of an environment keep their tasks.
-    ``tables`` is a named tuple of tensors, each (T, ...), ``problem`` is as for :meth:`TaskIndex.rows`.
+    They are buffers that follow the module to a device, keep their precision and are not saved. What a batch selected
+    is kept for the next. ``problem`` is as for :meth:`TaskIndex.rows`.
     """
 
     def __init__(self, index: TaskIndex, tables: Tables, problem: str) -> None:

@@ -68,10 +68,9 @@ class Task:
             count = f"at most {_MOST_OBJECTS}, the gripper included, got {len(self.objects)}"
             raise ValueError(f"objects of task {self.name!r} must be {count}")
         names = [named.name for named in self.objects]
-        if not names or names[0] != GRIPPER:
-            raise ValueError(f"objects of task {self.name!r} must begin with {GRIPPER!r}, got {names}")
-        if len(set(names)) != len(names):
-            raise ValueError(f"objects of task {self.name!r} must have different names, got {names}")
+        if names[:1] != [GRIPPER] or len({*names}) != len(names):
+            what = f"begin with {GRIPPER!r} and have different names"
+            raise ValueError(f"objects of task {self.name!r} must {what}, got {names}")
 
     @cached_property
     def object_names(self) -> tuple[str, ...]:
@@ -126,10 +125,8 @@ class Task:
 
     @classmethod
     def from_json(cls, name: str, row: Any, layout: Layout = METAWORLD) -> Task:
-        """The task of a row of tasks.toml, as :meth:`to_json` gives it; any other value is a :class:`TaskError`.
-
-        ``layout`` counts where the row states none.
-        """
+        """The task of a row of tasks.toml, as :meth:`to_json` gives it, of ``layout`` where it states none; any other
+        value is a :class:`TaskError`."""
         try:
             if not isinstance(row, Mapping):
                 raise ValueError(f"must be a table, got {shown(row)}")

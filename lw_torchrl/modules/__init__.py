@@ -1,53 +1,27 @@
 """Policies as TensorDictModules: plan-conditioned ones, the baselines, and what they are made of."""
 
 import lw_torchrl._torchrl  # noqa: F401
-from lw_torchrl.modules.actor_ensemble import ActorEnsemble
+from lw_torchrl.modules.composed_actors import ActorEnsemble, TransferredActor
 from lw_torchrl.modules.conditioned_actor import ConditionedActor
 from lw_torchrl.modules.critics import PlanConditionedQValue, PlanConditionedValue, QValue, Value, plan_actor_value
 from lw_torchrl.modules.descriptor_conditioned_actor import DescriptorConditionedActor, DescriptorEncoder
-from lw_torchrl.modules.encoder import Encoder
 from lw_torchrl.modules.held_evaluator import HeldEvaluator
 from lw_torchrl.modules.image_query_evaluator import IMAGE_ENCODERS, ImageQueryEvaluator
 from lw_torchrl.modules.observation_features import ObservationFeatures
 from lw_torchrl.modules.plan_attention import PlanAttention
 from lw_torchrl.modules.plan_conditioned_actor import PlanConditionedActor
 from lw_torchrl.modules.plan_encoder import PlanEncoder
-from lw_torchrl.modules.policy import METHODS, POLICIES, Method, Policy, make_policy
+from lw_torchrl.modules.policy import METHODS, POLICIES, Encoder, Method, Policy, make_policy
 from lw_torchrl.modules.query_evaluator import EVALUATORS, QueryEvaluator
 from lw_torchrl.modules.relative_positions import PlanFocus
 from lw_torchrl.modules.residual_actor import ResidualActor
 from lw_torchrl.modules.scripted_skill_actor import ScriptedSkillActor
 from lw_torchrl.modules.state_query_evaluator import StateQueryEvaluator
-from lw_torchrl.modules.transferred_actor import TransferredActor
 
 __all__ = [
-    "EVALUATORS",
-    "IMAGE_ENCODERS",
-    "METHODS",
-    "POLICIES",
-    "ActorEnsemble",
-    "ConditionedActor",
-    "DescriptorConditionedActor",
-    "DescriptorEncoder",
-    "Encoder",
-    "HeldEvaluator",
-    "ImageQueryEvaluator",
-    "Method",
-    "ObservationFeatures",
-    "PlanAttention",
-    "PlanConditionedActor",
-    "PlanConditionedQValue",
-    "PlanConditionedValue",
-    "PlanEncoder",
-    "PlanFocus",
-    "Policy",
-    "QValue",
-    "QueryEvaluator",
-    "ResidualActor",
-    "ScriptedSkillActor",
-    "StateQueryEvaluator",
-    "TransferredActor",
-    "Value",
-    "make_policy",
-    "plan_actor_value",
-]
+    "EVALUATORS", "IMAGE_ENCODERS", "METHODS", "POLICIES", "ActorEnsemble", "ConditionedActor",
+    "DescriptorConditionedActor", "DescriptorEncoder", "Encoder", "HeldEvaluator", "ImageQueryEvaluator", "Method",
+    "ObservationFeatures", "PlanAttention", "PlanConditionedActor", "PlanConditionedQValue", "PlanConditionedValue",
+    "PlanEncoder", "PlanFocus", "Policy", "QValue", "QueryEvaluator", "ResidualActor", "ScriptedSkillActor",
+    "StateQueryEvaluator", "TransferredActor", "Value", "make_policy", "plan_actor_value",
+]  # fmt: skip

@@ -61,12 +61,8 @@ class PlanClauses(NamedTuple):
 
 def conjunction(logits: Tensor, mask: Tensor) -> Tensor:
     """The logit (...) of all of some statements, of logits (..., K) of size 30 at most, where ``mask`` (..., K) bool is
-    true; of none it is 30. Their errors are taken to be independent of one another.
-
-    Each statement has the probability sigmoid(l), all of them their product p, whose logit log(p / (1 - p)) is
-    -log(expm1(sum(softplus(-l)))). Of one statement that is its own logit; of several sure ones nearly the least. Two
-    of 0.6 each make 0.36: where all are barely true, the conjunction is not.
-    """
+    true; of none it is 30. Of independent statements the probabilities sigmoid(l) have the product p, whose logit
+    log(p / (1 - p)) is -log(expm1(sum(softplus(-l)))): of several sure ones nearly the least."""
     doubt = torch.where(mask, nn.functional.softplus(-logits), 0.0).sum(-1).clamp(min=1e-13)
     return -(doubt + torch.log(-torch.expm1(-doubt)))
 
@@ -75,18 +71,16 @@ class ClauseEvaluator(QueryEvaluator):
     """Answers conditions by a network that was trained on the query answering function's answers, and never asks it.
 
     Reads what is seen of a state and ``task_id`` (B,) int64; writes ``qaf_logits`` (B, S) float32, positive where a
-    condition of the row's plan holds, -1e4 beyond its last step. A condition's clauses are answered one by one, each
-    once in a task, and put together as :func:`conjunction` says, so that new conjunctions need no training.
-
-    A subclass gives ``network``, whose call takes what is seen of B states, their clauses (B, C) and the texts'
-    vectors, to logits (B, C), and says in ``seen_dims`` how many dimensions a state has.
+    condition of the row's plan holds, -1e4 beyond its last step. A condition's clauses are answered one by one, and put
+    together as :func:`conjunction` says. A subclass gives ``network``, from what is seen of B states, their clauses
+    (B, C) and the texts' vectors to logits (B, C), and in ``seen_dims`` how many dimensions a state has.
 
     Args:
         plans: whose conditions it answers.
         structure: a clause is read as the query language parses it: its predicate and its things by number, "not" as
             the opposite. False: only its text's vector is known.
-        predicates: with ``structure``, the relations and predicates that it can tell; None for all that there are.
-        names: with ``structure``, the things that it can tell; empty where they are not told apart by name.
+        predicates, names: with ``structure``, the relations and predicates, and the things, that it can tell; None for
+            all predicates, no names where things are not told apart by name.
         text_encoder: without ``structure``, texts to vectors (n, E) float32; None for the sentence encoder, which
             needs the extra ``[text]``: clauses' vectors are not shipped.
 
@@ -141,11 +135,10 @@ class ClauseEvaluator(QueryEvaluator):
         """What is seen (..., ...) and task_id (...) int64 to (..., S) float32."""
         seen, task_id = read
         self.check_seen(seen)
-        if task_id.shape != seen.shape[: -self.seen_dims]:
-            raise ValueError(
-                f"task_id must be of shape {tuple(seen.shape[: -self.seen_dims])}, one for each row of "
-                f"{self.in_keys[0]!r}, got {tuple(task_id.shape)}"
-            )
+        shape = seen.shape[: -self.seen_dims]
+        if task_id.shape != shape:
+            each = f"one for each row of {self.in_keys[0]!r}"
+            raise ValueError(f"task_id must be of shape {tuple(shape)}, {each}, got {tuple(task_id.shape)}")
         rows = seen.reshape(-1, *seen.shape[-self.seen_dims :])
         tables = self.tables.select(task_id.reshape(-1), rows)
         clauses = self.network(rows, tables.clauses, self.text_vectors)
@@ -155,16 +148,12 @@ class ClauseEvaluator(QueryEvaluator):
 
     def code(self, clauses: Sequence[tuple[Task, Clause]]) -> tuple[Clauses, Tensor | None]:
         """Any clauses of tasks, for the network: (G,) of them, and the vectors of their texts, if it reads texts; the
-        second half are then the negations of the first.
-        """
+        second half are then the negations of the first."""
         if self.predicates:
             return _as_tensors(clauses, self.predicates, None, self.names), None
         both = [*clauses, *((task, replace(clause, negated=not clause.negated)) for task, clause in clauses)]
         texts = _texts(both)
         return _as_tensors(both, (), texts), unit_scale(_vectors(texts, self.text_encoder))
-
-    def made_for(self, plans: Plans) -> Self:
-        return type(self)(plans, text_encoder=self.text_encoder, **self.config)
 
     @classmethod
     def from_options(cls, plans: Plans, options: Mapping[str, Any], text_encoder: TextEncoder | None) -> Self:
@@ -184,10 +173,8 @@ def _vectors(texts: Sequence[str], encoder: TextEncoder | None) -> Tensor:
     try:
         return encoded(texts, encoder)
     except ImportError as error:
-        raise ImportError(
-            f"structure=False reads the vectors of clauses' texts, which are not shipped: {error}; or give a "
-            "text_encoder of yours, or take structure=True, which reads no texts"
-        ) from error
+        what = f"structure=False reads the vectors of clauses' texts, which are not shipped: {error}"
+        raise ImportError(f"{what}; or give a text_encoder, or take structure=True") from error
 
 
 def _position(task: Task, name: str) -> tuple[list[int], list[float]]:

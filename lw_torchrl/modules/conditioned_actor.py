@@ -22,9 +22,8 @@ from torchrl.envs import Transform
 from lw_torchrl._checks import check_int, checked
 from lw_torchrl._keys import as_keys, check_apart, dispatched, key_beside, read, write
 from lw_torchrl.language.tasks import Task
-from lw_torchrl.modules.encoder import Encoder, Encoding
 from lw_torchrl.modules.networks import DISTRIBUTIONS, ActionHead, DistributionName
-from lw_torchrl.modules.policy import Policy
+from lw_torchrl.modules.policy import Encoder, Encoding, Policy
 
 _ALTERING = ("jitter", "swap_unmentioned", "hide_opening")
 
@@ -86,9 +85,8 @@ class ConditionedActor(Policy):
         self.encoder = self.encoder_class(about, feature_noise=feature_noise, **options)
         if distribution is not None and any(self.encoder.config.get(name) for name in _ALTERING):
             raise ValueError(
-                f"{', '.join(_ALTERING[:-1])} and {_ALTERING[-1]} must be 0 with a distribution: in training mode they "
-                "would change its likelihoods from call to call; train an actor without one, and take "
-                "actor.stochastic()"
+                f"{', '.join(_ALTERING[:-1])} and {_ALTERING[-1]} must be 0 with a distribution, whose likelihood they "
+                "would change from call to call; train an actor without one, and take actor.stochastic()"
             )
         head: Any = dict(width=width, depth=depth, squash=squash, distribution=distribution, init_std=init_std)
         self.layout = self.encoder.layout
@@ -194,20 +192,16 @@ class ConditionedActor(Policy):
 
     def _require_distribution(self) -> None:
         if self.head.distribution is None:
-            raise TypeError(
-                f"{type(self).__name__} has no distribution; make it with distribution='tanh_normal', or make a "
-                "stochastic one of a trained one by actor.stochastic()"
-            )
+            make = "make it with distribution='tanh_normal', or of a trained one by actor.stochastic()"
+            raise TypeError(f"{type(self).__name__} has no distribution; {make}")
 
     def _loc_scale(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         self._require_distribution()
         return self.head.loc_scale(self.encoder.encode(*self.prepare(tensordict)).joined)
 
     def stochastic(self, distribution: DistributionName = "tanh_normal", init_std: float = 0.3) -> Self:
-        """A copy with a distribution, whose mode is what this actor does, to be trained by RL.
-
-        Its features have no noise, jitter, swaps nor hidden opening, which would change its likelihoods from call to
-        call.
+        """A copy with a distribution, whose mode is what this actor does, to be trained by RL; its features have no
+        noise, jitter, swaps nor hidden opening.
 
         Args:
             distribution: "tanh_normal", or "normal", whose actions the environment clips.

@@ -15,10 +15,10 @@ from torchrl.envs import Transform
 from lw_torchrl._checks import check_int, checked, passes_on
 from lw_torchrl._keys import as_keys, check_apart, check_key, dispatched, read, write
 from lw_torchrl.language.plans import ConditionalPlan, Plans
-from lw_torchrl.modules.encoder import Encoder
 from lw_torchrl.modules.networks import DistributionName, check_width, head
 from lw_torchrl.modules.plan_conditioned_actor import PlanConditionedActor
 from lw_torchrl.modules.plan_encoder import PlanEncoder
+from lw_torchrl.modules.policy import Encoder
 
 _OWN = ("ensemble", "width", "depth", "layer_norm", "out_keys")  # options of a critic, not of its encoder
 
@@ -125,10 +125,7 @@ class QValue(Value):
     ) -> None:
         self._numbers = check_int("quantiles", quantiles, minimum=1)
         if quantiles > 1 and ensemble != 1:
-            raise ValueError(
-                f"ensemble must be 1 with quantiles, whose least is no value, got {ensemble}: TQCLoss makes several "
-                "critics by its num_qvalue_nets"
-            )
+            raise ValueError(f"ensemble must be 1 with quantiles, got {ensemble}: TQCLoss makes several critics itself")
         super().__init__(encoder, ensemble=ensemble, **options)
         check_key("action_key", action_key)
         self.action_key = action_key

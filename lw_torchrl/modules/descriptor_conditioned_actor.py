@@ -17,9 +17,9 @@ from lw_torchrl.language.task_index import TaskIndex
 from lw_torchrl.language.tasks import MT50, TASKS, Task, named_tasks, one_layout
 from lw_torchrl.language.text import TextEncoder, encoded
 from lw_torchrl.modules.conditioned_actor import ConditionedActor
-from lw_torchrl.modules.encoder import Encoder, Encoding
 from lw_torchrl.modules.networks import text_to_latent, unit_scale
 from lw_torchrl.modules.observation_features import Features, ObservationFeatures
+from lw_torchrl.modules.policy import Encoder, Encoding
 
 
 class DescriptorEncoder(Encoder):
@@ -62,15 +62,9 @@ class DescriptorEncoder(Encoder):
         self.in_keys = as_keys("in_keys", in_keys, ("observation", "task_id"))
         self.out_keys = as_keys("out_keys", out_keys, ("encoding",))
         check_apart(self.in_keys, self.out_keys)
-        self.config: dict[str, Any] = {
-            "condition": condition,
-            "features": features,
-            "feature_noise": feature_noise,
-            "latent_size": latent_size,
-            "encoder_width": encoder_width,
-            "encoder_depth": encoder_depth,
-            "in_keys": self.in_keys,
-        }
+        seen = dict(condition=condition, features=features, feature_noise=feature_noise)
+        texts = dict(latent_size=latent_size, encoder_width=encoder_width, encoder_depth=encoder_depth)
+        self.config: dict[str, Any] = {**seen, **texts, "in_keys": self.in_keys}
         self.text_encoder = text_encoder
         own = (lambda texts: torch.eye(len(texts))) if text_encoder is None and condition == "one-hot" else text_encoder
         found = encoded([task.description for task in self.definitions.values()], own)
@@ -110,10 +104,8 @@ class DescriptorConditionedActor(ConditionedActor):
 
     Args:
         tasks: the tasks it is to act in, see :class:`DescriptorEncoder`.
-        feature_noise, width, depth, squash, distribution, init_std, out_keys: as for
-            :class:`~lw_torchrl.modules.ConditionedActor`.
-        **options: condition, features, latent_size, encoder_width, encoder_depth, text_encoder and in_keys, as for
-            :class:`DescriptorEncoder`.
+        **options: of :class:`~lw_torchrl.modules.ConditionedActor` and of :class:`DescriptorEncoder`; ``out_keys`` are
+            the actor's.
 
     Raises:
         ValueError: an unknown task; at call time, a task_id outside ``tasks``.

@@ -10,14 +10,14 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import Compose, Transform
 
-from lw_torchrl._checks import check_int, checked
+from lw_torchrl._checks import Count, Natural, checked
 from lw_torchrl._devices import device_of, in_blocks
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.networks import evaluating
 from lw_torchrl.modules.query_evaluator import QueryEvaluator, evaluator_from_description
 from lw_torchrl.transforms.camera import CameraTransform
-from lw_torchrl.transforms.late_answers import HeldAnswers
+from lw_torchrl.transforms.environment import HeldAnswers
 
 _MOST = 2**16  # steps; a policy file with more would be refused
 
@@ -25,14 +25,11 @@ _MOST = 2**16  # steps; a policy file with more would be refused
 class HeldEvaluator(QueryEvaluator):
     """Another evaluator, asked every k steps, as suits a costly one: in step t of its episode, 0 at the reset, a row is
     given the answers of step every · ⌊max(t - delay, 0) / every⌋.
-
     Reads ``qaf_held_logits`` (B, S) float32 and gives them as they are. ``transform()`` writes them, behind the
-    evaluator's own transform: it runs the evaluator, in eval mode and without gradients, on the rows of the environment
-    whose answers are due, in blocks of one size, so that results do not depend on the number of rows. Cameras draw
-    only the pictures that are looked at. A ``_step`` or ``_reset`` mask counts for its rows alone; after
-    ``load_state_dict`` the environment must be reset.
-
-    Rows of a replay buffer have no such steps: train with the evaluator itself, and hold it when acting.
+    evaluator's own transform: it runs the evaluator, in eval mode and without gradients, on the rows whose answers are
+    due, in blocks of one size, so that results do not depend on the number of rows. A ``_step`` or ``_reset`` mask
+    counts for its rows alone; after ``load_state_dict`` the environment must be reset. Rows of a replay buffer have no
+    such steps: train with the evaluator itself, and hold it when acting.
 
     Args:
         evaluator: what is asked; its plans are ``plans``.
@@ -57,32 +54,22 @@ class HeldEvaluator(QueryEvaluator):
     """
 
     @checked
-    def __init__(self, evaluator: QueryEvaluator, *, every: int = 1, delay: int = 0) -> None:
+    def __init__(self, evaluator: QueryEvaluator, *, every: Count = 1, delay: Natural = 0) -> None:
         if isinstance(evaluator, HeldEvaluator):
             raise ValueError("evaluator must be no HeldEvaluator: hold the one inside it, its .evaluator")
         super().__init__(evaluator.plans)
-        self.evaluator = evaluator
-        self.every, self.delay = _steps("every", every, 1), _steps("delay", delay, 0)
-        self.config = {"every": self.every, "delay": self.delay}
-        self.in_keys = ["qaf_held_logits"]
-
-    @property
-    def text_encoder(self) -> TextEncoder | None:
-        """The evaluator's, if it reads texts; files are checked by it."""
-        return getattr(self.evaluator, "text_encoder", None)
-
-    @property
-    def text_vectors(self) -> Tensor | None:
-        return getattr(self.evaluator, "text_vectors", None)
+        self.evaluator, self.every, self.delay = evaluator, int(every), int(delay)
+        for name, steps in (config := {"every": self.every, "delay": self.delay}).items():
+            if steps > _MOST:
+                raise ValueError(f"{name} must be at most {_MOST} steps, got {steps}")
+        self.config, self.in_keys, self.text_encoder = config, ["qaf_held_logits"], evaluator.text_encoder
 
     def logits(self, *read: Tensor) -> Tensor:
         """The held logits (..., S), as they are."""
         (held,) = read
         if held is None:
-            raise ValueError(
-                "qaf_held_logits is needed, which HeldEvaluator.transform() writes in an environment; of rows of a "
-                "replay buffer ask the evaluator inside, its .evaluator"
-            )
+            where = "in an environment; of rows of a replay buffer ask the evaluator inside, its .evaluator"
+            raise ValueError(f"qaf_held_logits is needed, which HeldEvaluator.transform() writes {where}")
         return held
 
     def ask(self, tensordict: TensorDictBase) -> Tensor:
@@ -94,14 +81,8 @@ class HeldEvaluator(QueryEvaluator):
 
     def transform(self) -> Transform:
         """A new transform that asks, behind the evaluator's own."""
-        asks = HeldAnswers(
-            self.ask,
-            self.plans.num_steps,
-            every=self.every,
-            delay=self.delay,
-            in_keys=self.evaluator.in_keys,
-            out_key=self.in_keys[0],
-        )
+        options = {"in_keys": self.evaluator.in_keys, "out_key": self.in_keys[0], **self.config}
+        asks = HeldAnswers(self.ask, self.plans.num_steps, **options)
         own = self.evaluator.transform()
         if own is None:
             return asks
@@ -128,9 +109,3 @@ class HeldEvaluator(QueryEvaluator):
         if isinstance(inside, Mapping) and inside.get("kind") == cls.__name__:  # before any of a long nest is made
             raise ValueError("evaluator of a HeldEvaluator must be no HeldEvaluator")
         return cls(evaluator_from_description(inside, plans, text_encoder), **numbers)
-
-
-def _steps(argument: str, given: Any, least: int) -> int:
-    if (value := check_int(argument, given, minimum=least)) > _MOST:
-        raise ValueError(f"{argument} must be at most {_MOST} steps, got {value}")
-    return value

@@ -45,22 +45,17 @@ def _conv(before: int, after: int, stride: int = 1) -> nn.Sequential:
 
 
 class PointingNetwork(ClauseNetwork):
-    """Points at things in pictures, and judges clauses by where they are.
+    """Points at things in pictures, and judges clauses by where they are, as :class:`ClauseNetwork` does.
 
-    A thing is a vector of its own, or, of a clause's text, two that the text gives. In each camera's picture it is
-    compared with the features of every place; the softmax over the places is where it points. From the places' mean
-    coordinates and features in all pictures, and from the mean coordinates of some landmarks, which are the same for
-    all things, an MLP gives the thing's four numbers: its position in metres, and how far it is open. Clauses are
-    judged by the difference of the two things' numbers, as by :class:`ClauseNetwork`.
+    A thing's vector, its own or one that a clause's text gives, is compared with the features of every place in each
+    camera's picture; the softmax over the places is where it points. From the places' mean coordinates and features,
+    and from some landmarks' coordinates, which are the same for all things, an MLP gives the thing's four numbers: its
+    position in metres, and how far it is open.
+
+    ``encoder`` makes a map of ``features`` (n, F, h, w) of pictures (n, 3, H, W) float32 in [0, 1]; ``names`` is the
+    number of things, 0 for a network that reads texts; ``trunk`` is as of :class:`ClauseNetwork`.
 
     Source: the spatial softmax of 'Deep spatial autoencoders for visuomotor learning' (Finn et al., 2016).
-
-    Args:
-        encoder: pictures (n, 3, H, W) float32 in [0, 1] to a map of features (n, F, h, w).
-        features: F, the size of a place's features.
-        cameras: C, side by side in a row's pictures.
-        names: N, how many things there are; 0 for a network that reads texts.
-        **trunk: of :class:`ClauseNetwork`.
     """
 
     numbers = 4
@@ -100,21 +95,15 @@ class PointingNetwork(ClauseNetwork):
 
     def places(self, seen: Tensor, things: Tensor) -> tuple[Tensor, Tensor]:
         """Of pictures (B, H, W·C, 3) uint8 and things' vectors (N, 32) float32: positions in metres and how far they
-        are open, (B, N, 4) float32; where they are seen, (B, C, N, h, w) float32, which sums to 1 over each picture.
-        """
+        are open, (B, N, 4) float32; where they are seen, (B, C, N, h, w) float32, which sums to 1 over each picture."""
         rows = len(seen)
         pictures = seen.unflatten(-2, (self.cameras, -1)).permute(0, 2, 4, 1, 3).flatten(0, 1)
         features = self.encoder(pictures.to(torch.float32) / 255.0)
         height, width = features.shape[-2:]
         scores = torch.einsum("nk,bkp->bnp", things, self.key(features).flatten(-2))
         pointed = (_SHARP / sqrt(KEYS) * scores).softmax(-1)
-        grid = torch.stack(
-            torch.meshgrid(
-                torch.linspace(-1.0, 1.0, height, device=seen.device),
-                torch.linspace(-1.0, 1.0, width, device=seen.device),
-                indexing="ij",
-            )
-        ).flatten(-2)
+        axes = [torch.linspace(-1.0, 1.0, size, device=seen.device) for size in (height, width)]
+        grid = torch.stack(torch.meshgrid(*axes, indexing="ij")).flatten(-2)
         values = torch.cat((grid.expand(len(features), -1, -1), self.seen(features).flatten(-2)), -2)
         there = torch.einsum("bnp,bfp->bnf", pointed, values)  # (B·C, N, 2 + 16)
         there = there.unflatten(0, (rows, self.cameras)).transpose(1, 2).flatten(-2)
@@ -204,17 +193,8 @@ class ImageQueryEvaluator(ClauseEvaluator):
             predicates=len(self.predicates),
             text_size=self.text_size,
         )
-        self.config |= {
-            "cameras": list(self.cameras),
-            "height": height,
-            "width": width,
-            "every": self.every,
-            "encoder": encoder,
-            "hidden": hidden,
-            "depth": depth,
-        }
-        if structure:
-            self.config["names"] = list(self.names)
+        self.config |= dict(cameras=list(self.cameras), height=height, width=width, every=self.every, encoder=encoder)
+        self.config |= dict(hidden=hidden, depth=depth) | ({"names": list(self.names)} if structure else {})
 
     def transform(self) -> CameraTransform:
         """A new transform that takes its pictures."""
@@ -223,11 +203,9 @@ class ImageQueryEvaluator(ClauseEvaluator):
     def check_seen(self, seen: Tensor) -> None:
         shape = (self.height, self.width * len(self.cameras), 3)
         if seen.shape[-3:] != shape or seen.dtype != torch.uint8:
-            raise ValueError(
-                f"pixels must be uint8 of shape (..., {', '.join(map(str, shape))}), pictures by "
-                f"{', '.join(self.cameras)} side by side, got {seen.dtype} of shape {tuple(seen.shape)}; "
-                "evaluator.transform() takes them"
-            )
+            wanted = f"uint8 of shape (..., {', '.join(map(str, shape))}), pictures by {', '.join(self.cameras)}"
+            got = f"{seen.dtype} of shape {tuple(seen.shape)}; evaluator.transform() takes them"
+            raise ValueError(f"pixels must be {wanted} side by side, got {got}")
 
 
 @torch.no_grad()
@@ -235,8 +213,6 @@ def _num_features(encoder: nn.Module, name: str, height: int, width: int) -> int
     """F, of the map of features that an encoder gives for a picture of zeros."""
     found = encoder(torch.zeros(1, 3, height, width))
     if not isinstance(found, Tensor) or found.dim() != 4 or len(found) != 1 or not found.is_floating_point():
-        shape = tuple(found.shape) if isinstance(found, Tensor) else type(found).__name__
-        raise ValueError(
-            f"encoder {name!r} must give a map of features (n, F, h, w) for pictures (n, 3, H, W), got {shape}"
-        )
+        got = tuple(found.shape) if isinstance(found, Tensor) else type(found).__name__
+        raise ValueError(f"encoder {name!r} must give a map of features (n, F, h, w), got {got}")
     return found.shape[1]

@@ -71,13 +71,8 @@ DISTRIBUTIONS: dict[str, Callable[[Tensor, Tensor], Distribution]] = {
 
 
 class ActionHead(nn.Module):
-    """An MLP to the action, and to its standard deviation where there is a distribution.
-
-    Args:
-        size: of the encoding.
-        actions: A, the numbers of an action.
-        width, depth, squash, distribution, init_std: as for :class:`ConditionedActor`.
-    """
+    """An MLP from an encoding of ``size`` to the A numbers of an action, and to its standard deviation where there is a
+    distribution; the options are those of :class:`ConditionedActor`."""
 
     def __init__(
         self,

@@ -19,11 +19,8 @@ _FINE, _COARSE = 0.02, 0.1  # metres: where the two squashed copies of each diff
 
 
 def relative(observation: Tensor, layout: Layout = METAWORLD) -> Tensor:
-    """The pairwise differences between hand, things and goal: of Meta-World's two things (..., 39) to (..., 54).
-
-    Differences of three metres each, the same through tanh at 2 cm and at 10 cm. Differences to a thing behind the
-    first that the task does not have are zero.
-    """
+    """The pairwise differences between hand, things and goal, of three metres each, the same through tanh at 2 cm and
+    at 10 cm: of Meta-World's two things (..., 39) to (..., 54); those to a thing that a task lacks are zero."""
     places = [observation[..., place] for place in layout.positions]
     absent = {n: (places[n] == 0).all(-1, keepdim=True) for n in range(2, len(places) - 1)}
     pairs = []
@@ -61,10 +58,8 @@ TRANSFERS = ("opening",)
 def check_observation(observation: Tensor, layout: Layout) -> None:
     """Raise :class:`ValueError` unless it is (..., D) float32, of a layout."""
     if observation.shape[-1:] != (layout.size,) or observation.dtype != torch.float32:
-        raise ValueError(
-            f"observation must be float32 of shape (..., {layout.size}), got {observation.dtype} of shape "
-            f"{tuple(observation.shape)}"
-        )
+        got = f"{observation.dtype} of shape {tuple(observation.shape)}"
+        raise ValueError(f"observation must be float32 of shape (..., {layout.size}), got {got}")
 
 
 class ObservationFeatures(nn.Module):
@@ -106,10 +101,8 @@ class ObservationFeatures(nn.Module):
         if layout == self.layout:
             return self
         if self.kind not in TRANSFERS:
-            raise ValueError(
-                f"features={self.kind!r} of layout {self.layout.name!r} do not carry over to {layout.name!r}; those "
-                f"that do are {', '.join(map(repr, TRANSFERS))} with roles=True"
-            )
+            what = f"features={self.kind!r} of layout {self.layout.name!r} do not carry over to {layout.name!r}"
+            raise ValueError(f"{what}; those that do are {', '.join(map(repr, TRANSFERS))} with roles=True")
         other = ObservationFeatures(self.kind, self.noise, layout)
         other.mean, other.std = self.mean, self.std
         return other

@@ -27,11 +27,8 @@ def attend(logits: Tensor, steps: Tensor) -> Tensor:
 
 
 def attention_logits(logits: Tensor, answers: Answers, scale: float) -> Tensor:
-    """What an evaluator's logits (...,) count in the attention's softmax, where exact truth counts 5 and -5.
-
-    "logit": what they are. "tanh": 5·tanh(scale·logit), which at 0.5 is the paper's 10·p - 5 of the probability p.
-    "hard": 5 above 0 and else -5; its gradient is that of "tanh", straight through.
-    """
+    """What an evaluator's logits (...,) count in the attention's softmax, where exact truth counts 5 and -5: what they
+    are ("logit"), 5·tanh(scale·logit) ("tanh"), or 5 above 0 and else -5, with the gradient of "tanh" ("hard")."""
     if answers == "logit":
         return logits
     soft = 5.0 * torch.tanh(scale * logits)
@@ -43,10 +40,8 @@ def attention_logits(logits: Tensor, answers: Answers, scale: float) -> Tensor:
 def check_truth(qaf: Tensor, shape: tuple[int, ...]) -> None:
     """Raise :class:`ValueError` unless truth has a column for each step, and soft truth is from 0 to 1."""
     if qaf.shape != shape:
-        raise ValueError(
-            f"qaf must have shape {shape}, one column for each step of the actor's plans, got {tuple(qaf.shape)}; give "
-            "QAFTransform the same plans"
-        )
+        got = f"got {tuple(qaf.shape)}; give QAFTransform the same plans"
+        raise ValueError(f"qaf must have shape {shape}, one column for each step of the actor's plans, {got}")
     if qaf.dtype != torch.bool:  # of bool, there is nothing to look at
         problem = "qaf must be bool, or numbers from 0 to 1 for soft truth, got others, or NaN"
         check_values(lambda truth: ((truth >= 0) & (truth <= 1)).all(), qaf, problem)

@@ -29,11 +29,8 @@ class PlanConditionedActor(ConditionedActor):
         plans: a plan for each task it is to act in.
         mix: "latents", decode the mixed latent, as in the paper; "actions", decode every step's latent and mix the
             actions.
-        feature_noise, width, depth, squash, distribution, init_std, out_keys: as for
-            :class:`~lw_torchrl.modules.ConditionedActor`.
-        **options: features, focus, roles, jitter, swap_unmentioned, hide_opening, latent_size, encoder_width,
-            encoder_depth, evaluator, answers, answer_scale, text_encoder and in_keys, as for
-            :class:`~lw_torchrl.modules.PlanEncoder`.
+        **options: of :class:`~lw_torchrl.modules.ConditionedActor` and of :class:`~lw_torchrl.modules.PlanEncoder`;
+            ``out_keys`` are the actor's.
 
     Attributes:
         skills: the K different skill texts, sorted.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -11,14 +12,16 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from lw_torchrl._checks import check_probability, check_scale, checked
-from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
+from lw_torchrl.language.layout import METAWORLD, Layout, places
+from lw_torchrl.language.plans import ConditionalPlan, Plans, PlanStep, as_plans
 from lw_torchrl.language.skills import closes
+from lw_torchrl.language.task_index import PlanTables
+from lw_torchrl.language.tasks import Task
 from lw_torchrl.language.text import TextEncoder, encoded
-from lw_torchrl.modules.augmentation import hide_opening, mentioned, swap_unmentioned
-from lw_torchrl.modules.encoder import Encoder, Encoding
 from lw_torchrl.modules.networks import text_to_latent, unit_scale
 from lw_torchrl.modules.observation_features import Features, ObservationFeatures
 from lw_torchrl.modules.plan_attention import Answers, PlanAttention, attend, attention_logits
+from lw_torchrl.modules.policy import Encoder, Encoding
 from lw_torchrl.modules.query_evaluator import QueryEvaluator, ReadsPlans
 from lw_torchrl.modules.relative_positions import PlanFocus, PlanRoles, RelativePositions
 from lw_torchrl.transforms.qaf import plan_number_key, plan_program
@@ -108,8 +111,8 @@ class PlanEncoder(ReadsPlans, Encoder):
         self.read_plans(plans, evaluator, in_keys, out_keys, ("encoding",))
         if evaluator is not None and (focus or roles or swap_unmentioned or hide_opening):
             raise ValueError(
-                "focus, roles, swap_unmentioned and hide_opening read the queries' exact truth, which an evaluator "
-                "takes away; what has learned with exact truth is evaluated by lw.evaluate(actor, evaluator=...)"
+                "focus, roles, swap_unmentioned and hide_opening read exact truth, which an evaluator takes away; "
+                "lw.evaluate(actor, evaluator=...) evaluates what has learned with it"
             )
         if features == "opening" and not (focus or roles):
             raise ValueError("features='opening' shows nothing of where things are; it needs roles=True or focus=True")
@@ -119,19 +122,11 @@ class PlanEncoder(ReadsPlans, Encoder):
             raise ValueError(f"jitter moves the way of the roles, and roles is False; got jitter={jitter}")
         if evaluator is None and (answers, answer_scale) != ("logit", 0.5):
             raise ValueError("answers and answer_scale are of an evaluator's logits, and evaluator is None")
-        self.config: dict[str, Any] = {
-            "features": features,
-            "feature_noise": feature_noise,
-            "focus": focus,
-            "roles": roles,
-            "jitter": jitter,
-            "swap_unmentioned": check_probability("swap_unmentioned", swap_unmentioned),
-            "hide_opening": check_probability("hide_opening", hide_opening),
-            "latent_size": latent_size,
-            "encoder_width": encoder_width,
-            "encoder_depth": encoder_depth,
-            "in_keys": self.own_keys,
-        }
+        seen = dict(features=features, feature_noise=feature_noise, focus=focus, roles=roles, jitter=jitter)
+        texts = dict(latent_size=latent_size, encoder_width=encoder_width, encoder_depth=encoder_depth)
+        altered = dict(swap_unmentioned=swap_unmentioned, hide_opening=hide_opening)
+        altered = {name: check_probability(name, given) for name, given in altered.items()}
+        self.config: dict[str, Any] = {**seen, **altered, **texts, "in_keys": self.own_keys}
         if evaluator is not None:
             self.config |= {"answers": answers, "answer_scale": check_scale("answer_scale", answer_scale)}
         self.text_encoder = text_encoder
@@ -203,10 +198,8 @@ class PlanEncoder(ReadsPlans, Encoder):
         steps, _, _, *asked = prepared
         logits = self.evaluator.answers(*asked)
         if logits.shape != steps.shape:
-            raise ValueError(
-                f"logits of {type(self.evaluator).__name__} must be {tuple(steps.shape)}, a row for each observation, "
-                f"got shape {tuple(logits.shape)}"
-            )
+            wanted = f"{tuple(steps.shape)}, a row for each observation, got shape {tuple(logits.shape)}"
+            raise ValueError(f"logits of {type(self.evaluator).__name__} must be {wanted}")
         return attend(attention_logits(logits, self.config["answers"], self.config["answer_scale"]), steps)
 
     def encode(self, *prepared: Tensor) -> Encoding:
@@ -227,3 +220,53 @@ class PlanEncoder(ReadsPlans, Encoder):
         if self.roles is not None and other.roles is not None:
             other.roles.share_contact(self.roles)
         return other.train(self.training)
+
+
+def _names(step: PlanStep, task: Task) -> set[str]:
+    names = {name for clause in step.condition.clauses for name in (clause.subject, clause.object) if name}
+    text = step.skill
+    for name in sorted(task.object_names, key=len, reverse=True):  # "drawer handle" is no "drawer"
+        text, found = re.subn(rf"(?<![\w-]){re.escape(name)}(?![\w-])", " ", text)
+        if found:
+            names.add(name)
+    return names
+
+
+def mentioned(plans: Plans, tables: PlanTables, roles: PlanRoles | None = None) -> Tensor:
+    """(T, S, P) bool: whether a step mentions each thing of the layout, and the goal; with ``roles``, or moves it."""
+    of_parts = [{number for part in parts for number in places(part)} for parts in plans.layout.parts]
+    table = torch.zeros(len(plans), plans.num_steps, len(of_parts), dtype=torch.bool)
+    for task, plan in plans.items():
+        for number, step in enumerate(plan.steps):
+            for name in _names(step, plan.definition):
+                for thing, place in enumerate(of_parts):
+                    if place.intersection(plan.definition.object(name).position):
+                        table[tables.index.row(task), number, thing] = True
+    if roles is not None:
+        ends = torch.cat((roles.begin, roles.end), -1).flatten(2)  # (T, S, 6)
+        for thing, place in enumerate(of_parts):
+            table[..., thing] |= torch.isin(ends, torch.tensor(sorted(place))).any(-1)
+    return table
+
+
+def swap_unmentioned(observation: Tensor, kept: Tensor, probability: float, layout: Layout = METAWORLD) -> Tensor:
+    """Put what no step in force mentions where it is in another row of the batch, drawn from PyTorch's global
+    generator, so that a policy cannot rely on it. ``kept`` (..., P) bool tells which things, and the goal, are."""
+    rows, kept = observation.reshape(-1, observation.shape[-1]), kept.reshape(-1, len(layout.parts))
+    swapped, number, device = rows.clone(), len(rows), observation.device
+    for thing, parts in enumerate(layout.parts):
+        away = ~kept[:, thing] & (torch.rand(number, device=device) < probability)
+        others = rows[torch.randint(number, (number,), device=device)]
+        for part in parts:
+            swapped[:, part] = torch.where(away.unsqueeze(-1), others[:, part], rows[:, part])
+    return swapped.reshape(observation.shape)
+
+
+def hide_opening(observation: Tensor, kept: Tensor, probability: float, layout: Layout = METAWORLD) -> Tensor:
+    """Observations (..., D) where the gripper's opening may be another row's, but where it is ``kept`` (...) bool."""
+    opening = observation[..., layout.opening]
+    others = opening.flatten()[torch.randint(opening.numel(), opening.shape, device=opening.device)]
+    hidden = torch.rand_like(opening) < probability
+    observation = observation.clone()
+    observation[..., layout.opening] = torch.where(hidden & ~kept, others, opening)
+    return observation

@@ -17,7 +17,7 @@ from lw_torchrl._checks import check_choice, checked
 from lw_torchrl._keys import as_keys, check_apart, dispatched, write
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.text import TextEncoder
-from lw_torchrl.modules.encoder import Prepared
+from lw_torchrl.modules.policy import Prepared
 from lw_torchrl.transforms.qaf import QAFTransform
 
 EVALUATORS: dict[str, str | type[QueryEvaluator]] = {
@@ -55,6 +55,7 @@ class QueryEvaluator(TensorDictModuleBase):
     """
 
     config: dict[str, Any]
+    text_encoder: TextEncoder | None = None
 
     @checked
     def __init__(self, plans: Plans) -> None:
@@ -72,16 +73,13 @@ class QueryEvaluator(TensorDictModuleBase):
         """:meth:`logits` as float32; :class:`TypeError` if they are no floats, :class:`ValueError` if they have not a
         column for each of the plans' steps."""
         found = self.logits(*read)
+        what = f"logits of {type(self).__name__} must be"
         if not isinstance(found, Tensor) or not found.is_floating_point():
             given = found.dtype if isinstance(found, Tensor) else type(found).__name__
-            raise TypeError(
-                f"logits of {type(self).__name__} must be float32, above 0 where a condition holds, got {given}"
-            )
+            raise TypeError(f"{what} float32, above 0 where a condition holds, got {given}")
         if found.shape[-1:] != (self.plans.num_steps,):
-            raise ValueError(
-                f"logits of {type(self).__name__} must be (B, {self.plans.num_steps}), a column for each step of the "
-                f"longest plan, got shape {tuple(found.shape)}"
-            )
+            wanted = f"(B, {self.plans.num_steps}), a column for each step of the longest plan"
+            raise ValueError(f"{what} {wanted}, got shape {tuple(found.shape)}")
         return found.to(torch.float32)
 
     def transform(self) -> Transform | None:
@@ -104,7 +102,7 @@ class QueryEvaluator(TensorDictModuleBase):
 
     def made_for(self, plans: Plans) -> QueryEvaluator:
         """Another of the same options for other plans, with fresh weights."""
-        return type(self)(plans, **self.config)
+        return self.from_options(plans, self.config, self.text_encoder)
 
     @classmethod
     def from_options(cls, plans: Plans, options: Mapping[str, Any], text_encoder: TextEncoder | None) -> QueryEvaluator:

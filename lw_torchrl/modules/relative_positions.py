@@ -24,16 +24,11 @@ Pair = tuple[NamedObject, NamedObject]
 
 
 class RelativePositions(nn.Module):
-    """The positions of things relative to others, mixed by the attention over the steps.
+    """The positions of things relative to others, mixed by the attention over the steps: 9·P features, three
+    differences of each pair, in units of 10 cm, and through tanh at 2 cm and at 10 cm.
 
-    Args:
-        pairs: of a plan, for each step up to P pairs: the thing from which, and the thing to which. A step that has
-            fewer has 0 there.
-        number: P.
-        noise: standard deviation of the noise on each feature while training.
-
-    Attributes:
-        width: 9·P features: three differences of each pair, in units of 10 cm, and through tanh at 2 cm and at 10 cm.
+    ``pairs`` gives of a plan, for each step, up to ``number`` P pairs: the thing from which, and the thing to which. A
+    step that has fewer has 0 there. ``noise`` is each feature's standard deviation while training.
     """
 
     begin: Tensor
@@ -74,9 +69,7 @@ class RelativePositions(nn.Module):
 
     def positions(self, observation: Tensor, weights: Tensor, rows: Tensor, yaw: Tensor | None = None) -> Tensor:
         """(..., 39) float32, attention (..., S) float32 and rows (...) int64, as from :meth:`PlanTables.rows`, to
-        (..., P, 3) float32 metres. Fixed places and offsets are turned by ``yaw`` (...) float32, the angle by which
-        :class:`RandomYaw` turned the observation.
-        """
+        (..., P, 3) float32 metres. Fixed places and offsets are turned by ``yaw`` (...) float32, that of RandomYaw."""
         if yaw is not None:
             observation = turn_observation(observation, -yaw, self.layout)
         known = torch.cat((observation, self.constants.expand(*observation.shape[:-1], -1)), -1)
@@ -115,22 +108,15 @@ class PlanFocus(RelativePositions):
 class PlanRoles(RelativePositions):
     """From the thing that a step moves to its target, mixed by the attention over the steps.
 
-    "lower the gripper around the puck" and "lower the gripper around the mug" are the same motion in this relative
-    position, so that what was learned in one task is of use in another: 9 features, 0 for a step without roles (see
-    :func:`plan_roles`).
+    "lower the gripper around the puck" and "... the mug" are the same motion in this relative position, so that what
+    was learned in one task is of use in another: 9 features, 0 for a step without roles (see :func:`plan_roles`). Where
+    the gripper acts on a thing that is touched beside its position, it is that of the *contact*, which
+    demonstrations of the task show, see :meth:`fit`; a task without any has the points that its plan's conditions name.
 
-    Where the gripper acts on a thing that is touched beside its position, the relative position is that of the
-    *contact*, which demonstrations of the task show, see :meth:`fit`. A task that was never demonstrated has the points
-    that its plan's conditions name.
-
-    Args:
-        jitter: standard deviation, in metres, of the noise on the position's height while training, and half of it to
-            the sides, where the gripper pushes or pulls: things are touched at other places in other tasks.
-
-    Attributes:
-        contact: (T, 3) float32 buffer, metres, a row for each task as in ``tables``: from the first object to the hand
-            while this acts on it; saved with the module.
-        fitted: () bool buffer, whether demonstrations were asked for contacts; saved with the module.
+    ``jitter`` is the standard deviation, in metres, of the noise on the position's height while training, and half of
+    it to the sides, where the gripper pushes or pulls. Saved with the module are ``contact`` (T, 3) float32, metres, a
+    row for each task, from the first object to the hand while this acts on it, and ``fitted`` () bool, whether
+    demonstrations were asked for contacts.
 
     Source: ours; as the keypoints of task-axis controllers, read from words.
     """
@@ -160,12 +146,11 @@ class PlanRoles(RelativePositions):
                 if not role.moved or not role.target:
                     continue
                 at = (tables.index.row(task), number)
-                first = {name: _is_first(plan, name) for name in (role.target, role.moved)}
                 by_hand = role.moved == GRIPPER
-                at_contact[at] = by_hand and first[role.target]
+                at_contact[at] = by_hand and _is_first(plan, role.target)
                 pushing[at] = by_hand and pushes(step.skill)
                 touches = closes(step.skill) or (pushes(step.skill) and not presses(step.skill))
-                acts[at] = first[role.moved] or (at_contact[at] and touches)
+                acts[at] = _is_first(plan, role.moved) or (at_contact[at] and touches)
         self.register_buffer("at_contact", at_contact, persistent=False)
         self.register_buffer("acts", acts, persistent=False)
         self.register_buffer("pushes", pushing, persistent=False)
@@ -184,8 +169,7 @@ class PlanRoles(RelativePositions):
     def fit(self, observation: Tensor, weights: Tensor, rows: Tensor) -> None:
         """Take the contacts from demonstrations, observations (R, 39) and attention (R, S) float32 with their rows (R,)
         int64, in place: the median of hand minus object while a step is in force that closes the gripper around the
-        first object, pushes or pulls it, or moves it. What is pressed from above has none: the gripper goes through it.
-        """
+        first object, pushes or pulls it, or moves it, but not where it is pressed from above."""
         held = (weights * self.acts[rows]).sum(-1) > 0.5
         hand, first, *_ = self.layout.positions
         away = observation[:, hand] - observation[:, first]

@@ -71,10 +71,8 @@ class ResidualActor(Policy):
     ) -> None:
         super().__init__()
         if not isinstance(base, ConditionedActor):
-            raise TypeError(
-                "base must be a PlanConditionedActor or a DescriptorConditionedActor, whose encoding the network "
-                f"reads, got {type(base).__name__}"
-            )
+            got = f"whose encoding the network reads, got {type(base).__name__}"
+            raise TypeError(f"base must be a PlanConditionedActor or a DescriptorConditionedActor, {got}")
         if base.head.distribution is not None:
             raise ValueError(f"base must have no distribution, this one's is {base.head.distribution!r}")
         if base.config.get("mix") == "actions":
@@ -174,7 +172,7 @@ def check_steps(steps: Any, plans: Plans) -> dict[str, list[int]]:
         if len(numbers) > there:
             raise ValueError(f"{where} must be different ones of its plan's {there}, got {len(numbers)}")
         found[task] = sorted(check_int(where, number, minimum=0) for number in numbers)
-        if not found[task] or len(set(found[task])) != len(found[task]):
+        if not found[task] or len({*found[task]}) < len(numbers):
             raise ValueError(f"{where} must be different ones of its plan's {there}, got {shown(numbers)}")
         if found[task][-1] >= there:
             raise ValueError(f"{where} must be from 0 to {there - 1}, got {shown(found[task][-1])}")

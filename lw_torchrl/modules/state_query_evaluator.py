@@ -23,22 +23,16 @@ _SCALES = (0.005, 0.02, 0.1, 0.5)  # metres: where the squashed copies of d bend
 
 
 class ClauseNetwork(nn.Module):
-    """What tells a clause's truth: a trunk on the difference d of two positions, and a vector of what is asked of it.
+    """What tells a clause's truth: a trunk on the difference d of two positions, and a vector of what is asked of it,
+    by which the trunk's output is multiplied. Both come from a clause's structure or its text.
 
-    The logit is the product of the trunk's output and that vector. Both parts of a clause come
+    From its structure: the two positions are those of the subject and the object, where the tasks' table says that they
+    stand; each predicate has a vector of its own; "not" turns the sign. From its text alone: its vector says which of
+    the observation's positions (hand, first, second, goal, the gripper's opening or none) the two are, by attention,
+    what is added to d, and what is asked of it, "not" too.
 
-    - from its structure: the two positions are those of the subject and the object, read where the tasks' table says
-      that they stand; each predicate has a vector of its own; "not" turns the sign. What is learned is the predicates,
-      as classes of d, whatever the objects are called;
-    - or from its text alone: its vector says which of the observation's positions (hand, first, second, goal, the
-      gripper's opening or none) the two are, by attention, what is added to d, and what is asked of it, "not" too. A
-      network then has to find out from examples what every name stands for.
-
-    Args:
-        width, depth: hidden layers of the trunk, and the width of the text's.
-        predicates: P, how many there are; 0 for a network that reads texts.
-        text_size: E, the numbers of a text's vector, where it reads texts.
-        layout: of the observations.
+    ``width`` and ``depth`` are of the trunk; ``predicates`` is how many there are, 0 for a network that reads texts,
+    ``text_size`` the numbers of a text's vector.
     """
 
     numbers: int = 3  # of a difference
@@ -75,8 +69,7 @@ class ClauseNetwork(nn.Module):
         return self.judge(d, asked, None if self.reads_text else clauses.negated)
 
     def judge(self, d: Tensor, asked: Tensor, negated: Tensor | None) -> Tensor:
-        """The logits (B, C) of differences d (B, C, 3) and what is asked of them (B, C, W + 1), with the opposite sign
-        where ``negated`` (B, C) bool."""
+        """The logits (B, C) of differences d (B, C, 3) and what is asked (B, C, W + 1), opposite where ``negated``."""
         features = torch.cat([torch.tanh(d / scale) for scale in _SCALES], -1)
         logits = (self.trunk(features.to(asked.dtype)) * asked[..., :-1]).sum(-1) / sqrt(self.width) + asked[..., -1]
         if negated is not None:

@@ -8,11 +8,6 @@ from lw_torchrl.objectives.reduction import with_n_steps
 from lw_torchrl.objectives.skill_latents import SkillLatentLoss
 
 __all__ = [
-    "AdvantageWeightedLoss",
-    "DemonstratedSACLoss",
-    "DemonstratedTD3Loss",
-    "ExpectileValueLoss",
-    "SkillLatentLoss",
-    "standardize_by_task",
-    "with_n_steps",
-]
+    "AdvantageWeightedLoss", "DemonstratedSACLoss", "DemonstratedTD3Loss", "ExpectileValueLoss", "SkillLatentLoss",
+    "standardize_by_task", "with_n_steps",
+]  # fmt: skip

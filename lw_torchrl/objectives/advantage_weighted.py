@@ -27,14 +27,12 @@ class ExpectileValueLoss(LossModule):
 
     The target is the reward, of n steps where ``steps_to_next_obs`` says so, and what the target network says of the
     state behind them, the mean over a critic's ensemble. With an expectile over one half V follows what better rows
-    reach. Where transitions are deterministic, as the simulator's are, a row's target less V is the advantage of what
-    it did (:meth:`advantage`), by which :class:`AdvantageWeightedLoss` imitates.
+    reach. A row's target less V is the advantage of what it did, by which :class:`AdvantageWeightedLoss` imitates.
 
     Reads what the network reads, here and in ``next``, ``("next", "reward")`` (B, 1) float32, ``("next", "done")`` and
     ``("next", "terminated")`` (B, 1) bool, and, where they are, ``steps_to_next_obs`` (B,) int64 and
     ``priority_weight`` (B,) float32. Gives ``loss_value`` () float32, (B,) by ``reduction="none"``, and ``value`` ()
-    float32, the mean of V, detached; it writes ``td_error`` (B,) float32, the largest of a row's u², into what it is
-    given, for :class:`torchrl.data.PrioritizedSampler`.
+    float32, the mean of V, detached; writes ``td_error`` (B,) float32, a row's largest u², into what it is given.
 
     Args:
         value_network: writes ``state_value`` (B, 1) float32. Where it writes ``state_values`` (B, E) float32, as
@@ -153,10 +151,9 @@ class ExpectileValueLoss(LossModule):
 
     @torch.no_grad()
     def _target(self, tensordict: TensorDictBase) -> Tensor:
-        following = self._values(tensordict.get("next"), self.target_value_network_params)
-        return self.value_estimator.value_estimate(
-            tensordict.copy(), next_value=following.mean(-1, keepdim=True)
-        )  # a copy, since one that averages rewards writes them
+        next_value = self._values(tensordict.get("next"), self.target_value_network_params).mean(-1, keepdim=True)
+        # A copy, since one that averages rewards writes them.
+        return self.value_estimator.value_estimate(tensordict.copy(), next_value=next_value)
 
     def _values(self, tensordict: TensorDictBase, params: TensorDictParams) -> Tensor:
         """(B, E), each member's."""
@@ -164,10 +161,8 @@ class ExpectileValueLoss(LossModule):
         key = keys.values if unravel_key(keys.values) in network.out_keys else keys.value
         several = isinstance(network, Value) and len(network.heads) > 1
         if unravel_key(key) not in network.out_keys or (several and key != keys.values):
-            raise ValueError(
-                f"the value network writes {network.out_keys}, which lack {keys.value!r} or, of an ensemble, "
-                f"{keys.values!r}: name them by loss.set_keys(value=..., values=...)"
-            )
+            what = f"lack {keys.value!r} or, of an ensemble, {keys.values!r}: name them by loss.set_keys(value=...)"
+            raise ValueError(f"the value network writes {network.out_keys}, which {what}")
         with params.to_module(network, preserve_module_state=False):
             (found,) = read(network(tensordict.select(*network.in_keys, strict=False)), [key])
         return found
@@ -250,10 +245,8 @@ class AdvantageWeightedLoss(LossModule):
         """The loss; what is given stays as it is."""
         action, advantage = read(tensordict, [self.tensor_keys.action, self.tensor_keys.advantage])
         if advantage.shape != (*tensordict.batch_size, 1) or advantage.dtype != action.dtype:
-            raise ValueError(
-                f"advantage must be {(*tensordict.batch_size, 1)}, a number for each row, in the action's "
-                f"{action.dtype}, got shape {tuple(advantage.shape)} in {advantage.dtype}"
-            )
+            got = f"shape {tuple(advantage.shape)} in {advantage.dtype}"
+            raise ValueError(f"advantage must be {(*tensordict.batch_size, 1)} in {action.dtype}, got {got}")
         check_finite("advantage", advantage)
         logs, most = self.beta * advantage.detach().squeeze(-1), math.log(self.max_weight)
         # In a mean only the weights' ratios count: over the largest of the batch they cannot all vanish.
@@ -303,10 +296,7 @@ def standardize_by_task(advantage: Tensor, task_id: Tensor) -> Tensor:
     if advantage.dtype != torch.float32 or advantage.ndim != 2 or advantage.shape[1] != 1:
         raise ValueError(f"advantage must be (R, 1) float32, got {tuple(advantage.shape)} {advantage.dtype}")
     if task_id.dtype != torch.int64 or task_id.shape != advantage.shape[:1]:
-        raise ValueError(
-            f"task_id must be ({len(advantage)},) int64, a task for each row of advantage, got "
-            f"{tuple(task_id.shape)} {task_id.dtype}"
-        )
+        raise ValueError(f"task_id must be ({len(advantage)},) int64, got {tuple(task_id.shape)} {task_id.dtype}")
     check_finite("advantage", advantage)
     found = torch.zeros_like(advantage)
     for task in task_id.unique():

@@ -21,14 +21,7 @@ from lw_torchrl.objectives.reduction import Reduction, let_go, priority_weight
 
 def imitation(action: Tensor, demonstrated: Tensor, is_demonstration: Tensor) -> Tensor:
     """The squared distance of (B, A) float32 actions to the demonstrated ones, (B,) float32: 0 in rows that are no
-    demonstrations, and scaled so that its mean over all rows is the mean over demonstrations.
-
-    Example:
-        >>> import torch
-        >>> one, other = torch.zeros(4, 2), torch.tensor([[9.0, 9.0], [9.0, 9.0], [1.0, 1.0], [0.0, 2.0]])
-        >>> imitation(one, other, torch.tensor([False, False, True, True])).mean()
-        tensor(1.5000)
-    """
+    demonstrations, and scaled so that its mean over all rows is the mean over demonstrations."""
     rows = is_demonstration.reshape(action.shape[:-1])
     distance = (action - demonstrated).square().mean(-1) * rows
     return distance * (rows.numel() / rows.sum().clamp(min=1))
@@ -58,9 +51,8 @@ class _ImitatesDemonstrations(_Loss):
             raise ValueError("alpha is 1 here: give bc_weight, the weight of the imitation")
         spec = options.get("action_spec")
         if spec is not None and not isinstance(spec, Composite) and len(spec.shape) > 1:  # actions of as many rows
-            raise ValueError(
-                f"action_spec must be of one row, got one of shape {tuple(spec.shape)}: take env.action_spec_unbatched"
-            )
+            got = f"one of shape {tuple(spec.shape)}: take env.action_spec_unbatched"
+            raise ValueError(f"action_spec must be of one row, got {got}")
         critics = qvalue_network if isinstance(qvalue_network, list) else [qvalue_network]
         if not critics or not all(isinstance(critic, TensorDictModuleBase) for critic in critics):
             raise TypeError(
@@ -80,9 +72,8 @@ class _ImitatesDemonstrations(_Loss):
         key = self.tensor_keys.is_demonstration
         if (found := tensordict.get(key, None)) is None:
             raise ValueError(
-                f"the batch lacks {key!r}, which says which rows to imitate: a LanguageWorldExperienceReplay writes "
-                f"it, as does a buffer on a GrowingStorage; in a buffer of your own, set it, (B,) bool, or name it by "
-                f"set_keys"
+                f"the batch lacks {key!r}, which says which rows to imitate: a LanguageWorldExperienceReplay "
+                "writes it, and a GrowingStorage; in a buffer of your own set it, (B,) bool, or name it by set_keys"
             )
         if found.dtype != torch.bool:
             raise ValueError(f"{key!r} must be torch.bool, true of demonstrations, got {found.dtype}")

@@ -37,9 +37,8 @@ def let_go(*tensordicts: TensorDictBase) -> None:
 def with_n_steps(loss: LossModule, batch: TensorDictBase) -> TensorDictBase:
     """A minibatch whose n steps the loss's value estimator sees: ``loss(with_n_steps(loss, batch))``.
 
-    TorchRL's :class:`~torchrl.objectives.IQLLoss` and :class:`~torchrl.objectives.REDQLoss` show their estimator only
-    what is under ``"next"``. ``steps_to_next_obs`` is not there, so they would bootstrap over one step. This sets it
-    there too, and has the estimator read it. For other losses, and rows without it, nothing happens.
+    TorchRL's :class:`~torchrl.objectives.IQLLoss` and :class:`~torchrl.objectives.REDQLoss` show it only what is under
+    ``"next"``, where this sets ``steps_to_next_obs`` too. For other losses, and rows without it, nothing happens.
 
     Args:
         loss: any loss; call ``make_value_estimator`` before.

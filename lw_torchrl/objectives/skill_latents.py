@@ -45,9 +45,8 @@ class SkillLatentLoss(LossModule):
         ['loss_latents']
 
     Source: paper, what it leaves to future work: 'regularization or contrastive learning'. "consistency": Tung, Mori,
-    "Similarity-Preserving Knowledge Distillation", 2019, with the text encoder as the teacher. "contrastive": van den
-    Oord, Li, Vinyals, "Representation Learning with Contrastive Predictive Coding", 2018; where the positive is the
-    skill itself, the part that keeps apart remains, the uniformity of Wang, Isola, 2020.
+    "Similarity-Preserving Knowledge Distillation", 2019. "contrastive": van den Oord, Li, Vinyals, "Representation
+    Learning with Contrastive Predictive Coding", 2018; what remains is the uniformity of Wang, Isola, 2020.
     """
 
     out_keys = ["loss_latents"]

@@ -19,8 +19,7 @@ from lw_torchrl.evaluation import EvaluationResult, plot_methods
 from lw_torchrl.evaluation.summary import markdown_table
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.modules import DescriptorEncoder, PlanEncoder, QValue, Value
-from lw_torchrl.modules.encoder import Encoder
-from lw_torchrl.modules.policy import METHODS, Policy, make_policy
+from lw_torchrl.modules.policy import METHODS, Encoder, Policy, make_policy
 from lw_torchrl.objectives import AdvantageWeightedLoss, ExpectileValueLoss, standardize_by_task
 from lw_torchrl.paper.offline_recipes import (
     MIXTURES,

@@ -16,22 +16,8 @@ from lw_torchrl.training.online import OnlineTrainer
 from lw_torchrl.training.stacked import StackedBehavioralCloning
 
 __all__ = [
-    "LEARNERS",
-    "BehavioralCloningConfig",
-    "BehavioralCloningTrainer",
-    "ImageQueryEvaluatorConfig",
-    "ImageQueryEvaluatorTrainer",
-    "LabelledQueries",
-    "OfflineConfig",
-    "OfflineTrainer",
-    "OnlineConfig",
-    "OnlineTrainer",
-    "QueryEvaluatorConfig",
-    "QueryEvaluatorTrainer",
-    "StackedBehavioralCloning",
-    "fit_normalization",
-    "load_actor",
-    "load_evaluator",
-    "save_actor",
-    "save_evaluator",
-]
+    "LEARNERS", "BehavioralCloningConfig", "BehavioralCloningTrainer", "ImageQueryEvaluatorConfig",
+    "ImageQueryEvaluatorTrainer", "LabelledQueries", "OfflineConfig", "OfflineTrainer", "OnlineConfig", "OnlineTrainer",
+    "QueryEvaluatorConfig", "QueryEvaluatorTrainer", "StackedBehavioralCloning", "fit_normalization", "load_actor",
+    "load_evaluator", "save_actor", "save_evaluator",
+]  # fmt: skip

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import warnings
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import Any, Literal, Unpack
 
 import torch
 from tensordict import TensorDictBase
@@ -15,18 +14,17 @@ from torch import Tensor, nn
 from torch.nn.utils import clip_grad_norm_
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.objectives import BCLoss
-from torchrl.record.loggers import Logger
 
-from lw_torchrl._checks import Count, Positive, Scale, check_fields, checked
+from lw_torchrl._checks import Count, Positive, Scale, check_fields, checked, passes_on
 from lw_torchrl._devices import place
+from lw_torchrl.data.replay_checks import check_replay
 from lw_torchrl.language.task_index import PlanTables
 from lw_torchrl.modules.policy import Policy
 from lw_torchrl.modules.query_evaluator import QueryEvaluator
 from lw_torchrl.objectives.skill_latents import Kind, latent_term, skill_encoder
-from lw_torchrl.training.buffers import check_replay
 from lw_torchrl.training.envelope import POLICY
 from lw_torchrl.training.files import check_can_be_saved, describe_data, describe_replay
-from lw_torchrl.training.loop import ReplayState, Training, make_schedule
+from lw_torchrl.training.loop import ReplayState, Training, TrainingOptions, make_schedule
 from lw_torchrl.training.normalization import check_contacts, fit_normalization
 from lw_torchrl.transforms.qaf import plan_program
 
@@ -145,7 +143,7 @@ class BehavioralCloningTrainer(Training):
     Args:
         actor: it is trained in place.
         replay: samples with what the actor reads and ``action`` (B, 4) float32.
-        config, checkpoint, logger, progress: as of :class:`~lw_torchrl.training.loop.Training`, with its errors.
+        config, checkpoint, logger, progress, title: as of :class:`~lw_torchrl.training.loop.Training`, with its errors.
         device: where to train: "cpu", "cuda", "cuda:1", "mps", or "auto" for the fastest that there is. The actor is
             moved there, and stays; None for where it is. On a GPU no step waits for another: losses are read every 100
             steps. Make the buffer with the same ``device``, or each minibatch has to go over.
@@ -172,6 +170,7 @@ class BehavioralCloningTrainer(Training):
 
     envelope, says_device = POLICY, True
 
+    @passes_on(Training.__init__)
     @checked
     def __init__(
         self,
@@ -179,13 +178,11 @@ class BehavioralCloningTrainer(Training):
         replay: TensorDictReplayBuffer,
         config: BehavioralCloningConfig | None = None,
         *,
-        checkpoint: str | os.PathLike[str] | None = None,
-        logger: Logger | None = None,
-        progress: bool = True,
         device: str | torch.device | None = None,
+        **options: Unpack[TrainingOptions],
     ) -> None:
         config = config or BehavioralCloningConfig()
-        super().__init__(config, [replay], checkpoint, logger=logger, progress=progress)
+        super().__init__(config, [replay], **options)
         self.actor, self.module, self.replay, self.networks = actor, actor, replay, [actor]
         self.device = place(actor, device)
         check_replay(actor, replay, config.batch_size)

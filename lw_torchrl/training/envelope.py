@@ -55,12 +55,9 @@ class Envelope:
 
     def save(self, path: str | os.PathLike[str], module: Any, texts: Mapping[str, Tensor], about: dict) -> None:
         """Write a module that a file can hold, and ``about``; :class:`ValueError` if it names what a file says."""
-        if reserved := {"format", "version", "versions", self.part, "state", "sha256"} & set(about):
-            raise ValueError(
-                f"about must not be named {', '.join(sorted(reserved))}, which {self.called} file says itself"
-            )
-        groups = {"weights": module.state_dict(), "texts": texts}
-        self.write(path, {self.part: module.describe(), **about}, groups)
+        if reserved := sorted({"format", "version", "versions", self.part, "state", "sha256"} & set(about)):
+            raise ValueError(f"about must not be named {', '.join(reserved)}, which {self.called} file says itself")
+        self.write(path, {self.part: module.describe(), **about}, {"weights": module.state_dict(), "texts": texts})
 
     def write(
         self,
@@ -78,11 +75,8 @@ class Envelope:
         try:
             write_archive(path, described, groups)
         except OSError as error:
-            raise OSError(
-                error.errno,
-                f"{self.argument}: {str(path)!r} cannot be written ({error.strerror}); what stood there before is as "
-                "it was",
-            ) from error
+            what = f"{self.argument}: {str(path)!r} cannot be written ({error.strerror}); an earlier file is as it was"
+            raise OSError(error.errno, what) from error
 
     def open(self, path: str | os.PathLike[str]) -> TensorArchive:
         """The archive of a file whose format, version and part have been checked."""
@@ -124,10 +118,8 @@ class Envelope:
             check_like(weights, again.state_dict(), "weights")
             check_finite(weights, weights)
         except Exception as error:
-            raise ValueError(
-                f"{self.part} cannot be kept in a file, which would not make it again from its description "
-                f"({first_line(error)})"
-            ) from error
+            what = f"{self.part} cannot be kept in a file, whose description would not make it again"
+            raise ValueError(f"{what} ({first_line(error)})") from error
 
     def load(
         self,
@@ -150,24 +142,21 @@ class Envelope:
         except ImportError:
             raise
         except Exception as error:  # a file from a stranger may say anything
-            raise ValueError(
-                f"{self.argument}: the {self.part} of {str(path)!r} cannot be made ({first_line(error)})"
-            ) from error
+            what = f"{self.argument}: the {self.part} of {str(path)!r} cannot be made"
+            raise ValueError(f"{what} ({first_line(error)})") from error
         return module.eval()
 
     def resume(
         self,
         path: Path,
         described: Mapping[str, Any],
-        live: Mapping[str, Tensor],
+        contents: Mapping[str, Mapping[str, Tensor]],
         load: Callable[[dict[str, Any]], None],
         *,
-        texts: Mapping[str, Tensor] | None = None,
         device: torch.device | None = None,
         packages: Sequence[str] = LIBRARIES,
     ) -> None:
-        """Go on with the training of a file; warn if it was written on another kind of device, or under other
-        versions of packages."""
+        """Go on with a file's training; warn if another kind of device, or other versions of packages, wrote it."""
         archive = self.open(path)
         check_same_description(path, archive.description, described)
         if device is not None and (before := archive.description.get("device", "cpu")) != device.type:
@@ -181,24 +170,22 @@ class Envelope:
             state = join(archive.description.get("state"), archive.tensors("training"))
             if not isinstance(state, dict):
                 raise ValueError("it has no training state")
-            if texts is not None:
-                check_texts(archive.tensors("texts"), texts)
-            copy_weights(archive.tensors(self.group), live)
+            if "texts" in contents:
+                check_texts(archive.tensors("texts"), contents["texts"])
+            copy_weights(archive.tensors(self.group), contents[self.group])
             load(state)
         except (ValueError, KeyError, TypeError, RuntimeError, AttributeError) as error:  # RecursionError among them
-            raise ValueError(
-                f"checkpoint: {str(path)!r} does not fit, it is of another architecture or damaged "
-                f"({first_line(error)})"
-            ) from error
+            what = f"checkpoint: {str(path)!r} does not fit, it is of another architecture or damaged"
+            raise ValueError(f"{what} ({first_line(error)})") from error
 
 
-POLICY: Envelope = Envelope("lw_torchrl.policy", 3, "actor", "checkpoint", "a policy", "lw-torchrl train")
-EVALUATOR: Envelope = Envelope(
-    "lw_torchrl.evaluator", 1, "evaluator", "evaluator", "an evaluator", "lw-torchrl train-evaluator"
-)
-TRAINING: Envelope = Envelope(
-    "lw_torchrl.training", 1, "loss", "checkpoint", "a loss's training", "lw-torchrl offline", "loss"
-)
+def _envelope(name: str, *of: Any) -> Envelope:
+    return Envelope(f"lw_torchrl.{name}", *of)
+
+
+POLICY: Envelope = _envelope("policy", 3, "actor", "checkpoint", "a policy", "lw-torchrl train")
+EVALUATOR: Envelope = _envelope("evaluator", 1, "evaluator", "evaluator", "an evaluator", "lw-torchrl train-evaluator")
+TRAINING: Envelope = _envelope("training", 1, "loss", "checkpoint", "a loss's training", "lw-torchrl offline", "loss")
 
 
 def check_description(path: Path, ours: Mapping[str, Any]) -> None:

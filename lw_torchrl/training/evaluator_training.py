@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from hashlib import blake2b
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Unpack
 
 import torch
 from torch import Tensor, nn
 
-from lw_torchrl._checks import Count, Scale, checked_but
+from lw_torchrl._checks import Count, Scale, checked_but, passes_on
 from lw_torchrl._state_tree import check_like, check_optimizer_state
 from lw_torchrl.modules.clause_evaluator import ClauseEvaluator
 from lw_torchrl.modules.image_query_evaluator import ImageQueryEvaluator
@@ -20,7 +19,7 @@ from lw_torchrl.modules.state_query_evaluator import StateQueryEvaluator
 from lw_torchrl.training.envelope import EVALUATOR
 from lw_torchrl.training.files import check_evaluator_can_be_saved, evaluator_texts
 from lw_torchrl.training.labelled_queries import Asked, LabelledQueries, QueryEvaluatorConfig
-from lw_torchrl.training.loop import Training
+from lw_torchrl.training.loop import Training, TrainingOptions
 
 _MOST_WEIGHT = 20.0  # of a rare truth, by the median
 
@@ -95,21 +94,8 @@ class _PictureMinibatches:
             evaluator.check_seen(one.seen("pixels"))
         self.coded = [evaluator.code([(one.task, clause) for clause in one.clauses]) for one in asked]
         self.weights = [_answer_weights(one) for one in asked]
-        self.positions = [self._known_positions(one) for one in asked]
+        self.positions = [_known_positions(one, evaluator.names) for one in asked]
         self.labels = _digest(tensor for one in asked for tensor in (one.observation, one.truth, one.seen("pixels")))
-
-    def _known_positions(self, asked: Asked) -> tuple[Tensor, Tensor, Tensor]:
-        """A task's things, (n,); where they are, and how far each is open, (R, n, 4); what counts, (n, 4)."""
-        names = [name for name in asked.task.object_names if name in self.evaluator.names]
-        positions, number = asked.task.positions(asked.observation), self.evaluator.names.index
-        known = torch.zeros(len(asked.observation), len(names), 4)
-        counts = torch.ones(len(names), 4)
-        for place, name in enumerate(names):
-            known[:, place, :3] = positions[name]
-            if (opening := asked.task.openings.get(name)) is not None:
-                known[:, place, 3] = asked.observation[:, opening]
-            counts[place, 3] = opening is not None
-        return torch.tensor([number(name) for name in names], dtype=torch.int64), known, counts
 
     def loss(self, step: int, generator: torch.Generator) -> Tensor:
         each = max(1, self.config.batch_size // len(self.asked))
@@ -136,6 +122,19 @@ class _PictureMinibatches:
         return (errors * weights).sum() / weights.sum() + self.config.position_weight * placed
 
 
+def _known_positions(asked: Asked, known: tuple[str, ...]) -> tuple[Tensor, Tensor, Tensor]:
+    """A task's things, (n,); where they are, and how far each is open, (R, n, 4); what counts, (n, 4)."""
+    names = [name for name in asked.task.object_names if name in known]
+    positions, openings = asked.task.positions(asked.observation), asked.task.openings
+    found, counts = torch.zeros(len(asked.observation), len(names), 4), torch.ones(len(names), 4)
+    for place, name in enumerate(names):
+        found[:, place, :3] = positions[name]
+        counts[place, 3] = name in openings
+        if name in openings:
+            found[:, place, 3] = asked.observation[:, openings[name]]
+    return torch.tensor([known.index(name) for name in names], dtype=torch.int64), found, counts
+
+
 def _answer_weights(asked: Asked) -> Tensor:
     """(2, Q) float32, of a clause's false and true answers: each predicate and truth weighs alike."""
     true = asked.truth.double().mean(0)
@@ -158,14 +157,14 @@ def _digest(tensors: Iterable[Tensor]) -> str:
 class QueryEvaluatorTrainer(Training):
     """Trains an evaluator on the answers of the query answering function to all base queries of tasks.
 
-    A minibatch has equally many pairs of a state and a clause of each predicate and truth, as far as there are any. An
-    evaluator that reads texts is asked half of the clauses negated. A minibatch hangs on the seed and the step alone.
+    A minibatch, which hangs on the seed and the step alone, has equally many pairs of a state and a clause of each
+    predicate and truth. An evaluator that reads texts is asked half of the clauses negated.
 
     Args:
         evaluator: it is trained in place; its plans do not matter.
         data: what is asked, and what of it is held out.
         config: how to train, the one that the data were made with.
-        checkpoint, progress: as of :class:`~lw_torchrl.training.loop.Training`, with its errors;
+        checkpoint, logger, progress, title: as of :class:`~lw_torchrl.training.loop.Training`, with its errors;
             :func:`load_evaluator` reads the file.
 
     Raises:
@@ -187,20 +186,20 @@ class QueryEvaluatorTrainer(Training):
     trains: ClassVar[type[ClauseEvaluator]] = StateQueryEvaluator
     minibatches: ClassVar[Callable[..., _StateMinibatches | _PictureMinibatches]] = _StateMinibatches
 
+    @passes_on(Training.__init__)
     @checked_but("evaluator")
     def __init__(
         self,
         evaluator: ClauseEvaluator,
         data: LabelledQueries,
         config: QueryEvaluatorConfig | None = None,
-        *,
-        checkpoint: str | os.PathLike[str] | None = None,
-        progress: bool = True,
+        **options: Unpack[TrainingOptions],
     ) -> None:
         if not isinstance(evaluator, self.trains):
             raise TypeError(f"evaluator must be of class {self.trains.__name__}, got {type(evaluator).__name__}")
         config = config or QueryEvaluatorConfig()
-        super().__init__(config, [], checkpoint, progress=progress, title="training the evaluator")
+        options.setdefault("title", "training the evaluator")
+        super().__init__(config, [], **options)
         self.evaluator, self.module, self.networks = evaluator, evaluator, [evaluator]
         if not data.parts["training"]:
             raise ValueError("data must have states and queries to train on, all are held out")

@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping
 from typing import Any
 
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.envs import Compose, Transform
 
 from lw_torchrl._checks import checked, checked_but
@@ -48,10 +48,8 @@ def save_actor(actor: Policy, path: str | os.PathLike[str], **about: Any) -> Non
 def check_can_be_saved(actor: Any) -> Policy:
     """Return the actor if a policy file can hold it: what cannot be loaded again is refused before any training."""
     if not isinstance(actor, Policy):
-        raise TypeError(
-            f"actor must be a Policy to be kept in a file, got {type(actor).__name__}: save the policy inside of it, "
-            "derive your class from lw_torchrl.Policy, or train without a checkpoint"
-        )
+        what = f"actor must be a Policy to be kept in a file, got {type(actor).__name__}"
+        raise TypeError(f"{what}: save the policy inside of it, or derive your class from lw_torchrl.Policy")
 
     def make(described: Any) -> Policy:
         again = from_description(described, stand_in(text_vectors(actor)))
@@ -103,16 +101,14 @@ def check_evaluator_can_be_saved(evaluator: Any) -> QueryEvaluator:
     """As :func:`check_can_be_saved`, of an evaluator."""
     if not isinstance(evaluator, QueryEvaluator):
         raise TypeError(f"evaluator must be a QueryEvaluator to be kept in a file, got {type(evaluator).__name__}")
-    encoder = getattr(evaluator, "text_encoder", None)
-    EVALUATOR.check_can_be_saved(evaluator, lambda found: evaluator_from_description(found, evaluator.plans, encoder))
+    plans, encoder = evaluator.plans, evaluator.text_encoder
+    EVALUATOR.check_can_be_saved(evaluator, lambda found: evaluator_from_description(found, plans, encoder))
     return evaluator
 
 
 def evaluator_texts(evaluator: QueryEvaluator) -> dict[str, Tensor]:
     """The vector of one text, of an evaluator that reads texts: a file's texts."""
-    if getattr(evaluator, "text_vectors", None) is None:
-        return {}
-    return {"probe": encoded([_PROBE], getattr(evaluator, "text_encoder", None))}
+    return {"probe": encoded([_PROBE], evaluator.text_encoder)} if text_vectors(evaluator) else {}
 
 
 @checked
@@ -170,7 +166,11 @@ def describe_replay(replay: Any) -> dict[str, Any]:
         "label": getattr(replay, "label", None),
         "rows": None if describe_data(replay) is None else len(replay),  # after_success leaves so many
         "sampler": type(replay.sampler).__name__,
-        "transforms": [_describe_transform(part) for part in parts if not isinstance(part, Compose)],
+        "transforms": [
+            {"class": type(part).__name__} | {name: repr(value) for name, value in plain_options(part).items()}
+            for part in parts
+            if not isinstance(part, Compose)
+        ],
     }
 
 
@@ -182,7 +182,7 @@ def describe_learning(replay: Any) -> dict[str, Any]:
     return describe_replay(replay) | told | ({} if grow is None else {"grow": grow})
 
 
-def _describe_transform(transform: Transform) -> dict[str, str]:
-    options = {name: value for name, value in vars(transform).items() if name[0] != "_" and name != "training"}
-    simple = {name: repr(value) for name, value in options.items() if isinstance(value, (bool, int, float, str))}
-    return {"class": type(transform).__name__, **simple}
+def plain_options(module: nn.Module) -> dict[str, bool | int | float | str]:
+    """The attributes of a transform or a loss that are flags, numbers and texts."""
+    options = {name: value for name, value in vars(module).items() if name[0] != "_" and name != "training"}
+    return {name: value for name, value in options.items() if isinstance(value, (bool, int, float, str))}

@@ -66,14 +66,13 @@ class QueryEvaluatorConfig:
         for name in ("held_out_states", "held_out_pairs"):
             if getattr(self, name) > 0.9:
                 raise ValueError(f"{name} must leave a tenth to train on, got {getattr(self, name)}")
-        if isinstance(self.held_out_tasks, (int, str)):
-            check_int("held_out_tasks", self.held_out_tasks, minimum=0)
-        else:
-            if not isinstance(self.held_out_tasks, Iterable):
-                raise TypeError(f"held_out_tasks must be a number or names, got {shown(self.held_out_tasks)}")
-            object.__setattr__(self, "held_out_tasks", tuple(self.held_out_tasks))
-            for task in self.held_out_tasks:
-                check_text("held_out_tasks", task)
+        given = self.held_out_tasks
+        if isinstance(given, str) or not isinstance(given, Iterable):
+            check_int("held_out_tasks", given, minimum=0)
+            return
+        object.__setattr__(self, "held_out_tasks", tuple(given))
+        for task in self.held_out_tasks:  # type: ignore[union-attr]
+            check_text("held_out_tasks", task)
 
 
 @dataclass(frozen=True)
@@ -93,8 +92,8 @@ class Asked:
             return self.observation
         if key != "pixels" or self.pixels is None:
             raise ValueError(
-                f"data must have the column {key!r}, which the evaluator reads: lw.data.add_pictures(root, ...) draws "
-                "a dataset's rows, replay.add_column('pixels', lw.data.load_pictures(replay, ...)) shows them"
+                f"data must have the column {key!r}, which the evaluator reads, as lw.data.add_pictures(root, ...) and "
+                "replay.add_column('pixels', lw.data.load_pictures(replay, ...)) give it"
             )
         return self.pixels
 
@@ -176,8 +175,8 @@ class LabelledQueries:
 
 
 def _pair(clause: Clause) -> tuple[str, str]:
-    first, second = sorted((clause.subject, clause.object or ""))
-    return first, second
+    pair = clause.subject, clause.object or ""
+    return min(pair), max(pair)
 
 
 def _some(rows: Tensor, most: int, generator: torch.Generator) -> Tensor:

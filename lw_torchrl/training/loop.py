@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from types import FrameType
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypedDict
 
 import torch
 from tensordict import TensorDictBase
@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.record.loggers import Logger
 
-from lw_torchrl._checks import check_int
+from lw_torchrl._checks import check_int, checked
 from lw_torchrl._devices import CPU, drawn_on
 from lw_torchrl._files import held, sweep
 from lw_torchrl._progress import Progress
@@ -75,26 +75,31 @@ class ReplayState:
             ours.load_state_dict(sampler)
 
 
+class TrainingOptions(TypedDict, total=False):
+    """The options of :class:`Training` that every trainer takes."""
+
+    checkpoint: str | os.PathLike[str] | None
+    logger: Logger | None
+    progress: bool
+    title: str
+
+
 class Training:
     """What all trainers share. A subclass makes ``optimizer`` and ``module``, and fills in :meth:`step`.
 
     Args:
-        config: how to train, with ``steps``, ``checkpoint_every`` and ``learning_rate``; of trainers, None for the
-            defaults.
+        config: how to train, with ``steps``, ``checkpoint_every`` and ``learning_rate``; None for the defaults.
         replays: the buffers. Their generators are set to the configuration's seed.
         checkpoint: a file to write checkpoints to. If it is there already, training carries on from it.
         logger: a TorchRL logger for what :meth:`means` gives, every 100 steps.
-        progress: show a progress bar.
-        title: of the progress bar.
+        progress, title: show a progress bar, and its title.
 
     Attributes:
         module: holds all that is trained.
         steps: the minibatches done.
         states: of the buffers, one each.
-        networks: those that are in train mode while :meth:`run` lasts.
-        device: where the networks are.
+        networks, device: those that are in train mode while :meth:`run` lasts, and where they are.
         described: what a checkpoint says, as JSON: training resumes only from one that says the same.
-        envelope: of the checkpoint.
         says_device: whether a checkpoint says on which kind of device it was trained.
 
     Warns:
@@ -114,12 +119,13 @@ class Training:
     schedule: Schedule | None = None
     device = CPU
 
+    @checked
     def __init__(
         self,
         config: Any,
         replays: Sequence[TensorDictReplayBuffer],
-        checkpoint: str | os.PathLike[str] | None,
         *,
+        checkpoint: str | os.PathLike[str] | None = None,
         logger: Logger | None = None,
         progress: bool = True,
         title: str = "training",
@@ -174,7 +180,7 @@ class Training:
     def run(self, until: int | None = None) -> Tensor:
         """Train to the last step, or until so many in all; return the losses of the last 100 steps made, (n,) or (n, M)
         float32 on the CPU. Ctrl-C ends it between two steps, with a checkpoint."""
-        every, total = self.config.checkpoint_every, self.config.steps
+        total = self.config.steps
         if until is not None and check_int("until", until, minimum=1) > total:
             raise ValueError(f"until must be at most the configuration's steps, {total}, got {until}")
         self._losses.clear()
@@ -185,16 +191,12 @@ class Training:
             while self.steps < last and not interrupt.asked:
                 self.step()
                 bar.update()
-                saves = self.steps % every == 0 or self.steps == last
-                tells = self.steps % READ_EVERY == 0 or self.steps == last
-                losses = self._read_losses() if saves or tells else None
-                if tells and losses is not None:
-                    self.log(found := self.means(losses), self.steps)
+                if self.steps % READ_EVERY == 0 or self.steps == last:
+                    self.log(found := self.means(self._read_losses()), self.steps)
                     bar.note(**{name: f"{value:.4f}" for name, value in found.items() if "loss" in name})
-                if saves:
+                if self.steps % self.config.checkpoint_every == 0 or self.steps == last:
                     self.save()
             if interrupt.asked:
-                self._read_losses()
                 self.save()
         for network in self.networks:
             network.eval()
@@ -248,16 +250,16 @@ class Training:
         return stat.st_ino, stat.st_size, stat.st_mtime_ns
 
     def save(self) -> None:
-        """Write the checkpoint, if there is to be one; an earlier one is replaced whole."""
+        """Write the checkpoint, if there is to be one and all losses are finite; an earlier one is replaced whole."""
+        self._read_losses()
         try:
             check_finite(self.parameters(), self.parameters())
         except ValueError as error:
             raise ValueError(f"{error} after step {self.steps}: the learning rate is too high") from error
         if self.checkpoint is not None:
-            kind = self.device.type
-            said = {"device": kind} if self.says_device and kind != "cpu" else {}
+            said = {"device": self.device.type} if self.says_device and self.device.type != "cpu" else {}
             self.envelope.write(self.checkpoint, self.described | said, self.contents(), self.state_dict())
-            self._file_known = self._file_now()  # it was read or written by this training
+            self._file_known = self._file_now()
 
     def resume(self, packages: Sequence[str] = LIBRARIES) -> bool:
         """Go on from the checkpoint, and say whether it is there."""
@@ -266,10 +268,10 @@ class Training:
         for replay in self.replays:
             if isinstance(replay, LanguageWorldExperienceReplay):
                 replay.verify()
-        contents, load = self.contents(), self.load_state_dict
-        live, texts = contents[self.envelope.group], contents.get("texts")
         device = self.device if self.says_device else None
-        self.envelope.resume(self.checkpoint, self.described, live, load, texts=texts, device=device, packages=packages)
+        self.envelope.resume(
+            self.checkpoint, self.described, self.contents(), self.load_state_dict, device=device, packages=packages
+        )
         return True
 
     def state_dict(self) -> dict[str, Any]:

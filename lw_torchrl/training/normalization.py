@@ -21,10 +21,9 @@ from lw_torchrl.modules.relative_positions import PlanRoles
 
 @checked
 def fit_normalization(target: nn.Module, replay: TensorDictReplayBuffer) -> None:
-    """Give a policy, a critic, or all that a loss holds, the statistics of a buffer's rows.
+    """Give a policy, a critic, or all that a loss holds, copies and targets too, the statistics of a buffer's rows.
 
-    A loss's copies and targets get them too. Each row counts as often as :class:`CoLearningSampler` draws it: a
-    target's few rows would not count otherwise, and its features lie far outside the base tasks' range.
+    Each row counts as often as :class:`CoLearningSampler` draws it: a target's few rows would not count otherwise.
 
     Args:
         target: a :class:`Policy`, a critic, a module with :class:`ObservationFeatures` in it, or a loss of such.
@@ -61,11 +60,7 @@ def fit_normalization(target: nn.Module, replay: TensorDictReplayBuffer) -> None
         if isinstance(target, Policy) and (task_id := rows.get("task_id", None)) is not None:
             target.fit_contacts(observation, task_id.cpu())
         return
-    if _lacks_contacts(target):
-        raise ValueError(
-            "roles: where the hand touches things is taken from demonstrations by fit_normalization(actor, replay), "
-            "before the loss is made of the actor"
-        )
+    check_contacts(target)
     known: dict[tuple[str, Layout], ObservationFeatures] = {}
     for features, mean, std in _statistics(target):
         kind = features.kind, features.layout
@@ -81,10 +76,10 @@ def fit_normalization(target: nn.Module, replay: TensorDictReplayBuffer) -> None
 
 def check_contacts(actor: nn.Module) -> None:
     """Raise :class:`ValueError` if an actor with ``roles`` would be trained without contacts."""
-    if _lacks_contacts(actor):
+    if any(not of("fitted") for _, of in _held(actor, PlanRoles)):
         raise ValueError(
             "roles want to know where the demonstrations touch things; call fit_normalization(actor, replay) of "
-            "lw_torchrl.training first, which normalize=True does for a Policy"
+            "lw_torchrl.training, as normalize=True does; with roles: do so before the loss is made of the actor"
         )
 
 
@@ -95,17 +90,13 @@ def fit_untrained(loss: LossModule, replay: TensorDictReplayBuffer) -> None:
     for mean, old_mean, std, old_std in before:
         untrained = not old_mean.any() and bool((old_std == 1).all())
         if not untrained and not (torch.allclose(mean, old_mean) and torch.allclose(std, old_std)):
-            for now, then in ((a, b) for row in before for a, b in (row[:2], row[2:])):
-                now.copy_(then)
+            for row in before:
+                row[0].copy_(row[1])
+                row[2].copy_(row[3])
             raise ValueError(
-                "normalize: a network of the loss has the statistics of other rows, with which it was trained; give "
-                "OfflineConfig(normalize=False) to keep them, and fresh networks theirs by fit_normalization(network, "
-                "replay) before the loss is made"
+                "normalize: a network of the loss has the statistics of other rows, with which it was trained: give "
+                "normalize=False to keep them, and fresh networks theirs by fit_normalization(network, replay)"
             )
-
-
-def _lacks_contacts(target: nn.Module) -> bool:
-    return any(not of("fitted") for _, of in _held(target, PlanRoles))
 
 
 def _statistics(target: nn.Module) -> Iterator[tuple[ObservationFeatures, Tensor, Tensor]]:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from hashlib import sha256
-from typing import Any, Literal
+from typing import Any, Literal, Unpack
 
 import torch
 from tensordict import TensorDictBase
@@ -16,15 +15,14 @@ from torch.nn.utils import clip_grad_norm_
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import MultiStepTransform
 from torchrl.objectives import LossModule, SoftUpdate
-from torchrl.record.loggers import Logger
 
-from lw_torchrl._checks import Count, Positive, Probability, Scale, check_fields, checked_but
+from lw_torchrl._checks import Count, Positive, Probability, Scale, check_fields, checked_but, passes_on
+from lw_torchrl.data.replay_checks import check_minibatches
 from lw_torchrl.objectives.reduction import with_n_steps
-from lw_torchrl.training.buffers import check_minibatches
 from lw_torchrl.training.envelope import TRAINING
 from lw_torchrl.training.file_checks import tensors_of
-from lw_torchrl.training.files import describe_data, describe_learning
-from lw_torchrl.training.loop import READ_EVERY, ReplayState, Training, make_schedule
+from lw_torchrl.training.files import describe_data, describe_learning, plain_options
+from lw_torchrl.training.loop import READ_EVERY, ReplayState, Training, TrainingOptions, make_schedule
 from lw_torchrl.training.normalization import fit_untrained
 
 _INSTEAD = {"loss_actor_bc"}  # minimised in place of another entry: in CQL's first steps of the actor
@@ -98,21 +96,18 @@ class OfflineTrainer(Training):
 
     envelope = TRAINING
 
+    @passes_on(Training.__init__)
     @checked_but("loss")
     def __init__(
         self,
         loss: LossModule,
         replay: TensorDictReplayBuffer,
         config: OfflineConfig | None = None,
-        *,
-        checkpoint: str | os.PathLike[str] | None = None,
-        logger: Logger | None = None,
-        progress: bool = True,
-        title: str = "training",
+        **options: Unpack[TrainingOptions],
     ) -> None:
         check_loss(loss, replay)
         config = config or OfflineConfig()
-        super().__init__(config, [replay], checkpoint, logger=logger, progress=progress, title=title)
+        super().__init__(config, [replay], **options)
         self.loss, self.module, self.replay, self.networks = loss, loss, replay, networks_of(loss)
         self.device = next(loss.parameters()).device
         check_minibatches(self.networks, replay, config.batch_size)
@@ -125,8 +120,8 @@ class OfflineTrainer(Training):
         others = [parameter for name, parameter in trained if not name.startswith("actor_network_params")]
         rates = (actor, config.learning_rate), (others, config.critic_learning_rate)
         self.groups = [group for group, _ in rates if group]
-        options = [{"params": group, "lr": float(rate)} for group, rate in rates if group]
-        self.optimizer = torch.optim.AdamW(options, weight_decay=config.weight_decay, fused=True)
+        groups = [{"params": group, "lr": float(rate)} for group, rate in rates if group]
+        self.optimizer = torch.optim.AdamW(groups, weight_decay=config.weight_decay, fused=True)
         self.schedule = make_schedule(config.schedule, self.optimizer, config.steps)
         self.last: dict[str, float] = {}
         self._given: deque[Mapping[str, Tensor]] = deque(maxlen=READ_EVERY)
@@ -180,16 +175,12 @@ def check_loss(loss: LossModule, replay: TensorDictReplayBuffer) -> None:
     """Raise unless a loss can be trained on a buffer; a value estimator that TorchRL would make later is made."""
     if not isinstance(loss, LossModule):
         raise TypeError(
-            f"loss must be a LossModule, got {type(loss).__name__}, whose targets and actor cannot be found; compile a "
-            "loss in place, by loss.compile()"
+            f"loss must be a LossModule, got {type(loss).__name__}; compile one in place, by loss.compile()"
         )
     if getattr(loss, "reduction", "mean") == "none":
         raise ValueError("loss must give the mean of its rows, got reduction='none'")
     if getattr(loss, "with_lagrange", False):
-        raise ValueError(
-            "loss: with_lagrange=True gives a loss_alpha_prime that reaches the critics, and takes from them what "
-            "loss_cql adds; give with_lagrange=False"
-        )
+        raise ValueError("loss: with_lagrange=True takes from the critics what loss_cql adds; give with_lagrange=False")
     summed = [part.gamma for part in replay.transform if isinstance(part, MultiStepTransform)]
     shown = next(iter(summed), getattr(replay, "gamma", None))  # None where ``next`` is one step ahead
     if shown is None or loss.default_value_estimator is None:
@@ -219,10 +210,9 @@ def describe_loss(loss: LossModule) -> dict[str, Any]:
         digest.update(f"{name} {tuple(tensor.shape)}".encode())
         if fixed:
             digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
-    options = {name: value for name, value in vars(loss).items() if name[0] != "_" and name != "training"}
     return {
         "class": type(loss).__name__,
-        "options": {name: v for name, v in options.items() if isinstance(v, (bool, int, float, str))},
+        "options": plain_options(loss),
         "networks": [type(network).__name__ for network in networks_of(loss)],
         "shapes": {name: list(parameter.shape) for name, parameter in loss.named_parameters()},
         "fixed": digest.hexdigest(),

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable
 from dataclasses import asdict
 from hashlib import sha256
-from typing import Any
+from typing import Any, Unpack
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
-from torchrl.record.loggers import Logger
 
-from lw_torchrl._checks import checked_but
+from lw_torchrl._checks import checked_but, passes_on
 from lw_torchrl._devices import CPU, drawn_on
 from lw_torchrl._progress import Progress
 from lw_torchrl._state_tree import check_like
@@ -22,6 +20,7 @@ from lw_torchrl._versions import LIBRARIES, SIMULATORS
 from lw_torchrl.data.co_learning_sampler import GROWN, CoLearningSampler
 from lw_torchrl.data.growing import GrowingStorage
 from lw_torchrl.data.replay import LanguageWorldExperienceReplay
+from lw_torchrl.data.replay_checks import check_minibatches, check_replay
 from lw_torchrl.data.rewards import REWARDS
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.language.layout import METAWORLD, Layout
@@ -31,10 +30,9 @@ from lw_torchrl.modules.policy import Policy
 from lw_torchrl.suites.suite import Suite, find_suite, listed_tasks
 from lw_torchrl.training.algorithms import LEARNERS, OnlineConfig, method_config
 from lw_torchrl.training.algorithms.learner import NoiseConfig
-from lw_torchrl.training.buffers import check_minibatches, check_replay
 from lw_torchrl.training.envelope import POLICY
 from lw_torchrl.training.files import check_can_be_saved, describe_data, describe_learning
-from lw_torchrl.training.loop import Interrupt, Training
+from lw_torchrl.training.loop import Interrupt, Training, TrainingOptions
 
 _MOST_EPISODES = 1_000_000
 
@@ -43,8 +41,8 @@ class OnlineTrainer(Training):
     """Trains a policy in its environment, beside demonstrations.
 
     In a round, each row of the environment runs episodes, which end at their first success or after ``max_steps``;
-    their steps go into the buffer, and the learner makes its gradient steps. At its end all rows are reset, since an
-    episode's physics cannot be restored, and a checkpoint is written, from which training goes on with the same bits.
+    their steps go into the buffer, and the learner makes its gradient steps. At its end all rows are reset, and a
+    checkpoint is written, from which training goes on with the same bits.
 
     Args:
         actor: the policy to begin with, one that was cloned, say. "advantage", "td3" and "expert-iteration" train it in
@@ -59,8 +57,8 @@ class OnlineTrainer(Training):
         suite: that has the tasks; None for the one that their names begin with.
         critic: whose copies are trained, where the method has one, with its normalisation as it is
             (``critic.fit_normalization``); None for one that sees what the actor sees, by the actor's.
-        checkpoint, logger, progress: as of :class:`~lw_torchrl.training.loop.Training`, with its errors; the checkpoint
-            holds the buffer's rows too, and what ``history`` holds is logged, by steps of the environment.
+        checkpoint, logger, progress, title: as of :class:`~lw_torchrl.training.loop.Training`, with its errors; the
+            checkpoint holds the buffer's rows too, and what ``history`` holds is logged, by steps of the environment.
         num_threads: of the simulation, which changes no result.
 
     Attributes:
@@ -102,6 +100,7 @@ class OnlineTrainer(Training):
 
     envelope = POLICY
 
+    @passes_on(Training.__init__)
     @checked_but("critic")
     def __init__(
         self,
@@ -113,13 +112,12 @@ class OnlineTrainer(Training):
         tasks: str | Task | Iterable[str | Task] | None = None,
         suite: str | Suite | None = None,
         critic: QValue | None = None,
-        checkpoint: str | os.PathLike[str] | None = None,
-        logger: Logger | None = None,
-        progress: bool = True,
         num_threads: int | None = None,
+        **options: Unpack[TrainingOptions],
     ) -> None:
         config = method_config(method, config)
-        super().__init__(config, [replay], checkpoint, logger=logger, progress=progress, title=f"training {method}")
+        options.setdefault("title", f"training {method}")
+        super().__init__(config, [replay], **options)
         check_can_be_saved(actor)
         check_growing_replay(actor, replay, config)
         if critic is not None:
@@ -209,11 +207,10 @@ class OnlineTrainer(Training):
                         break
                     self._drawn, self._episodes = drawn, base.get_extra_state()
                     self.round, self.steps = self.round + 1, self.learner.made
-                    for name, value in done.items():
-                        if name.startswith("loss") and value != value:
-                            raise ValueError(
-                                f"{name} is no number in round {self.round}: the learning rate is too high"
-                            )
+                    if wrong := [name for name, value in done.items() if name.startswith("loss") and value != value]:
+                        raise ValueError(
+                            f"{wrong[0]} is no number in round {self.round}: the learning rate is too high"
+                        )
                     self.history.append(done)
                     self.log({name: value for name, value in done.items() if name != "frames"}, int(done["frames"]))
                     self.save()
@@ -225,12 +222,10 @@ class OnlineTrainer(Training):
         config, learner = self.config, self.learner
         state, done_before = env.reset(), self.frames
         first = FirstEpisodes(config.rows)
-        exploration = (
-            Exploration(config, self._patience, self.policy.layout) if isinstance(config, NoiseConfig) else None
-        )
-        came = []
+        noisy = isinstance(config, NoiseConfig)
+        exploration = Exploration(config, self._patience, self.policy.layout) if noisy else None
+        came, due = [], 0
         steps = min(config.round_steps, config.steps - self.round * config.round_steps)
-        due = 0
         for begin in range(0, steps, config.exploration_hold):
             if interrupt.asked:
                 return None
@@ -297,12 +292,9 @@ def longest_standstill(rows: TensorDictBase) -> int:
 
 
 class Exploration:
-    """The noise of a round.
-
-    A row is stuck if no condition's truth has changed for more states than ``patience``, the longest time in the
-    demonstrations (0: never). There the hand's noise grows, until half as long again, from ``exploration`` to
-    ``stuck_exploration``; the gripper's would open grasps.
-    """
+    """The noise of a round. A row is stuck if no condition's truth has changed for more states than ``patience``, the
+    longest time in the demonstrations (0: never). There the hand's noise grows, until half as long again, from
+    ``exploration`` to ``stuck_exploration``; the gripper's would open grasps."""
 
     def __init__(self, config: NoiseConfig, patience: int, layout: Layout = METAWORLD) -> None:
         self.patience = patience

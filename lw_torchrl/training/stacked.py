@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Sequence
 from hashlib import sha256
-from typing import Any
+from typing import Any, Unpack
 
 import torch
 from torch import Tensor, nn
@@ -14,15 +13,15 @@ from torch.func import functional_call, stack_module_state, vmap
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.objectives.utils import distance_loss
 
-from lw_torchrl._checks import checked
+from lw_torchrl._checks import checked, passes_on
 from lw_torchrl._devices import place
+from lw_torchrl.data.replay_checks import check_replay
 from lw_torchrl.modules.policy import Policy
 from lw_torchrl.training.behavioral_cloning import BehavioralCloningConfig, LatentTerms, make_optimizer
-from lw_torchrl.training.buffers import check_replay
 from lw_torchrl.training.envelope import POLICY
 from lw_torchrl.training.file_checks import text_vectors
 from lw_torchrl.training.files import check_can_be_saved, describe_data, describe_replay
-from lw_torchrl.training.loop import ReplayState, Training, make_schedule
+from lw_torchrl.training.loop import ReplayState, Training, TrainingOptions, make_schedule
 from lw_torchrl.training.normalization import check_contacts, fit_normalization
 
 
@@ -60,7 +59,7 @@ class StackedBehavioralCloning(Training):
             place.
         replays: M buffers, each with its sampler; the i-th actor's batches come from the i-th.
         config: how to train each; the i-th has the seed ``config.seed + i``.
-        checkpoint, progress: as of :class:`~lw_torchrl.training.loop.Training`, with its errors.
+        checkpoint, logger, progress, title: as of :class:`~lw_torchrl.training.loop.Training`, with its errors.
         device: where to train, as for :class:`BehavioralCloningTrainer`; None for where the first actor is.
 
     Raises:
@@ -85,6 +84,7 @@ class StackedBehavioralCloning(Training):
 
     envelope, says_device = POLICY, True
 
+    @passes_on(Training.__init__)
     @checked
     def __init__(
         self,
@@ -92,15 +92,14 @@ class StackedBehavioralCloning(Training):
         replays: Sequence[TensorDictReplayBuffer],
         config: BehavioralCloningConfig | None = None,
         *,
-        checkpoint: str | os.PathLike[str] | None = None,
-        progress: bool = True,
         device: str | torch.device | None = None,
+        **options: Unpack[TrainingOptions],
     ) -> None:
         config = config or BehavioralCloningConfig()
         if not actors or len(replays) != len(actors):
             raise ValueError(f"replays must be as many as actors, at least one, got {len(replays)} and {len(actors)}")
-        title = f"training {len(actors)} models"
-        super().__init__(config, replays, checkpoint, progress=progress, title=title)
+        options.setdefault("title", f"training {len(actors)} models")
+        super().__init__(config, replays, **options)
         self.actors = list(actors)
         self.networks = [*actors]
         _check_actors(actors)

@@ -16,17 +16,15 @@ from torchrl.envs.batched_envs import BatchedEnvBase
 from lw_torchrl._checks import check_int, checked
 from lw_torchrl._keys import as_keys
 from lw_torchrl._rendering import check_cameras
-from lw_torchrl.transforms.environment import KeepsEnvState, base_env
-from lw_torchrl.transforms.late_answers import reset_rows
+from lw_torchrl.transforms.environment import KeepsEnvState, base_env, reset_rows
 
 
 class CameraTransform(KeepsEnvState):
     """Writes ``pixels`` (B, height, width·C, 3) uint8, pictures by C cameras side by side, the first on the left.
 
     A picture of a row is taken at its reset and then every so many steps of its episode, and held in between; rows that
-    a ``_step`` or ``_reset`` mask leaves out are not drawn. The simulation does not change. Its ``state_dict`` holds
-    the environment's, as :class:`EnvState` does; after ``load_state_dict`` the environment must be reset. With
-    SerialEnv and ParallelEnv put it into each worker. :func:`add_pictures` draws a dataset's rows.
+    a ``_step`` or ``_reset`` mask leaves out are not drawn. Its ``state_dict`` holds the environment's, as
+    :class:`EnvState` does. With SerialEnv and ParallelEnv put it into each worker.
 
     Args:
         cameras: "corner2", "corner", "corner3", "corner4", "topview", "behindGripper" or "gripperPOV", or several.
@@ -74,10 +72,8 @@ class CameraTransform(KeepsEnvState):
         super().set_container(container)
         env = base_env(self)
         if isinstance(env, BatchedEnvBase):
-            raise TypeError(
-                f"CameraTransform cannot see into the workers of a {type(env).__name__}: put it into each of them, "
-                "lambda: TransformedEnv(LanguageWorldEnv(...), CameraTransform(...))"
-            )
+            workers = f"the workers of a {type(env).__name__}: put it into each of them"
+            raise TypeError(f"CameraTransform cannot see into {workers}")
         if env is not None and not hasattr(env, "row_tasks"):
             raise TypeError(f"CameraTransform must be around a LanguageWorldEnv, got {type(env).__name__}")
 
@@ -105,10 +101,7 @@ class CameraTransform(KeepsEnvState):
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         if self._steps is None:
-            raise RuntimeError(
-                "no picture was taken of these episodes: reset the environment (env.reset(), collector.reset()) "
-                "before the next step"
-            )
+            raise RuntimeError("no picture was taken of these episodes: reset the environment before the next step")
         moved = self._rows(tensordict.get("_step", None))
         self._steps = self._steps + moved
         return self._draw(moved & (self._steps % self.every == 0), next_tensordict)

@@ -16,8 +16,7 @@ from lw_torchrl._seeding import episode_generator
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.queries import Query, read_query
 from lw_torchrl.language.task_index import PlanTables
-from lw_torchrl.transforms.environment import EpisodeTransform
-from lw_torchrl.transforms.late_answers import DelayedAnswers, reset_rows
+from lw_torchrl.transforms.environment import DelayedAnswers, EpisodeTransform, reset_rows
 from lw_torchrl.transforms.qaf import plan_number_key
 
 _BLOCK = 64  # steps of an episode whose draws are made at once
@@ -114,10 +113,7 @@ class CorruptQAF(EpisodeTransform):
             raise ValueError("qaf answers other plans than CorruptQAF was given: give both the same plans")
         shape = (*self._plan.shape, self.plans.num_steps)
         if truth.dtype != torch.bool or truth.shape != shape:
-            raise ValueError(
-                f"qaf must be bool of shape {shape}, a column for each step of the longest of plans, got {truth.dtype} "
-                f"of shape {tuple(truth.shape)}"
-            )
+            raise ValueError(f"qaf must be bool of shape {shape}, got {truth.dtype} of shape {tuple(truth.shape)}")
         return tensordict_reset.set(self.in_keys[0], self._spoilt(self._rows.begin(truth, begun)))
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
@@ -182,9 +178,9 @@ class _Draws:
 def _as_texts(drop: Iterable[str | Query]) -> tuple[str, ...]:
     if isinstance(drop, (str, Query)) or not isinstance(drop, Iterable):
         raise TypeError(f"drop must be a list of queries, got {shown(drop)}")
-    for one in (listed := tuple(drop)):
-        if not isinstance(one, (str, Query)):
-            raise TypeError(f"drop must be a list of queries, got {shown(one)} in it")
+    listed = tuple(drop)
+    if wrong := [one for one in listed if not isinstance(one, (str, Query))]:
+        raise TypeError(f"drop must be a list of queries, got {shown(wrong[0])} in it")
     return tuple(map(str, listed))
 
 

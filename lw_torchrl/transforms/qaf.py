@@ -18,8 +18,14 @@ from lw_torchrl._keys import as_keys, check_apart, key_beside
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.query_program import QueryProgram
 from lw_torchrl.language.task_index import PlanTables, TaskTables
-from lw_torchrl.transforms.environment import KeepsEnvState, base_env, refuse_changed, transforms_beside
-from lw_torchrl.transforms.late_answers import DelayedAnswers, reset_rows
+from lw_torchrl.transforms.environment import (
+    DelayedAnswers,
+    KeepsEnvState,
+    base_env,
+    refuse_changed,
+    reset_rows,
+    transforms_beside,
+)
 
 _HALF = (torch.float16, torch.bfloat16)  # in which metres are not told apart as conditions do
 
@@ -48,14 +54,12 @@ class QAFTransform(KeepsEnvState):
     the environment's, as :class:`EnvState` does.
 
     Conditions speak of metres, so it comes before whatever changes the observation: a normaliser, :class:`RandomYaw`.
-    A transform that comes first and names the observation in its ``out_keys`` is refused, also in a SerialEnv's
-    workers. It cannot see, and answers wrongly behind, one that does not name it or is in a ParallelEnv's processes:
-    put it into each worker, before them.
+    A transform that comes first and names the observation in its ``out_keys`` is refused. It cannot see one that does
+    not name it or is in a ParallelEnv's processes: put it into each worker, before them.
 
     Answers may be slow: with ``every`` and ``delay``, in step t of its episode, 0 at the reset, a row is shown those of
     step every · ⌊max(t - delay, 0) / every⌋. A ``_step`` or ``_reset`` mask counts for its rows alone. After
-    ``load_state_dict`` the environment must be reset: episodes under way are no part of it. Rows of a replay buffer
-    have no such steps, so a ``QAFTransform`` with either is refused there.
+    ``load_state_dict`` the environment must be reset. A replay buffer, whose rows have no such steps, refuses both.
 
     Args:
         plans: a plan for each task that will be seen.
@@ -117,10 +121,8 @@ class QAFTransform(KeepsEnvState):
         if observation is None or task_id is None:
             raise missing_keys(tensordict.keys(True, True), *map(str, self.in_keys))
         if observation.dtype in _HALF:
-            raise ValueError(
-                f"observation must be float32 or float64, as the environment gave it, got {observation.dtype}: put "
-                "QAFTransform before what casts it"
-            )
+            got = f"got {observation.dtype}: put QAFTransform before what casts it"
+            raise ValueError(f"observation must be float32 or float64, {got}")
         tensordict.set(self.out_keys[0], self.program(observation, task_id))
         number = self._number.select(task_id.reshape(-1), observation).plan
         tensordict.set(self.out_keys[1], number.reshape(task_id.shape).clone())  # a collector zeroes what it is given
@@ -152,8 +154,7 @@ class QAFTransform(KeepsEnvState):
         if self._rows is not None:
             raise ValueError(
                 f"QAFTransform(every={self.every}, delay={self.delay}) counts the steps of an environment's episodes, "
-                "which rows of a replay buffer do not tell: put it into the environment, whose rows then carry qaf, or "
-                "take QAFTransform(plans) here, which answers each row in its own state"
+                "which rows of a replay buffer do not tell: put it into the environment, or leave both out here"
             )
         if (beside := transforms_beside(self)) != self._beside:  # something was put there later
             refuse_changed(self, self.in_keys[0])

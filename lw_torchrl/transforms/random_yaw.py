@@ -51,17 +51,15 @@ def yaw_key(observation: NestedKey) -> NestedKey:
 
 
 class RandomYaw(Transform):
-    """Turns each sampled row, its positions and its action alike, by a random angle about the vertical.
-
-    A policy then learns to move towards the goal rather than in the direction that the demonstrations happened to have.
-    For replay buffers; a :class:`QAFTransform` comes first, since conditions speak of the scene as it was.
+    """Turns each sampled row, its positions and its action alike, by a random angle about the vertical, so that a
+    policy learns to move towards the goal rather than in the direction that the demonstrations happened to have. For
+    replay buffers; a :class:`QAFTransform` comes first, since conditions speak of the scene as it was.
 
     Changes ``observation`` (B, 39) float32 and ``action`` (B, 4) float32, and, where they are, ``expert_action`` and
     ``unclipped_action`` (B, 4) float32 and ``("next", "observation")``; writes ``observation_yaw`` (B,) float32, the
     angle in radians, and ``("next", "observation_yaw")``. An action's way in the plane is shortened where turning would
-    lead it out of [-1, 1]; one that was outside before keeps its length. Orientations stay as they were: use it with
-    features that do not hold them, "differences" or "relative". ``focus`` and ``roles`` turn fixed places by the angle.
-    Angles are drawn from PyTorch's global generator; the trainers seed it.
+    lead it out of [-1, 1]. Orientations stay as they were: use it with features that do not hold them, "differences" or
+    "relative". ``focus`` and ``roles`` turn fixed places by the angle, which is drawn from PyTorch's global generator.
 
     Args:
         scale: standard deviation of the angle, in radians.

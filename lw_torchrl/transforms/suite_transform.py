@@ -70,10 +70,8 @@ class SuiteTransform(Transform):
     def _seen(self, tensordict: TensorDictBase) -> Tensor:
         found = self.observe(*read(tensordict, self.in_keys)).to(torch.float32)
         if found.shape[-1:] != (self.layout.size,):
-            raise ValueError(
-                f"observe must give the {self.layout.size} numbers of layout {self.layout.name!r}, got shape "
-                f"{tuple(found.shape)}"
-            )
+            wanted = f"the {self.layout.size} numbers of layout {self.layout.name!r}"
+            raise ValueError(f"observe must give {wanted}, got shape {tuple(found.shape)}")
         return found.clone()
 
     def _write(self, tensordict: TensorDictBase, before: Tensor | None) -> TensorDictBase:

@@ -15,8 +15,8 @@ from torchrl.objectives import BCLoss, CQLLoss, IQLLoss, REDQLoss, SACLoss, Soft
 from torchrl.record.loggers import Logger
 
 import lw_torchrl as lw
+from lw_torchrl.data.replay_checks import check_minibatches
 from lw_torchrl.training import OfflineConfig, OfflineTrainer, fit_normalization
-from lw_torchrl.training.buffers import check_minibatches
 from lw_torchrl.training.file_checks import tensors_of
 from lw_torchrl.training.offline import sum_of_losses
 

@@ -16,7 +16,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import Compose, EnvBase, ParallelEnv, SerialEnv, TransformedEnv, check_env_specs
 
 import lw_torchrl as lw
-from lw_torchrl.transforms.late_answers import DelayedAnswers
+from lw_torchrl.transforms.environment import DelayedAnswers
 
 ROWS = 4
 

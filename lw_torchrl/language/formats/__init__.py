@@ -35,11 +35,10 @@ PLAN_FORMATS = PlanFormats(
 
 @checked
 def encode_plan(plan: ConditionalPlan, format: str) -> str:
-    """A plan as text.
+    """A plan as text, from which :func:`~lw_torchrl.decode_plan` reads an equal plan.
 
-    :func:`~lw_torchrl.decode_plan` reads an equal plan from it: its conditions and skills, and in the goal formats its
-    goals. Reasons are written where a format explains; a goal that is not its skill's usual one has no place in the
-    basic and chain formats.
+    Reasons are written where a format explains; a goal that is not its skill's usual one has no place in the basic and
+    chain formats.
 
     Example:
         >>> from lw_torchrl.language.plan_files import load_plans

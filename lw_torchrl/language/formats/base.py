@@ -41,9 +41,7 @@ class PlanFormat:
 STYLES = {"basic": Style(), "chain": Style(explains=True), "goal": Style(explains=True, goals=True)}
 """The paper's three styles by name."""
 
-
-END = re.compile(r"\[eod\]|<\|(?:endoftext|end_of_text|im_end|eot_id)\|>")
-"""What some models write where their answer ends; what follows is no part of it."""
+END = re.compile(r"\[eod\]|<\|(?:endoftext|end_of_text|im_end|eot_id)\|>")  # where some models say that they end
 _ITEM = re.compile(r"\s*\[?(\d{1,4})[.):\]]\s*(\S.*)")
 
 

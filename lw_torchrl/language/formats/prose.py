@@ -25,7 +25,7 @@ def md(style: Style) -> PlanFormat:
         said = "".join(f"{line}\n" for line in hints)
         return "\n".join([about, *(_write(plan, style) for plan in examples), said + _opening(task)])
 
-    return PlanFormat("md", lambda plan: _write(plan, style), read_prose, prompt, style)
+    return PlanFormat("md", lambda plan: _write(plan, style), ProseReading, prompt, style)
 
 
 def _opening(task: Task) -> str:
@@ -38,7 +38,7 @@ def _write(plan: ConditionalPlan, style: Style) -> str:
         lines.append("Steps:  " + "  ".join(f"{number}. {step.skill}" for number, step in enumerate(plan.steps, 1)))
     for step, goal in zip(plan.steps, plan.goals, strict=True):
         reason = one_line(step.reason)
-        if style.explains and reason and _is_comment(reason):  # else it would be read as a step
+        if style.explains and reason and not _is_read(reason):
             lines.append(reason)
         if style.goals and goal is not None:
             lines.append(f"- When {step.condition}, move the robot's gripper until {goal}.")
@@ -64,21 +64,16 @@ _COMMA = re.compile(r",\s(?:then\s)?")
 _NO_SKILL = frozenset(("the", "a", "an", "it", "this", "that", "you", "we", "they", "there", "and", "or"))
 
 
-def read_prose(text: str) -> Reading:
-    """What a text says in prose, for :attr:`PlanFormat.read`.
-
-    A clause is a bullet that begins with "When", "If", "Once" and the like; in a text without such bullets, sentences
-    like "When C, the robot should S" count. Other sentences before a clause are its reason.
-    """
-    return _Reader(text)
+def _is_read(line: str) -> bool:
+    """Whether a line would be read as a part of a plan, and no comment."""
+    found = END.search(line) or _heading(line) or _BULLET.match(line) or item(line) or _clause(1, line, bullet=False)
+    return bool(found) or _listing(line) is not None
 
 
-def _is_comment(line: str) -> bool:
-    is_plan = END.search(line) or _heading(line) or _BULLET.match(line) or item(line) or _clause(1, line, bullet=False)
-    return not is_plan and _listing(line) is None
+class ProseReading(Reading):
+    """What a text says in prose, for :attr:`PlanFormat.read`: a clause is a bullet that begins with "When", "If" and
+    the like, or, without such bullets, a sentence like "When C, the robot should S"; others are its reason."""
 
-
-class _Reader(Reading):
     def __init__(self, text: str) -> None:
         super().__init__()
         self.bulleted: dict[int, bool] = {}  # of a section, by its place: whether its clauses are bullets

@@ -27,7 +27,7 @@ def py(style: Style) -> PlanFormat:
         said = "".join(f"# {line}\n" for line in hints)
         return "\n".join([*(_write(plan, style) for plan in examples), said + function_head(task)])
 
-    return PlanFormat("py", lambda plan: _write(plan, style), read_python, prompt, style)
+    return PlanFormat("py", lambda plan: _write(plan, style), PythonReading, prompt, style)
 
 
 def _write(plan: ConditionalPlan, style: Style) -> str:
@@ -78,7 +78,7 @@ def py_md(style: Style) -> PlanFormat:
             + fenced(function_head(task))
         )
 
-    return PlanFormat("md", encode, read_python, prompt, style)
+    return PlanFormat("md", encode, PythonReading, prompt, style)
 
 
 _STRING = r'(?:[fFrRbBuU]{0,2}(?:"(?:[^"\\]|\\.)*+"|\'(?:[^\'\\]|\\.)*+\'))'
@@ -94,11 +94,6 @@ _HEADING = re.compile(r"#+\s*([A-Za-z][\w-]*)\s*:")
 _MOST_JOINED = 6  # lines of one statement
 
 
-def read_python(text: str) -> Reading:
-    """What a text says in Python, for :attr:`PlanFormat.read`."""
-    return _Reader(text)
-
-
 @dataclass
 class _Block:
     """An ``if``: its indentation, its line, what it asks (None if it cannot be read), and its block's indentation."""
@@ -109,8 +104,9 @@ class _Block:
     body: int | None = None
 
 
-class _Reader(Reading):
-    """Matches lines against a few forms; blocks follow the indentation, and an ``if`` in a block asks for both."""
+class PythonReading(Reading):
+    """What a text says in Python, for :attr:`PlanFormat.read`: its lines are matched against a few forms; blocks follow
+    the indentation, and an ``if`` in a block asks for both."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -288,19 +284,15 @@ def _statements(text: str) -> Iterator[tuple[int, str]]:
         if printed := _PRINTED.fullmatch(line):
             line = re.sub(r"\\(.)", r"\1", printed[2])
         at += 1
-        if "check" in line or "robot." in line:
-            while at < len(lines) and at - start < _MOST_JOINED and _is_open(line):
-                code = lines[at].strip()
-                if not code or code.startswith(("#", "```", "def ", "robot.")) or _BRANCH.match(code):
-                    break  # a statement of its own
-                line, at = f"{line} {code}", at + 1
+        joins = "check" in line or "robot." in line
+        while joins and at < len(lines) and at - start < _MOST_JOINED:
+            bare, code = _bare(line), lines[at].strip()
+            if '"' in bare or bare.count("(") <= bare.count(")"):
+                break  # no parenthesis, or a string, is open
+            if not code or code.startswith(("#", "```", "def ", "robot.")) or _BRANCH.match(code):
+                break  # a statement of its own
+            line, at = f"{line} {code}", at + 1
         yield start + 1, line
-
-
-def _is_open(line: str) -> bool:
-    """Whether a parenthesis, and no string, is open at the end of a line."""
-    bare = _bare(line)
-    return '"' not in bare and bare.count("(") > bare.count(")")
 
 
 def _bare(code: str) -> str:

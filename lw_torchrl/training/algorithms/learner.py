@@ -19,10 +19,9 @@ from lw_torchrl._state_tree import check_like, check_optimizer_state
 from lw_torchrl.modules.conditioned_actor import ConditionedActor
 from lw_torchrl.modules.critics import QValue
 from lw_torchrl.modules.descriptor_conditioned_actor import DescriptorEncoder
-from lw_torchrl.modules.encoder import Encoder
 from lw_torchrl.modules.networks import DistributionName
 from lw_torchrl.modules.plan_encoder import PlanEncoder
-from lw_torchrl.modules.policy import Policy
+from lw_torchrl.modules.policy import Encoder, Policy
 from lw_torchrl.modules.residual_actor import ResidualActor
 from lw_torchrl.training.file_checks import copy_weights, tensors_of
 
