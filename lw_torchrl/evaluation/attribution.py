@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from lw_torchrl._checks import check_int, check_scale, checked, missing_keys
+from lw_torchrl._checks import Count, Scale, checked, missing_keys
 from lw_torchrl._devices import device_of
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.evaluation.counterfactuals import Counterfactuals, EpisodeId, EpisodeRepeater, own_evaluators
@@ -40,12 +40,7 @@ _COUNTERFACTUALS: dict[str, tuple[Cause, str]] = {  # the smaller ones first; ti
     "skills": ("skill", "scripts in all steps"),
     "time": ("out of time", "twice the time"),
 }
-_PARTS: dict[Cause, str] = {"query": "true answers", "plan": "the reference plan", "skill": "scripts"}
-_PAIRS: dict[str, tuple[Cause, Cause]] = {
-    "query + skill": ("query", "skill"),
-    "query + plan": ("query", "plan"),
-    "plan + skill": ("plan", "skill"),
-}
+_PARTS: dict[str, str] = {"query": "true answers", "plan": "the reference plan", "skill": "scripts"}
 
 
 @checked
@@ -58,9 +53,9 @@ def attribute_failures(
     evaluator: Callable[[TensorDictBase], TensorDictBase] | None = None,
     skills: Mapping[str, ScriptedSkill] | None = None,
     seed: int,
-    noise_scale: float = 0.1,
-    max_steps: int | None = None,
-    num_envs: int | None = None,
+    noise_scale: Scale = 0.1,
+    max_steps: Count | None = None,
+    num_envs: Count | None = None,
     suite: str | Suite | None = None,
     engine: Any = None,
     num_threads: int | None = None,
@@ -130,9 +125,6 @@ def attribute_failures(
     Source: the plan's conditions, its steps and what carries them out are apart, so each can be replaced.
     """
     answered = as_plans(plans)
-    check_scale("noise_scale", noise_scale)
-    check_int("max_steps", 1 if max_steps is None else max_steps, minimum=1)
-    check_int("num_envs", 1 if num_envs is None else num_envs, minimum=1)
     if actor is not None and (own := plans_of(actor)) is not None and (other := answered.differences(own)):
         raise ValueError(f"plans differ from the actor's own for {', '.join(other)}; pass the actor's plans")
     if not isinstance(rollouts, Iterable):
@@ -239,7 +231,7 @@ def choose_cause_pair(mended: Iterable[str], shares: Mapping[str, float]) -> tup
     """The pair that counts, the first the cause: wrong answers, which are a fact; else what alone mends more of the
     task's failed episodes."""
     alone = {**shares, "skill": max(shares.get("skill", 0.0), shares.get("skills", 0.0))}
-    found = [_PAIRS[name] for name in mended if name in _PAIRS]
+    found: list[Any] = [name.split(" + ") for name in mended if " + " in name]
     if not found:
         return None
     cause, also = max(found, key=lambda pair: sum(alone.get(name, 0.0) for name in pair))
@@ -298,7 +290,7 @@ def _by_counterfactuals(
 
 def _listed(names: Iterable[str], joint: str) -> str:
     words = [
-        _COUNTERFACTUALS[name][1] if name in _COUNTERFACTUALS else " and ".join(_PARTS[part] for part in _PAIRS[name])
+        " and ".join(_PARTS[part] for part in name.split(" + ")) if " + " in name else _COUNTERFACTUALS[name][1]
         for name in names
     ]
     return f" {joint} ".join(words) if len(words) < 3 else f"{', '.join(words[:-1])} {joint} {words[-1]}"

@@ -15,9 +15,8 @@ from lw_torchrl._files import held
 from lw_torchrl.data import CoLearningSampler, LanguageWorldExperienceReplay
 from lw_torchrl.data.co_learning_sampler import GROWN
 from lw_torchrl.data.rewards import RewardName
-from lw_torchrl.envs.episodes import FinishedEpisode
+from lw_torchrl.envs.episodes import FinishedEpisode, policy_of
 from lw_torchrl.evaluation import EvaluationResult, PlanUse, evaluate, stuck_steps, weakest_step
-from lw_torchrl.evaluation.protocol import policy_of
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.modules.policy import METHODS, Policy, make_policy
 from lw_torchrl.modules.residual_actor import ResidualActor

@@ -15,16 +15,15 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from lw_torchrl._checks import checked, missing_keys, shown
 from lw_torchrl._files import replacing
-from lw_torchrl._progress import Progress
-from lw_torchrl.envs.episodes import FinishedEpisode, policy_of, run_episodes
+from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.envs.seeding import episode_seed
 from lw_torchrl.evaluation.failure_records import Failure
-from lw_torchrl.evaluation.protocol import actor_plans, make_env, tasks_of
+from lw_torchrl.evaluation.protocol import actor_plans, tasks_of
+from lw_torchrl.evaluation.running import make_env, running
 from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
@@ -252,22 +251,13 @@ def run_recorded(
     written = set() if answered is None else {"qaf", *actor.out_keys}
     evaluator = getattr(actor, "evaluator", None)
     asked = [] if evaluator is None else evaluator.in_keys
-    bar = Progress("recording", len(chosen) * len(episodes) * base.max_steps, "step", show=progress)
+    keys = list(dict.fromkeys([*_KEYS, *sorted(_PLAN_KEYS & written), *asked]))
+    how: dict[str, Any] = {"noise_scale": noise_scale, "progress": progress, "keys": keys}
     found = {}
-    try:
-        with bar, torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-            for one in run_episodes(
-                env,
-                policy_of(actor.eval()),
-                {task: list(episodes) for task in chosen},
-                keys=list(dict.fromkeys([*_KEYS, *sorted(_PLAN_KEYS & written), *asked])),
-                noise=(lambda _: (noise_scale,) * base.layout.action_size) if noise_scale else None,
-                on_progress=bar.update,
-            ):
-                steps = one.steps if evaluator is None else evaluator(one.steps)
-                found[one.task, one.episode] = one._replace(steps=steps)
-    finally:
-        env.close()
+    with running("recording", env, actor, dict.fromkeys(chosen, episodes), **how) as finished:
+        for one in finished:
+            steps = one.steps if evaluator is None else evaluator(one.steps)
+            found[one.task, one.episode] = one._replace(steps=steps)
     return [found[task, episode] for task in chosen for episode in episodes]
 
 
