@@ -141,20 +141,18 @@ def attribute_failures(
     seen = [states_of(task, k, steps, answered, _answers(steps, actor)) for task, k, steps in failed]
     scripts = Scripts(answered, table)
     theirs = None if trusted is None else Scripts(trusted, table)
-    told = {(one.task, one.episode): explain(one, answered, scripts, trusted, theirs) for one in seen}
+    told = {one.which: explain(one, scripts, theirs) for one in seen}
     if actor is None:
-        return [_by_rule(one, told[one.task, one.episode], seed) for one in seen]
+        return [_by_rule(one, told[one.which], seed) for one in seen]
     tasks = {name: found.tasks.get(name, answered[name].definition) for name in names}
     max_steps = found.max_steps if max_steps is None else max_steps
-    firsts = {(one.task, one.episode): one.steps.get("observation")[0] for one in seen}
+    firsts = {one.which: one.steps.get("observation")[0] for one in seen}
     env = {"seed": seed, "suite": found, "engine": engine, "num_threads": num_threads}
     repeat = EpisodeRepeater(tasks, firsts, env, noise_scale, max_steps, num_envs, device, progress)
-    tried = Counterfactuals(actor, answered, evaluator, trusted, scripts, repeat)
+    tried = Counterfactuals(actor, evaluator, trusted, scripts, repeat)
     tried.run(seen, [which for which, one in told.items() if one.evidence.get("plan_departs") == 0.0])
     shares = tried.shares()
-    return [
-        _by_counterfactuals(one, told[one.task, one.episode], tried, shares.get(one.task, {}), seed) for one in seen
-    ]
+    return [_by_counterfactuals(one, told[one.which], tried, shares.get(one.task, {}), seed) for one in seen]
 
 
 def _failed(
@@ -240,22 +238,20 @@ def choose_cause_pair(mended: Iterable[str], shares: Mapping[str, float]) -> tup
 
 
 def _by_rule(one: EpisodeStates, told: Explanation, seed: int) -> Failure:
-    cause = told.cause
-    why = _text(*(["The states alone do not tell"] if cause == "undecided" else []), told.why[cause])
-    return Failure(one.task, seed, one.episode, cause, None, told.steps[cause], told.at[cause], why, told.evidence)
+    step, at, why = told.blames[told.cause]
+    why = _text(*(["The states alone do not tell"] if told.cause == "undecided" else []), why)
+    return Failure(one.task, seed, one.episode, told.cause, None, step, at, why, told.evidence)
 
 
 def _by_counterfactuals(
     one: EpisodeStates, told: Explanation, tried: Counterfactuals, shares: Mapping[str, float], seed: int
 ) -> Failure:
     """What the counterfactuals tell, explained by the states."""
-    which = one.task, one.episode
-    first = {name: results[which] for name, results in tried.found.items() if which in results}
+    first = {name: results[one.which] for name, results in tried.found.items() if one.which in results}
     mended = [name for name, hit in first.items() if hit is not None]
-    replaced: dict[str, bool] = {}
-    for name in first:
-        shown = "skill" if name == "skills" else name
-        replaced[shown] = replaced.get(shown, False) or name in mended
+    replaced = {name: name in mended for name in first if name != "skills"}
+    if "skills" in first:
+        replaced["skill"] = replaced.get("skill", False) or "skills" in mended
     cause: Cause = "undecided"
     also: Cause | None = None
     same = told.evidence.get("plan_departs") == 0.0
@@ -277,11 +273,10 @@ def _by_counterfactuals(
     else:
         words = "There is nothing to replace"
     if cause == "undecided" and told.cause != "undecided":
-        words += f". By the states alone it would be the {told.cause}: {told.why[told.cause]}"
-    step, at, why = told.steps[cause], told.at[cause], told.why[cause]
+        words += f". By the states alone it would be the {told.cause}: {told.blames[told.cause].why}"
+    step, at, why = told.blames[cause]
     if best == "skill":
-        step = tried.step[which]
-        plan = tried.plans[one.task]
+        step, plan = tried.step[one.which], tried.plans[one.task]
         at, why = stall_step(one, step, plan.definition.layout), describe_active_time(one, plan, step)
     by = {f"mended_by_{name.replace(' + ', '_and_')}": share for name, share in shares.items()}
     evidence = {**told.evidence, **by}

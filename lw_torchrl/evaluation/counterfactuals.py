@@ -155,15 +155,10 @@ class Counterfactuals:
     """Runs the counterfactuals that are worth it, and keeps what each gave."""
 
     def __init__(
-        self,
-        actor: Any,
-        plans: Plans,
-        evaluator: Any,
-        reference: Plans | None,
-        scripts: Scripts,
-        repeat: EpisodeRepeater,
+        self, actor: Any, evaluator: Any, reference: Plans | None, scripts: Scripts, repeat: EpisodeRepeater
     ) -> None:
-        self.actor, self.plans, self.evaluator, self.scripts, self.repeat = actor, plans, evaluator, scripts, repeat
+        self.actor, self.evaluator, self.scripts, self.repeat = actor, evaluator, scripts, repeat
+        self.plans = plans = scripts.plans
         self.found: dict[str, dict[EpisodeId, int | None]] = {}  # counterfactual to episodes and their first success
         self.step: dict[EpisodeId, int] = {}  # in which a script mends the episode
         self.reference: Plans | None = None
@@ -184,7 +179,7 @@ class Counterfactuals:
 
     def run(self, seen: Sequence[EpisodeStates], same: Collection[EpisodeId] = ()) -> None:
         """Run all that are worth it."""
-        every = [(one.task, one.episode) for one in seen]
+        every = [one.which for one in seen]
         wrong = [w for w, one in zip(every, seen, strict=True) if bool((one.given != one.truth).any())]
         with_reference = [w for w in every if self.reference is not None and w[0] in self.reference]
         true = with_true_answers(self.actor)
@@ -229,7 +224,7 @@ class Counterfactuals:
         for one in seen:
             unlike = unlike_scripts(self.actor, one, self.scripts)
             if unlike is None or unlike.any():
-                ranked[one.task, one.episode] = candidates(one, unlike)
+                ranked[one.which] = candidates(one, unlike)
         for turn in range(_TRIED_STEPS):
             which = self._unmended([w for w, steps in ranked.items() if len(steps) > turn], "skill")
             steps = {one: ranked[one][turn] for one in which}

@@ -15,8 +15,16 @@ from torch import Tensor
 
 from lw_torchrl._files import read_json, write_json
 from lw_torchrl._versions import package_versions
-from lw_torchrl.evaluation.failure_records import Failure, failure_table, read_failures
-from lw_torchrl.evaluation.records import Rules, check_rules, is_integer, is_number, read_records
+from lw_torchrl.evaluation.failure_records import (
+    Failure,
+    Rules,
+    check_rules,
+    failure_table,
+    is_integer,
+    is_number,
+    read_failures,
+    read_records,
+)
 
 FORMAT = "lw_torchrl.evaluation"
 FORMAT_VERSION = 1

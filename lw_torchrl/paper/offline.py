@@ -22,7 +22,7 @@ from lw_torchrl.modules import DescriptorEncoder, PlanEncoder, QValue, Value
 from lw_torchrl.modules.encoder import Encoder
 from lw_torchrl.modules.policy import METHODS, Policy, make_policy
 from lw_torchrl.objectives import AdvantageWeightedLoss, ExpectileValueLoss, standardize_by_task
-from lw_torchrl.paper.offline_recipes import (
+from lw_torchrl.paper.recipes import (
     MIXTURES,
     NOISE,
     OFFLINE_METHODS,

@@ -16,8 +16,7 @@ from typing import Any
 from lw_torchrl._checks import checked
 from lw_torchrl._files import replacing
 from lw_torchrl.record.conventions import EPISODE_TIMELINE
-from lw_torchrl.record.recording_file import find_recording, opened, opening_step
-from lw_torchrl.record.rerun_binary import LOCAL, failure, free_port, running
+from lw_torchrl.record.recording_file import LOCAL, failure, find_recording, free_port, opened, opening_step, running
 
 START_SECONDS = 60.0
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"

@@ -22,8 +22,7 @@ from urllib.error import URLError
 from lw_torchrl._checks import checked
 from lw_torchrl._files import replacing
 from lw_torchrl.record.conventions import EPISODE_TIMELINE
-from lw_torchrl.record.recording_file import find_recording, opened, opening_step
-from lw_torchrl.record.rerun_binary import LOCAL, failure, free_port, running
+from lw_torchrl.record.recording_file import LOCAL, failure, find_recording, free_port, opened, opening_step, running
 
 LARGE = 30 * 10**6
 START_SECONDS = 60.0

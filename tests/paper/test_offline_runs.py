@@ -14,7 +14,7 @@ import lw_torchrl as lw
 from lw_torchrl.data.behaviours import BEHAVIOURS
 from lw_torchrl.data.dataset import read_metadata
 from lw_torchrl.paper.offline import DISTRIBUTIONS, Advantages, BehaviourDataset, OfflineRun, offline_runs, write_table
-from lw_torchrl.paper.offline_recipes import (
+from lw_torchrl.paper.recipes import (
     MIXTURES,
     NOISE,
     OFFLINE_METHODS,
