@@ -137,19 +137,23 @@ def attribute_failures(
     table = (found.skills or load_skills()) if skills is None else skills
     given = {} if reference is None else as_plans(reference, "reference")
     others = {task: plan for task, plan in given.items() if task in names}
-    trusted = Plans(others) if others else None
     seen = [states_of(task, k, steps, answered, _answers(steps, actor)) for task, k, steps in failed]
-    scripts = Scripts(answered, table)
-    theirs = None if trusted is None else Scripts(trusted, table)
+    scripts, theirs = Scripts(answered, table), Scripts(Plans(others), table) if others else None
     told = {one.which: explain(one, scripts, theirs) for one in seen}
     if actor is None:
-        return [_by_rule(one, told[one.which], seed) for one in seen]
+        found_out = []
+        for one in seen:
+            cause, blames, evidence = told[one.which]
+            step, at, why = blames[cause]
+            why = _text(*(["The states alone do not tell"] if cause == "undecided" else []), why)
+            found_out.append(Failure(one.task, seed, one.episode, cause, None, step, at, why, evidence))
+        return found_out
     tasks = {name: found.tasks.get(name, answered[name].definition) for name in names}
     max_steps = found.max_steps if max_steps is None else max_steps
     firsts = {one.which: one.steps.get("observation")[0] for one in seen}
     env = {"seed": seed, "suite": found, "engine": engine, "num_threads": num_threads}
     repeat = EpisodeRepeater(tasks, firsts, env, noise_scale, max_steps, num_envs, device, progress)
-    tried = Counterfactuals(actor, evaluator, trusted, scripts, repeat)
+    tried = Counterfactuals(actor, evaluator, None if theirs is None else theirs.plans, scripts, repeat)
     tried.run(seen, [which for which, one in told.items() if one.evidence.get("plan_departs") == 0.0])
     shares = tried.shares()
     return [_by_counterfactuals(one, told[one.which], tried, shares.get(one.task, {}), seed) for one in seen]
@@ -235,12 +239,6 @@ def choose_cause_pair(mended: Iterable[str], shares: Mapping[str, float]) -> tup
     cause, also = max(found, key=lambda pair: sum(alone.get(name, 0.0) for name in pair))
     later = cause != "query" and alone.get(also, 0.0) > alone.get(cause, 0.0)
     return (also, cause) if later else (cause, also)
-
-
-def _by_rule(one: EpisodeStates, told: Explanation, seed: int) -> Failure:
-    step, at, why = told.blames[told.cause]
-    why = _text(*(["The states alone do not tell"] if told.cause == "undecided" else []), why)
-    return Failure(one.task, seed, one.episode, told.cause, None, step, at, why, told.evidence)
 
 
 def _by_counterfactuals(

@@ -46,15 +46,6 @@ def tasks_of(tasks: TaskList, plans: Plans | None, suite: str | Suite | None = N
     return found, found.named_tasks(tasks, {name: task for name, task in own.items() if name not in found.tasks})
 
 
-def _result(finished: FinishedEpisode, stopped_early: bool, keep_actions: bool) -> EpisodeResult:
-    task, episode, steps = finished
-    first = finished.first_success
-    at_end = None if stopped_early else bool(steps.get(("next", "success"))[-1])
-    total = None if stopped_early else float(steps.get(("next", "reward")).double().sum())
-    actions = steps.get("action").clone() if keep_actions else None
-    return EpisodeResult(task, episode, first is not None, first, at_end, total, actions)
-
-
 def _checked(policy: Acts, env: EnvBase, also_record: Iterable[NestedKey]) -> Acts:
     """``policy``, whose action is checked, and at its first call whether it and ``env`` write ``also_record``."""
     unseen = [unravel_key(key) for key in also_record]
@@ -179,8 +170,13 @@ def evaluate(
     listed = dict.fromkeys(names, range(episodes_per_task))
     with running("evaluating", env, answered_by(actor, evaluator), listed, **how, **options) as episodes:
         for finished in episodes:
-            found.append(_result(finished, stop_at_success, record_actions))
-            if attribute and not found[-1].success:
+            first, steps = finished.first_success, finished.steps
+            at_end = None if stop_at_success else bool(steps.get(("next", "success"))[-1])
+            total = None if stop_at_success else float(steps.get(("next", "reward")).double().sum())
+            actions = steps.get("action").clone() if record_actions else None
+            about = finished.task, finished.episode, first is not None, first, at_end, total, actions
+            found.append(EpisodeResult(*about))
+            if attribute and first is None:
                 failed.append(finished)
             if on_episode is not None:
                 on_episode(finished)

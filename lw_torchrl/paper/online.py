@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from lw_torchrl._checks import check_choice, check_int
+from lw_torchrl._checks import Count, check_choice, check_fields, check_int
 from lw_torchrl._files import held
 from lw_torchrl.data import CoLearningSampler, LanguageWorldExperienceReplay
 from lw_torchrl.data.co_learning_sampler import GROWN
@@ -42,15 +42,15 @@ _DIAGNOSED = 20  # episodes
 class OnlineRecipe:
     """How weak policies are made and improved, the same for every task; the configurations get the run's seed."""
 
-    demonstrations: int = 1  # of the task, without noise, all successful
+    demonstrations: Count = 1  # of the task, without noise, all successful
     feature_noise: float = 0.1  # of the policy cloned from them
     cloning: BehavioralCloningConfig = field(default_factory=lambda: BehavioralCloningConfig(1_500, 200))
     reward: RewardName = "dense_cost"  # of the buffer
-    n_steps: int = 5  # of the buffer
+    n_steps: Count = 5  # of the buffer
     config: OnlineConfig = field(default_factory=OnlineConfig)  # of the training: of all methods, or the run's own
 
     def __post_init__(self) -> None:
-        check_int("demonstrations", self.demonstrations, minimum=1)
+        check_fields(self)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from itertools import product
 from types import MappingProxyType
 from typing import Any, Literal
 
-from lw_torchrl._checks import check_choice, check_int, check_probability, check_scale
+from lw_torchrl._checks import Count, Probability, Scale, check_choice, check_fields
 from lw_torchrl._files import read_toml
 from lw_torchrl.data import BEHAVIOURS, EpisodeFilter
 from lw_torchrl.data.rewards import REWARDS, RewardName
@@ -128,32 +128,26 @@ class OfflineRecipe:
     """The numbers of all methods."""
 
     reward: RewardName = "dense_cost"  # what values are of
-    n_steps: int = 10  # of the values' targets
-    gamma: float = 0.99  # of these
-    expectile: float = 0.7  # of the value
-    beta: float = 2.0  # of the weights by advantage, as for :class:`AdvantageWeightedLoss`
-    max_weight: float = 20.0  # of these
+    n_steps: Count = 10  # of the values' targets
+    gamma: Probability = 0.99  # of these
+    expectile: Probability = 0.7  # of the value
+    beta: Scale = 2.0  # of the weights by advantage, as for :class:`AdvantageWeightedLoss`
+    max_weight: Scale = 20.0  # of these
     distance: Literal["l1", "l2"] = "l1"  # to what is imitated; the mean of open and close would half open the gripper
-    temperature: float = 3.0  # of IQL's actor
-    alpha: float = 2.5  # of TD3+BC, the weight of the value beside the imitation
-    cql_weight: float = 1.0  # of CQL's penalty
-    steps: int = 4000  # minibatches of every actor; of the value, ``value_steps``
-    value_steps: int = 4000
-    batch_size: int = 250  # rows of one
-    width: int = 256  # of hidden layers
-    depth: int = 3  # of actors
-    critic_depth: int = 2
-    feature_noise: float = 0.05  # of actors while they train
+    temperature: Scale = 3.0  # of IQL's actor
+    alpha: Scale = 2.5  # of TD3+BC, the weight of the value beside the imitation
+    cql_weight: Scale = 1.0  # of CQL's penalty
+    steps: Count = 4000  # minibatches of every actor; of the value, ``value_steps``
+    value_steps: Count = 4000
+    batch_size: Count = 250  # rows of one
+    width: Count = 256  # of hidden layers
+    depth: Count = 3  # of actors
+    critic_depth: Count = 2
+    feature_noise: Scale = 0.05  # of actors while they train
 
     def __post_init__(self) -> None:
         check_choice("reward", self.reward, REWARDS)
-        check_choice("distance", self.distance, ("l1", "l2"))
-        for name in ("expectile", "gamma"):
-            check_probability(name, getattr(self, name))
-        for name in ("beta", "max_weight", "temperature", "alpha", "cql_weight", "feature_noise"):
-            check_scale(name, getattr(self, name))
-        for name in ("n_steps", "steps", "value_steps", "batch_size", "width", "depth", "critic_depth"):
-            check_int(name, getattr(self, name), minimum=1)
+        check_fields(self)
 
 
 @dataclass(frozen=True)
@@ -162,10 +156,6 @@ class OfflineTable:
 
     tasks: str  # a name of :data:`TASK_SETS`
     rows: Mapping[str, tuple[tuple[str, str, str], ...]]  # mixture to its rows, (method, actor, critic) each
-
-
-def _method(name: str, keep: Mapping[str, Any] | None = None, **given: Any) -> OfflineMethod:
-    return OfflineMethod(name, keep=None if keep is None else EpisodeFilter(**keep), **given)
 
 
 def _table(tasks: str, runs: Sequence[Mapping[str, Any]]) -> OfflineTable:
@@ -185,7 +175,10 @@ MIXTURES: Mapping[str, tuple[Portion, ...]] = MappingProxyType(
 )
 NOISE: Mapping[str, dict[str, Any]] = {one: _TABLES["noise"].get(one, _TABLES["noise"]["others"]) for one in BEHAVIOURS}
 OFFLINE_METHODS: Mapping[str, OfflineMethod] = MappingProxyType(
-    {name: _method(name, **given) for name, given in _TABLES["methods"].items()}
+    {
+        name: OfflineMethod(name, **given | ({"keep": EpisodeFilter(**given["keep"])} if "keep" in given else {}))
+        for name, given in _TABLES["methods"].items()
+    }
 )
 OFFLINE_TABLES: Mapping[str, OfflineTable] = MappingProxyType(
     {name: _table(**given) for name, given in _TABLES["tables"].items()}

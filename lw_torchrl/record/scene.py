@@ -95,7 +95,11 @@ def _log_simple_robot(stream: Stream, scene: str, episode: RecordedEpisode) -> N
         stream.log(f"{scene}/{path}", boxes, static=True)
 
     box("table", [TABLE_CENTER], [TABLE_HALF], TABLE)
-    stream.log(f"{scene}/table/grid", rr.LineStrips3D(_grid(), colors=[GRID], radii=[0.0007]), static=True)
+    (x, y, _), (width, depth, _), z = TABLE_CENTER, TABLE_HALF, 0.0005
+    across, along = np.arange(y - depth, y + depth + 1e-6, 0.1), np.arange(x - width, x + width + 1e-6, 0.1)
+    grid = [[(x - width, at, z), (x + width, at, z)] for at in across.tolist()]
+    grid += [[(at, y - depth, z), (at, y + depth, z)] for at in along.tolist()]
+    stream.log(f"{scene}/table/grid", rr.LineStrips3D(grid, colors=[GRID], radii=[0.0007]), static=True)
     box("gripper/palm", [(0.0, 0.0, PALM_RISE)], [PALM_HALF], STEEL)
     # Its name stands above the hand, where the objects that it handles are not.
     box("gripper/wrist", [(0.0, 0.0, WRIST_RISE)], [WRIST_HALF], STEEL, [GRIPPER])
@@ -106,15 +110,6 @@ def _log_simple_robot(stream: Stream, scene: str, episode: RecordedEpisode) -> N
     centers = np.stack([zero, half, drop, zero, -half, drop], axis=1).reshape(-1, 3)  # of two fingers, row by row
     fingers = rr.Boxes3D.columns(centers=centers.astype(np.float32))
     stream.send_columns(f"{scene}/gripper/fingers", times, fingers.partition([2] * len(episode)))
-
-
-def _grid() -> list[list[tuple[float, float, float]]]:
-    """Lines on the table, 10 cm apart."""
-    middle, half = np.array(TABLE_CENTER[:2]), np.array(TABLE_HALF[:2])
-    (left, near), (right, far), z = (middle - half).tolist(), (middle + half).tolist(), 0.0005
-    across = [[(left, y, z), (right, y, z)] for y in np.arange(near, far + 1e-6, 0.1).tolist()]
-    along = [[(x, near, z), (x, far, z)] for x in np.arange(left, right + 1e-6, 0.1).tolist()]
-    return across + along
 
 
 def _log_target(stream: Stream, scene: str, episode: RecordedEpisode, times: Sequence[Any]) -> None:

@@ -166,7 +166,10 @@ def log_timeline(stream: Stream, root: str, episode: RecordedEpisode) -> int:
         names = [f"{i} {skill}" for i, (_, skill) in enumerate(episode.steps, 1)] or map(str, range(1, columns + 1))
         styles = {str(i): (name, step_color(i)) for i, name in enumerate(names)}
         styles |= {NONE_HOLDS: (NONE_HOLDS, FALSE), EVENLY: (EVENLY, FALSE)}
-        send(f"{0:0{width}}_in_force", 0, _states_in_force(episode), styles)
+        answered = True if episode.answers is None else episode.answers.any(axis=1)
+        nobody = np.where(np.broadcast_to(answered, len(episode)), EVENLY, NONE_HOLDS)
+        states = np.where(episode.in_force == NOBODY, nobody, episode.in_force.astype(str)).tolist()
+        send(f"{0:0{width}}_in_force", 0, states, styles)
     for column in range(columns):
         number = f"{column + 1:0{width}}"
         if episode.qaf is not None:
@@ -178,14 +181,6 @@ def log_timeline(stream: Stream, root: str, episode: RecordedEpisode) -> int:
     if episode.success is not None:
         truth("success", 1, episode.success, ("success", "not yet"))
     return rows
-
-
-def _states_in_force(episode: RecordedEpisode) -> list[str]:
-    """The number of the step in force in each row, or why there is none."""
-    assert episode.in_force is not None
-    answered = True if episode.answers is None else episode.answers.any(axis=1)
-    nobody = np.where(np.broadcast_to(answered, len(episode)), EVENLY, NONE_HOLDS)
-    return np.where(episode.in_force == NOBODY, nobody, episode.in_force.astype(str)).tolist()
 
 
 def log_plan(stream: Stream, root: str, episode: RecordedEpisode) -> None:

@@ -127,13 +127,18 @@ class RecordingWriter:
 class RecordingFile:
     """A file that grows by pieces of a rerun stream; between two of them, it is a recording that any viewer opens.
 
-    An older file of its name is set aside; ``previous`` is that one's new name, or None.
+    An older file of its name, unless it is empty, is set aside as "run.previous.rrd" or "run.previous-2.rrd";
+    ``previous`` is that name, or None.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         path.parent.mkdir(parents=True, exist_ok=True)
-        self.previous = set_aside(path)
+        self.previous: Path | None = None
+        if path.is_file() and path.stat().st_size:
+            names = (f"{path.stem}.previous{'' if i == 1 else f'-{i}'}{path.suffix}" for i in count(1))
+            self.previous = next(free for name in names if not (free := path.with_name(name)).exists())
+            os.rename(path, self.previous)
         try:
             self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o666)
         except OSError:
@@ -271,13 +276,3 @@ def check_path(path: str | os.PathLike[str]) -> Path:
     if nearest is not None and not nearest.is_dir():
         raise ValueError(f"path {str(target)!r} must lie in a folder, but {str(nearest)!r} is a file")
     return target
-
-
-def set_aside(path: Path) -> Path | None:
-    """Rename a file, "run.previous.rrd" or "run.previous-2.rrd"; None: there is none, or it is empty."""
-    if not path.is_file() or not path.stat().st_size:
-        return None
-    names = (f"{path.stem}.previous{'' if i == 1 else f'-{i}'}{path.suffix}" for i in count(1))
-    kept = next(free for name in names if not (free := path.with_name(name)).exists())
-    os.rename(path, kept)
-    return kept

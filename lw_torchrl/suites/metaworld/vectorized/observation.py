@@ -273,16 +273,13 @@ class SuccessFunction:
         for k in np.flatnonzero(held):
             current, program = scene.current[rows[k]], self._programs(int(rows[k]))
             lifted = current[OBJECT][2] - STICK_LIFT > program.stick_init_pos[2]
-            held[k] = current[GRIPPER] > 0.0 and lifted and _both_pads_press(program.model, program.data)
+            if not (current[GRIPPER] > 0.0 and lifted):
+                held[k] = False
+                continue
+            # Both pads must push against the stick, by the contact forces that Meta-World looks at.
+            model, data, pairs = program.model, program.data, program.data.contact.geom
+            touched = (pairs == model.geom("objGeom").id).any(axis=1)
+            for pad in ("leftpad_geom", "rightpad_geom"):
+                contacts = touched & (pairs == model.geom(pad).id).any(axis=1)
+                held[k] &= sum(data.efc_force[data.contact.efc_address[contacts]]) > 0
         return held
-
-
-def _both_pads_press(model: Any, data: Any) -> bool:
-    """Whether both pads of the gripper push against the stick, by the contact forces Meta-World looks at."""
-    pairs = data.contact.geom
-    touched = (pairs == model.geom("objGeom").id).any(axis=1)
-    for pad in ("leftpad_geom", "rightpad_geom"):
-        contacts = touched & (pairs == model.geom(pad).id).any(axis=1)
-        if not sum(data.efc_force[data.contact.efc_address[contacts]]) > 0:
-            return False
-    return True
