@@ -237,8 +237,7 @@ def choose_cause_pair(mended: Iterable[str], shares: Mapping[str, float]) -> tup
     if not found:
         return None
     cause, also = max(found, key=lambda pair: sum(alone.get(name, 0.0) for name in pair))
-    later = cause != "query" and alone.get(also, 0.0) > alone.get(cause, 0.0)
-    return (also, cause) if later else (cause, also)
+    return (also, cause) if cause != "query" and alone.get(also, 0.0) > alone.get(cause, 0.0) else (cause, also)
 
 
 def _by_counterfactuals(

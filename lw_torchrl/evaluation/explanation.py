@@ -131,8 +131,7 @@ def candidates(seen: EpisodeStates, among: Tensor | None = None) -> list[int]:
         if counted[-window:].any():
             ranked += reversed(where_stuck(in_charge, window))
     ranked += torch.bincount(seen.in_force[counted]).argsort(descending=True).tolist()
-    present = set(seen.in_force[counted].tolist())
-    return [step for step in dict.fromkeys(ranked) if step in present]
+    return [step for step in dict.fromkeys(ranked) if step in seen.in_force[counted]]
 
 
 def last_stay_start(states: Tensor) -> int:
@@ -251,8 +250,7 @@ def unlike_scripts(actor: Any, seen: EpisodeStates, scripts: Scripts) -> Tensor 
         return None
     states = seen.steps.select(*keys).clone()
     if "qaf" in actor.in_keys:
-        width = actor.plans.num_steps
-        states.set("qaf", torch.nn.functional.pad(seen.given, (0, width - seen.given.shape[1])))
+        states.set("qaf", torch.nn.functional.pad(seen.given, (0, actor.plans.num_steps - seen.given.shape[1])))
     with torch.no_grad(), evaluating(actor):
         action = actor(states.to(device_of(actor))).get("action").cpu()
     program = scripts.program(seen.steps.get("observation"), seen.steps.get("task_id"))[:, : seen.weights.shape[1]]

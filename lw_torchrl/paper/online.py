@@ -106,8 +106,7 @@ class OnlineRun(Run):
     @property
     def folder(self) -> Path:
         step = f"step{self.step + 1}" if isinstance(self.step, int) else self.step
-        method = self.method if step is None else f"{self.method}-{step}"
-        return self.group / self.task / method / f"seed{self.seed}"
+        return self.group / self.task / "-".join(filter(None, (self.method, step))) / f"seed{self.seed}"
 
     @property
     def datasets(self) -> tuple[ExpertDataset, ...]:

@@ -9,10 +9,10 @@ from itertools import product
 from types import MappingProxyType
 from typing import Any, Literal
 
-from lw_torchrl._checks import Count, Probability, Scale, check_choice, check_fields
+from lw_torchrl._checks import Count, Probability, Scale, check_fields
 from lw_torchrl._files import read_toml
 from lw_torchrl.data import BEHAVIOURS, EpisodeFilter
-from lw_torchrl.data.rewards import REWARDS, RewardName
+from lw_torchrl.data.rewards import RewardName
 from lw_torchrl.data.selection import Label
 from lw_torchrl.language.tasks import MT10
 from lw_torchrl.training.behavioral_cloning import BehavioralCloningConfig
@@ -146,7 +146,6 @@ class OfflineRecipe:
     feature_noise: Scale = 0.05  # of actors while they train
 
     def __post_init__(self) -> None:
-        check_choice("reward", self.reward, REWARDS)
         check_fields(self)
 
 

@@ -10,7 +10,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, Literal
 
-from lw_torchrl._checks import check_choice, check_int, check_positive, check_scale, checked, counted, shown
+from lw_torchrl._checks import Count, Natural, Positive, Scale, check_choice, check_int, checked, counted, shown
 from lw_torchrl._progress import Progress
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
@@ -78,15 +78,15 @@ class OpenAIPlanner:
         skills: Skills | None = None,
         plans: Plans | Mapping[str, ConditionalPlan] | None = None,
         vocabulary: bool = False,
-        temperature: float | None = None,
-        max_tokens: int = 1024,
+        temperature: Scale | None = None,
+        max_tokens: Count = 1024,
         seed: int | None = None,
         options: Mapping[str, Any] | None = None,
         name: str | None = None,
         cache: str | os.PathLike[str] = "runs/answers",
-        concurrency: int = 4,
-        retries: int = 6,
-        timeout: float = 300.0,
+        concurrency: Count = 4,
+        retries: Natural = 6,
+        timeout: Positive = 300.0,
     ) -> None:
         if not model.strip():
             raise TypeError(f"model must be a model's name, got {shown(model)}")
@@ -98,15 +98,12 @@ class OpenAIPlanner:
         self.skills, self.vocabulary = skills, vocabulary
         self.examples = None if plans is None else as_plans(plans)
         self.address = server_address(base_url)
-        self.temperature = None if temperature is None else check_scale("temperature", temperature)
-        self.max_tokens = check_int("max_tokens", max_tokens, minimum=1)
-        self.seed = None if seed is None else check_int("seed", seed)
+        self.temperature = None if temperature is None else float(temperature)
+        self.max_tokens, self.seed = int(max_tokens), None if seed is None else int(seed)
         self.options = request_options(options)
         self.name = folder_name(name or (f"{model}-constrained" if constrain else model))
         self.cache = AnswerCache(cache)
-        self.concurrency = check_int("concurrency", concurrency, minimum=1)
-        self.retries = check_int("retries", retries, minimum=0)
-        self.timeout = check_positive("timeout", timeout)
+        self.concurrency, self.retries, self.timeout = int(concurrency), int(retries), float(timeout)
         self._dialect: Dialect | None = None
 
     def __repr__(self) -> str:

@@ -48,8 +48,8 @@ def plan_facts(check: PlanCheck, task: Task, notes: Sequence[str] = ()) -> str:
     unread = [f"The answer is too long: {note}." for note in notes if note == CUT_OFF]
     unread += [f"In the answer, {note}" for note in check.decoded.notes]
     if check.decoded.plan is None:
-        none = f"The answer was read, and no plan was found in it: {check.decoded.reason}."
-        return "\n".join([none, *unread, again])
+        reason = check.decoded.reason
+        return "\n".join([f"The answer was read, and no plan was found in it: {reason}.", *unread, again])
     lines = [f"The plan was carried out, and succeeded in {check.success:.0%} of episodes."]
     if check.own is None:
         lines = ["The plan was not carried out: the robot has no skill that is near one of its steps."]

@@ -46,10 +46,9 @@ class ModelGeometry:
 
 def model_geometry(model: RowModel) -> ModelGeometry:
     """What is drawn of a model; prepared once for each XML file, in about half a second."""
-    found = _prepared.get(model.path)
-    if found is None:
-        found = _prepared[model.path] = _prepare(model.model)
-    return found
+    if model.path not in _prepared:
+        _prepared[model.path] = _prepare(model.model)
+    return _prepared[model.path]
 
 
 def log_model(stream: Stream, root: str, geometry: ModelGeometry) -> None:
@@ -65,8 +64,8 @@ def log_motion(stream: Stream, root: str, motion: Motion) -> None:
         place, turn = motion.position[:, body], motion.quaternion[:, body][:, [1, 2, 3, 0]]
         moved = (place[1:] != place[:-1]).any(axis=1) | (turn[1:] != turn[:-1]).any(axis=1)
         if not moved.any():
-            pose = rr.Transform3D(translation=place[0], quaternion=rr.Quaternion(xyzw=turn[0]))
-            stream.log(path, pose, static=True)
+            still = rr.Transform3D(translation=place[0], quaternion=rr.Quaternion(xyzw=turn[0]))
+            stream.log(path, still, static=True)
             continue
         steps = np.flatnonzero(np.concatenate([[True], moved]))
         columns = rr.Transform3D.columns(translation=place[steps], quaternion=turn[steps])

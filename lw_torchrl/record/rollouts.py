@@ -100,8 +100,7 @@ def log_rollout(
     if isinstance(failure, Sequence):
         raise ValueError(f"failure must be one Failure for one episode, got {len(failure)}")
     heading, episode = read_rollout(rollout, plans, seed=seed, policy=policy, failure=failure, tasks=tasks)
-    motion = _motion(heading, episode) if seed is not None else None
-    return logger.add_page(heading, episode, motion=motion, name=name)
+    return logger.add_page(heading, episode, motion=_motion(heading, episode), name=name)
 
 
 def read_rollout(
@@ -185,9 +184,7 @@ def simulate_again(
 
 
 def _motion(heading: Heading, episode: RecordedEpisode) -> Motion | None:
-    assert heading.seed is not None
-    assert heading.episode is not None
-    if (suite := known_suite(heading.task)) is None:
+    if heading.seed is None or heading.episode is None or (suite := known_suite(heading.task)) is None:
         return None
     try:
         return simulate_again(heading.task, heading.seed, heading.episode, episode.action, episode.observation, suite)
@@ -246,18 +243,15 @@ def run_recorded(
     answered = actor_plans(actor, plans)
     found_suite, chosen = tasks_of(tasks, answered, suite)
     options: dict[str, Any] = {"seed": seed, "max_steps": max_steps, "suite": found_suite, "engine": engine}
-    base = LanguageWorldEnv(list(chosen.values()), strict=True, **options)
-    env = make_env(actor, answered, base)
+    env = make_env(actor, answered, LanguageWorldEnv(list(chosen.values()), strict=True, **options))
     written = set() if answered is None else {"qaf", *actor.out_keys}
     evaluator = getattr(actor, "evaluator", None)
-    asked = [] if evaluator is None else evaluator.in_keys
-    keys = list(dict.fromkeys([*_KEYS, *sorted(_PLAN_KEYS & written), *asked]))
+    keys = list(dict.fromkeys([*_KEYS, *sorted(_PLAN_KEYS & written), *getattr(evaluator, "in_keys", ())]))
     how: dict[str, Any] = {"noise_scale": noise_scale, "progress": progress, "keys": keys}
     found = {}
     with running("recording", env, actor, dict.fromkeys(chosen, episodes), **how) as finished:
         for one in finished:
-            steps = one.steps if evaluator is None else evaluator(one.steps)
-            found[one.task, one.episode] = one._replace(steps=steps)
+            found[one.task, one.episode] = one if evaluator is None else one._replace(steps=evaluator(one.steps))
     return [found[task, episode] for task in chosen for episode in episodes]
 
 

@@ -53,8 +53,7 @@ def log_scene(stream: Stream, root: str, episode: RecordedEpisode, motion: Motio
         stream.send_columns(f"{scene}/{path}", times, rr.Points3D.columns(positions=position))
 
     def lines(path: str, strips: NDArray[np.float32], radius: float, color: Color) -> None:
-        style = rr.LineStrips3D.from_fields(colors=[color], radii=[radius])
-        stream.log(f"{scene}/{path}", style, static=True)
+        stream.log(f"{scene}/{path}", rr.LineStrips3D.from_fields(colors=[color], radii=[radius]), static=True)
         stream.send_columns(f"{scene}/{path}", times, rr.LineStrips3D.columns(strips=strips))
 
     goal = np.ascontiguousarray(episode.observation[:, episode.layout.positions[-1]])

@@ -213,8 +213,8 @@ class Layout:
     def save(self, stream: Stream) -> None:
         """Write the new tabs as properties of a recording."""
         for number in range(self._saved, len(self._entries)):
-            values = rr.AnyValues(entry=self._entries[number])
-            stream.log(f"__properties/{_PROPERTY}/{number}", values, static=True)
+            entry = self._entries[number]
+            stream.log(f"__properties/{_PROPERTY}/{number}", rr.AnyValues(entry=entry), static=True)
         self._saved = len(self._entries)
 
     def is_due(self, seconds: float) -> bool:
@@ -236,27 +236,19 @@ class Layout:
                 shown = [_view(kind, names) for names in views]
                 tabs.append(shown[0] if kind == "hparams" else rrb.Grid(*shown, name=TABS[kind]))
         front = None if tab is None else self._find(tab)
-        time: dict[str, Any] = {
-            "timeline": self.tab(tab).timeline,
-            "fps": 80.0,
-            "play_state": "paused",
-            "loop_mode": "all",
-        }
-        panels = [rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed")]
-        panels.append(rrb.TimePanel(state="collapsed", **time))
+        closed = {"state": "collapsed"}
+        time = {"timeline": self.tab(tab).timeline, "fps": 80.0, "play_state": "paused", "loop_mode": "all"}
+        panels = rrb.BlueprintPanel(**closed), rrb.SelectionPanel(**closed), rrb.TimePanel(**closed, **time)
         return rrb.Blueprint(rrb.Tabs(*tabs, active_tab=front), *panels, auto_views=False)
 
     def tabs(self) -> list[Tab]:
         """The tabs from left to right."""
-        return [
-            *(Tab(title, title, names) for title, names in self._compared),
-            *(Tab(name, page.title, [name]) for name, page in list(self.pages.items())),
-            *(
-                Tab(TABS[kind], TABS[kind], [], METRIC_TIMELINE if kind in OF_TRAINING else EPISODE_TIMELINE)
-                for kind, views in self._views.items()
-                if views
-            ),
-        ]
+        tabs = [Tab(title, title, names) for title, names in self._compared]
+        tabs += [Tab(name, page.title, [name]) for name, page in list(self.pages.items())]
+        for kind in (kind for kind, views in self._views.items() if views):
+            timeline = METRIC_TIMELINE if kind in OF_TRAINING else EPISODE_TIMELINE
+            tabs.append(Tab(TABS[kind], TABS[kind], [], timeline))
+        return tabs
 
     def _find(self, name: str | None) -> int:
         """The place of the tab of that name or title, or of the only one whose title holds it; of None the first."""

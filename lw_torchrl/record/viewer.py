@@ -142,8 +142,7 @@ def connect(process: subprocess.Popen[bytes], port: int) -> tuple[Any, Any]:
 
 def go_to(client: Any, recording: Any, step: int | None) -> None:
     """Set the time cursor to ``step``, or to the last one, of the timeline that the layout chose."""
-    timelines = {timeline.name: timeline for timeline in recording.timelines}
-    timeline = timelines.get(recording.current_timeline)
+    timeline = next((one for one in recording.timelines if one.name == recording.current_timeline), None)
     if timeline is None or timeline.end is None:
         return
     if step is None:  # an episode's success and reward stand one step after its last row

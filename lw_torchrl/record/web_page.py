@@ -122,9 +122,10 @@ class WebPage(AbstractContextManager["WebPage"]):
 
 def _handler(files: dict[str, tuple[str, bytes]]) -> type[BaseHTTPRequestHandler]:
     class Handler(BaseHTTPRequestHandler):
+        timeout = STALLED_SECONDS
+
         def setup(self) -> None:
             super().setup()
-            self.connection.settimeout(STALLED_SECONDS)
             self._asking = threading.Timer(ASKING_SECONDS, self._end)
             self._asking.daemon = True
             self._asking.start()
@@ -196,8 +197,7 @@ def _viewer_files() -> tuple[str, bytes]:
 def request(step: int) -> bytes:
     """The message that asks a viewer for ``step`` of the timeline in force, paused (a ``ViewerControlRequest``)."""
     paused = b"\x28\x01"
-    cursor = b"\x1a" + _sized(b"\x08" + _varint(step)) + paused
-    return b"\x32" + _sized(cursor)
+    return b"\x32" + _sized(b"\x1a" + _sized(b"\x08" + _varint(step)) + paused)
 
 
 def sign(step: int) -> bytes:
