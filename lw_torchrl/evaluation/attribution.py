@@ -15,15 +15,7 @@ from lw_torchrl._checks import Count, Scale, checked, missing_keys
 from lw_torchrl._devices import device_of
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.evaluation.counterfactuals import Counterfactuals, EpisodeId, EpisodeRepeater, own_evaluators
-from lw_torchrl.evaluation.explanation import (
-    EpisodeStates,
-    Explanation,
-    Scripts,
-    describe_active_time,
-    explain,
-    stall_step,
-    states_of,
-)
+from lw_torchrl.evaluation.explanation import EpisodeStates, Explanation, Scripts, explain, stall_step, states_of
 from lw_torchrl.evaluation.failure_records import Cause, Failure
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.skills import ScriptedSkill, load_skills
@@ -274,7 +266,7 @@ def _by_counterfactuals(
     step, at, why = told.blames[cause]
     if best == "skill":
         step, plan = tried.step[one.which], tried.plans[one.task]
-        at, why = stall_step(one, step, plan.definition.layout), describe_active_time(one, plan, step)
+        at, why = stall_step(one, step, plan.definition.layout), one.active_time(plan, step)
     by = {f"mended_by_{name.replace(' + ', '_and_')}": share for name, share in shares.items()}
     evidence = {**told.evidence, **by}
     return Failure(one.task, seed, one.episode, cause, also, step, at, _text(why, words), evidence, replaced)

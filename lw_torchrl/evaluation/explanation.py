@@ -48,6 +48,12 @@ class EpisodeStates(NamedTuple):
     def which(self) -> tuple[str, int]:
         return self.task, self.episode
 
+    def active_time(self, plan: ConditionalPlan, step: int) -> str:
+        """How long a step was in force, in words."""
+        late = min(_LATE, len(self.in_force))
+        inside = int((self.in_force == step)[-late:].sum())
+        return f"step {step + 1}, '{plan.steps[step].skill}', was in force in {inside} of the last {late} states"
+
 
 class Blame(NamedTuple):
     """Where a cause shows."""
@@ -153,13 +159,6 @@ def stall_step(seen: EpisodeStates, step: int, layout: Layout = METAWORLD) -> in
     return begin + (int(still.int().argmax()) if still.any() else 0)
 
 
-def describe_active_time(seen: EpisodeStates, plan: ConditionalPlan, step: int) -> str:
-    """How long a step was in force, in words."""
-    late = min(_LATE, len(seen.in_force))
-    inside = int((seen.in_force == step)[-late:].sum())
-    return f"step {step + 1}, '{plan.steps[step].skill}', was in force in {inside} of the last {late} states"
-
-
 def explain(seen: EpisodeStates, scripts: Scripts, reference: Scripts | None) -> Explanation:
     """The rule of :func:`attribute_failures`; without a reference, a plan is to blame where no condition holds, and a
     skill that stays in force far from its goal."""
@@ -204,7 +203,7 @@ def explain(seen: EpisodeStates, scripts: Scripts, reference: Scripts | None) ->
         blames["plan"] = Blame(step, at, f"in {states} states {said}, where the reference says '{asked}'")
 
     evidence["in_step_late"] = float((seen.in_force == stuck)[-late:].float().mean())
-    told = describe_active_time(seen, plan, stuck)
+    told = seen.active_time(plan, stuck)
     if scripts.known[seen.task][stuck]:
         last = seen.steps[-1:]
         far = float(scripts.distance(last.get("observation"), last.get("task_id"), stuck))

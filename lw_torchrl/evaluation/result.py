@@ -16,13 +16,7 @@ from torch import Tensor
 from lw_torchrl._checks import Count, Natural, check_flag, check_int, check_scale
 from lw_torchrl._files import read_json, write_json
 from lw_torchrl._versions import package_versions
-from lw_torchrl.evaluation.failure_records import (
-    Failure,
-    failure_table,
-    is_number,
-    read_failures,
-    read_records,
-)
+from lw_torchrl.evaluation.failure_records import Failure, failure_table, is_number, read_failures, read_records
 
 FORMAT = "lw_torchrl.evaluation"
 FORMAT_VERSION = 1

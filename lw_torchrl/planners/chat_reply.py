@@ -45,8 +45,7 @@ class Redactor(logging.Filter):
 
     def __call__(self, text: str) -> str:
         """The text, with ``(the key)`` in the place of each secret."""
-        if self._words:
-            text = self._words.sub(HIDDEN, text)
+        text = self._words.sub(HIDDEN, text) if self._words else text
         if not any(form in _letters(view) for view in _views(text) for form in self._forms):
             return text
         places = sorted(self._places(text)) if len(text) <= _LONGEST else []

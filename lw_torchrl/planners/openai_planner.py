@@ -16,14 +16,7 @@ from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.skills import Skills
 from lw_torchrl.language.tasks import TASKS, Task, TaskList, Tasks, get_task, named_tasks
-from lw_torchrl.planners.answer_files import (
-    AnswerCache,
-    answer_path,
-    folder_name,
-    recorded_answer,
-    settle_folder,
-    write_answer,
-)
+from lw_torchrl.planners.answer_files import AnswerCache, folder_name, recorded_answer, settle_folder, write_answer
 from lw_torchrl.planners.answers import Answer, Answers, Reply, read_reply, storable, unanswered
 from lw_torchrl.planners.chat_server import ChatServer, Dialect, ask_at_once, server_address
 from lw_torchrl.planners.prompts import Question, chat_messages, example_plans, plan_schema, request_options
@@ -156,11 +149,8 @@ class OpenAIPlanner:
         """
         check_choice("format", format, PLAN_FORMATS)
         count = check_int("attempts", attempts, minimum=1)
-        questions = [
-            Question(task, attempt, self.request(task, format, attempt))
-            for task in named_tasks(tasks).values()
-            for attempt in range(count)
-        ]
+        each = [(task, attempt) for task in named_tasks(tasks).values() for attempt in range(count)]
+        questions = [Question(task, attempt, self.request(task, format, attempt)) for task, attempt in each]
         return self._answers(questions, format, self.name, out, progress, "taken" if recorded else "replaced")
 
     def revise(
@@ -193,8 +183,7 @@ class OpenAIPlanner:
         for answer, fact in zip(before, told, strict=True):
             task = get_task(answer.task, tasks)
             request = self.request(task, format, answer.attempt)
-            talk = {"assistant": answer.raw, "user": fact}
-            request["messages"] += [{"role": role, "content": content} for role, content in talk.items()]
+            request["messages"] += [{"role": "assistant", "content": answer.raw}, {"role": "user", "content": fact}]
             questions.append(Question(task, answer.attempt, request))
         name = f"{self.name}-round{check_int('round', round, minimum=1)}"
         return self._answers(questions, format, name, out, progress, "refused")
@@ -222,9 +211,8 @@ class OpenAIPlanner:
                     found.append(there)
                     continue
                 if there is not None and (reply is None or self._read(reply, question, format).text != there.text):
-                    path = str(answer_path(out, name, format, there.task, there.attempt))
-                    what = f"{path!r} is there already, the answer to another question; it is not replaced"
-                    raise ValueError(f"out: {what}: give the new ones another name (--name) or out")
+                    what = f"the answer to another question, {question}, is in {str(Path(out) / name)!r} already"
+                    raise ValueError(f"out: {what}; it is not replaced: give the new ones another name (--name) or out")
             if reply is None:
                 missing[str(question)] = question, note
             else:

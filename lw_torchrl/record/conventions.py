@@ -28,10 +28,7 @@ EPISODE_TIMELINE, SECONDS_TIMELINE, METRIC_TIMELINE = "step", "time", "global_st
 CONTROL_PERIOD = 0.0125
 """Seconds between two actions in Meta-World: 5 simulation steps of 2.5 ms, hence 80 Hz."""
 
-Stream = Any
-"""A rerun RecordingStream."""
 Color = tuple[int, ...]
-BACKGROUND = (24, 27, 33)
 TRUE, FALSE = (70, 170, 105), (52, 56, 64)
 STEEL, GOLD, GREEN = (205, 210, 220), (255, 200, 60), (90, 220, 120)
 _SERIES = ("50aaff", "ff9646", "6ed778", "e16ee1", "f0d750", "64d7d7", "fa6e78", "aa96fa")

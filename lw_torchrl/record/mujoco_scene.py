@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl.record.conventions import Stream, entity_path, rr, time_columns
+from lw_torchrl.record.conventions import entity_path, rr, time_columns
 from lw_torchrl.suites.engine import RowModel
 
 SHOWN_GROUPS = (0, 1, 2)
@@ -51,13 +51,13 @@ def model_geometry(model: RowModel) -> ModelGeometry:
     return _prepared[model.path]
 
 
-def log_model(stream: Stream, root: str, geometry: ModelGeometry) -> None:
+def log_model(stream: Any, root: str, geometry: ModelGeometry) -> None:
     """The geoms below ``root``, each under its body's name; they never change."""
     for body, part, archetypes in geometry.parts:
         stream.log(f"{root}{entity_path(body, part)}", *archetypes, static=True)
 
 
-def log_motion(stream: Stream, root: str, motion: Motion) -> None:
+def log_motion(stream: Any, root: str, motion: Motion) -> None:
     """The poses of the bodies below ``root``, row t at step t: static where a body never moves."""
     for body, name in model_geometry(motion.model).bodies.items():
         path = f"{root}{entity_path(name)}"

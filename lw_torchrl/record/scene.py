@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lw_torchrl.language.named_objects import GRIPPER
-from lw_torchrl.record.conventions import GOLD, GREEN, STEEL, Color, Stream, entity_path, rr, step_color, time_columns
+from lw_torchrl.record.conventions import GOLD, GREEN, STEEL, Color, entity_path, rr, step_color, time_columns
 from lw_torchrl.record.mujoco_scene import Motion, log_model, log_motion, model_geometry
 from lw_torchrl.record.recorded_episode import RecordedEpisode
 
@@ -32,7 +32,7 @@ TABLE_CENTER, TABLE_HALF = (0.0, 0.6, -0.010), (0.7, 0.4, 0.010)
 TABLE, GRID = (58, 64, 74), (92, 99, 112)
 
 
-def log_scene(stream: Stream, root: str, episode: RecordedEpisode, motion: Motion | None = None) -> list[str]:
+def log_scene(stream: Any, root: str, episode: RecordedEpisode, motion: Motion | None = None) -> list[str]:
     """Draw robot, objects, goal, the hand's path and the target pose under ``root``/scene; returns the trails' paths.
 
     A trail is one short line per row, to be shown up to the time cursor. Without a motion, the robot is a hand over a
@@ -83,7 +83,7 @@ def log_scene(stream: Stream, root: str, episode: RecordedEpisode, motion: Motio
     return trails
 
 
-def _log_simple_robot(stream: Stream, scene: str, episode: RecordedEpisode) -> None:
+def _log_simple_robot(stream: Any, scene: str, episode: RecordedEpisode) -> None:
     """The table and the gripper below ``scene``."""
     times = time_columns(np.arange(len(episode)))
 
@@ -111,7 +111,7 @@ def _log_simple_robot(stream: Stream, scene: str, episode: RecordedEpisode) -> N
     stream.send_columns(f"{scene}/gripper/fingers", times, fingers.partition([2] * len(episode)))
 
 
-def _log_target(stream: Stream, scene: str, episode: RecordedEpisode, times: Sequence[Any]) -> None:
+def _log_target(stream: Any, scene: str, episode: RecordedEpisode, times: Sequence[Any]) -> None:
     """An arrow from what the scripted skill in force moves to where it goes, in the step's colour."""
     if episode.in_force is None or not any(episode.target_poses):
         return

@@ -8,16 +8,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple
 
 from lw_torchrl._checks import unknown_name
-from lw_torchrl.record.conventions import (
-    BACKGROUND,
-    EPISODE_TIMELINE,
-    METRIC_TIMELINE,
-    SECONDS_TIMELINE,
-    Stream,
-    entity_path,
-    rr,
-    rrb,
-)
+from lw_torchrl.record.conventions import EPISODE_TIMELINE, METRIC_TIMELINE, SECONDS_TIMELINE, entity_path, rr, rrb
 from lw_torchrl.record.mujoco_scene import Motion
 from lw_torchrl.record.recorded_episode import RecordedEpisode
 from lw_torchrl.record.scene import log_scene
@@ -81,7 +72,7 @@ class Page:
         return rrb.Spatial3DView(
             origin=f"{self.root}/scene",
             name="Scene",
-            background=BACKGROUND,
+            background=(24, 27, 33),
             line_grid=False,
             eye_controls=rrb.EyeControls3D(position=self.eye[0], look_target=self.eye[1], eye_up=(0.0, 0.0, 1.0)),
             overrides={path: trail for path in self.trails},
@@ -121,7 +112,7 @@ def side_by_side(pages: Sequence[Page], title: str) -> rrb.Horizontal:
 
 
 def send_page(
-    stream: Stream, name: str, title: str, heading: Heading, episode: RecordedEpisode, motion: Motion | None
+    stream: Any, name: str, title: str, heading: Heading, episode: RecordedEpisode, motion: Motion | None
 ) -> Page:
     """Log an episode under ``name``; what its views, a tab called ``title``, are to show."""
     root = entity_path(name)
@@ -210,7 +201,7 @@ class Layout:
                 layout.add_view(name, *content)
         return layout if found else None
 
-    def save(self, stream: Stream) -> None:
+    def save(self, stream: Any) -> None:
         """Write the new tabs as properties of a recording."""
         for number in range(self._saved, len(self._entries)):
             entry = self._entries[number]
@@ -222,7 +213,7 @@ class Layout:
         new = len(self._entries) - self._shown
         return bool(new) and (4 * new >= self._shown or seconds >= 5 * self._shown)
 
-    def send(self, stream: Stream, tab: str | None = None) -> None:
+    def send(self, stream: Any, tab: str | None = None) -> None:
         """Have the viewer show the tabs, ``tab`` in front; an unknown one is a ValueError."""
         self._shown = len(self._entries)
         stream.send_blueprint(self.blueprint(tab))

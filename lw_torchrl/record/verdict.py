@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lw_torchrl.evaluation.failure_records import CAUSES, Failure
-from lw_torchrl.record.conventions import FALSE, STEEL, TRUE, Color, Stream, entity_path, rr, step_color, time_columns
+from lw_torchrl.record.conventions import FALSE, STEEL, TRUE, Color, entity_path, rr, step_color, time_columns
 from lw_torchrl.record.recorded_episode import NOBODY, RecordedEpisode
 
 AFTER_SUCCESS, AROUND_FAILURE = 20, 60
@@ -136,7 +136,7 @@ ACTION_NAMES = ("dx", "dy", "dz", "gripper")
 MARKS = {True: "✓", False: "✗", None: "·"}
 
 
-def log_timeline(stream: Stream, root: str, episode: RecordedEpisode) -> int:
+def log_timeline(stream: Any, root: str, episode: RecordedEpisode) -> int:
     """Rows for the step in force, each condition and success below ``root``/timeline; returns how many.
 
     A row has an entry where its state changes, and an empty one at the end. The viewer shows a row's path as its title,
@@ -183,8 +183,8 @@ def log_timeline(stream: Stream, root: str, episode: RecordedEpisode) -> int:
     return rows
 
 
-def log_plan(stream: Stream, root: str, episode: RecordedEpisode) -> None:
-    """The plan in ``root``/plan, with a text wherever truth or the step in force change."""
+def log_plan(stream: Any, root: str, episode: RecordedEpisode) -> None:
+    """The plan in ``root``/plan, with a text in Markdown wherever truth or the step in force change."""
     length = len(episode)
     columns = [
         np.full((length, 1), -1) if episode.in_force is None else episode.in_force[:, None],
@@ -192,28 +192,22 @@ def log_plan(stream: Stream, root: str, episode: RecordedEpisode) -> None:
     ]
     states = np.concatenate(columns, axis=1)
     changes = np.flatnonzero(np.concatenate([[True], (states[1:] != states[:-1]).any(axis=1)]))
-    texts = [_plan_text(episode, row) for row in changes.tolist()]
+    texts = []
+    for row in changes.tolist():
+        parts = []
+        for step, (condition, skill) in enumerate(episode.steps):
+            truth = None if episode.qaf is None else bool(episode.qaf[row, step])
+            line = f"{MARKS[truth]}  {step + 1}.  if {condition}"
+            if episode.believed is not None and (believed := bool(episode.believed[row, step])) != truth:
+                line += f"  (evaluator: {MARKS[believed]})"
+            leads = episode.in_force is not None and episode.in_force[row] == step
+            parts.append(f"**{line}**\n### → {skill}\n" if leads else f"{line}  \n\u2003\u2003{skill}\n")
+        texts.append("\n".join(parts))
     documents = rr.TextDocument.columns(text=texts, media_type=[rr.MediaType.MARKDOWN] * len(texts))
     stream.send_columns(f"{root}/plan", time_columns(changes), documents)
 
 
-def _plan_text(episode: RecordedEpisode, row: int) -> str:
-    """The plan as it stands in one row, in Markdown."""
-    parts = []
-    for step, (condition, skill) in enumerate(episode.steps):
-        truth = None if episode.qaf is None else bool(episode.qaf[row, step])
-        line = f"{MARKS[truth]}  {step + 1}.  if {condition}"
-        if episode.believed is not None:
-            believed = bool(episode.believed[row, step])
-            line += f"  (evaluator: {MARKS[believed]})" if believed != truth else ""
-        if episode.in_force is not None and episode.in_force[row] == step:
-            parts.append(f"**{line}**\n### → {skill}\n")
-        else:
-            parts.append(f"{line}  \n\u2003\u2003{skill}\n")
-    return "\n".join(parts)
-
-
-def log_curves(stream: Stream, root: str, episode: RecordedEpisode) -> list[str]:
+def log_curves(stream: Any, root: str, episode: RecordedEpisode) -> list[str]:
     """``root``/action, and, where there is any, /distance (cm), /reward, /skill_weights, /corrected; returns which."""
     rows = np.arange(len(episode))
     sent = ["action"]
@@ -243,7 +237,7 @@ def log_curves(stream: Stream, root: str, episode: RecordedEpisode) -> list[str]
     return sent
 
 
-def _send(stream: Stream, path: str, steps: Any, values: Any, names: Sequence[str], *color: Color) -> None:
+def _send(stream: Any, path: str, steps: Any, values: Any, names: Sequence[str], *color: Color) -> None:
     colors = list(color) or [step_color(i) for i in range(len(names))]
     stream.log(path, rr.SeriesLines(names=names, colors=colors, widths=[1.5] * len(names)), static=True)
     columns = rr.Scalars.columns(scalars=values.ravel()).partition([values.shape[1]] * len(values))

@@ -79,10 +79,7 @@ class VectorizedEngine(SeenRows):
         self._high = np.array([space.high for space in bounds]).reshape(n, METAWORLD.size)
         self._mocap_low = np.array([builder.mocap_low for builder in builders]).reshape(n, 3)
         self._mocap_high = np.array([builder.mocap_high for builder in builders]).reshape(n, 3)
-        scales = {builder.action_scale for builder in builders}
-        if len(scales) > 1:
-            raise RuntimeError(f"the tasks were to share one action scale, got {sorted(scales)}")
-        self._action_scale = scales.pop() if scales else 0.01
+        (self._action_scale,) = {builder.action_scale for builder in builders} or {0.01}  # all tasks share one
 
         self._mocap = np.zeros((n, 3))
         self._goal = np.zeros((n, 3))

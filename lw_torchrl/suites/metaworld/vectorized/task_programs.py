@@ -23,15 +23,10 @@ SUPPORTED_VERSIONS = {"metaworld": "3.1.1", "mujoco": "3.3.0"}
 def check_versions() -> None:
     """Raise ImportError for a Meta-World or MuJoCo whose numbers have not been compared with this engine's."""
     for package, supported in SUPPORTED_VERSIONS.items():
-        try:
-            installed = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            installed = "none"
-        if installed != supported:
+        if (installed := importlib.metadata.version(package)) != supported:
             raise ImportError(
-                f"the vectorized engine reproduces {package} {supported}, but the installed version is "
-                f"{installed}. Install {package}=={supported}, or choose engine='metaworld', which runs "
-                "whatever is installed."
+                f"the vectorized engine reproduces {package} {supported}, but the installed version is {installed}. "
+                f"Install {package}=={supported}, or choose engine='metaworld', which runs whatever is installed."
             )
 
 

@@ -45,12 +45,6 @@ class Parameters(SimpleNamespace):
 
 
 def make_parameters(rewards: Sequence[TaskReward]) -> Parameters:
-    kinds = list({id(reward): reward for reward in rewards}.values())
-    place = {id(reward): number for number, reward in enumerate(kinds)}
-    return _parameters(kinds).of(np.array([place[id(reward)] for reward in rewards]))
-
-
-def _parameters(rewards: Sequence[TaskReward]) -> Parameters:
     terms = [reward.terms for reward in rewards]
 
     def of_terms(name: str) -> Array:
