@@ -151,9 +151,7 @@ def attribute_failures(
     return [_by_counterfactuals(one, told[one.which], tried, shares.get(one.task, {}), seed) for one in seen]
 
 
-def _failed(
-    rollouts: Iterable[FinishedEpisode | TensorDictBase], plans: Plans
-) -> list[tuple[str, int, TensorDictBase]]:
+def _failed(rollouts: Iterable[Any], plans: Plans) -> list[tuple[str, int, TensorDictBase]]:
     """The failed episodes: task, episode and steps."""
     by_id = {task_id(task): task for task in plans}
     found: list[tuple[str, int, TensorDictBase]] = []
@@ -273,10 +271,8 @@ def _by_counterfactuals(
 
 
 def _listed(names: Iterable[str], joint: str) -> str:
-    words = [
-        " and ".join(_PARTS[part] for part in name.split(" + ")) if " + " in name else _COUNTERFACTUALS[name][1]
-        for name in names
-    ]
+    pairs = {f"{a} + {b}": f"{_PARTS[a]} and {_PARTS[b]}" for a in _PARTS for b in _PARTS}
+    words = [pairs.get(name) or _COUNTERFACTUALS[name][1] for name in names]
     return f" {joint} ".join(words) if len(words) < 3 else f"{', '.join(words[:-1])} {joint} {words[-1]}"
 
 

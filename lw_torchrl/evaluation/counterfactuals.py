@@ -172,10 +172,8 @@ class Counterfactuals:
             theirs = evaluator.with_plans(reference) if hasattr(evaluator, "with_plans") else evaluator
             self.other, self.other_evaluator, self.reference = other, theirs, reference
         except (AttributeError, ImportError, RuntimeError, TypeError, ValueError) as error:
-            warnings.warn(
-                f"reference: the policy cannot carry it out, so no plan is replaced ({type(error).__name__}: {error})",
-                stacklevel=4,
-            )
+            why = f"{type(error).__name__}: {error}"
+            warnings.warn(f"reference: the policy cannot carry it out, so no plan is replaced ({why})", stacklevel=4)
 
     def run(self, seen: Sequence[EpisodeStates], same: Collection[EpisodeId] = ()) -> None:
         """Run all that are worth it."""

@@ -46,10 +46,8 @@ def plot_reliability(report: EvaluatorReport, path: str | os.PathLike[str] | Non
         there = number > 0
         upper.plot([0, 1], [0, 1], color="#bab0ac", linewidth=1)
         upper.plot(told[there] / number[there], true[there] / number[there], "o-", color="#4c78a8", markersize=4)
-        upper.set_title(
-            f"{PARTS[part]}\naccuracy {score.accuracy():.4f}, calibration error {score.calibration_error:.4f}",
-            fontsize=9,
-        )
+        numbers = f"accuracy {score.accuracy():.4f}, calibration error {score.calibration_error:.4f}"
+        upper.set_title(f"{PARTS[part]}\n{numbers}", fontsize=9)
         upper.set_ylabel("share that holds")
         lower.bar([(place + 0.5) / BINS for place in range(BINS)], number, width=0.9 / BINS, color="#4c78a8")
         lower.set_yscale("log")

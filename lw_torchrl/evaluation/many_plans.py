@@ -107,12 +107,7 @@ class _PlanOfRow(nn.Module):
     row_by_row = True
 
     def __init__(
-        self,
-        plans: Mapping[str, Sequence[ConditionalPlan]],
-        episodes: int,
-        seed: int,
-        choose: str,
-        skills: Mapping[str, ScriptedSkill] | None,
+        self, plans: Mapping[str, Sequence[ConditionalPlan]], episodes: int, seed: int, choose: str, skills: Any
     ) -> None:
         super().__init__()
         self.episodes, self.seed, self.random = episodes, seed, choose == "random"

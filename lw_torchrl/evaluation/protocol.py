@@ -31,10 +31,8 @@ def actor_plans(actor: Any, plans: Plans | Mapping[str, ConditionalPlan] | None)
         return own
     given = as_plans(plans)
     if own is not None and (different := given.differences(own)):
-        raise ValueError(
-            f"plans differ from the actor's own for {', '.join(different)}; pass plans=None, or evaluate "
-            "actor.with_plans(plans)"
-        )
+        how = "pass plans=None, or evaluate actor.with_plans(plans)"
+        raise ValueError(f"plans differ from the actor's own for {', '.join(different)}; {how}")
     return own or given
 
 

@@ -125,9 +125,7 @@ class EvaluationResult:
             origin["plans"] = plans
         told: dict[str, Any] = {"format": FORMAT, "version": FORMAT_VERSION, "origin": origin, "config": self.config}
         told["mean_success_once"] = self.mean_success
-        told |= {
-            name: getattr(self, name) for name in ("success_once", "success_at_end", "first_success", "mean_return")
-        }
+        told |= {k: getattr(self, k) for k in ("success_once", "success_at_end", "first_success", "mean_return")}
         told["episodes"] = [{k: v for k, v in asdict(e).items() if k != "actions"} for e in self.episodes]
         if self.failures is not None:
             told["failures"] = [asdict(failure) for failure in self.failures]
@@ -156,9 +154,7 @@ class EvaluationResult:
             failures = read_failures(found["failures"], config, failed) if "failures" in found else None
             return cls(config, episodes, origin, failures)
         except FileNotFoundError:
-            raise FileNotFoundError(
-                f"path: no result file {str(path)!r}; evaluate(...).save(path) writes one"
-            ) from None
+            raise FileNotFoundError(f"path: no result file {str(path)!r}; evaluate(...).save(path) writes it") from None
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(
                 f"path: {str(path)!r} is no result of {FORMAT} version {FORMAT_VERSION} "

@@ -107,9 +107,8 @@ def probability_of_improvement(x: ArrayLike, y: ArrayLike, *, confidence: float 
 
     Source: Agarwal et al. 2021; the Mann-Whitney statistic of each task, averaged.
     """
-    return _seed_interval(
-        lambda a, b: ((a[:, None] > b) + 0.5 * (a[:, None] == b)).mean(), _pair(x, y), confidence, least=0.0
-    )
+    beats = _pair(x, y)
+    return _seed_interval(lambda a, b: (0.5 + 0.5 * np.sign(a[:, None] - b)).mean(), beats, confidence, least=0.0)
 
 
 @checked

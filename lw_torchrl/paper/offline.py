@@ -54,12 +54,8 @@ class BehaviourDataset(Dataset):
     def options(self) -> dict[str, Any]:
         behaviour = self.portion.behaviour
         seed = _SEEDS * list(BEHAVIOURS).index(behaviour) + self.seed
-        found = {
-            "tasks": recipes.TASK_SETS[self.tasks],
-            "episodes_per_task": self.portion.episodes,
-            "policy": behaviour,
-        }
-        return {**found, "seed": seed, "max_steps": self.max_steps, **recipes.NOISE[behaviour]}
+        found = {"tasks": recipes.TASK_SETS[self.tasks], "policy": behaviour, "max_steps": self.max_steps}
+        return {**found, "episodes_per_task": self.portion.episodes, "seed": seed, **recipes.NOISE[behaviour]}
 
 
 @dataclass(frozen=True)
@@ -85,9 +81,8 @@ class _Learned:
 
     @property
     def datasets(self) -> tuple[BehaviourDataset, ...]:
-        return tuple(
-            BehaviourDataset(self.tasks, one, self.seed, self.max_steps) for one in recipes.MIXTURES[self.mixture]
-        )
+        portions = recipes.MIXTURES[self.mixture]
+        return tuple(BehaviourDataset(self.tasks, one, self.seed, self.max_steps) for one in portions)
 
     def own_plans(self, plans: Plans) -> Plans:
         return Plans([plans[task] for task in recipes.TASK_SETS[self.tasks]])
@@ -235,10 +230,7 @@ def _encoder(condition: str, plans: Plans, noise: float = 0.0) -> Encoder:
     return DescriptorEncoder(tuple(plans), feature_noise=noise, **METHODS[condition].options)
 
 
-DISTRIBUTIONS: Mapping[str, str | None] = dict.fromkeys(("advantage", "bc", "td3-bc")) | {
-    "iql": "normal",
-    "cql": "tanh_normal",
-}
+DISTRIBUTIONS = {"advantage": None, "bc": None, "td3-bc": None, "iql": "normal", "cql": "tanh_normal"}
 """By name: the distribution that the loss wants of its actor."""
 
 
@@ -279,10 +271,8 @@ def write_table(
     name: str, runs: Sequence[OfflineRun], results: Mapping[OfflineRun, EvaluationResult], out: Path
 ) -> str:
     """Write a table's Markdown, numbers and figure to ``out``; returns its head, to print."""
-    compared = {
-        mixture: compare((run, results[run]) for run in runs if run.mixture == mixture)
-        for mixture in dict.fromkeys(run.mixture for run in runs)
-    }
+    mixtures = dict.fromkeys(run.mixture for run in runs)
+    compared = {one: compare((run, results[run]) for run in runs if run.mixture == one) for one in mixtures}
     rows = []
     for label in dict.fromkeys(run.label for run in runs):
         means = [str(one.summaries[label].mean) if label in one.summaries else "" for one in compared.values()]

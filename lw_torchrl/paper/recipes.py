@@ -89,9 +89,7 @@ def _preset(name: str, every: Mapping[str, Any], own: Mapping[str, Any]) -> Pres
 
 
 _TABLE = read_toml(files("lw_torchrl.paper") / "data" / "recipes.toml", ValueError)
-SETTINGS: Mapping[str, DataSetting] = MappingProxyType(
-    {name: DataSetting(name, **setting) for name, setting in _TABLE["settings"].items()}
-)
+SETTINGS = MappingProxyType({name: DataSetting(name, **setting) for name, setting in _TABLE["settings"].items()})
 EXECUTIONS = {name: Execution(name, **_tuples(execution)) for name, execution in _TABLE["executions"].items()}
 TARGET = EXECUTIONS["target"]
 _MEMBERS = {name: Member(**member) for name, member in _TABLE["members"].items()}
@@ -166,9 +164,7 @@ def _table(tasks: str, runs: Sequence[Mapping[str, Any]]) -> OfflineTable:
 
 
 _TABLES = read_toml(files("lw_torchrl.paper") / "data" / "offline.toml", ValueError)
-TASK_SETS: Mapping[str, tuple[str, ...]] = MappingProxyType(
-    {"MT10": MT10, **{name: tuple(tasks) for name, tasks in _TABLES["task_sets"].items()}}
-)
+TASK_SETS = MappingProxyType({"MT10": MT10} | {name: tuple(tasks) for name, tasks in _TABLES["task_sets"].items()})
 MIXTURES: Mapping[str, tuple[Portion, ...]] = MappingProxyType(
     {name: tuple(Portion(*portion) for portion in mixture.items()) for name, mixture in _TABLES["mixtures"].items()}
 )
@@ -179,6 +175,4 @@ OFFLINE_METHODS: Mapping[str, OfflineMethod] = MappingProxyType(
         for name, given in _TABLES["methods"].items()
     }
 )
-OFFLINE_TABLES: Mapping[str, OfflineTable] = MappingProxyType(
-    {name: _table(**given) for name, given in _TABLES["tables"].items()}
-)
+OFFLINE_TABLES = MappingProxyType({name: _table(**given) for name, given in _TABLES["tables"].items()})

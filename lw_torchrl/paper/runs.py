@@ -228,10 +228,8 @@ def compare(
     found: dict[str, dict[int, list[EvaluationResult]]] = {}
     for run, result in results:
         found.setdefault(run.label, {}).setdefault(run.seed, []).append(result)
-    return MethodComparison(
-        {label: summarize({seed: joined(of) for seed, of in seeds.items()}) for label, seeds in found.items()},
-        published or {},
-    )
+    each = {label: summarize({seed: joined(of) for seed, of in seeds.items()}) for label, seeds in found.items()}
+    return MethodComparison(each, published)
 
 
 def write_summary(path: Path, text: str, numbers: Mapping[str, Any]) -> None:

@@ -93,10 +93,9 @@ def log_rollout(
         failures = failure if isinstance(failure, Sequence) else [failure] * len(rollout)
         if len(failures) != len(rollout):
             raise ValueError(f"failure must be one for each of {len(rollout)} rows, got {len(failures)}")
-        rows, tasks = zip(rollout, failures, strict=True), list(tasks)
-        return [
-            log_rollout(logger, row, plans, seed=seed, policy=policy, failure=why, tasks=tasks) for row, why in rows
-        ]
+        known: dict[str, Any] = {"seed": seed, "policy": policy, "tasks": list(tasks)}
+        rows = zip(rollout, failures, strict=True)
+        return [log_rollout(logger, row, plans, failure=why, **known) for row, why in rows]
     if isinstance(failure, Sequence):
         raise ValueError(f"failure must be one Failure for one episode, got {len(failure)}")
     heading, episode = read_rollout(rollout, plans, seed=seed, policy=policy, failure=failure, tasks=tasks)
@@ -132,9 +131,8 @@ def read_rollout(
     if not isinstance(failure, Failure | None):
         raise TypeError(f"failure must be a Failure, got {shown(failure)} ({type(failure).__name__})")
     if failure is not None and (failure.task, failure.episode) != (label, failure.episode if index is None else index):
-        raise ValueError(
-            f"failure must be of the rollout's episode, {label} {index}, got that of {failure.task} {failure.episode}"
-        )
+        got = f"{failure.task} {failure.episode}"
+        raise ValueError(f"failure must be of the rollout's episode, {label} {index}, got that of {got}")
     observation = rollout.get("observation", None)
     objects: dict[str, Tensor] = {}
     if task is not None and observation is not None and observation.shape[1:] == (task.layout.size,):

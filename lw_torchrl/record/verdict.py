@@ -221,10 +221,9 @@ def log_curves(stream: Any, root: str, episode: RecordedEpisode) -> list[str]:
         stream.send_columns(f"{root}/distance", time_columns(rows), columns)
         sent.append("distance")
     # A sparse reward is the success, which has a row in the timeline.
-    if episode.reward is not None and not (
-        episode.success is not None and np.array_equal(episode.reward, episode.success)
-    ):
-        _send(stream, f"{root}/reward", rows + 1, episode.reward[:, None], ["reward"], STEEL)
+    reward: Any = episode.reward
+    if reward is not None and not (episode.success is not None and np.array_equal(reward, episode.success)):
+        _send(stream, f"{root}/reward", rows + 1, reward[:, None], ["reward"], STEEL)
         sent.append("reward")
     weights = episode.skill_weights
     if weights is not None and bool(((weights > 1e-3) & (weights < 1 - 1e-3)).any()):  # else the timeline has them

@@ -34,9 +34,7 @@ PROBE_SECONDS, SEND_SECONDS, CLOSE_SECONDS = 0.5, 5.0, 1.0
 WAITING_BYTES = 256 * 2**20
 """What may wait for a viewer that is slower than the recording grows."""
 
-_URL = re.compile(
-    r"(?:(?P<scheme>rerun(?:\+https?)?)://)?(?P<host>\[[^]]+\]|[^/:\s]+)(?::(?P<port>\d+))?(?P<rest>/.*)?"
-)
+_URL = re.compile(r"(?:(?P<scheme>rerun(?:\+https?)?)://)?(?P<host>\[[^]]+\]|[^/:\s]+)(?::(?P<port>\d+))?(?P<end>/.*)?")
 
 
 class RecordingWriter:
@@ -256,7 +254,7 @@ class LiveViewer:
 def check_address(address: str) -> tuple[str, str, int]:
     """The URL, host and port of a viewer from "127.0.0.1:9876", "host" or "rerun+http://host:9876/proxy"."""
     found = _URL.fullmatch(address)
-    if found is None or found["rest"] not in (None, "/", "/proxy") or not 0 < int(found["port"] or 1) < 65536:
+    if found is None or found["end"] not in (None, "/", "/proxy") or not 0 < int(found["port"] or 1) < 65536:
         raise ValueError(
             f"connect must be an address like '127.0.0.1:9876' or 'rerun+http://127.0.0.1:9876/proxy', got {address!r}"
         )

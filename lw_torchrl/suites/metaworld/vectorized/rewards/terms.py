@@ -39,9 +39,8 @@ class Parameters(SimpleNamespace):
     other arrays of terms the term."""
 
     def of(self, rows: Any) -> Parameters:
-        return Parameters(
-            **{key: own.of(rows) if isinstance(own, Parameters) else own[rows] for key, own in vars(self).items()}
-        )
+        own = vars(self).items()
+        return Parameters(**{key: v.of(rows) if isinstance(v, Parameters) else v[rows] for key, v in own})
 
 
 def make_parameters(rewards: Sequence[TaskReward]) -> Parameters:
@@ -80,20 +79,15 @@ def make_parameters(rewards: Sequence[TaskReward]) -> Parameters:
 
 
 def _numbers(kind: Any, parts: Sequence[Any]) -> dict[str, Any]:
-    return {
-        one.name: np.array([getattr(part, one.name) for part in parts], dtype=_DTYPES[one.type])
-        for one in fields(kind)
-        if one.type in _DTYPES
-    }
+    numeric: list[Any] = [one for one in fields(kind) if one.type in _DTYPES]
+    return {one.name: np.array([getattr(part, one.name) for part in parts], _DTYPES[one.type]) for one in numeric}
 
 
 def _points(reward: TaskReward) -> list[list[list[list[int]]]]:
     margins = [term.margin if isinstance(term.margin, tuple) else term.between[:1] * 2 for term in reward.terms]
     pairs = [[term.between for term in reward.terms], margins]
     constant = range(FEATURES)[CONSTANT]
-    waypoint = [
-        (COLUMNS[value] if isinstance(value, str) else constant)[axis] for axis, value in enumerate(reward.waypoint)
-    ]
+    waypoint = [(COLUMNS[v] if isinstance(v, str) else constant)[axis] for axis, v in enumerate(reward.waypoint)]
     columns = COLUMNS | {"waypoint": waypoint}
     return [[[columns[pair[end]] for pair in kind] for end in (0, 1)] for kind in pairs]
 
