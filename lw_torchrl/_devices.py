@@ -64,17 +64,14 @@ def place(module: Any, device: str | torch.device | None) -> torch.device:
 @contextmanager
 def drawn_on(device: torch.device, state: torch.Tensor) -> Iterator[None]:
     """Within the block the generators draw from ``state``, the CPU's, which also seeds a device's generator."""
-    if device.type == "cpu":
-        with torch.random.fork_rng(devices=[]):
-            torch.set_rng_state(state)
-            yield
-        return
-    with torch.random.fork_rng(devices=[device], device_type=device.type):
+    others = [] if device.type == "cpu" else [device]
+    with torch.random.fork_rng(devices=others, device_type=device.type):
         torch.set_rng_state(state)
-        seed = int(torch.randint(2**62, ()))
-        module = torch.get_device_module(device.type)
-        generators = getattr(module, "default_generators", None)  # one for each; manual_seed is of the current one
-        (module if generators is None else generators[device.index]).manual_seed(seed)
+        if others:
+            seed = int(torch.randint(2**62, ()))
+            module = torch.get_device_module(device.type)
+            generators = getattr(module, "default_generators", None)  # one for each; manual_seed is of the current one
+            (module if generators is None else generators[device.index]).manual_seed(seed)
         yield
 
 

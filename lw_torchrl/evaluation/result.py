@@ -7,7 +7,8 @@ from collections.abc import Callable, Collection, Iterator
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from functools import cached_property
-from hashlib import file_digest
+from hashlib import sha256
+from pathlib import Path
 from reprlib import repr as short
 from typing import Any
 
@@ -119,8 +120,7 @@ class EvaluationResult:
         origin: dict[str, Any] = dict(self.origin) or made
         for name, given in (("checkpoint", checkpoint), ("evaluator", evaluator)):
             if given is not None:
-                with open(given, "rb") as file:
-                    origin[name] = {"path": str(given), "sha256": file_digest(file, "sha256").hexdigest()}
+                origin[name] = {"path": str(given), "sha256": sha256(Path(given).read_bytes()).hexdigest()}
         if plans is not None:
             origin["plans"] = plans
         told: dict[str, Any] = {"format": FORMAT, "version": FORMAT_VERSION, "origin": origin, "config": self.config}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from hashlib import file_digest
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -118,10 +118,7 @@ class OnlineRun(Run):
 
     @cached_property
     def _start_digest(self) -> str | None:
-        if self.start is None:
-            return None
-        with open(self.start, "rb") as file:
-            return file_digest(file, "sha256").hexdigest()
+        return None if self.start is None else sha256(self.start.read_bytes()).hexdigest()
 
     def own_plans(self, plans: Plans) -> Plans:
         return Plans([plans[self.task]])

@@ -180,10 +180,8 @@ def execute_run(
     if work.device.type != "cpu" and not run.any_device:
         raise ValueError(f"device must be the CPU for {type(run).__name__}, got {device}")
     if (text_encoder is None) != (not run.encoder_name):
-        raise ValueError(
-            f"text_encoder must be given where the run has an encoder_name, which tells its folder from others, and "
-            f"only there; it has {run.encoder_name!r}"
-        )
+        named = f"the run has an encoder_name, and only there; it has {run.encoder_name!r}"
+        raise ValueError(f"text_encoder must be given where {named}")
     if (done := load_result(run, plans, out, work.tasks)) is not None:
         return done
     with held(out / run.folder, "out", folder=True, wait=True):

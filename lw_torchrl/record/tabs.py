@@ -105,12 +105,6 @@ def _stacked(parts: Sequence[tuple[float, Any]], name: str | None = None) -> rrb
     return rrb.Vertical(*(view for _, view in parts), row_shares=[share for share, _ in parts], name=name)
 
 
-def side_by_side(pages: Sequence[Page], title: str) -> rrb.Horizontal:
-    """Episodes beside one another, a column each."""
-    shown = min(page.shown[0] for page in pages), max(page.shown[1] for page in pages)
-    return rrb.Horizontal(*(page.column(shown) for page in pages), name=title)
-
-
 def send_page(
     stream: Any, name: str, title: str, heading: Heading, episode: RecordedEpisode, motion: Motion | None
 ) -> Page:
@@ -220,12 +214,16 @@ class Layout:
 
     def blueprint(self, tab: str | None = None) -> rrb.Blueprint:
         """The layout as rerun's; its time panel plays episodes at Meta-World's 80 steps a second."""
-        tabs: list[Any] = [side_by_side([self.pages[name] for name in names], title) for title, names in self._compared]
+        tabs: list[Any] = []
+        for title, names in self._compared:  # a column each
+            pages = [self.pages[name] for name in names]
+            shown = min(page.shown[0] for page in pages), max(page.shown[1] for page in pages)
+            tabs.append(rrb.Horizontal(*(page.column(shown) for page in pages), name=title))
         tabs += [page.tab() for page in list(self.pages.values())]
         for kind, views in self._views.items():
             if views:
-                shown = [_view(kind, names) for names in views]
-                tabs.append(shown[0] if kind == "hparams" else rrb.Grid(*shown, name=TABS[kind]))
+                grid = [_view(kind, names) for names in views]
+                tabs.append(grid[0] if kind == "hparams" else rrb.Grid(*grid, name=TABS[kind]))
         front = None if tab is None else self._find(tab)
         closed = {"state": "collapsed"}
         time = {"timeline": self.tab(tab).timeline, "fps": 80.0, "play_state": "paused", "loop_mode": "all"}

@@ -47,7 +47,7 @@ def make_parameters(rewards: Sequence[TaskReward]) -> Parameters:
     terms = [reward.terms for reward in rewards]
 
     def of_terms(name: str) -> Array:
-        return np.array([[getattr(term, name) for term in four] for four in terms])
+        return np.array([[getattr(term, name) for term in four] for four in terms], float)
 
     cages = [reward.cage or _NO_CAGE for reward in rewards]
     funnels = [reward.funnel or _NO_FUNNEL for reward in rewards]
@@ -59,8 +59,8 @@ def make_parameters(rewards: Sequence[TaskReward]) -> Parameters:
         offset=np.stack([of_terms("offset"), of_terms("margin_offset")], axis=1),
         axes=of_terms("axes"),
         within=of_terms("within"),
-        less=np.array([[_less(term) for term in four] for four in terms]),
-        gaussian=of_terms("curve") == "gaussian",
+        less=np.array([[_less(term) for term in four] for four in terms], float),
+        gaussian=np.array([[term.curve == "gaussian" for term in four] for four in terms]),
         cage=Parameters(
             **_numbers(Cage, cages),
             used=np.array([reward.cage is not None for reward in rewards]),
