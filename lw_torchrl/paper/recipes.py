@@ -163,18 +163,16 @@ def _table(tasks: str, runs: Sequence[Mapping[str, Any]]) -> OfflineTable:
     return OfflineTable(tasks, rows)
 
 
-_OFFLINE = read_toml(files("lw_torchrl.paper") / "data" / "offline.toml", ValueError)
-TASK_SETS = MappingProxyType({"MT10": MT10} | {name: tuple(tasks) for name, tasks in _OFFLINE["task_sets"].items()})
+_TABLES = read_toml(files("lw_torchrl.paper") / "data" / "offline.toml", ValueError)
+TASK_SETS = MappingProxyType({"MT10": MT10} | {name: tuple(tasks) for name, tasks in _TABLES["task_sets"].items()})
 MIXTURES: Mapping[str, tuple[Portion, ...]] = MappingProxyType(
-    {name: tuple(Portion(*portion) for portion in mixture.items()) for name, mixture in _OFFLINE["mixtures"].items()}
+    {name: tuple(Portion(*portion) for portion in mixture.items()) for name, mixture in _TABLES["mixtures"].items()}
 )
-NOISE: Mapping[str, dict[str, Any]] = {
-    one: _OFFLINE["noise"].get(one, _OFFLINE["noise"]["others"]) for one in BEHAVIOURS
-}
+NOISE: Mapping[str, dict[str, Any]] = {one: _TABLES["noise"].get(one, _TABLES["noise"]["others"]) for one in BEHAVIOURS}
 OFFLINE_METHODS: Mapping[str, OfflineMethod] = MappingProxyType(
     {
         name: OfflineMethod(name, **given | ({"keep": EpisodeFilter(**given["keep"])} if "keep" in given else {}))
-        for name, given in _OFFLINE["methods"].items()
+        for name, given in _TABLES["methods"].items()
     }
 )
-OFFLINE_OFFLINE = MappingProxyType({name: _table(**given) for name, given in _OFFLINE["tables"].items()})
+OFFLINE_TABLES = MappingProxyType({name: _table(**given) for name, given in _TABLES["tables"].items()})

@@ -100,7 +100,7 @@ class SimulatedRow:
 class RowGroup:
     """Rows that share a model, and so take turns; ``seconds`` is the time of each row's last work."""
 
-    rows: list[int]
+    rows: tuple[int, ...]
     seconds: float = 1.0
 
 
@@ -111,7 +111,7 @@ def split_into_groups(keys: Sequence[str], num_threads: int) -> list[RowGroup]:
         by_key[key].append(row)
     largest = len(keys) if num_threads == 1 else ceil(len(keys) / (2 * num_threads))
     parts = [part for rows in by_key.values() for part in np.array_split(rows, ceil(len(rows) / largest))]
-    return [RowGroup(part.tolist()) for part in parts]
+    return [RowGroup(tuple(part.tolist())) for part in parts]
 
 
 class WorkerPool:
