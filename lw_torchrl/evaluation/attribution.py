@@ -133,13 +133,13 @@ def attribute_failures(
     scripts, theirs = Scripts(answered, table), Scripts(Plans(others), table) if others else None
     told = {one.which: explain(one, scripts, theirs) for one in seen}
     if actor is None:
-        found_out = []
+        failures = []
         for one in seen:
             cause, blames, evidence = told[one.which]
             step, at, why = blames[cause]
             why = _text(*(["The states alone do not tell"] if cause == "undecided" else []), why)
-            found_out.append(Failure(one.task, seed, one.episode, cause, None, step, at, why, evidence))
-        return found_out
+            failures.append(Failure(one.task, seed, one.episode, cause, None, step, at, why, evidence))
+        return failures
     tasks = {name: found.tasks.get(name, answered[name].definition) for name in names}
     max_steps = found.max_steps if max_steps is None else max_steps
     firsts = {one.which: one.steps.get("observation")[0] for one in seen}
@@ -236,9 +236,10 @@ def _by_counterfactuals(
     """What the counterfactuals tell, explained by the states."""
     first = {name: results[one.which] for name, results in tried.found.items() if one.which in results}
     mended = [name for name, hit in first.items() if hit is not None]
-    replaced = {name: name in mended for name in first if name != "skills"}
-    if "skills" in first:
-        replaced["skill"] = replaced.get("skill", False) or "skills" in mended
+    replaced: dict[str, bool] = {}
+    for name in first:
+        part = "skill" if name == "skills" else name
+        replaced[part] = replaced.get(part, False) or name in mended
     cause: Cause = "undecided"
     also: Cause | None = None
     same = told.evidence.get("plan_departs") == 0.0

@@ -81,7 +81,12 @@ def interquartile_mean(rates: ArrayLike, *, confidence: float = 0.95) -> Estimat
 
     Source: Agarwal et al. 2021; the same as ``scipy.stats.trim_mean(rates, 0.25, axis=None)``.
     """
-    return _seed_interval(_interquartile_mean, [check_rates("rates", rates)], confidence, least=0.0)
+
+    def middle(rates: Array) -> float:
+        cut = rates.size // 4
+        return np.sort(rates, axis=None)[cut : rates.size - cut].mean()
+
+    return _seed_interval(middle, [check_rates("rates", rates)], confidence, least=0.0)
 
 
 @checked
@@ -131,11 +136,6 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
     center = (rate + z**2 / (2 * trials)) / (1 + z**2 / trials)
     half = z / (1 + z**2 / trials) * math.sqrt(rate * (1 - rate) / trials + z**2 / (4 * trials**2))
     return max(0.0, center - half), min(1.0, center + half)
-
-
-def _interquartile_mean(rates: Array) -> float:
-    cut = rates.size // 4
-    return np.sort(rates, axis=None)[cut : rates.size - cut].mean()
 
 
 def _pair(x: ArrayLike, y: ArrayLike) -> list[Array]:

@@ -14,7 +14,6 @@ import numpy as np
 from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
-from lw_torchrl._checks import check_choice
 from lw_torchrl.suites.metaworld.plain_engine import import_metaworld
 
 SUPPORTED_VERSIONS = {"metaworld": "3.1.1", "mujoco": "3.3.0"}
@@ -156,7 +155,6 @@ def _task_class(task: str) -> Any:
     import_metaworld()
     from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 
-    check_choice("task", f"{task}-v3", ALL_V3_ENVIRONMENTS)
     return ALL_V3_ENVIRONMENTS[f"{task}-v3"]
 
 
