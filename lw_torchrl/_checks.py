@@ -166,7 +166,7 @@ def _resolved(annotation: object, names: dict[str, Any]) -> Any:
     """What an annotation means, whose names stand in ``names``."""
     try:
         return eval(annotation, names) if isinstance(annotation, str) else annotation
-    except NameError:  # imported for type checkers alone
+    except (NameError, AttributeError, TypeError):  # imported for type checkers alone, or no type
         return Any
 
 
@@ -322,9 +322,10 @@ def check_fields(instance: Any, inside: str = "") -> None:
 def _checks_of_fields(kind: Any) -> dict[str, Check]:
     """The checks of a dataclass's flags, numbers, texts and choices."""
     found: dict[str, Check | None] = {}
-    for base in reversed(kind.__mro__):  # each in the module that it stands in
+    for base in reversed(kind.__mro__):
+        names = getattr(sys.modules.get(base.__module__), "__dict__", {})  # of the module that it stands in
         for name, stated in inspect.get_annotations(base).items():
-            meant = _resolved(stated, vars(sys.modules[base.__module__]))
+            meant = _resolved(stated, names)
             parts = get_args(meant) if get_origin(meant) in (Union, UnionType) else [meant]
             plain = all((get_origin(part) or part) in _PLAIN_KINDS for part in parts)
             found[name] = _check_of_type(meant) if plain else None

@@ -27,14 +27,11 @@ from lw_torchrl.training import LEARNERS, BehavioralCloningConfig, BehavioralClo
 from lw_torchrl.training.algorithms import ResidualConfig, method_config
 from lw_torchrl.training.files import load_actor, read_description
 
-START = "start"
-"""The policy that is begun with: a run beside those of :data:`~lw_torchrl.training.LEARNERS`."""
-WEAKEST = "weakest"
-"""The step that failed episodes came to and not beyond."""
+START = "start"  # the policy that is begun with: a run beside those of :data:`~lw_torchrl.training.LEARNERS`
+WEAKEST = "weakest"  # the step that failed episodes came to and not beyond
 ONLINE_SEED = 20_000
 """The training episodes of seed k have seed 20000 + k, which no demonstration and no evaluation has."""
-DIAGNOSIS_SEED = 30_000
-"""Those in which a policy's weakest step is looked for."""
+DIAGNOSIS_SEED = 30_000  # of the episodes in which a policy's weakest step is looked for
 _DIAGNOSED = 20  # episodes
 
 

@@ -26,8 +26,7 @@ from lw_torchrl.training import load_actor, save_actor
 from lw_torchrl.training.envelope import check_description
 from lw_torchrl.training.files import describe_data
 
-EVALUATION_SEED = 10_000
-"""Training seeds count from 0; the evaluation of training seed k has seed 10000 + k."""
+EVALUATION_SEED = 10_000  # training seeds count from 0; the evaluation of training seed k has seed 10000 + k
 RESULTS = "results.json"
 
 

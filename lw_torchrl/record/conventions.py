@@ -25,8 +25,7 @@ else:
     rr, rrb = _Later("rerun"), _Later("rerun.blueprint")
 
 EPISODE_TIMELINE, SECONDS_TIMELINE, METRIC_TIMELINE = "step", "time", "global_step"
-CONTROL_PERIOD = 0.0125
-"""Seconds between two actions in Meta-World: 5 simulation steps of 2.5 ms, hence 80 Hz."""
+CONTROL_PERIOD = 0.0125  # seconds between two actions in Meta-World: 5 simulation steps of 2.5 ms, hence 80 Hz
 
 Color = tuple[int, ...]
 TRUE, FALSE = (70, 170, 105), (52, 56, 64)

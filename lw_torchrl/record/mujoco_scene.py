@@ -15,10 +15,8 @@ from numpy.typing import NDArray
 from lw_torchrl.record.conventions import entity_path, rr, time_columns
 from lw_torchrl.suites.engine import RowModel
 
-SHOWN_GROUPS = (0, 1, 2)
-"""Meta-World keeps what only collides in group 4."""
-DEFAULT_RGBA = (0.5, 0.5, 0.5, 1.0)
-"""MuJoCo's colour of a geom that was given none: the material's counts."""
+SHOWN_GROUPS = (0, 1, 2)  # Meta-World keeps what only collides in group 4
+DEFAULT_RGBA = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's colour of a geom that was given none: the material's counts
 
 FINEST, COARSEST = 0.0015, 0.006
 CUBES_ALONG = 40.0

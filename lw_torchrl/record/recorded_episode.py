@@ -18,8 +18,7 @@ from lw_torchrl.language.skills import load_skills
 from lw_torchrl.language.tasks import Task
 from lw_torchrl.suites.suite import known_suite
 
-NOBODY = -1
-"""In the place of a step's number: no step is in force alone."""
+NOBODY = -1  # in the place of a step's number: no step is in force alone
 
 
 class PlanLike(Protocol):

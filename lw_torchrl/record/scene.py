@@ -21,13 +21,9 @@ OBJECT_COLORS: tuple[Color, ...] = ((80, 170, 255), (255, 120, 90), (200, 130, 2
 
 # Measured in Meta-World's model: obs[3] is the distance between the fingers over 0.1 m; they slide along y
 # and reach 4.5 cm below obs[0:3], the position of the hand.
-FINGER_TRAVEL = 0.1
-FINGER_HALF = (0.010, 0.006, 0.024)
-FINGER_DROP = 0.026
-PALM_HALF = (0.018, 0.062, 0.014)
-PALM_RISE = 0.012
-WRIST_HALF = (0.012, 0.012, 0.055)
-WRIST_RISE = 0.081
+FINGER_TRAVEL, FINGER_HALF, FINGER_DROP = 0.1, (0.010, 0.006, 0.024), 0.026
+PALM_HALF, PALM_RISE = (0.018, 0.062, 0.014), 0.012
+WRIST_HALF, WRIST_RISE = (0.012, 0.012, 0.055), 0.081
 TABLE_CENTER, TABLE_HALF = (0.0, 0.6, -0.010), (0.7, 0.4, 0.010)
 TABLE, GRID = (58, 64, 74), (92, 99, 112)
 

@@ -21,8 +21,7 @@ from lw_torchrl._files import replacing
 from lw_torchrl.record.conventions import rr
 from lw_torchrl.record.recording_file import copy_recording
 
-PERIOD = 0.5
-"""Seconds between two writes: with them done, a kill loses less than a second of what was logged."""
+PERIOD = 0.5  # seconds between two writes: with them done, a kill loses less than a second of what was logged
 ENCODE_SECONDS = 60.0
 MOST_COMPACTED = 256 * 2**20
 """Bytes up to which a recording is made compact when it is closed; it is read whole for that."""
@@ -31,8 +30,7 @@ HEADER_BYTES, MESSAGE = 12, struct.Struct("<QQ")
 END = MESSAGE.pack(0, 0)
 DEFAULT_PORT = 9876
 PROBE_SECONDS, SEND_SECONDS, CLOSE_SECONDS = 0.5, 5.0, 1.0
-WAITING_BYTES = 256 * 2**20
-"""What may wait for a viewer that is slower than the recording grows."""
+WAITING_BYTES = 256 * 2**20  # what may wait for a viewer that is slower than the recording grows
 
 _URL = re.compile(r"(?:(?P<scheme>rerun(?:\+https?)?)://)?(?P<host>\[[^]]+\]|[^/:\s]+)(?::(?P<port>\d+))?(?P<end>/.*)?")
 

@@ -21,8 +21,7 @@ from lw_torchrl.suites.metaworld.vectorized.observation import Array, Index, Mas
 from lw_torchrl.suites.metaworld.vectorized.rewards.dense_reward import DenseReward, EpisodeStarts
 from lw_torchrl.suites.metaworld.vectorized.tables import reward_table, simulation_table
 
-FINGERS = np.array([1.0, -1.0])
-"""The two fingers are driven against each other by one number of the action."""
+FINGERS = np.array([1.0, -1.0])  # the two fingers are driven against each other by one number of the action
 
 
 def available_cores() -> int:
