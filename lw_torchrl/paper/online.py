@@ -93,10 +93,6 @@ class OnlineRun(Run):
         return Path(self.condition if self.start is None else f"from-{self.start.stem}")
 
     @property
-    def label(self) -> str:
-        return self.method
-
-    @property
     def scope(self) -> tuple[str, ...]:
         return (self.task,)
 
