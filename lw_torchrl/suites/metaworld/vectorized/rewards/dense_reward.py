@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lw_torchrl._checks import check_choice
 from lw_torchrl.suites.metaworld.vectorized.observation import CURRENT, GRIPPER, OBJECT, Array, Index, Mask
 from lw_torchrl.suites.metaworld.vectorized.rewards import terms
 from lw_torchrl.suites.metaworld.vectorized.rewards.formulas import FORMULAS, LIFTS, StepState
@@ -20,6 +21,10 @@ class EpisodeStarts:
     """What rewards need of the beginning of an episode, one entry a row."""
 
     def __init__(self, rewards: Sequence[TaskReward]) -> None:
+        for reward in rewards:
+            check_choice("formula", reward.formula, FORMULAS)
+            if reward.lift is not None:
+                check_choice("lift", reward.lift, LIFTS)
         self.rewards = tuple(rewards)
         self.task = terms.make_parameters(rewards)
         self.points = np.zeros((len(rewards), terms.EPISODE.stop - terms.EPISODE.start))
