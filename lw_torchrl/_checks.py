@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import ast
 import functools
 import inspect
 import math
 import os
-import re
+import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields
 from difflib import get_close_matches
@@ -15,7 +14,7 @@ from fractions import Fraction
 from numbers import Integral, Real
 from reprlib import Repr
 from types import NoneType, UnionType
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -143,26 +142,15 @@ def check_probability(argument: str, given: Any) -> float:
     return value
 
 
-Count = int  # Annotations that say more of a number, for a reader and for check_fields: at least 1,
-Natural = int  # at least 0,
-Scale = float  # finite and at least 0,
-Positive = float  # finite and above 0,
-Probability = float  # from 0 to 1.
-
 Check = Callable[[str, Any], object]
-_LITERAL = re.compile(r"Literal\[([^\[\]]*)\]")
-_PLAIN: dict[str, Check] = {
-    "bool": check_flag,
-    "int": check_int,
-    "float": _check_real,
-    "str": check_text,
-    "str | os.PathLike[str]": check_path,
-    "Count": functools.partial(check_int, minimum=1),
-    "Natural": functools.partial(check_int, minimum=0),
-    "Scale": check_scale,
-    "Positive": check_positive,
-    "Probability": check_probability,
-}
+Count = Annotated[int, functools.partial(check_int, minimum=1)]  # Annotations that say more of a number: at least 1,
+Natural = Annotated[int, functools.partial(check_int, minimum=0)]  # at least 0,
+Scale = Annotated[float, check_scale]  # finite and at least 0,
+Positive = Annotated[float, check_positive]  # finite and above 0,
+Probability = Annotated[float, check_probability]  # from 0 to 1.
+
+_PLAIN: dict[Any, Check] = {bool: check_flag, int: check_int, float: _check_real, str: check_text}
+_PLAIN_KINDS = {*_PLAIN, Annotated, Literal, os.PathLike, NoneType}
 _SEVERAL: dict[Any, tuple[type, str]] = {
     int: (Integral, "an integer"),
     float: (Real, "a number"),
@@ -174,29 +162,19 @@ _SEVERAL: dict[Any, tuple[type, str]] = {
 }
 
 
-@functools.cache
-def _plain_check(annotation: str) -> Check | None:
-    """The check of a plain annotation, as it is written: one of :data:`_PLAIN` or a Literal, or one of them or None."""
-    plain = annotation.removesuffix(" | None")
-    check = _PLAIN.get(plain)
-    if choices := _LITERAL.fullmatch(plain):
-        check = functools.partial(check_choice, allowed=ast.literal_eval(f"({choices[1]},)"))
-    return check if plain == annotation else _or_none(check)
-
-
-def _check_of(annotation: object, names: dict[str, Any]) -> Check | None:
-    """The check of an annotation, whose names stand in ``names``; None for what its function checks."""
-    if plain := _plain_check(annotation if isinstance(annotation, str) else getattr(annotation, "__name__", "")):
-        return plain
+def _resolved(annotation: object, names: dict[str, Any]) -> Any:
+    """What an annotation means, whose names stand in ``names``."""
     try:
-        return _check_of_type(eval(annotation, names) if isinstance(annotation, str) else annotation)
-    except NameError:  # imported for type checkers alone
-        return None
+        return eval(annotation, names) if isinstance(annotation, str) else annotation
+    except (NameError, AttributeError, TypeError):  # imported for type checkers alone, or no type
+        return Any
 
 
 def _check_of_type(found: Any) -> Check | None:
     """The check of a type: of a class, a Literal, a function, or a collection of these."""
     origin, inside = get_origin(found) or found, get_args(found)
+    if origin is Annotated:
+        return inside[1]
     if origin in (Union, UnionType):
         others = [one for one in inside if one is not NoneType]
         origins = [get_origin(one) for one in others]
@@ -204,6 +182,8 @@ def _check_of_type(found: Any) -> Check | None:
             others = [Callable]  # a module is called too
         if len(others) == 1:
             check = _check_of_type(others[0])
+        elif {*origins, *others} == {None, os.PathLike, str, os.PathLike[str]}:
+            check = check_path
         else:
             kinds = {_SEVERAL.get(get_origin(one) or one): None for one in others}
             check = None if None in kinds else functools.partial(_check_kinds, kinds)
@@ -218,7 +198,7 @@ def _check_of_type(found: Any) -> Check | None:
         return held and functools.partial(_check_collection, origin, held)  # of the others the function tells more
     if not isinstance(origin, type) or origin in (tuple, object, Any) or protocol or origin.__name__ == "NestedKey":
         return None
-    return _PLAIN.get(found.__name__) or functools.partial(_check_class, origin)
+    return _PLAIN.get(origin) or functools.partial(_check_class, origin)
 
 
 def _or_none(check: Check | None) -> Check | None:
@@ -275,7 +255,7 @@ def checked_but(*arguments: str) -> Callable[[Function], Function]:
         @functools.cache
         def checks() -> dict[str, Check]:  # at the first call: by then all names of the annotations are there
             found = {
-                name: _check_of(one.annotation, function.__globals__)
+                name: _check_of_type(_resolved(one.annotation, function.__globals__))
                 for name, one in signature.parameters.items()
                 if name not in arguments
                 and one.kind not in (one.VAR_POSITIONAL, one.VAR_KEYWORD)
@@ -333,10 +313,23 @@ def passes_on(*others: Callable[..., Any]) -> Callable[[Function], Function]:
 
 def check_fields(instance: Any, inside: str = "") -> None:
     """Check the plain fields of a dataclass as :func:`checked` does arguments; errors begin with ``inside``."""
-    for field in fields(instance):
-        stated: Any = field.type  # a text, unless its module evaluates annotations
-        if (check := _plain_check(stated) if isinstance(stated, str) else _check_of(stated, {})) is not None:
-            check(inside + field.name, getattr(instance, field.name))
+    kind: Any = type(instance)
+    for name, check in _checks_of_fields(kind).items():
+        check(inside + name, getattr(instance, name))
+
+
+@functools.cache
+def _checks_of_fields(kind: Any) -> dict[str, Check]:
+    """The checks of a dataclass's flags, numbers, texts and choices."""
+    found: dict[str, Check | None] = {}
+    for base in reversed(kind.__mro__):
+        names = getattr(sys.modules.get(base.__module__), "__dict__", {})  # of the module that it stands in
+        for name, stated in inspect.get_annotations(base).items():
+            meant = _resolved(stated, names)
+            parts = get_args(meant) if get_origin(meant) in (Union, UnionType) else [meant]
+            plain = all((get_origin(part) or part) in _PLAIN_KINDS for part in parts)
+            found[name] = _check_of_type(meant) if plain else None
+    return {field.name: check for field in fields(kind) if (check := found[field.name])}
 
 
 _SHOWN = Repr()

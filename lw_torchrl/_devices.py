@@ -23,7 +23,11 @@ def check_device(argument: str, given: Any) -> torch.device:
     device, or of none in this machine, is a :class:`ValueError`, anything else a :class:`TypeError`."""
     if not isinstance(given, (str, torch.device)):
         raise TypeError(f"{argument} must be a device's name, got {shown(given)}")
-    there = _there()
+    accelerator = torch.accelerator.current_accelerator(check_available=True)
+    there = ["cpu"]
+    if accelerator is not None:
+        kind = accelerator.type
+        there += [kind, *(f"{kind}:{number}" for number in range(torch.accelerator.device_count()))]
     if given == "auto":
         given = there[1] if len(there) > 1 else "cpu"
     try:
@@ -33,21 +37,10 @@ def check_device(argument: str, given: Any) -> torch.device:
     if device.type == "cpu":
         return CPU
     if str(device) not in there:
-        of = device.type.upper()
-        lack = "" if device.type in there else f": this machine, or this build of PyTorch, has no {of}"
-        raise ValueError(
-            f"{argument} must be one of {', '.join(map(repr, [*there, 'auto']))} here, got {str(device)!r}{lack}"
-        )
+        known, none = ", ".join(map(repr, [*there, "auto"])), f"this build of PyTorch, has no {device.type.upper()}"
+        lack = "" if device.type in there else f": this machine, or {none}"
+        raise ValueError(f"{argument} must be one of {known} here, got {str(device)!r}{lack}")
     return torch.empty(0, device=device).device
-
-
-def _there() -> list[str]:
-    """The names of this machine's devices."""
-    accelerator = torch.accelerator.current_accelerator(check_available=True)
-    if accelerator is None:
-        return ["cpu"]
-    kind = accelerator.type
-    return ["cpu", kind, *(f"{kind}:{number}" for number in range(torch.accelerator.device_count()))]
 
 
 def device_of(module: Any) -> torch.device:
@@ -71,17 +64,14 @@ def place(module: Any, device: str | torch.device | None) -> torch.device:
 @contextmanager
 def drawn_on(device: torch.device, state: torch.Tensor) -> Iterator[None]:
     """Within the block the generators draw from ``state``, the CPU's, which also seeds a device's generator."""
-    if device.type == "cpu":
-        with torch.random.fork_rng(devices=[]):
-            torch.set_rng_state(state)
-            yield
-        return
-    with torch.random.fork_rng(devices=[device], device_type=device.type):
+    others = [] if device.type == "cpu" else [device]
+    with torch.random.fork_rng(devices=others, device_type=device.type):
         torch.set_rng_state(state)
-        seed = int(torch.randint(2**62, ()))
-        module = torch.get_device_module(device.type)
-        generators = getattr(module, "default_generators", None)  # one for each; manual_seed is of the current one
-        (module if generators is None else generators[device.index]).manual_seed(seed)
+        if others:
+            seed = int(torch.randint(2**62, ()))
+            module = torch.get_device_module(device.type)
+            generators = getattr(module, "default_generators", None)  # one for each; manual_seed is of the current one
+            (module if generators is None else generators[device.index]).manual_seed(seed)
         yield
 
 

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 try:
     import fcntl
@@ -137,9 +137,9 @@ def held(
     handle = _locked(lock, PATIENCE)
     if handle is None:
         if not wait:
+            kind = "folder" if folder else "file"
             raise error(
-                f"{argument}: another {who} is at work in {str(path)!r}; let it finish, or choose another "
-                f"{'folder' if folder else 'file'}"
+                f"{argument}: another {who} is at work in {str(path)!r}; let it finish, or choose another {kind}"
             )
         print(f"waiting for another {who} that is at work in {str(path)!r}", file=sys.stderr, flush=True)
         handle = _locked(lock, float("inf"))
@@ -243,9 +243,7 @@ def parse_json(content: bytes) -> dict[str, Any]:
     """The object in JSON in UTF-8; :class:`ValueError` for anything else, NaN and Infinity, what is nested too deeply,
     a name that comes twice, and a number too long to read."""
     try:
-        found = json.loads(
-            content.decode("utf-8"), object_pairs_hook=_object, parse_constant=_no_number, parse_float=_number
-        )
+        found = json.loads(content.decode(), object_pairs_hook=_object, parse_constant=_number, parse_float=_number)
     except RecursionError:
         raise ValueError("it is nested too deeply") from None
     if not isinstance(found, dict):
@@ -262,11 +260,7 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return found
 
 
-def _no_number(text: str) -> NoReturn:
-    raise ValueError(f"it holds {text}, which is no JSON")
-
-
 def _number(text: str) -> float:
-    if abs(found := float(text)) == float("inf"):
-        raise ValueError(f"it holds {text[:40]}, which is too large a number")
-    return found
+    if abs(found := float(text)) < float("inf"):
+        return found
+    raise ValueError(f"it holds {text[:40]}, which is {'too large a number' if text[-1].isdigit() else 'no JSON'}")

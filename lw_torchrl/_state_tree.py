@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import inf
 from typing import Any
 
 import torch
@@ -92,14 +93,9 @@ def check_optimizer_state(found: Any, optimizer: torch.optim.Optimizer, step: in
             where = f"optimizer['state'][{number}][{name!r}]"
             shape = () if name == "step" else parameters[number].shape
             check_like(value, torch.empty(shape, dtype=torch.float32, device="meta"), where)
-            if not _may_be(name, value, step):
+            low, high = {"step": (1.0, step), "exp_avg_sq": (0.0, inf)}.get(name, (-inf, inf))
+            if not bool((value.isfinite() & (value >= low) & (value <= high)).all()):
                 raise ValueError(f"{where} holds what {step} steps cannot give")
-
-
-def _may_be(name: str, value: Tensor, step: int) -> bool:
-    if name == "step":
-        return 1 <= value.item() <= step
-    return bool(value.isfinite().all()) and (name != "exp_avg_sq" or bool((value >= 0).all()))
 
 
 def check_same(found: Mapping[str, Any], live: Mapping[str, Any], where: str, but: set[str]) -> None:

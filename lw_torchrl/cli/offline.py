@@ -56,7 +56,7 @@ def offline(
     known = read_plans(plans, read_tasks(None))
     from lw_torchrl._files import read_json
     from lw_torchrl.paper.offline import OfflineRun, offline_runs, write_table
-    from lw_torchrl.paper.offline_recipes import OFFLINE_TABLES, OfflineRecipe
+    from lw_torchrl.paper.recipes import OFFLINE_TABLES, OfflineRecipe
     from lw_torchrl.paper.runs import execute_run
 
     changed = {"reward": reward, "beta": beta, "distance": distance, "steps": steps, "value_steps": steps}

@@ -11,19 +11,11 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from lw_torchrl._checks import check_int, check_scale, checked, missing_keys
+from lw_torchrl._checks import Count, Scale, checked, missing_keys
 from lw_torchrl._devices import device_of
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.evaluation.counterfactuals import Counterfactuals, EpisodeId, EpisodeRepeater, own_evaluators
-from lw_torchrl.evaluation.explanation import (
-    EpisodeStates,
-    Explanation,
-    Scripts,
-    describe_active_time,
-    explain,
-    stall_step,
-    states_of,
-)
+from lw_torchrl.evaluation.explanation import EpisodeStates, Explanation, Scripts, explain, stall_step, states_of
 from lw_torchrl.evaluation.failure_records import Cause, Failure
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.skills import ScriptedSkill, load_skills
@@ -40,12 +32,7 @@ _COUNTERFACTUALS: dict[str, tuple[Cause, str]] = {  # the smaller ones first; ti
     "skills": ("skill", "scripts in all steps"),
     "time": ("out of time", "twice the time"),
 }
-_PARTS: dict[Cause, str] = {"query": "true answers", "plan": "the reference plan", "skill": "scripts"}
-_PAIRS: dict[str, tuple[Cause, Cause]] = {
-    "query + skill": ("query", "skill"),
-    "query + plan": ("query", "plan"),
-    "plan + skill": ("plan", "skill"),
-}
+_PARTS: dict[str, str] = {"query": "true answers", "plan": "the reference plan", "skill": "scripts"}
 
 
 @checked
@@ -58,9 +45,9 @@ def attribute_failures(
     evaluator: Callable[[TensorDictBase], TensorDictBase] | None = None,
     skills: Mapping[str, ScriptedSkill] | None = None,
     seed: int,
-    noise_scale: float = 0.1,
-    max_steps: int | None = None,
-    num_envs: int | None = None,
+    noise_scale: Scale = 0.1,
+    max_steps: Count | None = None,
+    num_envs: Count | None = None,
     suite: str | Suite | None = None,
     engine: Any = None,
     num_threads: int | None = None,
@@ -130,9 +117,6 @@ def attribute_failures(
     Source: the plan's conditions, its steps and what carries them out are apart, so each can be replaced.
     """
     answered = as_plans(plans)
-    check_scale("noise_scale", noise_scale)
-    check_int("max_steps", 1 if max_steps is None else max_steps, minimum=1)
-    check_int("num_envs", 1 if num_envs is None else num_envs, minimum=1)
     if actor is not None and (own := plans_of(actor)) is not None and (other := answered.differences(own)):
         raise ValueError(f"plans differ from the actor's own for {', '.join(other)}; pass the actor's plans")
     if not isinstance(rollouts, Iterable):
@@ -145,29 +129,29 @@ def attribute_failures(
     table = (found.skills or load_skills()) if skills is None else skills
     given = {} if reference is None else as_plans(reference, "reference")
     others = {task: plan for task, plan in given.items() if task in names}
-    trusted = Plans(others) if others else None
     seen = [states_of(task, k, steps, answered, _answers(steps, actor)) for task, k, steps in failed]
-    scripts = Scripts(answered, table)
-    theirs = None if trusted is None else Scripts(trusted, table)
-    told = {(one.task, one.episode): explain(one, answered, scripts, trusted, theirs) for one in seen}
+    scripts, theirs = Scripts(answered, table), Scripts(Plans(others), table) if others else None
+    told = {one.which: explain(one, scripts, theirs) for one in seen}
     if actor is None:
-        return [_by_rule(one, told[one.task, one.episode], seed) for one in seen]
+        failures = []
+        for one in seen:
+            cause, blames, evidence = told[one.which]
+            step, at, why = blames[cause]
+            why = _text(*(["The states alone do not tell"] if cause == "undecided" else []), why)
+            failures.append(Failure(one.task, seed, one.episode, cause, None, step, at, why, evidence))
+        return failures
     tasks = {name: found.tasks.get(name, answered[name].definition) for name in names}
     max_steps = found.max_steps if max_steps is None else max_steps
-    firsts = {(one.task, one.episode): one.steps.get("observation")[0] for one in seen}
+    firsts = {one.which: one.steps.get("observation")[0] for one in seen}
     env = {"seed": seed, "suite": found, "engine": engine, "num_threads": num_threads}
     repeat = EpisodeRepeater(tasks, firsts, env, noise_scale, max_steps, num_envs, device, progress)
-    tried = Counterfactuals(actor, answered, evaluator, trusted, scripts, repeat)
+    tried = Counterfactuals(actor, evaluator, None if theirs is None else theirs.plans, scripts, repeat)
     tried.run(seen, [which for which, one in told.items() if one.evidence.get("plan_departs") == 0.0])
     shares = tried.shares()
-    return [
-        _by_counterfactuals(one, told[one.task, one.episode], tried, shares.get(one.task, {}), seed) for one in seen
-    ]
+    return [_by_counterfactuals(one, told[one.which], tried, shares.get(one.task, {}), seed) for one in seen]
 
 
-def _failed(
-    rollouts: Iterable[FinishedEpisode | TensorDictBase], plans: Plans
-) -> list[tuple[str, int, TensorDictBase]]:
+def _failed(rollouts: Iterable[Any], plans: Plans) -> list[tuple[str, int, TensorDictBase]]:
     """The failed episodes: task, episode and steps."""
     by_id = {task_id(task): task for task in plans}
     found: list[tuple[str, int, TensorDictBase]] = []
@@ -239,31 +223,23 @@ def choose_cause_pair(mended: Iterable[str], shares: Mapping[str, float]) -> tup
     """The pair that counts, the first the cause: wrong answers, which are a fact; else what alone mends more of the
     task's failed episodes."""
     alone = {**shares, "skill": max(shares.get("skill", 0.0), shares.get("skills", 0.0))}
-    found = [_PAIRS[name] for name in mended if name in _PAIRS]
+    found: list[Any] = [name.split(" + ") for name in mended if " + " in name]
     if not found:
         return None
     cause, also = max(found, key=lambda pair: sum(alone.get(name, 0.0) for name in pair))
-    later = cause != "query" and alone.get(also, 0.0) > alone.get(cause, 0.0)
-    return (also, cause) if later else (cause, also)
-
-
-def _by_rule(one: EpisodeStates, told: Explanation, seed: int) -> Failure:
-    cause = told.cause
-    why = _text(*(["The states alone do not tell"] if cause == "undecided" else []), told.why[cause])
-    return Failure(one.task, seed, one.episode, cause, None, told.steps[cause], told.at[cause], why, told.evidence)
+    return (also, cause) if cause != "query" and alone.get(also, 0.0) > alone.get(cause, 0.0) else (cause, also)
 
 
 def _by_counterfactuals(
     one: EpisodeStates, told: Explanation, tried: Counterfactuals, shares: Mapping[str, float], seed: int
 ) -> Failure:
     """What the counterfactuals tell, explained by the states."""
-    which = one.task, one.episode
-    first = {name: results[which] for name, results in tried.found.items() if which in results}
+    first = {name: results[one.which] for name, results in tried.found.items() if one.which in results}
     mended = [name for name, hit in first.items() if hit is not None]
     replaced: dict[str, bool] = {}
     for name in first:
-        shown = "skill" if name == "skills" else name
-        replaced[shown] = replaced.get(shown, False) or name in mended
+        part = "skill" if name == "skills" else name
+        replaced[part] = replaced.get(part, False) or name in mended
     cause: Cause = "undecided"
     also: Cause | None = None
     same = told.evidence.get("plan_departs") == 0.0
@@ -285,22 +261,19 @@ def _by_counterfactuals(
     else:
         words = "There is nothing to replace"
     if cause == "undecided" and told.cause != "undecided":
-        words += f". By the states alone it would be the {told.cause}: {told.why[told.cause]}"
-    step, at, why = told.steps[cause], told.at[cause], told.why[cause]
+        words += f". By the states alone it would be the {told.cause}: {told.blames[told.cause].why}"
+    step, at, why = told.blames[cause]
     if best == "skill":
-        step = tried.step[which]
-        plan = tried.plans[one.task]
-        at, why = stall_step(one, step, plan.definition.layout), describe_active_time(one, plan, step)
+        step, plan = tried.step[one.which], tried.plans[one.task]
+        at, why = stall_step(one, step, plan.definition.layout), one.active_time(plan, step)
     by = {f"mended_by_{name.replace(' + ', '_and_')}": share for name, share in shares.items()}
     evidence = {**told.evidence, **by}
     return Failure(one.task, seed, one.episode, cause, also, step, at, _text(why, words), evidence, replaced)
 
 
 def _listed(names: Iterable[str], joint: str) -> str:
-    words = [
-        _COUNTERFACTUALS[name][1] if name in _COUNTERFACTUALS else " and ".join(_PARTS[part] for part in _PAIRS[name])
-        for name in names
-    ]
+    pairs = {f"{a} + {b}": f"{_PARTS[a]} and {_PARTS[b]}" for a in _PARTS for b in _PARTS}
+    words = [pairs.get(name) or _COUNTERFACTUALS[name][1] for name in names]
     return f" {joint} ".join(words) if len(words) < 3 else f"{', '.join(words[:-1])} {joint} {words[-1]}"
 
 

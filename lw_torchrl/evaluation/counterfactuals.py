@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from contextlib import closing, nullcontext
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from itertools import groupby
@@ -14,26 +13,19 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
-from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from lw_torchrl._progress import Progress
-from lw_torchrl.envs.episodes import policy_of, run_episodes
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.evaluation.explanation import EpisodeStates, Scripts, attended, candidates, unlike_scripts
+from lw_torchrl.evaluation.running import ROWS, Acts, answered_by, make_env, running
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.task_index import PlanTables
 from lw_torchrl.language.tasks import TASKS, Task, task_id
-from lw_torchrl.modules.networks import evaluating
 from lw_torchrl.modules.plan_encoder import IN_FORCE
-from lw_torchrl.modules.policy import transform_of
 from lw_torchrl.modules.query_evaluator import QueryEvaluator
 from lw_torchrl.suites.metaworld.experts import ExpertActor
 from lw_torchrl.transforms.qaf import plan_program
 
-Acts = Callable[[TensorDictBase], TensorDictBase]
 EpisodeId = tuple[str, int]  # task, episode
-_ROWS = 256
 _TRIED_STEPS = 3  # in which a skill is replaced, one at a time, before it is in all steps
 
 
@@ -74,36 +66,6 @@ def with_true_answers(actor: Any) -> Any:
                 if "answers" in (config := getattr(module, "config", {})):
                     module.config = {**config, "answers": "logit"}  # exact truth is worth what it is
     return other
-
-
-def make_env(actor: Any, plans: Plans | None, base: LanguageWorldEnv, evaluator: Any = None) -> EnvBase:
-    """The environment with what must run before the actor: the answers to the plans' queries, and behind them an
-    evaluator that is a transform, or what a module reads."""
-    if isinstance(evaluator, Transform):
-        evaluator = evaluator.clone()  # a transform has one environment
-    else:
-        evaluator = evaluator.transform() if isinstance(evaluator, QueryEvaluator) else None
-    before = [one for one in (transform_of(actor, plans), evaluator) if one is not None]
-    return TransformedEnv(base, before[0] if len(before) == 1 else Compose(*before)) if before else base
-
-
-class AnsweredBy(nn.Module):
-    """A policy that acts on an evaluator's answers, which take the place of ``qaf``."""
-
-    def __init__(self, actor: Acts, evaluator: Acts) -> None:
-        super().__init__()
-        self.actor, self.evaluator = actor, evaluator
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        answered = self.evaluator(tensordict)
-        if isinstance(self.evaluator, QueryEvaluator):
-            answered.set("qaf", answered.get("qaf_logits") > 0)
-        return self.actor(answered)
-
-
-def answered_by(actor: Any, evaluator: Any) -> Any:
-    """The actor behind an evaluator that is a module or a function; a transform belongs into the environment."""
-    return actor if evaluator is None or isinstance(evaluator, Transform) else AnsweredBy(actor, evaluator)
 
 
 class WithScripts(nn.Module):
@@ -168,27 +130,16 @@ class EpisodeRepeater:
     ) -> dict[EpisodeId, int | None]:
         """Each episode's first successful step, from 0, or None; episodes may be ``longer`` by this factor."""
         wanted = {task: [k for _, k in listed] for task, listed in groupby(sorted(which), itemgetter(0))}
-        rows = len(wanted) * max(1, min(max(map(len, wanted.values())), _ROWS // len(wanted)))
+        rows = len(wanted) * max(1, min(max(map(len, wanted.values())), ROWS // len(wanted)))
         rows = max(len(wanted), min(rows, self.num_envs or rows))
-        max_steps, scale = self.max_steps * longer, self.noise_scale
         tasks = [self.tasks[task] for task in wanted]
-        base = LanguageWorldEnv(tasks, num_envs=rows, max_steps=max_steps, strict=True, **self.env)
+        base = LanguageWorldEnv(tasks, num_envs=rows, max_steps=self.max_steps * longer, strict=True, **self.env)
         env = make_env(actor.actor if isinstance(actor, WithScripts) else actor, plans, base, evaluator)
-        actor = answered_by(actor, evaluator)
         found: dict[EpisodeId, int | None] = {}
-        mode = evaluating(actor) if isinstance(actor, nn.Module) else nullcontext()
-        deterministic = set_exploration_type(ExplorationType.DETERMINISTIC)
-        bar = Progress(f"again with {what}", len(which) * max_steps, "step", show=self.progress)
-        with closing(env), mode, bar, torch.no_grad(), deterministic:
-            for one in run_episodes(
-                env,
-                policy_of(actor, self.device),
-                wanted,
-                keys=["observation", ("next", "success")],
-                noise=(lambda _: (scale,) * base.layout.action_size) if scale else None,
-                after_success=0,
-                on_progress=bar.update,
-            ):
+        how: dict[str, Any] = {"noise_scale": self.noise_scale, "device": self.device, "progress": self.progress}
+        how |= {"keys": ["observation", ("next", "success")], "after_success": 0}
+        with running(f"again with {what}", env, answered_by(actor, evaluator), wanted, **how) as episodes:
+            for one in episodes:
                 if not torch.equal(one.steps.get("observation")[0], self.firsts[one.task, one.episode]):
                     raise ValueError(
                         f"rollouts: episode {one.episode} of {one.task!r} does not begin as episode {one.episode} of "
@@ -204,15 +155,10 @@ class Counterfactuals:
     """Runs the counterfactuals that are worth it, and keeps what each gave."""
 
     def __init__(
-        self,
-        actor: Any,
-        plans: Plans,
-        evaluator: Any,
-        reference: Plans | None,
-        scripts: Scripts,
-        repeat: EpisodeRepeater,
+        self, actor: Any, evaluator: Any, reference: Plans | None, scripts: Scripts, repeat: EpisodeRepeater
     ) -> None:
-        self.actor, self.plans, self.evaluator, self.scripts, self.repeat = actor, plans, evaluator, scripts, repeat
+        self.actor, self.evaluator, self.scripts, self.repeat = actor, evaluator, scripts, repeat
+        self.plans = plans = scripts.plans
         self.found: dict[str, dict[EpisodeId, int | None]] = {}  # counterfactual to episodes and their first success
         self.step: dict[EpisodeId, int] = {}  # in which a script mends the episode
         self.reference: Plans | None = None
@@ -226,14 +172,12 @@ class Counterfactuals:
             theirs = evaluator.with_plans(reference) if hasattr(evaluator, "with_plans") else evaluator
             self.other, self.other_evaluator, self.reference = other, theirs, reference
         except (AttributeError, ImportError, RuntimeError, TypeError, ValueError) as error:
-            warnings.warn(
-                f"reference: the policy cannot carry it out, so no plan is replaced ({type(error).__name__}: {error})",
-                stacklevel=4,
-            )
+            why = f"{type(error).__name__}: {error}"
+            warnings.warn(f"reference: the policy cannot carry it out, so no plan is replaced ({why})", stacklevel=4)
 
     def run(self, seen: Sequence[EpisodeStates], same: Collection[EpisodeId] = ()) -> None:
         """Run all that are worth it."""
-        every = [(one.task, one.episode) for one in seen]
+        every = [one.which for one in seen]
         wrong = [w for w, one in zip(every, seen, strict=True) if bool((one.given != one.truth).any())]
         with_reference = [w for w in every if self.reference is not None and w[0] in self.reference]
         true = with_true_answers(self.actor)
@@ -278,7 +222,7 @@ class Counterfactuals:
         for one in seen:
             unlike = unlike_scripts(self.actor, one, self.scripts)
             if unlike is None or unlike.any():
-                ranked[one.task, one.episode] = candidates(one, unlike)
+                ranked[one.which] = candidates(one, unlike)
         for turn in range(_TRIED_STEPS):
             which = self._unmended([w for w, steps in ranked.items() if len(steps) > turn], "skill")
             steps = {one: ranked[one][turn] for one in which}

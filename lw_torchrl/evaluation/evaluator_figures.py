@@ -16,7 +16,7 @@ from lw_torchrl.evaluation.figures import check_image, new_figure, saved, trim
 from lw_torchrl.language.queries import Clause
 from lw_torchrl.modules.image_query_evaluator import ImageQueryEvaluator
 from lw_torchrl.modules.networks import evaluating
-from lw_torchrl.training.labelled_queries import Asked, LabelledQueries
+from lw_torchrl.training.labelled_queries import LabelledQueries
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -46,10 +46,8 @@ def plot_reliability(report: EvaluatorReport, path: str | os.PathLike[str] | Non
         there = number > 0
         upper.plot([0, 1], [0, 1], color="#bab0ac", linewidth=1)
         upper.plot(told[there] / number[there], true[there] / number[there], "o-", color="#4c78a8", markersize=4)
-        upper.set_title(
-            f"{PARTS[part]}\naccuracy {score.accuracy():.4f}, calibration error {score.calibration_error:.4f}",
-            fontsize=9,
-        )
+        numbers = f"accuracy {score.accuracy():.4f}, calibration error {score.calibration_error:.4f}"
+        upper.set_title(f"{PARTS[part]}\n{numbers}", fontsize=9)
         upper.set_ylabel("share that holds")
         lower.bar([(place + 0.5) / BINS for place in range(BINS)], number, width=0.9 / BINS, color="#4c78a8")
         lower.set_yscale("log")
@@ -88,19 +86,16 @@ def wrong_answers(evaluator: ImageQueryEvaluator, data: LabelledQueries, most: i
             surest = (believed - truth.float()).abs().argmax(0).tolist()  # of each clause
             for column, (row, clause) in enumerate(zip(surest, asked.clauses, strict=True)):
                 told, holds = float(believed[row, column]), bool(truth[row, column])
-                if (told > 0.5) != holds:
-                    off = _off(evaluator, asked, row, clause)
-                    found.append(WrongAnswer(clause, holds, told, asked.seen("pixels")[row], off))
+                if (told > 0.5) == holds:
+                    continue
+                pixels, off = asked.seen("pixels")[row], {}
+                if evaluator.names:
+                    places, _ = evaluator.network.places(pixels[None], evaluator.network.names.weight)
+                    true = asked.task.positions(asked.observation[row])
+                    for name in filter(None, (clause.subject, clause.object)):
+                        off[name] = float((places[0, evaluator.names.index(name), :3] - true[name]).norm())
+                found.append(WrongAnswer(clause, holds, told, pixels, off))
     return sorted(found, key=lambda one: -abs(one.believed - one.holds))[:most]
-
-
-def _off(evaluator: ImageQueryEvaluator, asked: Asked, row: int, clause: Clause) -> dict[str, float]:
-    if not evaluator.names:
-        return {}
-    places, _ = evaluator.network.places(asked.seen("pixels")[row : row + 1], evaluator.network.names.weight)
-    true = asked.task.positions(asked.observation[row])
-    things = [clause.subject, *([clause.object] if clause.object else [])]
-    return {name: float((places[0, evaluator.names.index(name), :3] - true[name]).norm()) for name in things}
 
 
 @checked

@@ -101,13 +101,11 @@ class EvaluatorReport:
         """The numbers as text, with so many of the worst predicates of each part."""
         lines = [f"{'':36}{'answers':>10}{'accuracy':>10}{'balanced':>10}{'calibration error':>19}"]
         for part, score in self.parts.items():
-            lines.append(
-                f"{PARTS[part]:36}{score.answers:10}{score.accuracy():10.4f}{score.balanced_accuracy():10.4f}"
-                f"{score.calibration_error:19.4f}"
-            )
+            both = f"{score.accuracy():10.4f}{score.balanced_accuracy():10.4f}"
+            lines.append(f"{PARTS[part]:36}{score.answers:10}{both}{score.calibration_error:19.4f}")
             for name in score.worst[:most]:
-                asked = sum(score.asked[name])
-                lines.append(f"  {name:34}{asked:10}{score.accuracy(name):10.4f}{score.balanced_accuracy(name):10.4f}")
+                both = f"{score.accuracy(name):10.4f}{score.balanced_accuracy(name):10.4f}"
+                lines.append(f"  {name:34}{sum(score.asked[name]):10}{both}")
         return "\n".join(lines)
 
     def save(self, path: str | os.PathLike[str]) -> None:

@@ -44,14 +44,30 @@ class EpisodeStates(NamedTuple):
     weights: Tensor  # (T, S) float32, the policy's attention over the plan's steps
     in_force: Tensor  # (T,) int64, the step with most of it; -1 where all have the same, so that none is in force
 
+    @property
+    def which(self) -> tuple[str, int]:
+        return self.task, self.episode
+
+    def active_time(self, plan: ConditionalPlan, step: int) -> str:
+        """How long a step was in force, in words."""
+        late = min(_LATE, len(self.in_force))
+        inside = int((self.in_force == step)[-late:].sum())
+        return f"step {step + 1}, '{plan.steps[step].skill}', was in force in {inside} of the last {late} states"
+
+
+class Blame(NamedTuple):
+    """Where a cause shows."""
+
+    step: int | None  # of the plan
+    at: int  # the state to look at
+    why: str  # half a sentence with its numbers
+
 
 class Explanation(NamedTuple):
     """What the states say by themselves."""
 
     cause: Cause  # "undecided" where they do not tell
-    steps: Mapping[str, int | None]  # for each cause, the plan's step that would be to blame
-    at: Mapping[str, int]  # for each cause, the state to look at
-    why: Mapping[str, str]  # for each cause, half a sentence with its numbers
+    blames: Mapping[str, Blame]  # of each cause that it may be
     evidence: Mapping[str, float]  # name to number
 
 
@@ -59,28 +75,23 @@ class Scripts:
     """The scripted skills of plans' steps, as far as a table of text to scripted skill has any."""
 
     def __init__(self, plans: Plans, table: Mapping[str, ScriptedSkill]) -> None:
-        self.table = table
-        found: dict[Any, list[ScriptedSkill]] = {
-            plan.definition: [_script(plan, step.skill, table) or _REST for step in plan.steps]
-            for plan in plans.values()
-        }
-        self.known = {task.name: [skill is not _REST for skill in listed] for task, listed in found.items()}
-        self.program = SkillProgram(found)
-        self._ruler = SkillProgram({task: [_ruler(skill) for skill in listed] for task, listed in found.items()})
+        self.plans, self.table = plans, table
+        self.known: dict[str, list[bool]] = {}
+        found: dict[Any, list[ScriptedSkill]] = {}
+        for task, plan in plans.items():
+            given = [table.get(step.skill) for step in plan.steps]
+            self.known[task] = known = [one is not None and one.suits(plan.definition) for one in given]
+            pairs = zip(given, known, strict=True)
+            found[plan.definition] = [one.for_task(plan.definition) if one and right else _REST for one, right in pairs]
+        rulers: dict[Any, list[ScriptedSkill]] = {}
+        for definition, skills in found.items():
+            gains: list[Any] = [tuple(_RULER if gain else 0.0 for gain in one.gain) for one in skills]
+            rulers[definition] = [replace(one, gain=gain, variants={}) for one, gain in zip(skills, gains, strict=True)]
+        self.program, self._ruler = SkillProgram(found), SkillProgram(rulers)
 
     def distance(self, observation: Tensor, task_id: Tensor, step: int) -> Tensor:
         """(T,) metres, how far what a step's skill moves is from where it goes."""
         return self._ruler(observation, task_id)[:, step, :3].norm(dim=-1) / _RULER
-
-
-def _script(plan: ConditionalPlan, text: str, table: Mapping[str, ScriptedSkill]) -> ScriptedSkill | None:
-    skill = table.get(text)
-    return skill.for_task(plan.definition) if skill is not None and skill.suits(plan.definition) else None
-
-
-def _ruler(skill: ScriptedSkill) -> ScriptedSkill:
-    x, y, z = (_RULER if gain else 0.0 for gain in skill.gain)
-    return replace(skill, gain=(x, y, z), variants={})
 
 
 def chosen(truth: Tensor, steps: int) -> Tensor:
@@ -126,8 +137,7 @@ def candidates(seen: EpisodeStates, among: Tensor | None = None) -> list[int]:
         if counted[-window:].any():
             ranked += reversed(where_stuck(in_charge, window))
     ranked += torch.bincount(seen.in_force[counted]).argsort(descending=True).tolist()
-    present = set(seen.in_force[counted].tolist())
-    return [step for step in dict.fromkeys(ranked) if step in present]
+    return [step for step in dict.fromkeys(ranked) if step in seen.in_force[counted]]
 
 
 def last_stay_start(states: Tensor) -> int:
@@ -149,79 +159,58 @@ def stall_step(seen: EpisodeStates, step: int, layout: Layout = METAWORLD) -> in
     return begin + (int(still.int().argmax()) if still.any() else 0)
 
 
-def describe_active_time(seen: EpisodeStates, plan: ConditionalPlan, step: int) -> str:
-    """How long a step was in force, in words."""
-    late = min(_LATE, len(seen.in_force))
-    inside = int((seen.in_force == step)[-late:].sum())
-    return f"step {step + 1}, '{plan.steps[step].skill}', was in force in {inside} of the last {late} states"
-
-
-def explain(
-    seen: EpisodeStates, plans: Plans, scripts: Scripts, reference: Plans | None, reference_scripts: Scripts | None
-) -> Explanation:
+def explain(seen: EpisodeStates, scripts: Scripts, reference: Scripts | None) -> Explanation:
     """The rule of :func:`attribute_failures`; without a reference, a plan is to blame where no condition holds, and a
     skill that stays in force far from its goal."""
-    plan, length = plans[seen.task], len(seen.in_force)
-    observation, task_id = seen.steps.get("observation"), seen.steps.get("task_id")
+    plan, length = scripts.plans[seen.task], len(seen.in_force)
     late = min(_LATE, length)
     stuck = next(iter(candidates(seen)), len(plan.steps) - 1)
-    steps: dict[str, int | None] = {"out of time": stuck, "undecided": stuck}
-    at = {"out of time": length - 1, "undecided": stall_step(seen, stuck, plans.layout)}
-    why, evidence = {}, {"states": float(length)}
+    stalled = stall_step(seen, stuck, scripts.plans.layout)
+    blames, evidence = {}, {"states": float(length)}
 
     wrong = seen.given != seen.truth
-    share = float(wrong.any(-1).float().mean())
-    evidence["answers_wrong"] = share
+    share = evidence["answers_wrong"] = float(wrong.any(-1).float().mean())
     if share:
         changes = chosen(seen.given, len(plan.steps)) != chosen(seen.truth, len(plan.steps))
         matter = wrong & changes.unsqueeze(-1) if changes.any() else wrong
         column = int(matter.sum(0).argmax())
-        steps["query"], at["query"] = column, int(matter[:, column].int().argmax())
         evidence["answers_wrong_late"] = float(wrong[-late:].any(-1).float().mean())
-        why["query"] = (
-            f"'{plan.steps[column].condition}' (step {column + 1}) was answered wrongly in "
-            f"{int(wrong[:, column].sum())} of {length} states, first at {int(wrong[:, column].int().argmax())}"
-        )
+        here = wrong[:, column].int()
+        often = f"{int(here.sum())} of {length} states, first at {int(here.argmax())}"
+        why = f"'{plan.steps[column].condition}' (step {column + 1}) was answered wrongly in {often}"
+        blames["query"] = Blame(column, int(matter[:, column].int().argmax()), why)
 
     none = ~seen.truth.any(-1)
     evidence["no_condition_late"] = float(none[-late:].float().mean())
-    if reference is not None and reference_scripts is not None and seen.task in reference:
-        departs, ours, theirs = _departs(seen, plan, scripts, reference[seen.task], reference_scripts)
+    if reference is None or seen.task not in reference.plans:
+        why = f"no condition of the plan held in {int(none[-late:].sum())} of the last {late} states"
+        blames["plan"] = Blame(stuck, last_stay_start(none) if none.any() else stalled, why)
+    else:
+        other = reference.plans[seen.task]
+        departs, ours, theirs = _departs(seen, plan, scripts, other, reference)
         evidence["plan_departs"] = float(departs.float().mean())
         evidence["plan_departs_late"] = float(departs[-late:].float().mean())
-        where = departs.clone()
-        where[:-late] &= not bool(departs[-late:].any())
-        step = int(torch.bincount(ours[where]).argmax()) if where.any() else stuck
-        steps["plan"], at["plan"] = (
-            step,
-            last_stay_start(departs & (ours == step)) if departs.any() else at["undecided"],
-        )
-        other = int(torch.bincount(theirs[where & (ours == step)]).argmax()) if where.any() else 0
-        asked = reference[seen.task].steps[other].skill
+        recent, where, step, asked = int(departs[-late:].sum()), departs.clone(), stuck, other.steps[0].skill
+        where[:-late] &= not recent
+        if where.any():
+            step = int(torch.bincount(ours[where]).argmax())
+            asked = other.steps[int(torch.bincount(theirs[where & (ours == step)]).argmax())].skill
+        said = f"the plan asks for something else than the reference, as step {step + 1}, '{plan.steps[step].skill}'"
         if where.any() and none[where].float().mean() > 0.5:
-            said = f"no condition of the plan holds, where the reference says '{asked}'"
-        else:
-            said = (
-                f"the plan asks for something else than the reference, as step {step + 1}, "
-                f"'{plan.steps[step].skill}', where the reference says '{asked}'"
-            )
-        often = int(departs[-late:].sum())
-        states = f"{often} of the last {late}" if often else f"{int(departs.sum())} of {length}"
-        why["plan"] = f"in {states} states {said}"
-    else:
-        steps["plan"], at["plan"] = stuck, last_stay_start(none) if none.any() else at["undecided"]
-        why["plan"] = f"no condition of the plan held in {int(none[-late:].sum())} of the last {late} states"
+            said = "no condition of the plan holds"
+        states = f"{recent} of the last {late}" if recent else f"{int(departs.sum())} of {length}"
+        at = last_stay_start(departs & (ours == step)) if departs.any() else stalled
+        blames["plan"] = Blame(step, at, f"in {states} states {said}, where the reference says '{asked}'")
 
-    inside = seen.in_force == stuck
-    evidence["in_step_late"] = float(inside[-late:].float().mean())
-    steps["skill"], at["skill"] = stuck, stall_step(seen, stuck, plans.layout)
-    told = describe_active_time(seen, plan, stuck)
+    evidence["in_step_late"] = float((seen.in_force == stuck)[-late:].float().mean())
+    told = seen.active_time(plan, stuck)
     if scripts.known[seen.task][stuck]:
-        far = float(scripts.distance(observation[-1:], task_id[-1:], stuck))
+        last = seen.steps[-1:]
+        far = float(scripts.distance(last.get("observation"), last.get("task_id"), stuck))
         evidence["distance_at_end"] = far
         told += f" and ended {100 * far:.0f} cm from where it goes"
-    why["skill"] = told
-    why["out of time"] = why["undecided"] = told
+    blames["skill"] = blames["undecided"] = Blame(stuck, stalled, told)
+    blames["out of time"] = Blame(stuck, length - 1, told)
 
     cause: Cause = "undecided"
     if share >= _WRONG:
@@ -232,7 +221,7 @@ def explain(
         cause = "plan"
     elif evidence["in_step_late"] > 0.9 and evidence.get("distance_at_end", 0.0) > 0.05:
         cause = "skill"
-    return Explanation(cause, steps, at, why, evidence)
+    return Explanation(cause, blames, evidence)
 
 
 def _departs(
@@ -260,8 +249,7 @@ def unlike_scripts(actor: Any, seen: EpisodeStates, scripts: Scripts) -> Tensor 
         return None
     states = seen.steps.select(*keys).clone()
     if "qaf" in actor.in_keys:
-        width = actor.plans.num_steps
-        states.set("qaf", torch.nn.functional.pad(seen.given, (0, width - seen.given.shape[1])))
+        states.set("qaf", torch.nn.functional.pad(seen.given, (0, actor.plans.num_steps - seen.given.shape[1])))
     with torch.no_grad(), evaluating(actor):
         action = actor(states.to(device_of(actor))).get("action").cpu()
     program = scripts.program(seen.steps.get("observation"), seen.steps.get("task_id"))[:, : seen.weights.shape[1]]

@@ -1,12 +1,36 @@
-"""Failure: why a policy failed in one episode; tables of failures, and their JSON."""
+"""Failure: why a policy failed in one episode; tables of failures, and records of JSON, none of which is trusted."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from reprlib import repr as short
 from typing import Any, Literal
 
-from lw_torchrl.evaluation.records import Rules, is_integer, is_number, read_records
+from lw_torchrl._checks import Natural, check_fields
+
+
+def is_number(value: Any) -> bool:
+    """Whether JSON's value is a number that can be summed."""
+    return type(value) in (int, float) and abs(value) < 1e300
+
+
+def read_records(argument: str, stated: Any, record: Any, faults: Callable[[Any], Iterable[str]]) -> tuple[Any, ...]:
+    """A list of objects as dataclasses, whose fields that are compared each must have; ``faults`` says what a record
+    must be and is not."""
+    if not isinstance(stated, list):
+        raise ValueError(f"{argument} must be a list, got {short(stated)}")
+    names, found = {field.name for field in fields(record) if field.compare}, []
+    for number, entry in enumerate(stated):
+        where = f"{argument}[{number}]"
+        if not isinstance(entry, dict) or set(entry) != names:
+            raise ValueError(f"{where} must be an object of {', '.join(sorted(names))}, got {short(entry)}")
+        found.append(record(**entry))
+        check_fields(found[-1], f"{where}: ")
+        for fault in faults(found[-1]):
+            raise ValueError(f"{where}: {fault}, got {short(entry)}")
+    return tuple(found)
+
 
 Cause = Literal["query", "plan", "skill", "out of time", "undecided"]
 
@@ -38,11 +62,11 @@ class Failure:
 
     task: str
     seed: int
-    episode: int
+    episode: Natural
     cause: Cause
     also: Cause | None
-    step: int | None
-    at: int
+    step: Natural | None
+    at: Natural
     why: str
     evidence: Mapping[str, float] = field(default_factory=dict)
     counterfactuals: Mapping[str, bool] = field(default_factory=dict)
@@ -75,29 +99,24 @@ def failure_table(tasks: Sequence[str], episodes_per_task: int, failures: Sequen
 
 def read_failures(stated: Any, config: Mapping[str, Any], failed: Sequence[tuple[str, int]]) -> tuple[Failure, ...]:
     """The failures of a file: one for each failed episode, given by task and number, else :class:`ValueError`."""
+
+    def faults(one: Failure) -> Iterator[str]:
+        if one.seed != config["seed"]:
+            yield "seed must be config's"
+        if one.also is not None and (one.also == one.cause or "undecided" in (one.also, one.cause)):
+            yield "also must be null or another cause than the first"
+        if one.at >= config["max_steps"]:
+            yield "at must be a step of the episode"
+        if not isinstance(one.evidence, dict) or not all(map(is_number, one.evidence.values())):
+            yield "evidence must be names and numbers"
+        tried = one.counterfactuals.items() if isinstance(one.counterfactuals, dict) else [("", 0)]
+        if not all(set(name.split(" + ")) <= set(PARTS) and type(bit) is bool for name, bit in tried):
+            yield f"counterfactuals must be some of {', '.join(PARTS)}, or two of them, to true or false"
+
     if isinstance(stated, list):  # earlier files say "swaps"
         new = {"swaps": "counterfactuals"}
         stated = [{new.get(k, k): v for k, v in one.items()} if isinstance(one, dict) else one for one in stated]
-    found = read_records("failures", stated, Failure, lambda failure: _rules(failure, config))
+    found = read_records("failures", stated, Failure, faults)
     if sorted(failed) != sorted((failure.task, failure.episode) for failure in found):
         raise ValueError("failures must be one for each episode without success")
     return found
-
-
-def _rules(failure: Failure, config: Mapping[str, Any]) -> Rules:
-    cause, also, evidence, replaced = failure.cause, failure.also, failure.evidence, failure.counterfactuals
-    causes = [name for name in CAUSES if name != "undecided"]
-    yield "task", isinstance(failure.task, str) and failure.task in config["tasks"], "one of config"
-    yield "seed", type(failure.seed) is int and failure.seed == config["seed"], "config's"
-    yield "episode", is_integer(failure.episode, 0), "an integer of at least 0"
-    yield "cause", isinstance(cause, str) and cause in CAUSES, f"one of {', '.join(CAUSES)}"
-    second = isinstance(also, str) and also in causes and also != cause and cause in causes
-    yield "also", also is None or second, "null or another cause than the first"
-    yield "step", failure.step is None or is_integer(failure.step, 0, 2**31 - 1), "null or an integer of at least 0"
-    yield "at", is_integer(failure.at, 0, config["max_steps"] - 1), "a step of the episode"
-    yield "why", isinstance(failure.why, str), "a text"
-    yield "evidence", isinstance(evidence, dict) and all(map(is_number, evidence.values())), "names and numbers"
-    holds = isinstance(replaced, dict) and all(
-        set(name.split(" + ")) <= set(PARTS) and type(bit) is bool for name, bit in replaced.items()
-    )
-    yield "counterfactuals", holds, f"some of {', '.join(PARTS)}, or two of them, to true or false"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -184,7 +184,12 @@ def plot_sorted_tasks(
     for k, (method, rates) in enumerate(named.items()):
         _draw_method(axes, method, np.stack([rates[task] for task in tasks]), COLORS[k % len(COLORS)], order, of)
     for k, (label, rates) in enumerate(dashed.items()):
-        _draw_published(axes, label, np.array([rates[task].mean() for task in tasks]), k, order)
+        line = np.array([rates[task].mean() for task in tasks])
+        line, mean = np.sort(line) if order == "own" else line, float(line.mean())
+        look: dict[str, Any] = {"linestyle": _DASHES[k // 2 % len(_DASHES)], "zorder": 1.5}
+        look["color"] = ("#666666", "#aaaaaa")[k % 2]
+        axes.plot(line, linewidth=1, label=f"{label}: mean {mean:.2f}", **look)
+        axes.axhline(mean, linewidth=0.9, **look)
     shown = [*tasks] if order == "shared" else [str(rank) for rank in range(1, len(tasks) + 1)]
     axes.set_xticks(range(len(tasks)), shown, rotation=90 if order == "shared" else 0, fontsize=8)
     axes.set_xlabel(f"tasks, sorted by {first}" if order == "shared" else "tasks, each curve sorted for itself")
@@ -220,13 +225,6 @@ def _draw_method(axes: Axes, method: str, rates: Array, color: str, order: str, 
     label = f"{method}: mean {mean.mean():.2f} ({spread})"
     axes.plot(x, mean, color=color, linewidth=2, marker=".", zorder=3, label=label)
     axes.axhline(float(mean.mean()), color=color, linewidth=1.2, alpha=0.8)
-
-
-def _draw_published(axes: Axes, label: str, rates: Array, k: int, order: str) -> None:
-    rates = np.sort(rates) if order == "own" else rates
-    color, style = ("#666666", "#aaaaaa")[k % 2], _DASHES[k // 2 % len(_DASHES)]
-    axes.plot(rates, color=color, linewidth=1, linestyle=style, zorder=1.5, label=f"{label}: mean {rates.mean():.2f}")
-    axes.axhline(float(rates.mean()), color=color, linewidth=0.9, linestyle=style, zorder=1.5)
 
 
 def _as_rates(argument: str, given: Rates | Summary | Mapping[str, float]) -> dict[str, Array]:

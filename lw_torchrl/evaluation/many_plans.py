@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
 from typing import Any, Literal
 
 import numpy as np
@@ -12,12 +11,10 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch.nn.utils.rnn import pad_sequence
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from lw_torchrl._checks import check_int, check_scale, checked
-from lw_torchrl._progress import Progress
-from lw_torchrl.envs.episodes import policy_of, run_episodes
+from lw_torchrl._checks import Count, Scale, checked
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
+from lw_torchrl.evaluation.running import ROWS, running
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.language.query_program import QueryProgram
 from lw_torchrl.language.skill_program import SkillProgram
@@ -25,7 +22,6 @@ from lw_torchrl.language.skills import ScriptedSkill
 from lw_torchrl.language.task_index import TaskIndex
 from lw_torchrl.suites.suite import Suite, find_suite
 
-_ROWS = 256
 _PLACE = "place"
 
 
@@ -33,14 +29,14 @@ _PLACE = "place"
 def evaluate_plans(
     plans: Sequence[ConditionalPlan],
     *,
-    episodes: int = 20,
+    episodes: Count = 20,
     seed: int,
     choose: Literal["random", "first"] = "random",
     skills: Mapping[str, ScriptedSkill] | None = None,
-    noise_scale: float = 0.0,
+    noise_scale: Scale = 0.0,
     max_steps: int | None = None,
     suite: str | Suite | None = None,
-    num_envs: int = _ROWS,
+    num_envs: Count = ROWS,
     num_threads: int | None = None,
     progress: bool = True,
     on_plan: Callable[[int, tuple[bool, ...]], object] | None = None,
@@ -71,9 +67,6 @@ def evaluate_plans(
     """
     if not plans:
         raise ValueError("plans must be one at least, got none")
-    check_int("episodes", episodes, minimum=1)
-    check_scale("noise_scale", noise_scale)
-    check_int("num_envs", num_envs, minimum=1)
     by_task: dict[str, dict[str, list[int]]] = {}  # fingerprint to the plans of it
     for index, plan in enumerate(plans):
         by_task.setdefault(plan.task, {}).setdefault(Plans([plan]).fingerprint, []).append(index)
@@ -92,24 +85,15 @@ def evaluate_plans(
         strict=True,
     )
     listed = {task: list(range(episodes)) * len(found) for task, found in different.items()}
-    total = sum(map(len, listed.values()))
-    bar = Progress("carrying out plans", total * env.max_steps, "step", show=progress)
+    how: dict[str, Any] = {"noise_scale": noise_scale, "progress": progress, "after_success": 0}
+    how |= {"keys": [_PLACE, ("next", "success")], "place": _PLACE}
     won: dict[int, dict[int, bool]] = {index: {} for index in range(len(plans))}
 
     def in_order(index: int) -> tuple[bool, ...]:
         return tuple(won[index][episode] for episode in range(episodes))
 
-    with closing(env), bar, torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-        for one in run_episodes(
-            env,
-            policy_of(policy),
-            listed,
-            keys=[_PLACE, ("next", "success")],
-            noise=(lambda _: (noise_scale,) * env.layout.action_size) if noise_scale else None,
-            after_success=0,
-            place=_PLACE,
-            on_progress=bar.update,
-        ):
+    with running("carrying out plans", env, policy, listed, **how) as finished:
+        for one in finished:
             for index in equal[one.task][int(one.steps.get(_PLACE)[0]) // episodes]:
                 won[index][one.episode] = one.first_success is not None
                 if len(won[index]) == episodes and on_plan is not None:
@@ -123,12 +107,7 @@ class _PlanOfRow(nn.Module):
     row_by_row = True
 
     def __init__(
-        self,
-        plans: Mapping[str, Sequence[ConditionalPlan]],
-        episodes: int,
-        seed: int,
-        choose: str,
-        skills: Mapping[str, ScriptedSkill] | None,
+        self, plans: Mapping[str, Sequence[ConditionalPlan]], episodes: int, seed: int, choose: str, skills: Any
     ) -> None:
         super().__init__()
         self.episodes, self.seed, self.random = episodes, seed, choose == "random"

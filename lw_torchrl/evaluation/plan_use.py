@@ -210,6 +210,4 @@ def stuck_table(steps: Sequence[StuckStep]) -> str:
         counts = f"{s.stuck} of {s.failed}", f"{s.furthest} of {s.failed}"
         rows.append((s.task, str(s.step + 1), *counts, s.skill, s.condition))
     task, skill = (max(len(row[column]) for row in rows) for column in (0, 4))
-    return "\n".join(
-        f"{row[0]:{task}}  {row[1]:>4}  {row[2]:>10}  {row[3]:>10}  {row[4]:{skill}}  {row[5]}" for row in rows
-    )
+    return "\n".join(f"{a:{task}}  {b:>4}  {c:>10}  {d:>10}  {e:{skill}}  {f}" for a, b, c, d, e, f in rows)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import closing, nullcontext
 from typing import Any, Literal
 
 import torch
@@ -11,23 +10,18 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
 from torchrl.envs import EnvBase
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from lw_torchrl._checks import check_int, check_scale, checked, unknown_name
+from lw_torchrl._checks import Count, Scale, check_int, checked, unknown_name
 from lw_torchrl._keys import check_key
-from lw_torchrl._progress import Progress
-from lw_torchrl.envs.episodes import FinishedEpisode, policy_of, read_action, run_episodes
+from lw_torchrl.envs.episodes import FinishedEpisode, read_action
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.evaluation.attribution import attribute_failures, keys_to_attribute
-from lw_torchrl.evaluation.counterfactuals import Acts, answered_by, make_env
 from lw_torchrl.evaluation.result import EpisodeResult, EvaluationResult
+from lw_torchrl.evaluation.running import ROWS, Acts, answered_by, make_env, running
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.tasks import Task, TaskList
-from lw_torchrl.modules.networks import evaluating
 from lw_torchrl.modules.policy import Policy, plans_of
 from lw_torchrl.suites.suite import Suite, find_suite, listed_tasks
-
-_ROWS = 256  # more hardly make a step of all of them cheaper per row, and cost memory
 
 
 def actor_plans(actor: Any, plans: Plans | Mapping[str, ConditionalPlan] | None) -> Plans | None:
@@ -37,10 +31,8 @@ def actor_plans(actor: Any, plans: Plans | Mapping[str, ConditionalPlan] | None)
         return own
     given = as_plans(plans)
     if own is not None and (different := given.differences(own)):
-        raise ValueError(
-            f"plans differ from the actor's own for {', '.join(different)}; pass plans=None, or evaluate "
-            "actor.with_plans(plans)"
-        )
+        how = "pass plans=None, or evaluate actor.with_plans(plans)"
+        raise ValueError(f"plans differ from the actor's own for {', '.join(different)}; {how}")
     return own or given
 
 
@@ -50,15 +42,6 @@ def tasks_of(tasks: TaskList, plans: Plans | None, suite: str | Suite | None = N
     found = find_suite(tasks, suite)
     own = {} if plans is None else {plan.task: plan.definition for plan in plans.values()}
     return found, found.named_tasks(tasks, {name: task for name, task in own.items() if name not in found.tasks})
-
-
-def _result(finished: FinishedEpisode, stopped_early: bool, keep_actions: bool) -> EpisodeResult:
-    task, episode, steps = finished
-    first = finished.first_success
-    at_end = None if stopped_early else bool(steps.get(("next", "success"))[-1])
-    total = None if stopped_early else float(steps.get(("next", "reward")).double().sum())
-    actions = steps.get("action").clone() if keep_actions else None
-    return EpisodeResult(task, episode, first is not None, first, at_end, total, actions)
 
 
 def _checked(policy: Acts, env: EnvBase, also_record: Iterable[NestedKey]) -> Acts:
@@ -86,14 +69,14 @@ def evaluate(
     *,
     tasks: str | Task | Iterable[str | Task],
     plans: Plans | Mapping[str, ConditionalPlan] | None = None,
-    episodes_per_task: int = 20,
+    episodes_per_task: Count = 20,
     seed: int,
-    noise_scale: float = 0.1,
+    noise_scale: Scale = 0.1,
     num_envs: int | None = None,
     stop_at_success: bool = False,
     record_actions: bool = False,
     reward: Literal["sparse", "dense"] = "sparse",
-    max_steps: int | None = None,
+    max_steps: Count | None = None,
     suite: str | Suite | None = None,
     engine: Any = None,
     num_threads: int | None = None,
@@ -166,36 +149,32 @@ def evaluate(
         raise TypeError(f"also_record must be a list of keys, got {also_record!r}")
     for key in (also_record := list(also_record)):
         check_key("also_record", key)
-    check_int("episodes_per_task", episodes_per_task, minimum=1)
-    check_scale("noise_scale", noise_scale)
     if num_envs is None:
-        num_envs = len(names) * max(1, _ROWS // len(names))
+        num_envs = len(names) * max(1, ROWS // len(names))
     num_envs = min(check_int("num_envs", num_envs), len(names) * episodes_per_task)  # a row more would have no work
-    max_steps = found_suite.max_steps if max_steps is None else check_int("max_steps", max_steps, minimum=1)
+    max_steps = found_suite.max_steps if max_steps is None else max_steps
     shared: dict[str, Any] = {"seed": seed, "engine": engine, "num_threads": num_threads, "max_steps": max_steps}
     shared["suite"] = found_suite
     base = LanguageWorldEnv(list(chosen.values()), num_envs=num_envs, reward=reward, strict=True, **shared)
     env = make_env(actor, answered, base, evaluator)
-    policy = policy_of(answered_by(actor, evaluator), device)
     seen: dict[NestedKey, None] = dict.fromkeys(also_record)
     if attribute:
         seen |= dict.fromkeys(keys_to_attribute(actor, env))
     found: list[EpisodeResult] = []
     failed: list[FinishedEpisode] = []
-    bar = Progress("evaluating", len(names) * episodes_per_task * max_steps, "step", show=progress)
-    mode = evaluating(actor) if isinstance(actor, torch.nn.Module) else nullcontext()
-    with closing(env), mode, bar, torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-        for finished in run_episodes(
-            env,
-            _checked(policy, env, seen),
-            {task: range(episodes_per_task) for task in names},
-            keys=["action", ("next", "success"), ("next", "reward"), *seen],
-            noise=(lambda _: (noise_scale,) * env.action_spec.shape[-1]) if noise_scale else None,
-            after_success=0 if stop_at_success else None,
-            on_progress=bar.update,
-        ):
-            found.append(_result(finished, stop_at_success, record_actions))
-            if attribute and not found[-1].success:
+    how: dict[str, Any] = {"noise_scale": noise_scale, "device": device, "progress": progress}
+    options: dict[str, Any] = {"keys": ["action", ("next", "success"), ("next", "reward"), *seen]}
+    options |= {"after_success": 0 if stop_at_success else None, "wrap": lambda policy: _checked(policy, env, seen)}
+    listed = dict.fromkeys(names, range(episodes_per_task))
+    with running("evaluating", env, answered_by(actor, evaluator), listed, **how, **options) as episodes:
+        for finished in episodes:
+            first, steps = finished.first_success, finished.steps
+            at_end = None if stop_at_success else bool(steps.get(("next", "success"))[-1])
+            total = None if stop_at_success else float(steps.get(("next", "reward")).double().sum())
+            actions = steps.get("action").clone() if record_actions else None
+            about = finished.task, finished.episode, first is not None, first, at_end, total, actions
+            found.append(EpisodeResult(*about))
+            if attribute and first is None:
                 failed.append(finished)
             if on_episode is not None:
                 on_episode(finished)
@@ -204,7 +183,6 @@ def evaluate(
     failures = None
     if attribute and answered is not None:
         failed.sort(key=lambda episode: (episode.task, episode.episode))
-        shared |= {"noise_scale": noise_scale, "num_envs": num_envs, "device": device, "progress": progress}
-        options = {"actor": actor, "reference": reference, "evaluator": evaluator, **shared}
-        failures = tuple(attribute_failures(failed, answered, **options))
+        given: dict[str, Any] = {"actor": actor, "reference": reference, "evaluator": evaluator, "num_envs": num_envs}
+        failures = tuple(attribute_failures(failed, answered, **given, **shared, **how))
     return EvaluationResult(config, tuple(sorted(found, key=lambda e: (e.task, e.episode))), failures=failures)

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection, Container
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from functools import cached_property
-from hashlib import file_digest
+from hashlib import sha256
+from pathlib import Path
 from reprlib import repr as short
 from typing import Any
 
 from torch import Tensor
 
+from lw_torchrl._checks import Count, Natural, check_flag, check_int, check_scale
 from lw_torchrl._files import read_json, write_json
 from lw_torchrl._versions import package_versions
-from lw_torchrl.evaluation.failure_records import Failure, failure_table, read_failures
-from lw_torchrl.evaluation.records import Rules, check_rules, is_integer, is_number, read_records
+from lw_torchrl.evaluation.failure_records import Failure, failure_table, is_number, read_failures, read_records
 
 FORMAT = "lw_torchrl.evaluation"
 FORMAT_VERSION = 1
@@ -36,9 +37,9 @@ class EpisodeResult:
     """
 
     task: str
-    episode: int
+    episode: Natural
     success: bool
-    first_success: int | None
+    first_success: Count | None
     success_at_end: bool | None
     episode_return: float | None
     actions: Tensor | None = field(default=None, compare=False, repr=False)
@@ -119,15 +120,12 @@ class EvaluationResult:
         origin: dict[str, Any] = dict(self.origin) or made
         for name, given in (("checkpoint", checkpoint), ("evaluator", evaluator)):
             if given is not None:
-                with open(given, "rb") as file:
-                    origin[name] = {"path": str(given), "sha256": file_digest(file, "sha256").hexdigest()}
+                origin[name] = {"path": str(given), "sha256": sha256(Path(given).read_bytes()).hexdigest()}
         if plans is not None:
             origin["plans"] = plans
         told: dict[str, Any] = {"format": FORMAT, "version": FORMAT_VERSION, "origin": origin, "config": self.config}
         told["mean_success_once"] = self.mean_success
-        told |= {
-            name: getattr(self, name) for name in ("success_once", "success_at_end", "first_success", "mean_return")
-        }
+        told |= {k: getattr(self, k) for k in ("success_once", "success_at_end", "first_success", "mean_return")}
         told["episodes"] = [{k: v for k, v in asdict(e).items() if k != "actions"} for e in self.episodes]
         if self.failures is not None:
             told["failures"] = [asdict(failure) for failure in self.failures]
@@ -148,7 +146,7 @@ class EvaluationResult:
             config, origin = found["config"], found.get("origin", {})
             if not isinstance(config, dict) or not isinstance(origin, dict):
                 raise ValueError("its config and its origin must be objects")
-            check_rules("config", config, _config_rules(config))
+            _check_config(config)
             episodes = _read_episodes(found["episodes"], config)
             if not isinstance(found["success_once"], dict) or set(found["success_once"]) != set(config["tasks"]):
                 raise ValueError("the tasks of its success_once are not those of its config")
@@ -156,9 +154,7 @@ class EvaluationResult:
             failures = read_failures(found["failures"], config, failed) if "failures" in found else None
             return cls(config, episodes, origin, failures)
         except FileNotFoundError:
-            raise FileNotFoundError(
-                f"path: no result file {str(path)!r}; evaluate(...).save(path) writes one"
-            ) from None
+            raise FileNotFoundError(f"path: no result file {str(path)!r}; evaluate(...).save(path) writes it") from None
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(
                 f"path: {str(path)!r} is no result of {FORMAT} version {FORMAT_VERSION} "
@@ -192,35 +188,33 @@ def _mean(values: Collection[Any]) -> float | None:
     return None if not values or None in values else sum(values) / len(values)
 
 
-def _config_rules(config: dict[str, Any]) -> Rules:
-    tasks, noise = config["tasks"], config["noise_scale"]
+def _check_config(config: dict[str, Any]) -> None:
+    tasks = config["tasks"]
     named = isinstance(tasks, list) and bool(tasks) and all(isinstance(task, str) for task in tasks)
-    yield "tasks", named and len(set(tasks)) == len(tasks), "different names"
+    if not named or len(set(tasks)) != len(tasks):
+        raise ValueError(f"config: tasks must be different names, got {short(tasks)}")
     for name in ("episodes_per_task", "max_steps"):
-        yield name, is_integer(config[name], 1), "an integer of at least 1"
-    yield "seed", is_integer(config["seed"], -(2**63)), "an integer"
-    yield "noise_scale", is_number(noise) and noise >= 0, "a number of at least 0"
-    yield "stop_at_success", isinstance(config["stop_at_success"], bool), "true or false"
-
-
-def _episode_rules(episode: EpisodeResult, tasks: Container[str], max_steps: int) -> Rules:
-    success, first, end = episode.success, episode.first_success, episode.success_at_end
-    yield "task", isinstance(episode.task, str) and episode.task in tasks, "in config"
-    yield "episode", is_integer(episode.episode, 0), "an integer of at least 0"
-    yield "success", isinstance(success, bool), "true or false"
-    if success:
-        yield "first_success", is_integer(first, 1, max_steps), f"a step from 1 to {max_steps}"
-    else:
-        yield "first_success", first is None, "null without success"
-    yield "success_at_end", end is None or isinstance(end, bool), "true, false or null"
-    yield "success_at_end", success or not end, "false without success"
-    yield "episode_return", episode.episode_return is None or is_number(episode.episode_return), "a number or null"
+        check_int(f"config: {name}", config[name], minimum=1)
+    check_int("config: seed", config["seed"])
+    check_scale("config: noise_scale", config["noise_scale"])
+    check_flag("config: stop_at_success", config["stop_at_success"])
 
 
 def _read_episodes(stated: Any, config: dict[str, Any]) -> tuple[EpisodeResult, ...]:
     """The episodes of a file, as many of each task as its configuration says, all different."""
-    count, wanted = dict.fromkeys(config["tasks"], 0), config["episodes_per_task"]
-    found = read_records("episodes", stated, EpisodeResult, lambda one: _episode_rules(one, count, config["max_steps"]))
+    count, wanted, max_steps = dict.fromkeys(config["tasks"], 0), config["episodes_per_task"], config["max_steps"]
+
+    def faults(one: EpisodeResult) -> Iterator[str]:
+        if one.task not in count:
+            yield "task must be in config"
+        if one.success != (one.first_success is not None) or (one.first_success or 0) > max_steps:
+            yield f"first_success must be a step up to {max_steps}, or null without success"
+        if one.success_at_end and not one.success:
+            yield "success_at_end must be false without success"
+        if not (one.episode_return is None or is_number(one.episode_return)):
+            yield "episode_return must be a number or null"
+
+    found = read_records("episodes", stated, EpisodeResult, faults)
     for task, _ in {(one.task, one.episode) for one in found}:
         count[task] += 1
     if len(found) != sum(count.values()) or set(count.values()) != {wanted}:

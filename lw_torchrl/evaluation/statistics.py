@@ -81,7 +81,12 @@ def interquartile_mean(rates: ArrayLike, *, confidence: float = 0.95) -> Estimat
 
     Source: Agarwal et al. 2021; the same as ``scipy.stats.trim_mean(rates, 0.25, axis=None)``.
     """
-    return _seed_interval(_interquartile_mean, [check_rates("rates", rates)], confidence, least=0.0)
+
+    def middle(rates: Array) -> float:
+        cut = rates.size // 4
+        return np.sort(rates, axis=None)[cut : rates.size - cut].mean()
+
+    return _seed_interval(middle, [check_rates("rates", rates)], confidence, least=0.0)
 
 
 @checked
@@ -107,9 +112,8 @@ def probability_of_improvement(x: ArrayLike, y: ArrayLike, *, confidence: float 
 
     Source: Agarwal et al. 2021; the Mann-Whitney statistic of each task, averaged.
     """
-    return _seed_interval(
-        lambda a, b: ((a[:, None] > b) + 0.5 * (a[:, None] == b)).mean(), _pair(x, y), confidence, least=0.0
-    )
+    beats = _pair(x, y)
+    return _seed_interval(lambda a, b: (0.5 + 0.5 * np.sign(a[:, None] - b)).mean(), beats, confidence, least=0.0)
 
 
 @checked
@@ -134,12 +138,6 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
     return max(0.0, center - half), min(1.0, center + half)
 
 
-def _interquartile_mean(rates: Array) -> float:
-    flat = np.sort(rates, axis=None)
-    cut = len(flat) // 4
-    return flat[cut : len(flat) - cut].mean()
-
-
 def _pair(x: ArrayLike, y: ArrayLike) -> list[Array]:
     pair = [check_rates("x", x), check_rates("y", y)]
     if pair[0].shape[1] != pair[1].shape[1]:
@@ -158,17 +156,14 @@ def _seed_interval(
     value = float(statistic(*methods))
     if min(len(rates) for rates in methods) == 1:
         return Estimate(value)  # one seed says nothing of another
-    variances = np.array([_jackknife(statistic, methods, number) for number in range(len(methods))])
+    variances = np.zeros(len(methods))  # over the seeds of each method: each is left out once
+    for k, rates in enumerate(methods):
+        without = [np.delete(rates, seed, axis=0) for seed in range(len(rates))]
+        left = [statistic(*methods[:k], others, *methods[k + 1 :]) for others in without]
+        variances[k] = np.var(left) * (len(rates) - 1)
     if not variances.any():
         return Estimate(value, value, value)
     shares = variances / variances.max()  # their squares may be too small for a float
     freedom = shares.sum() ** 2 / sum(v**2 / (len(x) - 1) for v, x in zip(shares, methods, strict=True))
     half = float(stdtrit(freedom, (1 + confidence) / 2) * np.sqrt(variances.sum()))
     return Estimate(value, max(value - half, least), min(value + half, most))
-
-
-def _jackknife(statistic: Callable[..., Any], methods: list[Array], number: int) -> float:
-    """The variance of the statistic over the seeds of one method: each is left out once."""
-    before, rates, after = methods[:number], methods[number], methods[number + 1 :]
-    left = [statistic(*before, np.delete(rates, seed, axis=0), *after) for seed in range(len(rates))]
-    return float(np.var(left) * (len(rates) - 1))

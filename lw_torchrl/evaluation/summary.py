@@ -89,10 +89,8 @@ class Summary:
         columns = dict(beside or {})
         head = "".join(f" {f'({k + 1})':>6}" for k in range(len(columns)))
         solved = f"{self.solved} of {len(self.tasks)} tasks >= {self.threshold:g}"
-        lines = [
-            f"mean {self.mean}, IQM {self.iqm}; {solved}; {counted(len(self.seeds), 'seed')}",
-            f"{'task':28} {'mean':>6} {'min':>6} {'max':>6}{head}",
-        ]
+        lines = [f"mean {self.mean}, IQM {self.iqm}; {solved}; {counted(len(self.seeds), 'seed')}"]
+        lines.append(f"{'task':28} {'mean':>6} {'min':>6} {'max':>6}{head}")
         seeds = self.by_seed.values()
         total = TaskSummary(self.mean.value, min(seeds), max(seeds))
         for name, found in [*self.per_task.items(), ("mean", total)]:
@@ -263,10 +261,8 @@ class MethodComparison:
             solved = sum(rates[task] >= self.threshold - 1e-9 for task in self.tasks)
             last = [f"{_mean(rates, outside):.3f}"] if outside else []
             rows.append([label, f"{_mean(rates, self.tasks):.3f}", "", str(solved), "", *last])
-        lines = [
-            f"{pair.methods[0]} - {pair.methods[1]}: {pair.difference}; probability of improvement {pair.improvement}"
-            for pair in self.pairs
-        ]
+        more = "probability of improvement"
+        lines = [f"{' - '.join(pair.methods)}: {pair.difference}; {more} {pair.improvement}" for pair in self.pairs]
         return "\n\n".join(filter(None, [markdown_table(head, rows), "  \n".join(lines)]))
 
     def per_task(self) -> str:

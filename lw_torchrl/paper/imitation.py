@@ -181,7 +181,11 @@ class ImitationRun(Run):
         for number, member in enumerate(preset.members):
             first = 1_000 * self.seed + len(targets) * number if targets else self.seed + 1_000 * number
             config = replace(preset.training, steps=steps, seed=first)
-            actors = [self._make_actor(member, work, first + i) for i in range(len(targets) or 1)]
+            actors = []
+            for i in range(len(targets) or 1):
+                torch.manual_seed(first + i)
+                given = self.actor_options(member)
+                actors.append(make_policy(self.method, work.plans, text_encoder=work.text_encoder, **given))
             checkpoint = work.out / self.folder / f"checkpoint-{number}.zip"
             options: dict[str, Any] = {"checkpoint": checkpoint, "progress": work.progress, "device": work.device}
             trainer: BehavioralCloningTrainer | StackedBehavioralCloning
@@ -206,10 +210,6 @@ class ImitationRun(Run):
             trainer.train()
             members.append(actors)
         return members, replays
-
-    def _make_actor(self, member: Member, work: Work, seed: int) -> Policy:
-        torch.manual_seed(seed)
-        return make_policy(self.method, work.plans, text_encoder=work.text_encoder, **self.actor_options(member))
 
     def _replay(
         self, member: Member, work: Work, actor: Policy, roots: Any, sampler: Any, **options: Any

@@ -21,16 +21,8 @@ from lw_torchrl.language.plans import Plans
 from lw_torchrl.modules import DescriptorEncoder, PlanEncoder, QValue, Value
 from lw_torchrl.modules.policy import METHODS, Encoder, Policy, make_policy
 from lw_torchrl.objectives import AdvantageWeightedLoss, ExpectileValueLoss, standardize_by_task
-from lw_torchrl.paper.offline_recipes import (
-    MIXTURES,
-    NOISE,
-    OFFLINE_METHODS,
-    TASK_SETS,
-    OfflineMethod,
-    OfflineRecipe,
-    OfflineTable,
-    Portion,
-)
+from lw_torchrl.paper import recipes
+from lw_torchrl.paper.recipes import OfflineMethod, OfflineRecipe, OfflineTable, Portion
 from lw_torchrl.paper.runs import Dataset, Run, Work, compare, kept_policy, own_tasks, plain, write_summary
 from lw_torchrl.training import OfflineConfig, OfflineTrainer
 from lw_torchrl.training.behavioral_cloning import bc_loss
@@ -61,8 +53,8 @@ class BehaviourDataset(Dataset):
     def options(self) -> dict[str, Any]:
         behaviour = self.portion.behaviour
         seed = _SEEDS * list(BEHAVIOURS).index(behaviour) + self.seed
-        found = {"tasks": TASK_SETS[self.tasks], "episodes_per_task": self.portion.episodes, "policy": behaviour}
-        return {**found, "seed": seed, "max_steps": self.max_steps, **NOISE[behaviour]}
+        found = {"tasks": recipes.TASK_SETS[self.tasks], "policy": behaviour, "max_steps": self.max_steps}
+        return {**found, "episodes_per_task": self.portion.episodes, "seed": seed, **recipes.NOISE[behaviour]}
 
 
 @dataclass(frozen=True)
@@ -76,8 +68,8 @@ class _Learned:
     max_steps: int = 500  # of an episode
 
     def __post_init__(self) -> None:
-        check_choice("tasks", self.tasks, TASK_SETS)
-        check_choice("mixture", self.mixture, MIXTURES)
+        check_choice("tasks", self.tasks, recipes.TASK_SETS)
+        check_choice("mixture", self.mixture, recipes.MIXTURES)
         if not 0 <= self.seed < 100:
             raise ValueError(f"seed must be from 0 to 99, got {self.seed}")
 
@@ -88,14 +80,15 @@ class _Learned:
 
     @property
     def datasets(self) -> tuple[BehaviourDataset, ...]:
-        return tuple(BehaviourDataset(self.tasks, one, self.seed, self.max_steps) for one in MIXTURES[self.mixture])
+        portions = recipes.MIXTURES[self.mixture]
+        return tuple(BehaviourDataset(self.tasks, one, self.seed, self.max_steps) for one in portions)
 
     def own_plans(self, plans: Plans) -> Plans:
-        return Plans([plans[task] for task in TASK_SETS[self.tasks]])
+        return Plans([plans[task] for task in recipes.TASK_SETS[self.tasks]])
 
     def describe(self, plans: Plans) -> dict[str, Any]:
         """Everything that it depends on, as JSON."""
-        data = [asdict(dataset.portion) | NOISE[dataset.portion.behaviour] for dataset in self.datasets]
+        data = [asdict(dataset.portion) | recipes.NOISE[dataset.portion.behaviour] for dataset in self.datasets]
         own = self.own_plans(plans)
         return plain(asdict(self) | {"plans": own.fingerprint, "data": data} | own_tasks(own))
 
@@ -171,13 +164,13 @@ class OfflineRun(_Learned, Run):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_choice("method", self.method, OFFLINE_METHODS)
+        check_choice("method", self.method, recipes.OFFLINE_METHODS)
         for name in ("actor", "critic"):
             check_choice(name, getattr(self, name), METHODS)
 
     @property
     def how(self) -> OfflineMethod:
-        return OFFLINE_METHODS[self.method]
+        return recipes.OFFLINE_METHODS[self.method]
 
     @property
     def label(self) -> str:
@@ -191,7 +184,7 @@ class OfflineRun(_Learned, Run):
 
     @property
     def scope(self) -> tuple[str, ...]:
-        return TASK_SETS[self.tasks]
+        return recipes.TASK_SETS[self.tasks]
 
     @property
     def advantages(self) -> Advantages | None:
@@ -236,10 +229,7 @@ def _encoder(condition: str, plans: Plans, noise: float = 0.0) -> Encoder:
     return DescriptorEncoder(tuple(plans), feature_noise=noise, **METHODS[condition].options)
 
 
-DISTRIBUTIONS: Mapping[str, str | None] = dict.fromkeys(("advantage", "bc", "td3-bc")) | {
-    "iql": "normal",
-    "cql": "tanh_normal",
-}
+DISTRIBUTIONS = {"advantage": None, "bc": None, "td3-bc": None, "iql": "normal", "cql": "tanh_normal"}
 """By name: the distribution that the loss wants of its actor."""
 
 
@@ -280,10 +270,8 @@ def write_table(
     name: str, runs: Sequence[OfflineRun], results: Mapping[OfflineRun, EvaluationResult], out: Path
 ) -> str:
     """Write a table's Markdown, numbers and figure to ``out``; returns its head, to print."""
-    compared = {
-        mixture: compare((run, results[run]) for run in runs if run.mixture == mixture)
-        for mixture in dict.fromkeys(run.mixture for run in runs)
-    }
+    mixtures = dict.fromkeys(run.mixture for run in runs)
+    compared = {one: compare((run, results[run]) for run in runs if run.mixture == one) for one in mixtures}
     rows = []
     for label in dict.fromkeys(run.label for run in runs):
         means = [str(one.summaries[label].mean) if label in one.summaries else "" for one in compared.values()]
@@ -292,7 +280,7 @@ def write_table(
     about = "Brackets are 95 % intervals, Student's t over seeds."
     parts = [f"# {name}: {runs[0].tasks} tasks, mean success", head, about]
     for mixture, one in compared.items():
-        portions = ", ".join(f"{part.episodes} {part.behaviour}" for part in MIXTURES[mixture])
+        portions = ", ".join(f"{part.episodes} {part.behaviour}" for part in recipes.MIXTURES[mixture])
         parts += [f"## {mixture}: of each task {portions}", one.headline(), one.per_task()]
     numbers = {mixture: one.to_json() for mixture, one in compared.items()}
     write_summary(out / name, "\n\n".join(parts) + "\n", numbers)

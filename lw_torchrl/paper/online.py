@@ -4,20 +4,19 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from hashlib import file_digest
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from lw_torchrl._checks import check_choice, check_int
+from lw_torchrl._checks import Count, check_choice, check_fields, check_int
 from lw_torchrl._files import held
 from lw_torchrl.data import CoLearningSampler, LanguageWorldExperienceReplay
 from lw_torchrl.data.co_learning_sampler import GROWN
 from lw_torchrl.data.rewards import RewardName
-from lw_torchrl.envs.episodes import FinishedEpisode
+from lw_torchrl.envs.episodes import FinishedEpisode, policy_of
 from lw_torchrl.evaluation import EvaluationResult, PlanUse, evaluate, stuck_steps, weakest_step
-from lw_torchrl.evaluation.protocol import policy_of
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.modules.policy import METHODS, Policy, make_policy
 from lw_torchrl.modules.residual_actor import ResidualActor
@@ -28,14 +27,11 @@ from lw_torchrl.training import LEARNERS, BehavioralCloningConfig, BehavioralClo
 from lw_torchrl.training.algorithms import ResidualConfig, method_config
 from lw_torchrl.training.files import load_actor, read_description
 
-START = "start"
-"""The policy that is begun with: a run beside those of :data:`~lw_torchrl.training.LEARNERS`."""
-WEAKEST = "weakest"
-"""The step that failed episodes came to and not beyond."""
+START = "start"  # the policy that is begun with: a run beside those of :data:`~lw_torchrl.training.LEARNERS`
+WEAKEST = "weakest"  # the step that failed episodes came to and not beyond
 ONLINE_SEED = 20_000
 """The training episodes of seed k have seed 20000 + k, which no demonstration and no evaluation has."""
-DIAGNOSIS_SEED = 30_000
-"""Those in which a policy's weakest step is looked for."""
+DIAGNOSIS_SEED = 30_000  # of the episodes in which a policy's weakest step is looked for
 _DIAGNOSED = 20  # episodes
 
 
@@ -43,15 +39,15 @@ _DIAGNOSED = 20  # episodes
 class OnlineRecipe:
     """How weak policies are made and improved, the same for every task; the configurations get the run's seed."""
 
-    demonstrations: int = 1  # of the task, without noise, all successful
+    demonstrations: Count = 1  # of the task, without noise, all successful
     feature_noise: float = 0.1  # of the policy cloned from them
     cloning: BehavioralCloningConfig = field(default_factory=lambda: BehavioralCloningConfig(1_500, 200))
     reward: RewardName = "dense_cost"  # of the buffer
-    n_steps: int = 5  # of the buffer
+    n_steps: Count = 5  # of the buffer
     config: OnlineConfig = field(default_factory=OnlineConfig)  # of the training: of all methods, or the run's own
 
     def __post_init__(self) -> None:
-        check_int("demonstrations", self.demonstrations, minimum=1)
+        check_fields(self)
 
 
 @dataclass(frozen=True)
@@ -97,18 +93,13 @@ class OnlineRun(Run):
         return Path(self.condition if self.start is None else f"from-{self.start.stem}")
 
     @property
-    def label(self) -> str:
-        return self.method
-
-    @property
     def scope(self) -> tuple[str, ...]:
         return (self.task,)
 
     @property
     def folder(self) -> Path:
         step = f"step{self.step + 1}" if isinstance(self.step, int) else self.step
-        method = self.method if step is None else f"{self.method}-{step}"
-        return self.group / self.task / method / f"seed{self.seed}"
+        return self.group / self.task / "-".join(filter(None, (self.method, step))) / f"seed{self.seed}"
 
     @property
     def datasets(self) -> tuple[ExpertDataset, ...]:
@@ -120,10 +111,7 @@ class OnlineRun(Run):
 
     @cached_property
     def _start_digest(self) -> str | None:
-        if self.start is None:
-            return None
-        with open(self.start, "rb") as file:
-            return file_digest(file, "sha256").hexdigest()
+        return None if self.start is None else sha256(self.start.read_bytes()).hexdigest()
 
     def own_plans(self, plans: Plans) -> Plans:
         return Plans([plans[self.task]])

@@ -1,15 +1,20 @@
-"""The paper's experiments as frozen configurations: what data each may see, and how presets make and use it."""
+"""The experiments as frozen configurations, the paper's and the offline ones, as the tables in data/ have them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
+from itertools import product
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Literal
 
+from lw_torchrl._checks import Count, Probability, Scale, check_fields
 from lw_torchrl._files import read_toml
+from lw_torchrl.data import BEHAVIOURS, EpisodeFilter
+from lw_torchrl.data.rewards import RewardName
 from lw_torchrl.data.selection import Label
+from lw_torchrl.language.tasks import MT10
 from lw_torchrl.training.behavioral_cloning import BehavioralCloningConfig
 
 
@@ -84,9 +89,7 @@ def _preset(name: str, every: Mapping[str, Any], own: Mapping[str, Any]) -> Pres
 
 
 _TABLE = read_toml(files("lw_torchrl.paper") / "data" / "recipes.toml", ValueError)
-SETTINGS: Mapping[str, DataSetting] = MappingProxyType(
-    {name: DataSetting(name, **setting) for name, setting in _TABLE["settings"].items()}
-)
+SETTINGS = MappingProxyType({name: DataSetting(name, **setting) for name, setting in _TABLE["settings"].items()})
 EXECUTIONS = {name: Execution(name, **_tuples(execution)) for name, execution in _TABLE["executions"].items()}
 TARGET = EXECUTIONS["target"]
 _MEMBERS = {name: Member(**member) for name, member in _TABLE["members"].items()}
@@ -97,3 +100,79 @@ PRESETS: Mapping[str, Mapping[str, Preset]] = MappingProxyType(
     }
 )
 """Preset's name, then setting's name, to :class:`Preset`."""
+
+
+@dataclass(frozen=True)
+class Portion:
+    """Episodes of one behaviour."""
+
+    behaviour: str  # a name of :data:`BEHAVIOURS`
+    episodes: int  # of each task
+
+
+@dataclass(frozen=True)
+class OfflineMethod:
+    """How a policy is learned from a mixture."""
+
+    name: str  # in folders and tables
+    loss: str  # a name of :data:`lw_torchrl.paper.offline.DISTRIBUTIONS`
+    keep: EpisodeFilter | None = None  # which episodes it sees; None for all
+    critic: bool = False  # whether it has a critic, which may be conditioned otherwise than the actor
+    version: int = 1  # raised by 1 whenever the method changes, so that earlier results are refused
+
+
+@dataclass(frozen=True)
+class OfflineRecipe:
+    """The numbers of all methods."""
+
+    reward: RewardName = "dense_cost"  # what values are of
+    n_steps: Count = 10  # of the values' targets
+    gamma: Probability = 0.99  # of these
+    expectile: Probability = 0.7  # of the value
+    beta: Scale = 2.0  # of the weights by advantage, as for :class:`AdvantageWeightedLoss`
+    max_weight: Scale = 20.0  # of these
+    distance: Literal["l1", "l2"] = "l1"  # to what is imitated; the mean of open and close would half open the gripper
+    temperature: Scale = 3.0  # of IQL's actor
+    alpha: Scale = 2.5  # of TD3+BC, the weight of the value beside the imitation
+    cql_weight: Scale = 1.0  # of CQL's penalty
+    steps: Count = 4000  # minibatches of every actor; of the value, ``value_steps``
+    value_steps: Count = 4000
+    batch_size: Count = 250  # rows of one
+    width: Count = 256  # of hidden layers
+    depth: Count = 3  # of actors
+    critic_depth: Count = 2
+    feature_noise: Scale = 0.05  # of actors while they train
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+
+@dataclass(frozen=True)
+class OfflineTable:
+    """Runs that are compared: the first row of a mixture with each of the others."""
+
+    tasks: str  # a name of :data:`TASK_SETS`
+    rows: Mapping[str, tuple[tuple[str, str, str], ...]]  # mixture to its rows, (method, actor, critic) each
+
+
+def _table(tasks: str, runs: Sequence[Mapping[str, Any]]) -> OfflineTable:
+    rows: dict[str, tuple[tuple[str, str, str], ...]] = {}
+    for block in runs:
+        own = tuple(product(block["methods"], block.get("actors", ["pcbc"]), block.get("critics", ["pcbc"])))
+        rows |= {mixture: rows.get(mixture, ()) + own for mixture in block["mixtures"]}
+    return OfflineTable(tasks, rows)
+
+
+_TABLES = read_toml(files("lw_torchrl.paper") / "data" / "offline.toml", ValueError)
+TASK_SETS = MappingProxyType({"MT10": MT10} | {name: tuple(tasks) for name, tasks in _TABLES["task_sets"].items()})
+MIXTURES: Mapping[str, tuple[Portion, ...]] = MappingProxyType(
+    {name: tuple(Portion(*portion) for portion in mixture.items()) for name, mixture in _TABLES["mixtures"].items()}
+)
+NOISE: Mapping[str, dict[str, Any]] = {one: _TABLES["noise"].get(one, _TABLES["noise"]["others"]) for one in BEHAVIOURS}
+OFFLINE_METHODS: Mapping[str, OfflineMethod] = MappingProxyType(
+    {
+        name: OfflineMethod(name, **given | ({"keep": EpisodeFilter(**given["keep"])} if "keep" in given else {}))
+        for name, given in _TABLES["methods"].items()
+    }
+)
+OFFLINE_TABLES = MappingProxyType({name: _table(**given) for name, given in _TABLES["tables"].items()})

@@ -27,8 +27,7 @@ from lw_torchrl.training import load_actor, save_actor
 from lw_torchrl.training.envelope import check_description
 from lw_torchrl.training.files import describe_data
 
-EVALUATION_SEED = 10_000
-"""Training seeds count from 0; the evaluation of training seed k has seed 10000 + k."""
+EVALUATION_SEED = 10_000  # training seeds count from 0; the evaluation of training seed k has seed 10000 + k
 RESULTS = "results.json"
 
 
@@ -181,10 +180,8 @@ def execute_run(
     if work.device.type != "cpu" and not run.any_device:
         raise ValueError(f"device must be the CPU for {type(run).__name__}, got {device}")
     if (text_encoder is None) != (not run.encoder_name):
-        raise ValueError(
-            f"text_encoder must be given where the run has an encoder_name, which tells its folder from others, and "
-            f"only there; it has {run.encoder_name!r}"
-        )
+        named = f"the run has an encoder_name, and only there; it has {run.encoder_name!r}"
+        raise ValueError(f"text_encoder must be given where {named}")
     if (done := load_result(run, plans, out, work.tasks)) is not None:
         return done
     with held(out / run.folder, "out", folder=True, wait=True):
@@ -229,10 +226,8 @@ def compare(
     found: dict[str, dict[int, list[EvaluationResult]]] = {}
     for run, result in results:
         found.setdefault(run.label, {}).setdefault(run.seed, []).append(result)
-    return MethodComparison(
-        {label: summarize({seed: joined(of) for seed, of in seeds.items()}) for label, seeds in found.items()},
-        published or {},
-    )
+    each = {label: summarize({seed: joined(of) for seed, of in seeds.items()}) for label, seeds in found.items()}
+    return MethodComparison(each, published)
 
 
 def write_summary(path: Path, text: str, numbers: Mapping[str, Any]) -> None:

@@ -3,10 +3,9 @@
 How answers fare needs the simulator: :mod:`~lw_torchrl.planners.checking`, :mod:`~lw_torchrl.planners.comparing`.
 """
 
-from lw_torchrl.planners.answer_files import answer_path, folder_name, write_answer
+from lw_torchrl.planners.answer_files import FilePlanner, Planner, answer_path, folder_name, write_answer
 from lw_torchrl.planners.answers import Answer, Answers, PlannerError, Tokens
 from lw_torchrl.planners.openai_planner import OpenAIPlanner
-from lw_torchrl.planners.planner import FilePlanner, Planner
 from lw_torchrl.planners.prompts import plan_prompt, plan_schema, prompt_examples
 
 __all__ = [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeGuard
@@ -34,8 +35,7 @@ class PlannerError(RuntimeError):
 
 def unanswered(errors: Sequence[Exception], came: int, total: int, folder: Path) -> Exception:
     """The error for questions without an answer, or the first that is no :class:`PlannerError`, as it is."""
-    first = next((error for error in errors if not isinstance(error, PlannerError)), errors[0])
-    if not isinstance(first, PlannerError):
+    if not isinstance(first := min(errors, key=lambda error: isinstance(error, PlannerError)), PlannerError):
         return first
     others = f" So did {counted(len(errors) - 1, 'other question')}." if len(errors) > 1 else ""
     kept = f"{came} of {counted(total, 'answer')} are kept in {str(folder)!r}; the same again asks the rest"
@@ -133,10 +133,9 @@ def read_reply(
     elif not raw.strip():
         notes.append("it is empty")
     elif schema and reply.finish != "length":
-        try:
+        kept = False
+        with suppress(ValueError, RecursionError):
             kept = passes(json.loads(raw), schema)
-        except (ValueError, RecursionError):
-            kept = False
         notes += [] if kept else ["the server did not keep to the schema"]
     notes += reply.notes
     return Answer(task.name, format, attempt, storable(text), raw, decoded, reply.tokens, notes=tuple(notes))

@@ -14,8 +14,7 @@ from urllib.parse import parse_qsl, unquote, urlsplit
 
 from lw_torchrl._checks import counted, shown
 from lw_torchrl.planners.answers import PlannerError, Reply
-from lw_torchrl.planners.chat_reply import NoCompletion, bounded_client, in_a_line, read_completion
-from lw_torchrl.planners.redaction import Redactor
+from lw_torchrl.planners.chat_reply import NoCompletion, Redactor, bounded_client, in_a_line, read_completion
 
 OPENAI = "https://api.openai.com/v1"
 _KEY = "OPENAI_API_KEY"

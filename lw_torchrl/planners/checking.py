@@ -41,8 +41,7 @@ class PlanCheck:
             return "\n".join([f"{self.task}: no plan: {self.decoded.reason}", *map(str, self.decoded.notes)])
         assert self.expert is not None
         lines = [f"{self.task}, {len(self.decoded.plan.steps)} steps"]
-        kept = [step for step in self.decoded.steps if not step.dropped]
-        for k, step in enumerate(kept):
+        for k, step in enumerate(step for step in self.decoded.steps if not step.dropped):
             own = "" if self.own is None else f", {self.own.true[k]:.0%} of its own; acts in {self.own.chosen[k]:.0%}"
             lines += [
                 f"{k + 1}  when {step.condition}{_said(step.written_condition, step.condition_distance)}",

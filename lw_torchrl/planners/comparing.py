@@ -50,11 +50,14 @@ class PlanComparison:
     def __init__(self, answers: Sequence[ComparedAnswer], settings: Mapping[str, Any]) -> None:
         self.answers = tuple(sorted(answers, key=lambda one: (one.model, one.format, one.task, one.attempt)))
         self.settings = dict(settings)
+        self._found: dict[Group, dict[str, list[ComparedAnswer]]] = {}
+        for one in self.answers:
+            self._found.setdefault((one.model, one.format), {}).setdefault(one.task, []).append(one)
 
     @property
     def groups(self) -> tuple[Group, ...]:
         """(model, format) of the answers."""
-        return tuple(dict.fromkeys((one.model, one.format) for one in self.answers))
+        return tuple(self._found)
 
     @property
     def models(self) -> tuple[str, ...]:
@@ -62,14 +65,7 @@ class PlanComparison:
 
     def rates(self, model: str, format: str) -> dict[str, list[float]]:
         """Task to the success rate of each of its answers."""
-        return {task: [one.rate for one in found] for task, found in self._by_task(model, format).items()}
-
-    def _by_task(self, model: str, format: str) -> dict[str, list[ComparedAnswer]]:
-        found: dict[str, list[ComparedAnswer]] = {}
-        for one in self.answers:
-            if (one.model, one.format) == (model, format):
-                found.setdefault(one.task, []).append(one)
-        return found
+        return {task: [one.rate for one in found] for task, found in self._found.get((model, format), {}).items()}
 
     def mean(self, model: str, format: str) -> float:
         """The mean success rate, of each task over its answers, then over tasks."""
@@ -81,13 +77,13 @@ class PlanComparison:
 
     def best_of(self, model: str, format: str) -> float:
         """The mean over tasks of the odd episodes' success of the answer best in the even ones; NaN of one episode."""
-        listed = self._by_task(model, format).values()
+        listed = self._found[model, format].values()
         chosen = [max(found, key=lambda one: _mean(one.success[::2])) for found in listed]
         return _mean([_mean(one.success[1::2]) for one in chosen])
 
     def best_plans(self, model: str, format: str) -> dict[str, ConditionalPlan]:
         """The plan of each task that succeeded most often, of equals the first."""
-        listed = self._by_task(model, format).values()
+        listed = self._found[model, format].values()
         best = [max(found, key=lambda one: (one.plan is not None, one.rate)) for found in listed]
         return {one.task: one.plan for one in best if one.plan is not None}
 
@@ -96,8 +92,8 @@ class PlanComparison:
         rows = []
         for model, format in self.groups:
             rates = self.rates(model, format)
-            found = [one for listed in self._by_task(model, format).values() for one in listed]
             success = str(mean_rate([[_mean(one)] for one in rates.values()]))
+            found = [one for one in self.answers if (one.model, one.format) == (model, format)]
             counts = map(str, (len(rates), len(found), sum(bool(one.steps) for one in found)))
             rows.append([model, format, *counts, success, f"{self.best_of(model, format):.3f}"])
         head = ["model", "format", "tasks", "answers", "with a plan that runs", "success", "best answer of a task"]

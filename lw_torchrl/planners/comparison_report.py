@@ -82,9 +82,8 @@ def _draw(
     if not common:
         file.unlink(missing_ok=True)
         return
-    curves = {name: {task: found[task] for task in sorted(common)} for name, found in rates.items()}
-    least = min(len(one) for found in curves.values() for one in found.values())
-    even = {name: {task: one[:least] for task, one in found.items()} for name, found in curves.items()}
+    least = min(len(found[task]) for found in rates.values() for task in common)
+    even = {name: {task: found[task][:least] for task in sorted(common)} for name, found in rates.items()}
     published = {}
     for model, format in groups:
         with suppress(ValueError):  # the paper has no such group

@@ -51,8 +51,8 @@ def read_request(body: bytes, model: str, context: int) -> bytes:
     asked = request.get("response_format") or {}
     if asked.get("type") == "json_schema":
         request["response_format"] = {"type": "json_object", "schema": asked["json_schema"]["schema"]}
-    given = {name: value for name, value in request.items() if value is not None}
     try:
+        given = {name: value for name, value in request.items() if value is not None}
         return json.dumps(given, ensure_ascii=False).encode()
     except UnicodeEncodeError:
         raise Refused(400, "the body has half of a surrogate pair, which UTF-8 cannot hold") from None

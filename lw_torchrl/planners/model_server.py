@@ -8,7 +8,7 @@ from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
 
-from lw_torchrl._checks import check_int, unknown_name
+from lw_torchrl._checks import Count, Natural, check_int, checked, unknown_name
 from lw_torchrl.planners.guard import Guard, run_server
 
 INSTALL = (
@@ -29,13 +29,14 @@ def _small_folder() -> Path | None:
     return Path(package.origin).parent if package and package.origin else None
 
 
+@checked
 def serve_model(
     model: str | os.PathLike[str] | None = None,
     *,
     host: str = LOCAL,
-    port: int = 8000,
+    port: Natural = 8000,
     context: int = 8192,
-    threads: int | None = None,
+    threads: Count | None = None,
     ready: Callable[[str, str], None] = lambda name, address: None,
 ) -> None:
     """Serve a language model until Ctrl-C, one question at a time.
@@ -59,10 +60,7 @@ def serve_model(
     Example:
         >>> serve_model("Llama-3.2-3B-Instruct-Q4_K_M.gguf", port=8001)  # doctest: +SKIP
     """
-    check_int("port", port, minimum=0)
     check_int("context", context, minimum=512)
-    if threads is not None:
-        check_int("threads", threads, minimum=1)
     file = model_file(model)
     try:
         from llama_cpp.server.app import create_app

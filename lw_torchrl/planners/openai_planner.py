@@ -10,20 +10,13 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, Literal
 
-from lw_torchrl._checks import check_choice, check_int, check_positive, check_scale, checked, counted, shown
+from lw_torchrl._checks import Count, Natural, Positive, Scale, check_choice, check_int, checked, counted, shown
 from lw_torchrl._progress import Progress
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.skills import Skills
 from lw_torchrl.language.tasks import TASKS, Task, TaskList, Tasks, get_task, named_tasks
-from lw_torchrl.planners.answer_files import (
-    AnswerCache,
-    answer_path,
-    folder_name,
-    recorded_answer,
-    settle_folder,
-    write_answer,
-)
+from lw_torchrl.planners.answer_files import AnswerCache, folder_name, recorded_answer, settle_folder, write_answer
 from lw_torchrl.planners.answers import Answer, Answers, Reply, read_reply, storable, unanswered
 from lw_torchrl.planners.chat_server import ChatServer, Dialect, ask_at_once, server_address
 from lw_torchrl.planners.prompts import Question, chat_messages, example_plans, plan_schema, request_options
@@ -78,15 +71,15 @@ class OpenAIPlanner:
         skills: Skills | None = None,
         plans: Plans | Mapping[str, ConditionalPlan] | None = None,
         vocabulary: bool = False,
-        temperature: float | None = None,
-        max_tokens: int = 1024,
+        temperature: Scale | None = None,
+        max_tokens: Count = 1024,
         seed: int | None = None,
         options: Mapping[str, Any] | None = None,
         name: str | None = None,
         cache: str | os.PathLike[str] = "runs/answers",
-        concurrency: int = 4,
-        retries: int = 6,
-        timeout: float = 300.0,
+        concurrency: Count = 4,
+        retries: Natural = 6,
+        timeout: Positive = 300.0,
     ) -> None:
         if not model.strip():
             raise TypeError(f"model must be a model's name, got {shown(model)}")
@@ -98,15 +91,12 @@ class OpenAIPlanner:
         self.skills, self.vocabulary = skills, vocabulary
         self.examples = None if plans is None else as_plans(plans)
         self.address = server_address(base_url)
-        self.temperature = None if temperature is None else check_scale("temperature", temperature)
-        self.max_tokens = check_int("max_tokens", max_tokens, minimum=1)
-        self.seed = None if seed is None else check_int("seed", seed)
+        self.temperature = None if temperature is None else float(temperature)
+        self.max_tokens, self.seed = int(max_tokens), None if seed is None else int(seed)
         self.options = request_options(options)
         self.name = folder_name(name or (f"{model}-constrained" if constrain else model))
         self.cache = AnswerCache(cache)
-        self.concurrency = check_int("concurrency", concurrency, minimum=1)
-        self.retries = check_int("retries", retries, minimum=0)
-        self.timeout = check_positive("timeout", timeout)
+        self.concurrency, self.retries, self.timeout = int(concurrency), int(retries), float(timeout)
         self._dialect: Dialect | None = None
 
     def __repr__(self) -> str:
@@ -159,11 +149,8 @@ class OpenAIPlanner:
         """
         check_choice("format", format, PLAN_FORMATS)
         count = check_int("attempts", attempts, minimum=1)
-        questions = [
-            Question(task, attempt, self.request(task, format, attempt))
-            for task in named_tasks(tasks).values()
-            for attempt in range(count)
-        ]
+        each = [(task, attempt) for task in named_tasks(tasks).values() for attempt in range(count)]
+        questions = [Question(task, attempt, self.request(task, format, attempt)) for task, attempt in each]
         return self._answers(questions, format, self.name, out, progress, "taken" if recorded else "replaced")
 
     def revise(
@@ -196,8 +183,7 @@ class OpenAIPlanner:
         for answer, fact in zip(before, told, strict=True):
             task = get_task(answer.task, tasks)
             request = self.request(task, format, answer.attempt)
-            talk = {"assistant": answer.raw, "user": fact}
-            request["messages"] += [{"role": role, "content": content} for role, content in talk.items()]
+            request["messages"] += [{"role": "assistant", "content": answer.raw}, {"role": "user", "content": fact}]
             questions.append(Question(task, answer.attempt, request))
         name = f"{self.name}-round{check_int('round', round, minimum=1)}"
         return self._answers(questions, format, name, out, progress, "refused")
@@ -225,9 +211,8 @@ class OpenAIPlanner:
                     found.append(there)
                     continue
                 if there is not None and (reply is None or self._read(reply, question, format).text != there.text):
-                    path = str(answer_path(out, name, format, there.task, there.attempt))
-                    what = f"{path!r} is there already, the answer to another question; it is not replaced"
-                    raise ValueError(f"out: {what}: give the new ones another name (--name) or out")
+                    what = f"the answer to another question, {question}, is in {str(Path(out) / name)!r} already"
+                    raise ValueError(f"out: {what}; it is not replaced: give the new ones another name (--name) or out")
             if reply is None:
                 missing[str(question)] = question, note
             else:

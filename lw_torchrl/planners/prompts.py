@@ -44,8 +44,7 @@ def prompt_examples(
     Source: paper section 'Conditional Plan Generation'.
     """
     owner = get_task(task, tasks)
-    known = example_plans(plans)
-    others = [plan for name, plan in known.items() if name != owner.name]
+    others = [plan for name, plan in example_plans(plans).items() if name != owner.name]
     if not others:
         raise ValueError(f"plans must hold one of another task than {owner.name!r}, got none")
 

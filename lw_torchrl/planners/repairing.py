@@ -48,8 +48,8 @@ def plan_facts(check: PlanCheck, task: Task, notes: Sequence[str] = ()) -> str:
     unread = [f"The answer is too long: {note}." for note in notes if note == CUT_OFF]
     unread += [f"In the answer, {note}" for note in check.decoded.notes]
     if check.decoded.plan is None:
-        none = f"The answer was read, and no plan was found in it: {check.decoded.reason}."
-        return "\n".join([none, *unread, again])
+        reason = check.decoded.reason
+        return "\n".join([f"The answer was read, and no plan was found in it: {reason}.", *unread, again])
     lines = [f"The plan was carried out, and succeeded in {check.success:.0%} of episodes."]
     if check.own is None:
         lines = ["The plan was not carried out: the robot has no skill that is near one of its steps."]
@@ -70,17 +70,16 @@ def _distances(task: Task, failed: Iterable[Tensor]) -> list[str]:
     episodes = [task.published.positions(observation) for observation in failed]
     if not episodes:
         return []
-    names = list(task.published.object_names)
+    names = task.published.object_names
     moved = [name for name in names if any((one[name] - one[name][0]).norm(dim=-1).max() > 0.02 for one in episodes)]
     pairs = [(GRIPPER, name) for name in names if name != GRIPPER]
     pairs += [(a, b) for a in moved for b in names if GRIPPER not in (a, b) and b not in moved]
     lines = []
     for a, b in pairs:
         far = [(one[a] - one[b]).norm(dim=-1) for one in episodes]
-        least = torch.stack([distance.min() for distance in far]).median()
-        last = torch.stack([distance[-1] for distance in far]).median()
-        near = f"The {a} came within {100 * float(least):.0f} cm of the {b}"
-        lines.append(f"{near}, and ended {100 * float(last):.0f} cm from it.")
+        both = [distance.min() for distance in far], [distance[-1] for distance in far]
+        least, last = (100 * float(torch.stack(listed).median()) for listed in both)
+        lines.append(f"The {a} came within {least:.0f} cm of the {b}, and ended {last:.0f} cm from it.")
     return lines
 
 
@@ -132,8 +131,8 @@ def repair_plans(
         if not open_:
             break
         before = [found[k].answers[-1] for k in open_]
-        told = zip(open_, before, strict=True)
-        facts = [plan_facts(found[k].checks[-1], tasks[answer.task], answer.notes) for k, answer in told]
+        checks = [found[k].checks[-1] for k in open_]
+        facts = [plan_facts(one, tasks[of.task], of.notes) for one, of in zip(checks, before, strict=True)]
         came = planner.revise(before, facts, round=number, tasks=tasks, out=out, progress=progress)
         of = {(answer.task, answer.attempt): answer for answer in came}
         others = [of[answer.task, answer.attempt] for answer in before]

@@ -25,25 +25,13 @@ else:
     rr, rrb = _Later("rerun"), _Later("rerun.blueprint")
 
 EPISODE_TIMELINE, SECONDS_TIMELINE, METRIC_TIMELINE = "step", "time", "global_step"
-CONTROL_PERIOD = 0.0125
-"""Seconds between two actions in Meta-World: 5 simulation steps of 2.5 ms, hence 80 Hz."""
+CONTROL_PERIOD = 0.0125  # seconds between two actions in Meta-World: 5 simulation steps of 2.5 ms, hence 80 Hz
 
-Stream = Any
-"""A rerun RecordingStream."""
 Color = tuple[int, ...]
-BACKGROUND = (24, 27, 33)
 TRUE, FALSE = (70, 170, 105), (52, 56, 64)
 STEEL, GOLD, GREEN = (205, 210, 220), (255, 200, 60), (90, 220, 120)
-SERIES_COLORS: tuple[Color, ...] = (
-    (80, 170, 255),
-    (255, 150, 70),
-    (110, 215, 120),
-    (225, 110, 225),
-    (240, 215, 80),
-    (100, 215, 215),
-    (250, 110, 120),
-    (170, 150, 250),
-)
+_SERIES = ("50aaff", "ff9646", "6ed778", "e16ee1", "f0d750", "64d7d7", "fa6e78", "aa96fa")
+SERIES_COLORS: tuple[Color, ...] = tuple(tuple(bytes.fromhex(one)) for one in _SERIES)
 
 
 def step_color(step: int) -> Color:

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lw_torchrl.record.conventions import Stream, rr
+from lw_torchrl.record.conventions import rr
 
 MOST_CURVES = 64
 JPEG_QUALITY = 90
@@ -30,11 +30,8 @@ def numbers(name: str, value: Any) -> list[float]:
     if type(value) is float or type(value) is int:
         return [float(value)]
     try:
-        if value is None or isinstance(value, str):
-            raise TypeError
-        if isinstance(value, Tensor):
-            value = value.detach().cpu().to(torch.float64).numpy()
-        found = np.asarray(value, dtype=np.float64).ravel().tolist()
+        value = value.detach().cpu() if isinstance(value, Tensor) else value
+        found = torch.as_tensor(value, dtype=torch.float64).ravel().tolist()
     except (TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"value of {name!r} must be a number or several, got {value!r}") from error
     if not 1 <= len(found) <= MOST_CURVES:
@@ -51,16 +48,6 @@ def histogram(name: str, data: Any, bins: Any) -> Any:
     counts, edges = np.histogram(values, bins=bins)
     centers, widths = (edges[1:] + edges[:-1]) / 2, np.diff(edges)
     return rr.BarChart.columns(values=[counts.astype(np.int64)], abscissa=[centers], widths=[widths], color=[BARS])
-
-
-def check_video(name: str, video: Tensor) -> NDArray[np.uint8]:
-    """The frames T×H×W×C of a video T×C×H×W uint8, C = 1 or 3, that is not empty; else :class:`ValueError`."""
-    if video.ndim != 4 or video.shape[1] not in (1, 3) or not video.numel() or video.dtype != torch.uint8:
-        raise ValueError(
-            f"video {name!r} must be uint8 of shape T×C×H×W with C = 1 or 3, "
-            f"got {str(video.dtype).removeprefix('torch.')} of shape {'×'.join(map(str, video.shape))}"
-        )
-    return video.permute(0, 2, 3, 1).contiguous().numpy()
 
 
 def check_image(name: str, image: Any) -> NDArray[np.uint8]:
@@ -81,7 +68,7 @@ def check_image(name: str, image: Any) -> NDArray[np.uint8]:
     return pixels.contiguous().numpy()
 
 
-def send_images(stream: Stream, path: str, times: Any, images: Iterable[NDArray[np.uint8]]) -> None:
+def send_images(stream: Any, path: str, times: Any, images: Iterable[NDArray[np.uint8]]) -> None:
     """Add images H×W×C, each a JPEG at its time."""
     from PIL import Image
 
@@ -92,13 +79,6 @@ def send_images(stream: Stream, path: str, times: Any, images: Iterable[NDArray[
         jpegs.append(buffer.getvalue())
     stream.log(path, rr.EncodedImage.from_fields(media_type="image/jpeg"), static=True)
     stream.send_columns(path, times, rr.EncodedImage.columns(blob=jpegs))
-
-
-def send_hparams(stream: Stream, hparams: Mapping[str, str]) -> None:
-    """Show hyperparameters as a table, sorted by name."""
-    cells = [[text.replace("|", "\\|").replace("\n", " ") for text in pair] for pair in sorted(hparams.items())]
-    text = "\n".join(["| key | value |", "|---|---|", *(f"| {key} | {value} |" for key, value in cells)])
-    stream.log("hparams", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
 
 
 def flatten(cfg: Mapping[Any, Any], prefix: str = "") -> dict[str, str]:

@@ -12,13 +12,11 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl.record.conventions import Stream, entity_path, rr, time_columns
+from lw_torchrl.record.conventions import entity_path, rr, time_columns
 from lw_torchrl.suites.engine import RowModel
 
-SHOWN_GROUPS = (0, 1, 2)
-"""Meta-World keeps what only collides in group 4."""
-DEFAULT_RGBA = (0.5, 0.5, 0.5, 1.0)
-"""MuJoCo's colour of a geom that was given none: the material's counts."""
+SHOWN_GROUPS = (0, 1, 2)  # Meta-World keeps what only collides in group 4
+DEFAULT_RGBA = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's colour of a geom that was given none: the material's counts
 
 FINEST, COARSEST = 0.0015, 0.006
 CUBES_ALONG = 40.0
@@ -46,27 +44,26 @@ class ModelGeometry:
 
 def model_geometry(model: RowModel) -> ModelGeometry:
     """What is drawn of a model; prepared once for each XML file, in about half a second."""
-    found = _prepared.get(model.path)
-    if found is None:
-        found = _prepared[model.path] = _prepare(model.model)
-    return found
+    if model.path not in _prepared:
+        _prepared[model.path] = _prepare(model.model)
+    return _prepared[model.path]
 
 
-def log_model(stream: Stream, root: str, geometry: ModelGeometry) -> None:
+def log_model(stream: Any, root: str, geometry: ModelGeometry) -> None:
     """The geoms below ``root``, each under its body's name; they never change."""
     for body, part, archetypes in geometry.parts:
         stream.log(f"{root}{entity_path(body, part)}", *archetypes, static=True)
 
 
-def log_motion(stream: Stream, root: str, motion: Motion) -> None:
+def log_motion(stream: Any, root: str, motion: Motion) -> None:
     """The poses of the bodies below ``root``, row t at step t: static where a body never moves."""
     for body, name in model_geometry(motion.model).bodies.items():
         path = f"{root}{entity_path(name)}"
         place, turn = motion.position[:, body], motion.quaternion[:, body][:, [1, 2, 3, 0]]
         moved = (place[1:] != place[:-1]).any(axis=1) | (turn[1:] != turn[:-1]).any(axis=1)
         if not moved.any():
-            pose = rr.Transform3D(translation=place[0], quaternion=rr.Quaternion(xyzw=turn[0]))
-            stream.log(path, pose, static=True)
+            still = rr.Transform3D(translation=place[0], quaternion=rr.Quaternion(xyzw=turn[0]))
+            stream.log(path, still, static=True)
             continue
         steps = np.flatnonzero(np.concatenate([[True], moved]))
         columns = rr.Transform3D.columns(translation=place[steps], quaternion=turn[steps])

@@ -18,8 +18,7 @@ from lw_torchrl.language.skills import load_skills
 from lw_torchrl.language.tasks import Task
 from lw_torchrl.suites.suite import known_suite
 
-NOBODY = -1
-"""In the place of a step's number: no step is in force alone."""
+NOBODY = -1  # in the place of a step's number: no step is in force alone
 
 
 class PlanLike(Protocol):
@@ -154,13 +153,18 @@ class RecordedEpisode:
                 raise ValueError(f"rollout[{key!r}] must be bool, got {rollout.get(key).dtype}")
             return array[:, 0] if flat else array[:, : needed or None]
 
-        logits = optional("qaf_logits")
-        observation = column("observation", layout.size)
+        logits, observation = optional("qaf_logits"), column("observation", layout.size)
+        if not isinstance(objects, Mapping):
+            raise TypeError(f"objects must map names to T×3 positions, got {type(objects).__name__}")
+        if unnamed := [name for name in objects if not isinstance(name, str) or not name]:
+            raise TypeError(f"objects must be named by non-empty strings, got {unnamed[0]!r}")
+        places = {name: _array(value, f"objects[{name!r}]", (length, 3)) for name, value in objects.items()}
+        places.setdefault(GRIPPER, observation[:, layout.positions[0]])
         executed = ("next", "executed_action")
         return cls(
             observation=observation,
             action=column("action" if rollout.get(executed, None) is None else executed, layout.action_size),
-            objects=_positions(objects, observation, layout),
+            objects=places,
             qaf=optional("qaf", truth=True),
             believed=None if logits is None else logits > 0,
             skill_weights=optional("skill_weights"),
@@ -185,13 +189,3 @@ def _array(value: Any, label: str, shape: tuple[int | None, ...]) -> NDArray[Any
         row = int(np.argwhere(~np.isfinite(array))[0][0])
         raise ValueError(f"{label} must be finite, got {array[row].tolist()} in row {row}")
     return array
-
-
-def _positions(objects: Any, observation: NDArray[np.float32], layout: Layout) -> dict[str, NDArray[np.float32]]:
-    if not isinstance(objects, Mapping):
-        raise TypeError(f"objects must map names to T×3 positions, got {type(objects).__name__}")
-    for name in objects:
-        if not isinstance(name, str) or not name:
-            raise TypeError(f"objects must be named by non-empty strings, got {name!r}")
-    checked = {name: _array(value, f"objects[{name!r}]", (len(observation), 3)) for name, value in objects.items()}
-    return checked if GRIPPER in checked else checked | {GRIPPER: observation[:, layout.positions[0]]}

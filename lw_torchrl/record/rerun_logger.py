@@ -25,11 +25,10 @@ from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.plans import ConditionalPlan
 from lw_torchrl.record import metrics
 from lw_torchrl.record.conventions import CONTROL_PERIOD, METRIC_TIMELINE, entity_path, rr, time_columns
-from lw_torchrl.record.episode_page import send_page
 from lw_torchrl.record.metrics import check_name
 from lw_torchrl.record.mujoco_scene import Motion
 from lw_torchrl.record.recorded_episode import PlanLike, RecordedEpisode
-from lw_torchrl.record.tabs import TABS, Layout
+from lw_torchrl.record.tabs import TABS, Layout, send_page
 from lw_torchrl.record.verdict import Heading
 from lw_torchrl.record.writer import RecordingWriter, check_address, check_path
 
@@ -173,7 +172,11 @@ class RerunLogger(Logger):
             for i, one in enumerate(video):
                 self.log_video(f"{name}/{i}", one, step, **kwargs)
             return
-        frames = metrics.check_video(name, video[0] if video.ndim == 5 else video)
+        video = video[0] if video.ndim == 5 else video
+        if video.ndim != 4 or video.shape[1] not in (1, 3) or not video.numel() or video.dtype != torch.uint8:
+            got = f"{str(video.dtype).removeprefix('torch.')} of shape {'×'.join(map(str, video.shape))}"
+            raise ValueError(f"video {name!r} must be uint8 of shape T×C×H×W with C = 1 or 3, got {got}")
+        frames = video.permute(0, 2, 3, 1).contiguous().numpy()
         stream, parts = self._open(), check_name(name).split("/")
         if step is not None:
             parts.append(f"step {int(step)}")
@@ -189,7 +192,10 @@ class RerunLogger(Logger):
         if not isinstance(cfg, Mapping):
             raise TypeError(f"cfg must be a mapping, got {type(cfg).__name__}")
         self._hparams.update(metrics.flatten(cfg))
-        metrics.send_hparams(self._open(), self._hparams)
+        rows = [("key", "value"), ("---", "---"), *sorted(self._hparams.items())]
+        cells = [[text.replace("|", "\\|").replace("\n", " ") for text in row] for row in rows]
+        table = "\n".join(f"| {key} | {value} |" for key, value in cells)
+        self._open().log("hparams", rr.TextDocument(table, media_type=rr.MediaType.MARKDOWN), static=True)
         self._layout.add_view("hparams")
 
     def log_histogram(self, name: str, data: Sequence[float] | Tensor | NDArray[Any], **kwargs: Any) -> None:
@@ -313,20 +319,15 @@ class RerunLogger(Logger):
         """Add the page of an episode that was checked; returns its name. With a motion the robot is shown as it is."""
         stream = self._open()
         with self._adding:  # else two threads find the same name free
-            entity = self._episode_name(heading.name, name)
-            title = heading.title(episode, None if entity == heading.name else entity)
-            self._layout.add_page(entity, send_page(stream, entity, title, heading, episode, motion))
-        return entity
-
-    def _episode_name(self, wanted: str, name: str | None) -> str:
-        """The name of a new episode: the one given, or the one wanted, then "wanted-2"; one taken is a ValueError."""
-        taken = (*TABS, *self._layout.pages)
-        if name is None:
-            return next(free for i in count(1) if (free := wanted if i == 1 else f"{wanted}-{i}") not in taken)
-        if not isinstance(name, str) or not name.strip():
-            raise ValueError(f"name must be a non-empty string, got {name!r}")
-        if name in taken:
-            raise ValueError(f"name must be another than {', '.join(taken)}, got {name!r}")
+            taken, own = (*TABS, *self._layout.pages), heading.name
+            if name is None:
+                name = next(free for i in count(1) if (free := own if i == 1 else f"{own}-{i}") not in taken)
+            elif not isinstance(name, str) or not name.strip():
+                raise ValueError(f"name must be a non-empty string, got {name!r}")
+            elif name in taken:
+                raise ValueError(f"name must be another than {', '.join(taken)}, got {name!r}")
+            title = heading.title(episode, None if name == own else name)
+            self._layout.add_page(name, send_page(stream, name, title, heading, episode, motion))
         return name
 
     def compare(self, names: Sequence[str], title: str = "Side by side") -> None:

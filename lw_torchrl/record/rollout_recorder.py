@@ -106,7 +106,7 @@ class RolloutRecorder(Transform):
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         # All at once: to get them one by one takes as long as the rest.
         before, after = dict(tensordict.items()), dict(next_tensordict.items())
-        done = _array(after["done"]).reshape(-1)
+        done = after["done"].reshape(-1).tolist()
         for row in _named(before.get("_step"), self.rows):
             running = self._running[row]
             running.take(before, after)
@@ -181,17 +181,12 @@ class _Row:
 
     def _of(self, values: Tensor) -> NDArray[Any]:
         """A copy of this row's part of a tensor of all rows: some environments write into theirs again."""
-        array = _array(values)
+        array = values.numpy(force=True)
         return np.array(array[self._row] if self._batched else array)
 
     def _look(self) -> None:
         if self._recorded and self._engine is not None:
             self._poses.append([np.array(values) for values in self._engine.poses(self._row)])
-
-
-def _array(values: Tensor) -> NDArray[Any]:
-    """The values, on the CPU; shared where they are there."""
-    return values.detach().numpy() if values.is_cpu else values.numpy(force=True)
 
 
 def _named(mask: Tensor | None, rows: Sequence[int]) -> list[int]:

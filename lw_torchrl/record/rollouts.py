@@ -15,16 +15,15 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from lw_torchrl._checks import checked, missing_keys, shown
 from lw_torchrl._files import replacing
-from lw_torchrl._progress import Progress
-from lw_torchrl.envs.episodes import FinishedEpisode, policy_of, run_episodes
+from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.envs.seeding import episode_seed
 from lw_torchrl.evaluation.failure_records import Failure
-from lw_torchrl.evaluation.protocol import actor_plans, make_env, tasks_of
+from lw_torchrl.evaluation.protocol import actor_plans, tasks_of
+from lw_torchrl.evaluation.running import make_env, running
 from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
@@ -96,16 +95,14 @@ def log_rollout(
         failures = failure if isinstance(failure, Sequence) else [failure] * len(rollout)
         if len(failures) != len(rollout):
             raise ValueError(f"failure must be one for each of {len(rollout)} rows, got {len(failures)}")
-        same: Any = {"seed": seed, "policy": policy, "tasks": list(tasks), "suite": suite}
-        return [
-            log_rollout(logger, row, plans, failure=why, **same) for row, why in zip(rollout, failures, strict=True)
-        ]
+        same: dict[str, Any] = {"seed": seed, "policy": policy, "tasks": list(tasks), "suite": suite}
+        rows = zip(rollout, failures, strict=True)
+        return [log_rollout(logger, row, plans, failure=why, **same) for row, why in rows]
     if isinstance(failure, Sequence):
         raise ValueError(f"failure must be one Failure for one episode, got {len(failure)}")
     heading, episode = read_rollout(rollout, plans, seed=seed, policy=policy, failure=failure, tasks=tasks)
     found = known_suite(heading.task) if suite is None else load_suite(suite)
-    motion = _motion(heading, episode, found) if seed is not None and found is not None else None
-    return logger.add_page(heading, episode, motion=motion, name=name)
+    return logger.add_page(heading, episode, motion=_motion(heading, episode, found), name=name)
 
 
 def read_rollout(
@@ -137,9 +134,8 @@ def read_rollout(
     if not isinstance(failure, Failure | None):
         raise TypeError(f"failure must be a Failure, got {shown(failure)} ({type(failure).__name__})")
     if failure is not None and (failure.task, failure.episode) != (label, failure.episode if index is None else index):
-        raise ValueError(
-            f"failure must be of the rollout's episode, {label} {index}, got that of {failure.task} {failure.episode}"
-        )
+        got = f"{failure.task} {failure.episode}"
+        raise ValueError(f"failure must be of the rollout's episode, {label} {index}, got that of {got}")
     observation = rollout.get("observation", None)
     objects: dict[str, Tensor] = {}
     if task is not None and observation is not None and observation.shape[1:] == (task.layout.size,):
@@ -191,9 +187,9 @@ def simulate_again(
         engine.close()
 
 
-def _motion(heading: Heading, episode: RecordedEpisode, suite: Suite) -> Motion | None:
-    assert heading.seed is not None
-    assert heading.episode is not None
+def _motion(heading: Heading, episode: RecordedEpisode, suite: Suite | None) -> Motion | None:
+    if heading.seed is None or heading.episode is None or suite is None:
+        return None
     try:
         return simulate_again(heading.task, heading.seed, heading.episode, episode.action, episode.observation, suite)
     except DiffersError as error:
@@ -251,27 +247,15 @@ def run_recorded(
     answered = actor_plans(actor, plans)
     found_suite, chosen = tasks_of(tasks, answered, suite)
     options: dict[str, Any] = {"seed": seed, "max_steps": max_steps, "suite": found_suite, "engine": engine}
-    base = LanguageWorldEnv(list(chosen.values()), strict=True, **options)
-    env = make_env(actor, answered, base)
+    env = make_env(actor, answered, LanguageWorldEnv(list(chosen.values()), strict=True, **options))
     written = set() if answered is None else {"qaf", *actor.out_keys}
     evaluator = getattr(actor, "evaluator", None)
-    asked = [] if evaluator is None else evaluator.in_keys
-    bar = Progress("recording", len(chosen) * len(episodes) * base.max_steps, "step", show=progress)
+    keys = list(dict.fromkeys([*_KEYS, *sorted(_PLAN_KEYS & written), *getattr(evaluator, "in_keys", ())]))
+    how: dict[str, Any] = {"noise_scale": noise_scale, "progress": progress, "keys": keys}
     found = {}
-    try:
-        with bar, torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-            for one in run_episodes(
-                env,
-                policy_of(actor.eval()),
-                {task: list(episodes) for task in chosen},
-                keys=list(dict.fromkeys([*_KEYS, *sorted(_PLAN_KEYS & written), *asked])),
-                noise=(lambda _: (noise_scale,) * base.layout.action_size) if noise_scale else None,
-                on_progress=bar.update,
-            ):
-                steps = one.steps if evaluator is None else evaluator(one.steps)
-                found[one.task, one.episode] = one._replace(steps=steps)
-    finally:
-        env.close()
+    with running("recording", env, actor, dict.fromkeys(chosen, episodes), **how) as finished:
+        for one in finished:
+            found[one.task, one.episode] = one if evaluator is None else one._replace(steps=evaluator(one.steps))
     return [found[task, episode] for task in chosen for episode in episodes]
 
 

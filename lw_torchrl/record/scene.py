@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lw_torchrl.language.named_objects import GRIPPER
-from lw_torchrl.record.conventions import GOLD, GREEN, STEEL, Color, Stream, entity_path, rr, step_color, time_columns
+from lw_torchrl.record.conventions import GOLD, GREEN, STEEL, Color, entity_path, rr, step_color, time_columns
 from lw_torchrl.record.mujoco_scene import Motion, log_model, log_motion, model_geometry
 from lw_torchrl.record.recorded_episode import RecordedEpisode
 
@@ -21,18 +21,14 @@ OBJECT_COLORS: tuple[Color, ...] = ((80, 170, 255), (255, 120, 90), (200, 130, 2
 
 # Measured in Meta-World's model: obs[3] is the distance between the fingers over 0.1 m; they slide along y
 # and reach 4.5 cm below obs[0:3], the position of the hand.
-FINGER_TRAVEL = 0.1
-FINGER_HALF = (0.010, 0.006, 0.024)
-FINGER_DROP = 0.026
-PALM_HALF = (0.018, 0.062, 0.014)
-PALM_RISE = 0.012
-WRIST_HALF = (0.012, 0.012, 0.055)
-WRIST_RISE = 0.081
+FINGER_TRAVEL, FINGER_HALF, FINGER_DROP = 0.1, (0.010, 0.006, 0.024), 0.026
+PALM_HALF, PALM_RISE = (0.018, 0.062, 0.014), 0.012
+WRIST_HALF, WRIST_RISE = (0.012, 0.012, 0.055), 0.081
 TABLE_CENTER, TABLE_HALF = (0.0, 0.6, -0.010), (0.7, 0.4, 0.010)
 TABLE, GRID = (58, 64, 74), (92, 99, 112)
 
 
-def log_scene(stream: Stream, root: str, episode: RecordedEpisode, motion: Motion | None = None) -> list[str]:
+def log_scene(stream: Any, root: str, episode: RecordedEpisode, motion: Motion | None = None) -> list[str]:
     """Draw robot, objects, goal, the hand's path and the target pose under ``root``/scene; returns the trails' paths.
 
     A trail is one short line per row, to be shown up to the time cursor. Without a motion, the robot is a hand over a
@@ -53,8 +49,7 @@ def log_scene(stream: Stream, root: str, episode: RecordedEpisode, motion: Motio
         stream.send_columns(f"{scene}/{path}", times, rr.Points3D.columns(positions=position))
 
     def lines(path: str, strips: NDArray[np.float32], radius: float, color: Color) -> None:
-        style = rr.LineStrips3D.from_fields(colors=[color], radii=[radius])
-        stream.log(f"{scene}/{path}", style, static=True)
+        stream.log(f"{scene}/{path}", rr.LineStrips3D.from_fields(colors=[color], radii=[radius]), static=True)
         stream.send_columns(f"{scene}/{path}", times, rr.LineStrips3D.columns(strips=strips))
 
     goal = np.ascontiguousarray(episode.observation[:, episode.layout.positions[-1]])
@@ -84,7 +79,7 @@ def log_scene(stream: Stream, root: str, episode: RecordedEpisode, motion: Motio
     return trails
 
 
-def _log_simple_robot(stream: Stream, scene: str, episode: RecordedEpisode) -> None:
+def _log_simple_robot(stream: Any, scene: str, episode: RecordedEpisode) -> None:
     """The table and the gripper below ``scene``."""
     times = time_columns(np.arange(len(episode)))
 
@@ -95,7 +90,11 @@ def _log_simple_robot(stream: Stream, scene: str, episode: RecordedEpisode) -> N
         stream.log(f"{scene}/{path}", boxes, static=True)
 
     box("table", [TABLE_CENTER], [TABLE_HALF], TABLE)
-    stream.log(f"{scene}/table/grid", rr.LineStrips3D(_grid(), colors=[GRID], radii=[0.0007]), static=True)
+    (x, y, _), (width, depth, _), z = TABLE_CENTER, TABLE_HALF, 0.0005
+    across, along = np.arange(y - depth, y + depth + 1e-6, 0.1), np.arange(x - width, x + width + 1e-6, 0.1)
+    grid = [[(x - width, at, z), (x + width, at, z)] for at in across.tolist()]
+    grid += [[(at, y - depth, z), (at, y + depth, z)] for at in along.tolist()]
+    stream.log(f"{scene}/table/grid", rr.LineStrips3D(grid, colors=[GRID], radii=[0.0007]), static=True)
     box("gripper/palm", [(0.0, 0.0, PALM_RISE)], [PALM_HALF], STEEL)
     # Its name stands above the hand, where the objects that it handles are not.
     box("gripper/wrist", [(0.0, 0.0, WRIST_RISE)], [WRIST_HALF], STEEL, [GRIPPER])
@@ -108,16 +107,7 @@ def _log_simple_robot(stream: Stream, scene: str, episode: RecordedEpisode) -> N
     stream.send_columns(f"{scene}/gripper/fingers", times, fingers.partition([2] * len(episode)))
 
 
-def _grid() -> list[list[tuple[float, float, float]]]:
-    """Lines on the table, 10 cm apart."""
-    middle, half = np.array(TABLE_CENTER[:2]), np.array(TABLE_HALF[:2])
-    (left, near), (right, far), z = (middle - half).tolist(), (middle + half).tolist(), 0.0005
-    across = [[(left, y, z), (right, y, z)] for y in np.arange(near, far + 1e-6, 0.1).tolist()]
-    along = [[(x, near, z), (x, far, z)] for x in np.arange(left, right + 1e-6, 0.1).tolist()]
-    return across + along
-
-
-def _log_target(stream: Stream, scene: str, episode: RecordedEpisode, times: Sequence[Any]) -> None:
+def _log_target(stream: Any, scene: str, episode: RecordedEpisode, times: Sequence[Any]) -> None:
     """An arrow from what the scripted skill in force moves to where it goes, in the step's colour."""
     if episode.in_force is None or not any(episode.target_poses):
         return

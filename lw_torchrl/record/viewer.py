@@ -16,8 +16,7 @@ from typing import Any
 from lw_torchrl._checks import checked
 from lw_torchrl._files import replacing
 from lw_torchrl.record.conventions import EPISODE_TIMELINE
-from lw_torchrl.record.recording_file import find_recording, opened, opening_step
-from lw_torchrl.record.rerun_binary import LOCAL, failure, free_port, running
+from lw_torchrl.record.recording_file import LOCAL, failure, find_recording, free_port, opened, opening_step, running
 
 START_SECONDS = 60.0
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
@@ -143,8 +142,7 @@ def connect(process: subprocess.Popen[bytes], port: int) -> tuple[Any, Any]:
 
 def go_to(client: Any, recording: Any, step: int | None) -> None:
     """Set the time cursor to ``step``, or to the last one, of the timeline that the layout chose."""
-    timelines = {timeline.name: timeline for timeline in recording.timelines}
-    timeline = timelines.get(recording.current_timeline)
+    timeline = next((one for one in recording.timelines if one.name == recording.current_timeline), None)
     if timeline is None or timeline.end is None:
         return
     if step is None:  # an episode's success and reward stand one step after its last row

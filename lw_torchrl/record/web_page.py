@@ -22,8 +22,7 @@ from urllib.error import URLError
 from lw_torchrl._checks import checked
 from lw_torchrl._files import replacing
 from lw_torchrl.record.conventions import EPISODE_TIMELINE
-from lw_torchrl.record.recording_file import find_recording, opened, opening_step
-from lw_torchrl.record.rerun_binary import LOCAL, failure, free_port, running
+from lw_torchrl.record.recording_file import LOCAL, failure, find_recording, free_port, opened, opening_step, running
 
 LARGE = 30 * 10**6
 START_SECONDS = 60.0
@@ -123,9 +122,10 @@ class WebPage(AbstractContextManager["WebPage"]):
 
 def _handler(files: dict[str, tuple[str, bytes]]) -> type[BaseHTTPRequestHandler]:
     class Handler(BaseHTTPRequestHandler):
+        timeout = STALLED_SECONDS
+
         def setup(self) -> None:
             super().setup()
-            self.connection.settimeout(STALLED_SECONDS)
             self._asking = threading.Timer(ASKING_SECONDS, self._end)
             self._asking.daemon = True
             self._asking.start()
@@ -197,8 +197,7 @@ def _viewer_files() -> tuple[str, bytes]:
 def request(step: int) -> bytes:
     """The message that asks a viewer for ``step`` of the timeline in force, paused (a ``ViewerControlRequest``)."""
     paused = b"\x28\x01"
-    cursor = b"\x1a" + _sized(b"\x08" + _varint(step)) + paused
-    return b"\x32" + _sized(cursor)
+    return b"\x32" + _sized(b"\x1a" + _sized(b"\x08" + _varint(step)) + paused)
 
 
 def sign(step: int) -> bytes:

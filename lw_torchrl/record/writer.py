@@ -21,8 +21,7 @@ from lw_torchrl._files import replacing
 from lw_torchrl.record.conventions import rr
 from lw_torchrl.record.recording_file import copy_recording
 
-PERIOD = 0.5
-"""Seconds between two writes: with them done, a kill loses less than a second of what was logged."""
+PERIOD = 0.5  # seconds between two writes: with them done, a kill loses less than a second of what was logged
 ENCODE_SECONDS = 60.0
 MOST_COMPACTED = 256 * 2**20
 """Bytes up to which a recording is made compact when it is closed; it is read whole for that."""
@@ -31,12 +30,9 @@ HEADER_BYTES, MESSAGE = 12, struct.Struct("<QQ")
 END = MESSAGE.pack(0, 0)
 DEFAULT_PORT = 9876
 PROBE_SECONDS, SEND_SECONDS, CLOSE_SECONDS = 0.5, 5.0, 1.0
-WAITING_BYTES = 256 * 2**20
-"""What may wait for a viewer that is slower than the recording grows."""
+WAITING_BYTES = 256 * 2**20  # what may wait for a viewer that is slower than the recording grows
 
-_URL = re.compile(
-    r"(?:(?P<scheme>rerun(?:\+https?)?)://)?(?P<host>\[[^]]+\]|[^/:\s]+)(?::(?P<port>\d+))?(?P<rest>/.*)?"
-)
+_URL = re.compile(r"(?:(?P<scheme>rerun(?:\+https?)?)://)?(?P<host>\[[^]]+\]|[^/:\s]+)(?::(?P<port>\d+))?(?P<end>/.*)?")
 
 
 class RecordingWriter:
@@ -127,13 +123,18 @@ class RecordingWriter:
 class RecordingFile:
     """A file that grows by pieces of a rerun stream; between two of them, it is a recording that any viewer opens.
 
-    An older file of its name is set aside; ``previous`` is that one's new name, or None.
+    An older file of its name, unless it is empty, is set aside as "run.previous.rrd" or "run.previous-2.rrd";
+    ``previous`` is that name, or None.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         path.parent.mkdir(parents=True, exist_ok=True)
-        self.previous = set_aside(path)
+        self.previous: Path | None = None
+        if path.is_file() and path.stat().st_size:
+            names = (f"{path.stem}.previous{'' if i == 1 else f'-{i}'}{path.suffix}" for i in count(1))
+            self.previous = next(free for name in names if not (free := path.with_name(name)).exists())
+            os.rename(path, self.previous)
         try:
             self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o666)
         except OSError:
@@ -251,7 +252,7 @@ class LiveViewer:
 def check_address(address: str) -> tuple[str, str, int]:
     """The URL, host and port of a viewer from "127.0.0.1:9876", "host" or "rerun+http://host:9876/proxy"."""
     found = _URL.fullmatch(address)
-    if found is None or found["rest"] not in (None, "/", "/proxy") or not 0 < int(found["port"] or 1) < 65536:
+    if found is None or found["end"] not in (None, "/", "/proxy") or not 0 < int(found["port"] or 1) < 65536:
         raise ValueError(
             f"connect must be an address like '127.0.0.1:9876' or 'rerun+http://127.0.0.1:9876/proxy', got {address!r}"
         )
@@ -271,13 +272,3 @@ def check_path(path: str | os.PathLike[str]) -> Path:
     if nearest is not None and not nearest.is_dir():
         raise ValueError(f"path {str(target)!r} must lie in a folder, but {str(nearest)!r} is a file")
     return target
-
-
-def set_aside(path: Path) -> Path | None:
-    """Rename a file, "run.previous.rrd" or "run.previous-2.rrd"; None: there is none, or it is empty."""
-    if not path.is_file() or not path.stat().st_size:
-        return None
-    names = (f"{path.stem}.previous{'' if i == 1 else f'-{i}'}{path.suffix}" for i in count(1))
-    kept = next(free for name in names if not (free := path.with_name(name)).exists())
-    os.rename(path, kept)
-    return kept

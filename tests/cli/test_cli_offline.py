@@ -8,7 +8,7 @@ from commands import document, fails, run
 
 import lw_torchrl as lw
 from lw_torchrl.paper import offline
-from lw_torchrl.paper.offline_recipes import OFFLINE_TABLES
+from lw_torchrl.paper.recipes import OFFLINE_TABLES
 
 SMALL = dict(width=16, depth=1, critic_depth=1, batch_size=20)
 TINY = f"""

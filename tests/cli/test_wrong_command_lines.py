@@ -235,8 +235,8 @@ def test_the_words_of_the_command_line_are_those_of_the_library():
 
     from lw_torchrl.data import BEHAVIOURS
     from lw_torchrl.modules import METHODS
-    from lw_torchrl.paper.offline_recipes import MIXTURES, OFFLINE_METHODS
     from lw_torchrl.paper.online import WEAKEST
+    from lw_torchrl.paper.recipes import MIXTURES, OFFLINE_METHODS
 
     assert tuple(BEHAVIOURS) == options.ACTORS
     assert tuple(METHODS) == options.METHODS

@@ -14,7 +14,7 @@ import lw_torchrl as lw
 from lw_torchrl.data.behaviours import BEHAVIOURS
 from lw_torchrl.data.dataset import read_metadata
 from lw_torchrl.paper.offline import DISTRIBUTIONS, Advantages, BehaviourDataset, OfflineRun, offline_runs, write_table
-from lw_torchrl.paper.offline_recipes import (
+from lw_torchrl.paper.recipes import (
     MIXTURES,
     NOISE,
     OFFLINE_METHODS,
@@ -195,7 +195,7 @@ def test_what_a_method_gave_before_it_was_changed_is_refused(out, monkeypatch):
     run = tiny("bc")
     execute_run(run, PLANS, out, progress=False)
     changed = replace(OFFLINE_METHODS["bc"], version=2)
-    monkeypatch.setattr("lw_torchrl.paper.offline.OFFLINE_METHODS", {**OFFLINE_METHODS, "bc": changed})
+    monkeypatch.setattr("lw_torchrl.paper.recipes.OFFLINE_METHODS", {**OFFLINE_METHODS, "bc": changed})
     with pytest.raises(ValueError, match=r"it differs in how.version"):
         execute_run(run, PLANS, out, progress=False)
 
@@ -258,7 +258,7 @@ def test_descriptions_tell_what_a_result_hangs_on():
     assert replace(cloned, critic="dc").describe(PLANS) == cloned.describe(PLANS)
     noise = {**NOISE, "wrong": {"noise_scale": 0.1}}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lw_torchrl.paper.offline.NOISE", noise)
+        patch.setattr("lw_torchrl.paper.recipes.NOISE", noise)
         assert run.describe(PLANS) != described
     assert described["data"][0] == {"behaviour": "spoilt-30", "episodes": 20, **NOISE["spoilt-30"]}
     assert isinstance(Advantages("five", "B", 0).describe(PLANS)["recipe"], dict)

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 import lw_torchrl as lw
 from lw_torchrl.planners import chat_reply
 from lw_torchrl.planners.answer_files import AnswerCache
-from lw_torchrl.planners.chat_reply import NoCompletion, read_completion
-from lw_torchrl.planners.redaction import Redactor
+from lw_torchrl.planners.chat_reply import NoCompletion, Redactor, read_completion
 
 pytestmark = pytest.mark.usefixtures("no_account")
 

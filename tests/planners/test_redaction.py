@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import lw_torchrl as lw
-from lw_torchrl.planners.redaction import Redactor
+from lw_torchrl.planners.chat_reply import Redactor
 
 SECRET = "sk-proj-9fK2xQ7LmZ4tRw8B"
 

@@ -11,7 +11,7 @@ from recordings import PLAN, STEPS, Recording, make_objects, make_rollout, recor
 
 from lw_torchrl.record import RerunLogger
 from lw_torchrl.record.recorded_episode import NOBODY, RecordedEpisode
-from lw_torchrl.record.timeline import EVENLY, NONE_HOLDS
+from lw_torchrl.record.verdict import EVENLY, NONE_HOLDS
 
 ROWS = [f"/push/timeline/{i}_" + c.replace("'", "ʼ").replace(" ", "_") for i, (c, _) in enumerate(STEPS, 1)]
 

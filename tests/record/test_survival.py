@@ -17,8 +17,7 @@ from logging_processes import LoggingProcesses
 from recordings import Recording, make_rollout
 
 from lw_torchrl.record import RerunLogger
-from lw_torchrl.record.recording_file import opened
-from lw_torchrl.record.rerun_binary import LOCAL, binary, free_port
+from lw_torchrl.record.recording_file import LOCAL, binary, free_port, opened
 
 MOMENTS = sorted(random.Random(seed).uniform(1.2, 3.5) for seed in range(5))
 

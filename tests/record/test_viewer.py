@@ -17,8 +17,7 @@ from rerun.chunk import RrdReader
 from tensordict import TensorDict
 
 from lw_torchrl.record import RerunLogger, open_viewer, viewer
-from lw_torchrl.record.recording_file import find_recording, is_whole, opened, opening_step
-from lw_torchrl.record.rerun_binary import running
+from lw_torchrl.record.recording_file import find_recording, is_whole, opened, opening_step, running
 from lw_torchrl.record.viewer import connect, go_to
 
 

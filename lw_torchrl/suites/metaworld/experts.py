@@ -63,10 +63,8 @@ class ExpertActor(TensorDictModuleBase):
         if observation.shape[-1:] != (METAWORLD.size,):
             raise ValueError(f"observation must have 39 numbers, got shape {tuple(observation.shape)}")
         if given.shape != observation.shape[:-1]:
-            raise ValueError(
-                f"task_id must be of shape {tuple(observation.shape[:-1])}, one per observation, got "
-                f"{tuple(given.shape)}"
-            )
+            shape = tuple(observation.shape[:-1])
+            raise ValueError(f"task_id must be of shape {shape}, one per observation, got {tuple(given.shape)}")
         states = observation.reshape(-1, METAWORLD.size).cpu().numpy().astype(np.float64)
         task_ids = given.reshape(-1).tolist()
         action = np.zeros((len(task_ids), METAWORLD.action_size), dtype=np.float32)

@@ -21,8 +21,7 @@ from lw_torchrl.suites.metaworld.vectorized.observation import Array, Index, Mas
 from lw_torchrl.suites.metaworld.vectorized.rewards.dense_reward import DenseReward, EpisodeStarts
 from lw_torchrl.suites.metaworld.vectorized.tables import reward_table, simulation_table
 
-FINGERS = np.array([1.0, -1.0])
-"""The two fingers are driven against each other by one number of the action."""
+FINGERS = np.array([1.0, -1.0])  # the two fingers are driven against each other by one number of the action
 
 
 def available_cores() -> int:
@@ -79,10 +78,7 @@ class VectorizedEngine(SeenRows):
         self._high = np.array([space.high for space in bounds]).reshape(n, METAWORLD.size)
         self._mocap_low = np.array([builder.mocap_low for builder in builders]).reshape(n, 3)
         self._mocap_high = np.array([builder.mocap_high for builder in builders]).reshape(n, 3)
-        scales = {builder.action_scale for builder in builders}
-        if len(scales) > 1:
-            raise RuntimeError(f"the tasks were to share one action scale, got {sorted(scales)}")
-        self._action_scale = scales.pop() if scales else 0.01
+        (self._action_scale,) = {builder.action_scale for builder in builders} or {0.01}  # all tasks share one
 
         self._mocap = np.zeros((n, 3))
         self._goal = np.zeros((n, 3))

@@ -120,9 +120,9 @@ class Observer:
     def __init__(self, sources: Sequence[TaskSources]) -> None:
         self._matrices = np.flatnonzero([row.quaternion.startswith(MATRIX_OF) for row in sources])
         self._dials = np.flatnonzero([row.dial is not None for row in sources])
-        self._offset = np.array([row.offset for row in sources])
+        self._offset = np.array([row.offset for row in sources], np.float64)
         self._seconds = np.flatnonzero([row.second is not None for row in sources])
-        self._second_offset = np.array([row.second_offset for row in sources if row.second is not None])
+        self._second_offset = np.array([row.second_offset for row in sources if row.second is not None], np.float64)
         self._constant = np.zeros((len(sources), CURRENT.stop))
         self._is_constant = np.zeros(self._constant.shape, dtype=bool)
         for k, row in enumerate(sources):
@@ -206,7 +206,7 @@ class SuccessFunction:
         success = [row.success for row in sources]
         self._programs = programs
         self._offset, self._axes, self._within, self._under, self._above, self._angle = (
-            np.array([getattr(row, name) for row in success])
+            np.array([getattr(row, name) for row in success], np.float64)
             for name in ("offset", "axes", "within", "under", "above", "angle")
         )
         points = [row.point for row in success]
@@ -214,7 +214,7 @@ class SuccessFunction:
         self._grippers = np.flatnonzero([point == "gripper" for point in points])
         self._places = np.flatnonzero([point not in ("object", "second", "gripper") for point in points])
         self._at_height = np.flatnonzero([row.goal_height is not None for row in success])
-        self._goal_height = np.array([row.goal_height for row in success if row.goal_height is not None])
+        self._goal_height = np.array([row.goal_height for row in success if row.goal_height is not None], np.float64)
         rules = [row.rule for row in success]
         self._rules = [
             (getattr(SuccessFunction, "_" + name.replace(" ", "_")), np.flatnonzero([rule == name for rule in rules]))
@@ -273,16 +273,13 @@ class SuccessFunction:
         for k in np.flatnonzero(held):
             current, program = scene.current[rows[k]], self._programs(int(rows[k]))
             lifted = current[OBJECT][2] - STICK_LIFT > program.stick_init_pos[2]
-            held[k] = current[GRIPPER] > 0.0 and lifted and _both_pads_press(program.model, program.data)
+            if not (current[GRIPPER] > 0.0 and lifted):
+                held[k] = False
+                continue
+            # Both pads must push against the stick, by the contact forces that Meta-World looks at.
+            model, data, pairs = program.model, program.data, program.data.contact.geom
+            touched = (pairs == model.geom("objGeom").id).any(axis=1)
+            for pad in ("leftpad_geom", "rightpad_geom"):
+                contacts = touched & (pairs == model.geom(pad).id).any(axis=1)
+                held[k] &= sum(data.efc_force[data.contact.efc_address[contacts]]) > 0
         return held
-
-
-def _both_pads_press(model: Any, data: Any) -> bool:
-    """Whether both pads of the gripper push against the stick, by the contact forces Meta-World looks at."""
-    pairs = data.contact.geom
-    touched = (pairs == model.geom("objGeom").id).any(axis=1)
-    for pad in ("leftpad_geom", "rightpad_geom"):
-        contacts = touched & (pairs == model.geom(pad).id).any(axis=1)
-        if not sum(data.efc_force[data.contact.efc_address[contacts]]) > 0:
-            return False
-    return True

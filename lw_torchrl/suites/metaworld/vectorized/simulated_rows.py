@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from math import ceil
 from time import perf_counter
 from typing import Any
@@ -95,12 +96,12 @@ class SimulatedRow:
             self.shared.load(self, self._places)
 
 
+@dataclass
 class RowGroup:
     """Rows that share a model, and so take turns; ``seconds`` is the time of each row's last work."""
 
-    def __init__(self, rows: Sequence[int]) -> None:
-        self.rows = tuple(rows)
-        self.seconds = 1.0
+    rows: tuple[int, ...]
+    seconds: float = 1.0
 
 
 def split_into_groups(keys: Sequence[str], num_threads: int) -> list[RowGroup]:
@@ -110,7 +111,7 @@ def split_into_groups(keys: Sequence[str], num_threads: int) -> list[RowGroup]:
         by_key[key].append(row)
     largest = len(keys) if num_threads == 1 else ceil(len(keys) / (2 * num_threads))
     parts = [part for rows in by_key.values() for part in np.array_split(rows, ceil(len(rows) / largest))]
-    return [RowGroup(part.tolist()) for part in parts]
+    return [RowGroup(tuple(part.tolist())) for part in parts]
 
 
 class WorkerPool:

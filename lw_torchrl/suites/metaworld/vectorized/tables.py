@@ -182,24 +182,15 @@ class TaskReward:
         return self.near, self.placed, self.via, across
 
 
-def _plain(table: Mapping[str, Any]) -> dict[str, Any]:
-    """TOML's lists as tuples and its whole numbers as floats, everything else as it is."""
-
-    def number(value: Any) -> Any:
-        return float(value) if type(value) is int else value
-
-    return {
-        key: tuple(map(number, value)) if isinstance(value, list) else value if key == "lifted_axis" else number(value)
-        for key, value in table.items()
-    }
-
-
 def _parse(text: str, kind: str, task: Any, parts: Mapping[str, Any]) -> dict[str, Any]:
+    def plain(table: Mapping[str, Any]) -> dict[str, Any]:
+        return {key: tuple(value) if isinstance(value, list) else value for key, value in table.items()}
+
     tasks = {}
     for name, entry in tomllib.loads(text).items():
         try:
-            made = {key: parts[key](**_plain(entry.pop(key))) for key in parts.keys() & entry.keys()}
-            tasks[name] = task(**_plain(entry), **made)
+            made = {key: parts[key](**plain(entry.pop(key))) for key in parts.keys() & entry.keys()}
+            tasks[name] = task(**plain(entry), **made)
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{kind} table, task {name!r}: {error}") from error
     return tasks

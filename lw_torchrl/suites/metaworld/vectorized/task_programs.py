@@ -14,7 +14,6 @@ import numpy as np
 from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
-from lw_torchrl._checks import check_choice
 from lw_torchrl.suites.metaworld.plain_engine import import_metaworld
 
 SUPPORTED_VERSIONS = {"metaworld": "3.1.1", "mujoco": "3.3.0"}
@@ -23,15 +22,10 @@ SUPPORTED_VERSIONS = {"metaworld": "3.1.1", "mujoco": "3.3.0"}
 def check_versions() -> None:
     """Raise ImportError for a Meta-World or MuJoCo whose numbers have not been compared with this engine's."""
     for package, supported in SUPPORTED_VERSIONS.items():
-        try:
-            installed = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            installed = "none"
-        if installed != supported:
+        if (installed := importlib.metadata.version(package)) != supported:
             raise ImportError(
-                f"the vectorized engine reproduces {package} {supported}, but the installed version is "
-                f"{installed}. Install {package}=={supported}, or choose engine='metaworld', which runs "
-                "whatever is installed."
+                f"the vectorized engine reproduces {package} {supported}, but the installed version is {installed}. "
+                f"Install {package}=={supported}, or choose engine='metaworld', which runs whatever is installed."
             )
 
 
@@ -161,7 +155,6 @@ def _task_class(task: str) -> Any:
     import_metaworld()
     from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 
-    check_choice("task", f"{task}-v3", ALL_V3_ENVIRONMENTS)
     return ALL_V3_ENVIRONMENTS[f"{task}-v3"]
 
 

@@ -56,21 +56,16 @@ class DenseReward:
         self._lifts = [(LIFTS[name], np.flatnonzero(task.lift == name)) for name in np.unique(task.lift) if name]
         self._formulas = [(FORMULAS[name], np.flatnonzero(task.formula == name)) for name in np.unique(task.formula)]
 
+    @np.errstate(all="ignore")  # rows whose simulation broke, and branches that are not taken, may hold anything
     def __call__(self, sensors: Array, observation: Array, goal: Array, action: NDArray[Any]) -> Array:
         """(rows,) as Meta-World's ``compute_reward``, of sensors (rows, REWARD_WIDTH), observations (rows, 39), goals
         (rows, 3) and actions (rows, 4) in their own precision."""
-        # Index whose simulation broke, and branches that are not taken, may hold anything.
-        with np.errstate(all="ignore"):
-            less, points = self._starts.less[self._rows], self._starts.points[self._rows]
-            features = terms.gather_features(self._task, sensors, observation[:, CURRENT], goal, points)
-            proximity = self._proximity(features, less)
-            self._starts.less[self._rows] = less
-            return self._reward(features, proximity, action[:, 3])
-
-    def _reward(self, features: Array, proximity: terms.Proximity, action: NDArray[Any]) -> Array:
-        task = self._task
+        task, less, points = self._task, self._starts.less[self._rows], self._starts.points[self._rows]
+        features = terms.gather_features(task, sensors, observation[:, CURRENT], goal, points)
+        proximity = self._proximity(features, less)
+        self._starts.less[self._rows] = less
         precision = np.result_type(action.dtype, 1.0)
-        action = action.astype(precision)
+        action = action[:, 3].astype(precision)
         effort = task.cage.effort.astype(precision)
         closed = np.minimum(np.maximum(action, 0), effort) / effort
         narrow = (action > 0) & (action <= effort) & (precision != np.float64)

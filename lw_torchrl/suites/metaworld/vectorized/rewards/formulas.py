@@ -17,8 +17,7 @@ Cast = Callable[[Any], Any]
 """Brings numbers to the precision that a formula is computed in: single, where a number of a float32 action takes part,
 for NumPy gives way to it where a plain Python number meets it."""
 
-Formula = Callable[["StepState", Index, Cast], Numbers]
-"""(state, rows, cast) -> (len(rows),) their rewards."""
+Formula = Callable[["StepState", Index, Cast], Numbers]  # (state, rows, cast) -> (len(rows),) their rewards
 
 
 @dataclass

@@ -39,22 +39,15 @@ class Parameters(SimpleNamespace):
     other arrays of terms the term."""
 
     def of(self, rows: Any) -> Parameters:
-        return Parameters(
-            **{key: own.of(rows) if isinstance(own, Parameters) else own[rows] for key, own in vars(self).items()}
-        )
+        own = vars(self).items()
+        return Parameters(**{key: v.of(rows) if isinstance(v, Parameters) else v[rows] for key, v in own})
 
 
 def make_parameters(rewards: Sequence[TaskReward]) -> Parameters:
-    kinds = list({id(reward): reward for reward in rewards}.values())
-    place = {id(reward): number for number, reward in enumerate(kinds)}
-    return _parameters(kinds).of(np.array([place[id(reward)] for reward in rewards]))
-
-
-def _parameters(rewards: Sequence[TaskReward]) -> Parameters:
     terms = [reward.terms for reward in rewards]
 
     def of_terms(name: str) -> Array:
-        return np.array([[getattr(term, name) for term in four] for four in terms])
+        return np.array([[getattr(term, name) for term in four] for four in terms], float)
 
     cages = [reward.cage or _NO_CAGE for reward in rewards]
     funnels = [reward.funnel or _NO_FUNNEL for reward in rewards]
@@ -66,8 +59,8 @@ def _parameters(rewards: Sequence[TaskReward]) -> Parameters:
         offset=np.stack([of_terms("offset"), of_terms("margin_offset")], axis=1),
         axes=of_terms("axes"),
         within=of_terms("within"),
-        less=np.array([[_less(term) for term in four] for four in terms]),
-        gaussian=of_terms("curve") == "gaussian",
+        less=np.array([[_less(term) for term in four] for four in terms], float),
+        gaussian=np.array([[term.curve == "gaussian" for term in four] for four in terms]),
         cage=Parameters(
             **_numbers(Cage, cages),
             used=np.array([reward.cage is not None for reward in rewards]),
@@ -86,20 +79,15 @@ def _parameters(rewards: Sequence[TaskReward]) -> Parameters:
 
 
 def _numbers(kind: Any, parts: Sequence[Any]) -> dict[str, Any]:
-    return {
-        one.name: np.array([getattr(part, one.name) for part in parts], dtype=_DTYPES[one.type])
-        for one in fields(kind)
-        if one.type in _DTYPES
-    }
+    numeric: list[Any] = [one for one in fields(kind) if one.type in _DTYPES]
+    return {one.name: np.array([getattr(part, one.name) for part in parts], _DTYPES[one.type]) for one in numeric}
 
 
 def _points(reward: TaskReward) -> list[list[list[list[int]]]]:
     margins = [term.margin if isinstance(term.margin, tuple) else term.between[:1] * 2 for term in reward.terms]
     pairs = [[term.between for term in reward.terms], margins]
     constant = range(FEATURES)[CONSTANT]
-    waypoint = [
-        (COLUMNS[value] if isinstance(value, str) else constant)[axis] for axis, value in enumerate(reward.waypoint)
-    ]
+    waypoint = [(COLUMNS[v] if isinstance(v, str) else constant)[axis] for axis, v in enumerate(reward.waypoint)]
     columns = COLUMNS | {"waypoint": waypoint}
     return [[[columns[pair[end]] for pair in kind] for end in (0, 1)] for kind in pairs]
 
