@@ -11,7 +11,6 @@ Its words are in robosuite_words/. pip install 'lw_torchrl[robosuite]'; beside m
 import argparse
 import logging
 import tomllib
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -52,7 +51,6 @@ class Row:
         self.env = robosuite.make(task.title(), **options, **({"use_latch": False} if task == "door" else {}))
 
     def reset(self, seed: int) -> np.ndarray:
-        """Start an episode, open the fingers and let things fall; an observation (23,) float64."""
         before = np.random.get_state()  # noqa: NPY002
         np.random.seed(seed % 2**32)  # noqa: NPY002  robosuite 1.5.1 draws from this generator, 1.5.2 from its own
         self.env.rng = self.env.placement_initializer.rng = np.random.default_rng(seed)
@@ -66,7 +64,7 @@ class Row:
             self.arm.update_initial_joints(qpos[joints])
         self.arm.set_goal_update_mode("desired")  # displacements add up, as Meta-World's do
         self.origin = np.array([robot.base_pos[0], 0.0, TABLE])
-        for _ in range(20):
+        for _ in range(20):  # the fingers open, things fall
             seen = self._simulate((0.0, 0.0, 0.0, -1.0))
         self.origin[2] = TABLE if self.task == "door" else seen[self.things[0]][2] - RESTING
         now = self._now(seen)
@@ -87,16 +85,15 @@ class Row:
         found = np.zeros(NOW)
         for at, name in zip((0, 4, 7), ("robot0_eef_pos", *self.things), strict=False):
             away, left, up = seen[name] - self.origin
-            found[at : at + 3] = -left, away, up
-        found[2] += HAND
+            found[at : at + 3] = -left, away, up + (0.0 if at else HAND)
         found[3] = np.clip(np.abs(seen["robot0_gripper_qpos"]).sum() / 0.08, 0.0, 1.0)
         return found
 
 
-class RobosuiteEngine:
+class Engine:
     """Rows of robosuite, stepped one after the other; each has an environment of its own."""
 
-    def __init__(self, row_tasks, *, arm, reward="sparse", num_threads=None):
+    def __init__(self, row_tasks, arm, *, reward="sparse", num_threads=None):
         self.rows = [Row(task.partition("/")[2], arm) for task in row_tasks]
         n, self.dense = len(self.rows), reward == "dense"
         self.seen, self.started, self.faulted = np.zeros((n, LAYOUT.size)), np.zeros(n, bool), np.zeros(n, bool)
@@ -112,10 +109,9 @@ class RobosuiteEngine:
         reward, success = np.zeros(len(active)), np.zeros(len(active), bool)
         self.faulted |= active & ~np.isfinite(action).all(1)
         for row in np.flatnonzero(active & ~self.faulted):
-            env = self.rows[row].env
             self.seen[row] = self.rows[row].step(np.clip(action[row], -1, 1))
-            success[row] = env._check_success()
-            reward[row] = env.reward(None) if self.dense else success[row]
+            success[row] = self.rows[row].env._check_success()
+            reward[row] = self.rows[row].env.reward(None) if self.dense else success[row]
         return EngineStep(self.seen.copy(), reward, success, active & self.faulted)
 
     def close(self):
@@ -125,7 +121,7 @@ class RobosuiteEngine:
 def make_suite(arm: str = "Panda") -> Suite:
     """The tasks with one of robosuite's arms, and a Panda's gripper."""
     words = {"plans": lw.load_plans(WORDS, tasks=TASKS), "skills": lw.load_skills(WORDS / "skills.toml", tasks=TASKS)}
-    return Suite("robosuite", LAYOUT, TASKS, partial(RobosuiteEngine, arm=arm), max_steps=300, **words)
+    return Suite("robosuite", LAYOUT, TASKS, lambda rows, **how: Engine(rows, arm, **how), max_steps=300, **words)
 
 
 def main() -> None:
@@ -136,8 +132,7 @@ def main() -> None:
     for name, number in (("episodes", 50), ("seed", 3000), ("steps", 300), ("rows", 5)):
         parser.add_argument(f"--{name}", type=int, default=number, help=f"{number} unless given")
     args = parser.parse_args()
-    for arm in args.arms:
-        suite = make_suite(arm)
+    for arm, suite in ((arm, make_suite(arm)) for arm in args.arms):
         if args.policy == "check":
             print(*(f"{arm} {one}" for one in check_suite(suite)), sep="\n")
             continue

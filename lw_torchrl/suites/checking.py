@@ -18,6 +18,7 @@ Array = NDArray[np.float64]
 _AXES = {"x": "right", "y": "away from the robot", "z": "up"}
 _STEPS, _COUNTED, _SHARE = 14, 4, 0.25  # of a movement, and of its last steps; a slow hand takes some to get going
 _SETTLING = 30
+_LAG, _CLOSING = 4, 13  # what is measured of Meta-World: steps that its hand goes on for, and that its fingers take
 _TABLE, _FLOATING = 0.02, 0.03  # metres: what "touching the table" allows; where a thing no longer seems meant to lie
 
 
@@ -45,8 +46,9 @@ def check_suite(suite: Suite, *, seed: int = 0) -> list[Finding]:
     """Run a few steps of each task and compare what happens with the suite's layout; success is never looked at.
 
     Checked are the numbers' size and precision, that a seed fixes an episode, the numbers of the step before, each axis
-    of the displacement and how far the hand moves in a step (``reach``), the gripper's opening and closing, whether
-    these take few steps (``binary_gripper``), and how high things rest above the table.
+    of the displacement, how far the hand moves in a step (``reach``) and how long it goes on afterwards, the gripper's
+    opening and closing, whether these take no longer than Meta-World's (``binary_gripper``), and how high things rest
+    above the table.
 
     Args:
         suite: its ``make_engine`` is asked for one row of each task.
@@ -96,6 +98,7 @@ def _rows(suite: Suite, engine: Any, seed: int) -> Iterator[tuple[str, str, str,
         kept = all(np.array_equal(b[width : 2 * width], a[:width]) for a, b in pairwise(walk))
         yield "numbers of the step before", "those" if kept else "others", "those", kept
     hand = layout.positions[0]
+    late = []
     for axis, name in enumerate(_AXES):
         reset()
         run(2 * _STEPS, z=_SHARE)  # away from the table and what stands on it
@@ -105,6 +108,9 @@ def _rows(suite: Suite, engine: Any, seed: int) -> Iterator[tuple[str, str, str,
         told = ", ".join(f"{part * 100:.1f}" for part in moved)
         right = moved.argmax() == axis and abs(moved[axis] - layout.reach) < 0.35 * layout.reach
         yield f"+{name} moves {_AXES[name]}", f"({told}) cm a step", f"{layout.reach * 100:.1f} cm along {name}", right
+        late.append((run(_STEPS)[-1][hand] - way[-1])[axis] / layout.reach / _SHARE)
+    slow = float(max(late))
+    yield "the hand goes on for", f"{slow:.1f} steps", f"{_LAG} steps or fewer, as Meta-World's", slow < _LAG + 0.5
     reset()
     opened = [state[layout.opening] for state in run(_SETTLING, close=-1.0)]
     closed = [state[layout.opening] for state in run(_SETTLING, close=1.0)]
@@ -117,8 +123,8 @@ def _rows(suite: Suite, engine: Any, seed: int) -> Iterator[tuple[str, str, str,
         yield (
             "steps to close",
             str(steps),
-            "few" if layout.binary_gripper else "any",
-            not layout.binary_gripper or (steps <= _SETTLING // 3),
+            f"fewer than Meta-World's {_CLOSING}" if layout.binary_gripper else "any",
+            not layout.binary_gripper or steps < _CLOSING,
         )
     resting = [first, *([] if not layout.things else run(5))][-1]
     for number, thing in enumerate(layout.things):

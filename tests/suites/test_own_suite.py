@@ -185,3 +185,15 @@ def test_the_check_says_what_is_off():
     slow = make_toy_suite(partial(ToyEngine, reach=0.02))
     off = {one.what for one in check_suite(slow) if not one.right}
     assert off == {"+x moves right", "+y moves away from the robot", "+z moves up"}
+
+
+@pytest.mark.parametrize(
+    ("fault", "found"),
+    [({"inertia": 0.9}, ("the hand goes on for", "5.7 steps")), ({"closing": 0.05}, ("steps to close", "18"))],
+)
+def test_the_check_says_what_is_slow(fault, found):
+    task = "toy/touch-red"
+    off = [
+        one for one in check_suite(make_toy_suite(partial(ToyEngine, **fault))) if one.task == task and not one.right
+    ]
+    assert found in {(one.what, one.measured) for one in off}
