@@ -250,3 +250,15 @@ def test_a_policy_trains_online(config, distribution, demos):
     trainer = lw.OnlineTrainer(actor, replay, run, method=method, tasks="toy", suite=SUITE, progress=False)
     trainer.train()
     assert trainer.history[-1]["frames"] == 20
+
+
+@pytest.mark.parametrize(
+    ("fault", "found"),
+    [({"inertia": 0.9}, ("the hand goes on for", "5.7 steps")), ({"closing": 0.05}, ("steps to close", "18"))],
+)
+def test_the_check_says_what_is_slow(fault, found):
+    task = "toy/touch-red"
+    off = [
+        one for one in check_suite(make_toy_suite(partial(ToyEngine, **fault))) if one.task == task and not one.right
+    ]
+    assert found in {(one.what, one.measured) for one in off}

@@ -39,17 +39,21 @@ def _plan(task: lw.Task) -> lw.ConditionalPlan:
 
 
 class ToyEngine:
-    """Rows of one hand and three blocks; an action moves the hand, and closes a gripper in two steps."""
+    """Rows of one hand and three blocks; an action moves the hand, and closes a gripper in two steps.
 
-    def __init__(self, row_tasks, *, reward="sparse", num_threads=None, reach=0.05):
+    The hand keeps a share of its speed, ``inertia``, from step to step; ``closing`` is how far the fingers go in one.
+    """
+
+    def __init__(self, row_tasks, *, reward="sparse", num_threads=None, reach=0.05, inertia=0.0, closing=0.5):
         self.target = np.array([TASKS[task].objects[1].position[0] for task in row_tasks])
         self.state = np.zeros((len(row_tasks), TOY.size))
-        self.dense, self.reach = reward == "dense", reach
+        self.dense, self.reach, self.inertia, self.closing = reward == "dense", reach, inertia, closing
+        self.speed = np.zeros((len(row_tasks), 3))
 
     def reset(self, rows, seeds):
         for row, seed in zip(rows, seeds, strict=True):
             drawn = np.random.default_rng(seed)
-            self.state[row] = 0.0
+            self.state[row] = self.speed[row] = 0.0
             self.state[row, 0] = 1.0
             self.state[row, 1:4] = (0.0, 0.5, 0.2)
             self.state[row, 4:13] = drawn.uniform(-0.2, 0.2, 9)
@@ -59,9 +63,10 @@ class ToyEngine:
 
     def step(self, action, active):
         asked = np.where(active[:, None], action.astype(float), 0.0)
-        self.state[:, 1:4] += self.reach * asked[:, 1:4]
+        self.speed = self.inertia * self.speed + (1 - self.inertia) * self.reach * asked[:, 1:4]
+        self.state[:, 1:4] += self.speed
         self.state[:, 3] = np.maximum(self.state[:, 3], 0.02)
-        self.state[:, 0] = np.clip(self.state[:, 0] + 0.5 * np.sign(asked[:, 6]), 0.0, 1.0)
+        self.state[:, 0] = np.clip(self.state[:, 0] + self.closing * np.sign(asked[:, 6]), 0.0, 1.0)
         block = np.take_along_axis(self.state, self.target[:, None] + np.arange(3), 1)
         gap = np.linalg.norm(block - self.state[:, 1:4], axis=1)
         success = (gap < 0.03) & active

@@ -1,0 +1,150 @@
+"""A suite of one's own: robosuite's Lift, Stack and Door with any of its arms, and Meta-World's policies in it.
+
+python examples/suite_robosuite.py check --arms Panda Sawyer                 # measure what the suite says of itself
+python examples/suite_robosuite.py expert --arms Panda --task stack --seed 7 # scripted skills
+python examples/suite_robosuite.py POLICY --arms Panda Sawyer --task lift --episodes 50 --seed 3000
+
+POLICY is a file of the zero-shot recipe, `lw-torchrl reproduce zero-shot --methods pcbc`: it has seen no robosuite.
+Its words are in robosuite_words/. pip install 'lw_torchrl[robosuite]'; beside mujoco 3.3 Sawyer needs robosuite 1.5.2.
+"""
+
+import argparse
+import logging
+import tomllib
+from pathlib import Path
+
+import numpy as np
+
+import lw_torchrl as lw
+from lw_torchrl.language.layout import Layout, Slot
+from lw_torchrl.suites import Suite, check_suite
+from lw_torchrl.suites.engine import EngineStep, checked_step, seeds_of_rows
+
+logging.getLogger("robosuite_logs").disabled = True  # it reports every controller that it loads
+import robosuite  # noqa: E402
+
+HAND, TIPS = 0.035, 0.009  # metres above robosuite's grip site, as Meta-World's hand above what it holds; and below it
+TABLE, RESTING = 0.8, 0.0194  # metres: robosuite's z of the table; our z of a cube on it, Meta-World's of its puck
+NOW = 10  # numbers of the hand (3), the opening, and two things (3, 3); again of the step before; then the goal (3)
+LAYOUT = Layout(  # robosuite's gripper obeys the effort's sign alone; within 3 cm the finger tips are beside the cube
+    "robosuite", 23, hand=0, opening=3, things=(Slot(4), Slot(7)), goal=20, past=NOW, reach=0.01, binary_gripper=True,
+    thresholds={"near": 0.03},
+)  # fmt: skip
+WORDS = Path(__file__).parent / "robosuite_words"
+ROWS = tomllib.loads((WORDS / "tasks.toml").read_text("utf-8"))
+TASKS = {name: lw.Task.from_json(name, row, LAYOUT) for name, row in ROWS.items()}
+THINGS = {"lift": ["cube_pos"], "stack": ["cubeA_pos", "cubeB_pos"], "door": ["handle_pos"]}
+GOAL = {"lift": (0.0, 0.2, 0.155), "stack": (0.0, 0.0, 0.045), "door": (-0.1, 0.0, 0.0)}  # metres from the last thing
+
+
+class Row:
+    """One robosuite environment, its numbers in our frame: x to the right, y away from the robot, z above the table."""
+
+    def __init__(self, task: str, arm: str) -> None:
+        self.task, self.things = task, THINGS[task]
+        config = robosuite.load_composite_controller_config(controller="BASIC", robot=arm)
+        part = {"type": "OSC_POSITION", "input_ref_frame": "world", "output_max": [1.0] * 3, "output_min": [-1.0] * 3}
+        # Twice robosuite's stiffness keeps slow arms on course; as much damping as lets the hand lag by three steps.
+        config["body_parts"] = {"right": config["body_parts"]["right"] | part | {"kp": 300, "damping_ratio": 2**0.5}}
+        options = {"has_renderer": False, "has_offscreen_renderer": False, "use_camera_obs": False, "ignore_done": True}
+        options |= {"robots": arm, "gripper_types": "PandaGripper", "controller_configs": config}
+        self.env = robosuite.make(task.title(), **options, **({"use_latch": False} if task == "door" else {}))
+
+    def reset(self, seed: int) -> np.ndarray:
+        before = np.random.get_state()  # noqa: NPY002
+        np.random.seed(seed % 2**32)  # noqa: NPY002  robosuite 1.5.1 draws from this generator, 1.5.2 from its own
+        self.env.rng = self.env.placement_initializer.rng = np.random.default_rng(seed)
+        self.env.reset()
+        np.random.set_state(before)  # noqa: NPY002
+        robot, qpos = self.env.robots[0], self.env.sim.data.qpos
+        self.arm = robot.part_controllers["right"]
+        if self.task == "door":  # turn the wrist: so the palm fits between the handle and the door
+            qpos[(joints := robot._ref_joint_pos_indexes)[-1]] += np.pi / 2
+            self.env.sim.forward()
+            self.arm.update_initial_joints(qpos[joints])
+        self.arm.set_goal_update_mode("desired")  # displacements add up, as Meta-World's do
+        self.origin = np.array([robot.base_pos[0], 0.0, TABLE])
+        for _ in range(20):  # the fingers open, things fall
+            seen = self._simulate((0.0, 0.0, 0.0, -1.0))
+        self.origin[2] = TABLE if self.task == "door" else seen[self.things[0]][2] - RESTING
+        now = self._now(seen)
+        self.seen = np.concatenate((now, now, now[: 4 + 3 * len(self.things)][-3:] + GOAL[self.task]))
+        return self.seen
+
+    def step(self, action: np.ndarray) -> np.ndarray:
+        self.seen = np.concatenate((self._now(self._simulate(action)), self.seen[:NOW], self.seen[2 * NOW :]))
+        return self.seen
+
+    def _simulate(self, action):
+        right, away, up, effort = map(float, action)
+        way = LAYOUT.reach * np.array([away, -right, up])
+        way[2] = max(way[2], TABLE + TIPS - self.arm.goal_pos[2])
+        return self.env.step(np.array([*way, effort]))[0]
+
+    def _now(self, seen):
+        found = np.zeros(NOW)
+        for at, name in zip((0, 4, 7), ("robot0_eef_pos", *self.things), strict=False):
+            away, left, up = seen[name] - self.origin
+            found[at : at + 3] = -left, away, up + (0.0 if at else HAND)
+        found[3] = np.clip(np.abs(seen["robot0_gripper_qpos"]).sum() / 0.08, 0.0, 1.0)
+        return found
+
+
+class Engine:
+    """Rows of robosuite, stepped one after the other; each has an environment of its own."""
+
+    def __init__(self, row_tasks, arm, *, reward="sparse", num_threads=None):
+        self.rows = [Row(task.partition("/")[2], arm) for task in row_tasks]
+        n, self.dense = len(self.rows), reward == "dense"
+        self.seen, self.started, self.faulted = np.zeros((n, LAYOUT.size)), np.zeros(n, bool), np.zeros(n, bool)
+
+    def reset(self, rows, seeds):
+        index, seed_of = seeds_of_rows(rows, seeds)
+        self.seen[index] = [self.rows[row].reset(seed_of[row]) for row in index]
+        self.started[index], self.faulted[index] = True, False
+        return self.seen[index]
+
+    def step(self, action, active):
+        action, active = checked_step(action, active, self.started, LAYOUT.action_size)
+        reward, success = np.zeros(len(active)), np.zeros(len(active), bool)
+        self.faulted |= active & ~np.isfinite(action).all(1)
+        for row in np.flatnonzero(active & ~self.faulted):
+            self.seen[row] = self.rows[row].step(np.clip(action[row], -1, 1))
+            success[row] = self.rows[row].env._check_success()
+            reward[row] = self.rows[row].env.reward(None) if self.dense else success[row]
+        return EngineStep(self.seen.copy(), reward, success, active & self.faulted)
+
+    def close(self):
+        self.rows = []
+
+
+def make_suite(arm: str = "Panda") -> Suite:
+    """The tasks with one of robosuite's arms, and a Panda's gripper."""
+    words = {"plans": lw.load_plans(WORDS, tasks=TASKS), "skills": lw.load_skills(WORDS / "skills.toml", tasks=TASKS)}
+    return Suite("robosuite", LAYOUT, TASKS, lambda rows, **how: Engine(rows, arm, **how), max_steps=300, **words)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("policy", help="a policy's file; or expert, for scripted skills; or check")
+    parser.add_argument("--arms", nargs="+", default=["Panda"], help="robosuite's names")
+    parser.add_argument("--task", choices=THINGS, default="lift")
+    for name, number in (("episodes", 50), ("seed", 3000), ("steps", 300), ("rows", 5)):
+        parser.add_argument(f"--{name}", type=int, default=number, help=f"{number} unless given")
+    args = parser.parse_args()
+    for arm, suite in ((arm, make_suite(arm)) for arm in args.arms):
+        if args.policy == "check":
+            print(*(f"{arm} {one}" for one in check_suite(suite)), sep="\n")
+            continue
+        actor = lw.ScriptedSkillActor(suite.plans, skills=suite.skills)
+        if args.policy != "expert":
+            actor = lw.modules.TransferredActor(lw.load_actor(args.policy), suite.plans)
+        result = lw.evaluate(
+            actor, tasks=f"robosuite/{args.task}", suite=suite, episodes_per_task=args.episodes, seed=args.seed,
+            max_steps=args.steps, num_envs=args.rows, noise_scale=0.0, stop_at_success=True,
+        )  # fmt: skip
+        print(f"{arm} {args.task}: {result.mean_success:.2f}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,81 @@
+"""The example's suite of robosuite: its check, its seeds, its plans, and the script itself."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import lw_torchrl as lw
+from lw_torchrl.suites import check_suite
+
+pytestmark = pytest.mark.slow
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+@pytest.fixture(scope="module")
+def example():
+    pytest.importorskip("robosuite")
+    sys.path.insert(0, str(EXAMPLES))
+    try:
+        import suite_robosuite
+    finally:
+        sys.path.remove(str(EXAMPLES))
+    return suite_robosuite
+
+
+@pytest.fixture(scope="module")
+def suite(example):
+    return example.make_suite("Panda")
+
+
+def test_the_suite_is_what_it_says(suite):
+    off = [(one.task, one.what) for one in check_suite(suite) if not one.right]
+    assert off == [("robosuite/stack", "thing 2 rests at")], (
+        "the lower cube is larger, and no query asks for its height"
+    )
+
+
+def test_a_seed_is_an_episode_whatever_the_row_did(suite):
+    engine = suite.make_engine(["robosuite/lift", "robosuite/lift"])
+    first = engine.reset([0, 1], [7, 8])
+    action = np.array([[0.3, -0.5, -1.0, 1.0]] * 2, np.float32)
+    walk = [engine.step(action, np.array([True, True])).observation for _ in range(5)]
+    before = np.random.get_state()[1].copy()  # noqa: NPY002
+    again = engine.reset([1, 0], [7, 8])
+    np.testing.assert_array_equal(np.random.get_state()[1], before)  # noqa: NPY002
+    np.testing.assert_array_equal(again, first)
+    assert not np.array_equal(first[0], first[1])
+    for state in walk:
+        np.testing.assert_array_equal(engine.step(action, np.array([True, True])).observation[[1, 0]], state)
+    alone = engine.step(action, np.array([True, False]))
+    np.testing.assert_array_equal(alone.observation[1], walk[-1][0])
+    spoilt = engine.step(np.full_like(action, np.nan), np.array([False, True]))
+    assert spoilt.fault.tolist() == [False, True]
+    engine.close()
+
+
+@pytest.mark.parametrize("task", ["lift", "stack", "door"])
+def test_plans_with_scripted_skills_succeed(task, suite):
+    actor = lw.ScriptedSkillActor(suite.plans, skills=suite.skills)
+    run = {"episodes_per_task": 1, "seed": 2000, "noise_scale": 0.0, "stop_at_success": True, "progress": False}
+    assert lw.evaluate(actor, tasks=f"robosuite/{task}", suite=suite, **run).mean_success == 1.0
+
+
+def test_the_example_runs_a_policy_of_meta_world(example, tmp_path):
+    actor = lw.PlanConditionedActor(lw.load_plans("MT10"), roles=True, features="opening", width=8)
+    lw.save_actor(actor, tmp_path / "policy.zip")
+    options = ["--episodes", "1", "--steps", "5", "--arms", "Panda", "IIWA"]
+    done = subprocess.run(
+        [sys.executable, str(EXAMPLES / "suite_robosuite.py"), str(tmp_path / "policy.zip"), *options],
+        env=dict(os.environ),
+        capture_output=True,
+        text=True,
+        timeout=240,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "Panda lift: 0.00\nIIWA lift: 0.00\n"
+    assert "Warning" not in done.stderr
+    assert "robosuite" not in done.stderr
