@@ -1,7 +1,7 @@
 """Fetch learns to reach, push, and pick and place from ten demonstrations of each: python examples/fetch_few_shot.py
 
-Plans carried out by scripts demonstrate, with noise on what they do. The policy sees where the things are that the active
-step is about, and how far the gripper is open: with few demonstrations, what else a state tells would lead it astray.
+Plans carried out by scripts demonstrate, with noise on what they do. The policy sees where the things are that the
+active step is about, and how far the gripper is open. With few demonstrations, more would lead it astray.
 """
 
 import argparse

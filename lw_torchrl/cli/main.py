@@ -23,6 +23,7 @@ from lw_torchrl.cli import plan as cli_plan
 from lw_torchrl.cli.check import check
 from lw_torchrl.cli.offline import offline
 from lw_torchrl.cli.online import online
+from lw_torchrl.cli.options import import_modules
 from lw_torchrl.cli.output import Output, complain, nobody_reads, sound_streams
 from lw_torchrl.cli.parsing import document, in_its_words, parse, unpadded
 from lw_torchrl.cli.train import train
@@ -52,6 +53,9 @@ COMMANDS: dict[str, Any] = {
 GROUPS: dict[str, dict[str, Any]] = {"plan": cli_plan.COMMANDS}
 """Commands that have commands of their own."""
 ABOUT = """Language-World with TorchRL: policies carried by plans in English. --version tells which.
+
+--import MODULE, beside any command, imports a module of yours first, which may add suites, relations, formats, policies
+or evaluators of your own to their tables (docs/extending.md).
 
 Exit status: 0, done; 1, a bug of ours, with a traceback; 2, an error that you can fix, in one line on the standard
 error; 130, stopped by Ctrl-C; 141, nobody reads the output. What prints a table prints JSON with --json."""
@@ -88,6 +92,7 @@ def _run(given: Sequence[str]) -> None:
     for arg in given:  # its name could be written to no file of ours
         if any("\ud800" <= character <= "\udfff" for character in arg):
             raise ValueError(f"the argument {arg!a} is no text in the encoding {sys.getfilesystemencoding()}")
+    given = import_modules(given)
     if list(given) == ["--version"]:
         print(f"lw-torchrl {__version__}")
         return

@@ -211,6 +211,23 @@ def _imported(option: str, name: str, kind: str) -> Any:
         raise ValueError(f"{option} {name!r} names no {kind}: {error}") from error
 
 
+def import_modules(given: Sequence[str]) -> list[str]:
+    """The command line without each ``--import MODULE``, which is imported; the working folder is searched first."""
+    rest, words = [], iter(given)
+    for word in words:
+        if word != "--import" and not word.startswith("--import="):
+            rest.append(word)
+            continue
+        name = next(words, "") if word == "--import" else word.removeprefix("--import=")
+        if "" not in sys.path:
+            sys.path.insert(0, "")
+        try:
+            import_module(name)
+        except (ImportError, ValueError) as error:
+            raise ValueError(f"--import {name!r} names no module: {error}") from error
+    return rest
+
+
 def read_encoder(name: str | None) -> TextEncoder | None:
     """The function that --text-encoder names, "package.module:function"; the working folder is searched first."""
     if name is None:

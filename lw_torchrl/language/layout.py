@@ -46,14 +46,15 @@ class Layout:
         opening: index of the gripper's opening, from 0, closed, to 1, open.
         things: the things, in the order in which tasks have them. All but the first may be absent: zeros.
         goal: index of the x of the task's target.
-        past: by how many places the numbers of the step before stand further back; None without them. The goal has no
-            past.
+        past: the numbers of the step before stand at their index + past; after a reset they are the present ones. None
+            without them. The goal has no past.
         action_size: A, how many numbers an action has, each in [-1, 1].
         displacement: index of the x of the hand's displacement; y and z follow. None where actions are something else,
             velocities of joints for one: scripted skills, ``RandomYaw`` and ``TransferredActor`` then refuse it.
         reach: metres that the hand moves in a step at a displacement of 1, once it moves.
         gripper: index of the gripper's effort; None where no number is one.
-        closes: the effort's sign that closes, 1 or -1.
+        closes: the effort's sign that closes, 1 or -1. Skills say 1 to close everywhere; actions and data have this
+            sign.
         binary_gripper: whether the gripper opens or closes fully within a few steps, so that an effort in between has
             to be decided.
         closes_above: the effort above which such a gripper closes. Meta-World's fingers, which close as fast as the
@@ -62,7 +63,7 @@ class Layout:
             elsewhere; only for relations of one comparison.
 
     Raises:
-        ValueError: an index outside the numbers, or a wrong sign.
+        ValueError: an index outside the numbers, a number that is two things, or a wrong sign.
 
     Example:
         >>> METAWORLD.positions
@@ -95,10 +96,19 @@ class Layout:
         ends += [thing.quaternion + 4 for thing in self.things if thing.quaternion is not None]
         if min(self.hand, self.opening, self.goal) < 0 or max(ends) > self.size:
             raise ValueError(f"layout {self.name!r} names numbers outside the {self.size} of an observation")
+        told = [number for part in self.parts[:-1] for place in part for number in range(place.start, place.stop)]
+        own = [*range(self.hand, self.hand + 3), self.opening]
+        told += [*own, *(number + (self.past or 0) for number in own if self.past is not None)]
+        if twice := sorted({number for number in told if told.count(number) > 1}):
+            raise ValueError(f"layout {self.name!r} says of number {twice[0]} that it is two things")
         for name, index, width in (("displacement", self.displacement, 3), ("gripper", self.gripper, 1)):
             if index is not None and not 0 <= index <= self.action_size - width:
                 within = f"within {self.action_size} numbers"
                 raise ValueError(f"{name} of layout {self.name!r} must be {within}, got {index}")
+        if self.displacement is not None and self.gripper in range(self.displacement, self.displacement + 3):
+            raise ValueError(
+                f"gripper of layout {self.name!r} must be no number of the displacement, got {self.gripper}"
+            )
         if self.closes not in (1, -1):
             raise ValueError(f"closes of layout {self.name!r} must be 1 or -1, got {shown(self.closes)}")
         if self.reach <= 0:

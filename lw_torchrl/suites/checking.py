@@ -74,7 +74,7 @@ def check_suite(suite: Suite, *, seed: int = 0) -> list[Finding]:
             bench = _Bench(suite, task, engine, seed)
             found += [Finding(task, *row) for row in bench.rows()]
             heights += bench.heights
-    if heights and min(heights) > _LOWEST:
+    if suite.layout.displacement is not None and min(heights, default=0.0) > _LOWEST:
         lowest = f"z = {min(heights) * 100:.1f} cm"
         found.append(Finding("all", "the lowest of things and pressed hands", lowest, "z counts from the table", False))
     return found

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from types import MappingProxyType
 from typing import Any
 
-from lw_torchrl._checks import check_fields, shown, unknown_name
+from lw_torchrl._checks import check_choice, check_fields, shown, unknown_name
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.plans import Plans
+from lw_torchrl.language.relations import PREDICATES
 from lw_torchrl.language.skills import Skills
 from lw_torchrl.language.tasks import Task, TaskList, Tasks, named_tasks
 from lw_torchrl.suites.engine import Engine
@@ -24,7 +25,8 @@ class Suite:
         name: "fetch"; its tasks are called "fetch/push".
         layout: what the numbers of observations and actions are.
         tasks: full name to :class:`Task`, each of this layout.
-        make_engine: ``(row_tasks, *, reward, num_threads) -> Engine``, the simulator of rows of these tasks.
+        make_engine: ``(row_tasks, *, reward, num_threads) -> Engine``, a row for each of ``row_tasks``, full names;
+            ``reward`` is "sparse" or "dense".
         skills: the scripted skills by their text; None for none.
         plans: a plan for each task that has one; None for none.
         make_expert: ``(tasks) -> actor``, a demonstrator that writes ``action`` (N, A) float32 in [-1, 1] and
@@ -53,6 +55,20 @@ class Suite:
 
     def __post_init__(self) -> None:
         check_fields(self)
+        kinds: dict[str, Any] = {
+            "tasks": Mapping,
+            "layout": Layout,
+            "make_engine": Callable,
+            "skills": Mapping,
+            "plans": Plans,
+        }
+        for name, kind in kinds.items():
+            if not isinstance(value := getattr(self, name), kind) and (
+                value is not None or name in ("tasks", "layout")
+            ):
+                raise TypeError(f"{name} of suite {self.name!r} must be a {kind.__name__}, got {shown(value)}")
+        for relation in self.layout.thresholds:
+            check_choice(f"thresholds of layout {self.layout.name!r}", relation, PREDICATES)
         if not self.tasks:
             raise ValueError(f"tasks of suite {self.name!r} must name at least one task")
         for name, task in self.tasks.items():
@@ -100,7 +116,10 @@ def load_suite(suite: str | Suite) -> Suite:
     if not isinstance(suite, str):
         raise TypeError(f"suite must be a suite's name or a Suite, got {shown(suite)} ({type(suite).__name__})")
     if suite not in SUITES:
-        raise unknown_name("suite", suite, SUITES)
+        raise ValueError(
+            f"{unknown_name('suite', suite, SUITES)} (yours is given as suite=, or has a name by lw.suites.SUITES["
+            f"{suite!r}] = ..., on the command line in a module that --import names)"
+        )
     found = SUITES[suite]
     if isinstance(found, str):
         found = SUITES[suite] = import_module(found).make_suite()

@@ -4,6 +4,7 @@ import math
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
 import pytest
 import torch
 from torchrl.envs import Compose, TransformedEnv, check_env_specs
@@ -11,7 +12,7 @@ from torchrl.objectives import TD3Loss
 from toy_suite import SKILLS, TASKS, TOY, ToyEngine, make_toy_suite
 
 import lw_torchrl as lw
-from lw_torchrl.language.layout import METAWORLD
+from lw_torchrl.language.layout import METAWORLD, Slot
 from lw_torchrl.language.skills import ScriptedSkill
 from lw_torchrl.modules import ActorEnsemble, TransferredActor
 from lw_torchrl.suites import SUITES, Suite, check_suite, find_suite, load_suite
@@ -210,6 +211,109 @@ def test_the_check_says_what_is_off():
     slow = make_toy_suite(partial(ToyEngine, reach=0.02))
     off = {one.what for one in check_suite(slow) if not one.right}
     assert off == {"+x moves right", "+y moves away from the robot", "+z moves up"}
+
+
+class Broken(ToyEngine):
+    """A toy with one fault."""
+
+    fault = ""
+
+    def _spoilt(self, seen):
+        if self.fault == "NaN":
+            seen[:, 10] = np.nan
+        elif self.fault == "floor":
+            seen[:, [3, 6, 9, 12, 15]] += 0.42
+        elif self.fault == "things from the hand":
+            seen[:, 4:13] -= np.tile(seen[:, 1:4], 3)
+            seen[:, 4:13] = -seen[:, 4:13]
+        elif self.fault == "single":
+            seen = seen.astype(np.float32)
+        return seen
+
+    def reset(self, rows, seeds):
+        seen = self._spoilt(super().reset(rows, seeds))
+        return np.tile(seen, (2, 1))[:2] if self.fault == "all rows" else seen
+
+    def step(self, action, active):
+        done = super().step(action, np.ones_like(active) if self.fault == "restless" else active)
+        if self.fault == "restless":
+            self.state[1, 1] += 0.01
+        done = done._replace(observation=self._spoilt(done.observation))
+        return tuple(done) if self.fault == "tuple" else done
+
+
+@pytest.mark.parametrize(
+    ("fault", "what"),
+    [
+        ("NaN", "the numbers"),
+        ("floor", "the lowest of things and pressed hands"),
+        ("things from the hand", "thing 1 as the hand moves"),
+        ("single", "observations of a reset"),
+        ("all rows", "a reset of one row of two"),
+        ("restless", "a row that is not active"),
+        ("tuple", "a step"),
+    ],
+)
+def test_the_check_finds_what_is_easily_wrong(fault, what, monkeypatch):
+    monkeypatch.setattr(Broken, "fault", fault)
+    assert what in {one.what for one in check_suite(make_toy_suite(Broken)) if not one.right}
+
+
+class NoPast(ToyEngine):
+    """The numbers of the step before are always 0."""
+
+    def reset(self, rows, seeds):
+        return np.pad(super().reset(rows, seeds), ((0, 0), (0, 13)))
+
+    def step(self, action, active):
+        done = super().step(action, active)
+        return done._replace(observation=np.pad(done.observation, ((0, 0), (0, 13))))
+
+
+def off_in(layout, engine, plans=None):
+    tasks = {name: replace(task, layout=layout) for name, task in TASKS.items()}
+    return {one.what for one in check_suite(Suite("toy", layout, tasks, engine, plans=plans)) if not one.right}
+
+
+def test_the_check_finds_a_past_that_is_zero():
+    assert off_in(replace(TOY, size=29, past=13, goal=26), NoPast) == {"numbers of the step before"}
+
+
+def test_the_check_finds_a_gripper_that_does_not_move():
+    still = replace(TOY, gripper=5)
+    task = replace(TASKS["toy/touch-red"], layout=still)
+    pairs = [("the gripper is open", "go"), ("the gripper is closed", "stay")]
+    plans = lw.Plans([lw.ConditionalPlan.from_pairs(task, pairs)])
+    assert off_in(still, ToyEngine) == set()
+    assert off_in(still, ToyEngine, plans) == {"gripper"}
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"opening": 2}, "says of number 2 that it is two things"),
+        ({"things": (Slot(3),)}, "says of number 3 that it is two things"),
+        ({"past": 2, "size": 40}, "that it is two things"),
+        ({"gripper": 2}, "gripper of layout 'toy' must be no number of the displacement, got 2"),
+    ],
+)
+def test_a_number_is_one_thing(change, says):
+    with pytest.raises(ValueError, match=says):
+        replace(TOY, **change)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "says"),
+    [
+        ({"plans": {}}, TypeError, "plans of suite 'toy' must be a Plans"),
+        ({"skills": ["go"]}, TypeError, "skills of suite 'toy' must be a Mapping"),
+        ({"tasks": []}, TypeError, "tasks of suite 'toy' must be a Mapping"),
+        ({"layout": replace(TOY, thresholds={"nearr": 0.05})}, ValueError, "got 'nearr'; did you mean 'near'"),
+    ],
+)
+def test_wrong_fields_of_a_suite_are_named(change, error, says):
+    with pytest.raises(error, match=says):
+        replace(SUITE, **change)
 
 
 def td3(plans):
