@@ -8,11 +8,13 @@ pytest.importorskip("gymnasium_robotics")
 
 import lw_torchrl as lw
 from lw_torchrl.cli.main import main
-from lw_torchrl.suites import load_suite
+from lw_torchrl.suites import SUITES, load_suite
+from lw_torchrl.suites import suite as suite_module
 
 OWN = """
 from dataclasses import replace
-from lw_torchrl.suites import load_suite
+from lw_torchrl.suites import SUITES, load_suite
+from lw_torchrl.suites import suite as suite_module
 
 fetch = load_suite("fetch")
 reach = {"fetch/reach": replace(fetch.tasks["fetch/reach"], layout=replace(fetch.layout, reach=0.1))}
@@ -86,6 +88,23 @@ def test_check_measures_a_suite(capsys, own):
     assert "OFF  fetch/reach  +x moves right" in printed.out
     assert "wanted: 10.0 cm along x" in printed.out
     assert "3 numbers of suite 'fetch' are off" in printed.err
+
+
+def test_a_module_of_yours_is_imported_first(capsys, tmp_path, monkeypatch):
+    (tmp_path / "my_desk.py").write_text(
+        "from dataclasses import replace\nimport lw_torchrl as lw\nfetch = lw.suites.load_suite('fetch')\n"
+        "layout = replace(fetch.layout, name='desk')\n"
+        "tasks = {f'desk/{n[6:]}': replace(t, name=f'desk/{n[6:]}', layout=layout) for n, t in fetch.tasks.items()}\n"
+        "lw.suites.SUITES['desk'] = replace(fetch, name='desk', layout=layout, tasks=tasks, plans=None)\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(suite_module, "SUITES", dict(SUITES))
+    monkeypatch.setattr(lw.suites, "SUITES", suite_module.SUITES)
+    assert len(said(capsys, "--import", "my_desk", "tasks", "desk")["tasks"]) == 4
+    assert len(said(capsys, "tasks", "desk/push", "--import=my_desk")["tasks"]) == 1
+    with pytest.raises(SystemExit):
+        main(["tasks", "--import", "no_such_module"])
+    assert "--import 'no_such_module' names no module" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
