@@ -18,12 +18,12 @@ READY := $(VENV)/.ready
 
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test test-slow test-all test-python check setup bench clean
+.PHONY: demo test test-slow test-all test-python check setup bench robosuite clean
 demo: $(READY)
 	$(BIN)/lw-torchrl demo
 test: $(READY)
 	$(PYTEST) -m 'not slow'
-test-slow: $(READY)
+test-slow: robosuite
 	$(PYTEST) -m slow
 test-all: test test-slow
 test-python:
@@ -33,6 +33,9 @@ check: $(READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 setup: $(READY)
+# Without what robosuite 1.5.2 asks for, numpy below 2 and keyboards that are compiled: its arms need neither.
+robosuite: $(READY)
+	$(BIN)/python -m pip install --disable-pip-version-check --no-deps robosuite==1.5.2 opencv-python-headless==5.0.0.93 termcolor==3.3.0
 bench: $(READY)
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks
 
