@@ -89,6 +89,9 @@ def log_rollout(
         'reach-0'
         >>> env.close()
     """
+    if suite is not None:
+        suite = load_suite(suite)
+        tasks = [*tasks, *suite.tasks.values()]
     if len(rollout.batch_size) == 2:
         if name is not None:
             raise ValueError(f"name is of one episode, but rollout holds {len(rollout)}; got {name!r}")
@@ -101,8 +104,8 @@ def log_rollout(
     if isinstance(failure, Sequence):
         raise ValueError(f"failure must be one Failure for one episode, got {len(failure)}")
     heading, episode = read_rollout(rollout, plans, seed=seed, policy=policy, failure=failure, tasks=tasks)
-    found = known_suite(heading.task) if suite is None else load_suite(suite)
-    return logger.add_page(heading, episode, motion=_motion(heading, episode, found), name=name)
+    motion = _motion(heading, episode, suite or known_suite(heading.task))
+    return logger.add_page(heading, episode, motion=motion, name=name)
 
 
 def read_rollout(

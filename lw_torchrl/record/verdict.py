@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lw_torchrl.evaluation.failure_records import CAUSES, Failure
+from lw_torchrl.language.layout import Layout
 from lw_torchrl.record.conventions import FALSE, STEEL, TRUE, Color, entity_path, rr, step_color, time_columns
 from lw_torchrl.record.recorded_episode import NOBODY, RecordedEpisode
 
@@ -132,7 +133,6 @@ def _step(episode: RecordedEpisode, step: int) -> str:
 
 
 NONE_HOLDS, EVENLY = "no condition holds", "evenly mixed"
-ACTION_NAMES = ("dx", "dy", "dz", "gripper")
 MARKS = {True: "✓", False: "✗", None: "·"}
 
 
@@ -211,7 +211,7 @@ def log_curves(stream: Any, root: str, episode: RecordedEpisode) -> list[str]:
     """``root``/action, and, where there is any, /distance (cm), /reward, /skill_weights, /corrected; returns which."""
     rows = np.arange(len(episode))
     sent = ["action"]
-    _send(stream, f"{root}/action", rows, episode.action, ACTION_NAMES)
+    _send(stream, f"{root}/action", rows, episode.action, action_names(episode.layout))
     if (distance := episode.distance()) is not None:
         # One line in centimetres, in the colour of the step in force.
         assert episode.in_force is not None
@@ -234,6 +234,15 @@ def log_curves(stream: Any, root: str, episode: RecordedEpisode) -> list[str]:
         _send(stream, f"{root}/corrected", rows, episode.corrected[:, None], ["of the correction"])
         sent.append("corrected")
     return sent
+
+
+def action_names(layout: Layout) -> list[str]:
+    names = [str(number) for number in range(layout.action_size)]
+    if layout.displacement is not None:
+        names[layout.displacement : layout.displacement + 3] = "dx", "dy", "dz"
+    if layout.gripper is not None:
+        names[layout.gripper] = "gripper"
+    return names
 
 
 def _send(stream: Any, path: str, steps: Any, values: Any, names: Sequence[str], *color: Color) -> None:

@@ -15,6 +15,7 @@ import lw_torchrl as lw
 from lw_torchrl.language.layout import METAWORLD, Slot
 from lw_torchrl.language.skills import ScriptedSkill
 from lw_torchrl.modules import ActorEnsemble, TransferredActor
+from lw_torchrl.record.verdict import action_names
 from lw_torchrl.suites import SUITES, Suite, check_suite, find_suite, load_suite
 from lw_torchrl.training.algorithms import PPOConfig, TD3Config
 
@@ -110,6 +111,15 @@ def test_a_policy_is_trained_saved_evaluated_and_recorded(demos, tmp_path):
             for one in episodes[:1]
         ]
     assert names[0].startswith("toy")
+
+
+def test_a_recording_names_the_layout_s_actions_and_needs_no_plan(tmp_path):
+    env = lw.LanguageWorldEnv("toy", suite=SUITE)
+    rollout = env.rollout(3, auto_reset=True)[0]
+    with lw.RerunLogger(tmp_path / "toy.rrd") as logger:
+        assert lw.log_rollout(logger, rollout, seed=env.seed, suite=SUITE).startswith("toy")
+    env.close()
+    assert action_names(TOY) == ["0", "dx", "dy", "dz", "4", "5", "gripper"]
 
 
 def test_failures_are_attributed_by_the_suite_s_own_skills():
