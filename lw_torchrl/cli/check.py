@@ -47,13 +47,11 @@ def check(
         try:
             kind, number, notes = _check_table(file, known, "" if task_file else "; tasks of yours come by --task-file")
         except ValueError as error:
-            output.show("files", [{"file": file, "steps": 0, "faults": [str(error)], "notes": []}])
             output.fault = str(error)
-            return output
+            return output.show("files", [{"file": file, "steps": 0, "faults": [str(error)], "notes": []}])
         lines = [*(f"{file.name}: note: {note}" for note in notes), f"{file.name}: {counted(number, kind)}, valid"]
         row = {"file": file, f"{kind}s": number, "faults": [], "notes": notes}
-        output.show("files", [row], "\n".join(lines))
-        return output
+        return output.show("files", [row], "\n".join(lines))
     paths = sorted(file.glob("*.plan")) if file.is_dir() else [file]
     if not paths:
         raise ValueError(f"file: the folder {str(file)!r} holds no .plan files")
@@ -66,13 +64,11 @@ def check(
         found = counted(len(faults), "fault") if faults else f"{counted(steps, 'step')}, valid"
         if not json:
             print("\n".join([*faults, *(f"{path.name}: note: {note}" for note in notes), f"{path.name}: {found}"]))
-    output.show("files", rows)
-    faults = [fault for row in rows for fault in row["faults"]]
-    if faults:
+    if faults := [fault for row in rows for fault in row["faults"]]:
         unknown = any(" is no task" in fault for fault in faults)
         hint = "; tasks of yours come by --task-file" if unknown and task_file is None else ""
         output.fault = f"{counted(len(faults), 'fault')} in {counted(len(paths), 'file')}{hint}"
-    return output
+    return output.show("files", rows)
 
 
 def _check_suite(name: str, json: bool) -> Output:
@@ -81,18 +77,16 @@ def _check_suite(name: str, json: bool) -> Output:
 
     suite = read_suite(name)
     assert suite is not None
-    rows = check_suite(suite)
-    output = Output(json)
+    rows, output = check_suite(suite), Output(json)
     width = [max(len(getattr(row, key)) for row in rows) for key in ("task", "what", "measured")]
     lines = [
         f"{'ok ' if row.right else 'OFF'}  {row.task:{width[0]}}  {row.what:{width[1]}}  {row.measured:{width[2]}}  "
         f"{'' if row.right else f'wanted: {row.wanted}'}".rstrip()
         for row in rows
     ]
-    output.show("suite", [vars(row) for row in rows], "\n".join(lines))
     if off := sum(not row.right for row in rows):
         output.fault = f"{counted(off, 'number')} of suite {suite.name!r} {'is' if off == 1 else 'are'} off"
-    return output
+    return output.show("suite", [vars(row) for row in rows], "\n".join(lines))
 
 
 def _check_table(file: Path, known: Mapping[str, Task], hint: str) -> tuple[str, int, list[str]]:
@@ -136,6 +130,5 @@ def _check_plan(
                 hint = f"the nearest is {found.text!r} ({score:.2f})"
             except ValueError:
                 hint = "nor does another; yours come by --skill-file"
-            note = f"no scripted skill {step.skill!r} suits {plan.task}; {hint}. A learned policy needs none"
-            notes.append(note)
+            notes.append(f"no scripted skill {step.skill!r} suits {plan.task}; {hint}. A learned policy needs none")
     return [], len(plan.steps), notes

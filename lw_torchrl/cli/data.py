@@ -65,14 +65,11 @@ def collect(
     how: dict[str, Any] = {"policy": acts, "behaviour": behaviour, "redraw_failures": redraw_failures, "seed": seed}
     how |= {"noise_scale": noise, "noise_hold": noise_hold, "gripper_noise_factor": gripper_noise}
     made = collect_demonstrations(chosen, episodes_per_task=episodes, root=out, num_envs=num_envs, **how)
-    output = Output(json)
     rates, runs = made.success_rate, made.attempts
     rows = [{"task": task, "success": rate, "episodes_run": runs[task]} for task, rate in rates.items()]
     columns: Columns = {"task": "task", "success": lambda row: f"{row['success']:.2f}", "episodes run": "episodes_run"}
-    output.table("tasks", rows, columns)
-    output.show("dataset", made.root)
-    output.show("steps", made.num_steps, f"{counted(made.num_steps, 'step')} in {made.root}")
-    return output
+    output = Output(json).table("tasks", rows, columns).show("dataset", made.root)
+    return output.show("steps", made.num_steps, f"{counted(made.num_steps, 'step')} in {made.root}")
 
 
 def data(

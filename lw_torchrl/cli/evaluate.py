@@ -62,50 +62,43 @@ def evaluate(
     options.check_encoder(text_encoder)
     elsewhere = options.read_suite(suite, tasks)
     known = dict(options.read_tasks(task_file)) | dict({} if elsewhere is None else elsewhere.tasks)
-    if elsewhere is not None:
-        chosen = tuple(elsewhere.named_tasks(options.one_or_many(tasks))) if tasks else ()
-    else:
-        chosen = options.simulated("tasks", options.one_or_many(tasks), known) if tasks else ()
+    chosen = options.simulated("tasks", options.one_or_many(tasks), known, elsewhere) if tasks else ()
     given = options.read_plans(plans, known) if plans else None
     import lw_torchrl as lw
     from lw_torchrl._devices import check_device
     from lw_torchrl._files import held
     from lw_torchrl.data.missing_episodes import suite_expert
-    from lw_torchrl.evaluation import plot_failures
     from lw_torchrl.record.rollouts import run_recorded, write_recording
-    from lw_torchrl.training.files import demonstrated_tasks, load_evaluator
+    from lw_torchrl.training.files import demonstrated_tasks
 
     options.use_one_thread()
     there = check_device("device", device)
     policy = None
     if str(checkpoint) != "expert":
-        policy = options.load_policy(checkpoint, seed, None if elsewhere else given, text_encoder)
-        if elsewhere is not None:
-            policy = options.moved(policy, elsewhere, given, speed)
+        policy = options.load_policy(checkpoint, seed, given, text_encoder, elsewhere, speed)
         if evaluator is not None:
             if policy.plans is None:
                 raise ValueError(f"--evaluator is for a policy with plans, {type(policy).__name__} has none")
             encoder = options.read_encoder(text_encoder)
-            policy = policy.with_evaluator(load_evaluator(evaluator, policy.plans, text_encoder=encoder))
+            inside = lw.training.load_evaluator(evaluator, policy.plans, text_encoder=encoder)
+            policy = policy.with_evaluator(inside)
         known.update({task: found for task in policy.tasks if (found := policy.definition(task)) is not None})
     if not chosen and policy is not None:
         chosen = _default_tasks(policy, set() if plans else demonstrated_tasks(checkpoint), elsewhere)
-    if policy is None and elsewhere is not None:
-        chosen = chosen or tuple(elsewhere.plans or elsewhere.tasks)
-        policy = suite_expert(elsewhere, chosen)
+    if policy is None:
+        chosen = chosen or (lw.MT10 if elsewhere is None else tuple(elsewhere.plans or elsewhere.tasks))
+        policy = None if elsewhere is None else suite_expert(elsewhere, chosen)
     if policy is None and there.type != "cpu":
         raise ValueError("--device is for a policy; the scripted experts work on the CPU")
     if attribute and (policy is None or policy.plans is None):
         raise ValueError(f"--attribute is for a policy with plans, {checkpoint} has none")
-    chosen = chosen or (lw.MT10 if elsewhere is None else tuple(elsewhere.tasks))
     how: dict[str, Any] = {"tasks": chosen, "episodes_per_task": episodes, "seed": seed, "noise_scale": noise}
     how |= {"stop_at_success": stop_at_success, "num_envs": num_envs, "device": there, "attribute": attribute}
     where: dict[str, Any] = {} if elsewhere is None else {"suite": elsewhere}
     where |= {} if max_steps is None else {"max_steps": max_steps}
     trusted = options.read_plans(reference, known) if reference else None
     result = lw.evaluate(policy or lw.ExpertActor(chosen), reference=trusted, **how, **where)
-    output = Output(json)
-    output.result(result)
+    output = Output(json).result(result)
     if attribute:
         failures = [asdict(one) for one in result.failures or ()]
         output.show("failures", failures, f"\n{result.failure_table()}")
@@ -117,7 +110,7 @@ def evaluate(
             result.save(out / "results.json", **told)
             lw.plot_success(result, out / "success.png", title=f"{checkpoint}, {episodes} episodes a task")
             if attribute:
-                plot_failures(result, out / "failures.png", title=str(checkpoint))
+                lw.evaluation.plot_failures(result, out / "failures.png", title=str(checkpoint))
             if policy is not None:
                 shown: list[str | Task] = list(result.config["tasks"][:3])
                 recorded = run_recorded(policy, shown, seed=seed, noise_scale=noise, **where)
@@ -195,8 +188,7 @@ def scripted(
                 ended = f", stuck here in {one['stuck']} of {found.failed} failed episodes" if one["stuck"] else ""
                 print(f"    true {one['true']:4.0%}  chosen {one['chosen']:4.0%}  {one['skill']}{ended}")
         print()
-    output = Output(json)
-    output.result(result, steps=steps)
+    output = Output(json).result(result, steps=steps)
     with held(out, "out", folder=True, wait=True):
         result.save(out / "results.json", plans=loaded.fingerprint)
         write_json(out / "plan_use.json", {task: found.to_json() for task, found in seen.items()})

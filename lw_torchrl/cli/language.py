@@ -34,10 +34,9 @@ def tasks(
     def objects(row: Row) -> str:
         return ", ".join(one["name"] + (" (ours)" if one["ours"] else "") for one in row["objects"])
 
-    output = Output(json)
     columns: Columns = {"task": "task", "MT10": "mt10", "description": "description"}
-    output.table("tasks", rows, {**columns, "objects beside the gripper": objects}, counted(len(rows), "task"))
-    return output
+    columns = {**columns, "objects beside the gripper": objects}
+    return Output(json).table("tasks", rows, columns, counted(len(rows), "task"))
 
 
 def skills(
@@ -62,8 +61,8 @@ def skills(
     output = Output(json)
     if nearest is not None:
         skill, score = nearest_skill(nearest, definition, table)
-        output.show("nearest", {"skill": skill.text, "similarity": score}, f"{skill.text}   (similarity {score:.2f})")
-        return output
+        found = {"skill": skill.text, "similarity": score}
+        return output.show("nearest", found, f"{skill.text}   (similarity {score:.2f})")
     rows = []
     for skill in table.values():
         if definition is not None and not skill.suits(definition):
@@ -79,8 +78,7 @@ def skills(
         "gain": lambda row: _numbers(row["gain"][:1] if len({*row["gain"]}) == 1 else row["gain"]),
         "gripper": lambda row: f"{row['gripper']:g}",
     }
-    output.table("skills", rows, columns, counted(len(rows), "scripted skill"))
-    return output
+    return output.table("skills", rows, columns, counted(len(rows), "scripted skill"))
 
 
 def _numbers(values: Iterable[float]) -> str:
@@ -122,22 +120,19 @@ def plans(
         ]
         objects: Columns = {"moved": lambda row: row["moved"] or "?", "target": lambda row: row["target"] or "?"}
         columns: Columns = {"task": "task", "skill": "skill", **objects, "told by": "told_by"}
-        output.table("steps", told, columns, counted(len(told), "step"))
-        return output
+        return output.table("steps", told, columns, counted(len(told), "step"))
     rows: list[dict[str, Any]] = []
     for name in chosen:
         steps = [{"condition": str(step.condition), "skill": step.skill} for step in loaded[name].steps]
         rows.append({"task": name, "steps": steps, "text": str(loaded[name])})
     if names:
-        output.show("plans", rows, "\n".join(row["text"] for row in rows))
-        return output
+        return output.show("plans", rows, "\n".join(row["text"] for row in rows))
     columns = {
         "task": "task",
         "steps": lambda row: len(row["steps"]),
         "skills": lambda row: "; ".join(dict.fromkeys(step["skill"] for step in row["steps"])),
     }
-    output.table("plans", rows, columns, counted(len(rows), "plan"))
-    return output
+    return output.table("plans", rows, columns, counted(len(rows), "plan"))
 
 
 def queries(
@@ -158,18 +153,15 @@ def queries(
 
     known = options.read_tasks(task_file, (task,))
     definition = known[check_task(task, known)]
-    output = Output(json)
     if text is not None:
         found = nearest_query(text, definition, by=by)
         nearest = {"query": str(found.query), "similarity": found.score}
-        output.show("nearest", nearest, f"{found.query}   (similarity {found.score:.2f})")
-        return output
+        return Output(json).show("nearest", nearest, f"{found.query}   (similarity {found.score:.2f})")
     published = set(lw.supported_queries(definition, published_only=True))
     listed = [{"query": query, "ours": query not in published} for query in lw.supported_queries(definition)]
     lines = [f"{one['query']}{'   (ours)' if one['ours'] else ''}" for one in listed]
     ending = f"\n{len(listed)} base queries; each may be negated, and joined to others by 'and'"
-    output.show("queries", listed, "\n".join([*lines, ending]))
-    return output
+    return Output(json).show("queries", listed, "\n".join([*lines, ending]))
 
 
 def query(
@@ -221,5 +213,4 @@ def query(
     said = [one["query"] for one in answers if one["holds"]]
     if text is not None:
         said = [f"{'yes' if one['holds'] else 'no'}: {one['query']}" for one in answers]
-    output.show("queries", answers, "\n".join(said))
-    return output
+    return output.show("queries", answers, "\n".join(said))

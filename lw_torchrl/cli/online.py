@@ -11,16 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 from tyro.conf import Positional
 
 from lw_torchrl._checks import counted, shown
-from lw_torchrl.cli.options import (
-    Json,
-    PlanSources,
-    check_saved,
-    make_logger,
-    one_or_many,
-    read_plans,
-    read_tasks,
-    simulated,
-)
+from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Output
 from lw_torchrl.cli.runs import Job, Scheduled
 
@@ -45,13 +36,13 @@ def online(
     frames: int | None = None,
     demonstrations: int = 1,  # of each task, without noise
     start: Path | None = None,  # a policy to begin with, of train; by default one is cloned from the demonstrations
-    condition: Literal["pcbc", "dc", "one-hot"] = "pcbc",  # that one is conditioned on plans, descriptions or numbers
-    plans: PlanSources = ("MT50",),
+    condition: options.Condition = "pcbc",  # that one is conditioned on plans, descriptions or numbers
+    plans: options.PlanSources = ("MT50",),
     episodes: int = 40,  # evaluated, on seeds that no training used, action noise 0.1
     step: str | None = None,
     logger: Literal["none", "csv", "tensorboard", "wandb"] = "none",
     out: Path = Path("runs/online"),  # where everything goes; on a cluster, a folder that all its machines share
-    json: Json = False,
+    json: options.Json = False,
 ) -> Output:
     """Train policies in their environment, beside demonstrations. If it is stopped, the same command resumes it.
 
@@ -78,11 +69,11 @@ def online(
             of = f"the method{'s' * (len(_READ_BY[option]) > 1)} {', '.join(_READ_BY[option])}"
             raise ValueError(f"--{option} is of {of}, --methods are {', '.join(methods)}")
     if start is not None:
-        check_saved("start", start)
+        options.check_saved("start", start)
     tuned = None if step is None else _read_step(step)
-    known = read_tasks(None, tasks)
-    chosen = simulated("tasks", one_or_many(tasks), known)
-    found = read_plans(plans, known)
+    known = options.read_tasks(None, tasks)
+    chosen = options.simulated("tasks", options.one_or_many(tasks), known)
+    found = options.read_plans(plans, known)
     found.require(chosen)
     if isinstance(tuned, int) and start is None:
         for task in chosen:
@@ -101,7 +92,7 @@ def online(
         for task in chosen
         for method in stage
     ]
-    make = None if logger == "none" else partial(make_logger, logger)
+    make = None if logger == "none" else partial(options.make_logger, logger)
     starts: dict[str, Job] = {}
     others: dict[str, Job] = {}
     for one in runs:

@@ -27,15 +27,11 @@ class Output:
     """Prints what is found as text, or gathers it for a JSON document; ``fault``, if any, then ends the command.
 
     Example:
-        >>> output = Output(as_json=False)
         >>> columns = {"task": "task", "episodes": "run"}
-        >>> output.table("tasks", [{"task": "push", "run": 3}, {"task": "reach", "run": None}], columns)
-        task   episodes
-        push   3
-        reach
-        >>> output = Output(as_json=True)
-        >>> output.show("rate", float("nan"), "no rate")
-        >>> output.document()
+        >>> _ = Output(as_json=False).table("tasks", [{"task": "push", "run": 3}], columns)
+        task  episodes
+        push  3
+        >>> Output(as_json=True).show("rate", float("nan"), "no rate").document()
         '{\\n  "rate": null\\n}'
     """
 
@@ -43,29 +39,29 @@ class Output:
         self.as_json, self.fault = as_json, ""
         self._found: dict[str, Any] = {}
 
-    def show(self, key: str, value: Any, text: str | None = None) -> None:
-        """Print ``text``, if there is any, or keep the value under the key."""
+    def show(self, key: str, value: Any, text: str | None = None) -> Output:
+        """Print ``text``, if there is any, or keep the value under the key; returns itself, as the others do."""
         if self.as_json:
             self._found[key] = value
         elif text is not None:
             print(text)
+        return self
 
-    def table(self, key: str, rows: Sequence[Row], columns: Columns, title: str = "") -> None:
+    def table(self, key: str, rows: Sequence[Row], columns: Columns, title: str = "") -> Output:
         """Print rows as a table of these columns, or keep them under the key."""
         if self.as_json:
-            self._found[key] = [dict(row) for row in rows]
-            return
+            return self.show(key, [dict(row) for row in rows])
         cells = [[_cell(row[of] if isinstance(of, str) else of(row)) for of in columns.values()] for row in rows]
         (_on_terminal if sys.stdout.isatty() else _in_pipe)(title, [*columns], cells)
+        return self
 
-    def result(self, found: EvaluationResult, **more: Mapping[str, Any]) -> None:
+    def result(self, found: EvaluationResult, **more: Mapping[str, Any]) -> Output:
         """Print an evaluation's table, or keep its numbers under "tasks", with more of each, and its configuration."""
         rates = ("success_once", "success_at_end", "first_success", "mean_return")
         columns = {name: getattr(found, name) for name in rates} | more
         rows = [{"task": task, **{name: of[task] for name, of in columns.items()}} for task in found.config["tasks"]]
-        self.show("tasks", rows, found.table())
-        self.show("mean_success", found.mean_success)
-        self.show("config", found.config)
+        self.show("tasks", rows, found.table()).show("mean_success", found.mean_success)
+        return self.show("config", found.config)
 
     def notes(self, found: Iterable[str]) -> None:
         """Print what is noted of answers, the most frequent first, or keep it under "notes"."""

@@ -76,7 +76,6 @@ def check(
 
     options.use_one_thread()
     found = check_plan(text, task, format, episodes=episodes, seed=seed, skills=skills, tasks=known)
-    output = Output(json)
     steps = [step for step in found.decoded.steps if not step.dropped]
     rows = [
         {"condition": str(step.condition), "skill": step.written_skill, "scripted": step.scripted}
@@ -85,12 +84,9 @@ def check(
         | {"chosen": None if found.own is None else found.own.chosen[k], "never": k in found.never}
         for k, step in enumerate(steps)
     ]
-    output.show("task", found.task, str(found))
-    output.show("reason", found.decoded.reason or None)
-    output.show("notes", [*map(str, found.decoded.notes)])
-    output.show("steps", rows)
-    output.show("success", None if found.own is None else found.success)
-    return output
+    output = Output(json).show("task", found.task, str(found)).show("reason", found.decoded.reason or None)
+    output.show("notes", [*map(str, found.decoded.notes)]).show("steps", rows)
+    return output.show("success", None if found.own is None else found.success)
 
 
 _BEST = ": of each task the plan that did best, be it one that never succeeds"

@@ -94,8 +94,7 @@ def generate(
     output.notes(notes)
     output.show("tokens", total)
     folder = asking.out / planner.name
-    output.show("folder", folder, f"{total} tokens; written to {folder}")
-    return output
+    return output.show("folder", folder, f"{total} tokens; written to {folder}")
 
 
 def _counts(answers: Sequence[Answer]) -> dict[str, int]:
@@ -159,5 +158,4 @@ def repair(
     print(f"{counted(len(first), 'answer')} to begin with, {asked} asked now")
     done = max(len(one.checks) for one in found) - 1
     folders = [asking.out / planner.name, *(asking.out / f"{planner.name}-round{k}" for k in range(1, done + 1))]
-    output.show("folders", folders, f"written to {', '.join(map(str, folders))}")
-    return output
+    return output.show("folders", folders, f"written to {', '.join(map(str, folders))}")

@@ -68,7 +68,7 @@ def record(
     # What can be refused is refused before the first episode runs.
     how = (seed, max_steps, speed, text_encoder)
     cast = [_cast(who, tasks, given, known, *how) for who in filter(None, (policy, compare))]
-    output, rows = Output(json), []
+    rows: list[dict[str, Any]] = []
     recorded: list[list[str]] = []
     with replacing(out) as file, lw.RerunLogger(file, exp_name=out.stem) as logger:
         for actor, shown, who in cast:
@@ -92,9 +92,8 @@ def record(
             recorded.append(pages)
         for pair, one in zip(zip(*recorded, strict=True), found, strict=True) if compare is not None else ():
             logger.compare(pair, f"{one.task} · episode {one.episode} · side by side")
-    output.show("episodes", rows)
-    output.show("recording", out, f"written to {out}\nlook at it with: lw-torchrl view {out}")
-    return output
+    output = Output(json).show("episodes", rows)
+    return output.show("recording", out, f"written to {out}\nlook at it with: lw-torchrl view {out}")
 
 
 def _cast(
@@ -115,8 +114,7 @@ def _cast(
 
     if who not in options.ACTORS:
         there = options.read_suite(None, tasks)
-        actor = options.load_policy(Path(who), seed, None if there else plans, text_encoder)
-        actor = actor if there is None else options.moved(actor, there, plans, speed)
+        actor = options.load_policy(Path(who), seed, plans, text_encoder, there, speed)
         if missing := [task for task in tasks if task not in actor.tasks]:
             knows = f"it knows {', '.join(actor.tasks)}"
             raise ValueError(f"the policy of {who!r} does not know {', '.join(missing)}; {knows}")

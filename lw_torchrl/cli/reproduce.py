@@ -38,10 +38,7 @@ def demo(out: Path | None = None, quick: bool = False, json: options.Json = Fals
 
     options.use_one_thread()
     result = run_demo(folder, QUICK if quick else DemoConfig())
-    output = Output(json)
-    if json:  # as text it has printed itself
-        output.result(result)
-    return output
+    return Output(json).result(result) if json else Output(json)  # as text it has printed itself
 
 
 def reproduce(

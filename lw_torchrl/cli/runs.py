@@ -61,8 +61,7 @@ class Schedule:
         every = {name: job for stage in (*shared, *runs) for name, job in stage.items()}
         names = [name for stage in runs for name in stage]
         if self.list:
-            output.show("runs", [*every], "\n".join(every))
-            return output
+            return output.show("runs", [*every], "\n".join(every))
         use_one_thread()
 
         def line(name: str) -> tuple[EvaluationResult | None, str]:
@@ -87,8 +86,7 @@ class Schedule:
                 commands = [[*map(str, command), "--run", name] for name in stage]
                 ended = run_commands(commands, self.launcher, self.jobs)
                 _report(len(stage), (printed.strip() or stage[index] for index, printed in ended))
-        output.show("summaries", summarize())
-        return output
+        return output.show("summaries", summarize())
 
 
 Scheduled = Annotated[Schedule, OmitArgPrefixes]

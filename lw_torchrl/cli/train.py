@@ -27,7 +27,7 @@ def train(
     plans: options.PlanSources = ("MT10",),
     task_file: options.TaskFile = None,
     text_encoder: options.EncoderName = None,
-    method: str = "pcbc",  # pcbc, by plan; or a baseline: dc, by the task's description, one-hot, by its number
+    method: options.Condition = "pcbc",  # pcbc, by plan; or a baseline: dc, by description, one-hot, by number
     mix: Literal["latents", "actions"] | None = None,
     features: Literal["raw", "differences", "relative", "both"] = "differences",
     width: int = 256,  # of the action decoder's hidden layers
@@ -65,8 +65,6 @@ def train(
     options.check_file("--out", out)
     if begin is not None and out.resolve() == begin.resolve():
         raise ValueError("--out must be another file than --begin, which is only read")
-    from lw_torchrl.language.tasks import resolve_tasks
-
     if answers is not None and evaluator is None:
         raise ValueError("--answers is of an evaluator's answers; give --evaluator")
     if qaf_anchor and evaluator is None and begin is None:
@@ -76,9 +74,9 @@ def train(
             "--evaluator new knows nothing: give --qaf-anchor 1 too, by which it learns what conditions mean"
         )
     options.check_dataset("data", data)
-    check_choice("method", method, options.METHODS)
     options.check_encoder(text_encoder)
     from lw_torchrl.data.dataset import read_metadata
+    from lw_torchrl.language.tasks import resolve_tasks
 
     held = read_metadata(data).config
     known = options.read_tasks(task_file, held.tasks)
@@ -95,26 +93,24 @@ def train(
     import torch
 
     import lw_torchrl as lw
-    from lw_torchrl import modules
     from lw_torchrl._devices import check_device
-    from lw_torchrl.modules.policy import make_policy, policy_class
+    from lw_torchrl.modules.policy import METHODS, make_policy, policy_class
 
     options.use_one_thread()
     there = check_device("device", device)
     encoder = options.read_encoder(text_encoder)
     actor_options: dict[str, Any] = {"features": features, "width": width, "depth": depth}
-    reads_plans = policy_class(modules.METHODS[method].policy).plan_options
-    for option, value in (("--mix", mix), ("--latent-consistency", latent_consistency)):
-        if value and not reads_plans:
-            raise ValueError(f"{option} is for a method that reads plans, --method {method} does not")
+    reads_plans = policy_class(METHODS[method].policy).plan_options
     if reads_plans:
         actor_options["mix"] = mix or "latents"
+    for name, one in {"mix": mix, "latent-consistency": latent_consistency, "evaluator": evaluator}.items():
+        if one and not reads_plans:
+            raise ValueError(f"--{name} is for a method that reads plans, --method {method} does not")
     numbers: dict[str, Any] = {"steps": steps, "batch_size": batch_size, "learning_rate": learning_rate, "seed": seed}
     numbers |= {"latent_consistency": latent_consistency, "qaf_anchor": qaf_anchor}
     config = lw.BehavioralCloningConfig(normalize=begin is None, **numbers)
-    rows: dict[str, Any] = {"episodes": None, "after_success": after_success}
-    if chosen:
-        rows["episodes"] = {check_choice("tasks", task, held.tasks): held.episodes_per_task for task in chosen}
+    wanted = {check_choice("tasks", task, held.tasks): held.episodes_per_task for task in chosen}
+    rows: dict[str, Any] = {"episodes": wanted or None, "after_success": after_success}
     replay = lw.LanguageWorldExperienceReplay(data, sampler=lw.TaskBalancedSampler(), device=there, **rows)
     torch.manual_seed(seed)
     if begin is not None:
@@ -130,8 +126,6 @@ def train(
     else:
         shown = loaded if reads_plans else {task: loaded[task] for task in replay.tasks}
         if evaluator is not None:
-            if not reads_plans:
-                raise ValueError(f"--evaluator is for a method that reads plans, --method {method} does not")
             actor_options |= {"evaluator": _evaluator(evaluator, loaded, encoder), "answers": answers or "tanh"}
         actor = make_policy(method, shown, text_encoder=encoder, **actor_options)
     loaded.require(replay.tasks)
